@@ -1,0 +1,1 @@
+"""From range maps to one cloud."""

@@ -1,0 +1,1 @@
+"""Descriptor matching and the choice of pairs."""

@@ -1,0 +1,1 @@
+"""How far poses and ranges are from the truth."""

@@ -1,0 +1,1 @@
+"""From pairs to the poses of all panoramas."""

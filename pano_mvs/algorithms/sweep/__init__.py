@@ -1,0 +1,1 @@
+"""The sphere sweep: range by testing virtual depths."""

@@ -1,0 +1,73 @@
+"""Every error that pano_mvs raises on purpose.
+
+    PanoMvsError
+    ├── UsageError (ValueError)            exit 2: a call or an option that cannot work
+    │   └── WorkflowError                  exit 2: mistakes in a workflow file, with line and column
+    ├── InputError (ValueError)            exit 2, or 3 where the rest can go on: a file we cannot use
+    ├── PluginError (ImportError)          exit 2: a plugin that failed to import or to register
+    ├── ContractError (TypeError)          exit 1: a stage returned what it had not declared
+    ├── StoreError (OSError)               exit 4: the cache or the output folder cannot be written
+    ├── GateError (RuntimeError)           exit 4: a quality gate stopped the run
+    └── StageFailedError (RuntimeError)    exit 3: a stage's own code failed on a unit
+
+A message says what is wrong, with which item, where, and what to do about it. Expected degeneracy
+(too few matches, pure rotation) is not an error: it is a falsy value that carries its reason.
+"""
+
+from __future__ import annotations
+
+
+class PanoMvsError(Exception):
+    """Base of all errors that pano_mvs raises on purpose."""
+
+    exit_code = 1
+
+
+class UsageError(PanoMvsError, ValueError):
+    """A call or an option that cannot work."""
+
+    exit_code = 2
+
+
+class WorkflowError(UsageError):
+    """One or more mistakes in a workflow; `problems` holds one line for each."""
+
+    def __init__(self, problems: list[str]) -> None:
+        self.problems = problems
+        super().__init__("\n".join(problems))
+
+
+class InputError(PanoMvsError, ValueError):
+    """A file or folder given by the user that cannot be used; the message names it and the remedy."""
+
+    exit_code = 2
+
+
+class PluginError(PanoMvsError, ImportError):
+    """A plugin that failed to import or to register."""
+
+    exit_code = 2
+
+
+class ContractError(PanoMvsError, TypeError):
+    """A stage returned something other than what it declared."""
+
+    exit_code = 1
+
+
+class StoreError(PanoMvsError, OSError):
+    """The cache or the output folder cannot be read or written."""
+
+    exit_code = 4
+
+
+class GateError(PanoMvsError, RuntimeError):
+    """A quality gate stopped the run; what was computed is kept."""
+
+    exit_code = 4
+
+
+class StageFailedError(PanoMvsError, RuntimeError):
+    """A stage's own code failed on a unit; the cause is chained."""
+
+    exit_code = 3

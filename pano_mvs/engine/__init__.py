@@ -1,0 +1,1 @@
+"""Workflows, plans, the store and execution; knows no stage by name."""

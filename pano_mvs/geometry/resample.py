@@ -1,0 +1,94 @@
+"""Resampling of panoramas: the seam wraps, the poles reflect with a half-turn, no border exists."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry.sphere import pixel_from_ray, ray_grid
+
+Scalar = TypeVar("Scalar", bound=np.generic)
+
+
+def pad_panorama(panorama: NDArray[Scalar], pad_px: int) -> NDArray[Scalar]:
+    """Return a panorama with a margin in which it goes on over the seam and over the poles.
+
+    Args:
+        panorama: (H, W, ...) with even W, the full sphere.
+        pad_px: width of the margin on all four sides, at most H.
+
+    Returns:
+        (H + 2 pad, W + 2 pad, ...), of the same type.
+
+    Raises:
+        UsageError: if W is odd (then no column lies exactly half a turn away) or the margin is wider than H.
+    """
+    height, width = panorama.shape[:2]
+    if width % 2 or not 0 <= pad_px <= min(height, width):
+        raise UsageError(f"cannot pad a {width}×{height} panorama by {pad_px} px: the width must be even, the margin "
+                         f"at most the height")  # fmt: skip
+    turned = np.roll(panorama, width // 2, axis=1)
+    rows = np.concatenate([turned[:pad_px][::-1], panorama, turned[height - pad_px :][::-1]], axis=0)
+    return np.concatenate([rows[:, width - pad_px :], rows, rows[:, :pad_px]], axis=1)
+
+
+def sample_panorama(panorama: NDArray[np.generic], pixels_px: ArrayLike) -> NDArray[np.float64]:
+    """Return a panorama's values between its pixels, bilinear, over the seam and over the poles.
+
+    Args:
+        panorama: (H, W) or (H, W, C), any real type, even W. A NaN neighbour with a weight makes the sample NaN.
+        pixels_px: (..., 2) positions (x, y), (0, 0) the upper-left corner; any x (it wraps), y in [0, H].
+
+    Returns:
+        (...,) or (..., C) float64.
+    """
+    pixels = np.asarray(pixels_px, dtype=np.float64)
+    height, width = panorama.shape[:2]
+    padded = pad_panorama(panorama, 1)
+    x = np.mod(pixels[..., 0], width) + 0.5
+    y = np.clip(pixels[..., 1], 0, height) + 0.5
+    column, row = np.floor(x).astype(np.intp), np.floor(y).astype(np.intp)
+    weight_x, weight_y = x - column, y - row
+    if panorama.ndim == 3:
+        weight_x, weight_y = weight_x[..., None], weight_y[..., None]
+    result = np.zeros(np.broadcast_shapes(weight_x.shape, (*pixels.shape[:-1], *panorama.shape[2:])))
+    for d_row, w_row in ((0, 1 - weight_y), (1, weight_y)):
+        for d_column, w_column in ((0, 1 - weight_x), (1, weight_x)):
+            weight = w_row * w_column
+            value = padded[np.minimum(row + d_row, height + 1), np.minimum(column + d_column, width + 1)]
+            result += np.where(weight > 0, weight * value, 0.0)
+    return result
+
+
+def rotate_panorama(panorama: NDArray[Scalar], new_from_old: ArrayLike) -> NDArray[Scalar]:
+    """Return the panorama as the same camera would see it after a turn about its centre (bilinear).
+
+    Args:
+        panorama: (H, W) or (H, W, C), the full sphere.
+        new_from_old: (3, 3) rotation; a ray r of the old frame appears as new_from_old @ r in the new one.
+
+    Returns:
+        An array of the same shape and type; integers are rounded.
+    """
+    rotation = np.asarray(new_from_old, dtype=np.float64)
+    height, width = panorama.shape[:2]
+    rays_in_old = ray_grid((height, width)) @ rotation
+    sampled = sample_panorama(panorama, pixel_from_ray(rays_in_old, (height, width)))
+    if np.issubdtype(panorama.dtype, np.integer):
+        sampled = np.rint(sampled)  # bilinear weights sum to 1, so no clipping is needed
+    return sampled.astype(panorama.dtype)
+
+
+def roll_panorama(panorama: NDArray[Scalar], columns: int) -> tuple[NDArray[Scalar], NDArray[np.float64]]:
+    """Return a panorama rolled to the right by whole columns, and the rotation new_from_old (3, 3) that this is.
+
+    A camera known as cam_from_world becomes new_from_old @ cam_from_world (rotation and translation).
+    """
+    width = panorama.shape[1]
+    angle = 2 * np.pi * columns / width
+    cosine, sine = np.cos(angle), np.sin(angle)
+    new_from_old = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
+    return np.roll(panorama, columns, axis=1), new_from_old

@@ -1,0 +1,114 @@
+"""Rigid and similarity transforms of 3D points, named target_from_source."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry.rotation import nearest_rotation
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rigid3:
+    """A rigid transform target_from_source: x_in_target = rotation @ x_in_source + translation.
+
+    Attributes:
+        rotation: (3, 3) rotation matrix.
+        translation: (3,) in scene units.
+    """
+
+    rotation: FloatArray
+    translation: FloatArray
+
+    @staticmethod
+    def identity() -> Rigid3:
+        """Return the transform that changes nothing."""
+        return Rigid3(np.eye(3), np.zeros(3))
+
+    @staticmethod
+    def from_center(rotation: FloatArray, center: ArrayLike) -> Rigid3:
+        """Return the cam_from_world whose camera centre lies at `center` (3,) in the world."""
+        return Rigid3(rotation, -rotation @ np.asarray(center, dtype=np.float64))
+
+    def apply(self, points_in_source: ArrayLike) -> FloatArray:
+        """Return points (..., 3) of the source frame in the target frame."""
+        return np.asarray(points_in_source, dtype=np.float64) @ self.rotation.T + self.translation
+
+    def inverse(self) -> Rigid3:
+        """Return source_from_target."""
+        return Rigid3(self.rotation.T, -self.rotation.T @ self.translation)
+
+    def __matmul__(self, other: Rigid3) -> Rigid3:
+        """Return the composition: a_from_b @ b_from_c is a_from_c."""
+        return Rigid3(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
+
+    @property
+    def center(self) -> FloatArray:
+        """The origin of the target frame in source coordinates: for cam_from_world, the camera's centre (3,)."""
+        return -self.rotation.T @ self.translation
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Similarity3:
+    """A similarity target_from_source: x_in_target = scale * rotation @ x_in_source + translation.
+
+    Attributes:
+        scale: positive factor from source lengths to target lengths.
+        rotation: (3, 3) rotation matrix.
+        translation: (3,) in target units.
+    """
+
+    scale: float
+    rotation: FloatArray
+    translation: FloatArray
+
+    def apply(self, points_in_source: ArrayLike) -> FloatArray:
+        """Return points (..., 3) of the source frame in the target frame."""
+        return self.scale * np.asarray(points_in_source, dtype=np.float64) @ self.rotation.T + self.translation
+
+    def inverse(self) -> Similarity3:
+        """Return source_from_target."""
+        rotation = self.rotation.T
+        return Similarity3(1 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
+
+    def __matmul__(self, other: Similarity3) -> Similarity3:
+        """Return the composition: a_from_b @ b_from_c is a_from_c."""
+        return Similarity3(self.scale * other.scale, self.rotation @ other.rotation, self.apply(other.translation))
+
+    def move_camera(self, cam_from_source: Rigid3) -> Rigid3:
+        """Return cam_from_target of a camera known as cam_from_source, in the target's unit of length."""
+        rotation = cam_from_source.rotation @ self.rotation.T
+        return Rigid3(rotation, self.scale * cam_from_source.translation - rotation @ self.translation)
+
+
+def similarity_from_points(source: ArrayLike, target: ArrayLike, *, with_scale: bool = True) -> Similarity3:
+    """Return the similarity target_from_source with the least squared distance between paired points.
+
+    Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991.
+
+    Args:
+        source: (N, 3) points, N ≥ 1. Points on one line leave the turn about it undetermined.
+        target: (N, 3) the same points in the target frame.
+        with_scale: whether to estimate the scale; else it is 1.
+
+    Raises:
+        UsageError: if the shapes differ, or the source points coincide although a scale is wanted.
+    """
+    a, b = np.asarray(source, dtype=np.float64), np.asarray(target, dtype=np.float64)
+    if a.shape != b.shape or a.ndim != 2 or a.shape[1] != 3 or len(a) < 1:
+        raise UsageError(f"similarity_from_points needs two (N, 3) arrays of paired points, got {a.shape}, {b.shape}")
+    mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
+    covariance = (b - mean_b).T @ (a - mean_a) / len(a)
+    rotation = nearest_rotation(covariance)
+    scale = 1.0
+    if with_scale:
+        variance = float(np.sum((a - mean_a) ** 2)) / len(a)
+        if variance < 1e-24:
+            raise UsageError("the source points coincide, so no scale can be estimated")
+        scale = float(np.trace(rotation.T @ covariance)) / variance
+    return Similarity3(scale, rotation, mean_b - scale * rotation @ mean_a)

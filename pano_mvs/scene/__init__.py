@@ -1,0 +1,31 @@
+"""Immutable typed records that pass between stages, and how each is stored."""
+
+from pano_mvs.scene.cloud import PointCloud
+from pano_mvs.scene.features import Features
+from pano_mvs.scene.files import Files
+from pano_mvs.scene.index import Pairs, Views
+from pano_mvs.scene.panorama import Panorama
+from pano_mvs.scene.poses import Pose, Poses
+from pano_mvs.scene.range_map import RangeMap
+from pano_mvs.scene.record import Axis, FilePart, Part, Parts, Record
+from pano_mvs.scene.scores import Scores
+from pano_mvs.scene.two_view import TwoView
+
+__all__ = [
+    "Axis",
+    "Features",
+    "FilePart",
+    "Files",
+    "Pairs",
+    "Panorama",
+    "Part",
+    "Parts",
+    "PointCloud",
+    "Pose",
+    "Poses",
+    "RangeMap",
+    "Record",
+    "Scores",
+    "TwoView",
+    "Views",
+]

@@ -1,0 +1,52 @@
+"""Files to deliver into the output folder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import ClassVar, Self
+
+from pano_mvs.scene.record import Axis, FilePart, Parts, Record, require
+
+
+@dataclass(frozen=True, eq=False)
+class Files(Record):
+    """Files to deliver into the output folder; the store keeps them, so that a deleted one is written again.
+
+    Attributes:
+        files: target, relative to the output folder with forward slashes, to the file that a stage wrote into its
+            scratch folder. `{item}` in a target stands for the image's path relative to the capture without its
+            extension; the stage need not know it, so renaming an image recomputes nothing.
+    """
+
+    axis: ClassVar[Axis | None] = None
+
+    files: Mapping[str, Path]
+
+    def check(self) -> None:
+        """Raise ContractError if a target would leave the output folder."""
+        for target in self.files:
+            path = PurePosixPath(target)
+            inside = not path.is_absolute() and ".." not in path.parts and "\\" not in target and ":" not in target
+            require(inside and bool(path.parts), self, f"target {target!r} is not inside the output folder")
+
+    def to_parts(self) -> Parts:
+        """Return the files under numbers, and their targets as JSON."""
+        targets = sorted(self.files)
+        parts: dict[str, FilePart | dict[str, list[str]]] = {"meta": {"targets": targets}}
+        for number, target in enumerate(targets):
+            parts[str(number)] = FilePart(self.files[target])
+        return parts
+
+    @classmethod
+    def from_parts(cls, parts: Parts) -> Self:
+        """Return the files that `to_parts` gave, at their places in the store."""
+        meta = parts["meta"]
+        assert isinstance(meta, dict)
+        files: dict[str, Path] = {}
+        for number, target in enumerate(meta["targets"]):
+            part = parts[str(number)]
+            assert isinstance(part, FilePart)
+            files[target] = part.path
+        return cls(files)

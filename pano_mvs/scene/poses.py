@@ -1,0 +1,169 @@
+"""Where the panoramas were taken, and the sparse points that tell it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.geometry import Rigid3
+from pano_mvs.scene.record import Axis, Parts, Record, require, require_array
+
+# Range limits are rounded outward to these steps, so that a point more or less does not recompute a view.
+_LIMIT_STEPS_PER_OCTAVE = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Pose(Record):
+    """The pose of one registered image.
+
+    Attributes:
+        cam_from_world: the rigid transform into the camera frame.
+        near: a range below which no sparse point of this image lies, rounded down to a quarter octave, or None
+            where the image has too few points.
+        far: likewise above which none lies, rounded up.
+    """
+
+    axis: ClassVar[Axis | None] = Axis.IMAGE
+
+    cam_from_world: Rigid3
+    near: float | None = None
+    far: float | None = None
+
+    def check(self) -> None:
+        """Raise ContractError unless the rotation is one."""
+        rotation = self.cam_from_world.rotation
+        require(bool(np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)), self, "the rotation is not orthonormal")
+        require(bool(np.linalg.det(rotation) > 0), self, "the rotation mirrors (its determinant is negative)")
+        require(bool(np.isfinite(self.cam_from_world.translation).all()), self, "the translation is not finite")
+
+    def to_parts(self) -> Parts:
+        """Return the pose as one JSON object (floats keep all their digits)."""
+        pose = self.cam_from_world
+        meta = {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
+        return {"meta": meta | {"near": self.near, "far": self.far}}
+
+    @classmethod
+    def from_parts(cls, parts: Parts) -> Self:
+        """Return the pose that `to_parts` gave."""
+        meta = parts["meta"]
+        assert isinstance(meta, dict)
+        transform = Rigid3(np.array(meta["rotation"], np.float64), np.array(meta["translation"], np.float64))
+        return cls(transform, meta["near"], meta["far"])
+
+
+@dataclass(frozen=True, eq=False)
+class Poses(Record):
+    """The poses of all registered images of a capture, with the sparse points and tracks behind them.
+
+    Attributes:
+        names: (N) names of the registered images, in the capture's order.
+        rotations: (N, 3, 3) float64 of cam_from_world.
+        translations: (N, 3) float64 of cam_from_world, scene units.
+        points_in_world: (P, 3) float64.
+        point_colors_rgb: (P, 3) uint8.
+        point_errors_rad: (P,) float32 mean angular reprojection error.
+        track_point_idx: (T,) int32: observation t is of this point …
+        track_image_idx: (T,) int32: … in this image (a position in `names`) …
+        track_bearings: (T, 3) float64: … along this unit ray in the camera frame.
+        rejected: name of every image that could not be registered, with the reason.
+        frame: what the world frame is, in words.
+        scale: where the unit of length comes from, in words.
+        metric: whether the unit of length is the metre.
+    """
+
+    axis: ClassVar[Axis | None] = Axis.ONE
+    explodes_into: ClassVar[type[Record] | None] = Pose
+
+    names: tuple[str, ...]
+    rotations: NDArray[np.float64]
+    translations: NDArray[np.float64]
+    points_in_world: NDArray[np.float64]
+    point_colors_rgb: NDArray[np.uint8]
+    point_errors_rad: NDArray[np.float32]
+    track_point_idx: NDArray[np.int32]
+    track_image_idx: NDArray[np.int32]
+    track_bearings: NDArray[np.float64]
+    rejected: dict[str, str]
+    frame: str = "the first registered camera"
+    scale: str = "the first reference–neighbour baseline is 1"
+    metric: bool = False
+
+    @staticmethod
+    def without_points(
+        poses: Mapping[str, Rigid3],
+        *,
+        rejected: Mapping[str, str] | None = None,
+        frame: str,
+        scale: str,
+        metric: bool,
+    ) -> Poses:
+        """Return poses that come without sparse points (read from a file, say)."""
+        count = len(poses)
+        return Poses(
+            names=tuple(poses),
+            rotations=np.array([pose.rotation for pose in poses.values()]).reshape(count, 3, 3),
+            translations=np.array([pose.translation for pose in poses.values()]).reshape(count, 3),
+            points_in_world=np.zeros((0, 3)),
+            point_colors_rgb=np.zeros((0, 3), np.uint8),
+            point_errors_rad=np.zeros(0, np.float32),
+            track_point_idx=np.zeros(0, np.int32),
+            track_image_idx=np.zeros(0, np.int32),
+            track_bearings=np.zeros((0, 3)),
+            rejected=dict(rejected or {}),
+            frame=frame,
+            scale=scale,
+            metric=metric,
+        )
+
+    def cam_from_world(self, image_idx: int) -> Rigid3:
+        """Return the pose of the image at a position in `names`."""
+        return Rigid3(np.asarray(self.rotations[image_idx]), np.asarray(self.translations[image_idx]))
+
+    @property
+    def centers(self) -> NDArray[np.float64]:
+        """The camera centres, (N, 3), in the world."""
+        centers: NDArray[np.float64] = -np.einsum("nji,nj->ni", self.rotations, self.translations)
+        return centers
+
+    def explode(self) -> Mapping[str, Pose]:
+        """Return the pose of each registered image, with the limits of its sparse points' ranges."""
+        points = np.asarray(self.points_in_world)[self.track_point_idx]
+        ranges = np.linalg.norm(points - self.centers[self.track_image_idx], axis=-1)
+        poses: dict[str, Pose] = {}
+        for idx, name in enumerate(self.names):
+            near, far = _range_limits(ranges[self.track_image_idx == idx])
+            poses[name] = Pose(self.cam_from_world(idx), near, far)
+        return poses
+
+    def check(self) -> None:
+        """Raise ContractError unless all arrays agree."""
+        images, points, tracks = len(self.names), len(self.points_in_world), len(self.track_point_idx)
+        require(len(set(self.names)) == images, self, "an image is listed twice")
+        require_array(self, "rotations", dtype=np.float64, shape=(images, 3, 3))
+        require_array(self, "translations", dtype=np.float64, shape=(images, 3))
+        require_array(self, "points_in_world", dtype=np.float64, shape=(points, 3))
+        require_array(self, "point_colors_rgb", dtype=np.uint8, shape=(points, 3))
+        require_array(self, "point_errors_rad", dtype=np.float32, shape=(points,))
+        require_array(self, "track_point_idx", dtype=np.int32, shape=(tracks,))
+        require_array(self, "track_image_idx", dtype=np.int32, shape=(tracks,))
+        require_array(self, "track_bearings", dtype=np.float64, shape=(tracks, 3))
+        if tracks:
+            require(
+                0 <= self.track_point_idx.min() <= self.track_point_idx.max() < points, self, "a track has no point"
+            )
+            require(
+                0 <= self.track_image_idx.min() <= self.track_image_idx.max() < images, self, "a track has no image"
+            )
+
+
+def _range_limits(ranges: NDArray[np.float64], *, enough: int = 50) -> tuple[float | None, float | None]:
+    """Return robust limits of the ranges of an image's points, rounded outward, or None where points are few."""
+    if len(ranges) < enough:
+        return None, None
+    near, far = np.quantile(ranges, [0.005, 0.995])
+    steps = _LIMIT_STEPS_PER_OCTAVE
+    return float(2 ** (np.floor(np.log2(near) * steps) / steps)), float(2 ** (np.ceil(np.log2(far) * steps) / steps))

@@ -1,0 +1,47 @@
+"""The range of every pixel of one panorama."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.scene.record import Axis, Record, require, require_array
+
+FILLED_CONFIDENCE = 1, 63
+WEAK_CONFIDENCE = 64, 127
+CONSISTENT_CONFIDENCE = 128, 255
+
+
+@dataclass(frozen=True, eq=False)
+class RangeMap(Record):
+    """The range of every pixel of a reference view.
+
+    Attributes:
+        range: (H, W) float32 distance along the ray in scene units; NaN is invalid.
+        confidence: (H, W) uint8: 0 invalid, 1–63 filled (interpolated, not seen), 64–127 seen but weak, 128–255
+            consistent with other views.
+    """
+
+    axis: ClassVar[Axis | None] = Axis.VIEW
+
+    range: NDArray[np.float32]
+    confidence: NDArray[np.uint8]
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """The pixels that have a range, (H, W)."""
+        return np.isfinite(self.range)
+
+    def check(self) -> None:
+        """Raise ContractError unless ranges are positive or NaN, and confidence is 0 exactly where they are NaN."""
+        array = require_array(self, "range", dtype=np.float32, shape=(None, None), finite=False)
+        confidence = require_array(self, "confidence", dtype=np.uint8, shape=array.shape)
+        valid = np.isfinite(array)
+        require(bool(np.all(array[valid] > 0)), self, "a range is zero or negative; invalid is NaN")
+        require(not np.isinf(array).any(), self, "a range is infinite; invalid is NaN")
+        require(
+            bool(np.array_equal(confidence > 0, valid)), self, "confidence must be 0 exactly where the range is NaN"
+        )

@@ -1,0 +1,128 @@
+"""What every record is: a frozen dataclass that knows its axis and how it is stored."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, ClassVar, Self, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import ContractError
+
+
+class Axis(StrEnum):
+    """What one item of a kind belongs to, and so what one unit of work on it is."""
+
+    ONE = "one"
+    IMAGE = "image"
+    PAIR = "pair"
+    VIEW = "view"
+
+
+@dataclass(frozen=True, slots=True)
+class FilePart:
+    """A native file that is part of a record.
+
+    Attributes:
+        path: where the bytes are now.
+        external: True for a user's own file, which the store remembers by its digest and never copies; False for
+            a file that a stage wrote into its scratch folder, which the store takes in.
+        digest: of the bytes; filled in by the store when it hands the part out.
+    """
+
+    path: Path
+    external: bool = False
+    digest: str = ""
+
+
+Part: TypeAlias = "NDArray[Any] | FilePart | dict[str, Any]"
+Parts: TypeAlias = Mapping[str, Part]
+
+
+class Record:
+    """Base of all kinds of values that pass between stages.
+
+    A kind is a frozen dataclass that derives from this. Fields that hold an array are stored as .npy, files as they
+    are, and all other fields together as one JSON part, `meta`. A kind that needs another form overrides `to_parts`
+    and `from_parts`.
+
+    Attributes:
+        axis: what one item belongs to; None if it follows the stage's input (exported files do).
+        kind_version: raise it when the stored form changes; records of other versions are then recomputed.
+        explodes_into: the kind of the items, by image, that a collection holds; see `explode`.
+    """
+
+    axis: ClassVar[Axis | None] = Axis.ONE
+    kind_version: ClassVar[int] = 1
+    explodes_into: ClassVar[type[Record] | None] = None
+
+    @classmethod
+    def kind_name(cls) -> str:
+        """Return the name under which the kind is shown and stored."""
+        return cls.__name__
+
+    def explode(self) -> Mapping[str, Record]:
+        """Return the items of a collection by image name; each is stored and digested on its own."""
+        return {}
+
+    def check(self) -> None:
+        """Raise ContractError if shapes, types or values are not what the kind promises."""
+
+    def to_parts(self) -> Parts:
+        """Return the record as named arrays, files and JSON objects."""
+        parts: dict[str, Part] = {}
+        meta: dict[str, Any] = {}
+        for field in dataclasses.fields(self):  # type: ignore[arg-type]  # every kind is a dataclass
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray | FilePart):
+                parts[field.name] = value
+            else:
+                meta[field.name] = value
+        parts["meta"] = meta
+        return parts
+
+    @classmethod
+    def from_parts(cls, parts: Parts) -> Self:
+        """Return the record that `to_parts` gave."""
+        values: dict[str, Any] = {}
+        fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+        for name, part in parts.items():
+            if name == "meta":
+                assert isinstance(part, dict)
+                values.update({key: _tuples(value) for key, value in part.items() if key in fields})
+            else:
+                values[name] = part
+        return cls(**values)
+
+
+def _tuples(value: Any) -> Any:
+    """Turn JSON's lists back into tuples, at any depth."""
+    if isinstance(value, list):
+        return tuple(_tuples(item) for item in value)
+    return value
+
+
+def require(condition: bool, kind: Record, what: str) -> None:
+    """Raise ContractError naming the kind unless the condition holds."""
+    if not condition:
+        raise ContractError(f"{kind.kind_name()}: {what}")
+
+
+def require_array(
+    kind: Record, name: str, *, dtype: type[np.generic], shape: tuple[int | None, ...], finite: bool = True
+) -> NDArray[Any]:
+    """Return the named field after checking that it is an array of that type and shape (None: any length)."""
+    array = getattr(kind, name)
+    require(isinstance(array, np.ndarray), kind, f"{name} must be an array, got {type(array).__name__}")
+    require(array.dtype == dtype, kind, f"{name} must be {np.dtype(dtype).name}, got {array.dtype}")
+    fits = len(array.shape) == len(shape) and all(b is None or a == b for a, b in zip(array.shape, shape, strict=True))
+    require(fits, kind, f"{name} must have shape {shape}, got {array.shape}")
+    if finite and np.issubdtype(array.dtype, np.floating):
+        require(bool(np.isfinite(array).all()), kind, f"{name} holds NaN or infinite values")
+    assert isinstance(array, np.ndarray)
+    return array

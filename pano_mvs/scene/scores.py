@@ -1,0 +1,25 @@
+"""How good a result is, against ground truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from pano_mvs.scene.record import Axis, Record
+
+
+@dataclass(frozen=True, eq=False)
+class Scores(Record):
+    """How good a result is, against ground truth; empty where none is known.
+
+    Attributes:
+        poses: name of a pose metric to its value.
+        views: image name to name of a depth metric to its value.
+        notes: what was left out, and why.
+    """
+
+    axis: ClassVar[Axis | None] = Axis.ONE
+
+    poses: dict[str, Any]
+    views: dict[str, dict[str, float]]
+    notes: tuple[str, ...] = ()

@@ -1,0 +1,1 @@
+"""Synthetic scenes with exact truth, and checks for the authors of stages."""
