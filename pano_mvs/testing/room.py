@@ -1,0 +1,205 @@
+"""A synthetic room whose range is known in closed form: the truth that the tests are fed from."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.geometry import Rigid3, ray_from_pixel, rotation_from_rotvec
+from pano_mvs.testing.surfaces import Ball, Cuboid, FloatArray, Quad, Surface, Vector
+from pano_mvs.testing.texture import noise
+
+Texture = Literal["strong", "weak", "isotropic"]
+
+# Cell sizes in scene units with the strength of the noise on each.
+_LIGHTNESS: dict[Texture, tuple[tuple[float, float], ...]] = {
+    "strong": ((0.015, 0.6), (0.047, 0.6), (0.16, 0.5)),
+    "weak": ((0.047, 0.03), (0.16, 0.05)),
+    "isotropic": ((0.015, 0.7), (0.047, 0.7)),
+}
+_HUE: dict[Texture, tuple[tuple[float, float], ...]] = {
+    "strong": ((0.06, 1.0),),
+    "weak": ((0.2, 0.15),),
+    "isotropic": ((0.06, 0.6),),
+}
+_RAYS_AT_ONCE = 1 << 17
+
+
+@dataclass(frozen=True)
+class Room:
+    """Surfaces with a texture and one lamp; what a ray meets first is what a camera sees.
+
+    Attributes:
+        surfaces: in any order.
+        texture: "strong" (features everywhere), "weak" (nearly plain walls), or "isotropic".
+        seed: of the texture.
+        lamp: where the light comes from; the shading is diffuse, without shadows.
+    """
+
+    surfaces: tuple[Surface, ...]
+    texture: Texture = "strong"
+    seed: int = 0
+    lamp: Vector = (0.4, -1.2, 0.3)
+
+
+def default_room(seed: int = 0, texture: Texture = "strong") -> Room:
+    """Return a furnished room of 6 × 2.8 × 5 units, free of furniture within 0.8 of its origin (y is down).
+
+    With the texture "isotropic" it is a plain sphere of radius 2 around the origin, which looks alike in all
+    directions.
+    """
+    if texture == "isotropic":
+        return Room((Ball((0.0, 0.0, 0.0), 2.0, ((0.75, 0.7, 0.6), (0.35, 0.45, 0.6))),), texture, seed, (0, 0, 0))
+    return Room(_furniture(), texture, seed)
+
+
+def capture_poses(count: int, *, seed: int = 0, spread: float = 0.6, tilt_deg: float = 10.0) -> list[Rigid3]:
+    """Return cameras in the free middle of the default room: any heading, a small tilt.
+
+    Args:
+        count: number of cameras.
+        seed: of the draw.
+        spread: half the side of the cube in which the centres lie; heights vary by half of it.
+        tilt_deg: standard deviation of the tilt about a horizontal axis.
+
+    Returns:
+        cam_from_world of each; the first is the identity.
+    """
+    rng = np.random.default_rng(seed)
+    poses = [Rigid3.identity()]
+    while len(poses) < count:
+        center = rng.uniform(-spread, spread, 3) * (1, 0.5, 1)
+        if min(float(np.linalg.norm(center - pose.center)) for pose in poses) < spread / count:
+            continue
+        tilt = rng.normal(size=3) * np.radians(tilt_deg) * (1, 0, 1)
+        heading = (0.0, rng.uniform(-np.pi, np.pi), 0.0)
+        poses.append(Rigid3.from_center(rotation_from_rotvec(tilt) @ rotation_from_rotvec(heading), center))
+    return poses[:count]
+
+
+def render(
+    room: Room, cam_from_world: Rigid3, size_hw: tuple[int, int], *, supersample: int = 2
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Return what a camera in the room sees, and how far away it is.
+
+    Args:
+        room: what there is.
+        cam_from_world: any pose.
+        size_hw: (height, width) of the panorama.
+        supersample: rays per pixel along either side that are averaged for the colour.
+
+    Returns:
+        Two arrays: (H, W, 3) uint8 RGB, and (H, W) float32 range along the ray through each pixel's exact centre,
+        NaN where the ray meets nothing.
+    """
+    height, width = size_hw
+    steps = (np.arange(supersample) + 0.5) / supersample
+    colors = np.zeros((height * width, 3))
+    for offset_y in steps:
+        for offset_x in steps:
+            colors += _traced(room, cam_from_world, size_hw, (float(offset_x), float(offset_y)))[1]
+    distances, _ = _traced(room, cam_from_world, size_hw, (0.5, 0.5), shaded=False)
+    image = np.rint(colors * (255 / supersample**2)).astype(np.uint8).reshape(height, width, 3)
+    ranges = np.where(np.isfinite(distances), distances, np.nan).astype(np.float32)
+    return image, ranges.reshape(height, width)
+
+
+def range_along(room: Room, origin_in_world: FloatArray, rays_in_world: FloatArray) -> FloatArray:
+    """Return the exact distance from a point (3,) to the first surface along unit rays (N, 3); (N,), inf if none."""
+    return _first_hit(room, origin_in_world, rays_in_world)[0]
+
+
+def write_capture(folder: Path, room: Room, poses: Sequence[Rigid3], size_hw: tuple[int, int]) -> None:
+    """Write a capture of the room: images/000.png …, truth/poses.json and truth/depth.npz.
+
+    The truth has the form that `pano_mvs.io.truth.read_truth` reads: poses are cam_from_world, ranges are float32
+    with inf where there is no surface, and each view carries the SHA-256 of its picture.
+    """
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    (folder / "truth").mkdir(exist_ok=True)
+    views: list[dict[str, object]] = []
+    ranges: dict[str, NDArray[np.float32]] = {}
+    for number, pose in enumerate(poses):
+        image, range_map = render(room, pose, size_hw)
+        name = f"{number:03d}"
+        data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
+        (folder / "images" / f"{name}.png").write_bytes(data)
+        ranges[name] = np.where(np.isfinite(range_map), range_map, np.float32(np.inf))
+        digest = hashlib.sha256(data).hexdigest()
+        view = {"id": number, "image": f"images/{name}.png", "sha256": digest}
+        views.append(view | {"R": pose.rotation.tolist(), "t": pose.translation.tolist()})
+    text = json.dumps({"width": size_hw[1], "height": size_hw[0], "metric": True, "views": views}, indent=1)
+    (folder / "truth" / "poses.json").write_text(text, encoding="utf-8")
+    np.savez_compressed(folder / "truth" / "depth.npz", **ranges)  # type: ignore[arg-type]  # names are ours
+
+
+def _traced(
+    room: Room, cam_from_world: Rigid3, size_hw: tuple[int, int], offset_px: tuple[float, float], *, shaded: bool = True
+) -> tuple[FloatArray, FloatArray]:
+    """Return distance (H W,) and colour (H W, 3) along the rays through one place within each pixel."""
+    height, width = size_hw
+    origin = cam_from_world.center
+    distances, colors = np.zeros(height * width), np.zeros((height * width, 3))
+    for start in range(0, height * width, _RAYS_AT_ONCE):
+        block = slice(start, min(start + _RAYS_AT_ONCE, height * width))
+        row, column = np.divmod(np.arange(block.start, block.stop), width)
+        pixels = np.stack([column + offset_px[0], row + offset_px[1]], axis=-1)
+        rays = ray_from_pixel(pixels, size_hw) @ cam_from_world.rotation
+        distances[block], surface_idx, normals = _first_hit(room, origin, rays)
+        if shaded:
+            colors[block] = _shaded(room, origin + distances[block, None] * rays, surface_idx, normals)
+    return distances, colors
+
+
+def _first_hit(room: Room, origin: FloatArray, rays: FloatArray) -> tuple[FloatArray, NDArray[np.int64], FloatArray]:
+    """Return distance, index of the surface (−1: none) and normal where each ray first meets a surface."""
+    best, which, normals = np.full(len(rays), np.inf), np.full(len(rays), -1), np.zeros_like(rays)
+    for idx, surface in enumerate(room.surfaces):
+        distance, normal = surface.hit(origin, rays)
+        nearer = distance < best
+        best[nearer], which[nearer], normals[nearer] = distance[nearer], idx, normal[nearer]
+    return best, which, normals
+
+
+def _shaded(room: Room, points: FloatArray, surface_idx: NDArray[np.int64], normals: FloatArray) -> FloatArray:
+    """Return the colours (N, 3) in [0, 1] of points on surfaces; black where there is none."""
+    colors = np.zeros_like(points)
+    for idx, surface in enumerate(room.surfaces):
+        on = surface_idx == idx
+        seed = 1000 * room.seed + 2 * idx
+        share = 0.5 + 0.5 * np.tanh(noise(points[on], cells=_HUE[room.texture], seed=seed))
+        lightness = np.tanh(noise(points[on], cells=_LIGHTNESS[room.texture], seed=seed + 1))
+        first, second = np.array(surface.colors_rgb)
+        albedo = share[:, None] * first + (1 - share[:, None]) * second
+        to_lamp = np.array(room.lamp) - points[on]
+        facing = np.abs(np.sum(to_lamp * normals[on], axis=1)) / np.maximum(np.linalg.norm(to_lamp, axis=1), 1e-9)
+        colors[on] = albedo * (0.55 + 0.45 * facing[:, None]) * (1 + 0.65 * lightness[:, None])
+    return np.clip(colors, 0, 1)
+
+
+def _furniture() -> tuple[Surface, ...]:
+    """Return the walls, a cupboard, a table, a bench, a leaning board, a screen, and three balls."""
+    oak, wall = ((0.62, 0.44, 0.27), (0.42, 0.28, 0.17)), ((0.72, 0.72, 0.66), (0.55, 0.58, 0.60))
+    blue, red = ((0.25, 0.38, 0.62), (0.45, 0.60, 0.75)), ((0.70, 0.26, 0.22), (0.80, 0.52, 0.40))
+    green = ((0.30, 0.52, 0.32), (0.62, 0.70, 0.36))
+    return (
+        Cuboid((-3.0, -1.5, -2.5), (3.0, 1.3, 2.5), wall),
+        Cuboid((-2.9, -0.7, 1.7), (-1.6, 1.3, 2.45), oak),
+        Cuboid((0.6, 0.45, 1.2), (2.2, 0.52, 2.1), oak),
+        Cuboid((0.7, 0.52, 1.3), (0.8, 1.3, 1.4), oak),
+        Cuboid((2.0, 0.52, 1.9), (2.1, 1.3, 2.0), oak),
+        Cuboid((-2.2, 0.85, -2.3), (-0.4, 1.3, -1.7), green),
+        Quad((1.6, -0.9, -2.3), (1.2, 0.0, 0.5), (-0.1, 2.2, 0.5), blue),
+        Quad((-2.7, -0.5, -0.9), (0.1, 0.0, 1.4), (0.0, 0.9, 0.0), red),
+        Ball((1.3, 0.20, 1.6), 0.25, red),
+        Ball((-1.5, 0.95, 0.6), 0.35, blue),
+        Ball((0.9, -0.7, -1.4), 0.3, green),
+    )
