@@ -21,7 +21,7 @@ Texture = Literal["strong", "weak", "isotropic"]
 
 # Cell sizes in scene units with the strength of the noise on each.
 _LIGHTNESS: dict[Texture, tuple[tuple[float, float], ...]] = {
-    "strong": ((0.015, 0.6), (0.047, 0.6), (0.16, 0.5)),
+    "strong": ((0.018, 0.4), (0.055, 0.5), (0.19, 0.5)),
     "weak": ((0.047, 0.03), (0.16, 0.05)),
     "isotropic": ((0.015, 0.7), (0.047, 0.7)),
 }

@@ -1,0 +1,150 @@
+"""The synthetic room: everything else trusts it, so it is held against closed forms."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_grid, roll_panorama, rotation_from_rotvec, sample_panorama
+from pano_mvs.testing.room import Room, capture_poses, default_room, range_along, render, write_capture
+from pano_mvs.testing.surfaces import Ball, Cuboid, Quad
+
+GREY = ((0.5, 0.5, 0.5), (0.4, 0.4, 0.4))
+SIZE = (64, 128)
+COMPONENT = st.floats(-0.6, 0.6)
+
+
+@given(center=st.tuples(COMPONENT, COMPONENT, COMPONENT), turn=st.tuples(*[st.floats(-3, 3)] * 3))
+@settings(max_examples=20, deadline=None)
+def test_range_inside_a_sphere_solves_its_quadratic(center, turn):
+    pose = Rigid3.from_center(rotation_from_rotvec(turn), center)
+    _, range_map = render(Room((Ball((0.1, -0.2, 0.3), 2.0, GREY),)), pose, (16, 32), supersample=1)
+    points = np.array(center) + range_map[..., None] * (ray_grid((16, 32)) @ pose.rotation)
+    assert np.linalg.norm(points - (0.1, -0.2, 0.3), axis=-1) == pytest.approx(2.0, abs=1e-6)
+
+
+@given(center=st.tuples(COMPONENT, COMPONENT, COMPONENT), turn=st.tuples(*[st.floats(-3, 3)] * 3))
+@settings(max_examples=20, deadline=None)
+def test_range_inside_a_box_ends_on_its_nearest_wall(center, turn):
+    pose = Rigid3.from_center(rotation_from_rotvec(turn), center)
+    _, range_map = render(Room((Cuboid((-1, -2, -3), (1, 2, 3), GREY),)), pose, (16, 32), supersample=1)
+    points = np.array(center) + range_map[..., None].astype(float) * (ray_grid((16, 32)) @ pose.rotation)
+    assert np.max(np.abs(points) / (1, 2, 3), axis=-1) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_rays_parallel_to_a_slab_are_told_apart():
+    box = Cuboid((-1, -1, 2), (1, 1, 3), GREY)
+    ahead = np.array([[0.0, 0.0, 1.0]])
+    assert box.hit(np.zeros(3), ahead)[0] == 2
+    assert np.isinf(box.hit(np.array([0.0, 1.5, 0.0]), ahead)[0])
+    assert np.isinf(box.hit(np.array([0.0, 0.0, 4.0]), ahead)[0])
+    assert box.hit(np.array([0.0, 0.0, 2.25]), ahead)[0] == 0.75
+
+
+def test_a_quad_is_met_within_its_edges_and_from_both_sides():
+    quad = Quad((-1, -1, 2), (2, 0, 0), (0, 2, 0), GREY)
+    rays = np.array([[0, 0, 1.0], [0.49, 0, 1], [0.51, 0, 1], [0, -0.49, 1], [0, -0.51, 1], [0, 0, -1]])
+    assert np.isfinite(quad.hit(np.zeros(3), rays)[0]).tolist() == [True, True, False, True, False, False]
+    distance, normal = quad.hit(np.array([0.0, 0, 3]), np.array([[0.0, 0, -1]]))
+    assert (distance.item(), normal.tolist()) == (1.0, [[0.0, 0.0, 1.0]])
+
+
+def test_normals_point_towards_the_camera():
+    room = default_room()
+    rays = ray_grid(SIZE).reshape(-1, 3)
+    for surface in room.surfaces:
+        distance, normal = surface.hit(np.array([0.1, 0.2, -0.1]), rays)
+        met = np.isfinite(distance)
+        assert met.any()
+        assert np.all(np.sum(normal[met] * rays[met], axis=1) < 0)
+        assert np.linalg.norm(normal[met], axis=1) == pytest.approx(1.0, abs=1e-9)
+
+
+def test_range_is_taken_at_the_exact_pixel_centre():
+    room, pose = default_room(), capture_poses(3)[2]
+    _, range_map = render(room, pose, SIZE, supersample=3)
+    exact = range_along(room, pose.center, ray_grid(SIZE).reshape(-1, 3) @ pose.rotation)
+    np.testing.assert_array_equal(range_map.ravel(), exact.astype(np.float32))
+
+
+def test_where_nothing_is_met_the_range_is_nan():
+    image, range_map = render(Room((Ball((0, 0, 3), 1.0, GREY),)), Rigid3.identity(), SIZE)
+    assert 0.9 < np.isnan(range_map).mean() < 1.0
+    assert np.nanmin(range_map) == pytest.approx(2.0, abs=5e-3)
+    assert not image[0].any()
+
+
+@pytest.mark.parametrize("columns", [1, 37, 64, -5])
+def test_rolling_the_camera_rolls_the_picture(columns):
+    room, pose = default_room(), capture_poses(2)[1]
+    image, range_map = render(room, pose, SIZE)
+    rolled, new_from_old = roll_panorama(range_map, columns)
+    turned_image, turned_range = render(room, Rigid3(new_from_old, np.zeros(3)) @ pose, SIZE)
+    np.testing.assert_allclose(turned_range, rolled, rtol=1e-6)
+    assert np.abs(turned_image.astype(int) - np.roll(image, columns, axis=1)).max() <= 1
+
+
+def test_turning_the_camera_keeps_every_point_in_its_place():
+    room, pose = default_room(texture="isotropic"), Rigid3.from_center(np.eye(3), (0.3, -0.1, 0.2))
+    turn = rotation_from_rotvec((0.9, -0.4, 1.3))
+    turned = Rigid3(turn, np.zeros(3)) @ pose
+    sizes = (128, 256)
+    (image, range_map), (turned_image, turned_range) = render(room, pose, sizes), render(room, turned, sizes)
+    in_turned = pixel_from_ray(ray_grid(sizes) @ turn.T, sizes)
+    assert np.abs(sample_panorama(turned_range, in_turned) - range_map).max() < 1e-3
+    difference = np.abs(sample_panorama(turned_image, in_turned) - image)
+    assert np.median(difference) < 12  # a texture this fine is blurred a little by the interpolation
+
+
+def test_a_point_has_the_same_colour_from_two_places():
+    room, sizes = default_room(), (256, 512)
+    first, second = Rigid3.identity(), capture_poses(2, seed=4)[1]
+    image, range_map = render(room, first, sizes)
+    other, other_range = render(room, second, sizes)
+    points_in_second = (second @ first.inverse()).apply(range_map[..., None] * ray_grid(sizes))
+    pixels = pixel_from_ray(points_in_second, sizes)
+    distance = np.linalg.norm(points_in_second, axis=-1)
+    visible = np.abs(sample_panorama(other_range, pixels) / distance - 1) < 2e-3
+    assert 0.8 < visible.mean() < 1
+    error = np.abs(sample_panorama(other, pixels) - image)[visible].mean()
+    shuffled = np.abs(np.roll(image, 7, axis=1).astype(float) - image)[visible].mean()
+    assert error < 0.3 * shuffled
+
+
+def test_the_weak_texture_is_weak_and_seeds_differ():
+    pose = Rigid3.identity()
+    strong, weak = (render(default_room(texture=name), pose, SIZE)[0].astype(float) for name in ("strong", "weak"))
+    steps = [np.abs(np.diff(image, axis=1)).mean() for image in (strong, weak)]
+    assert steps[1] < 0.4 * steps[0]
+    again = render(default_room(), pose, SIZE)[0]
+    np.testing.assert_array_equal(again, strong)
+    assert np.abs(render(default_room(1), pose, SIZE)[0] - strong).mean() > 10
+
+
+def test_the_isotropic_texture_is_as_rough_at_the_pole_as_at_the_equator():
+    room = default_room(texture="isotropic")
+    tipped = Rigid3(rotation_from_rotvec((np.pi / 2, 0, 0)), np.zeros(3))
+    upright, turned = (render(room, pose, (128, 256))[0].astype(float) for pose in (Rigid3.identity(), tipped))
+    ahead = np.s_[48:80, 112:144]  # the second camera looks straight at what is the first one's pole
+    assert turned[ahead].std() == pytest.approx(upright[ahead].std(), rel=0.2)
+
+
+def test_the_cameras_of_a_capture_are_free_and_apart():
+    room = default_room()
+    poses = capture_poses(9, seed=3)
+    assert len(poses) == 9
+    centers = np.array([pose.center for pose in poses])
+    apart = np.linalg.norm(centers[:, None] - centers[None], axis=-1) + 9 * np.eye(9)
+    assert apart.min() > 0.05
+    for pose in poses:
+        assert range_along(room, pose.center, ray_grid(SIZE).reshape(-1, 3)).min() > 0.1
+        assert pose.rotation @ pose.rotation.T == pytest.approx(np.eye(3), abs=1e-12)
+
+
+def test_a_written_capture_is_the_same_bytes_twice(tmp_path):
+    for folder in ("a", "b"):
+        write_capture(tmp_path / folder, default_room(), capture_poses(2), SIZE)
+    files = sorted(path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*.*"))
+    assert [str(path) for path in files] == ["images/000.png", "images/001.png", "truth/depth.npz", "truth/poses.json"]
+    for path in files:
+        assert (tmp_path / "a" / path).read_bytes() == (tmp_path / "b" / path).read_bytes()
