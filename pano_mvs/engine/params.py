@@ -1,0 +1,64 @@
+"""The settings of a stage: a frozen pydantic model, and which of its fields count towards the cache key."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, TypeAlias
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationInfo
+
+
+class Params(BaseModel):
+    """Base of every stage's settings: frozen, no unknown fields, no NaN."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
+
+
+class _NotInKey:
+    """Marks a field that cannot change the result."""
+
+
+class _KeyedByContent:
+    """Marks a path whose content, not whose name, counts."""
+
+
+NOT_IN_KEY = _NotInKey()
+"""`threads: Annotated[int, NOT_IN_KEY] = 0`: changing this setting recomputes nothing."""
+
+
+def _resolve(path: Path, info: ValidationInfo) -> Path:
+    base = (info.context or {}).get("base")
+    path = path.expanduser()
+    return path if base is None or path.is_absolute() else Path(base) / path
+
+
+InputPath: TypeAlias = Annotated[Path, AfterValidator(_resolve), _KeyedByContent()]
+"""A file or folder that the stage reads; relative to the workflow file; in the cache key by its content."""
+
+SourcePath: TypeAlias = Annotated[Path, AfterValidator(_resolve), NOT_IN_KEY]
+"""A file or folder that a source stage lists; its items count, one by one, not the path."""
+
+
+def key_fields(params: Params) -> tuple[dict[str, Any], dict[str, Path]]:
+    """Return the fields that count towards the cache key: plain values, and paths that count by content."""
+    plain: dict[str, Any] = {}
+    paths: dict[str, Path] = {}
+    dumped = params.model_dump(mode="json")
+    for name, field in type(params).model_fields.items():
+        marks = field.metadata
+        value = getattr(params, name)
+        if any(isinstance(mark, _NotInKey) for mark in marks):
+            continue
+        if _is_keyed_by_content(field.annotation, marks) and value is not None:
+            paths[name] = value
+        else:
+            plain[name] = dumped[name]
+    return plain, paths
+
+
+def _is_keyed_by_content(annotation: Any, marks: list[Any]) -> bool:
+    """Look for the mark on the field itself and inside `InputPath | None`."""
+    if any(isinstance(mark, _KeyedByContent) for mark in marks):
+        return True
+    inner = [*getattr(annotation, "__args__", ()), *getattr(annotation, "__metadata__", ())]
+    return any(isinstance(part, _KeyedByContent) or _is_keyed_by_content(part, []) for part in inner)

@@ -1,0 +1,216 @@
+"""The cache: small records by key, written last and in one step, over immutable blobs.
+
+Layout under the root: `blobs/ab/<digest><suffix>`, `records/ab/<key>.json`, `last/<id>.json` (which key each unit had
+in a workflow's latest run, for the reasons that the plan gives), `stat-cache.json`, `tmp/`, `layout.json`.
+What is cached is derived from the records: there is no status file that could be wrong and nothing to unlock.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pano_mvs.core.digest import digest_from_bytes, digest_from_value
+from pano_mvs.core.errors import ContractError, StoreError, UsageError
+from pano_mvs.core.files import write_text
+from pano_mvs.engine.blobs import BlobRef, BlobStore, DamagedBlobError
+from pano_mvs.engine.stat_cache import StatCache
+from pano_mvs.scene import Record
+
+LAYOUT_VERSION = 1
+
+
+@dataclass(frozen=True, slots=True)
+class ItemRef:
+    """A stored value: its kind, its parts, and the digest that stands for it in downstream keys."""
+
+    kind: str
+    digest: str
+    parts: Mapping[str, BlobRef]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the reference as a JSON value."""
+        return {"kind": self.kind, "digest": self.digest, "parts": {n: ref.to_json() for n, ref in self.parts.items()}}
+
+    @staticmethod
+    def from_json(value: Mapping[str, Any]) -> ItemRef:
+        """Return the reference that `to_json` gave."""
+        parts = {str(name): BlobRef.from_json(part) for name, part in value["parts"].items()}
+        return ItemRef(str(value["kind"]), str(value["digest"]), parts)
+
+
+@dataclass(frozen=True, slots=True)
+class UnitRecord:
+    """What one finished unit of work left.
+
+    Attributes:
+        key: its cache key.
+        identity: what the key was made of, for the plan's reasons.
+        output: the value.
+        items: the items of a collection, by image.
+        metrics: figures of the unit.
+        notes: what a user should know.
+        rejected: image name to why the result leaves it out.
+        seconds: how long it took when it was computed.
+    """
+
+    key: str
+    identity: Mapping[str, Any]
+    output: ItemRef
+    items: Mapping[str, ItemRef] = field(default_factory=dict)
+    metrics: Mapping[str, float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    rejected: Mapping[str, str] = field(default_factory=dict)
+    seconds: float = 0.0
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the record as a JSON value."""
+        return {
+            "key": self.key,
+            "identity": self.identity,
+            "output": self.output.to_json(),
+            "items": {name: item.to_json() for name, item in self.items.items()},
+            "metrics": dict(self.metrics),
+            "notes": list(self.notes),
+            "rejected": dict(self.rejected),
+            "seconds": self.seconds,
+        }
+
+    @staticmethod
+    def from_json(value: Mapping[str, Any]) -> UnitRecord:
+        """Return the record that `to_json` gave."""
+        return UnitRecord(
+            key=str(value["key"]),
+            identity=value["identity"],
+            output=ItemRef.from_json(value["output"]),
+            items={name: ItemRef.from_json(item) for name, item in value["items"].items()},
+            metrics=value["metrics"],
+            notes=tuple(value["notes"]),
+            rejected=value["rejected"],
+            seconds=float(value["seconds"]),
+        )
+
+
+class Store:
+    """The cache of one or many workflows."""
+
+    def __init__(self, root: Path) -> None:
+        """Open or create a store.
+
+        Raises:
+            StoreError: if the folder cannot be written.
+            UsageError: if it was made by a version with another layout.
+        """
+        self.root = root
+        self.damaged: list[str] = []
+        self._open_layout()
+        self.stat_cache = StatCache(root / "stat-cache.json")
+        self.blobs = BlobStore(root, self.stat_cache)
+
+    def find(self, key: str) -> UnitRecord | None:
+        """Return the record of a key if it is sound and all its blobs are there, else None."""
+        record = self.read_record(key)
+        if record is None:
+            return None
+        refs = [*record.output.parts.values(), *(ref for item in record.items.values() for ref in item.parts.values())]
+        return record if all(self.blobs.exists(ref) for ref in refs) else None
+
+    def read_record(self, key: str) -> UnitRecord | None:
+        """Return the record of a key whether or not its blobs are there; a damaged record is a miss."""
+        path = self._record_path(key)
+        try:
+            data = path.read_bytes()
+        except OSError:
+            return None
+        checksum, _, body = data.partition(b"\n")
+        try:
+            if checksum.decode() != digest_from_bytes(body):
+                raise ValueError("checksum")
+            return UnitRecord.from_json(json.loads(body))
+        except (ValueError, KeyError, TypeError):
+            self.damaged.append(str(path))
+            return None
+
+    def put(self, record: UnitRecord) -> None:
+        """Write a record; its blobs must be there already."""
+        body = json.dumps(record.to_json(), sort_keys=True)
+        write_text(self._record_path(record.key), f"{digest_from_bytes(body.encode())}\n{body}")
+
+    def put_value(self, value: Record) -> ItemRef:
+        """Store a value's parts and return its reference.
+
+        Raises:
+            ContractError: if the value is not what its kind promises, or holds what cannot be stored.
+        """
+        value.check()
+        try:
+            parts = {name: self.blobs.put(part) for name, part in value.to_parts().items()}
+        except (TypeError, ValueError) as error:
+            raise ContractError(f"{value.kind_name()} holds something that cannot be stored: {error}") from error
+        digests = {name: [ref.digest, ref.suffix] for name, ref in parts.items()}
+        digest = digest_from_value([value.kind_name(), value.kind_version, digests])
+        return ItemRef(value.kind_name(), digest, parts)
+
+    def load(self, ref: ItemRef, kind: type[Record]) -> Record:
+        """Return a stored value; its arrays are memory-mapped and read-only.
+
+        Raises:
+            DamagedBlobError: if a blob is damaged; it has been removed, so that the next run computes it again.
+        """
+        try:
+            return kind.from_parts({name: self.blobs.get(part) for name, part in ref.parts.items()})
+        except DamagedBlobError as error:
+            self.damaged.append(str(error))
+            raise
+
+    @contextmanager
+    def scratch(self) -> Iterator[Path]:
+        """Yield an empty folder inside the store, removed afterwards."""
+        try:
+            self.blobs.temporary.mkdir(parents=True, exist_ok=True)
+            folder = Path(tempfile.mkdtemp(dir=self.blobs.temporary))
+        except OSError as error:
+            raise StoreError(f"cache {self.root} cannot be written: {error.strerror}. Mend it, or choose another with "
+                             "--cache DIR")  from error  # fmt: skip
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def last_keys(self, workflow_id: str) -> dict[str, dict[str, str]]:
+        """Return the keys of a workflow's latest run: stage to unit to key."""
+        try:
+            keys = json.loads(self._last_path(workflow_id).read_bytes())
+        except (OSError, ValueError):
+            return {}
+        return keys if isinstance(keys, dict) else {}
+
+    def save_last_keys(self, workflow_id: str, keys: Mapping[str, Mapping[str, str]]) -> None:
+        """Remember the keys of a workflow's run."""
+        write_text(self._last_path(workflow_id), json.dumps(keys))
+
+    def _record_path(self, key: str) -> Path:
+        return self.root / "records" / key[:2] / f"{key}.json"
+
+    def _last_path(self, workflow_id: str) -> Path:
+        return self.root / "last" / f"{workflow_id}.json"
+
+    def _open_layout(self) -> None:
+        path = self.root / "layout.json"
+        try:
+            layout = json.loads(path.read_bytes())
+        except FileNotFoundError:
+            write_text(path, json.dumps({"layout": LAYOUT_VERSION}))
+            return
+        except (OSError, ValueError) as error:
+            raise StoreError(f"cache {self.root} cannot be read: {error}. Choose another with --cache DIR") from error
+        if not isinstance(layout, dict) or layout.get("layout") != LAYOUT_VERSION:
+            raise UsageError(
+                f"cache {self.root} has layout {layout!r}, this version uses {LAYOUT_VERSION}. Choose another with --cache DIR"
+            )
