@@ -5,9 +5,9 @@ from __future__ import annotations
 import inspect
 import typing
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from pano_mvs.core.errors import PluginError
 from pano_mvs.engine.context import Context
@@ -51,6 +51,7 @@ class StageSpec:
         list_items: for sources, what lists the items.
         origin: where it was defined, `file:line`.
         code_digest: digest of the code, for stages from user files; else empty.
+        extras: argument name to what it takes beside the ports.
     """
 
     name: str
@@ -62,6 +63,7 @@ class StageSpec:
     list_items: ListItems | None = None
     origin: str = ""
     code_digest: str = ""
+    extras: Mapping[str, Literal["params", "ctx", "item"]] = field(default_factory=dict)
 
     @property
     def doc(self) -> str:
@@ -95,6 +97,7 @@ class _Signature:
     ports: tuple[Port, ...]
     params_type: type[Params]
     output: type[Record]
+    extras: Mapping[str, Literal["params", "ctx", "item"]]
 
 
 def stage(name: str, *, version: int = 1) -> Callable[[Function], Function]:
@@ -109,10 +112,7 @@ def stage(name: str, *, version: int = 1) -> Callable[[Function], Function]:
 
     def decorate(function: Function) -> Function:
         signature = _read_signature(function, name)
-        spec = StageSpec(
-            name, version, function, signature.ports, signature.params_type, signature.output, origin=_origin(function)
-        )
-        setattr(function, _ATTRIBUTE, spec)
+        setattr(function, _ATTRIBUTE, _spec(name, version, function, signature, None))
         return function
 
     return decorate
@@ -127,10 +127,7 @@ def source(name: str, *, list_items: ListItems, version: int = 1) -> Callable[[F
 
     def decorate(function: Function) -> Function:
         signature = _read_signature(function, name, leading="item")
-        spec = StageSpec(
-            name, version, function, (), signature.params_type, signature.output, list_items, _origin(function)
-        )
-        setattr(function, _ATTRIBUTE, spec)
+        setattr(function, _ATTRIBUTE, _spec(name, version, function, signature, list_items))
         return function
 
     return decorate
@@ -140,6 +137,22 @@ def spec_of(value: object) -> StageSpec | None:
     """Return the stage that an object was declared as, or None."""
     spec = getattr(value, _ATTRIBUTE, None)
     return spec if isinstance(spec, StageSpec) else None
+
+
+def _spec(
+    name: str, version: int, function: Callable[..., Any], signature: _Signature, list_items: ListItems | None
+) -> StageSpec:
+    return StageSpec(
+        name=name,
+        version=version,
+        function=function,
+        ports=signature.ports,
+        params_type=signature.params_type,
+        output=signature.output,
+        list_items=list_items,
+        origin=_origin(function),
+        extras=signature.extras,
+    )
 
 
 def _origin(function: Callable[..., Any]) -> str:
@@ -156,12 +169,18 @@ def _read_signature(function: Callable[..., Any], name: str, *, leading: str = "
         raise PluginError(f"{where}: an annotation cannot be resolved: {error}") from error
     ports: list[Port] = []
     params_type: type[Params] = Params
+    extras: dict[str, Literal["params", "ctx", "item"]] = {}
     for argument in inspect.signature(function).parameters.values():
         annotation = hints.get(argument.name)
-        if argument.name == leading or annotation is Context:
+        if argument.name == leading:
+            extras[argument.name] = "item"
+            continue
+        if annotation is Context:
+            extras[argument.name] = "ctx"
             continue
         if isinstance(annotation, type) and issubclass(annotation, Params):
             params_type = annotation
+            extras[argument.name] = "params"
             continue
         port = port_from_annotation(argument.name, annotation)
         if port is None or port.name == INDEX_PORT:
@@ -173,4 +192,4 @@ def _read_signature(function: Callable[..., Any], name: str, *, leading: str = "
     output = hints.get("return")
     if not (isinstance(output, type) and issubclass(output, Record)):
         raise PluginError(f"{where}: the result must be annotated with a kind (a Record), got {output!r}")
-    return _Signature(tuple(ports), params_type, output)
+    return _Signature(tuple(ports), params_type, output, extras)

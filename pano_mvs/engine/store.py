@@ -212,5 +212,6 @@ class Store:
             raise StoreError(f"cache {self.root} cannot be read: {error}. Choose another with --cache DIR") from error
         if not isinstance(layout, dict) or layout.get("layout") != LAYOUT_VERSION:
             raise UsageError(
-                f"cache {self.root} has layout {layout!r}, this version uses {LAYOUT_VERSION}. Choose another with --cache DIR"
+                f"cache {self.root} has layout {layout!r}, this version uses {LAYOUT_VERSION}. "
+                "Choose another with --cache DIR"
             )

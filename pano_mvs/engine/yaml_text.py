@@ -46,11 +46,11 @@ class Located:
         """Return what stands at a path of keys and positions, or the nearest thing above it."""
         here = self
         for step in path:
-            inner = here.value
-            if (isinstance(inner, dict) and step in inner) or (isinstance(inner, list) and isinstance(step, int) and step < len(inner)):
-                here = inner[step]
-            else:
+            try:
+                inner = here.value[step]
+            except (KeyError, IndexError, TypeError):
                 break
+            here = inner if isinstance(inner, Located) else here
         return here
 
 

@@ -1,0 +1,111 @@
+"""What a run tells while it goes on, and what it returns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, Protocol
+
+Outcome = Literal["cached", "run", "failed", "blocked"]
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """A unit without a result.
+
+    Attributes:
+        stage: name of the stage in the workflow.
+        item: the unit; empty if the stage has one only.
+        cause: what went wrong and what to do.
+        trace: the Python traceback, if the stage's own code broke.
+        consequence: what the result lacks because of it.
+    """
+
+    stage: str
+    item: str
+    cause: str
+    trace: str = ""
+    consequence: str = ""
+
+
+@dataclass(slots=True)
+class StageSummary:
+    """What happened in one stage."""
+
+    name: str
+    use: str
+    units: int = 0
+    cached: int = 0
+    run: int = 0
+    failed: int = 0
+    blocked: int = 0
+    seconds: float = 0.0
+    metrics: dict[str, float] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class RunResult:
+    """What a run did.
+
+    Attributes:
+        stages: in the order in which they ran.
+        failures: units without a result.
+        rejected: image to the stage that left it out and why.
+        stopped: why the run ended early; empty if it did not.
+        exit_code: 0 ok, 3 finished with failed items, 4 stopped by a gate.
+        written: files written into the output folder by this run.
+        warnings: damaged parts of the store that were computed again, and the like.
+    """
+
+    stages: list[StageSummary] = field(default_factory=list)
+    failures: list[Failure] = field(default_factory=list)
+    rejected: dict[str, tuple[str, str]] = field(default_factory=dict)
+    stopped: str = ""
+    exit_code: int = 0
+    written: list[str] = field(default_factory=list)
+    removed: list[str] = field(default_factory=list)
+    published: Mapping[str, str] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def computed(self) -> int:
+        """Number of units that were computed rather than found in the cache."""
+        return sum(stage.run for stage in self.stages)
+
+    @property
+    def cached(self) -> int:
+        """Number of units that were found in the cache."""
+        return sum(stage.cached for stage in self.stages)
+
+
+class Observer(Protocol):
+    """Hears what a run does; the command line's progress bars are one."""
+
+    def stage_started(self, name: str, units: int) -> None:
+        """A stage's units are known."""
+
+    def unit_finished(self, name: str, item: str, outcome: Outcome, seconds: float) -> None:
+        """A unit is done."""
+
+    def stage_finished(self, summary: StageSummary) -> None:
+        """A stage is done."""
+
+    def warn(self, text: str) -> None:
+        """Something the user should know, though the run goes on."""
+
+
+class Silent:
+    """An observer that says nothing."""
+
+    def stage_started(self, name: str, units: int) -> None:
+        """Say nothing."""
+
+    def unit_finished(self, name: str, item: str, outcome: Outcome, seconds: float) -> None:
+        """Say nothing."""
+
+    def stage_finished(self, summary: StageSummary) -> None:
+        """Say nothing."""
+
+    def warn(self, text: str) -> None:
+        """Say nothing."""

@@ -1,0 +1,84 @@
+"""Run one unit: load its inputs, call the stage, store the result."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from pano_mvs.core.errors import ContractError
+from pano_mvs.engine.context import Context
+from pano_mvs.engine.ports import Cardinality, Port
+from pano_mvs.engine.store import ItemRef, Store, UnitRecord
+from pano_mvs.engine.units import Unit, UnitInput
+from pano_mvs.scene import Axis, Record
+from pano_mvs.scene.index import pair_from_name
+
+
+def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
+    """Run a unit and store its result; the record is written last.
+
+    Raises:
+        ContractError: if the stage returns something other than what it declared.
+        Exception: whatever the stage raises.
+    """
+    started = time.perf_counter()
+    with store.scratch() as scratch:
+        context = Context(np.random.default_rng(int(unit.key, 16)), scratch, threads)
+        arguments = _arguments(unit, store)
+        value = unit.entry.spec.function(**arguments, **_extras(unit, context))
+        _check_kind(value, unit)
+        try:
+            output = store.put_value(value)
+            items = {name: store.put_value(item) for name, item in value.explode().items()}
+        except ContractError as error:
+            error.add_note(f"returned by stage {unit.entry.spec.name} ({unit.entry.spec.origin}) for {unit.label}")
+            raise
+    record = UnitRecord(
+        unit.key,
+        unit.identity,
+        output,
+        items,
+        context.metrics,
+        tuple(context.notes),
+        context.rejected,
+        time.perf_counter() - started,
+    )
+    store.put(record)
+    return record
+
+
+def _arguments(unit: Unit, store: Store) -> dict[str, Any]:
+    ports = {port.name: port for port in unit.entry.spec.ports}
+    return {name: _load(ports[name], value, store) for name, value in unit.inputs.items()}
+
+
+def _load(port: Port, value: UnitInput, store: Store) -> Record | list[Record] | Mapping[Any, Record] | None:
+    if value is None:
+        return None
+    if isinstance(value, ItemRef):
+        return store.load(value, port.kind)
+    if port.cardinality is Cardinality.NEAR:
+        return [store.load(ref, port.kind) for ref in value.values()]
+    return {_gathered_key(port, name): store.load(ref, port.kind) for name, ref in value.items()}
+
+
+def _gathered_key(port: Port, name: str) -> str | tuple[str, ...]:
+    return pair_from_name(name) if port.kind.axis is Axis.PAIR else name
+
+
+def _extras(unit: Unit, context: Context) -> dict[str, Any]:
+    """Return params, context and source item under the names by which the function takes them."""
+    offered: dict[str, Any] = {"params": unit.entry.params, "ctx": context, "item": unit.source}
+    return {name: offered[role] for name, role in unit.entry.spec.extras.items()}
+
+
+def _check_kind(value: object, unit: Unit) -> None:
+    spec = unit.entry.spec
+    if not isinstance(value, spec.output):
+        raise ContractError(
+            f"stage {spec.name} ({spec.origin}) returned {type(value).__name__} for {unit.label}, "
+            f"it declares {spec.output.kind_name()}"
+        )

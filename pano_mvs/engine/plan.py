@@ -1,0 +1,79 @@
+"""What a run would do: per unit cached, run (and why), or may run because it waits for an output."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from pano_mvs.engine.reasons import reason_to_run
+from pano_mvs.engine.store import Store, UnitRecord
+from pano_mvs.engine.units import Resolution, StageState, Unit, resolve
+from pano_mvs.engine.wiring import Graph
+from pano_mvs.engine.workflow import Workflow
+
+
+@dataclass(slots=True)
+class StagePlan:
+    """What a run would do in one stage.
+
+    Attributes:
+        name: of the stage in the workflow.
+        use: of the stage in the registry.
+        cached: units that would not run.
+        run: unit to the reason why it would.
+        may_run: units that wait for an output, which may turn out the same.
+        blocked: unit to the reason why it cannot run.
+        open: whether the number of units is not known yet.
+    """
+
+    name: str
+    use: str
+    cached: list[str] = field(default_factory=list)
+    run: dict[str, str] = field(default_factory=dict)
+    may_run: list[str] = field(default_factory=list)
+    blocked: dict[str, str] = field(default_factory=dict)
+    open: bool = False
+
+
+def make_plan(workflow: Workflow, graph: Graph, store: Store, workflow_id: str) -> list[StagePlan]:
+    """Return what a run would do, stage by stage, without running anything.
+
+    Raises:
+        InputError: if the source cannot be listed.
+    """
+    last = store.last_keys(workflow_id)
+    states: dict[str, StageState] = {}
+    plans: list[StagePlan] = []
+    for name in graph.order:
+        entry = workflow.stages[name]
+        resolution = resolve(entry, graph.axes[name], graph.edges[name], states, store)
+        state = start_state(graph, name, resolution)
+        plan = StagePlan(name, entry.spec.name, may_run=list(resolution.waiting), blocked=dict(resolution.blocked))
+        plan.open = state.open = resolution.open
+        state.pending.update(resolution.waiting)
+        for unit in resolution.units:
+            record = store.find(unit.key)
+            if record is not None:
+                settle(state, unit, record)
+                plan.cached.append(unit.item)
+            else:
+                state.pending.add(unit.item)
+                plan.run[unit.item] = _reason(unit, last.get(name, {}), store)
+        states[name] = state
+        plans.append(plan)
+    return plans
+
+
+def start_state(graph: Graph, name: str, resolution: Resolution) -> StageState:
+    """Return the state of a stage of which only the units are known."""
+    return StageState(graph.axes[name], members=dict(resolution.members), failed=dict(resolution.blocked))
+
+
+def settle(state: StageState, unit: Unit, record: UnitRecord) -> None:
+    """Enter a unit's stored value into its stage's state."""
+    state.items[unit.item] = record.output
+    state.exploded.update(record.items)
+
+
+def _reason(unit: Unit, last: Mapping[str, str], store: Store) -> str:
+    return reason_to_run(unit, last.get(unit.item), store)

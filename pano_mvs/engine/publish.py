@@ -1,0 +1,91 @@
+"""Put a run's files into the output folder, from the store: what is there already is left alone."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path, PurePosixPath
+
+from pano_mvs.core.errors import StoreError, UsageError
+from pano_mvs.core.files import copy_file
+from pano_mvs.engine.blobs import BlobRef
+from pano_mvs.engine.store import ItemRef, Store
+
+
+class Publisher:
+    """Writes the files of one run into one folder."""
+
+    def __init__(self, out: Path, store: Store) -> None:
+        """Check that the folder can be written.
+
+        Raises:
+            StoreError: if it cannot.
+        """
+        self.out = out
+        self.store = store
+        self.written: list[str] = []
+        self.published: dict[str, str] = {}
+        self._owners: dict[str, str] = {}
+        self._stems: dict[str, str] = {}
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StoreError(_cannot_write(out, error.strerror or str(error))) from error
+        if not os.access(out, os.W_OK | os.X_OK):
+            raise StoreError(_cannot_write(out, "permission denied"))
+
+    def name_items(self, names: Iterable[str]) -> None:
+        """Fix the `{item}` of each image: its path without the extension, kept where two would collide."""
+        stems = {name: str(PurePosixPath(name).with_suffix("")) for name in names}
+        count = Counter(stem.casefold() for stem in stems.values())
+        self._stems.update({name: name if count[stem.casefold()] > 1 else stem for name, stem in stems.items()})
+
+    def publish(self, stage: str, item: str, ref: ItemRef, *, to: str = "") -> None:
+        """Write the files of one unit, unless they are there with the right bytes.
+
+        Raises:
+            UsageError: if two stages write the same file.
+            StoreError: if a file cannot be written.
+            DamagedBlobError: if the store's copy is damaged.
+        """
+        meta = self.store.blobs.get(ref.parts["meta"])
+        assert isinstance(meta, dict)
+        for number, target in enumerate(meta["targets"]):
+            name = str(PurePosixPath(to) / target.replace("{item}", self._stems.get(item, item)))
+            owner = self._owners.setdefault(name.casefold(), f"{stage}:{item}")
+            if owner != f"{stage}:{item}":
+                raise UsageError(f"stages {owner.partition(':')[0]!r} and {stage!r} both write {name}; give one of them "
+                                 "a folder of its own with `to: NAME`")  # fmt: skip
+            blob = ref.parts[str(number)]
+            self._write(name, blob)
+            self.published[name] = blob.digest
+
+    def remove_stale(self, earlier: dict[str, str]) -> list[str]:
+        """Delete files that an earlier run wrote and this one did not, if nobody has changed them since."""
+        removed: list[str] = []
+        for name, digest in earlier.items():
+            path = self.out / name
+            if name in self.published or not _is_inside(path, self.out) or not path.is_file():
+                continue
+            if self.store.stat_cache.digest(path) == digest:
+                path.unlink()
+                removed.append(name)
+        return removed
+
+    def _write(self, name: str, blob: BlobRef) -> None:
+        target = self.out / name
+        if target.is_file() and not target.is_symlink() and self.store.stat_cache.digest(target) == blob.digest:
+            return
+        if not _is_inside(target, self.out):
+            raise StoreError(_cannot_write(target, "it would leave the output folder (a link leads outside)"))
+        copy_file(self.store.blobs.verified_path(blob), target)
+        self.written.append(name)
+
+
+def _is_inside(path: Path, folder: Path) -> bool:
+    return path.parent.resolve().is_relative_to(folder.resolve())
+
+
+def _cannot_write(path: Path, reason: str) -> str:
+    return f"output {path} cannot be written: {reason}. Choose another folder with --out DIR"

@@ -1,0 +1,78 @@
+"""Why a unit has to run: the difference between what its key was made of last time and now."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pano_mvs.engine.ports import Cardinality
+from pano_mvs.engine.store import ItemRef, Store
+from pano_mvs.engine.units import Unit
+
+_SHOWN = 3
+
+
+def reason_to_run(unit: Unit, last_key: str | None, store: Store) -> str:
+    """Return in words why a unit is not cached.
+
+    Args:
+        unit: the unit, whose key the store does not have.
+        last_key: its key in the latest run of this workflow, if it was part of it.
+        store: where the record of that run may still be.
+    """
+    if last_key is None:
+        return "new"
+    if last_key == unit.key:
+        return "its cached result is gone or damaged, or it did not finish"
+    last = store.read_record(last_key)
+    if last is None:
+        return "changed (its last record is gone)"
+    before, now = last.identity, unit.identity
+    differences = [
+        *_differences("param", before.get("params", {}), now["params"]),
+        *_inputs(unit, before.get("inputs", {}), now["inputs"]),
+    ]
+    if before.get("stage") != now["stage"]:
+        differences.insert(0, f"stage {before.get('stage')} → {now['stage']}")
+    elif before.get("version") != now["version"]:
+        differences.insert(0, f"version of {now['stage']} {before.get('version')} → {now['version']}")
+    if before.get("code") != now["code"]:
+        differences.insert(0, f"code {unit.entry.spec.origin}")
+    differences.extend(_differences("kind", before.get("kinds", {}), now["kinds"]))
+    return "; ".join(differences) or "its key is made differently in this version"
+
+
+def _differences(what: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    return [
+        f"{what} {name} {before.get(name)!r} → {now.get(name)!r}"
+        for name in sorted({*before, *now})
+        if before.get(name) != now.get(name)
+    ]
+
+
+def _inputs(unit: Unit, before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    changed: list[str] = []
+    for port in sorted({*before, *now}):
+        old, new = before.get(port), now.get(port)
+        if old == new:
+            continue
+        if unit.source is not None:
+            changed.extend(f"input {path.name}" for path in unit.source.files.values())
+        else:
+            changed.append(f"input {port}: {_changed_items(unit, port, old, new)}")
+    return changed
+
+
+def _changed_items(unit: Unit, port: str, old: Any, new: Any) -> str:
+    value = unit.inputs.get(port)
+    if value is None or isinstance(value, ItemRef):
+        return unit.item or "changed"
+    cardinality = next(p.cardinality for p in unit.entry.spec.ports if p.name == port)
+    known = {entry if cardinality is Cardinality.NEAR else str(entry) for entry in old or []}
+    names = [
+        name for name, entry in zip(value, new, strict=True)
+        if (entry if cardinality is Cardinality.NEAR else str(entry)) not in known
+    ]  # fmt: skip
+    if not names:
+        return "fewer items" if len(new) < len(old or []) else "another order"
+    return ", ".join(names[:_SHOWN]) + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")

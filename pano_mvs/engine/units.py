@@ -1,0 +1,273 @@
+"""From a wired stage and what its producers made to the units of work, each with its cache key."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+from pano_mvs.core.digest import digest_from_value
+from pano_mvs.core.errors import InputError
+from pano_mvs.engine.params import key_fields
+from pano_mvs.engine.ports import Cardinality
+from pano_mvs.engine.stage import INDEX_PORT, SourceItem
+from pano_mvs.engine.store import ItemRef, Store
+from pano_mvs.engine.wiring import Edge
+from pano_mvs.engine.workflow import StageEntry
+from pano_mvs.scene import Axis, Pairs, Record, Views
+
+KEY_SCHEMA = 1
+WHOLE = ""
+"""The name of the one unit of a stage that has no fan-out."""
+
+UnitInput: TypeAlias = "ItemRef | dict[str, ItemRef] | None"
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """One unit of work: one image, pair, view, or a whole.
+
+    Attributes:
+        entry: its stage in the workflow.
+        item: its name within the stage; `WHOLE` if there is one only.
+        members: the images that it is about.
+        inputs: port to the item that it reads, or items by name for Near and All.
+        source: what to read, for units of a source.
+        key: cache key.
+        identity: what the key was made of.
+    """
+
+    entry: StageEntry
+    item: str
+    members: tuple[str, ...]
+    inputs: Mapping[str, UnitInput]
+    key: str
+    identity: Mapping[str, Any]
+    source: SourceItem | None = None
+
+    @property
+    def label(self) -> str:
+        """The unit as it is shown: `stage:item`."""
+        return f"{self.entry.name}:{self.item}" if self.item else self.entry.name
+
+
+@dataclass(slots=True)
+class StageState:
+    """What is known of a stage's output, in a run or in a plan.
+
+    Attributes:
+        axis: of its units.
+        items: unit to its stored value.
+        exploded: image to its item, where the value is a collection.
+        members: unit to the images that it is about.
+        failed: unit to the reason why it has no value.
+        pending: units whose value is not known yet (plans only).
+        open: whether even the list of units is not known yet (plans only).
+    """
+
+    axis: Axis
+    items: dict[str, ItemRef] = field(default_factory=dict)
+    exploded: dict[str, ItemRef] = field(default_factory=dict)
+    members: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    failed: dict[str, str] = field(default_factory=dict)
+    pending: set[str] = field(default_factory=set)
+    open: bool = False
+
+
+@dataclass(slots=True)
+class Resolution:
+    """The units of a stage.
+
+    Attributes:
+        units: those whose inputs are all there.
+        blocked: unit to the reason why it cannot run: an input failed.
+        waiting: units whose inputs are not known yet (plans only).
+        open: whether the list of units itself waits (plans only).
+        members: unit to the images that it is about.
+    """
+
+    units: list[Unit] = field(default_factory=list)
+    blocked: dict[str, str] = field(default_factory=dict)
+    waiting: list[str] = field(default_factory=list)
+    open: bool = False
+    members: dict[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+def resolve_source(entry: StageEntry, store: Store) -> Resolution:
+    """List a source's items and return a unit for each.
+
+    Raises:
+        InputError: if the list cannot be made, or names an item twice.
+    """
+    assert entry.spec.list_items is not None
+    resolution = Resolution()
+    static = _static_identity(entry, store)
+    for item in entry.spec.list_items(entry.params):
+        if item.name in resolution.members:
+            raise InputError(f"{entry.name}: the item {item.name!r} is listed twice")
+        resolution.members[item.name] = (item.name,)
+        if item.problem:
+            resolution.blocked[item.name] = item.problem
+            continue
+        try:
+            digests = {role: store.blobs.register_external(path) for role, path in sorted(item.files.items())}
+        except InputError as error:
+            resolution.blocked[item.name] = str(error)
+            continue
+        identity = static | {"inputs": {"files": digests}}
+        unit = Unit(entry, item.name, (item.name,), {}, digest_from_value(identity), identity, item)
+        resolution.units.append(unit)
+    return resolution
+
+
+def resolve(
+    entry: StageEntry, axis: Axis, edges: Mapping[str, Edge], states: Mapping[str, StageState], store: Store
+) -> Resolution:
+    """Return the units of a stage, given the states of its producers."""
+    if entry.spec.list_items is not None:
+        return resolve_source(entry, store)
+    return _Resolver(entry, axis, edges, states, store).resolve()
+
+
+class _Resolver:
+    def __init__(
+        self, entry: StageEntry, axis: Axis, edges: Mapping[str, Edge], states: Mapping[str, StageState], store: Store
+    ) -> None:
+        self.entry = entry
+        self.axis = axis
+        self.edges = edges
+        self.states = states
+        self.store = store
+        self.resolution = Resolution()
+        self.near: Mapping[str, tuple[str, ...]] = {}
+
+    def resolve(self) -> Resolution:
+        names = self._unit_names()
+        if names is None:
+            self.resolution.open = True
+            return self.resolution
+        static = _static_identity(self.entry, self.store)
+        for name, members in names.items():
+            self.resolution.members[name] = members
+            self._add(name, members, static)
+        return self.resolution
+
+    def _unit_names(self) -> Mapping[str, tuple[str, ...]] | None:
+        """Return the stage's units and the images each is about, or None if they are not known yet."""
+        if INDEX_PORT in self.edges:
+            return self._units_of_index(self.edges[INDEX_PORT])
+        if self.axis is Axis.ONE:
+            return {WHOLE: ()}
+        each = [edge for edge in self.edges.values() if edge.port.cardinality is Cardinality.EACH]
+        if any(self.states[edge.producer].open for edge in each):
+            return None
+        leading = [edge for edge in each if not edge.exploded and self.states[edge.producer].axis is self.axis]
+        names: dict[str, tuple[str, ...]] = {}
+        for number, edge in enumerate(leading or each):
+            found = self._members(edge)
+            names = found if number == 0 else {name: names[name] for name in names if name in found}
+        return names
+
+    def _members(self, edge: Edge) -> dict[str, tuple[str, ...]]:
+        state = self.states[edge.producer]
+        if edge.exploded:
+            return {name: (name,) for name in state.exploded}
+        return dict(state.members)
+
+    def _units_of_index(self, edge: Edge) -> Mapping[str, tuple[str, ...]] | None:
+        state = self.states[edge.producer]
+        if state.pending or state.open:
+            return None
+        if WHOLE not in state.items:
+            self.resolution.blocked[WHOLE] = f"needs {edge.producer}, which failed"
+            return {}
+        index = self.store.load(state.items[WHOLE], edge.port.kind)
+        assert isinstance(index, Pairs | Views)
+        self.near = index.units()
+        if self.axis is Axis.PAIR:
+            return self.near
+        return {name: (name,) for name in self.near}
+
+    def _add(self, name: str, members: tuple[str, ...], static: Mapping[str, Any]) -> None:
+        inputs: dict[str, UnitInput] = {}
+        waiting = False
+        for port in self.entry.spec.ports:
+            edge = self.edges.get(port.name)
+            if edge is None:
+                inputs[port.name] = None
+                continue
+            value, problem, waits = self._input(edge, name)
+            if problem:
+                self.resolution.blocked[name] = problem
+                return
+            waiting |= waits
+            inputs[port.name] = value
+        if waiting:
+            self.resolution.waiting.append(name)
+            return
+        identity = dict(static) | {"inputs": {port: self._encode(port, value) for port, value in inputs.items()}}
+        key = digest_from_value(identity)
+        self.resolution.units.append(Unit(self.entry, name, members, inputs, key, identity))
+
+    def _input(self, edge: Edge, name: str) -> tuple[UnitInput, str, bool]:
+        """Return what a unit reads at a port, why it cannot, and whether that is not known yet."""
+        state = self.states[edge.producer]
+        items = state.exploded if edge.exploded else state.items
+        source_failed = WHOLE in state.failed
+        match edge.port.cardinality:
+            case Cardinality.ONE:
+                wanted: Sequence[str] = (WHOLE,)
+            case Cardinality.EACH:
+                wanted = (name,)
+            case Cardinality.NEAR:
+                wanted = self.near[name]
+            case Cardinality.ALL:
+                if state.open or state.pending:
+                    return None, "", True
+                return (dict(items), "", False) if items else (None, self._why(edge, state, ""), False)
+        if state.open or (edge.exploded and state.pending):
+            return None, "", True
+        if any(item in state.pending for item in wanted):
+            return None, "", True
+        if edge.port.cardinality is Cardinality.NEAR:
+            found = {item: items[item] for item in wanted if item in items}
+            complete = len(found) == len(wanted) if self.axis is Axis.PAIR else bool(found)
+            missing = next((item for item in wanted if item not in items), "")
+            return (found, "", False) if complete else (None, self._why(edge, state, missing), False)
+        if wanted[0] in items:
+            return items[wanted[0]], "", False
+        return None, self._why(edge, state, WHOLE if source_failed else wanted[0]), False
+
+    @staticmethod
+    def _why(edge: Edge, state: StageState, item: str) -> str:
+        what = f"{edge.producer}:{item}" if item else edge.producer
+        return f"needs {what}, which {'failed' if state.failed else 'has no result'}"
+
+    def _encode(self, port: str, value: UnitInput) -> Any:
+        """Return what of an input counts towards the key: its digests, with names only where the stage sees them."""
+        if value is None:
+            return None
+        if isinstance(value, ItemRef):
+            return value.digest
+        if self.edges[port].port.cardinality is Cardinality.NEAR:
+            return [ref.digest for ref in value.values()]
+        state = self.states[self.edges[port].producer]
+        return [[list(state.members.get(name, (name,))), ref.digest] for name, ref in value.items()]
+
+
+def _static_identity(entry: StageEntry, store: Store) -> dict[str, Any]:
+    """Return the part of the identity that all units of a stage share."""
+    plain, paths = key_fields(entry.params)
+    return {
+        "schema": KEY_SCHEMA,
+        "stage": entry.spec.name,
+        "version": entry.spec.version,
+        "code": entry.spec.code_digest,
+        "params": plain | {name: store.stat_cache.digest(path) for name, path in paths.items()},
+        "kinds": _kind_versions(entry),
+    }
+
+
+def _kind_versions(entry: StageEntry) -> dict[str, int]:
+    kinds: list[type[Record]] = [entry.spec.output, *(port.kind for port in entry.spec.ports)]
+    return {kind.kind_name(): kind.kind_version for kind in kinds}
