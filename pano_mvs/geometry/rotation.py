@@ -71,4 +71,7 @@ def rotation_from_two_vectors(source: ArrayLike, target: ArrayLike) -> FloatArra
         if cosine > 0:
             return np.eye(3)
         axis, sine = np.cross(a, np.eye(3)[np.argmin(np.abs(a))]), 0.0
+    # Near opposite directions the cross product is mostly rounding: only its part across `a` may turn `a`.
+    axis = axis / np.linalg.norm(axis)
+    axis = axis - (axis @ a) * a
     return rotation_from_rotvec(axis / np.linalg.norm(axis) * np.arctan2(sine, cosine))
