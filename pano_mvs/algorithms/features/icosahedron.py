@@ -1,0 +1,104 @@
+"""Twenty overlapping tangent tiles, one on each face of an icosahedron.
+
+A gnomonic (tangent plane) picture of a small part of the sphere is an ordinary perspective picture, on which
+planar detectors work as they were meant to, with neither seam nor pole. Great circles are straight in it, so the
+part of the sphere that is nearest to a tile's centre is exactly a triangle: the face of the icosahedron
+(Eder et al., "Tangent Images for Mitigating Spherical Distortion", 2020).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from itertools import combinations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.geometry import pad_panorama, pixel_from_ray
+
+FloatArray = NDArray[np.float64]
+
+_MARGIN = 0.17  # in units of the focal length; what a detector and its descriptor need beyond the face
+_MIN_MARGIN_PX = 24
+_PAD_PX = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tile:
+    """A pinhole picture tangent to the sphere.
+
+    Attributes:
+        tile_from_cam: (3, 3) rotation; the tile's z axis is the direction of its centre.
+        focal_px: focal length; one radian at the centre.
+        principal_xy: (2,) pixel of the centre, (0, 0) the upper-left corner of the tile.
+        size_hw: (height, width) of the tile.
+    """
+
+    tile_from_cam: FloatArray
+    focal_px: float
+    principal_xy: FloatArray
+    size_hw: tuple[int, int]
+
+    def rays(self) -> FloatArray:
+        """Return the (H, W, 3) rays, not of unit length, through the tile's pixel centres, in the camera frame."""
+        y, x = np.mgrid[0 : self.size_hw[0], 0 : self.size_hw[1]] + 0.5
+        return self._rays_from_pixels(np.stack([x, y], axis=-1))
+
+    def bearings_from_pixels(self, pixels_px: FloatArray) -> FloatArray:
+        """Return the unit bearings (..., 3) in the camera frame of pixels (..., 2), (0, 0) the tile's corner."""
+        rays = self._rays_from_pixels(pixels_px)
+        unit: FloatArray = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+        return unit
+
+    def _rays_from_pixels(self, pixels_px: FloatArray) -> FloatArray:
+        plane = (pixels_px - self.principal_xy) / self.focal_px
+        rays: FloatArray = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1) @ self.tile_from_cam
+        return rays
+
+
+@cache
+def face_centers() -> FloatArray:
+    """Return the unit centres of the twenty faces, (20, 3); the nearest one owns a direction."""
+    return np.array([triangle.mean(axis=0) / np.linalg.norm(triangle.mean(axis=0)) for triangle in _faces()])
+
+
+def tangent_tiles(size_hw: tuple[int, int]) -> list[Tile]:
+    """Return the twenty tiles for a panorama, at its own resolution at the equator (W / 2π px per radian)."""
+    focal_px = size_hw[1] / (2 * np.pi)
+    return [_tile(triangle, focal_px) for triangle in _faces()]
+
+
+def sample_tile(panorama: NDArray[np.uint8], tile: Tile, *, interpolation: int = cv2.INTER_CUBIC) -> NDArray[np.uint8]:
+    """Return a tile's picture, (h, w) or (h, w, C) uint8, of a panorama (H, W) or (H, W, C): over seam and poles."""
+    height, width = panorama.shape[:2]
+    # OpenCV puts (0, 0) at the first pixel's centre.
+    pixels = (pixel_from_ray(tile.rays(), (height, width)) + (_PAD_PX - 0.5)).astype(np.float32)
+    padded = pad_panorama(panorama, _PAD_PX)
+    sampled: NDArray[np.uint8] = cv2.remap(padded, pixels[..., 0], pixels[..., 1], interpolation)
+    return sampled
+
+
+@cache
+def _faces() -> tuple[FloatArray, ...]:
+    """Return the corners (3, 3), unit vectors, of the twenty faces."""
+    golden = (1 + np.sqrt(5)) / 2
+    corners = np.array([np.roll([0.0, a, b * golden], shift) for shift in range(3) for a in (-1, 1) for b in (-1, 1)])
+    triples = [corners[list(triple)] for triple in combinations(range(12), 3)]
+    faces = [t for t in triples if np.allclose([np.linalg.norm(t[i] - t[i - 1]) for i in range(3)], 2.0)]
+    return tuple(face / np.linalg.norm(face[0]) for face in faces)
+
+
+def _tile(triangle: FloatArray, focal_px: float) -> Tile:
+    """Return the tile around a face, upright so that one corner of the face points along the tile's y axis."""
+    z = triangle.mean(axis=0) / np.linalg.norm(triangle.mean(axis=0))
+    y = triangle[0] - (triangle[0] @ z) * z
+    y /= np.linalg.norm(y)
+    tile_from_cam = np.array([np.cross(y, z), y, z])
+    in_tile = triangle @ tile_from_cam.T
+    plane = in_tile[:, :2] / in_tile[:, 2:]
+    margin = max(_MARGIN, _MIN_MARGIN_PX / focal_px)
+    low, high = plane.min(axis=0) - margin, plane.max(axis=0) + margin
+    width, height = np.ceil((high - low) * focal_px).astype(int)
+    return Tile(tile_from_cam, focal_px, -low * focal_px, (int(height), int(width)))

@@ -1,0 +1,66 @@
+"""Which key points to keep: distinct ones, spread evenly over the sphere."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+FloatArray = NDArray[np.float64]
+
+_KEYPOINTS_PER_CELL = 8
+
+
+def distinct_keypoints(bearings: FloatArray, scores: NDArray[np.float32], *, radius_rad: float) -> NDArray[np.intp]:
+    """Return the positions of key points that have no stronger one within a radius; of equals the first stays.
+
+    Args:
+        bearings: (N, 3) unit vectors.
+        scores: (N,) strength.
+        radius_rad: angular radius.
+    """
+    order = np.argsort(-scores, kind="stable")
+    if not len(order):
+        return order
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    pairs = cKDTree(bearings).query_pairs(2 * np.sin(radius_rad / 2), output_type="ndarray")
+    weaker, stronger = np.sort(rank[pairs], axis=1)[:, ::-1].T
+    kept = np.ones(len(order), np.bool_)
+    # In order of strength of the weaker one: by then it is settled whether the stronger one stays.
+    for pair in np.lexsort((stronger, weaker)):
+        if kept[stronger[pair]]:
+            kept[weaker[pair]] = False
+    return np.sort(order[kept])
+
+
+def spread_keypoints(bearings: FloatArray, scores: NDArray[np.float32], *, max_keypoints: int) -> NDArray[np.intp]:
+    """Return the positions of at most so many key points, strongest first, taken evenly from cells of equal area.
+
+    Every cell gives its best key point, then every cell its second best, and so on, until there are enough.
+
+    Args:
+        bearings: (N, 3) unit vectors.
+        scores: (N,) strength.
+        max_keypoints: how many to keep at most.
+    """
+    order = np.argsort(-scores, kind="stable")
+    if len(order) <= max_keypoints:
+        return order
+    cells = _fibonacci_sphere(max(20, max_keypoints // _KEYPOINTS_PER_CELL))
+    cell = cKDTree(cells).query(bearings[order])[1]
+    by_cell = np.argsort(cell, kind="stable")
+    first_of_cell = np.searchsorted(cell[by_cell], np.arange(len(cells)))
+    rank = np.empty(len(order), np.intp)
+    rank[by_cell] = np.arange(len(order)) - first_of_cell[cell[by_cell]]
+    chosen = np.sort(np.argsort(rank, kind="stable")[:max_keypoints])
+    return order[chosen]
+
+
+def _fibonacci_sphere(count: int) -> FloatArray:
+    """Return so many nearly evenly spread unit vectors, (count, 3)."""
+    idx = np.arange(count) + 0.5
+    y = 1 - 2 * idx / count
+    azimuth = np.pi * (1 + np.sqrt(5)) * idx
+    radius = np.sqrt(1 - y**2)
+    return np.stack([radius * np.cos(azimuth), y, radius * np.sin(azimuth)], axis=1)

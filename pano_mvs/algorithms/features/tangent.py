@@ -1,0 +1,191 @@
+"""SIFT and ORB on tangent tiles: key points as bearings, with neither seam nor pole."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.features.icosahedron import Tile, face_centers, sample_tile, tangent_tiles
+from pano_mvs.algorithms.features.selection import distinct_keypoints, spread_keypoints
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import pixel_from_ray
+from pano_mvs.scene import Features
+
+_ORB_SCALE, _ORB_LEVELS = 1.2, 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Found:
+    """Key points on one tile: (N, 2) pixels ((0, 0) the corner), (N,) sizes in pixels, strengths, (N, D) descriptors."""
+
+    pixels_px: NDArray[np.float64]
+    sizes_px: NDArray[np.float64]
+    scores: NDArray[np.float32]
+    descriptors: NDArray[np.generic]
+
+    def __getitem__(self, keep: NDArray[np.generic]) -> _Found:
+        return _Found(self.pixels_px[keep], self.sizes_px[keep], self.scores[keep], self.descriptors[keep])
+
+
+_Detector = Callable[[NDArray[np.uint8]], _Found]
+
+
+def extract_sift(
+    image: NDArray[np.uint8],
+    mask: NDArray[np.bool_],
+    *,
+    max_keypoints: int = 8000,
+    contrast_threshold: float = 0.012,
+    root: bool = True,
+) -> Features:
+    """Return the SIFT key points of a panorama (Lowe 2004, on the tangent tiles of an icosahedron).
+
+    Descriptors are whole numbers in float32, so that their products are exact and matching does not depend on the
+    order in which a BLAS adds.
+
+    Args:
+        image: (H, W, 3) uint8 RGB, the full sphere.
+        mask: (H, W) bool; False pixels have no key points, and neither has their border.
+        max_keypoints: at most so many are kept, spread evenly over the sphere.
+        contrast_threshold: least contrast of a blob, in OpenCV's scale (lower finds more on plain walls).
+        root: whether to take the square root of the L1-normalised descriptors (Arandjelović & Zisserman 2012).
+
+    Raises:
+        UsageError: if the shapes of image and mask do not fit.
+    """
+    # Without the precise upscale all key points of the first octave are shifted by a quarter of a pixel.
+    detector = cv2.SIFT_create(contrastThreshold=contrast_threshold, enable_precise_upscale=True)
+
+    def detect(tile_image: NDArray[np.uint8]) -> _Found:
+        keypoints, descriptors = detector.detectAndCompute(tile_image, None)
+        pixels = np.array([k.pt for k in keypoints]).reshape(-1, 2) + 0.5
+        described = np.zeros((0, 128), np.float32) if descriptors is None else descriptors
+        return _Found(pixels, *_sizes_and_scores(keypoints), _rooted(described) if root else described)
+
+    return _extract(image, mask, detect, max_keypoints=max_keypoints, metric="l2")
+
+
+def extract_orb(
+    image: NDArray[np.uint8],
+    mask: NDArray[np.bool_],
+    *,
+    max_keypoints: int = 8000,
+    fast_threshold: int = 7,
+) -> Features:
+    """Return the ORB key points of a panorama (Rublee et al. 2011, on the tangent tiles of an icosahedron).
+
+    Args:
+        image: (H, W, 3) uint8 RGB, the full sphere.
+        mask: (H, W) bool; False pixels have no key points, and neither has their border.
+        max_keypoints: at most so many are kept, spread evenly over the sphere.
+        fast_threshold: least brightness difference of a FAST corner.
+
+    Raises:
+        UsageError: if the shapes of image and mask do not fit.
+    """
+    detector = cv2.ORB_create(
+        nfeatures=max(500, max_keypoints // 5),
+        scaleFactor=_ORB_SCALE,
+        nlevels=_ORB_LEVELS,
+        edgeThreshold=24,
+        fastThreshold=fast_threshold,
+    )
+
+    def detect(tile_image: NDArray[np.uint8]) -> _Found:
+        keypoints, descriptors = detector.detectAndCompute(tile_image, None)
+        described = np.zeros((0, 32), np.uint8) if descriptors is None else descriptors
+        return _Found(_orb_pixels(keypoints, tile_image.shape), *_sizes_and_scores(keypoints), described)
+
+    return _extract(image, mask, detect, max_keypoints=max_keypoints, metric="hamming")
+
+
+def _extract(
+    image: NDArray[np.uint8],
+    mask: NDArray[np.bool_],
+    detect: _Detector,
+    *,
+    max_keypoints: int,
+    metric: Literal["l2", "hamming"],
+) -> Features:
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or mask.shape != image.shape[:2]:
+        raise UsageError(f"features need an (H, W, 3) uint8 picture and an (H, W) mask, got {image.shape} {image.dtype} "
+                         f"and {mask.shape}")  # fmt: skip
+    size_hw = (image.shape[0], image.shape[1])
+    gray: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    valid = mask.astype(np.uint8)
+    tiles = tangent_tiles(size_hw)
+    found = [_owned(_unmasked(detect(sample_tile(gray, t)), valid, t), t, i) for i, t in enumerate(tiles)]
+    bearings = np.concatenate([t.bearings_from_pixels(f.pixels_px) for t, f in zip(tiles, found, strict=True)])
+    sizes = np.concatenate([_angular_sizes(t, f) for t, f in zip(tiles, found, strict=True)])
+    scores = np.concatenate([f.scores for f in found])
+    descriptors = np.concatenate([f.descriptors for f in found])
+    pixel_rad = 2 * np.pi / size_hw[1]
+    x, y = np.floor(pixel_from_ray(bearings, size_hw)).astype(np.intp).T
+    x, y = x % size_hw[1], np.clip(y, 0, size_hw[0] - 1)
+    keep = np.flatnonzero(mask[y, x])
+    keep = keep[distinct_keypoints(bearings[keep], scores[keep], radius_rad=0.5 * pixel_rad)]
+    keep = keep[spread_keypoints(bearings[keep], scores[keep], max_keypoints=max_keypoints)]
+    return Features(
+        bearings=bearings[keep],
+        descriptors=np.ascontiguousarray(descriptors[keep]),
+        sizes_rad=sizes[keep].astype(np.float32),
+        scores=scores[keep],
+        colors_rgb=image[y[keep], x[keep]],
+        metric=metric,
+        size_hw=size_hw,
+    )
+
+
+def _unmasked(found: _Found, valid: NDArray[np.uint8], tile: Tile) -> _Found:
+    """Drop key points that lie in the mask, or so close to it that its edge may have made them."""
+    if valid.all() or not len(found.scores):
+        return found
+    valid_in_tile = sample_tile(valid, tile, interpolation=cv2.INTER_NEAREST)
+    # The frame of the tile is no border, so the distance is to masked pixels only.
+    clearance_px = cv2.distanceTransform(valid_in_tile, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    x, y = np.floor(found.pixels_px).astype(np.intp).T
+    clear = clearance_px[np.clip(y, 0, tile.size_hw[0] - 1), np.clip(x, 0, tile.size_hw[1] - 1)]
+    return found[clear > 1.0 + 1.5 * np.minimum(found.sizes_px, 31.0)]
+
+
+def _owned(found: _Found, tile: Tile, tile_idx: int) -> _Found:
+    """Keep the key points whose nearest tile centre is this tile's."""
+    nearest = np.argmax(tile.bearings_from_pixels(found.pixels_px) @ face_centers().T, axis=1)
+    return found[nearest == tile_idx]
+
+
+def _angular_sizes(tile: Tile, found: _Found) -> NDArray[np.float64]:
+    """Return patch diameters in radians; off the centre a gnomonic pixel shrinks by cos² along, cos across."""
+    cosine = tile.bearings_from_pixels(found.pixels_px) @ tile.tile_from_cam[2]
+    sizes: NDArray[np.float64] = found.sizes_px / tile.focal_px * cosine**1.5
+    return sizes
+
+
+def _sizes_and_scores(keypoints: list[cv2.KeyPoint]) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    return np.array([k.size for k in keypoints]), np.array([k.response for k in keypoints], np.float32)
+
+
+def _rooted(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return RootSIFT as whole numbers: 512 √(d / Σd), whose squared length is 512²."""
+    total = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9)
+    rooted: NDArray[np.float32] = np.rint(512 * np.sqrt(descriptors / total)).astype(np.float32)
+    return rooted
+
+
+def _orb_pixels(keypoints: list[cv2.KeyPoint], shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return ORB's key points in pixels with (0, 0) at the corner.
+
+    OpenCV multiplies the level's coordinates, counted from its first pixel's CENTRE, by the level's scale; so all
+    but the lowest level are off by (s − 1) / 2 pixels. The scale that the level really has is that of its size.
+    """
+    points = np.array([k.pt for k in keypoints]).reshape(-1, 2)
+    nominal = _ORB_SCALE ** np.array([k.octave for k in keypoints], np.float64).reshape(-1, 1)
+    size_xy = np.array(shape[1::-1], np.float64)
+    actual = size_xy / np.rint(size_xy / nominal)
+    pixels: NDArray[np.float64] = (points / nominal + 0.5) * actual
+    return pixels

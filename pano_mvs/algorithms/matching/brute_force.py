@@ -1,0 +1,97 @@
+"""Brute-force matching of descriptors: nearest neighbour, ratio test, mutual check."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import UsageError
+from pano_mvs.scene import Features
+
+_BLOCK_ROWS = 256
+
+
+def match_features(first: Features, second: Features, *, ratio: float = 0.8, mutual: bool = True) -> NDArray[np.int32]:
+    """Return the key points of two pictures whose descriptors are alike.
+
+    A match is kept if its distance is below `ratio` times that of the second nearest (Lowe 2004, section 7.1).
+
+    Args:
+        first: key points of the first picture.
+        second: of the second picture, with descriptors of the same kind.
+        ratio: in (0, 1]; 1 keeps every nearest neighbour.
+        mutual: whether both must be each other's nearest; matches are then one to one.
+
+    Returns:
+        (M, 2) int32 positions in the first and second picture, by ascending position in the first.
+
+    Raises:
+        UsageError: if the descriptors are of different kinds, or the ratio is out of range.
+    """
+    if first.metric != second.metric or first.descriptors.shape[1] != second.descriptors.shape[1]:
+        raise UsageError(f"descriptors of different kinds cannot be compared: {first.metric} with "
+                         f"{first.descriptors.shape[1]} and {second.metric} with {second.descriptors.shape[1]} "
+                         "components. Use one feature stage for all pictures")  # fmt: skip
+    if not 0 < ratio <= 1:
+        raise UsageError(f"the ratio of the ratio test must be in (0, 1], got {ratio}")
+    if len(first) == 0 or len(second) < 2:
+        return np.zeros((0, 2), np.int32)
+    match_descriptors = _match_l2 if first.metric == "l2" else _match_hamming
+    return match_descriptors(first.descriptors, second.descriptors, ratio=ratio, mutual=mutual)
+
+
+def _match_l2(
+    first: NDArray[np.generic], second: NDArray[np.generic], *, ratio: float, mutual: bool
+) -> NDArray[np.int32]:
+    """Compare by Euclidean distance: |a − b|² = |a|² + |b|² − 2 a·b, blocks of rows at a time."""
+    a, b = first.astype(np.float32, copy=False), second.astype(np.float32, copy=False)
+    half_squared_b = 0.5 * np.sum(b**2, axis=1)
+    squared_a = np.sum(a**2, axis=1)
+    nearest = np.empty(len(a), np.intp)
+    best, runner_up = np.empty(len(a), np.float32), np.empty(len(a), np.float32)
+    best_of_column = np.full(len(b), -np.inf, np.float32)
+    half_squared_a = 0.5 * squared_a
+    for start in range(0, len(a), _BLOCK_ROWS):
+        rows = slice(start, start + _BLOCK_ROWS)
+        # a·b − |b|²/2 orders a row, and less |a|²/2 a column, as the distance does.
+        closeness = a[rows] @ b.T
+        closeness -= half_squared_b
+        row_idx = np.arange(len(closeness))
+        nearest[rows] = closeness.argmax(axis=1)
+        best[rows] = closeness[row_idx, nearest[rows]]
+        if mutual:
+            np.maximum(best_of_column, (closeness - half_squared_a[rows, None]).max(axis=0), out=best_of_column)
+        closeness[row_idx, nearest[rows]] = -np.inf
+        runner_up[rows] = closeness.max(axis=1)
+    distance, next_distance = squared_a - 2 * best, squared_a - 2 * runner_up
+    kept = distance < np.float32(ratio**2) * next_distance if ratio < 1 else np.ones(len(a), np.bool_)
+    if mutual:
+        kept &= best - half_squared_a >= best_of_column[nearest]
+    return _one_to_one(np.flatnonzero(kept), nearest, distance, mutual=mutual)
+
+
+def _match_hamming(
+    first: NDArray[np.generic], second: NDArray[np.generic], *, ratio: float, mutual: bool
+) -> NDArray[np.int32]:
+    found = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(first, second, k=2)
+    nearest = np.array([near.trainIdx for near, _ in found], np.intp)
+    distance = np.array([near.distance for near, _ in found], np.float32)
+    next_distance = np.array([far.distance for _, far in found], np.float32)
+    kept = distance < ratio * next_distance if ratio < 1 else np.ones(len(first), np.bool_)
+    if mutual:
+        back = cv2.BFMatcher(cv2.NORM_HAMMING).match(second, first)
+        best_of_column = np.array([match.distance for match in back], np.float32)
+        kept &= distance <= best_of_column[nearest]
+    return _one_to_one(np.flatnonzero(kept), nearest, distance, mutual=mutual)
+
+
+def _one_to_one(
+    kept: NDArray[np.intp], nearest: NDArray[np.intp], distance: NDArray[np.float32], *, mutual: bool
+) -> NDArray[np.int32]:
+    """Return the matches; if mutual, of several equally near ones of a second key point the first alone."""
+    if mutual:
+        by_distance = kept[np.argsort(distance[kept], kind="stable")]
+        _, first_use = np.unique(nearest[by_distance], return_index=True)
+        kept = np.sort(by_distance[first_use])
+    return np.stack([kept, nearest[kept]], axis=1).astype(np.int32)

@@ -1,0 +1,105 @@
+"""Non-linear refinement of a two-view geometry: the angular error over the five degrees of freedom."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.geometry import Rigid3, rotation_from_rotvec
+
+FloatArray = NDArray[np.float64]
+
+
+def refine_relative_pose(
+    pose: Rigid3, first: FloatArray, second: FloatArray, *, scale_rad: float, max_iterations: int = 20
+) -> Rigid3:
+    """Return the second_from_first pose, |t| = 1, with the least Cauchy loss of the spherical Sampson error.
+
+    Gauss–Newton with reweighting and step halving; R ← exp(ω) R, t moves on the unit sphere.
+
+    Args:
+        pose: where to begin, |t| = 1.
+        first: (M, 3) unit bearings in the first image.
+        second: (M, 3) unit bearings in the second.
+        scale_rad: residual at which the weight has fallen to a half.
+        max_iterations: at most so many steps.
+    """
+    residuals, jacobian = _linearised(pose, first, second)
+    cost = _cost(residuals, scale_rad)
+    for _ in range(max_iterations):
+        weights = 1 / (1 + (residuals / scale_rad) ** 2)
+        hessian = (jacobian * weights[:, None]).T @ jacobian
+        hessian += 1e-9 * np.trace(hessian) * np.eye(5)
+        step = -np.linalg.solve(hessian, jacobian.T @ (weights * residuals))
+        for shrink in (1.0, 0.3, 0.1, 0.01):
+            moved = _moved(pose, shrink * step)
+            moved_residuals, moved_jacobian = _linearised(moved, first, second)
+            moved_cost = _cost(moved_residuals, scale_rad)
+            if moved_cost < cost:
+                break
+        else:
+            break
+        gain = cost - moved_cost
+        pose, residuals, jacobian, cost = moved, moved_residuals, moved_jacobian, moved_cost
+        if gain < 1e-10 * cost:
+            break
+    return pose
+
+
+def pose_uncertainty(
+    pose: Rigid3, first: FloatArray, second: FloatArray, *, noise_rad: float
+) -> tuple[float, float]:
+    """Return the standard deviations, in radians, of rotation and direction along their least certain axes.
+
+    The square roots of the largest eigenvalues of the blocks of σ² (JᵀJ)⁻¹.
+
+    Args:
+        pose: second_from_first, |t| = 1, at the optimum.
+        first: (M, 3) unit bearings that agree with it.
+        second: (M, 3) unit bearings.
+        noise_rad: σ, standard deviation of the residuals.
+    """
+    jacobian = _linearised(pose, first, second)[1]
+    hessian = jacobian.T @ jacobian
+    covariance = noise_rad**2 * np.linalg.inv(hessian + 1e-12 * np.trace(hessian) * np.eye(5))
+    rotation, direction = np.linalg.eigvalsh(covariance[:3, :3])[-1], np.linalg.eigvalsh(covariance[3:, 3:])[-1]
+    return float(np.sqrt(max(rotation, 0.0))), float(np.sqrt(max(direction, 0.0)))
+
+
+def tangent_basis(directions: FloatArray) -> FloatArray:
+    """Return two unit vectors that are normal to each direction and to one another; (..., 3) to (..., 3, 2)."""
+    axis = np.eye(3)[np.argmin(np.abs(directions), axis=-1)]
+    u = np.cross(directions, axis)
+    u /= np.linalg.norm(u, axis=-1, keepdims=True)
+    basis: FloatArray = np.stack([u, np.cross(directions, u)], axis=-1)
+    return basis
+
+
+def _linearised(pose: Rigid3, first: FloatArray, second: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the signed residuals r = e / √D, (M,), and their derivatives by ω and by t's two tangents, (M, 5).
+
+    With a = R p, e = q·(t × a) and D = |t × a|² + |t × q|² − 2 e²:
+    ∂e/∂ω = (t·a) q − (q·a) t, ∂e/∂t = a × q, ∂|t × a|²/∂ω = 2 (t·a) (t × a), ∂|t × a|²/∂t = −2 (t·a) a.
+    """
+    t, q, a = pose.translation, second, first @ pose.rotation.T
+    t_cross_a = np.cross(t, a)
+    t_dot_a, t_dot_q = a @ t, q @ t
+    e = np.sum(q * t_cross_a, axis=1)
+    squared = np.maximum(2 - t_dot_a**2 - t_dot_q**2 - 2 * e**2, 1e-12)
+    e_by_omega = t_dot_a[:, None] * q - np.sum(q * a, axis=1)[:, None] * t
+    e_by_t = np.cross(a, q)
+    d_by_omega = 2 * t_dot_a[:, None] * t_cross_a - 4 * e[:, None] * e_by_omega
+    d_by_t = -2 * (t_dot_a[:, None] * a + t_dot_q[:, None] * q) - 4 * e[:, None] * e_by_t
+    root = np.sqrt(squared)[:, None]
+    e_by = np.concatenate([e_by_omega, e_by_t @ tangent_basis(t)], axis=1)
+    d_by = np.concatenate([d_by_omega, d_by_t @ tangent_basis(t)], axis=1)
+    return e / root[:, 0], e_by / root - 0.5 * e[:, None] * d_by / root**3
+
+
+def _moved(pose: Rigid3, step: FloatArray) -> Rigid3:
+    translation = pose.translation + tangent_basis(pose.translation) @ step[3:]
+    return Rigid3(rotation_from_rotvec(step[:3]) @ pose.rotation, translation / np.linalg.norm(translation))
+
+
+def _cost(residuals: FloatArray, scale_rad: float) -> float:
+    return float(np.sum(np.log1p((residuals / scale_rad) ** 2)))

@@ -1,0 +1,143 @@
+"""Judge a pair of pictures: their relative pose, or why there is none that can be trusted."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.two_view.essential import in_front, sampson_angles
+from pano_mvs.algorithms.two_view.ransac import RelativePose, estimate_two_view
+from pano_mvs.algorithms.two_view.refinement import pose_uncertainty
+from pano_mvs.algorithms.two_view.rotation_only import estimate_rotation
+from pano_mvs.algorithms.two_view.significance import (
+    chance_of_agreement,
+    independent_count,
+    log10_false_alarms,
+)
+from pano_mvs.geometry import Rigid3, angle_between, skew
+from pano_mvs.scene import Features, TwoView
+
+FloatArray = NDArray[np.float64]
+
+_MAX_LOG10_FALSE_ALARMS = -6.0
+_MAX_DIRECTION_STD_DEG = 3.0
+_ROTATION_SHARE = 0.9
+_MIN_PARALLAX = 4.0  # in units of the threshold
+_MIN_WITH_PARALLAX = 12
+
+
+def verify_pair(
+    first: Features,
+    second: Features,
+    matches_idx: NDArray[np.int32],
+    *,
+    rng: np.random.Generator,
+    threshold_deg: float = 0.2,
+    min_inliers: int = 20,
+    max_iterations: int = 20_000,
+) -> TwoView:
+    """Return what two pictures agree on: their relative pose and the matches that bear it out.
+
+    A relative pose is believed only if so many independent matches would not agree by chance (see `significance`),
+    enough of them show parallax, and together they fix its direction.
+
+    Args:
+        first: key points of the first picture.
+        second: of the second.
+        matches_idx: (M, 2) positions of matching key points.
+        rng: draws the samples.
+        threshold_deg: spherical Sampson error below which a match agrees.
+        min_inliers: fewer independent agreeing matches are never enough.
+        max_iterations: at most so many hypotheses.
+
+    Returns:
+        geometry "general"; or "rotation", where the pictures were taken from one place; or "none". The last two are
+        falsy and carry their reason.
+    """
+    p, q = first.bearings[matches_idx[:, 0]], second.bearings[matches_idx[:, 1]]
+    threshold_rad = float(np.deg2rad(threshold_deg))
+    count = len(matches_idx)
+    if count < max(min_inliers, 16):
+        return TwoView.failed(f"{count} matches, {max(min_inliers, 16)} needed", candidates=count)
+    rotation, turned = estimate_rotation(p, q, rng=rng, threshold_rad=1.5 * threshold_rad)
+    pose = estimate_two_view(p, q, rng=rng, threshold_rad=threshold_rad, max_iterations=max_iterations)
+    if turned.sum() >= max(min_inliers, _ROTATION_SHARE * pose.inliers.sum()):
+        return _from_one_place(matches_idx, rotation, turned, angle_between(p @ rotation.T, q))
+    reason = pose.reason or _why_not(pose, p, q, rng=rng, threshold_rad=threshold_rad, min_inliers=min_inliers)
+    if reason:
+        return TwoView.failed(reason, candidates=count)
+    kept = pose.inliers
+    return TwoView(
+        matches_idx=matches_idx[kept],
+        rotation=pose.second_from_first.rotation,
+        direction=pose.second_from_first.translation,
+        residuals_rad=pose.residuals_rad[kept].astype(np.float32),
+        geometry="general",
+        candidates=count,
+        parallax_deg=float(np.rad2deg(np.median(_parallax(p[kept], q[kept], pose.second_from_first)))),
+    )
+
+
+def _from_one_place(
+    matches_idx: NDArray[np.int32], rotation: FloatArray, turned: NDArray[np.bool_], angles: FloatArray
+) -> TwoView:
+    return TwoView(
+        matches_idx=matches_idx[turned],
+        rotation=rotation,
+        direction=np.zeros(3),
+        residuals_rad=angles[turned].astype(np.float32),
+        geometry="rotation",
+        reason=f"taken from the same place: a turn alone explains {turned.sum()} of {len(turned)} matches, so the pair "
+        "shows no depth",
+        candidates=len(turned),
+    )
+
+
+def _why_not(
+    pose: RelativePose,
+    p: FloatArray,
+    q: FloatArray,
+    *,
+    rng: np.random.Generator,
+    threshold_rad: float,
+    min_inliers: int,
+) -> str:
+    """Return why a relative pose is not to be believed, or nothing."""
+    kept, count = pose.inliers, len(p)
+    witnesses = independent_count(p[kept], q[kept]) if kept.any() else 0
+    if witnesses < min_inliers:
+        return f"{witnesses} independent matches of {count} agree on a relative pose, {min_inliers} needed"
+    chance = _chance(pose.second_from_first, p, q, rng=rng, threshold_rad=threshold_rad)
+    false_alarms = log10_false_alarms(witnesses, max(independent_count(p, q), witnesses), chance=chance, sample=8)
+    if false_alarms > _MAX_LOG10_FALSE_ALARMS:
+        return (f"{witnesses} independent matches of {count} agree on a relative pose, which may be chance: the "
+                "pictures may not overlap")  # fmt: skip
+    parallax = _parallax(p[kept], q[kept], pose.second_from_first)
+    moved = int((parallax > _MIN_PARALLAX * threshold_rad).sum())
+    if moved < _MIN_WITH_PARALLAX:
+        return (f"only {moved} of {kept.sum()} agreeing matches show parallax, {_MIN_WITH_PARALLAX} needed: the "
+                "pictures were taken too close together for what they see")  # fmt: skip
+    noise_rad = max(float(np.sqrt(np.mean(pose.residuals_rad[kept] ** 2))), 0.1 * threshold_rad)
+    noise_rad *= np.sqrt(kept.sum() / witnesses)
+    direction_std_deg = np.rad2deg(pose_uncertainty(pose.second_from_first, p[kept], q[kept], noise_rad=noise_rad)[1])
+    if direction_std_deg > _MAX_DIRECTION_STD_DEG:
+        return (f"the matches leave the direction between the pictures open by {direction_std_deg:.0f}°: they lie too "
+                "close together, or show too little parallax")  # fmt: skip
+    return ""
+
+
+def _chance(
+    pose: Rigid3, p: FloatArray, q: FloatArray, *, rng: np.random.Generator, threshold_rad: float
+) -> float:
+    essential = skew(pose.translation) @ pose.rotation
+
+    def agrees(first: FloatArray, second: FloatArray) -> NDArray[np.bool_]:
+        near = sampson_angles(essential, first, second) < threshold_rad
+        near[near] = in_front(first[near], second[near], pose)
+        return near
+
+    return chance_of_agreement(agrees, p, q, rng=rng)
+
+
+def _parallax(p: FloatArray, q: FloatArray, pose: Rigid3) -> FloatArray:
+    return angle_between(p @ pose.rotation.T, q)
