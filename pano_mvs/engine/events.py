@@ -30,7 +30,7 @@ class Failure:
 
 @dataclass(slots=True)
 class StageSummary:
-    """What happened in one stage."""
+    """What happened in one stage; metrics are means over its units, `unit_metrics` each unit's own."""
 
     name: str
     use: str
@@ -41,6 +41,7 @@ class StageSummary:
     blocked: int = 0
     seconds: float = 0.0
     metrics: dict[str, float] = field(default_factory=dict)
+    unit_metrics: dict[str, dict[str, float]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
 

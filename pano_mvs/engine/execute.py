@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from pano_mvs.core.errors import ContractError
 from pano_mvs.engine.context import Context
-from pano_mvs.engine.ports import Cardinality, Port
+from pano_mvs.engine.ports import Cardinality, Names, Port
 from pano_mvs.engine.store import ItemRef, Store, UnitRecord
 from pano_mvs.engine.units import Unit, UnitInput
-from pano_mvs.scene import Axis, Record
+from pano_mvs.scene import Axis
 from pano_mvs.scene.index import pair_from_name
 
 
@@ -55,13 +54,15 @@ def _arguments(unit: Unit, store: Store) -> dict[str, Any]:
     return {name: _load(ports[name], value, store) for name, value in unit.inputs.items()}
 
 
-def _load(port: Port, value: UnitInput, store: Store) -> Record | list[Record] | Mapping[Any, Record] | None:
+def _load(port: Port, value: UnitInput, store: Store) -> object:
     if value is None:
         return None
     if isinstance(value, ItemRef):
         return store.load(value, port.kind)
     if port.cardinality is Cardinality.NEAR:
         return [store.load(ref, port.kind) for ref in value.values()]
+    if port.cardinality is Cardinality.NAMES:
+        return Names(value)
     return {_gathered_key(port, name): store.load(ref, port.kind) for name, ref in value.items()}
 
 

@@ -1,7 +1,8 @@
 """How a stage says what it reads: the cardinality of each port, written as a type.
 
 `Each[K]` is the unit's own item, `Near[K]` the items of its neighbours in order, `All[K]` every item by name,
-`One[K]` a whole value. A port annotated `Each[K] | None` may stay unconnected.
+`One[K]` a whole value, `Names[K]` only the names of all items: a stage that needs no more does not run
+again when an item's content changes. A port annotated `Each[K] | None` may stay unconnected.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import types
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Annotated, Any, TypeAlias, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Generic, TypeAlias, TypeVar, Union, get_args, get_origin
 
 from pano_mvs.scene import Record
 
@@ -22,6 +23,7 @@ class Cardinality(StrEnum):
     EACH = "Each"
     NEAR = "Near"
     ALL = "All"
+    NAMES = "Names"
 
 
 K = TypeVar("K")
@@ -31,6 +33,12 @@ Each: TypeAlias = Annotated[K, Cardinality.EACH]
 Near: TypeAlias = Annotated[Sequence[K], Cardinality.NEAR]
 All: TypeAlias = Annotated[Mapping[Any, K], Cardinality.ALL]
 """By image name; by (first, second) image names for kinds of the pair axis."""
+
+
+class Names(tuple[str, ...], Generic[K]):
+    """The names of all items of a kind, in the capture's order."""
+
+    __slots__ = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +63,9 @@ def port_from_annotation(name: str, annotation: Any) -> Port | None:
         if len(inner) != 1:
             return None
         annotation, optional = inner[0], True
+    if get_origin(annotation) is Names:
+        (kind,) = get_args(annotation)
+        return Port(name, kind, Cardinality.NAMES, optional)
     if get_origin(annotation) is not Annotated:
         return None
     value_type, *marks = get_args(annotation)

@@ -55,8 +55,9 @@ class Publisher:
             name = str(PurePosixPath(to) / target.replace("{item}", self._stems.get(item, item)))
             owner = self._owners.setdefault(name.casefold(), f"{stage}:{item}")
             if owner != f"{stage}:{item}":
-                raise UsageError(f"stages {owner.partition(':')[0]!r} and {stage!r} both write {name}; give one of them "
-                                 "a folder of its own with `to: NAME`")  # fmt: skip
+                other = owner.partition(":")[0]
+                raise UsageError(f"stages {other!r} and {stage!r} both write {name}; give one a folder of its own "
+                                 "with `to: NAME`")  # fmt: skip
             blob = ref.parts[str(number)]
             self._write(name, blob)
             self.published[name] = blob.digest

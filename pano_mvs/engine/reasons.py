@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from pano_mvs.engine.ports import Cardinality
 from pano_mvs.engine.store import ItemRef, Store
 from pano_mvs.engine.units import Unit
 
@@ -67,12 +66,8 @@ def _changed_items(unit: Unit, port: str, old: Any, new: Any) -> str:
     value = unit.inputs.get(port)
     if value is None or isinstance(value, ItemRef):
         return unit.item or "changed"
-    cardinality = next(p.cardinality for p in unit.entry.spec.ports if p.name == port)
-    known = {entry if cardinality is Cardinality.NEAR else str(entry) for entry in old or []}
-    names = [
-        name for name, entry in zip(value, new, strict=True)
-        if (entry if cardinality is Cardinality.NEAR else str(entry)) not in known
-    ]  # fmt: skip
+    known = [str(entry) for entry in old or []]
+    names = [name for name, entry in zip(value, new, strict=True) if str(entry) not in known]
     if not names:
         return "fewer items" if len(new) < len(old or []) else "another order"
     return ", ".join(names[:_SHOWN]) + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")

@@ -137,8 +137,8 @@ class Run:
         self.result.stages.append(summary)
         self.observer.stage_started(name, len(resolution.units))
         self._note_blocked(entry, resolution, summary)
-        records = [record for unit in resolution.units if (record := self._run_unit(unit, state, summary)) is not None]
-        self._sum_up(entry, records, summary)
+        records = {unit.item: self._run_unit(unit, state, summary) for unit in resolution.units}
+        self._sum_up(entry, {item: record for item, record in records.items() if record is not None}, summary)
         summary.seconds = time.perf_counter() - started
         self.observer.stage_finished(summary)
         self._check_gates(entry, summary)
@@ -203,12 +203,12 @@ class Run:
     def _publish(self, unit: Unit, ref: ItemRef) -> None:
         self._publisher.publish(unit.entry.name, unit.item, ref, to=unit.entry.policy.to)
 
-    def _sum_up(self, entry: StageEntry, records: list[UnitRecord], summary: StageSummary) -> None:
-        names = sorted({name for record in records for name in record.metrics})
-        for name in names:
-            values = [record.metrics[name] for record in records if name in record.metrics]
+    def _sum_up(self, entry: StageEntry, records: Mapping[str, UnitRecord], summary: StageSummary) -> None:
+        summary.unit_metrics = {item: dict(record.metrics) for item, record in records.items() if record.metrics}
+        for name in sorted({name for metrics in summary.unit_metrics.values() for name in metrics}):
+            values = [metrics[name] for metrics in summary.unit_metrics.values() if name in metrics]
             summary.metrics[name] = sum(values) / len(values)
-        for record in records:
+        for record in records.values():
             summary.notes.extend(note for note in record.notes if note not in summary.notes)
             for image, reason in record.rejected.items():
                 self.result.rejected.setdefault(image, (entry.name, reason))

@@ -220,8 +220,8 @@ class _Resolver:
             case Cardinality.EACH:
                 wanted = (name,)
             case Cardinality.NEAR:
-                wanted = self.near[name]
-            case Cardinality.ALL:
+                wanted = self._near(name)
+            case Cardinality.ALL | Cardinality.NAMES:
                 if state.open or state.pending:
                     return None, "", True
                 return (dict(items), "", False) if items else (None, self._why(edge, state, ""), False)
@@ -231,12 +231,24 @@ class _Resolver:
             return None, "", True
         if edge.port.cardinality is Cardinality.NEAR:
             found = {item: items[item] for item in wanted if item in items}
-            complete = len(found) == len(wanted) if self.axis is Axis.PAIR else bool(found)
-            missing = next((item for item in wanted if item not in items), "")
-            return (found, "", False) if complete else (None, self._why(edge, state, missing), False)
+            missing = next((item for item in self.near[name] if item not in found), "")
+            usable = not missing if self.axis is Axis.PAIR else bool(found)
+            return (found, "", False) if usable else (None, self._why(edge, state, missing), False)
         if wanted[0] in items:
             return items[wanted[0]], "", False
         return None, self._why(edge, state, WHOLE if source_failed else wanted[0]), False
+
+    def _near(self, name: str) -> list[str]:
+        """Return a unit's neighbours that every Near port has or may come to have, so that all ports stay in step."""
+        return [item for item in self.near[name] if all(self._may_have(edge, item) for edge in self.edges.values())]
+
+    def _may_have(self, edge: Edge, item: str) -> bool:
+        if edge.port.cardinality is not Cardinality.NEAR:
+            return True
+        state = self.states[edge.producer]
+        if state.open or item in state.pending or (edge.exploded and state.pending):
+            return True
+        return item in (state.exploded if edge.exploded else state.items)
 
     @staticmethod
     def _why(edge: Edge, state: StageState, item: str) -> str:
@@ -251,6 +263,8 @@ class _Resolver:
             return value.digest
         if self.edges[port].port.cardinality is Cardinality.NEAR:
             return [ref.digest for ref in value.values()]
+        if self.edges[port].port.cardinality is Cardinality.NAMES:
+            return list(value)
         state = self.states[self.edges[port].producer]
         return [[list(state.members.get(name, (name,))), ref.digest] for name, ref in value.items()]
 

@@ -1,0 +1,149 @@
+"""The command line: options in, the engine's or a library's function called, exit codes out.
+
+0 ok · 1 internal error · 2 usage or validation · 3 finished with failed items · 4 stopped by a gate or guard ·
+130 interrupted.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import Annotated, Any, Optional, TypeVar, cast
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from pano_mvs.core.errors import PanoMvsError, WorkflowError
+
+app = typer.Typer(
+    name="pano-mvs",
+    help="Dense 3D from 360° photographs.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+stage_app = typer.Typer(help="Look at one stage.", no_args_is_help=True)
+app.add_typer(stage_app, name="stage")
+
+WorkflowArgument = Annotated[str, typer.Argument(metavar="WORKFLOW", help="A workflow file, or the name of a preset.")]
+ImagesOption = Annotated[Optional[Path], typer.Option("--images", help="Folder of panoramas to use instead.")]  # noqa: UP045
+SetOption = Annotated[Optional[list[str]], typer.Option("--set", metavar="STAGE.PARAM=VALUE", help="Change a setting.")]  # noqa: UP045
+CacheOption = Annotated[Optional[Path], typer.Option("--cache", help="Folder of the cache.")]  # noqa: UP045
+OutOption = Annotated[Optional[Path], typer.Option("--out", help="Folder of the results; default out/<workflow>.")]  # noqa: UP045
+
+
+Command = TypeVar("Command", bound=Callable[..., None])
+
+
+def _guarded(command: Command) -> Command:
+    """Turn exceptions into messages and exit codes; the only place where that is done."""
+
+    @wraps(command)
+    def guarded(*args: Any, **kwargs: Any) -> None:
+        errors = Console(stderr=True)
+        try:
+            command(*args, **kwargs)
+        except PanoMvsError as error:
+            for problem in error.problems if isinstance(error, WorkflowError) else [str(error)]:
+                errors.print(f"[red]error:[/] {escape(problem)}", highlight=False, soft_wrap=True)
+            raise typer.Exit(error.exit_code) from None
+        except KeyboardInterrupt:
+            errors.print("interrupted; what was finished is kept: the same command goes on from here")
+            raise typer.Exit(130) from None
+        except typer.Exit:
+            raise
+        except Exception:
+            traceback.print_exc()
+            errors.print("[red]internal error:[/] this is a bug in pano_mvs; what was finished is kept")
+            raise typer.Exit(1) from None
+
+    return cast(Command, guarded)
+
+
+@app.command()
+@_guarded
+def run(
+    workflow: WorkflowArgument,
+    images: ImagesOption = None,
+    out: OutOption = None,
+    overrides: SetOption = None,
+    cache: CacheOption = None,
+) -> None:
+    """Run a workflow; the same command resumes it."""
+    from pano_mvs.cli.run_command import run_workflow
+    from pano_mvs.cli.session import open_session
+
+    session = open_session(workflow, overrides=overrides or [], images=images, cache=cache, out=out)
+    raise typer.Exit(run_workflow(session, Console()))
+
+
+@app.command()
+@_guarded
+def plan(
+    workflow: WorkflowArgument, images: ImagesOption = None, overrides: SetOption = None, cache: CacheOption = None
+) -> None:
+    """Show what a run would do, what is cached, and why the rest is not."""
+    from pano_mvs.cli.plan_command import show_plan
+    from pano_mvs.cli.session import open_session
+
+    show_plan(open_session(workflow, overrides=overrides or [], images=images, cache=cache), Console())
+
+
+@app.command()
+@_guarded
+def check(workflow: WorkflowArgument, images: ImagesOption = None, overrides: SetOption = None) -> None:
+    """Show every mistake in a workflow at once, with its line and column."""
+    from pano_mvs.cli.session import open_session
+
+    session = open_session(workflow, overrides=overrides or [], images=images)
+    Console().print(f"{workflow}: {len(session.workflow.stages)} stages, no mistakes", highlight=False)
+
+
+@app.command()
+@_guarded
+def status(
+    workflow: WorkflowArgument, images: ImagesOption = None, out: OutOption = None, cache: CacheOption = None
+) -> None:
+    """Show what the latest run did and what is cached now."""
+    from pano_mvs.cli.plan_command import show_status
+    from pano_mvs.cli.session import open_session
+
+    show_status(open_session(workflow, images=images, out=out, cache=cache), Console())
+
+
+@app.command()
+@_guarded
+def plugins() -> None:
+    """List all stages, where they come from, and the plugins that failed to load."""
+    from pano_mvs.cli.show import show_plugins
+
+    show_plugins(Console())
+
+
+@stage_app.command("show")
+@_guarded
+def stage_show(name: Annotated[str, typer.Argument(help="A stage's name, such as depth.sweep.")]) -> None:
+    """Show a stage's ports, settings and documentation."""
+    from pano_mvs.cli.show import show_stage
+
+    show_stage(name, Console())
+
+
+@app.command()
+@_guarded
+def evaluate(
+    out: Annotated[Path, typer.Argument(help="The output folder of a run.")],
+    truth: Annotated[Path, typer.Option("--truth", help="Folder with poses.json and depth.npz.")],
+) -> None:
+    """Compare a run's poses and range maps with the truth."""
+    from pano_mvs.cli.evaluate import evaluate_folder
+
+    evaluate_folder(out, truth, Console())
+
+
+def main() -> None:
+    """Run the command line."""
+    app()

@@ -1,0 +1,71 @@
+"""Show what a run would do, and what the latest one did."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from pano_mvs.cli.session import Session
+from pano_mvs.engine.plan import StagePlan, make_plan
+from pano_mvs.engine.run import workflow_id
+from pano_mvs.engine.store import Store
+
+_SHOWN_REASONS = 5
+
+
+def show_plan(session: Session, console: Console) -> None:
+    """Print per stage how many units are cached, would run, or may run, and why."""
+    plans = _plans(session)
+    table = Table("stage", "use", "cached", "run", "may run", "cannot run")
+    for plan in plans:
+        waiting = "all (units not known yet)" if plan.open else str(len(plan.may_run) or "")
+        table.add_row(plan.name, plan.use, str(len(plan.cached) or ""), str(len(plan.run) or ""), waiting,
+                      str(len(plan.blocked) or ""))  # fmt: skip
+    console.print(table)
+    for plan in plans:
+        _print_reasons(plan, console)
+    total = sum(len(plan.run) for plan in plans)
+    may = sum(len(plan.may_run) for plan in plans) + sum(plan.open for plan in plans)
+    text = "nothing to compute" if not total and not may else f"{total} units would run"
+    console.print(text + (", more may follow" if may else ""), highlight=False)
+
+
+def show_status(session: Session, console: Console) -> None:
+    """Print what the latest run into the output folder said, then what is cached now."""
+    path = session.out / "run.json"
+    try:
+        last = json.loads(path.read_bytes())
+    except FileNotFoundError:
+        console.print(f"no finished run in {escape(str(session.out))}", highlight=False)
+    except ValueError:
+        console.print(f"{escape(str(path))} is damaged; run again to write it anew", highlight=False)
+    else:
+        units = last["units"]
+        console.print(f"latest run {last['started']}: exit code {last['exit_code']}, {units['run']} computed, "
+                      f"{units['cached']} cached, {units['failed']} without a result", highlight=False)  # fmt: skip
+        for failure in last["failures"]:
+            console.print(escape(f"  {failure['stage']}:{failure['item']}: {failure['cause']}"), highlight=False)
+    show_plan(session, console)
+
+
+def _plans(session: Session) -> list[StagePlan]:
+    store = Store(session.store_root)
+    plans = make_plan(session.workflow, session.graph, store, workflow_id(session.workflow))
+    store.stat_cache.save()
+    return plans
+
+
+def _print_reasons(plan: StagePlan, console: Console) -> None:
+    by_reason = Counter(plan.run.values())
+    for reason, count in by_reason.most_common(_SHOWN_REASONS):
+        items = [item for item, why in plan.run.items() if why == reason and item]
+        which = f":{items[0]}" + (f" and {count - 1} more" if count > 1 else "") if items else ""
+        console.print(escape(f"{plan.name}{which}: {reason}"), highlight=False, soft_wrap=True)
+    if len(by_reason) > _SHOWN_REASONS:
+        console.print(f"{plan.name}: … and {len(by_reason) - _SHOWN_REASONS} other reasons", highlight=False)
+    for item, reason in list(plan.blocked.items())[:_SHOWN_REASONS]:
+        console.print(escape(f"{plan.name}:{item}: cannot run: {reason}"), highlight=False, soft_wrap=True)

@@ -1,0 +1,102 @@
+"""Run a workflow for a person: progress, the result files, a summary."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from pano_mvs.cli.progress import ProgressBars
+from pano_mvs.cli.session import Session
+from pano_mvs.cli.summary import summarise
+from pano_mvs.core.files import write_text
+from pano_mvs.engine.run import Run
+from pano_mvs.engine.store import Store
+from pano_mvs.report.page import write_report
+
+_SHOWN_FAILURES = 20
+
+
+def run_workflow(session: Session, console: Console) -> int:
+    """Run a workflow, write run.json and report.html, print what came out, and return the exit code."""
+    started, clock = datetime.now(UTC), time.perf_counter()
+    store = Store(session.store_root)
+    with ProgressBars(console) as bars:
+        run = Run(session.workflow, session.graph, store, session.out, observer=bars)
+        result = run.execute(earlier_files=earlier_files(session.out))
+    summary = summarise(run, result, started=started, seconds=time.perf_counter() - clock)
+    write_text(session.out / "run.json", json.dumps(summary, indent=1) + "\n")
+    write_report(session.out, summary)
+    print_summary(summary, session.out, console, written=len(result.written))
+    return result.exit_code
+
+
+def earlier_files(out: Path) -> dict[str, str]:
+    """Return the files, with their digests, that an earlier run wrote into a folder."""
+    try:
+        files = json.loads((out / "run.json").read_bytes())["files"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+    return {str(name): str(digest) for name, digest in files.items()} if isinstance(files, dict) else {}
+
+
+def print_summary(summary: Mapping[str, Any], out: Path, console: Console, *, written: int) -> None:
+    """Print where the results are and how good they are known to be."""
+    units = summary["units"]
+    failed = f", {units['failed']} without a result" if units["failed"] else ""
+    cached = " (nothing to compute)" if not units["run"] and not units["failed"] else ""
+    counts = f"{units['run']} units computed, {units['cached']} cached{failed}"
+    console.print(f"\n{counts} in {summary['seconds']:.1f} s{cached}", highlight=False)
+    _print_failures(summary, console)
+    _print_poses(summary, console)
+    _print_scores(summary["scores"], console)
+    for note in summary["notes"]:
+        console.print(f"note: {escape(note)}", highlight=False, soft_wrap=True)
+    if summary["stopped"]:
+        console.print(f"[red]stopped:[/] {escape(summary['stopped'])}", highlight=False, soft_wrap=True)
+    console.print(f"results in {escape(str(out))} ({len(summary['files'])} files, {written} written now): "
+                  "open report.html", highlight=False, soft_wrap=True)  # fmt: skip
+
+
+def _print_failures(summary: Mapping[str, Any], console: Console) -> None:
+    causes = [failure for failure in summary["failures"] if not failure["cause"].startswith("not run:")]
+    for failure in causes[:_SHOWN_FAILURES]:
+        label = f"{failure['stage']}:{failure['item']}" if failure["item"] else failure["stage"]
+        text = f"{label}: {failure['cause']} — {failure['consequence']}"
+        console.print(f"[red]failed:[/] {escape(text)}", highlight=False, soft_wrap=True)
+    if len(causes) > _SHOWN_FAILURES:
+        console.print(f"… and {len(causes) - _SHOWN_FAILURES} more, all in run.json", highlight=False)
+    dependent = len(summary["failures"]) - len(causes)
+    if dependent:
+        console.print(f"{dependent} further units could not run because of these", highlight=False)
+    for image, rejected in summary["rejected"].items():
+        text = f"{image}: {rejected['reason']}"
+        console.print(f"[yellow]left out:[/] {escape(text)}", highlight=False, soft_wrap=True)
+
+
+def _print_poses(summary: Mapping[str, Any], console: Console) -> None:
+    poses = summary["poses"]
+    if poses:
+        total = len(poses["registered"]) + len(poses["rejected"])
+        console.print(f"poses: {len(poses['registered'])} of {total} registered, {poses['points']} points; "
+                      f"scale: {poses['scale']}", highlight=False)  # fmt: skip
+
+
+def _print_scores(scores: Mapping[str, Any], console: Console) -> None:
+    if scores.get("poses"):
+        text = ", ".join(f"{name.replace('_', ' ')} {value:.4g}" for name, value in scores["poses"].items())
+        console.print(f"against the ground truth: {text}", highlight=False)
+    if not scores.get("views"):
+        return
+    columns = list(next(iter(scores["views"].values())))
+    table = Table("view", *(name.replace("_", " ") for name in columns))
+    for view, values in scores["views"].items():
+        table.add_row(view, *(f"{values[name]:.4g}" for name in columns))
+    console.print(table)

@@ -1,0 +1,63 @@
+"""What every command that takes a workflow needs: the workflow wired, its store, its output folder."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pano_mvs
+from pano_mvs.core.errors import InputError
+from pano_mvs.engine.registry import Registry
+from pano_mvs.engine.wiring import Graph, wire
+from pano_mvs.engine.workflow import Workflow, find_workflow, load_workflow
+
+CACHE_VARIABLE = "PANO_MVS_CACHE"
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """A workflow, ready to be planned or run."""
+
+    workflow: Workflow
+    graph: Graph
+    registry: Registry
+    store_root: Path
+    out: Path
+
+
+def presets_folder() -> Path:
+    """Return the folder of the shipped workflows: inside the installed package, or beside it in a checkout."""
+    package = Path(pano_mvs.__file__).parent
+    inside = package / "workflows"
+    return inside if inside.is_dir() else package.parent / "workflows"
+
+
+def open_session(
+    name: str,
+    *,
+    overrides: Sequence[str] = (),
+    images: Path | None = None,
+    cache: Path | None = None,
+    out: Path | None = None,
+) -> Session:
+    """Find, validate and wire a workflow.
+
+    The store is `cache`, else $PANO_MVS_CACHE, else `.pano-mvs` beside the workflow file (in the current folder for a
+    preset given by name). The output folder is `out`, else `out/<workflow name>` in the current folder.
+
+    Raises:
+        UsageError: if there is no such workflow.
+        WorkflowError: with every mistake in it.
+    """
+    path, is_preset = find_workflow(name, presets_folder())
+    if images is not None and not images.is_dir():
+        raise InputError(f"--images {images}: there is no such folder")
+    registry = Registry.installed()
+    workflow = load_workflow(path, registry, overrides=overrides, images=images)
+    graph = wire(workflow)
+    variable = os.environ.get(CACHE_VARIABLE)
+    beside = Path.cwd() if is_preset else path.parent
+    root = cache or (Path(variable) if variable else beside / ".pano-mvs")
+    return Session(workflow, graph, registry, root, out or Path("out") / workflow.name)

@@ -1,0 +1,144 @@
+"""What run.json and the report say of a run."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping
+from datetime import datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import PurePosixPath
+from typing import Any
+
+import pano_mvs
+from pano_mvs.engine.events import RunResult, StageSummary
+from pano_mvs.engine.run import Run
+from pano_mvs.engine.workflow import Workflow
+from pano_mvs.scene import Axis, PointCloud, Poses, RangeMap, Record, Scores, TwoView
+from pano_mvs.scene.index import pair_from_name
+
+_LIBRARIES = ("numpy", "numba", "opencv-python-headless", "pycolmap", "scipy")
+
+
+def summarise(run: Run, result: RunResult, *, started: datetime, seconds: float) -> dict[str, Any]:
+    """Return everything that run.json and the report say, as plain JSON values."""
+    workflow = run.workflow
+    return {
+        "workflow": {"name": workflow.name, "path": str(workflow.path or ""), "overrides": list(workflow.overrides)},
+        "version": pano_mvs.__version__,
+        "started": started.isoformat(timespec="seconds"),
+        "seconds": round(seconds, 3),
+        "exit_code": result.exit_code,
+        "stopped": result.stopped,
+        "units": {
+            "run": result.computed,
+            "cached": result.cached,
+            "failed": sum(stage.failed + stage.blocked for stage in result.stages),
+        },
+        "stages": [_stage(summary, workflow) for summary in result.stages],
+        "failures": [
+            {"stage": f.stage, "item": f.item, "cause": f.cause, "consequence": f.consequence} for f in result.failures
+        ],
+        "rejected": {image: {"stage": stage, "reason": why} for image, (stage, why) in result.rejected.items()},
+        "warnings": list(result.warnings),
+        "notes": [note for summary in result.stages for note in summary.notes],
+        "poses": _poses(run, result),
+        "scores": _scores(run),
+        "views": _views(run, result),
+        "cloud": _cloud(run, result),
+        "workflow_text": workflow.text,
+        "versions": _versions(),
+        "files": dict(sorted(result.published.items())),
+    }
+
+
+def latest(run: Run, kind: type[Record]) -> Record | None:
+    """Return the value of the last stage that made a whole value of a kind in this run."""
+    for name in reversed(list(run.states)):
+        if issubclass(run.workflow.stages[name].spec.output, kind):
+            value = run.load(name, kind)
+            if value is not None:
+                return value
+    return None
+
+
+def _stage(summary: StageSummary, workflow: Workflow) -> dict[str, Any]:
+    return {
+        "name": summary.name,
+        "use": summary.use,
+        "version": workflow.stages[summary.name].spec.version,
+        "params": workflow.stages[summary.name].params.model_dump(mode="json"),
+        "units": summary.units,
+        "run": summary.run,
+        "cached": summary.cached,
+        "failed": summary.failed,
+        "blocked": summary.blocked,
+        "seconds": round(summary.seconds, 3),
+        "metrics": summary.metrics,
+    }
+
+
+def _last_stage_of(run: Run, result: RunResult, kind: type[Record]) -> StageSummary | None:
+    of_kind = [s for s in result.stages if issubclass(run.workflow.stages[s.name].spec.output, kind)]
+    return of_kind[-1] if of_kind else None
+
+
+def _poses(run: Run, result: RunResult) -> dict[str, Any]:
+    poses = latest(run, Poses)
+    if not isinstance(poses, Poses):
+        return {}
+    links = []
+    for stage in result.stages:
+        if issubclass(run.workflow.stages[stage.name].spec.output, TwoView):
+            pairs = stage.unit_metrics.items()
+            links = [[*pair_from_name(pair), int(metrics.get("inliers", 0))] for pair, metrics in pairs]
+    return {
+        "registered": list(poses.names),
+        "rejected": {image: why for image, (_, why) in result.rejected.items()},
+        "centers": poses.centers.tolist(),
+        "points": len(poses.points_in_world),
+        "frame": poses.frame,
+        "scale": poses.scale,
+        "metric": poses.metric,
+        "links": links,
+    }
+
+
+def _scores(run: Run) -> dict[str, Any]:
+    scores = latest(run, Scores)
+    if not isinstance(scores, Scores):
+        return {}
+    return {"poses": scores.poses, "views": scores.views, "notes": list(scores.notes)}
+
+
+def _views(run: Run, result: RunResult) -> list[dict[str, Any]]:
+    stage = _last_stage_of(run, result, RangeMap)
+    if stage is None or run.states[stage.name].axis is not Axis.VIEW:
+        return []
+    previews = {str(PurePosixPath(n).relative_to("preview").with_suffix("")): n for n in result.published
+                if n.startswith("preview/")}  # fmt: skip
+    return [
+        {"name": item, "preview": previews.get(str(PurePosixPath(item).with_suffix("")), previews.get(item, ""))}
+        | _rounded(stage.unit_metrics.get(item, {}))
+        for item in run.states[stage.name].items
+    ]
+
+
+def _cloud(run: Run, result: RunResult) -> dict[str, Any]:
+    stage = _last_stage_of(run, result, PointCloud)
+    if stage is None or "points" not in stage.metrics:
+        return {}
+    return {"points": int(stage.metrics["points"])}
+
+
+def _rounded(metrics: Mapping[str, float]) -> dict[str, float]:
+    return {name: round(value, 6) for name, value in metrics.items()}
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version(), "pano_mvs": pano_mvs.__version__, "system": platform.platform()}
+    for name in _LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
