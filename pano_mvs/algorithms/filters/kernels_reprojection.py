@@ -1,0 +1,120 @@
+"""Compiled: what a source view says about the points of a reference view."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+# What a source says of a point: it cannot tell (no range there, or something nearer hides the point), it sees the
+# same surface, or it sees through the point to something farther away.
+UNKNOWN, AGREES, CONTRADICTS = 0, 1, 2
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def wrapped_column(row, column, height, width):  # type: ignore[no-untyped-def]
+    """Return the column, in the picture, of a pixel at most one picture height outside of it."""
+    if row < 0 or row >= height:
+        column += width // 2
+    return column % width
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def wrapped_row(row, height):  # type: ignore[no-untyped-def]
+    """Return the row, in the picture, of a pixel at most one picture height outside of it."""
+    if row < 0:
+        return -1 - row
+    if row >= height:
+        return 2 * height - 1 - row
+    return row
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def sample_range(ranges, x, y, max_step):  # type: ignore[no-untyped-def]
+    """Return the range between pixels: bilinear in 1/range where the four are one surface, else the nearest."""
+    height, width = ranges.shape
+    left, top = math.floor(x - 0.5), math.floor(y - 0.5)
+    weight_x, weight_y = x - 0.5 - left, y - 0.5 - top
+    row_0, row_1 = wrapped_row(top, height), wrapped_row(top + 1, height)
+    r00 = ranges[row_0, wrapped_column(top, left, height, width)]
+    r01 = ranges[row_0, wrapped_column(top, left + 1, height, width)]
+    r10 = ranges[row_1, wrapped_column(top + 1, left, height, width)]
+    r11 = ranges[row_1, wrapped_column(top + 1, left + 1, height, width)]
+    near, far = min(min(r00, r01), min(r10, r11)), max(max(r00, r01), max(r10, r11))
+    # min and max may swallow a NaN; the sum does not.
+    if math.isfinite(r00 + r01 + r10 + r11) and far <= near * (1 + max_step):
+        upper = (1 - weight_x) / r00 + weight_x / r01
+        lower = (1 - weight_x) / r10 + weight_x / r11
+        return 1.0 / ((1 - weight_y) * upper + weight_y * lower)
+    if weight_y < 0.5:
+        return float(r00) if weight_x < 0.5 else float(r01)
+    return float(r10) if weight_x < 0.5 else float(r11)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def project(point, rotation, translation, height, width):  # type: ignore[no-untyped-def]
+    """Return (x, y, distance) of a point (3 numbers) of the reference frame in a source panorama."""
+    a = rotation[0, 0] * point[0] + rotation[0, 1] * point[1] + rotation[0, 2] * point[2] + translation[0]
+    b = rotation[1, 0] * point[0] + rotation[1, 1] * point[1] + rotation[1, 2] * point[2] + translation[1]
+    c = rotation[2, 0] * point[0] + rotation[2, 1] * point[1] + rotation[2, 2] * point[2] + translation[2]
+    x = (math.atan2(a, c) / (2 * math.pi) + 0.5) * width
+    y = (0.5 - math.atan2(-b, math.hypot(a, c)) / math.pi) * height
+    return x, y, math.sqrt(a * a + b * b + c * c)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def reprojection_angle(point, baseline, ratio):  # type: ignore[no-untyped-def]
+    """Return the angle, at the reference, between a point and where the source puts it along its own ray.
+
+    `baseline` is the source's centre in the reference frame; the source puts the point at
+    baseline + ratio (point − baseline).
+    """
+    other_0 = baseline[0] + ratio * (point[0] - baseline[0])
+    other_1 = baseline[1] + ratio * (point[1] - baseline[1])
+    other_2 = baseline[2] + ratio * (point[2] - baseline[2])
+    cross_0 = point[1] * other_2 - point[2] * other_1
+    cross_1 = point[2] * other_0 - point[0] * other_2
+    cross_2 = point[0] * other_1 - point[1] * other_0
+    dot = point[0] * other_0 + point[1] * other_1 + point[2] * other_2
+    return math.atan2(math.sqrt(cross_0 * cross_0 + cross_1 * cross_1 + cross_2 * cross_2), dot)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def judge_point(point, rotation, translation, baseline, ranges, limits):  # type: ignore[no-untyped-def]
+    """Return (verdict, relative error, x, y, the source's range) of one source on one point.
+
+    `limits` holds the largest relative error, the largest reprojection angle in radians, and the largest relative
+    step between neighbours that still count as one surface.
+    """
+    x, y, distance = project(point, rotation, translation, ranges.shape[0], ranges.shape[1])
+    if not distance > 0:
+        return UNKNOWN, 0.0, x, y, 0.0
+    seen = sample_range(ranges, x, y, limits[2])
+    if not math.isfinite(seen):
+        return UNKNOWN, 0.0, x, y, 0.0
+    error = abs(seen - distance) / distance
+    if error <= limits[0] and reprojection_angle(point, baseline, seen / distance) <= limits[1]:
+        return AGREES, error, x, y, seen
+    if seen > distance * (1 + 2 * limits[0]):
+        return CONTRADICTS, error, x, y, seen
+    return UNKNOWN, error, x, y, seen
+
+
+@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+def judge_view(ranges, rays, rotation, translation, source_ranges, limits):  # type: ignore[no-untyped-def]
+    """Return the verdict of one source on every pixel, (H, W) uint8, and its relative error, (H, W) float32."""
+    height, width = ranges.shape
+    verdicts = np.zeros((height, width), np.uint8)
+    errors = np.zeros((height, width), np.float32)
+    baseline = -(rotation.T @ translation)
+    for row in prange(height):
+        for column in range(width):
+            r = ranges[row, column]
+            if math.isfinite(r):
+                ray = rays[row, column]
+                point = (r * ray[0], r * ray[1], r * ray[2])
+                verdict, error, _, _, _ = judge_point(point, rotation, translation, baseline, source_ranges, limits)
+                verdicts[row, column] = verdict
+                errors[row, column] = error
+    return verdicts, errors

@@ -1,0 +1,39 @@
+"""Remove small isolated surfaces from a range map."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import pixel_solid_angle
+from pano_mvs.scene import RangeMap
+
+
+def remove_speckles(range_map: RangeMap, *, max_size_px: float = 60.0, max_relative_step: float = 0.03) -> RangeMap:
+    """Return a range map without connected surfaces that are no larger than a given solid angle.
+
+    Pixels next to each other (over the seam, over the poles) belong to one surface if their ranges differ by no more
+    than `max_relative_step`. The size of a surface is the sum of its pixels' solid angles.
+
+    Args:
+        range_map: (H, W) with even W, the full sphere.
+        max_size_px: the largest surface to remove, in pixels at the equator.
+        max_relative_step: the largest step within a surface, relative to the nearer range.
+
+    Raises:
+        UsageError: if a limit is negative.
+    """
+    if max_size_px < 0 or max_relative_step < 0:
+        raise UsageError(f"limits must not be negative, got {max_size_px} and {max_relative_step}")
+    from pano_mvs.algorithms.filters.kernels_components import label_surfaces  # compiles on import
+
+    height, width = range_map.range.shape
+    labels = label_surfaces(np.ascontiguousarray(range_map.range), max_relative_step)
+    seen = labels >= 0
+    equator_px = pixel_solid_angle((height, width)) * height * width / (2 * np.pi**2)
+    sizes = np.bincount(labels[seen], weights=np.repeat(equator_px, width)[seen], minlength=height * width)
+    small = seen & (sizes[np.maximum(labels, 0)] <= max_size_px)
+    removed = small.reshape(height, width)
+    return RangeMap(
+        np.where(removed, np.float32(np.nan), range_map.range), np.where(removed, np.uint8(0), range_map.confidence)
+    )
