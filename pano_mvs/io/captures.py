@@ -1,0 +1,149 @@
+"""The pictures of a capture: which files, in which order, and whether each is a panorama."""
+
+from __future__ import annotations
+
+import re
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+from pano_mvs.core.errors import InputError
+from pano_mvs.io.gpano import GPano, find_gpano, read_head
+from pano_mvs.scene.image_file import decode_image
+
+PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp"})
+_IGNORED_FOLDERS = frozenset({"masks"})
+# Start-of-frame markers of JPEG: C0–CF without the tables DHT (C4), JPG (C8) and DAC (CC).
+_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_JPEG_ALONE = frozenset({0x01, *range(0xD0, 0xD9)})
+
+
+@dataclass(frozen=True)
+class PictureInfo:
+    """What is known of a panorama without decoding it.
+
+    Attributes:
+        size_hw: (height, width) of the full sphere at the file's own resolution, width = 2 × height.
+        file_size_hw: (height, width) of the picture in the file.
+        crop_ltwh: (left, top, width, height) of the part of the sphere that the file holds, or None for all of it.
+        gpano: its metadata, or None.
+        warnings: what the user should know of it, without the file's name.
+    """
+
+    size_hw: tuple[int, int]
+    file_size_hw: tuple[int, int]
+    crop_ltwh: tuple[int, int, int, int] | None
+    gpano: GPano | None
+    warnings: tuple[str, ...] = ()
+
+
+def list_pictures(folder: Path) -> list[Path]:
+    """Return the pictures in a folder and below it, ordered as people order them (2 before 10, case aside).
+
+    Hidden files, hidden folders and folders called `masks` are left out.
+
+    Raises:
+        InputError: if the folder does not exist or holds no picture.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder. Give the folder that holds the panoramas")
+    pictures = [path for path in folder.rglob("*") if _is_picture(path, path.relative_to(folder))]
+    if not pictures:
+        kinds = ", ".join(sorted(suffix.lstrip(".") for suffix in PICTURE_SUFFIXES))
+        raise InputError(f"{folder}: no pictures here. Panoramas may be {kinds}; folders called masks are left out")
+    return sorted(pictures, key=lambda path: natural_key(path.relative_to(folder).as_posix()))
+
+
+def natural_key(name: str) -> tuple[list[tuple[int, int, str]], str]:
+    """Return a sort key that puts 2 before 10 and ignores case; names that differ at all have different keys."""
+    chunks = re.split(r"([0-9]+)", name.casefold())
+    return [(0, int(chunk), "") if chunk.isdecimal() else (1, 0, chunk) for chunk in chunks if chunk], name
+
+
+def describe_picture(path: Path) -> PictureInfo:
+    """Return what is known of a panorama, reading no more than its header (TIFF and WebP are decoded).
+
+    A picture is a panorama if its GPano metadata say so, whole or cropped, or, with a warning, if it is exactly
+    twice as wide as high.
+
+    Raises:
+        InputError: if the file cannot be read, is no picture, or is no equirectangular panorama.
+    """
+    head = read_head(path)
+    gpano, warnings = find_gpano(head)
+    size = _jpeg_size(head) or _png_size(head) or decode_image(path).shape[:2]
+    height, width = int(size[0]), int(size[1])
+    if gpano is not None and gpano.projection_type != "equirectangular":
+        raise InputError(f"{path}: its metadata say that it is {gpano.projection_type}, not equirectangular. "
+                         "Export it as an equirectangular panorama, or remove it")  # fmt: skip
+    if gpano is not None and gpano.full_size_hw is not None and gpano.crop_ltwh is not None:
+        sphere, crop, more = _placed(path, (height, width), gpano.full_size_hw, gpano.crop_ltwh)
+        return PictureInfo(sphere, (height, width), crop, gpano, (*warnings, *more))
+    if width != 2 * height:
+        raise InputError(
+            f"{path}: {width}×{height} px is not a full sphere (the width must be twice the height) and no GPano "
+            "metadata place it on one. Remove it, export it anew as a full equirectangular panorama, or, if it is "
+            "cropped, write the GPano FullPano and CroppedArea fields into it"
+        )
+    if gpano is None:
+        warnings = (*warnings, "no GPano metadata; taken for a full equirectangular panorama because its width is "
+                    "twice its height")  # fmt: skip
+    return PictureInfo((height, width), (height, width), None, gpano, warnings)
+
+
+def _is_picture(path: Path, inside: Path) -> bool:
+    if path.suffix.lower() not in PICTURE_SUFFIXES or any(part.startswith(".") for part in inside.parts):
+        return False
+    return not any(part.lower() in _IGNORED_FOLDERS for part in inside.parts[:-1]) and path.is_file()
+
+
+def _placed(
+    path: Path, size_hw: tuple[int, int], full_hw: tuple[int, int], crop_ltwh: tuple[int, int, int, int]
+) -> tuple[tuple[int, int], tuple[int, int, int, int] | None, tuple[str, ...]]:
+    """Return the sphere's size, the part that the file holds (None: all), and warnings."""
+    (height, width), (full_height, full_width) = size_hw, full_hw
+    left, top, crop_width, crop_height = crop_ltwh
+    warnings: tuple[str, ...] = ()
+    if (crop_height, crop_width) != size_hw:
+        if abs(width * crop_height - height * crop_width) > max(width, height, crop_width, crop_height):
+            raise InputError(
+                f"{path}: {width}×{height} px, but its GPano metadata speak of {crop_width}×{crop_height}. It was cut "
+                "after it was taken: restore the original, or remove the metadata"
+            )
+        scale = width / crop_width
+        warnings = (f"resized from {crop_width}×{crop_height} to {width}×{height} px after it was taken; its GPano "
+                    "fields were scaled",)  # fmt: skip
+        full_width, full_height = round(full_width * scale / 2) * 2, round(full_height * scale)
+        left, top = min(round(left * scale), full_width - width), min(round(top * scale), full_height - height)
+    if full_width != 2 * full_height or left < 0 or top < 0:
+        raise InputError(f"{path}: its GPano metadata say that the full sphere is {full_width}×{full_height} px, but "
+                         "the width must be twice the height. Correct the metadata, or remove them")  # fmt: skip
+    whole = (height, width) == (full_height, full_width)
+    return (full_height, full_width), None if whole else (left, top, width, height), warnings
+
+
+def _jpeg_size(head: bytes) -> tuple[int, int] | None:
+    """Return (height, width) from a JPEG's frame header, or None."""
+    if head[:2] != b"\xff\xd8":
+        return None
+    offset = 2
+    while offset + 9 <= len(head):
+        if head[offset] != 0xFF:
+            return None
+        marker = head[offset + 1]
+        if marker in _JPEG_FRAMES:
+            height, width = struct.unpack_from(">HH", head, offset + 5)
+            return (height, width) if height and width else None
+        if marker == 0xFF:  # fill byte
+            offset += 1
+        else:
+            offset += 2 if marker in _JPEG_ALONE else 2 + struct.unpack_from(">H", head, offset + 2)[0]
+    return None
+
+
+def _png_size(head: bytes) -> tuple[int, int] | None:
+    """Return (height, width) from a PNG's header chunk, or None."""
+    if not head.startswith(b"\x89PNG\r\n\x1a\n") or len(head) < 24:
+        return None
+    width, height = struct.unpack_from(">II", head, 16)
+    return (height, width) if height and width else None

@@ -1,0 +1,168 @@
+"""COLMAP sparse models with EQUIRECTANGULAR cameras: written and read through pycolmap."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.geometry import pixel_from_ray, ray_from_pixel
+from pano_mvs.io.captures import natural_key
+from pano_mvs.scene import Poses
+
+_MODEL_FILES = (("cameras.bin", "images.bin", "points3D.bin"), ("cameras.txt", "images.txt", "points3D.txt"))
+_SPHERESFM_CAMERA = struct.Struct("<IiQQ3d")  # SphereSfM's SPHERE: id 11 as well, but three parameters (f, cx, cy)
+
+
+def write_colmap_model(folder: Path, poses: Poses, sizes_hw: Mapping[str, tuple[int, int]]) -> None:
+    """Write poses, tracks and points as one COLMAP model: cameras, images, points3D, rigs and frames .bin.
+
+    One EQUIRECTANGULAR camera for each distinct picture size, each its own trivial rig; the key points of an image
+    are its track observations, in pixels of the size given. The same poses give the same bytes.
+
+    Args:
+        folder: where the five files go; made if it is not there.
+        poses: what to write. Errors become pixels at the equator (w / 2π per radian).
+        sizes_hw: (height, width) of each picture, by the name of the image.
+
+    Raises:
+        UsageError: if the size of an image is not given.
+    """
+    import pycolmap
+
+    missing = [name for name in poses.names if name not in sizes_hw]
+    if missing:
+        raise UsageError(f"the size of {missing[0]} is not given (nor of {len(missing) - 1} more images)")
+    model = pycolmap.Reconstruction()
+    camera_ids = _add_cameras(model, [sizes_hw[name] for name in poses.names])
+    tracks: list[Any] = [pycolmap.Track() for _ in range(len(poses.points_in_world))]
+    for idx, name in enumerate(poses.names):
+        observed = np.flatnonzero(poses.track_image_idx == idx)
+        pixels = pixel_from_ray(poses.track_bearings[observed], sizes_hw[name])
+        image = pycolmap.Image(
+            name=name, keypoints=pixels.reshape(-1, 2), camera_id=camera_ids[sizes_hw[name]], image_id=idx + 1
+        )
+        rotation = pycolmap.Rotation3d(np.asarray(poses.rotations[idx]))
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(rotation, np.asarray(poses.translations[idx])))
+        for point2d_idx, point_idx in enumerate(poses.track_point_idx[observed]):
+            tracks[point_idx].add_element(idx + 1, point2d_idx)
+    errors_px = _errors_px(poses, sizes_hw)
+    for idx, track in enumerate(tracks):
+        point_id = model.add_point3D(poses.points_in_world[idx], track, poses.point_colors_rgb[idx])
+        model.points3D[point_id].error = float(errors_px[idx])
+    folder.mkdir(parents=True, exist_ok=True)
+    model.write_binary(str(folder))
+
+
+def read_colmap_model(folder: Path) -> Poses:
+    """Return the registered images, points and tracks of a COLMAP model of panoramas, in its own world and unit.
+
+    Args:
+        folder: holds cameras, images and points3D as .bin or .txt; images come in the natural order of their names.
+
+    Raises:
+        InputError: if the model cannot be read, has a camera that is no EQUIRECTANGULAR, or registers no image.
+    """
+    model = _loaded(folder)
+    for camera_id, camera in sorted(model.cameras.items()):
+        if camera.model_name != "EQUIRECTANGULAR":
+            raise InputError(f"{folder}: camera {camera_id} is {camera.model_name}, expected EQUIRECTANGULAR. Only "
+                             "models of panoramas can be used")  # fmt: skip
+    images = sorted((model.images[idx] for idx in model.reg_image_ids()), key=lambda image: natural_key(image.name))
+    if not images:
+        raise InputError(f"{folder}: the model registers no image")
+    point_ids = sorted(model.points3D)
+    point_idx = {point_id: idx for idx, point_id in enumerate(point_ids)}
+    points = [model.points3D[point_id] for point_id in point_ids]
+    tracks = [_observations(model, image, point_idx) for image in images]
+    errors_rad = [point.error * _mean_rad_per_px(model, point) if point.error > 0 else 0.0 for point in points]
+    return Poses(
+        names=tuple(image.name for image in images),
+        rotations=np.array([image.cam_from_world().rotation.matrix() for image in images]),
+        translations=np.array([image.cam_from_world().translation for image in images]),
+        points_in_world=np.array([point.xyz for point in points], np.float64).reshape(-1, 3),
+        point_colors_rgb=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
+        point_errors_rad=np.array(errors_rad, np.float32),
+        track_point_idx=np.concatenate([indices for indices, _ in tracks]),
+        track_image_idx=np.repeat(np.arange(len(images), dtype=np.int32), [len(indices) for indices, _ in tracks]),
+        track_bearings=np.concatenate([bearings for _, bearings in tracks]),
+        rejected={},
+        frame="the world of the COLMAP model",
+        scale="the unit of the COLMAP model",
+        metric=False,
+    )
+
+
+def is_colmap_model(folder: Path) -> bool:
+    """Return whether a folder holds the files of a COLMAP model."""
+    return any(all((folder / name).is_file() for name in names) for names in _MODEL_FILES)
+
+
+def _add_cameras(model: Any, sizes_hw: list[tuple[int, int]]) -> dict[tuple[int, int], int]:
+    """Add one camera for each distinct size, and return their ids."""
+    import pycolmap
+
+    ids: dict[tuple[int, int], int] = {}
+    for height, width in sizes_hw:
+        if (height, width) not in ids:
+            ids[height, width] = len(ids) + 1
+            # Without its params an EQUIRECTANGULAR camera takes the process down when it is used.
+            camera = pycolmap.Camera(model="EQUIRECTANGULAR", width=width, height=height, params=[width, height])
+            camera.camera_id = ids[height, width]
+            model.add_camera_with_trivial_rig(camera)
+    return ids
+
+
+def _errors_px(poses: Poses, sizes_hw: Mapping[str, tuple[int, int]]) -> NDArray[np.float64]:
+    """Return the error of each point in pixels at the equator, by the mean width of the images that observe it."""
+    widths = np.array([sizes_hw[name][1] for name in poses.names], np.float64)
+    count = len(poses.points_in_world)
+    seen = np.bincount(poses.track_point_idx, minlength=count)
+    total = np.bincount(poses.track_point_idx, weights=widths[poses.track_image_idx], minlength=count)
+    errors: NDArray[np.float64] = poses.point_errors_rad * total / np.maximum(seen, 1) / (2 * np.pi)
+    return errors
+
+
+def _loaded(folder: Path) -> Any:
+    import pycolmap
+
+    if not is_colmap_model(folder):
+        raise InputError(f"{folder}: no COLMAP model here. Give the folder that holds cameras, images and points3D as "
+                         ".bin or .txt (often sparse/0)")  # fmt: skip
+    if _is_spheresfm(folder / "cameras.bin"):
+        raise InputError(f"{folder}: the cameras are SphereSfM's SPHERE, whose number means another camera in COLMAP. "
+                         "Change them to EQUIRECTANGULAR: export the model as text and write width and height as "
+                         "their two parameters")  # fmt: skip
+    try:
+        return pycolmap.Reconstruction(str(folder))
+    except (RuntimeError, ValueError, IndexError, MemoryError) as error:
+        raise InputError(f"{folder}: the COLMAP model cannot be read ({error}). Is it complete?") from error
+
+
+def _is_spheresfm(cameras: Path) -> bool:
+    if not cameras.is_file():
+        return False
+    data = cameras.read_bytes()
+    count = (len(data) - 8) // _SPHERESFM_CAMERA.size
+    if len(data) < 8 or len(data) != 8 + count * _SPHERESFM_CAMERA.size or count == 0:
+        return False
+    return bool(struct.unpack_from("<Q", data)[0] == count and _SPHERESFM_CAMERA.unpack_from(data, 8)[1] == 11)
+
+
+def _observations(model: Any, image: Any, point_idx: dict[int, int]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """Return the points that an image observes, and the bearings of the observations."""
+    camera = model.cameras[image.camera_id]
+    observed = [(point_idx[p.point3D_id], p.xy) for p in image.points2D if p.has_point3D()]
+    pixels = np.array([xy for _, xy in observed], np.float64).reshape(-1, 2)
+    indices = np.array([idx for idx, _ in observed], np.int32)
+    return indices, ray_from_pixel(pixels, (camera.height, camera.width))
+
+
+def _mean_rad_per_px(model: Any, point: Any) -> float:
+    widths = [model.cameras[model.images[element.image_id].camera_id].width for element in point.track.elements]
+    return 2 * np.pi / float(np.mean(widths)) if widths else 0.0

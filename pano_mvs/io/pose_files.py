@@ -1,0 +1,100 @@
+"""Poses from whatever file or folder the user has."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from pano_mvs.core.errors import InputError
+from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
+from pano_mvs.io.colmap_model import is_colmap_model, read_colmap_model
+from pano_mvs.io.pose_json import read_json, read_posed_views, read_transforms, require_distinct, rigid_from_arrays
+from pano_mvs.scene import Poses
+
+CSV_HEADER = ("name", "tx", "ty", "tz", "qw", "qx", "qy", "qz")
+_IN_A_FOLDER = ("transforms.json", "poses.json", "truth/poses.json", "poses.csv")
+
+
+def read_poses(path: Path) -> Poses:
+    """Return the poses in a file or folder. Image names are as written there: `match_image_names` pairs them.
+
+    Understood are
+      * a folder with a COLMAP model of EQUIRECTANGULAR cameras (.bin or .txt), or with one in sparse/0;
+      * nerfstudio's transforms.json (camera_model EQUIRECTANGULAR);
+      * our own poses.json: {"metric": true, "views": [{"image": …, "R": 3 × 3, "t": 3}]}, cam_from_world;
+      * a CSV file whose first line is name,tx,ty,tz,qw,qx,qy,qz: cam_from_world as x_in_cam = R(q) x_in_world + t in
+        the camera frame x right, y down, z forward; quaternions of any length; empty lines and lines that begin
+        with # are left out.
+
+    Raises:
+        InputError: naming the file, and the line or the key, that cannot be used.
+    """
+    if path.is_dir():
+        return _poses_from_folder(path)
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder. Give a COLMAP model, a transforms.json, a poses.json or a "
+                         "CSV file")  # fmt: skip
+    suffix = path.suffix.lower()
+    if suffix == ".csv":
+        return _from_file(read_csv(path), path, metric=False)
+    if suffix != ".json":
+        raise InputError(f"{path}: poses are read from a COLMAP model (its folder), .json and .csv, not {suffix!r}")
+    data = read_json(path)
+    if "frames" in data:
+        return _from_file(read_transforms(path), path, metric=False)
+    if "views" in data:
+        views, metric = read_posed_views(path)
+        return _from_file({view.name: view.cam_from_world for view in views}, path, metric=metric)
+    raise InputError(f"{path}: neither key 'frames' (nerfstudio) nor key 'views' (pano-mvs): no poses here")
+
+
+def read_csv(path: Path) -> dict[str, Rigid3]:
+    """Return the cam_from_world of each image in a CSV file; see `read_poses` for its columns.
+
+    Raises:
+        InputError: naming the line that cannot be used.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not a text file in UTF-8") from error
+    numbered = [(idx, line) for idx, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
+    rows = [(idx, [cell.strip() for cell in next(csv.reader([line]))]) for idx, line in numbered]
+    if not rows or tuple(rows[0][1]) != CSV_HEADER:
+        raise InputError(f"{path}:{rows[0][0] if rows else 1}: the first line must be {','.join(CSV_HEADER)}")
+    poses = [(row[0], _pose_from_row(row, f"{path}:{line}")) for line, row in rows[1:]]
+    require_distinct([name for name, _ in poses], path)
+    return dict(poses)
+
+
+def _poses_from_folder(folder: Path) -> Poses:
+    for model in (folder, folder / "sparse" / "0", folder / "colmap" / "sparse" / "0"):
+        if is_colmap_model(model):
+            return read_colmap_model(model)
+    for name in _IN_A_FOLDER:
+        if (folder / name).is_file():
+            return read_poses(folder / name)
+    raise InputError(f"{folder}: no poses here. A folder must hold a COLMAP model (cameras, images, points3D), or one "
+                     f"of {', '.join(_IN_A_FOLDER)}")  # fmt: skip
+
+
+def _from_file(poses: dict[str, Rigid3], path: Path, *, metric: bool) -> Poses:
+    scale = "metres, as the file has it" if metric else "the unit of the file"
+    return Poses.without_points(poses, frame=f"the world of {path.name}", scale=scale, metric=metric)
+
+
+def _pose_from_row(row: list[str], where: str) -> Rigid3:
+    if len(row) != len(CSV_HEADER) or not row[0]:
+        raise InputError(f"{where}: expected a name and 7 numbers ({','.join(CSV_HEADER)}), got {len(row)} cells")
+    try:
+        numbers = np.array([float(cell) for cell in row[1:]])
+    except ValueError as error:
+        raise InputError(f"{where}: {error}") from error
+    quat_wxyz = numbers[3:]
+    if not np.isfinite(numbers).all() or np.linalg.norm(quat_wxyz) < 1e-6:
+        raise InputError(f"{where}: the pose of {row[0]} has no finite numbers, or a quaternion of length 0")
+    return rigid_from_arrays(rotation_from_quat_wxyz(quat_wxyz), numbers[:3], where)

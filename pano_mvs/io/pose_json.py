@@ -1,0 +1,154 @@
+"""Poses in JSON files: our own poses.json, and nerfstudio's transforms.json."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import InputError
+from pano_mvs.geometry import Rigid3, nearest_rotation
+
+# OpenGL's camera frame is x right, y up, z backwards.
+_CAM_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
+_ROTATION_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class PosedView:
+    """One view of a poses.json.
+
+    Attributes:
+        name: of the picture, forward slashes.
+        cam_from_world: its pose.
+        number: its id, or None.
+        sha256: of the picture's bytes in hex, or None.
+    """
+
+    name: str
+    cam_from_world: Rigid3
+    number: int | None
+    sha256: str | None
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return the object in a JSON file.
+
+    Raises:
+        InputError: if the file cannot be read or holds no JSON object.
+    """
+    try:
+        value = json.loads(path.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}:{error.lineno}:{error.colno}: not JSON ({error.msg})") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not a text file in UTF-8") from error
+    if not isinstance(value, dict):
+        raise InputError(f"{path}: expected a JSON object, got {type(value).__name__}")
+    return value
+
+
+def read_posed_views(path: Path) -> tuple[list[PosedView], bool]:
+    """Return the views of a poses.json, and whether its lengths are metres.
+
+    The file is {"metric": true, "views": [{"image": "images/000.png", "R": 3 × 3, "t": 3, "id": 0, "sha256": …}, …]}:
+    x_in_cam = R x_in_world + t in the camera frame x right, y down, z forward. `id` and `sha256` may be missing;
+    `metric` is true unless it says otherwise.
+
+    Raises:
+        InputError: naming the file and the key that is missing or malformed.
+    """
+    data = read_json(path)
+    entries = data.get("views")
+    if not isinstance(entries, list):
+        raise InputError(f"{path}: key 'views' must be a list of views, got {type(entries).__name__}")
+    views = [_posed_view(entry, f"{path}: views[{idx}]") for idx, entry in enumerate(entries)]
+    require_distinct([view.name for view in views], path)
+    return views, bool(data.get("metric", True))
+
+
+def read_transforms(path: Path) -> dict[str, Rigid3]:
+    """Return the poses of a nerfstudio transforms.json by image name (its file_path).
+
+    `transform_matrix` is world_from_cam for OpenGL's camera (x right, y up, z backwards). The world is the file's.
+
+    Raises:
+        InputError: naming the file and the key that is missing or malformed, or a camera that is no EQUIRECTANGULAR.
+    """
+    data = read_json(path)
+    frames = data.get("frames")
+    if not isinstance(frames, list):
+        raise InputError(f"{path}: key 'frames' must be a list of frames, got {type(frames).__name__}")
+    poses: list[tuple[str, Rigid3]] = []
+    for idx, frame in enumerate(frames):
+        where = f"{path}: frames[{idx}]"
+        name = _name(frame, "file_path", where)
+        model = frame.get("camera_model", data.get("camera_model"))
+        if model != "EQUIRECTANGULAR":
+            raise InputError(f"{where} ({name}): camera_model is {model}, expected EQUIRECTANGULAR. Only panoramas "
+                             "can be used")  # fmt: skip
+        matrix = _array(frame, "transform_matrix", (4, 4), where)
+        world_from_cam = rigid_from_arrays(matrix[:3, :3] @ _CAM_FROM_OPENGL, matrix[:3, 3], where)
+        poses.append((name, world_from_cam.inverse()))
+    require_distinct([name for name, _ in poses], path)
+    return dict(poses)
+
+
+def rigid_from_arrays(rotation: NDArray[np.float64], translation: NDArray[np.float64], where: str) -> Rigid3:
+    """Return the transform; small rounding errors of the rotation are taken out.
+
+    Raises:
+        InputError: beginning with `where`, if the matrix is no rotation or a number is not finite.
+    """
+    if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
+        raise InputError(f"{where}: the pose holds NaN or infinite numbers")
+    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if error > _ROTATION_TOLERANCE:
+        raise InputError(f"{where}: the rotation is not orthonormal (off by {error:.2g})")
+    if np.linalg.det(rotation) < 0:
+        raise InputError(f"{where}: the rotation mirrors (its determinant is −1): the axes are left-handed")
+    return Rigid3(rotation if error < 1e-12 else nearest_rotation(rotation), translation)
+
+
+def require_distinct(names: list[str], path: Path) -> None:
+    """Raise InputError if an image is named twice, or none at all."""
+    if not names:
+        raise InputError(f"{path}: holds no poses")
+    seen: set[str] = set()
+    for name in names:
+        if name in seen:
+            raise InputError(f"{path}: image {name!r} is listed twice")
+        seen.add(name)
+
+
+def _posed_view(entry: Any, where: str) -> PosedView:
+    name = _name(entry, "image", where)
+    pose = rigid_from_arrays(_array(entry, "R", (3, 3), where), _array(entry, "t", (3,), where), f"{where} ({name})")
+    number, digest = entry.get("id"), entry.get("sha256")
+    return PosedView(name, pose, number if type(number) is int else None, digest if isinstance(digest, str) else None)
+
+
+def _name(entry: Any, key: str, where: str) -> str:
+    if not isinstance(entry, dict):
+        raise InputError(f"{where}: expected an object, got {type(entry).__name__}")
+    name = entry.get(key)
+    if not isinstance(name, str) or not name:
+        raise InputError(f"{where}: key {key!r} must be the picture's name, got {name!r}")
+    return name.replace("\\", "/").removeprefix("./")
+
+
+def _array(entry: dict[str, Any], key: str, shape: tuple[int, ...], where: str) -> NDArray[np.float64]:
+    try:
+        array = np.array(entry.get(key), dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.zeros(0)
+    if array.shape != shape:
+        wanted = " × ".join(str(length) for length in shape)
+        raise InputError(f"{where}: key {key!r} must hold {wanted} numbers")
+    return array

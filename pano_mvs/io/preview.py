@@ -1,0 +1,96 @@
+"""Pictures for people: a panorama above its colour-mapped range, with a scale bar."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+_WIDTH = 1280
+_BAR_HEIGHT, _MARGIN = 16, 14
+_INVALID_GREY = 128
+_QUALITY = 88
+_PAPER, _INK = (255, 255, 255), (60, 60, 60)
+
+
+def write_preview(path: Path, image: NDArray[np.uint8], range_map: NDArray[np.float32]) -> None:
+    """Write a JPEG of a panorama above its range map, with a scale bar that carries numbers.
+
+    Args:
+        path: the file to write.
+        image: (H, W, 3) uint8 RGB.
+        range_map: (h, w) float32 range in scene units, NaN where invalid (shown grey).
+    """
+    height = _WIDTH // 2
+    shown = cv2.resize(image, (_WIDTH, height), interpolation=cv2.INTER_AREA)
+    resized = cv2.resize(range_map, (_WIDTH, height), interpolation=cv2.INTER_NEAREST)
+    near, far = range_limits(resized)
+    stack = [shown, np.full((4, _WIDTH, 3), 255, np.uint8), color_mapped(resized, near, far), _scale_bar(near, far)]
+    bgr = cv2.cvtColor(np.vstack(stack), cv2.COLOR_RGB2BGR)
+    path.write_bytes(bytes(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]))
+
+
+def range_limits(range_map: NDArray[np.float32]) -> tuple[float, float]:
+    """Return the near and the far end of a scale that suits a range map: its 1 % and 99 % quantiles, apart."""
+    valid = range_map[np.isfinite(range_map)]
+    if valid.size == 0:
+        return 1.0, 2.0
+    near, far = (float(limit) for limit in np.quantile(valid, [0.01, 0.99]))
+    middle = np.sqrt(near * far)
+    return min(near, middle / 1.1), max(far, middle * 1.1)
+
+
+def color_mapped(range_map: NDArray[np.float32], near: float, far: float) -> NDArray[np.uint8]:
+    """Return a range map as colours, (H, W, 3) RGB: logarithmic from near (red) to far (blue), invalid grey."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.log(range_map / near) / np.log(far / near)
+    valid = np.isfinite(range_map)
+    level = np.where(valid, np.clip(1 - share, 0, 1), 0)
+    # The ends of the map are nearly black: its middle 92 % keep their hue.
+    colors = cv2.applyColorMap(np.rint((0.04 + 0.92 * level) * 255).astype(np.uint8), cv2.COLORMAP_TURBO)
+    rgb: NDArray[np.uint8] = cv2.cvtColor(colors, cv2.COLOR_BGR2RGB)
+    rgb[~valid] = _INVALID_GREY
+    return rgb
+
+
+def _scale_bar(near: float, far: float) -> NDArray[np.uint8]:
+    """Return a strip (60, W, 3) with the colours of the scale and the ranges that they stand for."""
+    strip = np.full((_MARGIN + _BAR_HEIGHT + 32, _WIDTH, 3), _PAPER, np.uint8)
+    left, right = 2 * _MARGIN, _WIDTH - 150
+    positions = np.linspace(0, 1, right - left, dtype=np.float32)
+    ranges = (near * (far / near) ** positions).astype(np.float32)
+    bottom = _MARGIN + _BAR_HEIGHT
+    strip[_MARGIN:bottom, left:right] = color_mapped(np.tile(ranges, (_BAR_HEIGHT, 1)), near, far)
+    for value in scale_ticks(near, far):
+        x = left + round((right - left - 1) * np.log(value / near) / np.log(far / near))
+        cv2.line(strip, (x, bottom), (x, bottom + 5), _INK, 1)
+        _write(strip, f"{value:g}", x, bottom + 22, centered=True)
+    box = (right + 24, _MARGIN), (right + 24 + _BAR_HEIGHT, bottom)
+    cv2.rectangle(strip, *box, (_INVALID_GREY,) * 3, cv2.FILLED)
+    _write(strip, "no range", right + 48, bottom - 3, centered=False)
+    return strip
+
+
+def scale_ticks(near: float, far: float) -> list[float]:
+    """Return three to ten round numbers within a scale."""
+    for steps in (
+        (1, 2, 5),
+        (1, 1.5, 2, 3, 5, 7),
+        tuple(np.arange(10, 100, 2) / 10),
+        tuple(np.arange(100, 1000) / 100),
+    ):
+        decades = range(int(np.floor(np.log10(near))), int(np.ceil(np.log10(far))) + 1)
+        ticks = [float(f"{step * 10.0**decade:.3g}") for decade in decades for step in steps]
+        inside = [tick for tick in ticks if near <= tick <= far]
+        if len(inside) >= 3:
+            return inside[:: -(-len(inside) // 10)]
+    return [near, far]
+
+
+def _write(picture: NDArray[np.uint8], text: str, x: int, y: int, *, centered: bool) -> None:
+    font, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.5
+    if centered:
+        x -= cv2.getTextSize(text, font, scale, 1)[0][0] // 2
+    cv2.putText(picture, text, (x, y), font, scale, _INK, 1, cv2.LINE_AA)

@@ -1,0 +1,117 @@
+"""Ground truth beside a capture: poses.json and depth.npz."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import InputError
+from pano_mvs.geometry import Rigid3
+from pano_mvs.io.names import match_image_names
+from pano_mvs.io.pose_json import PosedView, read_posed_views
+
+
+@dataclass(frozen=True)
+class TruthView:
+    """What is known of one picture.
+
+    Attributes:
+        name: the picture's name, as the truth has it.
+        cam_from_world: its true pose.
+        range_key: the name of its range map in depth.npz, or None where there is none.
+        sha256: of the picture's bytes in hex, or None: tells a picture of the same name from the right one.
+    """
+
+    name: str
+    cam_from_world: Rigid3
+    range_key: str | None
+    sha256: str | None
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Ground truth of a capture; ranges are read when they are asked for.
+
+    Attributes:
+        folder: where it lies.
+        views: image name to what is known of it; names are those of poses.json.
+        metric: whether lengths are metres.
+    """
+
+    folder: Path
+    views: Mapping[str, TruthView]
+    metric: bool
+
+    @property
+    def poses(self) -> dict[str, Rigid3]:
+        """The true cam_from_world of each image."""
+        return {name: view.cam_from_world for name, view in self.views.items()}
+
+    def match(self, names: list[str]) -> dict[str, TruthView]:
+        """Return the views that belong to images of a capture, by the capture's names (folders may differ)."""
+        return {name: self.views[known] for name, known in match_image_names(names, self.views).items()}
+
+    def range_map(self, view: TruthView) -> NDArray[np.float32] | None:
+        """Return the true range (H, W) float32 of a view, NaN where there is no surface, or None if not known.
+
+        Raises:
+            InputError: if the file is damaged.
+        """
+        if view.range_key is None:
+            return None
+        try:
+            array = np.asarray(self._archive[view.range_key], dtype=np.float32)
+        except (OSError, ValueError, BadZipFile, EOFError) as error:
+            raise InputError(f"{self.folder / 'depth.npz'}: the range map of {view.name} cannot be read ({error}). "
+                             "Fetch the file again") from error  # fmt: skip
+        if array.ndim != 2:
+            raise InputError(f"{self.folder / 'depth.npz'}: {view.range_key} has shape {array.shape}, expected (H, W)")
+        return np.where(np.isfinite(array) & (array > 0), array, np.float32(np.nan))
+
+    @cached_property
+    def _archive(self) -> Mapping[str, Any]:
+        return open_ranges(self.folder)
+
+
+def read_truth(folder: Path) -> Truth:
+    """Return the ground truth in a folder: poses.json, and depth.npz if it is there.
+
+    A view's range map is looked up in depth.npz by its picture's stem, then by its id with three digits. Views
+    without a range map, and range maps without a view, do no harm.
+
+    Raises:
+        InputError: if poses.json is missing or malformed, or depth.npz is damaged.
+    """
+    posed, metric = read_posed_views(folder / "poses.json")
+    keys = frozenset(open_ranges(folder))
+    return Truth(folder, {view.name: _truth_view(view, keys) for view in posed}, metric)
+
+
+def open_ranges(folder: Path) -> Mapping[str, Any]:
+    """Return the arrays of depth.npz, each read on access; empty if there is no such file.
+
+    Raises:
+        InputError: if the file is damaged.
+    """
+    path = folder / "depth.npz"
+    if not path.exists():
+        return {}
+    try:
+        archive: Mapping[str, Any] = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, BadZipFile, EOFError) as error:
+        raise InputError(f"{path}: not a readable .npz file ({error}). Fetch it again") from error
+    return archive
+
+
+def _truth_view(view: PosedView, keys: frozenset[str]) -> TruthView:
+    stem = view.name.rsplit("/", 1)[-1].rsplit(".", 1)[0]
+    numbered = f"{view.number:03d}" if view.number is not None else ""
+    key = next((name for name in (stem, numbered) if name in keys), None)
+    return TruthView(view.name, view.cam_from_world, key, view.sha256)
