@@ -1,1 +1,1 @@
-"""From pairs to the poses of all panoramas."""
+"""Poses of a whole capture: tracks, scaled translations, bundle adjustment."""

@@ -1,0 +1,67 @@
+"""The pose of one panorama from points whose positions are known."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.two_view.refinement import tangent_basis
+from pano_mvs.geometry import Rigid3, angle_between, rotation_from_rotvec, skew
+
+FloatArray = NDArray[np.float64]
+
+
+def resection_errors(cam_from_world: Rigid3, points_in_world: FloatArray, bearings: FloatArray) -> FloatArray:
+    """Return the angle in radians between each observed ray and the one to its point, (M,)."""
+    return angle_between(cam_from_world.apply(points_in_world), bearings)
+
+
+def refine_resection(
+    cam_from_world: Rigid3, points_in_world: FloatArray, bearings: FloatArray, *, scale_rad: float, iterations: int = 10
+) -> Rigid3:
+    """Return the pose with the least Cauchy loss of the angular error, near the one given (damped Gauss–Newton).
+
+    Args:
+        cam_from_world: where to begin.
+        points_in_world: (M, 3) known points, M ≥ 3.
+        bearings: (M, 3) their unit rays in the camera.
+        scale_rad: error at which the weight has fallen to a half.
+        iterations: number of steps at most.
+    """
+    pose, damping = cam_from_world, 1e-6
+    cost = _cost(pose, points_in_world, bearings, scale_rad)
+    for _ in range(iterations):
+        residuals, jacobian = _linearised(pose, points_in_world, bearings)
+        weights = 1 / (1 + np.sum(residuals**2, axis=1) / scale_rad**2)
+        hessian = np.einsum("mij,m,mik->jk", jacobian, weights, jacobian)
+        gradient = np.einsum("mij,m,mi->j", jacobian, weights, residuals)
+        step = -np.linalg.solve(hessian + np.diag(damping * hessian.diagonal() + 1e-15), gradient)
+        moved = Rigid3.from_center(rotation_from_rotvec(step[:3]) @ pose.rotation, pose.center + step[3:])
+        moved_cost = _cost(moved, points_in_world, bearings, scale_rad)
+        if moved_cost >= cost:
+            damping *= 100
+            continue
+        converged = cost - moved_cost < 1e-9 * cost
+        pose, cost, damping = moved, moved_cost, damping / 10
+        if converged:
+            break
+    return pose
+
+
+def _linearised(pose: Rigid3, points: FloatArray, bearings: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the residuals on the bearings' tangent planes, (M, 2), and their derivatives by ω and centre, (M, 2, 6).
+
+    r = Bᵀ x / |x|, x = R (X − C); with R ← exp(ω) R, ∂x/∂ω = −[x]× and ∂x/∂C = −R.
+    """
+    in_cam = pose.apply(points)
+    length = np.linalg.norm(in_cam, axis=1)
+    unit = in_cam / length[:, None]
+    basis = np.swapaxes(tangent_basis(bearings), 1, 2)
+    by_point = (basis - (basis @ unit[:, :, None]) * unit[:, None, :]) / length[:, None, None]
+    jacobian = np.concatenate([-by_point @ skew(in_cam), -by_point @ pose.rotation], axis=2)
+    return (basis @ unit[:, :, None])[..., 0], jacobian
+
+
+def _cost(pose: Rigid3, points: FloatArray, bearings: FloatArray, scale_rad: float) -> float:
+    errors = resection_errors(pose, points, bearings)
+    return float(np.sum(np.log1p((errors / scale_rad) ** 2)))

@@ -1,0 +1,60 @@
+"""Translation scale factors: how long one pair's translation is against lengths that are known already."""
+
+from __future__ import annotations
+
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import UsageError
+
+FloatArray = NDArray[np.float64]
+ScaleEstimator: TypeAlias = Literal["kappa", "log_median", "cauchy"]
+
+_CAUCHY_STEPS = 20
+
+
+def estimate_scale(ratios: FloatArray, weights: FloatArray, *, estimator: ScaleEstimator, kappa: float) -> float:
+    """Return one scale factor from the ratios that single features give.
+
+    "kappa" is the paper's: the ratio with most others within κ of it (absolute). "log_median" is the median of the
+    log-ratios; "cauchy" their centre under a Cauchy loss, weighted, by iterated reweighting from the median.
+
+    Args:
+        ratios: (M,) positive, M ≥ 1.
+        weights: (M,) inverse variances of the log-ratios, up to a factor; "cauchy" alone uses them.
+        estimator: which of the three.
+        kappa: the κ of the paper.
+
+    Raises:
+        UsageError: if there is no ratio, or one is not positive.
+    """
+    if len(ratios) == 0 or not np.all(ratios > 0):
+        raise UsageError("a scale factor needs at least one ratio, all positive")
+    if estimator == "kappa":
+        return _most_neighbours(ratios, kappa)
+    logs = np.log(ratios)
+    center = float(np.median(logs))
+    return float(np.exp(center if estimator == "log_median" else _cauchy_center(logs, weights, center)))
+
+
+def _most_neighbours(ratios: FloatArray, kappa: float) -> float:
+    ordered = np.sort(ratios)
+    neighbours = np.searchsorted(ordered, ordered + kappa, "right") - np.searchsorted(ordered, ordered - kappa, "left")
+    # Of several with equally many the middle one, so that no end of the range is preferred.
+    best = np.flatnonzero(neighbours == neighbours.max())
+    return float(ordered[best[len(best) // 2]])
+
+
+def _cauchy_center(logs: FloatArray, weights: FloatArray, center: float) -> float:
+    spread = np.sqrt(weights / np.median(weights))
+    for _ in range(_CAUCHY_STEPS):
+        deviations = (logs - center) * spread
+        scale = max(1.4826 * float(np.median(np.abs(deviations))), 1e-9)
+        robust = weights / (1 + (deviations / (2 * scale)) ** 2)
+        moved = float(np.sum(robust * logs) / np.sum(robust))
+        if abs(moved - center) < 1e-10:
+            break
+        center = moved
+    return center

@@ -1,0 +1,104 @@
+"""The graph of images joined by verified pairs: which pairs contradict the others, what hangs together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.geometry import Rigid3, geodesic_angle
+from pano_mvs.scene import TwoView
+
+Edge = tuple[int, int]
+
+
+def consistent_edges(
+    names: tuple[str, ...], two_views: Mapping[tuple[str, str], TwoView], *, max_loop_deg: float = 3.0
+) -> dict[Edge, TwoView]:
+    """Return the pairs with a general geometry, less those whose rotations contradict the pairs around them.
+
+    Around a triangle of images the three rotations must cancel (Zach et al. 2010). While there are triangles where
+    they do not, the pair is taken out that has the largest share of them; of equals the one with fewest matches.
+
+    Args:
+        names: image names in the capture's order.
+        two_views: verified pairs, in either order of names.
+        max_loop_deg: largest rotation left over around a triangle.
+
+    Returns:
+        (first, second) positions in `names`, first < second, to the geometry second_from_first.
+    """
+    edges = _edges_by_position(names, two_views)
+    triangles = {t: _loop_error_rad(edges, t) < np.deg2rad(max_loop_deg) for t in _triangles(edges)}
+    while any(not closes for closes in triangles.values()):
+        good, bad = dict.fromkeys(edges, 0), dict.fromkeys(edges, 0)
+        for triangle, closes in triangles.items():
+            for edge in combinations(triangle, 2):
+                (good if closes else bad)[edge] += 1
+        worst = max(
+            (edge for edge in edges if bad[edge]),
+            key=lambda e: (bad[e] / (bad[e] + good[e]), -len(edges[e]), e),
+        )
+        del edges[worst]
+        triangles = {t: closes for t, closes in triangles.items() if not set(worst) <= set(t)}
+    return edges
+
+
+def connected_groups(edges: Iterable[Edge], count: int) -> list[list[int]]:
+    """Return the groups of images that hang together, largest first, of equals that with the earliest image."""
+    neighbours: list[set[int]] = [set() for _ in range(count)]
+    for first, second in edges:
+        neighbours[first].add(second)
+        neighbours[second].add(first)
+    groups, left = [], set(range(count))
+    while left:
+        front, group = [min(left)], {min(left)}
+        while front:
+            found = neighbours[front.pop()] - group
+            group |= found
+            front.extend(sorted(found))
+        left -= group
+        groups.append(sorted(group))
+    return sorted(groups, key=lambda group: (-len(group), group[0]))
+
+
+def relative_pose(edges: Mapping[Edge, TwoView], first: int, second: int) -> Rigid3:
+    """Return second_from_first of an edge, with a translation of length 1, whichever way it is stored."""
+    if (first, second) in edges:
+        return Rigid3(edges[first, second].rotation, edges[first, second].direction)
+    return Rigid3(edges[second, first].rotation, edges[second, first].direction).inverse()
+
+
+def _edges_by_position(
+    names: tuple[str, ...], two_views: Mapping[tuple[str, str], TwoView]
+) -> dict[Edge, TwoView]:
+    position = {name: idx for idx, name in enumerate(names)}
+    edges: dict[Edge, TwoView] = {}
+    for (first, second), view in two_views.items():
+        if view and first in position and second in position:
+            edge = position[first], position[second]
+            edges[min(edge), max(edge)] = view if edge[0] < edge[1] else _reversed(view)
+    return dict(sorted(edges.items()))
+
+
+def _reversed(view: TwoView) -> TwoView:
+    inverse = Rigid3(view.rotation, view.direction).inverse()
+    matches: NDArray[np.int32] = view.matches_idx[:, ::-1]
+    return TwoView(
+        matches, inverse.rotation, inverse.translation, view.residuals_rad, view.geometry, view.reason,
+        view.candidates, view.parallax_deg,
+    )  # fmt: skip
+
+
+def _triangles(edges: Mapping[Edge, TwoView]) -> list[tuple[int, int, int]]:
+    after: dict[int, set[int]] = {}
+    for first, second in edges:
+        after.setdefault(first, set()).add(second)
+    return [(i, j, k) for i, j in edges for k in sorted(after[i] & after.get(j, set()))]
+
+
+def _loop_error_rad(edges: Mapping[Edge, TwoView], triangle: tuple[int, int, int]) -> float:
+    i, j, k = triangle
+    return float(geodesic_angle(edges[j, k].rotation @ edges[i, j].rotation, edges[i, k].rotation))
