@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.geometry import Rigid3, Similarity3, similarity_from_points
+from pano_mvs.geometry import Similarity3, similarity_from_points
 from pano_mvs.scene import Poses
+
+FloatArray = NDArray[np.float64]
 
 # A neighbour nearer than this share of the median distance to the first camera makes no sound unit of length.
 _MIN_NEIGHBOUR_SHARE = 0.1
@@ -20,46 +24,46 @@ def normalised_poses(poses: Poses) -> Poses:
     if not poses.names:
         return poses
     first = poses.cam_from_world(0)
-    return moved_poses(poses, _scaled(first, 1 / first_baseline(poses.centers)))
+    neighbour = first_neighbour(poses.centers)
+    scale = 1 / _distance(poses.centers, neighbour) if neighbour else 1.0
+    moved = moved_poses(poses, Similarity3(scale, first.rotation, scale * first.translation))
+    # Exactly, not but for rounding.
+    moved.rotations[0], moved.translations[0] = np.eye(3), 0.0
+    return moved
 
 
-def first_baseline(centers: NDArray[np.float64]) -> float:
-    """Return the length of the first reference–neighbour baseline of cameras at (N, 3) centres; 1 for one camera."""
-    distances = np.linalg.norm(centers[1:] - centers[0], axis=1)
-    far = distances[distances > _MIN_NEIGHBOUR_SHARE * np.median(distances)] if len(distances) else distances
-    return float(far[0]) if len(far) else 1.0
+def in_gauge_of(poses: Poses, centers: FloatArray) -> Poses:
+    """Return refined poses in the world frame and unit of length of the (N, 3) centres from before the refinement.
 
-
-def aligned_poses(poses: Poses, centers: NDArray[np.float64]) -> Poses:
-    """Return the same scene moved so that its camera centres come as close as can be to (N, 3) given ones.
-
-    With fewer than three cameras the turn is left as it is.
+    Metric poses keep the frame by the similarity of all centres; others keep the first camera and first baseline.
     """
-    if len(centers) < 3:
-        scale = first_baseline(centers) / first_baseline(poses.centers)
-        return moved_poses(poses, Similarity3(scale, np.eye(3), centers[0] - scale * poses.centers[0]))
-    return moved_poses(poses, similarity_from_points(poses.centers, centers))
+    if poses.metric and len(centers) >= 3:
+        return moved_poses(poses, similarity_from_points(poses.centers, centers))
+    neighbour = first_neighbour(centers)
+    if not neighbour:
+        return poses
+    scale = _distance(centers, neighbour) / _distance(poses.centers, neighbour)
+    return moved_poses(poses, Similarity3(scale, np.eye(3), centers[0] - scale * poses.centers[0]))
+
+
+def first_neighbour(centers: FloatArray) -> int:
+    """Return the position of the camera whose distance to the first is the unit of length; 0 if there is none."""
+    distances = np.linalg.norm(centers - centers[0], axis=1)[1:] if len(centers) else np.zeros(0)
+    if not distances.any():
+        return 0
+    return 1 + int(np.flatnonzero(distances > _MIN_NEIGHBOUR_SHARE * np.median(distances))[0])
 
 
 def moved_poses(poses: Poses, new_from_old: Similarity3) -> Poses:
     """Return poses and points in another world frame."""
     cameras = [new_from_old.move_camera(poses.cam_from_world(idx)) for idx in range(len(poses.names))]
-    return Poses(
-        names=poses.names,
+    return replace(
+        poses,
         rotations=np.array([camera.rotation for camera in cameras]),
         translations=np.array([camera.translation for camera in cameras]),
         points_in_world=new_from_old.apply(poses.points_in_world),
-        point_colors_rgb=poses.point_colors_rgb,
-        point_errors_rad=poses.point_errors_rad,
-        track_point_idx=poses.track_point_idx,
-        track_image_idx=poses.track_image_idx,
-        track_bearings=poses.track_bearings,
-        rejected=poses.rejected,
-        frame=poses.frame,
-        scale=poses.scale,
-        metric=poses.metric,
     )
 
 
-def _scaled(rigid: Rigid3, scale: float) -> Similarity3:
-    return Similarity3(scale, rigid.rotation, scale * rigid.translation)
+def _distance(centers: FloatArray, neighbour: int) -> float:
+    return float(np.linalg.norm(centers[neighbour] - centers[0]))

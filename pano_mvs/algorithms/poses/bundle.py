@@ -1,0 +1,142 @@
+"""Angular bundle adjustment: Levenberg–Marquardt on cameras and points, points eliminated (Schur complement)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+from pano_mvs.algorithms.two_view.refinement import tangent_basis
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import rotation_from_rotvec
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int32]
+Loss: TypeAlias = Literal["huber", "cauchy"]
+
+_MIN_DAMPING, _MAX_DAMPING = 1e-9, 1e6
+_CONVERGED = 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """Cameras, points, and the observations that join them, sorted by point.
+
+    Attributes:
+        rotations: (N, 3, 3) of cam_from_world.
+        centers: (N, 3) in the world.
+        points: (P, 3) in the world.
+        point_idx: (T,) ascending.
+        image_idx: (T,).
+        bearings: (T, 3) unit rays in the camera.
+    """
+
+    rotations: FloatArray
+    centers: FloatArray
+    points: FloatArray
+    point_idx: IndexArray
+    image_idx: IndexArray
+    bearings: FloatArray
+
+    def check(self) -> None:
+        """Raise UsageError unless the observations are sorted by point and every point has one."""
+        if np.any(np.diff(self.point_idx) < 0) or len(np.unique(self.point_idx)) != len(self.points):
+            raise UsageError("the observations of a bundle must be sorted by point, and every point must have one")
+
+    def errors_rad(self) -> FloatArray:
+        """Return the angle between every observed ray and the one to its point, (T,), in [0, π]."""
+        in_cam = np.einsum(
+            "tij,tj->ti", self.rotations[self.image_idx], self.points[self.point_idx] - self.centers[self.image_idx]
+        )
+        sine = np.linalg.norm(np.cross(self.bearings, in_cam), axis=1)
+        angles: FloatArray = np.arctan2(sine, np.sum(self.bearings * in_cam, axis=1))
+        return angles
+
+
+def adjust_bundle(
+    bundle: Bundle, *, loss: Loss, scale_rad: float, max_iterations: int = 50, fixed_camera: int = 0
+) -> Bundle:
+    """Return the bundle with the least robust sum of squared angular errors; one camera stays where it is.
+
+    The length that only the gauge decides (the scale) stays near where it was, held by the damping.
+
+    Args:
+        bundle: where to begin.
+        loss: "huber" min(r², 2 s r − s²), or "cauchy" s² log(1 + r²/s²).
+        scale_rad: s, the error from which an observation loses influence.
+        max_iterations: at most so many steps.
+        fixed_camera: position of the camera that is not moved.
+
+    Raises:
+        UsageError: if the observations are not sorted by point.
+    """
+    bundle.check()
+    if not len(bundle.points):
+        return bundle
+    bases = tangent_basis(bundle.bearings)
+    errors = bundle.errors_rad()
+    cost, damping = robust_cost(errors, loss=loss, scale_rad=scale_rad), 1e-4
+    for _ in range(max_iterations):
+        weights = robust_weights(errors, loss=loss, scale_rad=scale_rad)
+        moved = _step(bundle, bases, weights, damping=damping, fixed_camera=fixed_camera)
+        moved_errors = moved.errors_rad()
+        moved_cost = robust_cost(moved_errors, loss=loss, scale_rad=scale_rad)
+        if not moved_cost < cost:
+            damping *= 10
+            if damping > _MAX_DAMPING:
+                break
+            continue
+        converged = cost - moved_cost < _CONVERGED * cost
+        bundle, errors, cost, damping = moved, moved_errors, moved_cost, max(damping / 10, _MIN_DAMPING)
+        if converged:
+            break
+    return bundle
+
+
+def robust_weights(errors_rad: FloatArray, *, loss: Loss, scale_rad: float) -> FloatArray:
+    """Return the weight of each observation in the reweighted least-squares problem, (T,) in (0, 1]."""
+    relative = errors_rad / scale_rad
+    weights: FloatArray = 1 / (1 + relative**2) if loss == "cauchy" else 1 / np.maximum(relative, 1.0)
+    return weights
+
+
+def robust_cost(errors_rad: FloatArray, *, loss: Loss, scale_rad: float) -> float:
+    """Return the robust loss summed over all observations, in units of the squared scale."""
+    relative = errors_rad / scale_rad
+    if loss == "cauchy":
+        return float(np.sum(np.log1p(relative**2)))
+    return float(np.sum(np.where(relative < 1, relative**2, 2 * relative - 1)))
+
+
+def _step(bundle: Bundle, bases: FloatArray, weights: FloatArray, *, damping: float, fixed_camera: int) -> Bundle:
+    """Return the bundle after one damped step."""
+    # Importing numba takes most of a second; who adjusts nothing does not pay for it.
+    from pano_mvs.algorithms.poses.kernels_bundle import reduced_system
+
+    starts = np.searchsorted(bundle.point_idx, np.arange(len(bundle.points) + 1))
+    system, gradient, diagonal, couplings, inverses, point_gradients = reduced_system(
+        bundle.rotations, bundle.centers, bundle.points, starts, bundle.image_idx, bases, weights, damping
+    )
+    free = np.ones(len(diagonal), np.bool_)
+    free[6 * fixed_camera : 6 * fixed_camera + 6] = False
+    # The small constant keeps a camera without observations in place.
+    system[np.diag_indices_from(system)] += damping * diagonal + 1e-12 * diagonal.mean()
+    camera_steps = np.zeros(len(diagonal))
+    try:
+        camera_steps[free] = -cho_solve(cho_factor(system[np.ix_(free, free)]), gradient[free])
+    except LinAlgError:
+        return bundle
+    steps = camera_steps.reshape(-1, 6)
+    coupled = np.einsum("tij,ti->tj", couplings, steps[bundle.image_idx])
+    right = point_gradients + np.stack(
+        [np.bincount(bundle.point_idx, column, len(bundle.points)) for column in coupled.T], axis=1
+    )
+    return replace(
+        bundle,
+        rotations=rotation_from_rotvec(steps[:, :3]) @ bundle.rotations,
+        centers=bundle.centers + steps[:, 3:],
+        points=bundle.points - np.einsum("pij,pj->pi", inverses, right),
+    )
