@@ -1,0 +1,225 @@
+"""The Fast Bilateral Solver on the sphere: ranges that are smooth where the picture is, and sharp where it is not.
+
+Barron and Poole, "The Fast Bilateral Solver", ECCV 2016: minimise over the vertices y of a bilateral grid
+
+    λ yᵀ (D_m − D_n B̄ D_n) y + Σ_i c_i ((Sᵀ y)_i − t_i)²
+
+where t are the measured values, c their confidences, S splats pixels to vertices, B̄ is a [1 2 1] blur along each
+dimension of the grid and D_n, D_m make it bistochastic; the result is Sᵀ y.
+
+Two things differ from the paper's grid. Its spatial cells lie on the sphere (`sphere_cells`), so that neither seam nor
+poles exist. And a pixel lies between the centres of four spatial cells with bilinear weights, where the paper takes
+the nearest vertex: without this a slanted floor becomes a staircase of cells, and the result depends on where the first
+cell begins. The colour bins are hard, as in the paper, since edges are there to be kept. The data term then has the
+matrix S C Sᵀ, which is not diagonal but stays sparse: four vertices by four, added up over the pixels of each element.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+import scipy.sparse
+import scipy.sparse.linalg
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.filters.sphere_cells import SphereCells, sphere_cells
+from pano_mvs.core.errors import UsageError
+from pano_mvs.scene import RangeMap
+from pano_mvs.scene.range_map import FILLED_CONFIDENCE
+
+FloatArray = NDArray[np.float64]
+
+# [1 2 1] along two dimensions of space and three of colour: the centre counts twice for each.
+_BLUR_CENTER = 10.0
+_BISTOCHASTIC_ITERATIONS = 10
+# A pixel without range is drawn towards a colour-blind guess this much, so that a colour that appears only inside a
+# hole has a value at all.
+_PRIOR_WEIGHT = 1e-4
+_TOLERANCE = 1e-4
+_SMALLEST_BIN = 2.1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BilateralSystem:
+    """The linear system A y = b of the solver, and how pixels read its solution.
+
+    Attributes:
+        cells: spatial cells.
+        elements: (H, W) int32 coloured element of each pixel.
+        vertices: (E, 4) int32 vertices of each coloured element.
+        mass: (V,) number of pixels at each vertex, S 1.
+        gram: (E, 4, 4) the data term S C Sᵀ of each element.
+        right: (V,) b = S C t.
+        graph: the blur B̄ without its centre, as compressed rows: starts (V + 1), indices (K), strengths (K).
+        n: (V,) diagonal of D_n.
+        m: (V,) diagonal of D_m.
+    """
+
+    cells: SphereCells
+    elements: NDArray[np.int32]
+    vertices: NDArray[np.int32]
+    mass: FloatArray
+    gram: FloatArray
+    right: FloatArray
+    graph: tuple[NDArray[np.int64], NDArray[np.int32], FloatArray]
+    n: FloatArray
+    m: FloatArray
+
+
+def fast_bilateral_solver(
+    range_map: RangeMap,
+    guide: NDArray[np.uint8],
+    *,
+    sigma_spatial: float = 8.0,
+    sigma_luma: float = 8.0,
+    sigma_chroma: float = 8.0,
+    smoothness: float = 4.0,
+    iterations: int = 60,
+    domain: Literal["range", "inverse"] = "inverse",
+    fill: bool = True,
+) -> RangeMap:
+    """Return a range map smoothed within the surfaces that the picture shows, and filled where it is invalid.
+
+    The weight of a pixel in the data term is (confidence / 255)², so that a consistent one (128–255) weighs four times
+    a weak one or more, and a filled one next to nothing. Pixels keep their confidence; newly filled ones get 1–63 by
+    the share of weight among the pixels of like place and colour.
+
+    Args:
+        range_map: (H, W) with even W, the full sphere.
+        guide: (H, W, 3) RGB picture.
+        sigma_spatial: size of a grid cell in pixels at the equator.
+        sigma_luma: size of a grid cell in luma (0–255), at least 2.1.
+        sigma_chroma: size of a grid cell in chroma (0–255), at least 2.1.
+        smoothness: λ, the multiplier of the smoothness term against weights of at most 1.
+        iterations: largest number of conjugate-gradient steps; fewer if it has converged.
+        domain: what is smooth: "inverse" (1/range, linear in the ray on every plane, and in which the errors of stereo
+            are even) or "range".
+        fill: whether invalid pixels get a range; else they stay invalid.
+
+    Raises:
+        UsageError: if guide and range map differ in size, or a parameter is out of bounds.
+    """
+    height, width = range_map.range.shape
+    if guide.shape != (height, width, 3) or guide.dtype != np.uint8:
+        raise UsageError(f"the guide must be ({height}, {width}, 3) uint8 like the range map, got {guide.shape} "
+                         f"{guide.dtype}")  # fmt: skip
+    if min(sigma_luma, sigma_chroma) < _SMALLEST_BIN or sigma_spatial < 1 or smoothness < 0 or iterations < 0:
+        raise UsageError(f"sigma_luma and sigma_chroma must be at least {_SMALLEST_BIN}, sigma_spatial at least 1, "
+                         f"smoothness and iterations not negative")  # fmt: skip
+    valid = range_map.valid
+    if not valid.any():
+        return range_map
+    target = np.zeros((height, width))
+    target[valid] = range_map.range[valid]
+    if domain == "inverse":
+        target[valid] = 1 / target[valid]
+    weight = np.where(valid, confidence_weight(range_map.confidence), 0.0)
+    cells = sphere_cells((height, width), sigma_spatial)
+    colors = _color_bins(guide, sigma_luma, sigma_chroma)
+    smooth, support = solve_bilateral(target, weight, colors, cells=cells, smoothness=smoothness, iterations=iterations)
+    # The solution is a weighted mean of the targets up to the tolerance of the solver: hold it within their limits.
+    smooth = np.clip(smooth, target[valid].min(), target[valid].max())
+    ranges = (1 / smooth if domain == "inverse" else smooth).astype(np.float32)
+    if not fill:
+        return RangeMap(np.where(valid, ranges, np.float32(np.nan)), range_map.confidence)
+    low, high = FILLED_CONFIDENCE
+    filled = np.rint(low + (high - low) * np.clip(support, 0, 1)).astype(np.uint8)
+    return RangeMap(ranges, np.where(valid, range_map.confidence, filled))
+
+
+def confidence_weight(confidence: NDArray[np.uint8]) -> FloatArray:
+    """Return the weight of the data term, in [0, 1], for each confidence."""
+    weight: FloatArray = (confidence / 255.0) ** 2
+    return weight
+
+
+def solve_bilateral(
+    target: FloatArray,
+    weight: FloatArray,
+    colors: NDArray[np.int64],
+    *,
+    cells: SphereCells,
+    smoothness: float,
+    iterations: int,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the solution at each pixel and the mean weight of its vertices, (H, W) each.
+
+    Args:
+        target: (H, W) measured values, anything finite where the weight is 0.
+        weight: (H, W) confidences, not all 0.
+        colors: (H, W) number of the colour bin.
+        cells: spatial cells of the panorama.
+        smoothness: λ.
+        iterations: largest number of conjugate-gradient steps.
+    """
+    from pano_mvs.algorithms.filters import kernels_bilateral as kernels  # compiles on import
+
+    prior = _blind_guess(target, weight, cells)
+    known = weight > 0
+    pull = np.where(known, weight, _PRIOR_WEIGHT * weight.max())
+    system = build_system(np.where(known, target, prior), pull, colors, cells)
+    count = len(system.mass)
+    diagonal_gram = np.ascontiguousarray(np.einsum("eaa->ea", system.gram))
+    data = kernels.sum_at_vertices(diagonal_gram, system.vertices, count)
+    diagonal = smoothness * (system.m - _BLUR_CENTER * system.n**2) + data
+    # S C Sᵀ 1, the weight that a vertex draws from its pixels.
+    pulled = kernels.sum_at_vertices(system.gram.sum(axis=2), system.vertices, count)
+    arguments = (smoothness, system.n, system.m, *system.graph, _BLUR_CENTER, system.vertices, system.gram)
+    solution, _ = kernels.solve(system.right, system.right / pulled, diagonal, _TOLERANCE, iterations, arguments)
+    place = cells.gap_of_row, cells.weight_row, cells.weight_upper, cells.weight_lower
+    smooth = kernels.slice_pixels(system.elements, system.vertices, solution, *place)
+    support = kernels.slice_pixels(system.elements, system.vertices, pulled / system.mass, *place)
+    return smooth, support
+
+
+def build_system(
+    target: FloatArray, weight: FloatArray, colors: NDArray[np.int64], cells: SphereCells
+) -> BilateralSystem:
+    """Return the linear system for values (H, W), weights (H, W) and colour bins (H, W)."""
+    from pano_mvs.algorithms.filters import kernels_bilateral as kernels  # compiles on import
+
+    elements, element_keys = kernels.number_elements(colors, cells.element_of_pixel, cells.gap_of_row)
+    vertices, vertex_keys = kernels.number_vertices(element_keys, cells.corners)
+    graph = kernels.blur_graph(vertex_keys, cells.starts, cells.neighbours, cells.strengths)
+    mass, gram, right = kernels.assemble(
+        elements, target, weight, len(vertices), cells.gap_of_row, cells.weight_row, cells.weight_upper,
+        cells.weight_lower,
+    )  # fmt: skip
+    count = len(vertex_keys)
+    mass = kernels.sum_at_vertices(mass, vertices, count)
+    n, m = kernels.bistochastise(mass, *graph, _BLUR_CENTER, _BISTOCHASTIC_ITERATIONS)
+    right = kernels.sum_at_vertices(right, vertices, count)
+    return BilateralSystem(cells, elements, vertices, mass, gram, right, graph, n, m)
+
+
+def _color_bins(guide: NDArray[np.uint8], sigma_luma: float, sigma_chroma: float) -> NDArray[np.int64]:
+    """Return the number of each pixel's bin of luma and chroma, (H, W)."""
+    from pano_mvs.algorithms.filters.kernels_bilateral import COLOR_BINS  # compiles on import
+
+    luma, red, blue = np.moveaxis(cv2.cvtColor(guide, cv2.COLOR_RGB2YCrCb), -1, 0)
+    # Bins begin at 1: the outermost ones stay empty, so that a step in one channel never reaches the next.
+    y, u, v = ((np.arange(256) / sigma).astype(np.int64) + 1 for sigma in (sigma_luma, sigma_chroma, sigma_chroma))
+    bins: NDArray[np.int64] = (y[luma] * COLOR_BINS + u[blue]) * COLOR_BINS + v[red]
+    return bins
+
+
+def _blind_guess(target: FloatArray, weight: FloatArray, cells: SphereCells) -> FloatArray:
+    """Return a smooth guess of the value everywhere, (H, W), from place alone.
+
+    The mean of the targets in each cell, spread over cells without any by Laplace's equation on the cells' graph.
+    """
+    count = len(cells.starts) - 1
+    element = cells.element_of_pixel[cells.gap_of_row]
+    cell = cells.corners[element, 0]
+    total_weight = np.bincount(cell.ravel(), weight.ravel(), count)
+    total = np.bincount(cell.ravel(), (weight * target).ravel(), count)
+    graph = scipy.sparse.csr_array((cells.strengths, cells.neighbours, cells.starts), shape=(count, count))
+    pull = 1e3 * total_weight / total_weight.max()
+    mean = total / np.where(total_weight > 0, total_weight, 1)
+    matrix = scipy.sparse.diags_array(pull + graph.sum(axis=1)) - graph
+    guess: FloatArray = np.asarray(scipy.sparse.linalg.spsolve(matrix.tocsc(), pull * mean), np.float64)
+    spread: FloatArray = guess[cell]
+    return spread

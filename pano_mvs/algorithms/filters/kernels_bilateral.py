@@ -1,0 +1,263 @@
+"""Compiled: the bilateral grid on the sphere and the linear system of the Fast Bilateral Solver."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+_EMPTY = -1
+# Colours are numbered within a cube of 128 bins per channel, of which the outermost stay empty.
+COLOR_BINS = 128
+_LUMA, _BLUE, _RED = COLOR_BINS * COLOR_BINS, COLOR_BINS, 1
+_SLOT_MULTIPLIER = np.uint64(0x9E3779B97F4A7C15)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def _slot(key, bits):  # type: ignore[no-untyped-def]
+    """Return where to look first for a key in a table of 2^bits slots (Fibonacci hashing)."""
+    return np.int64((np.uint64(key) * _SLOT_MULTIPLIER) >> np.uint64(64 - bits))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _find(table, numbers, key, bits):  # type: ignore[no-untyped-def]
+    """Return the number of a key, or −1."""
+    slot = _slot(key, bits)
+    mask = (1 << bits) - 1
+    while table[slot] != _EMPTY:
+        if table[slot] == key:
+            return numbers[slot]
+        slot = (slot + 1) & mask
+    return -1
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _find_or_add(table, numbers, key, bits, count):  # type: ignore[no-untyped-def]
+    """Return the number of a key; a new key gets the number `count`."""
+    slot = _slot(key, bits)
+    mask = (1 << bits) - 1
+    while table[slot] != _EMPTY:
+        if table[slot] == key:
+            return numbers[slot]
+        slot = (slot + 1) & mask
+    table[slot] = key
+    numbers[slot] = count
+    return count
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _bits_for(count):  # type: ignore[no-untyped-def]
+    """Return the size of a table, as a power of two, that stays at most half full."""
+    bits = 4
+    while (1 << bits) < 2 * count:
+        bits += 1
+    return bits
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def number_elements(colors, cell_elements, gap_of_row):  # type: ignore[no-untyped-def]
+    """Return the coloured element of each pixel, (H, W) int32, and the key of each, in order of appearance.
+
+    A key is element · COLOR_BINS³ + colour.
+    """
+    height, width = colors.shape
+    bits = _bits_for(height * width // 2)
+    table, numbers = np.full(1 << bits, _EMPTY, np.int64), np.empty(1 << bits, np.int32)
+    elements = np.empty((height, width), np.int32)
+    keys = np.empty(height * width, np.int64)
+    count = 0
+    for row in range(height):
+        gap = gap_of_row[row]
+        last_key, last = np.int64(_EMPTY), np.int32(0)
+        for column in range(width):
+            key = np.int64(cell_elements[gap, column]) * COLOR_BINS**3 + colors[row, column]
+            if key != last_key:
+                if 4 * count > 3 << bits:
+                    table, numbers, bits = _grow(keys, count, bits)
+                last_key, last = key, _find_or_add(table, numbers, key, bits, count)
+                if last == count:
+                    keys[count] = key
+                    count += 1
+            elements[row, column] = last
+    return elements, keys[:count].copy()
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _grow(keys, count, bits):  # type: ignore[no-untyped-def]
+    """Return a table of twice the size that holds the keys under their numbers, with its bits."""
+    bits += 1
+    table, numbers = np.full(1 << bits, _EMPTY, np.int64), np.empty(1 << bits, np.int32)
+    for number in range(count):
+        _find_or_add(table, numbers, keys[number], bits, number)
+    return table, numbers, bits
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def number_vertices(element_keys, corners):  # type: ignore[no-untyped-def]
+    """Return the four vertices of each coloured element, (E, 4) int32, and the key cell · COLOR_BINS³ + colour."""
+    count = len(element_keys)
+    bits = _bits_for(4 * count)
+    table, numbers = np.full(1 << bits, _EMPTY, np.int64), np.empty(1 << bits, np.int32)
+    vertices = np.empty((count, 4), np.int32)
+    keys = np.empty(4 * count, np.int64)
+    used = 0
+    for element in range(count):
+        color = element_keys[element] % COLOR_BINS**3
+        cell_element = element_keys[element] // COLOR_BINS**3
+        for corner in range(4):
+            key = np.int64(corners[cell_element, corner]) * COLOR_BINS**3 + color
+            vertex = _find_or_add(table, numbers, key, bits, used)
+            if vertex == used:
+                keys[used] = key
+                used += 1
+            vertices[element, corner] = vertex
+    return vertices, keys[:used].copy()
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def blur_graph(vertex_keys, starts, neighbours, strengths):  # type: ignore[no-untyped-def]
+    """Return the neighbours of each vertex in space and in colour as compressed rows: starts, indices, strengths."""
+    count = len(vertex_keys)
+    bits = _bits_for(count)
+    table, numbers = np.full(1 << bits, _EMPTY, np.int64), np.empty(1 << bits, np.int32)
+    for vertex in range(count):
+        _find_or_add(table, numbers, vertex_keys[vertex], bits, vertex)
+    row_starts = np.empty(count + 1, np.int64)
+    indices, values = np.empty(count * 16, np.int32), np.empty(count * 16, np.float64)
+    used = 0
+    for vertex in range(count):
+        row_starts[vertex] = used
+        key = vertex_keys[vertex]
+        cell, color = key // COLOR_BINS**3, key % COLOR_BINS**3
+        for position in range(starts[cell], starts[cell + 1]):
+            other = _find(table, numbers, np.int64(neighbours[position]) * COLOR_BINS**3 + color, bits)
+            if other >= 0:
+                indices[used], values[used] = other, strengths[position]
+                used += 1
+        for step in (-_LUMA, _LUMA, -_BLUE, _BLUE, -_RED, _RED):
+            # The outermost bins of the cube are never used, so that a step cannot run into the next row of it.
+            other = _find(table, numbers, key + step, bits)
+            if other >= 0:
+                indices[used], values[used] = other, 1.0
+                used += 1
+    row_starts[count] = used
+    return row_starts, indices[:used].copy(), values[:used].copy()
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def _corner_weights(weights, weight_row, upper, lower):  # type: ignore[no-untyped-def]
+    weights[0] = (1 - weight_row) * (1 - upper)
+    weights[1] = (1 - weight_row) * upper
+    weights[2] = weight_row * (1 - lower)
+    weights[3] = weight_row * lower
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def assemble(elements, targets, weights, count, gap_of_row, weight_row, weight_upper, weight_lower):  # type: ignore[no-untyped-def]
+    """Return, per coloured element, S 1 (E, 4), S C Sᵀ (E, 4, 4) and S C t (E, 4) restricted to its pixels."""
+    height, width = elements.shape
+    mass, gram, right = np.zeros((count, 4)), np.zeros((count, 4, 4)), np.zeros((count, 4))
+    w = np.empty(4)
+    for row in range(height):
+        gap = gap_of_row[row]
+        for column in range(width):
+            element = elements[row, column]
+            confidence, target = weights[row, column], targets[row, column]
+            _corner_weights(w, weight_row[row], weight_upper[gap, column], weight_lower[gap, column])
+            for a in range(4):
+                mass[element, a] += w[a]
+                cw = confidence * w[a]
+                right[element, a] += cw * target
+                for b in range(4):
+                    gram[element, a, b] += cw * w[b]
+    return mass, gram, right
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def sum_at_vertices(values, vertices, count):  # type: ignore[no-untyped-def]
+    """Return the sum of the elements' corner values, (E, 4), at each vertex, (V,)."""
+    result = np.zeros(count)
+    for element in range(len(vertices)):
+        for corner in range(4):
+            result[vertices[element, corner]] += values[element, corner]
+    return result
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def slice_pixels(elements, vertices, values, gap_of_row, weight_row, weight_upper, weight_lower):  # type: ignore[no-untyped-def]
+    """Return Sᵀ values at each pixel, (H, W)."""
+    height, width = elements.shape
+    result = np.empty((height, width))
+    w = np.empty(4)
+    for row in range(height):
+        gap = gap_of_row[row]
+        for column in range(width):
+            _corner_weights(w, weight_row[row], weight_upper[gap, column], weight_lower[gap, column])
+            element = elements[row, column]
+            total = 0.0
+            for corner in range(4):
+                total += w[corner] * values[vertices[element, corner]]
+            result[row, column] = total
+    return result
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def blur(values, starts, indices, strengths, center):  # type: ignore[no-untyped-def]
+    """Return B̄ values: `center` times each value plus the strengths times its neighbours' values."""
+    result = np.empty_like(values)
+    for vertex in range(len(values)):
+        total = center * values[vertex]
+        for position in range(starts[vertex], starts[vertex + 1]):
+            total += strengths[position] * values[indices[position]]
+        result[vertex] = total
+    return result
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def bistochastise(mass, starts, indices, strengths, center, iterations):  # type: ignore[no-untyped-def]
+    """Return the diagonals n and m of D_n and D_m (Barron and Poole, algorithm 1)."""
+    n = np.ones_like(mass)
+    for _ in range(iterations):
+        blurred = blur(n, starts, indices, strengths, center)
+        for vertex in range(len(n)):
+            n[vertex] = np.sqrt(n[vertex] * mass[vertex] / blurred[vertex])
+    # m from n, not the mass itself: then the rows of D_m − D_n B̄ D_n sum to exactly zero.
+    return n, n * blur(n, starts, indices, strengths, center)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def apply_system(values, smoothness, n, m, starts, indices, strengths, center, vertices, gram):  # type: ignore[no-untyped-def]
+    """Return (λ (D_m − D_n B̄ D_n) + S C Sᵀ) values."""
+    blurred = blur(n * values, starts, indices, strengths, center)
+    result = smoothness * (m * values - n * blurred)
+    for element in range(len(vertices)):
+        for a in range(4):
+            total = 0.0
+            for b in range(4):
+                total += gram[element, a, b] * values[vertices[element, b]]
+            result[vertices[element, a]] += total
+    return result
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def solve(right, initial, diagonal, tolerance, iterations, system):  # type: ignore[no-untyped-def]
+    """Return the solution of the system by conjugate gradients with Jacobi preconditioning, and the iterations.
+
+    `system` holds the arguments of `apply_system` after the values.
+    """
+    values = initial.copy()
+    residual = right - apply_system(values, *system)
+    scaled = residual / diagonal
+    direction = scaled.copy()
+    energy = np.sum(residual * scaled)
+    goal = tolerance**2 * np.sum(right * right / diagonal)
+    done = 0
+    while done < iterations and energy > goal:
+        image = apply_system(direction, *system)
+        step = energy / np.sum(direction * image)
+        values += step * direction
+        residual -= step * image
+        scaled = residual / diagonal
+        previous, energy = energy, np.sum(residual * scaled)
+        direction = scaled + (energy / previous) * direction
+        done += 1
+    return values, done
