@@ -17,7 +17,7 @@ from xml.etree import ElementTree
 from pano_mvs.core.errors import InputError
 
 _NAMESPACE = "{http://ns.google.com/photos/1.0/panorama/}"
-_STARTS, _ENDS = (b"<x:xmpmeta", b"<rdf:RDF"), (b"</x:xmpmeta>", b"</rdf:RDF>")
+_WRAPPED, _BARE = (b"<x:xmpmeta", b"</x:xmpmeta>"), (b"<rdf:RDF", b"</rdf:RDF>")
 _HEAD_BYTES = 4 << 20
 _PACKET_BYTES = 1 << 20
 _PNG_START = b"\x89PNG\r\n\x1a\n"
@@ -102,17 +102,20 @@ def _packets(head: bytes) -> Iterator[bytes]:
     """Yield every XMP packet of a file, those of compressed PNG chunks too."""
     sources = [*_png_texts(head), head] if head.startswith(_PNG_START) else [head]
     for source in sources:
-        for start_mark, end_mark in zip(_STARTS, _ENDS, strict=True):
-            found = False
-            start = source.find(start_mark)
-            while start >= 0:
-                end = source.find(end_mark, start, start + _PACKET_BYTES)
-                if end >= 0:
-                    found = True
-                    yield source[start : end + len(end_mark)]
-                start = source.find(start_mark, max(end, start + 1))
-            if found:
-                break
+        wrapped = list(_between(source, *_WRAPPED))
+        yield from wrapped or _between(source, *_BARE)
+
+
+def _between(source: bytes, start_mark: bytes, end_mark: bytes) -> Iterator[bytes]:
+    """Yield every stretch of at most 1 MiB from a start mark to the next end mark, both included."""
+    start = source.find(start_mark)
+    while start >= 0:
+        end = source.find(end_mark, start)
+        if end < 0:
+            return
+        if end - start <= _PACKET_BYTES:
+            yield source[start : end + len(end_mark)]
+        start = source.find(start_mark, end)
 
 
 def _png_texts(head: bytes) -> Iterator[bytes]:

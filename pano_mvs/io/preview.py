@@ -74,7 +74,7 @@ def _scale_bar(near: float, far: float) -> NDArray[np.uint8]:
 
 
 def scale_ticks(near: float, far: float) -> list[float]:
-    """Return three to ten round numbers within a scale."""
+    """Return four to ten round numbers within a scale."""
     for steps in (
         (1, 2, 5),
         (1, 1.5, 2, 3, 5, 7),
@@ -84,7 +84,7 @@ def scale_ticks(near: float, far: float) -> list[float]:
         decades = range(int(np.floor(np.log10(near))), int(np.ceil(np.log10(far))) + 1)
         ticks = [float(f"{step * 10.0**decade:.3g}") for decade in decades for step in steps]
         inside = [tick for tick in ticks if near <= tick <= far]
-        if len(inside) >= 3:
+        if len(inside) >= 4:
             return inside[:: -(-len(inside) // 10)]
     return [near, far]
 

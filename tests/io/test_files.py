@@ -1,0 +1,143 @@
+"""Range maps, confidences, clouds and previews come back as they were written."""
+
+import cv2
+import numpy as np
+import pytest
+
+from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.geometry import Rigid3
+from pano_mvs.io.ply import read_ply, write_ply
+from pano_mvs.io.preview import color_mapped, range_limits, scale_ticks, write_preview
+from pano_mvs.io.range_files import read_range_tiff, write_confidence_png, write_range_tiff
+from pano_mvs.scene import PointCloud
+from pano_mvs.testing.room import default_room, render
+
+
+def range_map():
+    values = np.random.default_rng(0).gamma(2, 2, (24, 48)).astype(np.float32)
+    values[values < 1] = np.nan
+    values[0, :2] = (1e-30, 3e30)
+    return values
+
+
+def test_a_range_map_keeps_every_bit_and_its_nans(tmp_path):
+    write_range_tiff(tmp_path / "a.tiff", range_map())
+    write_range_tiff(tmp_path / "b.tiff", range_map())
+    np.testing.assert_array_equal(read_range_tiff(tmp_path / "a.tiff"), range_map())
+    assert (tmp_path / "a.tiff").read_bytes() == (tmp_path / "b.tiff").read_bytes()
+
+
+@pytest.mark.parametrize("array", [np.zeros((2, 2)), np.zeros((2, 2, 1), np.float32)])
+def test_another_array_is_no_range_map(tmp_path, array):
+    with pytest.raises(UsageError, match=r"a range map is \(H, W\) float32"):
+        write_range_tiff(tmp_path / "a.tiff", array)
+
+
+def test_another_file_is_no_range_map(tmp_path):
+    with pytest.raises(InputError, match=r"gone\.tiff: cannot be read"):
+        read_range_tiff(tmp_path / "gone.tiff")
+    cv2.imwrite(str(tmp_path / "grey.tiff"), np.zeros((4, 4), np.uint8))
+    (tmp_path / "text.tiff").write_text("hello")
+    (tmp_path / "empty.tiff").touch()
+    for name in ("grey", "text", "empty"):
+        with pytest.raises(InputError, match=rf"{name}\.tiff: a range map is a one-channel float32 TIFF"):
+            read_range_tiff(tmp_path / f"{name}.tiff")
+
+
+def test_a_confidence_map_is_an_8_bit_png(tmp_path):
+    confidence = np.arange(256, dtype=np.uint8).reshape(8, 32)
+    write_confidence_png(tmp_path / "a.png", confidence)
+    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED), confidence)
+    with pytest.raises(UsageError, match=r"a confidence map is \(H, W\) uint8"):
+        write_confidence_png(tmp_path / "a.png", confidence.astype(float))
+
+
+def cloud(count):
+    rng = np.random.default_rng(count)
+    normals = rng.normal(size=(count, 3)).astype(np.float32)
+    return PointCloud(
+        rng.normal(size=(count, 3)).astype(np.float32), normals,
+        rng.integers(0, 256, (count, 3)).astype(np.uint8), np.zeros(count, np.uint8),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("count", [0, 1, 1000])
+def test_a_cloud_survives_the_round_trip(tmp_path, count):
+    write_ply(tmp_path / "a.ply", cloud(count))
+    back = read_ply(tmp_path / "a.ply")
+    back.check()
+    for name, value in vars(cloud(count)).items():
+        np.testing.assert_array_equal(getattr(back, name), value)
+
+
+def test_the_ply_header_is_what_other_programs_expect(tmp_path):
+    write_ply(tmp_path / "a.ply", cloud(3))
+    lines = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")[0].decode().splitlines()
+    names = [
+        "float x",
+        "float y",
+        "float z",
+        "float nx",
+        "float ny",
+        "float nz",
+        "uchar red",
+        "uchar green",
+        "uchar blue",
+    ]
+    assert lines[:3] == ["ply", "format binary_little_endian 1.0", "element vertex 3"]
+    assert lines[3:] == [f"property {name}" for name in names]
+    assert (tmp_path / "a.ply").stat().st_size == len("\n".join([*lines, "end_header", ""])) + 3 * 27
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        (lambda data: data[:-1], "promises 3 points, but it holds 2"),
+        (lambda data: data + b"\0" * 27, "promises 3 points, but it holds 4"),
+        (lambda data: data.replace(b"little", b"big"), "not a PLY file of pano-mvs"),
+        (lambda data: data.replace(b"vertex 3", b"vertex three"), "not a PLY file of pano-mvs"),
+        (lambda data: b"", "not a PLY file of pano-mvs"),
+    ],
+)
+def test_another_ply_is_refused(tmp_path, change, what):
+    write_ply(tmp_path / "a.ply", cloud(3))
+    (tmp_path / "a.ply").write_bytes(change((tmp_path / "a.ply").read_bytes()))
+    with pytest.raises(InputError, match=rf"a\.ply: .*{what}"):
+        read_ply(tmp_path / "a.ply")
+
+
+def test_a_preview_shows_the_panorama_above_its_range(tmp_path):
+    image, ranges = render(default_room(), Rigid3.identity(), (64, 128))
+    ranges[20:30, 40:60] = np.nan
+    write_preview(tmp_path / "a.jpg", image, ranges)
+    write_preview(tmp_path / "b.jpg", image, ranges)
+    assert (tmp_path / "a.jpg").read_bytes() == (tmp_path / "b.jpg").read_bytes()
+    shown = cv2.imread(str(tmp_path / "a.jpg"))
+    assert shown.shape[1] == 1280
+    assert shown.shape[0] > 1280
+    small = cv2.resize(shown[:640], (128, 64), interpolation=cv2.INTER_AREA)[..., ::-1]
+    assert np.abs(small.astype(float) - image).mean() < 5
+    hole = shown[644 + 210 : 644 + 290, 410:590].astype(float)
+    assert np.abs(hole - 128).max() < 12
+
+
+def test_near_is_red_far_is_blue_and_nothing_is_grey():
+    ranges = np.array([[1.0, 3.0, 9.0, np.nan, 0.1, 100.0]], np.float32)
+    near, middle, far, nothing, nearer, farther = color_mapped(ranges, 1.0, 9.0)[0].astype(int)
+    assert near[0] > 2 * near[2]
+    assert middle[1] == max(middle)
+    assert far[2] > 2 * far[1]
+    assert nothing.tolist() == [128, 128, 128]
+    assert (nearer.tolist(), farther.tolist()) == (near.tolist(), far.tolist())
+
+
+@pytest.mark.parametrize(
+    "ranges", [np.full((2, 4), np.nan), np.full((2, 4), 3.0), np.array([[0.01, 5000.0]]), np.array([[1e-5, 2e-5]])]
+)
+def test_the_scale_has_round_numbers_for_any_range(tmp_path, ranges):
+    near, far = range_limits(ranges.astype(np.float32))
+    ticks = scale_ticks(near, far)
+    assert 2 <= len(ticks) <= 10
+    assert ticks == sorted(set(ticks))
+    assert near <= ticks[0] < ticks[-1] <= far
+    write_preview(tmp_path / "a.jpg", np.zeros((2, 4, 3), np.uint8), ranges.astype(np.float32))
