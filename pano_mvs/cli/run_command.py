@@ -56,7 +56,7 @@ def print_summary(summary: Mapping[str, Any], out: Path, console: Console, *, wr
     console.print(f"\n{counts} in {summary['seconds']:.1f} s{cached}", highlight=False)
     _print_failures(summary, console)
     _print_poses(summary, console)
-    _print_scores(summary["scores"], console)
+    print_scores(summary["scores"], console)
     for note in summary["notes"]:
         console.print(f"note: {escape(note)}", highlight=False, soft_wrap=True)
     if summary["stopped"]:
@@ -89,7 +89,8 @@ def _print_poses(summary: Mapping[str, Any], console: Console) -> None:
                       f"scale: {poses['scale']}", highlight=False)  # fmt: skip
 
 
-def _print_scores(scores: Mapping[str, Any], console: Console) -> None:
+def print_scores(scores: Mapping[str, Any], console: Console) -> None:
+    """Print pose scores in a line and range scores in a table."""
     if scores.get("poses"):
         text = ", ".join(f"{name.replace('_', ' ')} {value:.4g}" for name, value in scores["poses"].items())
         console.print(f"against the ground truth: {text}", highlight=False)

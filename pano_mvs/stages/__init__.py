@@ -1,1 +1,42 @@
-"""The built-in stages, one module per kind: each binds its parameters to an algorithm, nothing more."""
+"""The built-in stages, one module per kind: each binds its parameters to an algorithm, nothing more.
+
+They are registered through the entry point `pano_mvs.plugins`, like anybody's.
+"""
+
+from pano_mvs.stages.depth import sweep
+from pano_mvs.stages.evaluate import truth
+from pano_mvs.stages.export import colmap, ply, previews, ranges
+from pano_mvs.stages.features import orb_tangent, sift_tangent
+from pano_mvs.stages.filters import bilateral_solver, consistency, gaussian, median, speckle
+from pano_mvs.stages.fusion import vote
+from pano_mvs.stages.matches import brute_force
+from pano_mvs.stages.pairs import exhaustive, sequential
+from pano_mvs.stages.poses import from_model, refine, scaled_translation, triangulate
+from pano_mvs.stages.source import folder
+from pano_mvs.stages.views import nearest
+
+__all__ = [
+    "bilateral_solver",
+    "brute_force",
+    "colmap",
+    "consistency",
+    "exhaustive",
+    "folder",
+    "from_model",
+    "gaussian",
+    "median",
+    "nearest",
+    "orb_tangent",
+    "ply",
+    "previews",
+    "ranges",
+    "refine",
+    "scaled_translation",
+    "sequential",
+    "sift_tangent",
+    "speckle",
+    "sweep",
+    "triangulate",
+    "truth",
+    "vote",
+]

@@ -1,0 +1,43 @@
+"""Evaluation against ground truth inside a workflow."""
+
+from __future__ import annotations
+
+import hashlib
+from functools import partial
+
+from pydantic import Field
+
+from pano_mvs.algorithms.metrics.score import score_capture
+from pano_mvs.api import All, InputPath, One, Panorama, Params, Poses, RangeMap, Scores, stage
+from pano_mvs.io.truth import read_truth
+
+
+class TruthParams(Params):
+    """Settings of evaluate.truth."""
+
+    truth: InputPath = Field(description="folder with poses.json and depth.npz")
+
+
+@stage("evaluate.truth")
+def truth(images: All[Panorama], poses: One[Poses], ranges: All[RangeMap], params: TruthParams) -> Scores:
+    """Compare poses and range maps with the truth.
+
+    A picture counts if the truth knows its name and, where the truth states the picture's SHA-256, its bytes: another
+    picture of the same name is not scored against it.
+    """
+    known = read_truth(params.truth)
+    notes: list[str] = []
+    matched = {}
+    for name, view in known.match(list(images)).items():
+        if view.sha256 is None or hashlib.sha256(images[name].image.path.read_bytes()).hexdigest() == view.sha256:
+            matched[name] = view
+        else:
+            notes.append(f"{name} is not the picture that the truth in {params.truth.name} belongs to")
+    estimated = {name: poses.cam_from_world(idx) for idx, name in enumerate(poses.names)}
+    scores = score_capture(
+        estimated,
+        {name: view.cam_from_world for name, view in matched.items()},
+        {name: ranges[name].range for name in matched if name in ranges},
+        {name: partial(known.range_map, view) for name, view in matched.items()},
+    )
+    return Scores(scores.poses, scores.views, (*scores.notes, *notes))

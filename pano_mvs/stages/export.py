@@ -1,0 +1,43 @@
+"""Exports: files that other programs open."""
+
+from __future__ import annotations
+
+from pano_mvs.api import All, Context, Each, Files, One, Panorama, PointCloud, Poses, RangeMap, stage
+from pano_mvs.io.colmap_model import write_colmap_model
+from pano_mvs.io.ply import write_ply
+from pano_mvs.io.preview import write_preview
+from pano_mvs.io.range_files import write_confidence_png, write_range_tiff
+
+
+@stage("export.colmap")
+def colmap(poses: One[Poses], images: All[Panorama], ctx: Context) -> Files:
+    """COLMAP model of EQUIRECTANGULAR cameras, with points and tracks, in colmap/sparse/0."""
+    folder = ctx.scratch / "model"
+    folder.mkdir()
+    write_colmap_model(folder, poses, {name: images[name].source_size_hw for name in poses.names if name in images})
+    return Files({f"colmap/sparse/0/{path.name}": path for path in sorted(folder.iterdir())})
+
+
+@stage("export.ply")
+def ply(cloud: One[PointCloud], ctx: Context) -> Files:
+    """The fused cloud as cloud.ply: binary little endian, x y z nx ny nz red green blue."""
+    path = ctx.scratch / "cloud.ply"
+    write_ply(path, cloud)
+    return Files({"cloud.ply": path})
+
+
+@stage("export.ranges")
+def ranges(range_map: Each[RangeMap], ctx: Context) -> Files:
+    """Each range map as range/<image>.tiff (float32, NaN invalid) and confidence/<image>.png (8 bit, 0 invalid)."""
+    tiff, png = ctx.scratch / "range.tiff", ctx.scratch / "confidence.png"
+    write_range_tiff(tiff, range_map.range)
+    write_confidence_png(png, range_map.confidence)
+    return Files({"range/{item}.tiff": tiff, "confidence/{item}.png": png})
+
+
+@stage("export.previews")
+def previews(range_map: Each[RangeMap], image: Each[Panorama], ctx: Context) -> Files:
+    """A picture for each view, preview/<image>.jpg: the panorama beside its colour-mapped range with a scale bar."""
+    path = ctx.scratch / "preview.jpg"
+    write_preview(path, image.load(), range_map.range)
+    return Files({"preview/{item}.jpg": path})

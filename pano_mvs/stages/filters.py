@@ -1,0 +1,114 @@
+"""Filters: range map in, range map out, in any order."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from pano_mvs.algorithms.filters.bilateral_solver import fast_bilateral_solver
+from pano_mvs.algorithms.filters.consistency import check_consistency
+from pano_mvs.algorithms.filters.gaussian import gaussian_range
+from pano_mvs.algorithms.filters.median import median_range
+from pano_mvs.algorithms.filters.speckle import remove_speckles
+from pano_mvs.api import Context, Each, Near, Panorama, Params, Pose, RangeMap, stage
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
+
+
+class MedianParams(Params):
+    """Settings of filters.median."""
+
+    window: int = Field(default=5, ge=3, le=15, description="side in pixels, odd")
+
+
+@stage("filters.median")
+def median(range_map: Each[RangeMap], params: MedianParams, ctx: Context) -> RangeMap:
+    """Median of the valid ranges in a window; invalid pixels stay invalid."""
+    return _measured(median_range(range_map, window=params.window), ctx)
+
+
+class GaussianParams(Params):
+    """Settings of filters.gaussian."""
+
+    window: int = Field(default=5, ge=3, le=15, description="side in pixels, odd")
+    sigma_px: float = Field(default=1.1, gt=0, description="width in pixels (the paper: 1.1)")
+
+
+@stage("filters.gaussian")
+def gaussian(range_map: Each[RangeMap], params: GaussianParams, ctx: Context) -> RangeMap:
+    """Gaussian mean of the valid ranges in a window; invalid pixels stay invalid."""
+    return _measured(gaussian_range(range_map, window=params.window, sigma_px=params.sigma_px), ctx)
+
+
+class SpeckleParams(Params):
+    """Settings of filters.speckle."""
+
+    max_size_px: float = Field(default=60.0, gt=0, description="smaller islands are removed; in pixels at the equator")
+    max_relative_step: float = Field(default=0.03, gt=0, description="neighbours of one surface differ by at most this")
+
+
+@stage("filters.speckle")
+def speckle(range_map: Each[RangeMap], params: SpeckleParams, ctx: Context) -> RangeMap:
+    """Remove small islands that hang in the air."""
+    cleaned = remove_speckles(range_map, max_size_px=params.max_size_px, max_relative_step=params.max_relative_step)
+    return _measured(cleaned, ctx)
+
+
+class ConsistencyParams(Params):
+    """Settings of filters.consistency."""
+
+    max_relative_error: float = Field(default=0.02, gt=0, description="ranges that agree differ by at most this share")
+    max_reprojection_px: float = Field(default=1.0, gt=0, description="forward and back may miss the pixel by this")
+    min_views: int = Field(default=1, ge=1, description="sources that must confirm a pixel")
+    remove_inconsistent: bool = Field(
+        default=False, description="remove what no source confirms and several contradict"
+    )
+    min_contradictions: int = Field(default=2, ge=1, description="sources that must contradict for that")
+
+
+@stage("filters.consistency")
+def consistency(
+    range_map: Each[RangeMap],
+    pose: Each[Pose],
+    sources: Near[RangeMap],
+    source_poses: Near[Pose],
+    params: ConsistencyParams,
+    ctx: Context,
+) -> RangeMap:
+    """Compare each range with those of the neighbours, forward and back: confidence 128–255 where they confirm it."""
+    checked = check_consistency(
+        range_map,
+        pose.cam_from_world,
+        sources,
+        [other.cam_from_world for other in source_poses],
+        **params.model_dump(),
+    )
+    return _measured(checked, ctx)
+
+
+class BilateralSolverParams(Params):
+    """Settings of filters.fast_bilateral_solver."""
+
+    sigma_spatial: float = Field(default=8.0, gt=0, description="spatial cells, in pixels at the equator")
+    sigma_luma: float = Field(default=8.0, gt=0, description="luma bins, in grey levels")
+    sigma_chroma: float = Field(default=8.0, gt=0, description="chroma bins, in grey levels")
+    smoothness: float = Field(
+        default=4.0, gt=0, description="λ: weight of smoothness against a pixel of full confidence"
+    )
+    domain: Literal["range", "inverse"] = Field(default="inverse", description="what is smoothed: range or 1/range")
+    fill: bool = Field(default=True, description="give a range to pixels that had none (confidence 1–63)")
+
+
+@stage("filters.fast_bilateral_solver")
+def bilateral_solver(
+    range_map: Each[RangeMap], image: Each[Panorama], params: BilateralSolverParams, ctx: Context
+) -> RangeMap:
+    """The Fast Bilateral Solver: smooth where the picture is smooth, edges where it has edges."""
+    solved = fast_bilateral_solver(range_map, image.load(), **params.model_dump())
+    return _measured(solved, ctx)
+
+
+def _measured(range_map: RangeMap, ctx: Context) -> RangeMap:
+    ctx.metric("completeness", float(range_map.valid.mean()))
+    ctx.metric("consistent", float((range_map.confidence >= CONSISTENT_CONFIDENCE[0]).mean()))
+    return range_map

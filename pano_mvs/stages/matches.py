@@ -1,0 +1,31 @@
+"""Matchers: which key points of two pictures are the same, and what the pictures' geometry says of it."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from pano_mvs.algorithms.matching.brute_force import match_features
+from pano_mvs.algorithms.two_view.verification import verify_pair
+from pano_mvs.api import Context, Features, Near, Params, TwoView, stage
+
+
+class BruteForceParams(Params):
+    """Settings of matches.brute_force."""
+
+    ratio: float = Field(default=0.8, gt=0, le=1, description="best distance over second best, at most")
+    mutual: bool = Field(default=True, description="only pairs that are each other's best")
+    threshold_deg: float = Field(default=0.2, gt=0, le=10, description="angular Sampson error of a match that agrees")
+    min_inliers: int = Field(default=20, ge=8, description="agreeing matches that a pair needs")
+
+
+@stage("matches.brute_force")
+def brute_force(features: Near[Features], params: BruteForceParams, ctx: Context) -> TwoView:
+    """Match all descriptors (ratio and mutual test), then verify by the spherical 8-point RANSAC."""
+    first, second = features
+    candidates = match_features(first, second, ratio=params.ratio, mutual=params.mutual)
+    two_view = verify_pair(
+        first, second, candidates, rng=ctx.rng, threshold_deg=params.threshold_deg, min_inliers=params.min_inliers
+    )
+    ctx.metric("candidates", len(candidates))
+    ctx.metric("inliers", len(two_view) if two_view else 0)
+    return two_view

@@ -1,0 +1,137 @@
+"""Pose solvers: where the pictures were taken."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from pano_mvs.algorithms.poses.refine import refine_poses
+from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
+from pano_mvs.algorithms.poses.tracks import triangulate_tracks
+from pano_mvs.api import (
+    All,
+    Context,
+    Features,
+    GateError,
+    InputError,
+    InputPath,
+    Names,
+    One,
+    Panorama,
+    Params,
+    Poses,
+    TwoView,
+    stage,
+)
+from pano_mvs.io.names import match_image_names
+from pano_mvs.io.pose_files import read_poses
+
+
+class ScaledTranslationParams(Params):
+    """Settings of poses.scaled_translation."""
+
+    scale_estimator: Literal["cauchy", "log_median", "kappa"] = Field(
+        default="cauchy", description="how translation scale factors are estimated; kappa is the paper's"
+    )
+    kappa: float = Field(default=0.01, gt=0, description="width of the paper's clusters of scale factors")
+
+
+@stage("poses.scaled_translation")
+def scaled_translation(
+    features: All[Features], matches: All[TwoView], params: ScaledTranslationParams, ctx: Context
+) -> Poses:
+    """The paper's solver, chained over the pairs that agree best: two-view poses joined by translation scale factors.
+
+    Pictures that cannot be joined soundly are left out, each with its reason.
+    """
+    poses = solve_scaled_translation(
+        features, matches, scale_estimator=params.scale_estimator, kappa=params.kappa, rng=ctx.rng
+    )
+    return _checked(poses, ctx)
+
+
+class RefineParams(Params):
+    """Settings of poses.refine."""
+
+    loss: Literal["cauchy", "huber"] = Field(default="cauchy", description="robust loss of the angular residuals")
+    loss_scale_deg: float = Field(default=0.05, gt=0, description="residual at which the loss starts to bend")
+    max_error_deg: float = Field(default=0.3, gt=0, description="observations further off are dropped")
+    max_iterations: int = Field(default=50, ge=1, description="of the optimiser, in each round")
+
+
+@stage("poses.refine")
+def refine(poses: One[Poses], params: RefineParams, ctx: Context) -> Poses:
+    """Angular bundle adjustment: all poses and points together, in degrees on the sphere rather than in pixels."""
+    refined = refine_poses(
+        poses,
+        loss=params.loss,
+        loss_scale_deg=params.loss_scale_deg,
+        max_error_deg=params.max_error_deg,
+        max_iterations=params.max_iterations,
+    )
+    return _checked(refined, ctx)
+
+
+class FromModelParams(Params):
+    """Settings of poses.from_model."""
+
+    path: InputPath = Field(description="COLMAP model folder, poses.json, transforms.json or CSV file")
+
+
+@stage("poses.from_model")
+def from_model(images: Names[Panorama], params: FromModelParams, ctx: Context) -> Poses:
+    """Poses that are known already: a COLMAP model, poses.json, nerfstudio's transforms.json, or CSV.
+
+    Image names are compared with and without their folders and extensions.
+    """
+    model = read_poses(params.path)
+    known = match_image_names(images, model.names)
+    if not known:
+        raise InputError(f"{params.path}: none of its {len(model.names)} images is one of this capture (it has "
+                         f"{', '.join(model.names[:3])} …, the capture {', '.join(images[:3])} …)")  # fmt: skip
+    position = {name: idx for idx, name in enumerate(model.names)}
+    poses = Poses.without_points(
+        {name: model.cam_from_world(position[known[name]]) for name in images if name in known},
+        rejected={name: f"{params.path.name} has no pose for it" for name in images if name not in known},
+        frame=model.frame,
+        scale=model.scale,
+        metric=model.metric,
+    )
+    return _checked(poses, ctx)
+
+
+class TriangulateParams(Params):
+    """Settings of poses.triangulate."""
+
+    max_error_deg: float = Field(default=0.3, gt=0, description="observations further off are dropped")
+    min_angle_deg: float = Field(default=1.0, gt=0, description="rays of a point must meet at this angle or more")
+
+
+@stage("poses.triangulate")
+def triangulate(
+    poses: One[Poses], features: All[Features], matches: All[TwoView], params: TriangulateParams, ctx: Context
+) -> Poses:
+    """Sparse points for poses that are kept exactly as they are."""
+    points = triangulate_tracks(
+        poses, features, matches, max_error_deg=params.max_error_deg, min_angle_deg=params.min_angle_deg
+    )
+    return _checked(points, ctx)
+
+
+def _checked(poses: Poses, ctx: Context) -> Poses:
+    """Report what was left out; stop where less than two pictures are left.
+
+    Raises:
+        GateError: if fewer than two pictures are registered: there is nothing to sweep.
+    """
+    for name, reason in poses.rejected.items():
+        ctx.reject(name, reason)
+    registered = len(poses.names)
+    ctx.metric("registered", registered / max(1, registered + len(poses.rejected)))
+    ctx.metric("points", len(poses.points_in_world))
+    if registered < 2:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(poses.rejected.items())[:8])
+        raise GateError("no two panoramas could be registered, so there is no model. Take pictures closer together "
+                        f"(0.5–1 m indoors) with more in common. {reasons}")  # fmt: skip
+    return poses

@@ -1,0 +1,98 @@
+"""Sources: where the panoramas come from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+
+from pydantic import Field
+
+from pano_mvs.api import Context, FilePart, InputError, Panorama, Params, SourceItem, SourcePath, source
+from pano_mvs.io.captures import PictureInfo, describe_picture, list_pictures
+from pano_mvs.scene.image_file import decode_image
+
+_SEPARATOR = "|"
+
+
+class FolderParams(Params):
+    """Settings of source.folder."""
+
+    path: SourcePath = Field(description="folder of the pictures, searched with its subfolders")
+    masks: SourcePath | None = Field(default=None, description="folder of masks <image name>.png; 0 is ignored")
+    mask: SourcePath | None = Field(default=None, description="one mask for all pictures; 0 is ignored")
+    nadir_deg: float = Field(default=0.0, ge=0, le=90, description="ignore so much around straight down (tripod)")
+    zenith_deg: float = Field(default=0.0, ge=0, le=90, description="ignore so much around straight up")
+    max_width: int = Field(default=4096, ge=16, description="wider panoramas are scaled down to this width")
+
+
+def list_folder(params: FolderParams) -> Iterator[SourceItem]:
+    """List the pictures of a folder with their masks.
+
+    Raises:
+        InputError: if the folder does not hold two pictures or more.
+    """
+    pictures = list_pictures(params.path)
+    if len(pictures) < 2:
+        raise InputError(f"{params.path}: holds one picture only ({pictures[0].name}); depth needs two or more "
+                         "panoramas of the same place, taken from different positions")  # fmt: skip
+    for path in pictures:
+        name = path.relative_to(params.path).as_posix()
+        problem = f"{path}: a file name with {_SEPARATOR!r} cannot be used; rename it" if _SEPARATOR in name else ""
+        files = {"image": path}
+        mask = _mask_of(name, params)
+        if mask is not None:
+            files["mask"] = mask
+        yield SourceItem(name, files, problem)
+
+
+@source("source.folder", list_items=list_folder)
+def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
+    """Read the panoramas of a folder and its subfolders.
+
+    A picture is a panorama if its GPano metadata say so (whole or cropped), or if it is twice as wide as high. Masks
+    are looked for as `<masks>/<image name>.png`, then `<masks>/<name without extension>.png`, then `mask`.
+    """
+    path = item.files["image"]
+    info = describe_picture(path)
+    for warning in info.warnings:
+        ctx.note(f"{item.name}: {warning}" if info.gpano is not None else f"pictures have {warning}")
+    _check_decodes(path, info)
+    mask = item.files.get("mask")
+    if mask is not None:
+        decode_image(mask)
+    return Panorama(
+        image=FilePart(path, external=True),
+        size_hw=_working_size(info.size_hw, params.max_width),
+        source_size_hw=info.size_hw,
+        crop_ltwh=info.crop_ltwh,
+        mask_file=None if mask is None else FilePart(mask, external=True),
+        nadir_deg=params.nadir_deg,
+        zenith_deg=params.zenith_deg,
+        up_in_cam=info.gpano.up_in_cam if info.gpano else None,
+        heading_deg=info.gpano.heading_deg if info.gpano else None,
+    )
+
+
+def _check_decodes(path: Path, info: PictureInfo) -> None:
+    """Decode the whole picture once, so that a damaged file is named here and not in the middle of a sweep."""
+    height, width = decode_image(path).shape[:2]
+    if (height, width) != info.file_size_hw:
+        raise InputError(f"{path}: decodes to {width}×{height} px, its header says {info.file_size_hw[::-1]}. "
+                         "Save it anew")  # fmt: skip
+
+
+def _working_size(source_hw: tuple[int, int], max_width: int) -> tuple[int, int]:
+    """Return the size to work at: the width a multiple of four, so that height and half a turn are whole pixels."""
+    width = min(source_hw[1], max_width) // 4 * 4
+    if width < 16:
+        raise InputError(f"a panorama of {source_hw[1]}×{source_hw[0]} px is too small; 16 columns are needed")
+    return width // 2, width
+
+
+def _mask_of(name: str, params: FolderParams) -> Path | None:
+    if params.masks is not None:
+        candidates = (params.masks / f"{name}.png", params.masks / PurePosixPath(name).with_suffix(".png"))
+        for candidate in candidates:
+            if candidate.is_file():
+                return candidate
+    return params.mask
