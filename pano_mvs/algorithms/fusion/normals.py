@@ -1,0 +1,59 @@
+"""Surface normals from a range map's own grid."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import ray_grid
+from pano_mvs.scene import RangeMap
+
+
+def normals_from_range(
+    range_map: RangeMap | NDArray[np.float32], *, radius: int = 2, max_relative_step: float = 0.05
+) -> NDArray[np.float32]:
+    """Return the unit normal of the surface at each pixel, towards the camera.
+
+    A plane that misses the camera's centre is p · X = 1, so on a ray F the inverse range is 1/r = p · F: linear in p.
+    p is the weighted least-squares fit over a window, and −p/|p| the normal. The window is measured on the sphere: it
+    goes over the seam and the poles, and takes every ⌈1/cos φ⌋-th column, so that it stays as wide as it is high.
+    A neighbour k steps away whose inverse range differs by more than k · `max_relative_step` lies on another surface
+    and has no weight; nearer ones have Tukey's biweight of that ratio.
+
+    Args:
+        range_map: a range map, or its ranges (H, W) with even W; NaN is invalid.
+        radius: half the width of the window in pixels at the equator.
+        max_relative_step: largest relative step of the range from one pixel to the next on one surface.
+
+    Returns:
+        (H, W, 3) float32 in the camera frame; NaN where the range is invalid or fewer than 5 pixels of the window are
+        of one surface.
+
+    Raises:
+        UsageError: if the ranges are not (H, W) with even W, or the radius does not fit.
+    """
+    from pano_mvs.algorithms.fusion.kernels_normals import fit_normals  # compiles on import
+
+    ranges = range_map.range if isinstance(range_map, RangeMap) else range_map
+    if ranges.ndim != 2 or ranges.shape[1] % 2 or not 1 <= radius <= ranges.shape[0]:
+        raise UsageError(
+            f"normals need ranges (H, W) with even W and a radius from 1 to H, got {ranges.shape}, {radius}"
+        )
+    height, width = ranges.shape
+    inverse = 1 / ranges.astype(np.float64)
+    normals: NDArray[np.float32] = fit_normals(
+        inverse, ray_grid((height, width)), column_stretch((height, width), radius), radius, max_relative_step
+    )
+    return normals
+
+
+def column_stretch(size_hw: tuple[int, int], radius: int) -> NDArray[np.int64]:
+    """Return for each row how many columns are as wide as a pixel at the equator, (H,) int64.
+
+    Limited so that a window of the given radius goes no more than once around.
+    """
+    height, width = size_hw
+    elevation = np.pi * (0.5 - (np.arange(height) + 0.5) / height)
+    stretch: NDArray[np.int64] = np.rint(1 / np.cos(elevation)).astype(np.int64)
+    return np.clip(stretch, 1, max(1, width // (2 * radius + 1)))
