@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,9 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.names import match_image_names
 from pano_mvs.io.pose_json import PosedView, read_posed_views
+
+# All that zipfile, zlib and the .npy reader raise on damaged files.
+_DAMAGE = (OSError, ValueError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 
 
 @dataclass(frozen=True)
@@ -67,17 +69,14 @@ class Truth:
         if view.range_key is None:
             return None
         try:
-            array = np.asarray(self._archive[view.range_key], dtype=np.float32)
-        except (OSError, ValueError, BadZipFile, EOFError) as error:
+            with zipfile.ZipFile(self.folder / "depth.npz") as archive, archive.open(f"{view.range_key}.npy") as stream:
+                array = np.asarray(np.lib.format.read_array(stream, allow_pickle=False), dtype=np.float32)
+        except _DAMAGE as error:
             raise InputError(f"{self.folder / 'depth.npz'}: the range map of {view.name} cannot be read ({error}). "
                              "Fetch the file again") from error  # fmt: skip
         if array.ndim != 2:
             raise InputError(f"{self.folder / 'depth.npz'}: {view.range_key} has shape {array.shape}, expected (H, W)")
         return np.where(np.isfinite(array) & (array > 0), array, np.float32(np.nan))
-
-    @cached_property
-    def _archive(self) -> Mapping[str, Any]:
-        return open_ranges(self.folder)
 
 
 def read_truth(folder: Path) -> Truth:
@@ -90,24 +89,19 @@ def read_truth(folder: Path) -> Truth:
         InputError: if poses.json is missing or malformed, or depth.npz is damaged.
     """
     posed, metric = read_posed_views(folder / "poses.json")
-    keys = frozenset(open_ranges(folder))
+    keys = _range_keys(folder / "depth.npz")
     return Truth(folder, {view.name: _truth_view(view, keys) for view in posed}, metric)
 
 
-def open_ranges(folder: Path) -> Mapping[str, Any]:
-    """Return the arrays of depth.npz, each read on access; empty if there is no such file.
-
-    Raises:
-        InputError: if the file is damaged.
-    """
-    path = folder / "depth.npz"
+def _range_keys(path: Path) -> frozenset[str]:
+    """Return the names of the arrays in an .npz file; none if there is no such file."""
     if not path.exists():
-        return {}
+        return frozenset()
     try:
-        archive: Mapping[str, Any] = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, BadZipFile, EOFError) as error:
+        with zipfile.ZipFile(path) as archive:
+            return frozenset(name.removesuffix(".npy") for name in archive.namelist())
+    except _DAMAGE as error:
         raise InputError(f"{path}: not a readable .npz file ({error}). Fetch it again") from error
-    return archive
 
 
 def _truth_view(view: PosedView, keys: frozenset[str]) -> TruthView:

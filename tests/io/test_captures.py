@@ -36,7 +36,8 @@ def test_a_folder_under_a_hidden_one_is_not_hidden(tmp_path):
 def test_names_that_differ_only_in_case_or_zeros_keep_one_order():
     names = ["img_1", "IMG_1", "img_01", "img_²"]
     assert len({tuple(map(str, natural_key(name))) for name in names}) == 4
-    assert sorted(names, key=natural_key) == sorted(names[::-1], key=natural_key)
+    backwards = ["img_²", "img_01", "IMG_1", "img_1"]
+    assert sorted(names, key=natural_key) == sorted(backwards, key=natural_key)
 
 
 @pytest.mark.parametrize(("folder", "what"), [("gone", "no such folder"), ("empty", "no pictures here")])

@@ -1,0 +1,120 @@
+"""Poses from a CSV file, from nerfstudio, and from what is neither."""
+
+import json
+
+import numpy as np
+import pytest
+
+from pano_mvs.core.errors import InputError
+from pano_mvs.geometry import Rigid3, quat_wxyz_from_rotation
+from pano_mvs.io.pose_files import read_poses
+from pano_mvs.testing.room import capture_poses
+
+POSES = dict(zip(("a/1.jpg", "a/2.jpg", "a/10.jpg"), capture_poses(3, seed=5), strict=True))
+HEADER = "name,tx,ty,tz,qw,qx,qy,qz"
+
+
+def same(found, expected):
+    found.check()
+    assert found.names == tuple(expected)
+    for idx, pose in enumerate(expected.values()):
+        assert found.rotations[idx] == pytest.approx(pose.rotation, abs=1e-9)
+        assert found.translations[idx] == pytest.approx(pose.translation, abs=1e-9)
+
+
+def csv_line(name, pose, factor=1.0):
+    numbers = [*pose.translation, *(factor * quat_wxyz_from_rotation(pose.rotation))]
+    return ",".join([name, *(repr(float(number)) for number in numbers)])
+
+
+def test_a_csv_file_is_read(tmp_path):
+    lines = [
+        "\ufeff# made by hand",
+        "",
+        HEADER,
+        *(csv_line(name, pose, -3.0) for name, pose in POSES.items()),
+        "# end",
+        " ",
+    ]
+    (tmp_path / "poses.csv").write_text("\n".join(lines), encoding="utf-8")
+    found = read_poses(tmp_path / "poses.csv")
+    same(found, POSES)
+    assert not found.metric
+
+
+def test_a_name_with_a_comma_may_be_quoted(tmp_path):
+    (tmp_path / "poses.csv").write_text(f'{HEADER}\n"a, b.jpg", 1, 2, 3, 1, 0, 0, 0\n')
+    assert read_poses(tmp_path / "poses.csv").names == ("a, b.jpg",)
+
+
+@pytest.mark.parametrize(
+    ("lines", "what"),
+    [
+        ([], ":1: the first line must be name,tx"),
+        (["image,x,y,z"], ":1: the first line must be name,tx"),
+        ([HEADER], ": holds no poses"),
+        ([HEADER, "", "a,1,2,3"], ":3: expected a name and 7 numbers .* got 4 cells"),
+        ([HEADER, "a,1,2,3,1,0,0,zero"], ":2: could not convert"),
+        ([HEADER, "# x", "a,1,2,3,0,0,0,0"], ":3: the pose of a .* quaternion of length 0"),
+        ([HEADER, "a,nan,2,3,1,0,0,0"], ":2: the pose of a has no finite"),
+        ([HEADER, "a,1,2,3,1,0,0,0", "a,1,2,3,1,0,0,0"], ": image 'a' is listed twice"),
+    ],
+)
+def test_a_malformed_csv_is_named_with_its_line(tmp_path, lines, what):
+    (tmp_path / "p.csv").write_text("\n".join(lines))
+    with pytest.raises(InputError, match=rf"p\.csv{what}"):
+        read_poses(tmp_path / "p.csv")
+
+
+def transforms(**more):
+    opengl_from_opencv = np.diag([1.0, -1.0, -1.0, 1.0])
+    frames = []
+    for name, pose in POSES.items():
+        world_from_cam = np.eye(4)
+        world_from_cam[:3, :3], world_from_cam[:3, 3] = pose.inverse().rotation, pose.center
+        frames.append({"file_path": f"./{name}", "transform_matrix": (world_from_cam @ opengl_from_opencv).tolist()})
+    return {"camera_model": "EQUIRECTANGULAR", "w": 64, "h": 32, "frames": frames} | more
+
+
+def test_nerfstudios_transforms_are_read(tmp_path):
+    (tmp_path / "transforms.json").write_text(json.dumps(transforms()))
+    same(read_poses(tmp_path / "transforms.json"), POSES)
+    same(read_poses(tmp_path), POSES)
+
+
+def test_opengl_looks_along_minus_z_with_y_up(tmp_path):
+    """The identity of nerfstudio is a camera that looks along −z of the world, which has y up."""
+    frames = [{"file_path": "a.jpg", "transform_matrix": np.eye(4).tolist()}]
+    (tmp_path / "transforms.json").write_text(json.dumps(transforms(frames=frames)))
+    pose = read_poses(tmp_path).cam_from_world(0)
+    assert pose.apply((0, 0, -1)) == pytest.approx((0, 0, 1))
+    assert pose.apply((0, 1, 0)) == pytest.approx((0, -1, 0))
+    assert isinstance(pose, Rigid3)
+
+
+@pytest.mark.parametrize(
+    ("data", "what"),
+    [
+        ({"frames": {}}, "key 'frames' must be a list"),
+        (transforms(camera_model="OPENCV"), r"frames\[0\] \(a/1\.jpg\): camera_model is OPENCV"),
+        (transforms(frames=[{"file_path": "a", "transform_matrix": [1]}]), r"frames\[0\]: key 'transform_matrix'"),
+        ({"cameras": []}, "neither key 'frames'"),
+        ([], "expected a JSON object, got list"),
+    ],
+)
+def test_malformed_transforms_are_named_with_their_key(tmp_path, data, what):
+    (tmp_path / "t.json").write_text(json.dumps(data))
+    with pytest.raises(InputError, match=rf"t\.json: {what}"):
+        read_poses(tmp_path / "t.json")
+
+
+def test_what_holds_no_poses_is_named(tmp_path):
+    (tmp_path / "broken.json").write_text('{\n "views": [}')
+    (tmp_path / "binary.json").write_bytes(b"\xff\xfe\x00")
+    (tmp_path / "poses.txt").touch()
+    for name, what in (("broken.json", ":2:12: not JSON"), ("binary.json", ": not a text file in UTF-8"),
+                       ("poses.txt", ": poses are read from"), ("gone.csv", ": no such file or folder")):  # fmt: skip
+        with pytest.raises(InputError, match=name.replace(".", r"\.") + what):
+            read_poses(tmp_path / name)
+    with pytest.raises(InputError, match="no poses here"):
+        read_poses(tmp_path)

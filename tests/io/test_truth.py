@@ -1,0 +1,126 @@
+"""Ground truth beside a capture, whole, in part and damaged."""
+
+import hashlib
+import json
+
+import numpy as np
+import pytest
+
+from pano_mvs.core.errors import InputError
+from pano_mvs.geometry import Rigid3
+from pano_mvs.io.pose_files import read_poses
+from pano_mvs.io.truth import read_truth
+from pano_mvs.testing.room import Room, capture_poses, default_room, render, write_capture
+from pano_mvs.testing.surfaces import Ball
+
+SIZE = (16, 32)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("capture")
+    write_capture(folder, default_room(), capture_poses(3), SIZE)
+    return folder
+
+
+def edited(capture, tmp_path, change):
+    """A copy of the truth with poses.json changed."""
+    data = json.loads((capture / "truth" / "poses.json").read_text())
+    change(data)
+    (tmp_path / "poses.json").write_text(json.dumps(data))
+    return tmp_path
+
+
+def test_poses_ranges_and_digests_are_those_of_the_room(capture):
+    truth = read_truth(capture / "truth")
+    assert truth.metric
+    assert list(truth.views) == ["images/000.png", "images/001.png", "images/002.png"]
+    for (name, view), pose in zip(truth.views.items(), capture_poses(3), strict=True):
+        np.testing.assert_array_equal(view.cam_from_world.rotation, pose.rotation)
+        np.testing.assert_array_equal(truth.poses[name].translation, pose.translation)
+        np.testing.assert_array_equal(truth.range_map(view), render(default_room(), pose, SIZE)[1])
+        assert view.sha256 == hashlib.sha256((capture / name).read_bytes()).hexdigest()
+
+
+def test_images_are_found_by_the_names_that_a_capture_gives_them(capture):
+    matched = read_truth(capture / "truth").match(["002.png", "000.jpg", "other.png"])
+    assert {name: view.name for name, view in matched.items()} == {
+        "002.png": "images/002.png",
+        "000.jpg": "images/000.png",
+    }
+
+
+def test_where_there_is_no_surface_the_range_is_nan(tmp_path):
+    room = Room((Ball((0, 0, 3), 1.0, ((1, 1, 1), (1, 1, 1))),))
+    write_capture(tmp_path, room, [Rigid3.identity()], SIZE)
+    assert np.isinf(np.load(tmp_path / "truth" / "depth.npz")["000"]).any()
+    truth = read_truth(tmp_path / "truth")
+    expected = render(room, Rigid3.identity(), SIZE)[1]
+    np.testing.assert_array_equal(truth.range_map(truth.views["images/000.png"]), expected)
+
+
+def test_views_without_ranges_and_ranges_without_views_do_no_harm(capture, tmp_path):
+    folder = edited(capture, tmp_path, lambda data: data["views"].pop())
+    ranges = {"001": np.ones(SIZE, np.float32), "077": np.ones(SIZE, np.float32)}
+    np.savez(folder / "depth.npz", **ranges)
+    truth = read_truth(folder)
+    assert truth.range_map(truth.views["images/000.png"]) is None
+    np.testing.assert_array_equal(truth.range_map(truth.views["images/001.png"]), ranges["001"])
+
+
+def test_without_any_ranges_there_are_poses(capture, tmp_path):
+    truth = read_truth(edited(capture, tmp_path, lambda data: None))
+    assert len(truth.poses) == 3
+    assert {truth.range_map(view) for view in truth.views.values()} == {None}
+
+
+def test_ranges_are_found_by_the_views_number(capture, tmp_path):
+    folder = edited(capture, tmp_path, lambda data: data["views"][1].update(image="images/lobby.png"))
+    np.savez(folder / "depth.npz", **{"001": np.full(SIZE, 2, np.float32)})
+    truth = read_truth(folder)
+    assert truth.views["images/lobby.png"].range_key == "001"
+
+
+def test_damaged_ranges_are_named(capture, tmp_path):
+    folder = edited(capture, tmp_path, lambda data: None)
+    (folder / "depth.npz").write_bytes(b"PK\x03\x04 this is no archive")
+    with pytest.raises(InputError, match=r"depth\.npz: not a readable \.npz file"):
+        read_truth(folder)
+    whole = (capture / "truth" / "depth.npz").read_bytes()
+    (folder / "depth.npz").write_bytes(whole[:300] + bytes(100) + whole[400:])
+    truth = read_truth(folder)
+    with pytest.raises(InputError, match=r"depth\.npz: the range map of images/000\.png cannot be read"):
+        truth.range_map(truth.views["images/000.png"])
+    np.savez(folder / "depth.npz", **{"000": np.zeros(3, np.float32)})
+    truth = read_truth(folder)
+    with pytest.raises(InputError, match=r"000 has shape \(3,\)"):
+        truth.range_map(truth.views["images/000.png"])
+
+
+def test_the_same_file_gives_known_poses(capture):
+    poses = read_poses(capture / "truth" / "poses.json")
+    poses.check()
+    assert poses.metric
+    assert poses.names == ("images/000.png", "images/001.png", "images/002.png")
+    np.testing.assert_array_equal(poses.rotations[2], capture_poses(3)[2].rotation)
+    assert read_poses(capture).names == poses.names
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        (lambda data: data.update(views=3), "key 'views' must be a list"),
+        (lambda data: data.update(views=[]), "holds no poses"),
+        (lambda data: data["views"].insert(1, 5), r"views\[1\]: expected an object, got int"),
+        (lambda data: data["views"][1].pop("image"), r"views\[1\]: key 'image' must be the picture's name"),
+        (lambda data: data["views"][1].update(R=[[1, 0], [0, 1]]), r"views\[1\]: key 'R' must hold 3 × 3 numbers"),
+        (lambda data: data["views"][2].update(t=["a", 0, 0]), r"views\[2\]: key 't' must hold 3 numbers"),
+        (lambda data: data["views"][0].update(R=[[2, 0, 0], [0, 1, 0], [0, 0, 1]]), r"views\[0\] .*not orthonormal"),
+        (lambda data: data["views"][0].update(R=[[-1, 0, 0], [0, 1, 0], [0, 0, 1]]), r"views\[0\] .*mirrors"),
+        (lambda data: data["views"][0].update(t=[float("nan"), 0, 0]), r"views\[0\] .*NaN"),
+        (lambda data: data["views"][0].update(image="images/001.png"), "'images/001.png' is listed twice"),
+    ],
+)
+def test_a_malformed_entry_is_named_with_its_key(capture, tmp_path, change, what):
+    with pytest.raises(InputError, match=rf"poses\.json: .*{what}"):
+        read_truth(edited(capture, tmp_path, change))
