@@ -32,6 +32,8 @@ def fit_plane(inverse, rays, row, column, stretch, radius, max_step, a, b):  # t
     `a` (6,) and `b` (3,) are scratch space.
     """
     height, width = inverse.shape
+    # prange counts in unsigned integers, and unsigned plus signed would be a float.
+    row, column = np.int64(row), np.int64(column)
     center = inverse[row, column]
     a[:] = 0.0
     b[:] = 0.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.filters.sphere_steps import columns_per_step
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import ray_grid
 from pano_mvs.scene import RangeMap
@@ -42,18 +43,6 @@ def normals_from_range(
         )
     height, width = ranges.shape
     inverse = 1 / ranges.astype(np.float64)
-    normals: NDArray[np.float32] = fit_normals(
-        inverse, ray_grid((height, width)), column_stretch((height, width), radius), radius, max_relative_step
-    )
+    stretches = columns_per_step((height, width), steps=2 * radius + 1)
+    normals: NDArray[np.float32] = fit_normals(inverse, ray_grid((height, width)), stretches, radius, max_relative_step)
     return normals
-
-
-def column_stretch(size_hw: tuple[int, int], radius: int) -> NDArray[np.int64]:
-    """Return for each row how many columns are as wide as a pixel at the equator, (H,) int64.
-
-    Limited so that a window of the given radius goes no more than once around.
-    """
-    height, width = size_hw
-    elevation = np.pi * (0.5 - (np.arange(height) + 0.5) / height)
-    stretch: NDArray[np.int64] = np.rint(1 / np.cos(elevation)).astype(np.int64)
-    return np.clip(stretch, 1, max(1, width // (2 * radius + 1)))

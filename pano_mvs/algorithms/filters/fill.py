@@ -1,0 +1,55 @@
+"""Fill holes of a range map from trusted pixels around them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pano_mvs.algorithms.filters.sphere_steps import columns_per_step
+from pano_mvs.core.errors import UsageError
+from pano_mvs.scene import RangeMap
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE
+
+# Neighbours whose inverse range is larger than this times the background's belong to an occluder.
+_MAX_RATIO = 1.25
+
+
+def fill_from_neighbours(
+    range_map: RangeMap, *, max_distance_px: int = 48, min_confidence: int = CONSISTENT_CONFIDENCE[0]
+) -> RangeMap:
+    """Return a range map whose invalid pixels have the range of the surface behind them.
+
+    From each invalid pixel eight paths run over the sphere (over the seam, over the poles, as wide as high) to the
+    first pixel that is trusted. A hole beside an edge is mostly what the nearer surface hides from the other views, so
+    it belongs to the farther one: the second largest of the ranges found counts as background (Hirschmüller, "Stereo
+    processing by semiglobal matching and mutual information", 2008, section 2.5.4), and nearer ones than that by over
+    a quarter are left out. The others' inverse ranges are averaged with weights 1 / distance, which is linear
+    interpolation, exact on a plane, between two opposite ones. Filled pixels serve no other pixel.
+
+    Args:
+        range_map: (H, W) with even W, the full sphere.
+        max_distance_px: how far a path runs, in pixels at the equator.
+        min_confidence: trusted pixels have at least this confidence; 128 is consistent.
+
+    Returns:
+        The range map; filled pixels have confidence 63, when next to a trusted pixel, down to 1.
+
+    Raises:
+        UsageError: if max_distance_px is not positive or larger than the height.
+    """
+    height, width = range_map.range.shape
+    if not 1 <= max_distance_px <= height:
+        raise UsageError(f"max_distance_px must lie between 1 and the height {height}, got {max_distance_px}")
+    from pano_mvs.algorithms.filters.kernels_fill import fill_holes  # compiles on import
+
+    wanted = ~range_map.valid
+    trusted = range_map.valid & (range_map.confidence >= min_confidence)
+    known = 1 / range_map.range.astype(np.float64)
+    columns = columns_per_step((height, width), steps=8)
+    inverse, distance = fill_holes(known, wanted, trusted, columns, max_distance_px, _MAX_RATIO)
+    filled = distance > 0
+    ranges, confidence = range_map.range.copy(), range_map.confidence.copy()
+    ranges[filled] = 1 / inverse[filled]
+    low, high = FILLED_CONFIDENCE
+    share = np.clip((distance[filled] - 1) / max_distance_px, 0, 1)
+    confidence[filled] = np.rint(high - (high - low) * share)
+    return RangeMap(ranges, confidence)
