@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 import time
 import traceback
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 
 from pano_mvs.core.digest import digest_from_value
-from pano_mvs.core.errors import GateError, PanoMvsError, StoreError
+from pano_mvs.core.errors import GateError, InputError, PanoMvsError, StoreError
 from pano_mvs.engine.blobs import DamagedBlobError
 from pano_mvs.engine.events import Failure, Observer, RunResult, Silent, StageSummary
 from pano_mvs.engine.execute import execute_unit
@@ -21,7 +22,8 @@ from pano_mvs.engine.wiring import Graph
 from pano_mvs.engine.workflow import StageEntry, Workflow
 from pano_mvs.scene import Axis, Files, Record
 
-_HEALING_ROUNDS = 5
+_HEALING_ROUNDS = 3
+_SHOWN_CAUSES = 10
 
 
 def workflow_id(workflow: Workflow) -> str:
@@ -100,14 +102,17 @@ class Run:
 
     def _execute_healing(self) -> None:
         """Run; where a cached blob turns out damaged, it has been removed: start over, which recomputes only it."""
-        for _ in range(_HEALING_ROUNDS):
+        found: Counter[str] = Counter()
+        while True:
             try:
                 self._execute_once()
                 return
             except DamagedBlobError as error:
+                found[str(error)] += 1
+                if found[str(error)] > _HEALING_ROUNDS:
+                    raise StoreError(f"{error} again and again: check the disk, or choose another cache with "
+                                     "--cache DIR")  from error  # fmt: skip
                 self._warn(f"{error}; computing it again")
-        raise StoreError(f"cache {self.store.root} is damaged again and again: check the disk, or choose another with "
-                         "--cache DIR")  # fmt: skip
 
     def _execute_once(self) -> None:
         self.result.stages.clear()
@@ -141,7 +146,15 @@ class Run:
         self._sum_up(entry, {item: record for item, record in records.items() if record is not None}, summary)
         summary.seconds = time.perf_counter() - started
         self.observer.stage_finished(summary)
+        self._require_items(entry, state)
         self._check_gates(entry, summary)
+
+    def _require_items(self, entry: StageEntry, state: StageState) -> None:
+        """Stop where a source has nothing to offer: the rest cannot go on."""
+        if entry.spec.list_items is not None and not state.items:
+            causes = [failure.cause for failure in self.result.failures if failure.stage == entry.name]
+            shown = "".join(f"\n  {cause}" for cause in causes[:_SHOWN_CAUSES])
+            raise InputError(f"{entry.name}: none of the {len(state.members)} items can be used{shown}")
 
     def _note_blocked(self, entry: StageEntry, resolution: Resolution, summary: StageSummary) -> None:
         is_source = entry.spec.list_items is not None

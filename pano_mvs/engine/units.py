@@ -20,6 +20,9 @@ KEY_SCHEMA = 1
 WHOLE = ""
 """The name of the one unit of a stage that has no fan-out."""
 
+PENDING = ItemRef("", "", {})
+"""Stands for an item of which only the name is known."""
+
 UnitInput: TypeAlias = "ItemRef | dict[str, ItemRef] | None"
 
 
@@ -221,6 +224,12 @@ class _Resolver:
                 wanted = (name,)
             case Cardinality.NEAR:
                 wanted = self._near(name)
+            case Cardinality.NAMES if not state.open and not edge.exploded:
+                # A plan takes pending units for ones that will succeed: their names are known, their values are not.
+                names = [item for item in state.members if item in items or item in state.pending]
+                return ({item: items.get(item, PENDING) for item in names}, "", False) if names else (
+                    None, self._why(edge, state, ""), False
+                )  # fmt: skip
             case Cardinality.ALL | Cardinality.NAMES:
                 if state.open or state.pending:
                     return None, "", True

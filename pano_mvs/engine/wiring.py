@@ -55,7 +55,7 @@ def wire(workflow: Workflow) -> Graph:
     edges = {name: wirer.connect(entry) for name, entry in workflow.stages.items()}
     order = wirer.sort(edges)
     axes: dict[str, Axis] = {}
-    for name in order:
+    for name in order if not wirer.problems else ():
         axes[name] = wirer.axis(workflow.stages[name], edges[name], axes)
     if wirer.problems:
         raise WorkflowError(wirer.problems)

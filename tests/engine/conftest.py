@@ -1,0 +1,76 @@
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from pano_mvs.cli.session import Session, open_session
+from pano_mvs.engine.events import RunResult
+from pano_mvs.engine.plan import StagePlan, make_plan
+from pano_mvs.engine.run import Run, workflow_id
+from pano_mvs.engine.store import Store
+from tests.engine.toy import HELPER, PLUGIN, WORKFLOW
+
+
+@dataclass
+class Toy:
+    """A toy capture in a folder, with shortcuts to run it."""
+
+    folder: Path
+
+    def number(self, name: str, text: str) -> None:
+        path = self.folder / "capture" / name
+        path.write_text(text)
+        settle(path)
+
+    def session(self, *overrides: str, cache: Path | None = None) -> Session:
+        return open_session(
+            str(self.folder / "wf.yaml"),
+            overrides=overrides,
+            cache=cache or self.folder / "cache",
+            out=self.folder / "out",
+        )
+
+    def run(self, *overrides: str, earlier: dict[str, str] | None = None, cache: Path | None = None) -> RunResult:
+        session = self.session(*overrides, cache=cache)
+        run = Run(session.workflow, session.graph, Store(session.store_root), session.out)
+        return run.execute(earlier_files=earlier)
+
+    def plan(self, *overrides: str) -> dict[str, StagePlan]:
+        session = self.session(*overrides)
+        plans = make_plan(session.workflow, session.graph, Store(session.store_root), workflow_id(session.workflow))
+        return {plan.name: plan for plan in plans}
+
+    def edit(self, name: str, change: Callable[[str], str]) -> None:
+        path = self.folder / name
+        path.write_text(change(path.read_text()))
+
+    def deliverables(self) -> dict[str, bytes]:
+        out = self.folder / "out"
+        return {p.relative_to(out).as_posix(): p.read_bytes() for p in sorted(out.rglob("*")) if p.is_file()}
+
+
+def settle(path: Path) -> None:
+    """Make a file old enough for its digest to be remembered by its time stamp."""
+    past = time.time() - 60
+    os.utime(path, (past, past))
+
+
+def ran(result: RunResult) -> dict[str, int]:
+    return {stage.name: stage.run for stage in result.stages if stage.run}
+
+
+@pytest.fixture
+def toy(tmp_path: Path) -> Toy:
+    (tmp_path / "capture").mkdir()
+    (tmp_path / "plug.py").write_text(PLUGIN)
+    (tmp_path / "helper.py").write_text(HELPER)
+    (tmp_path / "wf.yaml").write_text(WORKFLOW)
+    made = Toy(tmp_path)
+    for number in range(1, 6):
+        made.number(f"{number}.txt", str(10 * number))
+    return made
