@@ -1,0 +1,83 @@
+"""Numbers as people read them, and the tables of scores."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+
+def share(value: Any) -> str:
+    """Return a fraction as a percentage, never rounded up to 100 %."""
+    if not _is_number(value):
+        return "–"
+    percent = 100 * float(value)
+    if 0 < percent < 0.05:
+        return "< 0.1 %"
+    digits = 0 if 10 <= percent < 99 or percent in (0, 100) else 1
+    return f"{min(percent, 99.9) if percent < 100 else percent:.{digits}f} %"
+
+
+def duration(seconds: Any) -> str:
+    """Return seconds as `0.4 s`, `12 s`, `3 min 05 s` or `2 h 07 min`."""
+    if not _is_number(seconds):
+        return "–"
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+def figure(value: Any) -> str:
+    """Return a value with four significant digits, thousands apart."""
+    if isinstance(value, bool) or value is None:
+        return {True: "yes", False: "no", None: "–"}[value]
+    if isinstance(value, int):
+        return f"{value:,}".replace(",", "\u202f")
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            return "–"
+        return figure(round(value)) if abs(value) >= 1000 else f"{value:.4g}"
+    if isinstance(value, list | tuple):
+        return ", ".join(figure(item) for item in value)
+    if isinstance(value, Mapping):
+        return ", ".join(f"{words(str(key))} {figure(item)}" for key, item in value.items())
+    return str(value)
+
+
+def words(name: str) -> str:
+    """Return the name of a figure in words: `median_pair_error_deg` is `median pair error °`."""
+    units = {"deg": "°", "rad": "rad", "px": "px", "s": "s", "db": "dB"}
+    *parts, last = name.split("_")
+    return " ".join([*parts, units.get(last, last)]) if parts else name
+
+
+def score_tables(scores: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the scores of the poses as rows, and those of the views as a table with one column for each metric."""
+    views = scores.get("views") or {}
+    columns = list(dict.fromkeys(metric for values in views.values() for metric in values))
+    rows = [(name, [values.get(metric) for metric in columns]) for name, values in views.items()]
+    return {
+        "poses": list((scores.get("poses") or {}).items()),
+        "columns": columns,
+        "views": rows,
+        "median": [median([row[1][idx] for row in rows]) for idx in range(len(columns))] if len(rows) > 1 else [],
+        "notes": list(scores.get("notes") or []),
+    }
+
+
+def median(values: list[Any]) -> float | None:
+    """Return the median of those values that are finite numbers, or None."""
+    numbers = sorted(float(value) for value in values if _is_number(value))
+    if not numbers:
+        return None
+    middle = len(numbers) // 2
+    return numbers[middle] if len(numbers) % 2 else (numbers[middle - 1] + numbers[middle]) / 2
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
