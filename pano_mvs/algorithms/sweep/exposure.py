@@ -1,0 +1,112 @@
+"""Match the exposure of source pictures to the reference, from what both see."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_grid, sample_panorama
+
+_ROUNDS = 10
+_FEWEST_PIXELS = 50
+# No camera's exposures differ by more; a fit that says so has met moved things or bare walls.
+_GAIN_LIMITS = 0.4, 2.5
+
+
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """reference ≈ gain · source + offset.
+
+    Attributes:
+        gain: (C,) float64 for each colour.
+        offset: (C,) float64 in grey levels.
+    """
+
+    gain: NDArray[np.float64]
+    offset: NDArray[np.float64]
+
+    def apply(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the picture as the reference's exposure would have shown it, (H, W, C)."""
+        return np.asarray(np.clip(np.rint(picture * self.gain + self.offset), 0, 255), dtype=np.uint8)
+
+
+def match_exposure(
+    reference: NDArray[np.uint8],
+    source: NDArray[np.uint8],
+    source_from_reference: Rigid3,
+    ranges: NDArray[np.float32],
+    *,
+    source_mask: NDArray[np.bool_] | None = None,
+) -> Exposure:
+    """Return the exposure of a source against the reference, robustly, from pixels whose range is known roughly.
+
+    Geman–McClure weights on a straight line through (source, reference) colours for each channel: occluded and wrong
+    pixels drop out. Too few pixels, or a fit beyond reason, leave the channel as it is.
+
+    Args:
+        reference: (H, W, C) uint8.
+        source: (Hs, Ws, C) uint8.
+        source_from_reference: pose.
+        ranges: (h, w) rough ranges of the reference, at any resolution; NaN is left out.
+        source_mask: (Hs, Ws) False is left out.
+    """
+    rays = ray_grid((ranges.shape[0], ranges.shape[1]))
+    known = np.isfinite(ranges)
+    rays, known_ranges = rays[known], ranges[known].astype(np.float64)
+    pixels = pixel_from_ray(source_from_reference.apply(rays * known_ranges[:, None]), source.shape[:2])
+    seen = sample_panorama(source, pixels)
+    wanted = sample_panorama(reference, pixel_from_ray(rays, reference.shape[:2]))
+    usable = ((seen > 3) & (seen < 252) & (wanted > 3) & (wanted < 252)).all(axis=-1)
+    if source_mask is not None:
+        usable &= sample_panorama(source_mask, pixels) > 0.999
+    lines = [_robust_line(seen[usable, c], wanted[usable, c]) for c in range(seen.shape[-1])]
+    return Exposure(np.array([gain for gain, _ in lines]), np.array([offset for _, offset in lines]))
+
+
+def _robust_line(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the slope and the intercept of y over x; (1, 0) where they cannot be known."""
+    if len(x) < _FEWEST_PIXELS or np.std(x) < 1:
+        return 1.0, 0.0
+    gain, offset = float(np.std(y) / np.std(x)), 0.0
+    offset = float(np.median(y - gain * x))
+    for _ in range(_ROUNDS):
+        residual = y - gain * x - offset
+        spread = 1.4826 * float(np.median(np.abs(residual))) + 0.5
+        weight = 1 / (1 + (residual / (2 * spread)) ** 2) ** 2
+        mean_x, mean_y = np.average(x, weights=weight), np.average(y, weights=weight)
+        variance = float(np.sum(weight * (x - mean_x) ** 2))
+        if variance < 1e-6 * len(x):
+            return 1.0, 0.0
+        gain = float(np.sum(weight * (x - mean_x) * (y - mean_y))) / variance
+        offset = float(mean_y - gain * mean_x)
+    if not _GAIN_LIMITS[0] < gain < _GAIN_LIMITS[1]:
+        return 1.0, 0.0
+    return gain, offset
+
+
+def shrink(picture: NDArray[np.uint8], rows: int) -> NDArray[np.uint8]:
+    """Return a picture of at most `rows` rows, made smaller by a whole factor by averaging; (H, W, C)."""
+    height, width, channels = picture.shape
+    factor = max(1, height // rows)
+    while height % factor or width % (2 * factor):
+        factor -= 1
+    blocks = picture.reshape(height // factor, factor, width // factor, factor, channels)
+    return np.asarray(np.rint(blocks.mean(axis=(1, 3))), dtype=np.uint8)
+
+
+def match_all(
+    reference: NDArray[np.uint8],
+    sources: Sequence[NDArray[np.uint8]],
+    source_from_reference: Sequence[Rigid3],
+    ranges: NDArray[np.float32],
+    masks: Sequence[NDArray[np.bool_]] | None,
+) -> list[NDArray[np.uint8]]:
+    """Return all sources in the reference's exposure."""
+    matched = []
+    for idx, (source, pose) in enumerate(zip(sources, source_from_reference, strict=True)):
+        mask = None if masks is None else masks[idx]
+        matched.append(match_exposure(reference, source, pose, ranges, source_mask=mask).apply(source))
+    return matched

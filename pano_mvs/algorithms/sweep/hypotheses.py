@@ -1,0 +1,76 @@
+"""Which virtual ranges a sweep tries."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pano_mvs.core.errors import UsageError
+
+Spacing = Literal["inverse", "log", "uniform"]
+
+# What no sparse point shows: bare surfaces are nearer and farther than the textured ones.
+_NEAR_MARGIN, _FAR_MARGIN = 0.5, 1.5
+# Without points: nothing is nearer than this share of the longest baseline …
+_NEAREST_BASELINES = 0.3
+# … and a point this much parallax away from infinity cannot be told from it.
+_LEAST_PARALLAX_PX = 0.5
+
+
+def virtual_ranges(near: float, far: float, *, planes: int, spacing: Spacing) -> NDArray[np.float64]:
+    """Return the virtual ranges from near to far, (D,), ascending, in the unit of near and far."""
+    return range_at(np.arange(planes), near, far, planes=planes, spacing=spacing)
+
+
+def range_at(positions: ArrayLike, near: float, far: float, *, planes: int, spacing: Spacing) -> NDArray[np.float64]:
+    """Return the range at positions between the planes (0 is near, planes − 1 is far); any shape.
+
+    With s = position / (planes − 1): 1/range = (1 − s)/near + s/far for "inverse", the same in log range or in range
+    for the others.
+
+    Raises:
+        UsageError: unless 0 < near < far, both finite.
+    """
+    if not (0 < near < far and np.isfinite(far)):
+        raise UsageError(f"virtual ranges need 0 < near < far, got near {near} and far {far}")
+    share = np.asarray(positions, dtype=np.float64) / (planes - 1)
+    result: NDArray[np.float64]
+    if spacing == "inverse":
+        result = 1 / ((1 - share) / near + share / far)
+    elif spacing == "log":
+        result = near * (far / near) ** share
+    else:
+        result = near + (far - near) * share
+    return result
+
+
+def range_limits(
+    baselines: Sequence[float], *, width: int, near: float | None = None, far: float | None = None
+) -> tuple[float, float]:
+    """Return the nearest and the farthest range that a sweep should try.
+
+    Args:
+        baselines: distances from the reference to its sources, in scene units; at least one positive.
+        width: columns of the reference picture: one pixel at the equator is 2π/width.
+        near: the range of the reference's nearest sparse points, or None where there are too few.
+        far: likewise of its farthest.
+
+    Returns:
+        (near, far). With sparse points the limits go half as near and half as far again; a limit that no point gives
+        is 0.3 of the longest baseline b, and the range b / (½ px) at which parallax falls under half a pixel. Farther
+        than the latter the pictures cannot tell, so no limit lies there unless a point does.
+
+    Raises:
+        UsageError: if no baseline is positive.
+    """
+    longest = max(baselines, default=0.0)
+    if not (longest > 0 and np.isfinite(longest)):
+        raise UsageError("a sweep needs a source at some distance from the reference: all baselines are zero")
+    unseen = longest / (_LEAST_PARALLAX_PX * 2 * np.pi / width)
+    lower = _NEAREST_BASELINES * longest if near is None else _NEAR_MARGIN * near
+    upper = unseen if far is None else min(_FAR_MARGIN * far, max(unseen, far))
+    lower = min(lower, upper / 2)
+    return float(lower), float(upper)

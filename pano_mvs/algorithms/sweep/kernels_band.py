@@ -1,0 +1,177 @@
+"""Compiled: all planes of one band of rows, from packed sources to costs."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from pano_mvs.algorithms.sweep.kernels_cost import box_rows, census_row, combine_row, difference_row
+from pano_mvs.algorithms.sweep.kernels_warp import blend_row, gather_row, project_row, wrap_row
+from pano_mvs.algorithms.sweep.kernels_winner import update_winner
+
+_F = np.float32
+_U = np.uint64
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def warp_band(  # type: ignore[no-untyped-def]
+    first, height, sin_cos_azimuth, pose, virtual_range, packed, starts, shape, valid, valid_start, pad, warped, votes
+):
+    """Look up the rows `first` … of the reference, at one virtual range, in one source.
+
+    Rows before the first or after the last one of the picture lie beyond a pole: elevations over 90° turn the ray
+    around by themselves.
+
+    Args:
+        first: the first row, may be negative.
+        height: rows of the reference picture.
+        sin_cos_azimuth: (2, W) float32.
+        pose: (3, 4) float64 source_from_reference.
+        virtual_range: in scene units.
+        packed: (·,) uint32 the packed planes of all sources, see `pack_plane`.
+        starts: (C,) int64 where the planes of this source begin.
+        shape: (2,) int64 of the source picture.
+        valid: (·,) uint8 like a packed plane: whether a patch may vote; empty if all may.
+        valid_start: where this source's begins.
+        pad: width of the wrapped margin of the result.
+        warped: (C, rows, W + 2 pad) uint8, written.
+        votes: (rows, W) uint8, written unless `valid` is empty.
+    """
+    channels, rows = warped.shape[:2]
+    width = sin_cos_azimuth.shape[1]
+    index = np.empty(width, np.int32)
+    weight_x = np.empty(width, np.float32)
+    weight_y = np.empty(width, np.float32)
+    patches = np.empty(width, np.uint32)
+    matrix = np.empty((3, 2), np.float32)
+    offset = np.empty(3, np.float32)
+    for j in range(rows):
+        elevation = np.pi * (0.5 - (first + j + 0.5) / height)
+        level, dip = np.cos(elevation), -np.sin(elevation)
+        for a in range(3):
+            matrix[a, 0] = _F(level * pose[a, 0])
+            matrix[a, 1] = _F(level * pose[a, 2])
+            offset[a] = _F(dip * pose[a, 1] + pose[a, 3] / virtual_range)
+        project_row(sin_cos_azimuth, matrix, offset, shape, index, weight_x, weight_y)
+        for c in range(channels):
+            gather_row(packed, starts[c], index, patches)
+            blend_row(patches, weight_x, weight_y, warped[c, j], pad)
+            wrap_row(warped[c, j], width, pad)
+        if len(valid):
+            row = _U(j)
+            for i in range(_U(width)):
+                votes[row, i] = valid[_U(valid_start) + _U(index[i])]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def source_cost(  # type: ignore[no-untyped-def]
+    first, reference, warped, offsets, reach, compare_radius, box_radius, pad, pixel_costs, scratch, means
+):
+    """Compare a band of the reference with a warped source and average over the box.
+
+    Args:
+        first: the first row of the band.
+        reference: (C, H + 2 pad, W + 2 pad) uint8, padded over seam and poles.
+        warped: (C, rows + 2 (compare_radius + box_radius), W + 2 pad) uint8.
+        offsets: (H, window) int64 columns of the census window; (H, 1) for differences.
+        reach: (H,) int64 columns of the box on either side.
+        compare_radius: 0 for differences.
+        box_radius: rows of the box on either side.
+        pad: the margin.
+        pixel_costs: (rows + 2 box_radius, W + 2 pad) uint16, scratch.
+        scratch: (2, W + 2 pad) int32.
+        means: (rows, W) float32, written.
+    """
+    rows, width = means.shape
+    height = offsets.shape[0]
+    disagree = np.empty(width, np.uint8)
+    total = np.empty(width, np.uint16)
+    for j in range(rows + 2 * box_radius):
+        y = first - box_radius + j
+        if compare_radius > 0:
+            mirrored = -1 - y if y < 0 else (2 * height - 1 - y if y >= height else y)
+            census_row(reference[0], y + pad, warped[0], j + compare_radius, offsets[mirrored], pad, disagree)
+            for i in range(_U(width)):
+                total[i] = np.uint16(disagree[i])
+        else:
+            total[:] = 0
+            for c in range(reference.shape[0]):
+                difference_row(reference[c], y + pad, warped[c], j, pad, total)
+        pixel_costs[j, pad : pad + width] = total
+        wrap_row(pixel_costs[j], width, pad)
+    if box_radius:
+        box_rows(pixel_costs, reach[first : first + rows], box_radius, pad, scratch[0], scratch[1], means)
+        return
+    for j in range(_U(rows)):
+        for i in range(_U(width)):
+            means[j, i] = _F(pixel_costs[j, _U(pad) + i])
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def store_row(costs, scale, voxels):  # type: ignore[no-untyped-def]
+    """Bring costs to the scale of the volume, 0 to 255, rounded; (W,) float32 to (W,) uint8."""
+    for i in range(_U(costs.shape[0])):
+        scaled = costs[i] * scale + _F(0.5)
+        voxels[i] = np.uint8(np.int32(scaled if scaled < _F(255) else _F(255)))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def sweep_band(  # type: ignore[no-untyped-def]
+    first, reference, sin_cos_azimuth, poses, ranges, packed, starts, shapes, valid, valid_starts,
+    offsets, reach, compare_radius, box_radius, pad, best_half, scale, neutral, volume, state, planes,
+):  # fmt: skip
+    """Compute the costs of one band at all virtual ranges, into the volume or straight into the winners.
+
+    Args:
+        first: the first row of the band; it has as many rows as `planes`.
+        reference: (C, H + 2 pad, W + 2 pad) uint8.
+        sin_cos_azimuth: (2, W) float32.
+        poses: (S, 3, 4) float64 source_from_reference.
+        ranges: (D,) float64.
+        packed: (·,) uint32, all sources.
+        starts: (S, C) int64.
+        shapes: (S, 2) int64.
+        valid: (·,) uint8, or empty.
+        valid_starts: (S,) int64.
+        offsets: (H, window) int64.
+        reach: (H,) int64.
+        compare_radius: of the census window, 0 for differences.
+        box_radius: of the box.
+        pad: the margin, wider than every window reaches.
+        best_half: see `combine_row`.
+        scale: float32 from mean costs to the volume's.
+        neutral: float32 mean cost where no source votes.
+        volume: (H, D, W) uint8, written; empty if the winner is wanted at once.
+        state: (STATES, rows, W) float32, infinite; see `update_winner`.
+        planes: (rows, W) int32, written if the volume is empty.
+    """
+    rows, width = planes.shape
+    sources, channels = starts.shape
+    halo = compare_radius + box_radius
+    warped = np.empty((channels, rows + 2 * halo, width + 2 * pad), np.uint8)
+    votes = np.empty((rows + 2 * halo, width), np.uint8)
+    pixel_costs = np.empty((rows + 2 * box_radius, width + 2 * pad), np.uint16)
+    scratch = np.empty((2, width + 2 * pad), np.int32)
+    costs = np.empty((sources, rows, width), np.float32)
+    combined = np.empty(width, np.float32)
+    for d in range(len(ranges)):
+        for s in range(sources):
+            warp_band(
+                first - halo, offsets.shape[0], sin_cos_azimuth, poses[s], ranges[d], packed, starts[s], shapes[s],
+                valid, valid_starts[s], pad, warped, votes,
+            )  # fmt: skip
+            source_cost(
+                first, reference, warped, offsets, reach, compare_radius, box_radius, pad, pixel_costs, scratch,
+                costs[s],
+            )  # fmt: skip
+            if len(valid):
+                for j in range(rows):
+                    for i in range(width):
+                        if votes[j + halo, i] == 0:
+                            costs[s, j, i] = np.inf
+        for j in range(rows):
+            combine_row(costs, j, best_half, len(valid) == 0, neutral, combined)
+            if len(volume):
+                store_row(combined, scale, volume[first + j, d])
+            else:
+                update_winner(combined, d, state, j, planes)

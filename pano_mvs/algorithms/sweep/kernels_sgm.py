@@ -1,0 +1,139 @@
+"""Compiled: semi-global matching on the sphere, one path direction and one strip or row at a time.
+
+H. Hirschmüller, "Stereo processing by semiglobal matching and mutual information", TPAMI 2008, equation 13:
+L(p, d) = C(p, d) + min(L(q, d), L(q, d ± 1) + P1, min L(q) + P2) − min L(q), q the pixel before p on the path.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+_U = np.uint64
+_H = np.uint16
+_OUTSIDE = np.uint16(60000)  # the cost of the planes before the first and after the last; P1 on top must not overflow
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _step(  # type: ignore[no-untyped-def]
+    volume, total, place, segment, penalties, p1, before, least_before, after, least, keep
+):
+    """Advance the lines of one segment by one row: `place` (row, column), `segment` (first line, lines)."""
+    row, column = _U(place[0]), _U(place[1])
+    first, lines = _U(segment[0]), _U(segment[1])
+    for d in range(_U(volume.shape[1])):
+        for k in range(lines):
+            line = first + k
+            floor = least_before[line]
+            stay = before[d + _U(1), line]
+            down, up = _H(before[d, line] + p1), _H(before[d + _U(2), line] + p1)
+            near = down if down < up else up
+            jump = _H(floor + penalties[row, column + k])
+            near = near if near < jump else jump
+            near = stay if stay < near else near
+            value = _H(_H(near - floor) + _H(volume[row, d, column + k]))
+            after[d + _U(1), line] = value
+            least[line] = value if value < least[line] else least[line]
+        if keep:
+            for k in range(lines):
+                total[row, d, column + k] = _H(total[row, d, column + k] + after[d + _U(1), first + k])
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def sweep_strip(volume, total, penalties, p1, first, lines, drift, upward, warm):  # type: ignore[no-untyped-def]
+    """Follow one strip of parallel paths from pole to pole and add their costs to the total.
+
+    Line k is at column first + k + drift·i in step i. Steps i < 0 lie beyond the pole from which the paths come:
+    in row −1 − i, half a turn further on; their costs only prepare the state.
+
+    Args:
+        volume: (H, D, W) uint8.
+        total: (H, D, W) uint16, added to; strips of one direction touch disjoint entries.
+        penalties: (H, W) uint16 P2 of the step into each pixel.
+        p1: uint16.
+        first: column of the first line in row 0 (row H − 1 for upward paths).
+        lines: number of lines.
+        drift: columns by which a path moves in each step: −1, 0 or 1.
+        upward: whether the paths run from the last row to the first.
+        warm: steps before the pole.
+    """
+    height, depth, width = volume.shape
+    buffers = np.zeros((2, depth + 2, lines), np.uint16)
+    buffers[:, 0, :] = _OUTSIDE
+    buffers[:, depth + 1, :] = _OUTSIDE
+    least = np.zeros((2, lines), np.uint16)
+    for i in range(-warm, height):
+        now = (i + warm) % 2
+        row = i if i >= 0 else -1 - i
+        row = height - 1 - row if upward else row
+        column = first + drift * i + (0 if i >= 0 else width // 2)
+        column = (column % width + width) % width
+        least[now, :] = _OUTSIDE
+        direct = min(lines, width - column)
+        _step(
+            volume, total, (row, column), (0, direct), penalties, p1,
+            buffers[1 - now], least[1 - now], buffers[now], least[now], i >= 0,
+        )  # fmt: skip
+        if direct < lines:
+            _step(
+                volume, total, (row, 0), (direct, lines - direct), penalties, p1,
+                buffers[1 - now], least[1 - now], buffers[now], least[now], i >= 0,
+            )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _advance(costs, x, penalty, p1, before, floor, after):  # type: ignore[no-untyped-def]
+    """Advance a horizontal path by one pixel; return the least of its new costs."""
+    depth = _U(costs.shape[1])
+    pixel = _U(x)
+    jump = _H(floor + penalty)
+    for d in range(depth):
+        stay = before[d + _U(1)]
+        down, up = _H(before[d] + p1), _H(before[d + _U(2)] + p1)
+        near = down if down < up else up
+        near = near if near < jump else jump
+        near = stay if stay < near else near
+        after[d + _U(1)] = _H(_H(near - floor) + _H(costs[pixel, d]))
+    least = _OUTSIDE
+    for d in range(depth):
+        value = after[d + _U(1)]
+        least = value if value < least else least
+    return least
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def sweep_row(volume, total, penalties, p1, y, warm):  # type: ignore[no-untyped-def]
+    """Follow both horizontal paths of one row around the sphere and add their costs to the total.
+
+    Args:
+        volume: (H, D, W) uint8.
+        total: (H, D, W) uint16, added to.
+        penalties: (2, H, W) uint16 P2 of the step into each pixel from its left and from its right.
+        p1: uint16.
+        y: the row.
+        warm: steps before the seam, which only prepare the state.
+    """
+    depth, width = volume.shape[1:]
+    costs = np.empty((width, depth), np.uint8)
+    row = _U(y)
+    for d in range(_U(depth)):
+        for x in range(_U(width)):
+            costs[x, d] = volume[row, d, x]
+    sums = np.zeros((width, depth), np.uint16)
+    for direction in range(2):
+        buffers = np.zeros((2, depth + 2), np.uint16)
+        buffers[:, 0] = _OUTSIDE
+        buffers[:, depth + 1] = _OUTSIDE
+        least = _H(0)
+        for i in range(-warm, width):
+            now = (i + warm) % 2
+            x = (i + warm * width) % width
+            x = width - 1 - x if direction == 1 else x
+            least = _advance(costs, x, penalties[direction, y, x], p1, buffers[1 - now], least, buffers[now])
+            if i >= 0:
+                pixel = _U(x)
+                for d in range(_U(depth)):
+                    sums[pixel, d] = _H(sums[pixel, d] + buffers[now, d + _U(1)])
+    for d in range(_U(depth)):
+        for x in range(_U(width)):
+            total[row, d, x] = _H(total[row, d, x] + sums[x, d])

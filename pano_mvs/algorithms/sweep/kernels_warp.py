@@ -1,0 +1,109 @@
+"""Compiled: one row of the reference, at one virtual range, looked up in one source.
+
+Rows are computed in short separate loops (project, gather, blend) over arrays of one row: a loop that both gathers and
+stores cannot be proved free of aliasing, and is then not vectorised. Loop variables are unsigned, since numba checks
+signed ones for negative indices.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+_F = np.float32
+_U = np.uint64
+_HALF_PI, _PI = _F(np.pi / 2), _F(np.pi)
+_HALF, _TINY = _F(0.5), _F(1e-30)
+# Abramowitz and Stegun, Handbook of Mathematical Functions, 4.4.49: |error| ≤ 2e-8 on [0, 1].
+_A2, _A4, _A6, _A8 = _F(-0.3333314528), _F(0.1999355085), _F(-0.1420889944), _F(0.1065626393)
+_A10, _A12, _A14, _A16 = _F(-0.0752896400), _F(0.0429096138), _F(-0.0161657367), _F(0.0028662257)
+_ONE = _F(1)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def _atan_unit(a):  # type: ignore[no-untyped-def]
+    """Return atan of a number in [0, 1], float32."""
+    s = a * a
+    tail = _A8 + s * (_A10 + s * (_A12 + s * (_A14 + s * _A16)))
+    return a * (_ONE + s * (_A2 + s * (_A4 + s * (_A6 + s * tail))))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def project_row(  # type: ignore[no-untyped-def]
+    sin_cos_azimuth, matrix, offset, shape, index, weight_x, weight_y
+):
+    """Find where a row of rays, of azimuth θ, arrives in a packed source.
+
+    Args:
+        sin_cos_azimuth: (2, W) float32 sin θ and cos θ.
+        matrix: (3, 2) float32: x_in_source = matrix @ (sin θ, cos θ) + offset, of any positive length.
+        offset: (3,) float32.
+        shape: (2,) int64 rows and columns of the source picture.
+        index: (W,) int32, written: position in the packed source (rows + 1 by columns + 1).
+        weight_x: (W,) float32, written: the weight of the right neighbours.
+        weight_y: (W,) float32, written: the weight of the lower neighbours.
+    """
+    m00, m01, o0 = matrix[0, 0], matrix[0, 1], offset[0]
+    m10, m11, o1 = matrix[1, 0], matrix[1, 1], offset[1]
+    m20, m21, o2 = matrix[2, 0], matrix[2, 1], offset[2]
+    x_scale, y_scale = _F(shape[1] / (2 * np.pi)), _F(shape[0] / np.pi)
+    x_middle, y_middle = _F(shape[1] / 2 + 0.5), _F(shape[0] / 2 + 0.5)
+    stride = np.int32(shape[1] + 1)
+    last_row, last_column = np.int32(shape[0]), np.int32(shape[1])
+    for i in range(_U(index.shape[0])):
+        s, c = sin_cos_azimuth[0, i], sin_cos_azimuth[1, i]
+        x = m00 * s + m01 * c + o0
+        y = m10 * s + m11 * c + o1
+        z = m20 * s + m21 * c + o2
+        ax, ay, az = abs(x), abs(y), abs(z)
+        small = ax if ax < az else az
+        large = az if ax < az else ax
+        turn = _atan_unit(small / (large + _TINY))
+        turn = _HALF_PI - turn if ax > az else turn
+        turn = _PI - turn if z < _F(0) else turn
+        turn = -turn if x < _F(0) else turn
+        level = np.sqrt(x * x + z * z)
+        small = ay if ay < level else level
+        large = level if ay < level else ay
+        dip = _atan_unit(small / (large + _TINY))
+        dip = _HALF_PI - dip if ay > level else dip
+        dip = -dip if y < _F(0) else dip
+        px = turn * x_scale + x_middle
+        py = dip * y_scale + y_middle
+        column, row = np.int32(px), np.int32(py)
+        column = last_column if column > last_column else column
+        row = last_row if row > last_row else row
+        index[i] = np.int32(row * stride + column)
+        weight_x[i] = px - _F(column)
+        weight_y[i] = py - _F(row)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def gather_row(packed, start, index, patches):  # type: ignore[no-untyped-def]
+    """Fetch the 2×2 patches, packed as four bytes, at `start + index`; all (W,) but `packed`."""
+    base = _U(start)
+    for i in range(_U(index.shape[0])):
+        patches[i] = packed[base + _U(index[i])]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def blend_row(patches, weight_x, weight_y, row, pad):  # type: ignore[no-untyped-def]
+    """Blend 2×2 patches bilinearly into `row[pad:pad + W]`, uint8, rounded."""
+    first = _U(pad)
+    for i in range(_U(patches.shape[0])):
+        patch = patches[i]
+        upper_left = _F(np.int32(patch & np.uint32(255)))
+        lower_left = _F(np.int32((patch >> np.uint32(8)) & np.uint32(255)))
+        upper_right = _F(np.int32((patch >> np.uint32(16)) & np.uint32(255)))
+        lower_right = _F(np.int32(patch >> np.uint32(24)))
+        left = upper_left + weight_y[i] * (lower_left - upper_left)
+        right = upper_right + weight_y[i] * (lower_right - upper_right)
+        row[first + i] = np.uint8(np.int32(left + weight_x[i] * (right - left) + _HALF))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def wrap_row(row, width, pad):  # type: ignore[no-untyped-def]
+    """Fill the `pad` entries on either side of `row[pad:pad + width]` over the seam."""
+    for i in range(pad):
+        row[i] = row[width + i]
+        row[pad + width + i] = row[pad + i]

@@ -1,0 +1,136 @@
+"""The sweep, compiled: bands of rows in threads, no volume unless semi-global matching needs one.
+
+Memory beyond the pictures: for "box" about 0.3 MB a thread and 1,000 columns, whatever the planes; for "sgm" 3 bytes
+for each pixel and plane (a uint8 volume of costs and a uint16 volume of path sums; 201 MB at 512×1024×128).
+
+Bands and strips are handed to plain threads (the kernels release the GIL), as many as numba is told to use: they write
+disjoint parts in a fixed arithmetic order, so the number of threads changes no bit. numba's own parallel regions would
+take several times longer to compile, and their portable threading layer aborts when two Python threads enter it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.sweep.kernels_band import sweep_band
+from pano_mvs.algorithms.sweep.kernels_sgm import sweep_row, sweep_strip
+from pano_mvs.algorithms.sweep.kernels_winner import AFTER, BEFORE, BEST, RIVAL, STATES, winners_of_rows
+from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, step_penalties, warm_up
+from pano_mvs.algorithms.sweep.preparation import SweepInput
+from pano_mvs.algorithms.sweep.windows import column_offsets
+from pano_mvs.algorithms.sweep.winner import Winners
+from pano_mvs.geometry import pad_panorama
+
+_BAND_ROWS = 32
+_STRIP_LINES = 128
+
+Job = TypeVar("Job")
+
+
+def find_winners(work: SweepInput) -> Winners:
+    """Return the winning plane of every pixel and the costs around it; equals the numpy backend's but for rounding."""
+    height, width = work.reference.shape[:2]
+    settings = work.settings
+    bands = range(0, height, _BAND_ROWS)
+    state = [_fresh_state(min(_BAND_ROWS, height - first), width) for first in bands]
+    with_volume = settings.aggregation == "sgm"
+    volume = np.empty((height, settings.planes, width) if with_volume else (0, 0, 0), np.uint8)
+    prepared = _band_arguments(work)
+    with ThreadPoolExecutor(numba.get_num_threads()) as pool:
+        _run(pool, lambda k: sweep_band(bands[k], *prepared, volume, *state[k]), range(len(bands)))
+        if with_volume:
+            total = _aggregate(pool, work, volume)
+            _run(pool, lambda k: winners_of_rows(total, bands[k], *state[k]), range(len(bands)))
+    return _winners(state)
+
+
+def pack_plane(plane: NDArray[np.uint8]) -> NDArray[np.uint32]:
+    """Return all 2×2 patches of one colour of a panorama, (H, W) to (H + 1, W + 1), four bytes each.
+
+    Patch (j, i) holds the pixels of rows j − 1, j and columns i − 1, i, over the seam and over the poles, as upper
+    left | lower left << 8 | upper right << 16 | lower right << 24: one load then fetches all that a bilinear sample
+    needs, and no sample lies at a border.
+    """
+    padded = pad_panorama(plane, 1).astype(np.uint32)
+    upper, lower = padded[:-1], padded[1:]
+    return upper[:, :-1] | lower[:, :-1] << 8 | upper[:, 1:] << 16 | lower[:, 1:] << 24
+
+
+def _fresh_state(rows: int, width: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    return np.full((STATES, rows, width), np.inf, np.float32), np.zeros((rows, width), np.int32)
+
+
+def _band_arguments(work: SweepInput) -> tuple[object, ...]:
+    """Return the arguments of `sweep_band` that all bands share."""
+    height, width, _ = work.reference.shape
+    settings = work.settings
+    offsets = column_offsets((height, width), settings.compare_radius, spherical=settings.spherical_window)
+    reach = column_offsets((height, width), settings.box_radius, spherical=settings.spherical_window)[:, -1].copy()
+    halo = settings.compare_radius + settings.box_radius
+    pad = max(int(offsets.max()), int(reach.max()) + 1, halo)
+    reference = np.stack([pad_panorama(plane, pad) for plane in np.moveaxis(work.reference, -1, 0)])
+    azimuth = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
+    packed, starts = _packed([np.moveaxis(source, -1, 0) for source in work.sources])
+    valid, valid_starts = _packed_valid(work)
+    poses = np.stack([np.column_stack([pose.rotation, pose.translation]) for pose in work.source_from_reference])
+    shapes = np.array([source.shape[:2] for source in work.sources])
+    return (
+        reference, np.stack([np.sin(azimuth), np.cos(azimuth)]).astype(np.float32), poses, work.ranges,
+        packed, starts, shapes, valid, valid_starts, offsets, reach, settings.compare_radius, settings.box_radius, pad,
+        settings.combination == "best_half", np.float32(settings.cost_scale), np.float32(settings.neutral_cost),
+    )  # fmt: skip
+
+
+def _packed(sources: list[NDArray[np.uint8]]) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
+    """Return all planes of all sources packed in one array, and where each begins, (S, C)."""
+    planes = [pack_plane(plane).ravel() for source in sources for plane in source]
+    starts = np.concatenate([[0], np.cumsum([len(plane) for plane in planes])[:-1]])
+    return np.concatenate(planes), starts.reshape(len(sources), -1).astype(np.int64)
+
+
+def _packed_valid(work: SweepInput) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """Return whether each patch of each source may vote (all four pixels may); empty if all may."""
+    if work.source_valid is None:
+        return np.zeros(0, np.uint8), np.zeros(len(work.sources), np.int64)
+    packed, starts = _packed([mask.astype(np.uint8)[None] for mask in work.source_valid])
+    return (packed == 0x01010101).astype(np.uint8), starts[:, 0].copy()
+
+
+def _aggregate(pool: ThreadPoolExecutor, work: SweepInput, volume: NDArray[np.uint8]) -> NDArray[np.uint16]:
+    """Return the sum of the eight paths' costs, (H, D, W) uint16."""
+    height, _, width = volume.shape
+    settings = work.settings
+    total = np.zeros(volume.shape, np.uint16)
+    p1 = np.uint16(settings.p1)
+    warm = warm_up((height, width))
+    for direction in DIRECTIONS:
+        penalties = step_penalties(work.reference, direction, settings)
+        strip = min(_STRIP_LINES, width)
+
+        def follow(first: int, p2: NDArray[np.uint16] = penalties, step: tuple[int, int] = direction) -> None:
+            lines = min(strip, width - first)
+            sweep_strip(volume, total, p2, p1, first, lines, step[1], step[0] < 0, warm[0])
+
+        _run(pool, follow, range(0, width, strip))
+    sideways = np.stack([step_penalties(work.reference, (0, step), settings) for step in (1, -1)])
+    _run(pool, lambda y: sweep_row(volume, total, sideways, p1, y, warm[1]), range(height))
+    return total
+
+
+def _run(pool: ThreadPoolExecutor, work: Callable[[Job], object], jobs: Iterable[Job]) -> None:
+    """Do all jobs and raise what the first of them raised."""
+    for _ in pool.map(work, jobs):
+        pass
+
+
+def _winners(state: list[tuple[NDArray[np.float32], NDArray[np.int32]]]) -> Winners:
+    costs = np.concatenate([band for band, _ in state], axis=1)
+    plane = np.concatenate([planes for _, planes in state])
+    before = np.where(plane == 0, costs[BEST], costs[BEFORE])
+    return Winners(plane, costs[BEST], before, costs[AFTER], costs[RIVAL])

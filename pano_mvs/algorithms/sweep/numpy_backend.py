@@ -1,0 +1,140 @@
+"""The sweep, readable: the whole volume in memory, exact projection, one statement for each step.
+
+The reference against which compiled backends are held. Memory: about 20 bytes for each pixel and plane.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, step_penalties, warm_up
+from pano_mvs.algorithms.sweep.preparation import SweepInput
+from pano_mvs.algorithms.sweep.windows import column_offsets
+from pano_mvs.algorithms.sweep.winner import Winners
+from pano_mvs.geometry import pad_panorama, pixel_from_ray, ray_grid, sample_panorama
+
+FloatArray = NDArray[np.float64]
+
+
+def find_winners(work: SweepInput) -> Winners:
+    """Return the winning plane of every pixel and the costs around it."""
+    settings = work.settings
+    volume = np.stack([_combined_cost(work, virtual_range) for virtual_range in work.ranges], axis=1)
+    if settings.aggregation == "sgm":
+        stored = np.floor(np.minimum(volume * settings.cost_scale + 0.5, 255))
+        volume = _aggregate(stored.astype(np.int64), work).astype(np.float64)
+    return winners_of(volume)
+
+
+def winners_of(volume: FloatArray) -> Winners:
+    """Return the winners of a volume of costs, (H, D, W)."""
+    planes = np.arange(volume.shape[1])[:, None]
+    plane = np.argmin(volume, axis=1)
+    near_winner = np.abs(planes - plane[:, None]) <= 1
+
+    def cost_at(idx: NDArray[np.intp]) -> NDArray[np.float32]:
+        inside = np.clip(idx, 0, volume.shape[1] - 1)
+        return np.take_along_axis(volume, inside[:, None], axis=1)[:, 0].astype(np.float32)
+
+    rival = np.where(near_winner, np.inf, volume).min(axis=1).astype(np.float32)
+    return Winners(plane.astype(np.int32), cost_at(plane), cost_at(plane - 1), cost_at(plane + 1), rival)
+
+
+def _combined_cost(work: SweepInput, virtual_range: float) -> FloatArray:
+    """Return the mean cost of one plane over the sources that count, (H, W)."""
+    costs = np.stack([_source_cost(work, idx, virtual_range) for idx in range(len(work.sources))])
+    votes = np.isfinite(costs).sum(axis=0)
+    used = (votes + 1) // 2 if work.settings.combination == "best_half" else votes
+    ranked = np.sort(costs, axis=0)
+    taken = np.arange(len(costs))[:, None, None] < used
+    total = np.where(taken, ranked, 0.0).sum(axis=0)
+    return np.where(used > 0, total / np.maximum(used, 1), work.settings.neutral_cost)
+
+
+def _source_cost(work: SweepInput, idx: int, virtual_range: float) -> FloatArray:
+    """Return the cost of one plane in one source, (H, W), infinite where the source has no vote."""
+    size_hw = work.reference.shape[0], work.reference.shape[1]
+    settings, source = work.settings, work.sources[idx]
+    points = work.source_from_reference[idx].apply(ray_grid(size_hw) * virtual_range)
+    pixels = pixel_from_ray(points, (source.shape[0], source.shape[1]))
+    warped = np.floor(sample_panorama(source, pixels) + 0.5)
+    pixel_cost = _census(work.reference[..., 0], warped[..., 0], work) if settings.cost == "census" else (
+        np.abs(work.reference.astype(np.float64) - warped).sum(axis=-1)
+    )  # fmt: skip
+    cost = _box_mean(pixel_cost, settings.box_radius, spherical=settings.spherical_window)
+    if work.source_valid is not None:
+        cost[sample_panorama(work.source_valid[idx], pixels) < 1 - 1e-9] = np.inf
+    return cost
+
+
+def _census(reference: NDArray[np.uint8], warped: FloatArray, work: SweepInput) -> FloatArray:
+    """Return how many neighbours have another order against the centre in one picture than in the other, (H, W)."""
+    radius = work.settings.compare_radius
+    offsets = column_offsets(reference.shape, radius, spherical=work.settings.spherical_window)
+    differs = np.zeros(reference.shape)
+    for rows in range(-radius, radius + 1):
+        for k in range(2 * radius + 1):
+            above = _neighbours(reference, rows, offsets[:, k]) > reference
+            differs += above != (_neighbours(warped, rows, offsets[:, k]) > warped)
+    return differs
+
+
+def _box_mean(cost: FloatArray, radius: int, *, spherical: bool) -> FloatArray:
+    """Return the mean over windows of 2 radius + 1 rows, as wide as the centre's row asks for, (H, W)."""
+    reach = column_offsets((cost.shape[0], cost.shape[1]), radius, spherical=spherical)[:, -1]
+    rows = np.sum([_neighbours(cost, row, np.zeros_like(reach)) for row in range(-radius, radius + 1)], axis=0)
+    result = np.zeros_like(cost)
+    for columns in np.unique(reach):
+        here = reach == columns
+        shifted = [np.roll(rows[here], shift, axis=1) for shift in range(-columns, columns + 1)]
+        result[here] = np.sum(shifted, axis=0) / ((2 * radius + 1) * (2 * columns + 1))
+    return result
+
+
+def _neighbours(picture: NDArray[np.generic], rows: int, columns: NDArray[np.int64]) -> NDArray[np.generic]:
+    """Return for every pixel the one that lies `rows` below and `columns` (H,) to its right, (H, W)."""
+    height, width = picture.shape
+    pad = abs(rows)
+    shifted = pad_panorama(picture, pad)[pad + rows : pad + rows + height, pad : pad + width]
+    return np.take_along_axis(shifted, (np.arange(width) + columns[:, None]) % width, axis=1)
+
+
+def _aggregate(volume: NDArray[np.int64], work: SweepInput) -> NDArray[np.int64]:
+    """Return the sum of eight paths' costs, (H, D, W)."""
+    height, _, width = volume.shape
+    settings = work.settings
+    p1 = int(settings.p1)
+    before_pole, before_seam = warm_up((height, width))
+    total = np.zeros_like(volume)
+    for rows, columns in DIRECTIONS:
+        penalties = step_penalties(work.reference, (rows, columns), settings).astype(np.int64)
+        path = np.zeros(volume.shape[1:], np.int64)
+        for i in range(-before_pole, height):
+            row = i if i >= 0 else -1 - i
+            row = row if rows > 0 else height - 1 - row
+            beyond = 0 if i >= 0 else width // 2
+            here = np.roll(volume[row], beyond, axis=-1)
+            path = path_step(here, np.roll(path, columns, axis=-1), np.roll(penalties[row], beyond), p1)
+            if i >= 0:
+                total[row] += path
+    for step in (1, -1):
+        penalties = step_penalties(work.reference, (0, step), settings).astype(np.int64)
+        path = np.zeros((volume.shape[1], height), np.int64)
+        for i in range(-before_seam, width):
+            column = i % width if step > 0 else width - 1 - i % width
+            path = path_step(volume[:, :, column].T, path, penalties[:, column], p1)
+            if i >= 0:
+                total[:, :, column] += path.T
+    return total
+
+
+def path_step(
+    costs: NDArray[np.int64], before: NDArray[np.int64], penalty: NDArray[np.int64], p1: int
+) -> NDArray[np.int64]:
+    """Return L(p, ·) from C(p, ·) and L(q, ·), (D, N) each, for N paths at once; `penalty` is (N,) P2."""
+    floor = before.min(axis=0)
+    outside = np.full_like(before[:1], np.iinfo(np.int32).max)
+    down = np.concatenate([outside, before[:-1]]) + p1
+    up = np.concatenate([before[1:], outside]) + p1
+    return costs + np.minimum(np.minimum(before, floor + penalty), np.minimum(down, up)) - floor

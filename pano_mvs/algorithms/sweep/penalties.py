@@ -1,0 +1,45 @@
+"""What semi-global matching pays for a step, and how its paths run on a sphere; the same for every backend."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.sweep.settings import SweepSettings
+from pano_mvs.geometry import pad_panorama
+
+# (rows, columns) of one step of the six paths from pole to pole; the two along a row are handled on their own.
+DIRECTIONS = ((1, 0), (1, 1), (1, -1), (-1, 0), (-1, 1), (-1, -1))
+
+
+def step_penalties(
+    reference: NDArray[np.uint8], direction: tuple[int, int], settings: SweepSettings
+) -> NDArray[np.uint16]:
+    """Return P2 of the step into each pixel, (H, W) uint16: smaller where the picture has an edge.
+
+    P2' = max(P1, P2 / (1 + |ΔI| / contrast)), ΔI the step of the mean colour; beyond a pole and over the seam too.
+
+    Args:
+        reference: (H, W, C).
+        direction: (rows, columns) of the step, each −1, 0 or 1.
+        settings: p1, p2, p2_contrast.
+    """
+    height, width = reference.shape[:2]
+    if settings.p2_contrast == 0:
+        return np.full((height, width), np.rint(settings.p2), np.uint16)
+    padded = pad_panorama(reference.mean(axis=-1), 1)
+    rows, columns = direction
+    before = padded[1 - rows : 1 - rows + height, 1 - columns : 1 - columns + width]
+    contrast = np.abs(padded[1:-1, 1:-1] - before)
+    penalty = np.maximum(settings.p1, settings.p2 / (1 + contrast / settings.p2_contrast))
+    return np.rint(penalty).astype(np.uint16)
+
+
+def warm_up(size_hw: tuple[int, int]) -> tuple[int, int]:
+    """Return how many steps a path takes before it counts: beyond the pole, and before the seam.
+
+    A path has no beginning on a sphere. It starts this far before the first pixel that counts, so that what it carries
+    there comes from the picture and not from where the columns happen to start.
+    """
+    height, width = size_hw
+    return height // 8, width // 2

@@ -1,0 +1,110 @@
+"""From pictures to what is compared: filtered, matched in exposure, grey for census."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.sweep.settings import SweepSettings
+from pano_mvs.algorithms.sweep.windows import column_stretch
+from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray
+
+# Rec. 709 luma in 1/256.
+_LUMA = np.array([54, 183, 19])
+
+
+@dataclass(frozen=True, eq=False)
+class SweepInput:
+    """Everything that a backend needs, checked and prepared.
+
+    Attributes:
+        reference: (H, W, C) uint8: grey (C = 1) for census, RGB for differences.
+        sources: the sources likewise, each of its own size.
+        source_from_reference: their poses.
+        source_valid: for each source, where a sample may vote, (Hs, Ws); None if everywhere in all of them.
+        ranges: (D,) float64 virtual ranges, ascending.
+        settings: what was asked for.
+    """
+
+    reference: NDArray[np.uint8]
+    sources: tuple[NDArray[np.uint8], ...]
+    source_from_reference: tuple[Rigid3, ...]
+    source_valid: tuple[NDArray[np.bool_], ...] | None
+    ranges: NDArray[np.float64]
+    settings: SweepSettings
+
+
+def prepare_picture(picture: NDArray[np.uint8], settings: SweepSettings) -> NDArray[np.uint8]:
+    """Return the picture as it is compared, (H, W, 3) RGB to (H, W, 1) grey or (H, W, 3), prefiltered if asked for."""
+    if settings.prefilter_diameter:
+        picture = _bilateral(picture, settings)
+    if settings.cost == "sad":
+        return np.ascontiguousarray(picture)
+    luma = (picture.astype(np.uint16) @ _LUMA.astype(np.uint16) + 128) >> 8
+    return luma.astype(np.uint8)[..., None]
+
+
+def _bilateral(picture: NDArray[np.uint8], settings: SweepSettings) -> NDArray[np.uint8]:
+    pad = min(settings.prefilter_diameter, picture.shape[0])
+    padded = pad_panorama(picture, pad)
+    filtered = cv2.bilateralFilter(
+        padded, settings.prefilter_diameter, settings.prefilter_sigma_color, settings.prefilter_sigma_space_px
+    )
+    return np.asarray(filtered[pad:-pad, pad:-pad], dtype=np.uint8)
+
+
+def voting_pixels(mask: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
+    """Return the valid pixels of a source around which the whole window is valid too, (H, W).
+
+    A window that looks beyond the mask would compare with the tripod. The window is widened in columns like those of
+    the sweep.
+    """
+    if mask.all() or radius == 0:
+        return mask
+    height, width = mask.shape
+    stretch = column_stretch(height, spherical=True)
+    reach = np.clip(np.rint(radius * stretch).astype(np.int64), radius, width // 4)
+    wide = np.zeros_like(mask)
+    for columns in np.unique(reach):
+        rows = reach == columns
+        wide[rows] = _spread_columns(~mask[rows], int(columns))
+    padded = pad_panorama(wide, min(radius, height))
+    blocked = np.zeros_like(mask)
+    for shift in range(2 * radius + 1):
+        blocked |= padded[shift : shift + height, radius : radius + width]
+    return ~blocked
+
+
+def _spread_columns(blocked: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
+    result = blocked.copy()
+    for shift in range(1, reach + 1):
+        result |= np.roll(blocked, shift, axis=1) | np.roll(blocked, -shift, axis=1)
+    return result
+
+
+def sees_winner(
+    ranges: NDArray[np.float32],
+    sources: Sequence[Rigid3],
+    source_valid: Sequence[NDArray[np.bool_]],
+    rays: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """Return where at least one source may vote on the range that was found, (H, W).
+
+    Args:
+        ranges: (H, W) what was found.
+        sources: source_from_reference of each source.
+        source_valid: where each source may vote, (Hs, Ws).
+        rays: (H, W, 3) of the reference.
+    """
+    seen = np.zeros(ranges.shape, np.bool_)
+    for pose, valid in zip(sources, source_valid, strict=True):
+        height, width = valid.shape
+        pixels = pixel_from_ray(pose.apply(rays * ranges[..., None]), (height, width))
+        column = np.floor(pixels[..., 0]).astype(np.intp) % width
+        row = np.minimum(np.floor(pixels[..., 1]).astype(np.intp), height - 1)
+        seen |= valid[row, column]
+    return seen

@@ -1,0 +1,153 @@
+"""The sphere sweep: the range of every pixel of a panorama by testing virtual ranges.
+
+For a virtual range r a reference pixel u is looked up in source k at F⁻¹(r R F(u) + t), (R, t) = source_from_reference
+and F the ray of a pixel; the range at which reference and sources agree best wins.
+S. Yang, K. Kim, Y. Lee, "Dense Depth Estimation from Multiple 360-degree Images Using Virtual Depth", section 3.3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.sweep.exposure import match_all, shrink
+from pano_mvs.algorithms.sweep.hypotheses import virtual_ranges
+from pano_mvs.algorithms.sweep.preparation import SweepInput, prepare_picture, sees_winner, voting_pixels
+from pano_mvs.algorithms.sweep.settings import SweepSettings
+from pano_mvs.algorithms.sweep.winner import Winners, range_map_from_winners
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import Rigid3, ray_grid
+from pano_mvs.scene.range_map import RangeMap
+
+__all__ = ["Backend", "SweepSettings", "sweep_range"]
+
+Backend = Literal["numba", "numpy"]
+Mask = NDArray[np.bool_]
+Picture = NDArray[np.uint8]
+
+# The rough sweep behind the match of exposures.
+_ROUGH_ROWS, _ROUGH_PLANES = 128, 48
+
+
+def sweep_range(
+    reference: Picture,
+    sources: Sequence[Picture],
+    source_from_reference: Sequence[Rigid3],
+    *,
+    near: float,
+    far: float,
+    settings: SweepSettings | None = None,
+    backend: Backend = "numba",
+    reference_mask: Mask | None = None,
+    source_masks: Sequence[Mask | None] | None = None,
+) -> RangeMap:
+    """Return the range of every pixel of a reference panorama.
+
+    Args:
+        reference: (H, W, 3) uint8 RGB, the full sphere, W even, H and W at least 16.
+        sources: one or more (Hs, Ws, 3) uint8 RGB, each of its own size.
+        source_from_reference: the pose of each source: x_in_source = R x_in_reference + t, t in scene units.
+        near: the first virtual range, in scene units.
+        far: the last one.
+        settings: how to sample, compare and decide.
+        backend: "numba", compiled, or "numpy", the readable reference (the whole volume in memory).
+        reference_mask: (H, W) False where the reference is to be ignored: NaN in the result.
+        source_masks: for each source (Hs, Ws), False where it has no vote, or None.
+
+    Returns:
+        Ranges in scene units and confidence 64–127 ("seen but weak": a sweep alone cannot say that other views
+        agree); NaN and 0 where the reference is masked or no source sees the winning range.
+
+    Raises:
+        UsageError: if shapes, types or numbers do not fit together, or near and far are no limits.
+    """
+    settings = settings or SweepSettings()
+    _check_picture("reference", reference, reference_mask)
+    masks = _checked_sources(sources, source_from_reference, source_masks)
+    ranges = virtual_ranges(near, far, planes=settings.planes, spacing=settings.spacing)
+    if settings.exposure and settings.cost == "sad":
+        rough = _rough_range(reference, sources, source_from_reference, near=near, far=far, backend=backend)
+        sources = match_all(reference, sources, source_from_reference, rough, masks)
+    work = SweepInput(
+        reference=prepare_picture(reference, settings),
+        sources=tuple(prepare_picture(source, settings) for source in sources),
+        source_from_reference=tuple(source_from_reference),
+        source_valid=_voting(masks, settings),
+        ranges=ranges,
+        settings=settings,
+    )
+    winners = _find_winners(work, backend)
+    valid = np.ones(reference.shape[:2], np.bool_) if reference_mask is None else reference_mask
+    result = range_map_from_winners(winners, near=near, far=far, settings=settings, seen=valid)
+    if work.source_valid is None:
+        return result
+    rays = ray_grid((reference.shape[0], reference.shape[1]))
+    seen = valid & sees_winner(result.range, work.source_from_reference, work.source_valid, rays)
+    return range_map_from_winners(winners, near=near, far=far, settings=settings, seen=seen)
+
+
+def _find_winners(work: SweepInput, backend: Backend) -> Winners:
+    if backend == "numpy":
+        from pano_mvs.algorithms.sweep import numpy_backend
+
+        return numpy_backend.find_winners(work)
+    if backend == "numba":
+        from pano_mvs.algorithms.sweep import numba_backend  # on use: numba is slow to import
+
+        return numba_backend.find_winners(work)
+    raise UsageError(f"there is no sweep backend {backend!r}: use 'numba' or 'numpy'")
+
+
+def _rough_range(
+    reference: Picture,
+    sources: Sequence[Picture],
+    source_from_reference: Sequence[Rigid3],
+    *,
+    near: float,
+    far: float,
+    backend: Backend,
+) -> NDArray[np.float32]:
+    """Return ranges at low resolution by census, which exposure does not disturb; the surer half of them."""
+    settings = SweepSettings(planes=_ROUGH_PLANES, window=5, aggregation="box")
+    small = [shrink(source, _ROUGH_ROWS) for source in sources]
+    found = sweep_range(
+        shrink(reference, _ROUGH_ROWS), small, source_from_reference,
+        near=near, far=far, settings=settings, backend=backend,
+    )  # fmt: skip
+    sure = found.confidence >= np.median(found.confidence)
+    return np.where(sure, found.range, np.nan).astype(np.float32)
+
+
+def _voting(masks: tuple[Mask, ...] | None, settings: SweepSettings) -> tuple[Mask, ...] | None:
+    if masks is None:
+        return None
+    return tuple(voting_pixels(mask, settings.compare_radius + settings.box_radius) for mask in masks)
+
+
+def _checked_sources(
+    sources: Sequence[Picture], poses: Sequence[Rigid3], masks: Sequence[Mask | None] | None
+) -> tuple[Mask, ...] | None:
+    """Return the masks of all sources, or None if nothing is masked."""
+    if not sources or len(poses) != len(sources) or (masks is not None and len(masks) != len(sources)):
+        raise UsageError(f"a sweep needs one pose (and one mask, if any) for each of one or more sources, got "
+                         f"{len(sources)} sources, {len(poses)} poses")  # fmt: skip
+    given = masks if masks is not None else [None] * len(sources)
+    for idx, (source, mask) in enumerate(zip(sources, given, strict=True)):
+        _check_picture(f"source {idx}", source, mask)
+    if all(mask is None or mask.all() for mask in given):
+        return None
+    pairs = zip(sources, given, strict=True)
+    return tuple(np.ones(source.shape[:2], np.bool_) if mask is None else mask for source, mask in pairs)
+
+
+def _check_picture(name: str, picture: Picture, mask: Mask | None) -> None:
+    if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
+        raise UsageError(f"{name}: a sweep needs (H, W, 3) uint8 RGB, got {picture.shape} {picture.dtype}")
+    height, width = picture.shape[:2]
+    if width % 2 or min(height, width) < 16:
+        raise UsageError(f"{name}: a sweep needs an even width and at least 16×16 pixels, got {width}×{height}")
+    if mask is not None and (mask.shape != (height, width) or mask.dtype != np.bool_):
+        raise UsageError(f"{name}: its mask must be ({height}, {width}) bool, got {mask.shape} {mask.dtype}")

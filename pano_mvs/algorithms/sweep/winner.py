@@ -1,0 +1,76 @@
+"""From winning planes to ranges with confidence; the same for every backend."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.sweep.hypotheses import range_at
+from pano_mvs.algorithms.sweep.settings import SweepSettings
+from pano_mvs.scene.range_map import WEAK_CONFIDENCE, RangeMap
+
+# A best rival this much dearer than the winner, as a share of the winner's cost, counts as certainty.
+_SURE_MARGIN = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class Winners:
+    """The cheapest plane of every pixel, and the costs around it.
+
+    Attributes:
+        plane: (H, W) int32 index of the cheapest plane, the nearest one of equals.
+        cost: (H, W) float32 its cost.
+        before: (H, W) float32 the cost of the plane before it; of the plane itself where it is the first.
+        after: (H, W) float32 the cost of the plane after it; of the plane itself where it is the last.
+        rival: (H, W) float32 the least cost of all planes that are not next to it; infinite if there is none.
+    """
+
+    plane: NDArray[np.int32]
+    cost: NDArray[np.float32]
+    before: NDArray[np.float32]
+    after: NDArray[np.float32]
+    rival: NDArray[np.float32]
+
+
+def range_map_from_winners(
+    winners: Winners, *, near: float, far: float, settings: SweepSettings, seen: NDArray[np.bool_]
+) -> RangeMap:
+    """Return the range and the confidence of every pixel, NaN and 0 where it was not seen.
+
+    Args:
+        winners: of all pixels.
+        near: the first virtual range.
+        far: the last one.
+        settings: planes, spacing and whether to refine between planes.
+        seen: (H, W) where the reference is valid and at least one source saw the winner.
+    """
+    position = winners.plane.astype(np.float64)
+    if settings.subplane:
+        position += subplane_offset(winners, planes=settings.planes)
+    ranges = range_at(position, near, far, planes=settings.planes, spacing=settings.spacing)
+    result = np.where(seen, ranges, np.nan).astype(np.float32)
+    return RangeMap(result, np.where(seen, confidence(winners), 0).astype(np.uint8))
+
+
+def subplane_offset(winners: Winners, *, planes: int) -> NDArray[np.float64]:
+    """Return where between −½ and ½ plane the parabola through three costs has its minimum, (H, W); 0 at the ends."""
+    before, after = winners.before.astype(np.float64), winners.after.astype(np.float64)
+    curvature = before + after - 2.0 * winners.cost
+    inner = (winners.plane > 0) & (winners.plane < planes - 1) & (curvature > 0)
+    offset = 0.5 * (before - after) / np.where(inner, curvature, 1.0)
+    return np.where(inner, np.clip(offset, -0.5, 0.5), 0.0)
+
+
+def confidence(winners: Winners) -> NDArray[np.uint8]:
+    """Return how sure the winner is, (H, W) uint8 in 64–127: how much dearer the best rival is.
+
+    The uniqueness ratio 1 − cost/rival, which vanishes on bare surfaces, along the baseline (where no source can tell
+    ranges apart) and between two equally good ranges.
+    """
+    rival = np.maximum(winners.rival.astype(np.float64), 1e-6)
+    uniqueness = np.where(np.isfinite(rival), 1 - winners.cost / rival, 1.0)
+    low, high = WEAK_CONFIDENCE
+    share = np.clip(uniqueness / _SURE_MARGIN, 0, 1)
+    return np.asarray(np.rint(low + share * (high - low)), dtype=np.uint8)
