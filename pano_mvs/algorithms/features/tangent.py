@@ -40,7 +40,7 @@ def extract_sift(
     mask: NDArray[np.bool_],
     *,
     max_keypoints: int = 8000,
-    contrast_threshold: float = 0.012,
+    contrast_threshold: float = 0.004,
     root: bool = True,
 ) -> Features:
     """Return the SIFT key points of a panorama (Lowe 2004, on the tangent tiles of an icosahedron).

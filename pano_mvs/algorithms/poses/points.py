@@ -107,9 +107,7 @@ def _normal_equations(
     return matrix, np.stack([np.bincount(idx, across[:, axis], count) for axis in range(3)], axis=1)
 
 
-def _errors(
-    centers: FloatArray, rays: FloatArray, points: FloatArray, valid: NDArray[np.bool_]
-) -> FloatArray:
+def _errors(centers: FloatArray, rays: FloatArray, points: FloatArray, valid: NDArray[np.bool_]) -> FloatArray:
     """Return the angle between observed rays and points, π where there is no point (a ray behind gives > π/2)."""
     errors = np.full(len(rays), np.pi)
     towards = points[valid] - centers[valid]

@@ -23,7 +23,7 @@ def refine_poses(
     poses: Poses,
     *,
     loss: Loss = "cauchy",
-    loss_scale_deg: float = 0.05,
+    loss_scale_deg: float = 0.1,
     max_iterations: int = 50,
     max_error_deg: float = 0.4,
 ) -> Poses:
@@ -73,9 +73,7 @@ def _bundle(poses: Poses) -> tuple[Bundle, NDArray[np.uint8]]:
     return bundle, np.array(poses.point_colors_rgb)[seen]
 
 
-def _fitting(
-    bundle: Bundle, colors: NDArray[np.uint8], *, max_error_rad: float
-) -> tuple[Bundle, NDArray[np.uint8]]:
+def _fitting(bundle: Bundle, colors: NDArray[np.uint8], *, max_error_rad: float) -> tuple[Bundle, NDArray[np.uint8]]:
     """Triangulate all points anew, and keep what fits."""
     found = triangulate_observations(
         bundle.centers[bundle.image_idx],

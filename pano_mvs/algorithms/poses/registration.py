@@ -171,9 +171,7 @@ class GrowingModel:
         if usable.sum() < _MIN_RATIOS:
             return None
         ratios = known_range[usable] / unit_range[usable]
-        length = estimate_scale(
-            ratios, np.sin(parallax[usable]) ** 2, estimator=self.estimator, kappa=self.kappa
-        )
+        length = estimate_scale(ratios, np.sin(parallax[usable]) ** 2, estimator=self.estimator, kappa=self.kappa)
         scaled = Rigid3(image_from_partner.rotation, length * image_from_partner.translation)
         return scaled @ self.cameras[partner]
 

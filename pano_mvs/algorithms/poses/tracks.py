@@ -101,7 +101,9 @@ def triangulate_tracks(
     """
     known = {name: features[name] for name in poses.names if name in features}
     inside = {pair: view for pair, view in two_views.items() if pair[0] in known and pair[1] in known}
-    return poses_with_points(poses, build_tracks(known, inside), max_error_deg=max_error_deg, min_angle_deg=min_angle_deg)
+    return poses_with_points(
+        poses, build_tracks(known, inside), max_error_deg=max_error_deg, min_angle_deg=min_angle_deg
+    )
 
 
 def poses_with_points(poses: Poses, tracks: Tracks, *, max_error_deg: float, min_angle_deg: float) -> Poses:

@@ -71,9 +71,7 @@ def relative_pose(edges: Mapping[Edge, TwoView], first: int, second: int) -> Rig
     return Rigid3(edges[second, first].rotation, edges[second, first].direction).inverse()
 
 
-def _edges_by_position(
-    names: tuple[str, ...], two_views: Mapping[tuple[str, str], TwoView]
-) -> dict[Edge, TwoView]:
+def _edges_by_position(names: tuple[str, ...], two_views: Mapping[tuple[str, str], TwoView]) -> dict[Edge, TwoView]:
     position = {name: idx for idx, name in enumerate(names)}
     edges: dict[Edge, TwoView] = {}
     for (first, second), view in two_views.items():

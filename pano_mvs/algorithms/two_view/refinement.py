@@ -46,9 +46,7 @@ def refine_relative_pose(
     return pose
 
 
-def pose_uncertainty(
-    pose: Rigid3, first: FloatArray, second: FloatArray, *, noise_rad: float
-) -> tuple[float, float]:
+def pose_uncertainty(pose: Rigid3, first: FloatArray, second: FloatArray, *, noise_rad: float) -> tuple[float, float]:
     """Return the standard deviations, in radians, of rotation and direction along their least certain axes.
 
     The square roots of the largest eigenvalues of the blocks of σ² (JᵀJ)⁻¹.

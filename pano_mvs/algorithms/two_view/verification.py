@@ -126,9 +126,7 @@ def _why_not(
     return ""
 
 
-def _chance(
-    pose: Rigid3, p: FloatArray, q: FloatArray, *, rng: np.random.Generator, threshold_rad: float
-) -> float:
+def _chance(pose: Rigid3, p: FloatArray, q: FloatArray, *, rng: np.random.Generator, threshold_rad: float) -> float:
     essential = skew(pose.translation) @ pose.rotation
 
     def agrees(first: FloatArray, second: FloatArray) -> NDArray[np.bool_]:
