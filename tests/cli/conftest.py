@@ -1,0 +1,75 @@
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from pano_mvs.cli.app import app
+from pano_mvs.testing.room import capture_poses, default_room, write_capture
+
+SIZE_HW = (160, 320)
+SMALL = ("--set", "depth.planes=32", "--set", "features.max_keypoints=1500")
+
+
+@dataclass
+class Outcome:
+    code: int
+    text: str
+
+    @property
+    def flat(self) -> str:
+        """The output without line breaks, which depend on the width of the terminal."""
+        return " ".join(self.text.split())
+
+
+Command = Callable[..., Outcome]
+
+
+@pytest.fixture(scope="session")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four rendered panoramas of the synthetic room with their truth; not to be changed."""
+    folder = tmp_path_factory.mktemp("rendered")
+    write_capture(folder, default_room(), capture_poses(4, spread=0.4), SIZE_HW)
+    return folder
+
+
+@pytest.fixture
+def capture(rendered: Path, tmp_path: Path) -> Path:
+    """A copy of the rendered capture that a test may change."""
+    return Path(shutil.copytree(rendered, tmp_path / "capture"))
+
+
+@pytest.fixture
+def pano_mvs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Run the command line in a folder of its own."""
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.delenv("PANO_MVS_CACHE", raising=False)
+
+    def call(*arguments: str | os.PathLike[str]) -> Outcome:
+        result = CliRunner().invoke(app, [os.fspath(argument) for argument in arguments])
+        return Outcome(result.exit_code, result.output)
+
+    return call
+
+
+def run_json(folder: Path) -> dict[str, Any]:
+    summary: dict[str, Any] = json.loads((folder / "run.json").read_text())
+    return summary
+
+
+def deliverables(folder: Path) -> dict[str, bytes]:
+    """Return the files of an output folder, but for those that carry times."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name not in ("run.json", "report.html")
+    }

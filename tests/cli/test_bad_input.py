@@ -1,0 +1,137 @@
+"""Bad input: a clear message, the right exit code, and nothing that was computed is lost."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.cli.conftest import SMALL, Command, run_json
+
+STOPS_AFTER_FEATURES = """\
+pano_mvs: 1
+stages:
+  images:   {{use: source.folder, path: {images}}}
+  features: {{use: features.sift_tangent, max_keypoints: 200}}
+  pairs:    {{use: pairs.exhaustive}}
+  matches:  {{use: matches.brute_force}}
+"""
+
+
+@pytest.fixture
+def short(tmp_path: Path, capture: Path) -> Path:
+    """A workflow that is over after the matches."""
+    path = tmp_path / "short.yaml"
+    path.write_text(STOPS_AFTER_FEATURES.format(images=capture / "images"))
+    return path
+
+
+def test_empty_folder(pano_mvs: Command, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    result = pano_mvs("run", "quickstart", "--images", tmp_path / "empty")
+    assert result.code == 2
+    assert "no pictures here" in result.flat
+
+
+def test_folder_that_is_not_there(pano_mvs: Command) -> None:
+    result = pano_mvs("run", "quickstart", "--images", "nowhere")
+    assert result.code == 2
+    assert "there is no such folder" in result.flat
+
+
+def test_one_image(pano_mvs: Command, capture: Path) -> None:
+    for path in sorted((capture / "images").iterdir())[1:]:
+        path.unlink()
+    result = pano_mvs("run", "quickstart", "--images", capture / "images")
+    assert result.code == 2
+    assert "depth needs two or more panoramas" in result.flat
+
+
+@pytest.mark.parametrize("damage", ["truncated", "text", "empty", "not 2:1"])
+def test_one_bad_picture_among_good_ones(pano_mvs: Command, short: Path, capture: Path, damage: str) -> None:
+    image = cv2.imread(str(capture / "images" / "001.png"))
+    (capture / "images" / "001.png").unlink()
+    bad = capture / "images" / "001.jpg"
+    cv2.imwrite(str(bad), image[:, : image.shape[1] - 64] if damage == "not 2:1" else image)
+    data = bad.read_bytes()
+    if damage != "not 2:1":
+        bad.write_bytes({"truncated": data[: len(data) // 2], "text": b"not a picture", "empty": b""}[damage])
+    result = pano_mvs("run", short, "--out", "out")
+    assert result.code == 3, result.text
+    assert "001.jpg" in result.flat
+    assert run_json(Path("out"))["stages"][1]["run"] == 3
+    (capture / "images" / "001.jpg").unlink()
+    cv2.imwrite(str(capture / "images" / "001.png"), image)
+    again = pano_mvs("run", short, "--out", "out")
+    assert again.code == 0
+    assert run_json(Path("out"))["stages"][1]["cached"] == 3, "nothing that was computed is lost"
+
+
+def test_only_bad_pictures(pano_mvs: Command, short: Path, capture: Path) -> None:
+    for path in (capture / "images").iterdir():
+        path.write_bytes(b"no picture")
+    result = pano_mvs("run", short)
+    assert result.code == 2
+    assert "none of the 4 items can be used" in result.flat
+
+
+def test_mixed_sizes_work(pano_mvs: Command, capture: Path) -> None:
+    path = capture / "images" / "002.png"
+    image = cv2.imread(str(path))
+    cv2.imwrite(str(path), cv2.resize(image, (256, 128), interpolation=cv2.INTER_AREA))
+    result = pano_mvs("run", "quickstart", "--images", capture / "images", "--out", "out", *SMALL)
+    assert result.code == 0, result.text
+    assert run_json(Path("out"))["poses"]["registered"] == [f"00{number}.png" for number in range(4)]
+
+
+def test_two_identical_pictures(pano_mvs: Command, capture: Path) -> None:
+    shutil.copy(capture / "images" / "000.png", capture / "images" / "000_copy.png")
+    result = pano_mvs("run", "quickstart", "--images", capture / "images", "--out", "out", *SMALL)
+    assert result.code in (0, 3), result.text
+    registered = run_json(Path("out"))["poses"]["registered"]
+    assert {"001.png", "002.png", "003.png"} <= set(registered)
+
+
+def test_typo_in_stage_param_and_port(pano_mvs: Command, short: Path) -> None:
+    short.write_text(
+        short.read_text().replace("features.sift_tangent", "features.sift_tangentt").replace("pairs.exhaustive}", "pairs.exhaustive, in: {imagse: images}}")
+    )  # fmt: skip
+    result = pano_mvs("check", short)
+    assert result.code == 2
+    assert "did you mean 'features.sift_tangent'" in result.flat
+    result = pano_mvs("run", short)
+    assert result.code == 2
+
+
+def test_plugin_that_fails_to_import(pano_mvs: Command, short: Path) -> None:
+    (short.parent / "broken.py").write_text("from pano_mvs.api import stage\n1 / 0\n")
+    short.write_text(short.read_text().replace("stages:", "plugins: [broken.py]\nstages:"))
+    result = pano_mvs("run", short)
+    assert result.code == 2
+    assert "broken.py:2: ZeroDivisionError" in result.flat
+
+
+def test_output_folder_that_cannot_be_written(pano_mvs: Command, short: Path) -> None:
+    Path("blocked").write_text("a file")
+    result = pano_mvs("run", short, "--out", "blocked/out")
+    assert result.code == 4
+    assert "Choose another folder with --out DIR" in result.flat
+    if os.geteuid() != 0:  # root may write anywhere
+        Path("locked").mkdir(mode=0o500)
+        assert pano_mvs("run", short, "--out", "locked/out").code == 4
+
+
+def test_pictures_of_two_places_make_no_false_model(pano_mvs: Command, capture: Path) -> None:
+    rng = np.random.default_rng(1)
+    for name in ("002.png", "003.png"):
+        noise = rng.integers(0, 255, (20, 40, 3), dtype=np.uint8)
+        cv2.imwrite(str(capture / "images" / name), cv2.resize(noise, (320, 160), interpolation=cv2.INTER_CUBIC))
+    result = pano_mvs("run", "quickstart", "--images", capture / "images", "--out", "out", *SMALL)
+    assert result.code == 3, result.text
+    summary = run_json(Path("out"))
+    assert summary["poses"]["registered"] == ["000.png", "001.png"]
+    assert set(summary["rejected"]) == {"002.png", "003.png"}
