@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import TypeVar
 
 import numba
@@ -59,7 +60,8 @@ def pack_plane(plane: NDArray[np.uint8]) -> NDArray[np.uint32]:
     """
     padded = pad_panorama(plane, 1).astype(np.uint32)
     upper, lower = padded[:-1], padded[1:]
-    return upper[:, :-1] | lower[:, :-1] << 8 | upper[:, 1:] << 16 | lower[:, 1:] << 24
+    packed: NDArray[np.uint32] = upper[:, :-1] | lower[:, :-1] << 8 | upper[:, 1:] << 16 | lower[:, 1:] << 24
+    return packed
 
 
 def _fresh_state(rows: int, width: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
@@ -108,19 +110,22 @@ def _aggregate(pool: ThreadPoolExecutor, work: SweepInput, volume: NDArray[np.ui
     settings = work.settings
     total = np.zeros(volume.shape, np.uint16)
     p1 = np.uint16(settings.p1)
-    warm = warm_up((height, width))
-    for direction in DIRECTIONS:
-        penalties = step_penalties(work.reference, direction, settings)
-        strip = min(_STRIP_LINES, width)
-
-        def follow(first: int, p2: NDArray[np.uint16] = penalties, step: tuple[int, int] = direction) -> None:
-            lines = min(strip, width - first)
-            sweep_strip(volume, total, p2, p1, first, lines, step[1], step[0] < 0, warm[0])
-
-        _run(pool, follow, range(0, width, strip))
+    beyond_pole, before_seam = warm_up((height, width))
+    for rows, columns in DIRECTIONS:
+        penalties = step_penalties(work.reference, (rows, columns), settings)
+        follow = partial(_follow_strip, volume, total, penalties, p1, columns, rows < 0, beyond_pole)
+        _run(pool, follow, range(0, width, _STRIP_LINES))
     sideways = np.stack([step_penalties(work.reference, (0, step), settings) for step in (1, -1)])
-    _run(pool, lambda y: sweep_row(volume, total, sideways, p1, y, warm[1]), range(height))
+    _run(pool, lambda y: sweep_row(volume, total, sideways, p1, y, before_seam), range(height))
     return total
+
+
+def _follow_strip(
+    volume: NDArray[np.uint8], total: NDArray[np.uint16], penalties: NDArray[np.uint16], p1: np.uint16,
+    drift: int, upward: bool, warm: int, first: int,
+) -> None:  # fmt: skip
+    lines = min(_STRIP_LINES, volume.shape[2] - first)
+    sweep_strip(volume, total, penalties, p1, first, lines, drift, upward, warm)
 
 
 def _run(pool: ThreadPoolExecutor, work: Callable[[Job], object], jobs: Iterable[Job]) -> None:

@@ -5,6 +5,8 @@ The reference against which compiled backends are held. Memory: about 20 bytes f
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +17,7 @@ from pano_mvs.algorithms.sweep.winner import Winners
 from pano_mvs.geometry import pad_panorama, pixel_from_ray, ray_grid, sample_panorama
 
 FloatArray = NDArray[np.float64]
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 def find_winners(work: SweepInput) -> Winners:
@@ -92,7 +95,7 @@ def _box_mean(cost: FloatArray, radius: int, *, spherical: bool) -> FloatArray:
     return result
 
 
-def _neighbours(picture: NDArray[np.generic], rows: int, columns: NDArray[np.int64]) -> NDArray[np.generic]:
+def _neighbours(picture: NDArray[Scalar], rows: int, columns: NDArray[np.int64]) -> NDArray[Scalar]:
     """Return for every pixel the one that lies `rows` below and `columns` (H,) to its right, (H, W)."""
     height, width = picture.shape
     pad = abs(rows)
@@ -137,4 +140,5 @@ def path_step(
     outside = np.full_like(before[:1], np.iinfo(np.int32).max)
     down = np.concatenate([outside, before[:-1]]) + p1
     up = np.concatenate([before[1:], outside]) + p1
-    return costs + np.minimum(np.minimum(before, floor + penalty), np.minimum(down, up)) - floor
+    advanced: NDArray[np.int64] = costs + np.minimum(np.minimum(before, floor + penalty), np.minimum(down, up)) - floor
+    return advanced

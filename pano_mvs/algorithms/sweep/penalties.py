@@ -32,7 +32,7 @@ def step_penalties(
     before = padded[1 - rows : 1 - rows + height, 1 - columns : 1 - columns + width]
     contrast = np.abs(padded[1:-1, 1:-1] - before)
     penalty = np.maximum(settings.p1, settings.p2 / (1 + contrast / settings.p2_contrast))
-    return np.rint(penalty).astype(np.uint16)
+    return np.asarray(np.rint(penalty), dtype=np.uint16)
 
 
 def warm_up(size_hw: tuple[int, int]) -> tuple[int, int]:

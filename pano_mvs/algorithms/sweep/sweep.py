@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.sweep import numpy_backend
 from pano_mvs.algorithms.sweep.exposure import match_all, shrink
 from pano_mvs.algorithms.sweep.hypotheses import virtual_ranges
 from pano_mvs.algorithms.sweep.preparation import SweepInput, prepare_picture, sees_winner, voting_pixels
@@ -91,8 +92,6 @@ def sweep_range(
 
 def _find_winners(work: SweepInput, backend: Backend) -> Winners:
     if backend == "numpy":
-        from pano_mvs.algorithms.sweep import numpy_backend
-
         return numpy_backend.find_winners(work)
     if backend == "numba":
         from pano_mvs.algorithms.sweep import numba_backend  # on use: numba is slow to import

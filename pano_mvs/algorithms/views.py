@@ -1,0 +1,120 @@
+"""Which pictures each reference is swept against."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
+
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import angle_between
+from pano_mvs.scene import Poses, Views
+
+FloatArray = NDArray[np.float64]
+
+# Fewer shared points than this say nothing about how well two pictures see the same place.
+_FEWEST_SHARED = 8
+# Triangulation angles around this one weigh fully; MVS practice puts the best trade between precision and likeness
+# here (Schönberger et al., "Pixelwise view selection for unstructured multi-view stereo", 2016, use similar limits).
+_BEST_ANGLE_DEG = 12.0
+# Centres closer than this share of the extent of the capture are one place.
+_SAME_PLACE = 1e-9
+
+
+def select_views(poses: Poses, *, count: int = 4, min_angle_deg: float = 1.0, max_angle_deg: float = 60.0) -> Views:
+    """Return for each registered image the images to sweep it against, best first.
+
+    With tracks, a pair's score is the sum over the points that both see of a weight for the triangulation angle: 0
+    outside [min, max], rising to 1 at 12° and falling again slowly. Where a reference shares too few points with
+    anybody, and without tracks, near images come first, by the distance of the centres; those that stand much closer
+    together than is usual in the capture come after the others, since they see no parallax.
+
+    Args:
+        poses: of all registered images, with or without points.
+        count: the most sources of a reference.
+        min_angle_deg: points seen under a smaller angle from the two centres do not count.
+        max_angle_deg: nor those under a larger one.
+
+    Returns:
+        An entry for every registered image that has a source at another place, in the order of `poses.names`.
+        Ties are broken by that order.
+
+    Raises:
+        UsageError: if count is not positive or the angles are no interval.
+    """
+    if count < 1 or not 0 <= min_angle_deg < max_angle_deg <= 180:
+        raise UsageError(f"views need count ≥ 1 and 0 ≤ min_angle_deg < max_angle_deg ≤ 180, got {count}, "
+                         f"{min_angle_deg} and {max_angle_deg}")  # fmt: skip
+    distances = _center_distances(poses.centers)
+    scores = _shared_point_scores(poses, min_angle_deg=min_angle_deg, max_angle_deg=max_angle_deg)
+    preference = _distance_ranks(distances)
+    extent = float(distances.max(initial=0.0))
+    apart = distances > _SAME_PLACE * max(extent, 1e-300)
+    neighbours: dict[str, tuple[str, ...]] = {}
+    for idx, name in enumerate(poses.names):
+        usable = np.flatnonzero(apart[idx])
+        order = usable[np.lexsort((usable, preference[idx, usable], -scores[idx, usable]))]
+        if len(order):
+            neighbours[name] = tuple(poses.names[source] for source in order[:count])
+    return Views(neighbours)
+
+
+def _center_distances(centers: FloatArray) -> FloatArray:
+    """Return the distances between all centres, (N, N)."""
+    return np.asarray(cdist(centers, centers), dtype=np.float64)
+
+
+def _distance_ranks(distances: FloatArray) -> FloatArray:
+    """Return how far down the list each image comes by distance alone, (N, N): less is better.
+
+    The distance, with everything below a quarter of the capture's usual step put after all others.
+    """
+    others = np.where(distances > 0, distances, np.inf).min(axis=1, initial=np.inf)
+    usual = float(np.median(others[np.isfinite(others)])) if np.isfinite(others).any() else 0.0
+    too_close = distances < usual / 4
+    return distances + np.where(too_close, 2 * distances.max(initial=0.0), 0.0)
+
+
+def _shared_point_scores(poses: Poses, *, min_angle_deg: float, max_angle_deg: float) -> FloatArray:
+    """Return the weighted number of points that each two images share, (N, N), symmetric; 0 where they are too few."""
+    images = len(poses.names)
+    scores, shared = np.zeros((images, images)), np.zeros((images, images), np.int64)
+    first, second = _covisible(poses)
+    if not len(first):
+        return scores
+    points = np.asarray(poses.points_in_world)[poses.track_point_idx[first]]
+    image_a, image_b = poses.track_image_idx[first], poses.track_image_idx[second]
+    centers = poses.centers
+    with np.errstate(invalid="ignore", divide="ignore"):
+        angle_deg = np.degrees(angle_between(points - centers[image_a], points - centers[image_b]))
+    weight = _angle_weight(angle_deg, min_angle_deg, max_angle_deg)
+    np.add.at(scores, (image_a, image_b), weight)
+    np.add.at(shared, (image_a, image_b), weight > 0)
+    scores, shared = scores + scores.T, shared + shared.T
+    return np.where(shared >= _FEWEST_SHARED, scores, 0.0)
+
+
+def _angle_weight(angle_deg: FloatArray, min_angle_deg: float, max_angle_deg: float) -> FloatArray:
+    """Return the weights α/12° up to 12°, √(12°/α) from there on, 0 outside the limits; (M,)."""
+    inside = (angle_deg >= min_angle_deg) & (angle_deg <= max_angle_deg)
+    safe = np.where(inside, np.maximum(angle_deg, 1e-6), _BEST_ANGLE_DEG)
+    weight = np.minimum(safe / _BEST_ANGLE_DEG, np.sqrt(_BEST_ANGLE_DEG / safe))
+    return np.where(inside, weight, 0.0)
+
+
+def _covisible(poses: Poses) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return all pairs of observations of the same point, as two arrays of positions in the tracks."""
+    order = np.lexsort((poses.track_image_idx, poses.track_point_idx))
+    point = np.asarray(poses.track_point_idx)[order]
+    image = np.asarray(poses.track_image_idx)[order]
+    firsts, seconds = [np.zeros(0, np.intp)], [np.zeros(0, np.intp)]
+    step = 1
+    while step < len(point):
+        same = np.flatnonzero(point[:-step] == point[step:])
+        if not len(same):
+            break
+        same = same[image[same] != image[same + step]]
+        firsts.append(order[same])
+        seconds.append(order[same + step])
+        step += 1
+    return np.concatenate(firsts), np.concatenate(seconds)
