@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 _WIDTH = 1280
-_BAR_HEIGHT, _MARGIN = 16, 14
+_BAR_HEIGHT, _MARGIN = 24, 16
 _INVALID_GREY = 128
 _QUALITY = 88
 _PAPER, _INK = (255, 255, 255), (60, 60, 60)
+_TEXT_SIZE, _TEXT_WEIGHT = 0.9, 2  # legible when the picture is shown at a third of its width
 
 
 def write_preview(path: Path, image: NDArray[np.uint8], range_map: NDArray[np.float32]) -> None:
@@ -56,20 +57,20 @@ def color_mapped(range_map: NDArray[np.float32], near: float, far: float) -> NDA
 
 
 def _scale_bar(near: float, far: float) -> NDArray[np.uint8]:
-    """Return a strip (60, W, 3) with the colours of the scale and the ranges that they stand for."""
-    strip = np.full((_MARGIN + _BAR_HEIGHT + 32, _WIDTH, 3), _PAPER, np.uint8)
-    left, right = 2 * _MARGIN, _WIDTH - 150
+    """Return a strip (h, W, 3) with the colours of the scale and the ranges that they stand for."""
+    strip = np.full((_MARGIN + _BAR_HEIGHT + 46, _WIDTH, 3), _PAPER, np.uint8)
+    left, right = 2 * _MARGIN, _WIDTH - 220
     positions = np.linspace(0, 1, right - left, dtype=np.float32)
     ranges = (near * (far / near) ** positions).astype(np.float32)
     bottom = _MARGIN + _BAR_HEIGHT
     strip[_MARGIN:bottom, left:right] = color_mapped(np.tile(ranges, (_BAR_HEIGHT, 1)), near, far)
     for value in scale_ticks(near, far):
         x = left + round((right - left - 1) * np.log(value / near) / np.log(far / near))
-        cv2.line(strip, (x, bottom), (x, bottom + 5), _INK, 1)
-        _write(strip, f"{value:g}", x, bottom + 22, centered=True)
-    box = (right + 24, _MARGIN), (right + 24 + _BAR_HEIGHT, bottom)
+        cv2.line(strip, (x, bottom), (x, bottom + 7), _INK, 2)
+        _write(strip, f"{value:g}", x, bottom + 35, centered=True)
+    box = (right + 28, _MARGIN), (right + 28 + _BAR_HEIGHT, bottom)
     cv2.rectangle(strip, *box, (_INVALID_GREY,) * 3, cv2.FILLED)
-    _write(strip, "no range", right + 48, bottom - 3, centered=False)
+    _write(strip, "no range", right + 64, bottom - 3, centered=False)
     return strip
 
 
@@ -90,7 +91,6 @@ def scale_ticks(near: float, far: float) -> list[float]:
 
 
 def _write(picture: NDArray[np.uint8], text: str, x: int, y: int, *, centered: bool) -> None:
-    font, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.5
     if centered:
-        x -= cv2.getTextSize(text, font, scale, 1)[0][0] // 2
-    cv2.putText(picture, text, (x, y), font, scale, _INK, 1, cv2.LINE_AA)
+        x -= cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, _TEXT_SIZE, _TEXT_WEIGHT)[0][0] // 2
+    cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, _TEXT_SIZE, _INK, _TEXT_WEIGHT, cv2.LINE_AA)

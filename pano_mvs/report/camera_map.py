@@ -102,11 +102,11 @@ def _label_spots(placed: NDArray[np.float64], labels: list[str]) -> list[tuple[f
     taken: list[tuple[float, float]] = []
     for (x, y), label in zip(placed, labels, strict=True):
         spot = (float(x) + 9, float(y) - 7)
-        half = 4.0 * len(label)
+        half = 4.6 * len(label)
         if spot[0] + 2 * half > _WIDTH:
-            spot = (float(x) - 9 - 1.7 * half, spot[1])
-        while any(abs(spot[0] - other[0]) < 2 * half and abs(spot[1] - other[1]) < 13 for other in taken):
-            spot = (spot[0], spot[1] + 13)
+            spot = (float(x) - 9 - 1.8 * half, spot[1])
+        while any(abs(spot[0] - other[0]) < 2 * half and abs(spot[1] - other[1]) < 15 for other in taken):
+            spot = (spot[0], spot[1] + 15)
         taken.append(spot)
     return list(taken)
 

@@ -6,6 +6,20 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+# The figures of the scores, in words; others are spelt out from their names.
+_WORDS = {
+    "psnr_db": "PSNR dB",
+    "constant_psnr_db": "PSNR dB of a constant",
+    "mae": "mean error",
+    "w_mae": "mean error on the sphere",
+    "abs_rel": "mean relative error",
+    "delta_105": "within 5 %",
+    "w_delta_105": "within 5 % on the sphere",
+    "bad_5": "off by more than 5 %",
+    "of": "of panoramas with truth",
+}
+_UNITS = {"deg": "°", "rad": "rad", "px": "px", "s": "s", "db": "dB", "mb": "MB"}
+
 
 def share(value: Any) -> str:
     """Return a fraction as a percentage, never rounded up to 100 %."""
@@ -50,10 +64,13 @@ def figure(value: Any) -> str:
 
 
 def words(name: str) -> str:
-    """Return the name of a figure in words: `median_pair_error_deg` is `median pair error °`."""
-    units = {"deg": "°", "rad": "rad", "px": "px", "s": "s", "db": "dB"}
+    """Return the name of a figure in words: `median_pair_error_deg` is `median pair error, °`."""
+    if name in _WORDS:
+        return _WORDS[name]
     *parts, last = name.split("_")
-    return " ".join([*parts, units.get(last, last)]) if parts else name
+    if parts[:1] == ["auc"] and last == "deg":
+        return f"AUC at {'.'.join(parts[1:])}°"
+    return f"{' '.join(parts)}, {_UNITS[last]}" if parts and last in _UNITS else name.replace("_", " ")
 
 
 def score_tables(scores: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,0 +1,47 @@
+"""Numbers as people read them."""
+
+import pytest
+
+from pano_mvs.report.figures import duration, figure, median, share, words
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0, "0 %"), (1.0, "100 %"), (0.9999, "99.9 %"), (0.996, "99.6 %"), (0.98, "98 %"), (0.0123, "1.2 %"),
+     (0.0001, "< 0.1 %"), (None, "–"), (float("nan"), "–"), (True, "–")],
+)  # fmt: skip
+def test_shares_are_never_rounded_up_to_all(value, text):
+    assert share(value) == text
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0.04, "0.0 s"), (9.94, "9.9 s"), (9.96, "10 s"), (59.6, "1 min 00 s"), (187.2, "3 min 07 s"),
+     (7620, "2 h 07 min"), (None, "–")],
+)  # fmt: skip
+def test_durations_are_those_of_a_clock(seconds, text):
+    assert duration(seconds) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(1234567, "1\u202f234\u202f567"), (0.0123456, "0.01235"), (1234.56, "1\u202f235"), (float("inf"), "–"),
+     (True, "yes"), (None, "–"), ("numba", "numba"), ([1, 0.5], "1, 0.5"), ({"near_px": 2}, "near, px 2")],
+)  # fmt: skip
+def test_figures_have_four_digits(value, text):
+    assert figure(value) == text
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("median_pair_error_deg", "median pair error, °"), ("auc_0.5_deg", "AUC at 0.5°"), ("points", "points"),
+     ("w_mae", "mean error on the sphere"), ("s", "s")],
+)  # fmt: skip
+def test_names_become_words(name, text):
+    assert words(name) == text
+
+
+def test_the_median_leaves_out_what_is_no_number():
+    assert median([3, None, float("nan"), 1.0, "x", 2]) == 2
+    assert median([1, 2]) == 1.5
+    assert median([None]) is None
