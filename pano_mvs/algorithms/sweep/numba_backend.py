@@ -60,8 +60,8 @@ def pack_plane(plane: NDArray[np.uint8]) -> NDArray[np.uint32]:
     """
     padded = pad_panorama(plane, 1).astype(np.uint32)
     upper, lower = padded[:-1], padded[1:]
-    packed: NDArray[np.uint32] = upper[:, :-1] | lower[:, :-1] << 8 | upper[:, 1:] << 16 | lower[:, 1:] << 24
-    return packed
+    patches = upper[:, :-1] | lower[:, :-1] << 8 | upper[:, 1:] << 16 | lower[:, 1:] << 24
+    return np.asarray(patches, dtype=np.uint32)
 
 
 def _fresh_state(rows: int, width: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:

@@ -43,9 +43,9 @@ class SweepSettings:
     combination: Literal["sum", "best_half"] = "best_half"
     aggregation: Literal["box", "sgm"] = "sgm"
     support: int = 5
-    p1: float = 50.0
-    p2: float = 500.0
-    p2_contrast: float = 0.0
+    p1: int = 80
+    p2: int = 1600
+    p2_contrast: float = 15.0
     subplane: bool = True
     prefilter_diameter: int = 0
     prefilter_sigma_color: float = 25.0
