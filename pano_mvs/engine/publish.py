@@ -20,7 +20,7 @@ class Publisher:
         """Check that the folder can be written.
 
         Raises:
-            StoreError: if it cannot.
+            UsageError: if it cannot.
         """
         self.out = out
         self.store = store
@@ -31,9 +31,9 @@ class Publisher:
         try:
             out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise StoreError(_cannot_write(out, error.strerror or str(error))) from error
+            raise UsageError(_cannot_write(out, error.strerror or str(error))) from error
         if not os.access(out, os.W_OK | os.X_OK):
-            raise StoreError(_cannot_write(out, "permission denied"))
+            raise UsageError(_cannot_write(out, "permission denied"))
 
     def name_items(self, names: Iterable[str]) -> None:
         """Fix the `{item}` of each image: its path without the extension, kept where two would collide."""

@@ -57,7 +57,7 @@ class Run:
         """Prepare a run.
 
         Raises:
-            StoreError: if the output folder cannot be written.
+            UsageError: if the output folder cannot be written.
         """
         self.workflow = workflow
         self.graph = graph

@@ -104,8 +104,7 @@ class Store:
         """Open or create a store.
 
         Raises:
-            StoreError: if the folder cannot be written.
-            UsageError: if it was made by a version with another layout.
+            UsageError: if the folder cannot be written, or was made by a version with another layout.
         """
         self.root = root
         self.damaged: list[str] = []
@@ -206,12 +205,18 @@ class Store:
         try:
             layout = json.loads(path.read_bytes())
         except FileNotFoundError:
-            write_text(path, json.dumps({"layout": LAYOUT_VERSION}))
+            self._create(path)
             return
         except (OSError, ValueError) as error:
-            raise StoreError(f"cache {self.root} cannot be read: {error}. Choose another with --cache DIR") from error
+            raise UsageError(f"cache {self.root} cannot be read: {error}. Choose another with --cache DIR") from error
         if not isinstance(layout, dict) or layout.get("layout") != LAYOUT_VERSION:
             raise UsageError(
                 f"cache {self.root} has layout {layout!r}, this version uses {LAYOUT_VERSION}. "
                 "Choose another with --cache DIR"
             )
+
+    def _create(self, path: Path) -> None:
+        try:
+            write_text(path, json.dumps({"layout": LAYOUT_VERSION}))
+        except StoreError as error:
+            raise UsageError(f"cache {self.root} cannot be written. Choose another with --cache DIR") from error

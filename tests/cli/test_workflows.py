@@ -14,6 +14,14 @@ from pano_mvs.io.ply import read_ply
 from pano_mvs.io.range_files import read_range_tiff
 from tests.cli.conftest import SIZE_HW, SMALL, Command, deliverables, run_json
 
+
+def known(capture: Path) -> tuple[str, ...]:
+    """Options that point known_poses at a rendered capture and its truth."""
+    truth = capture / "truth"
+    paths = ("--set", f"poses.path={truth / 'poses.json'}", "--set", f"scores.truth={truth}")
+    return ("--images", str(capture / "images"), *paths, *SMALL)
+
+
 NAMES = ["000", "001", "002", "003"]
 
 
@@ -94,8 +102,7 @@ def test_cloud_lies_on_the_walls(quickstart: tuple[Path, str]) -> None:
 
 
 def test_second_run_computes_nothing_and_separate_stores_agree(pano_mvs: Command, capture: Path) -> None:
-    arguments = ("run", "known_poses", "--images", capture / "images", *SMALL,
-                 "--set", f"poses.path={capture / 'truth' / 'poses.json'}", "--set", f"scores.truth={capture / 'truth'}")  # fmt: skip
+    arguments = ("run", "known_poses", *known(capture))
     first = pano_mvs(*arguments, "--out", "a", "--cache", "cache_a")
     assert first.code == 0, first.text
     second = pano_mvs(*arguments, "--out", "a", "--cache", "cache_a")
@@ -109,9 +116,8 @@ def test_second_run_computes_nothing_and_separate_stores_agree(pano_mvs: Command
 
 
 def test_touching_one_image_under_known_poses_runs_exactly_its_units(pano_mvs: Command, capture: Path) -> None:
-    arguments = ("known_poses", "--images", capture / "images", *SMALL,
-                 "--set", f"poses.path={capture / 'truth' / 'poses.json'}", "--set", "views.sources=2",
-                 "--set", f"scores.truth={capture / 'truth'}", "--set", "depth.near=0.4", "--set", "depth.far=6")  # fmt: skip
+    limits = ("--set", "views.sources=2", "--set", "depth.near=0.4", "--set", "depth.far=6")
+    arguments = ("known_poses", *known(capture), *limits)
     assert pano_mvs("run", *arguments).code == 0
     path = capture / "images" / "003.png"
     image = cv2.imread(str(path))

@@ -14,10 +14,11 @@ from tests.engine.conftest import Toy
 EXEMPT = {"run.json", "report.html"}
 
 
-def start(toy: Toy) -> subprocess.Popen[str]:
+def start(toy: Toy, *, sleep_s: float = 0.0) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "pano_mvs", "run", str(toy.folder / "wf.yaml"),
                "--cache", str(toy.folder / "cache"), "--out", str(toy.folder / "out")]  # fmt: skip
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+                            env=os.environ | {"TOY_SLEEP_S": str(sleep_s)})  # fmt: skip
 
 
 def finished_records(toy: Toy) -> int:
@@ -42,10 +43,7 @@ def test_killed_run_resumes_with_the_unfinished_units_only(toy: Toy, tmp_path: P
     clean = deliverables(toy)
     for path in sorted((toy.folder / "out").rglob("*"), reverse=True):
         path.unlink() if path.is_file() else path.rmdir()
-    toy.edit(
-        "plug.py", lambda text: text.replace("    return Mean(", "    import time; time.sleep(0.2)\n    return Mean(")
-    )
-    process = start(toy)
+    process = start(toy, sleep_s=0.2)
     wait_for_records(toy, process, 5 + 5 + 1 + 4 + 1 + 1 + 2)  # in the middle of the means
     os.kill(process.pid, signal.SIGKILL)
     process.communicate()
@@ -58,10 +56,7 @@ def test_killed_run_resumes_with_the_unfinished_units_only(toy: Toy, tmp_path: P
 
 
 def test_interrupt_ends_with_exit_code_130_and_says_how_to_go_on(toy: Toy) -> None:
-    toy.edit(
-        "plug.py", lambda text: text.replace("    return Mean(", "    import time; time.sleep(0.3)\n    return Mean(")
-    )
-    process = start(toy)
+    process = start(toy, sleep_s=0.3)
     wait_for_records(toy, process, 18)
     process.send_signal(signal.SIGINT)
     output, _ = process.communicate(timeout=60)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pano_mvs.core.errors import GateError, InputError, StoreError, UsageError
+from pano_mvs.core.errors import GateError, InputError, UsageError
 from tests.engine.conftest import Toy, ran
 
 ALL_UNITS = {
@@ -182,7 +182,7 @@ def test_stages_that_write_one_file_are_told_so(toy: Toy) -> None:
 
 def test_output_folder_that_cannot_be_made_is_an_error(toy: Toy) -> None:
     (toy.folder / "out").write_text("a file is in the way")
-    with pytest.raises(StoreError, match="Choose another folder with --out"):
+    with pytest.raises(UsageError, match="Choose another folder with --out"):
         toy.run()
 
 

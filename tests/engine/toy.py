@@ -2,6 +2,8 @@
 
 PLUGIN = '''
 """A toy pipeline."""
+import os
+import time
 from dataclasses import dataclass
 from typing import ClassVar
 from pano_mvs.api import (
@@ -96,6 +98,7 @@ def views(names: Names[Number]) -> Views:
 @stage("toy.mean")
 def mean(own: Each[Number], around: Near[Number]) -> Mean:
     """Mean of the neighbours and the own."""
+    time.sleep(float(os.environ.get("TOY_SLEEP_S", "0")))
     return Mean((own.value + sum(x.value for x in around)) / (1 + len(around)))
 
 
