@@ -27,25 +27,25 @@ def fill_from_neighbours(
 
     Args:
         range_map: (H, W) with even W, the full sphere.
-        max_distance_px: how far a path runs, in pixels at the equator.
+        max_distance_px: how far a path runs, in pixels at the equator; no path runs further than from pole to pole.
         min_confidence: trusted pixels have at least this confidence; 128 is consistent.
 
     Returns:
         The range map; filled pixels have confidence 63, when next to a trusted pixel, down to 1.
 
     Raises:
-        UsageError: if max_distance_px is not positive or larger than the height.
+        UsageError: if max_distance_px is not positive
     """
     height, width = range_map.range.shape
-    if not 1 <= max_distance_px <= height:
-        raise UsageError(f"max_distance_px must lie between 1 and the height {height}, got {max_distance_px}")
+    if max_distance_px < 1:
+        raise UsageError(f"max_distance_px must be positive, got {max_distance_px}")
     from pano_mvs.algorithms.filters.kernels_fill import fill_holes  # compiles on import
 
     wanted = ~range_map.valid
     trusted = range_map.valid & (range_map.confidence >= min_confidence)
     known = 1 / range_map.range.astype(np.float64)
     columns = columns_per_step((height, width), steps=8)
-    inverse, distance = fill_holes(known, wanted, trusted, columns, max_distance_px, _MAX_RATIO)
+    inverse, distance = fill_holes(known, wanted, trusted, columns, min(max_distance_px, height), _MAX_RATIO)
     filled = distance > 0
     ranges, confidence = range_map.range.copy(), range_map.confidence.copy()
     ranges[filled] = 1 / inverse[filled]

@@ -9,13 +9,13 @@ _EMPTY = -1
 # Colours are numbered within a cube of 128 bins per channel, of which the outermost stay empty.
 COLOR_BINS = 128
 _LUMA, _BLUE, _RED = COLOR_BINS * COLOR_BINS, COLOR_BINS, 1
-_SLOT_MULTIPLIER = np.uint64(0x9E3779B97F4A7C15)
+_PRIME, _MULTIPLIER = 2147483647, 1640531527
 
 
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
 def _slot(key, bits):  # type: ignore[no-untyped-def]
-    """Return where to look first for a key in a table of 2^bits slots (Fibonacci hashing)."""
-    return np.int64((np.uint64(key) * _SLOT_MULTIPLIER) >> np.uint64(64 - bits))
+    """Return where to look first for a key in a table of 2^bits slots (multiplicative hashing without overflow)."""
+    return ((np.int64(key) % _PRIME * _MULTIPLIER) >> 20) & ((1 << bits) - 1)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

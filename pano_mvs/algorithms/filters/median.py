@@ -65,7 +65,7 @@ def _window_has_hole(padded: NDArray[np.float32], window: int) -> NDArray[np.boo
 
 def _median_of_windows(windows: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the lower median of the valid values of each window, (..., k, k) to (...,); NaN where there is none."""
-    values = np.sort(windows.reshape(*windows.shape[:-2], -1), axis=-1)  # NaN sorts last
+    values = np.sort(windows.reshape(*windows.shape[:-2], windows.shape[-1] ** 2), axis=-1)  # NaN sorts last
     count = np.isfinite(values).sum(axis=-1, keepdims=True)
     median: NDArray[np.float32] = np.take_along_axis(values, np.maximum(count - 1, 0) // 2, axis=-1)[..., 0]
     return median

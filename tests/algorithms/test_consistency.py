@@ -1,0 +1,150 @@
+"""Multi-view consistency: true ranges agree, wrong ones do not, and the compiled judge equals the plain one."""
+
+import numpy as np
+import pytest
+
+from pano_mvs.algorithms.filters.consistency import check_consistency, seen_ranges
+from pano_mvs.algorithms.filters.kernels_reprojection import judge_view
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import Rigid3, ray_grid, roll_panorama
+from pano_mvs.scene import RangeMap
+from pano_mvs.testing.room import capture_poses, default_room
+from tests.algorithms.range_scenes import as_map, random_map, rolled, room_range
+from tests.oracles import range_filters as oracle
+
+SIZE = (128, 256)
+POSES = capture_poses(4, seed=1, spread=0.4)
+# At this size the rays of a pixel and of its nearest neighbour are 1.4° apart, so the limits are wider than the defaults.
+LIMITS = {"max_relative_error": 0.02, "max_reprojection_px": 1.0}
+
+
+@pytest.fixture(scope="module")
+def true_maps():
+    room = default_room()
+    return [as_map(room_range(room, pose, SIZE)) for pose in POSES]
+
+
+def checked(maps, **settings):
+    return check_consistency(maps[0], POSES[0], maps[1:], POSES[1:], **LIMITS | settings)
+
+
+@pytest.mark.parametrize("size", [(12, 24), (13, 20)])
+def test_compiled_verdicts_equal_the_plain_ones(size):
+    """On maps without any order, seen from all over: every branch, the seam and the poles."""
+    rng = np.random.default_rng(0)
+    pose = capture_poses(2, seed=3, tilt_deg=60)[1]
+    reference, source = random_map(rng, size), random_map(rng, (16, 32))
+    smooth = as_map(2 + 0.02 * rng.random((16, 32)))
+    for ranges in (source.range, smooth.range):
+        verdicts, errors = judge_view(
+            reference.range, ray_grid(size), pose.rotation, pose.translation, ranges,
+            np.array([0.2, 3 * 2 * np.pi / size[1], 0.3]),
+        )  # fmt: skip
+        expected, expected_errors = oracle.judge(reference.range, pose, ranges, 0.2, 3, 0.3)
+        assert len(np.unique(expected)) == 3
+        np.testing.assert_array_equal(verdicts, expected)
+        np.testing.assert_allclose(errors, expected_errors, rtol=1e-5, atol=1e-6)
+
+
+def test_true_ranges_confirm_each_other(true_maps):
+    result = checked(true_maps, remove_inconsistent=True)
+    result.check()
+    assert (result.confidence >= 128).mean() > 0.96
+    assert result.valid.mean() > 0.995
+
+
+def test_wrong_ranges_are_not_confirmed_and_go_when_seen_through(true_maps):
+    rng = np.random.default_rng(1)
+    wrong = rng.random(SIZE) < 0.2
+    factor = np.where(wrong, rng.choice([0.6, 0.7, 1.4, 1.7], SIZE), 1)
+    maps = [as_map(true_maps[0].range * factor), *true_maps[1:]]
+    result = checked(maps)
+    assert (result.confidence[wrong] >= 128).mean() < 0.03
+    assert (result.confidence[~wrong] >= 128).mean() > 0.96
+    assert result.valid.all()
+    removed = ~checked(maps, remove_inconsistent=True).valid
+    near = wrong & (factor < 1)
+    assert removed[near].mean() > 0.9
+    assert removed[~wrong].mean() < 0.005
+    # A range too large lies behind what the others see: they cannot tell it from something hidden.
+    assert removed[factor > 1].mean() < 0.1
+
+
+def test_confidence_grows_with_the_number_of_views_and_falls_with_the_error(true_maps):
+    few, many = checked(true_maps[:2] + [as_map(np.full(SIZE, np.nan))] * 2), checked(true_maps)
+    both = few.confidence >= 128
+    assert np.median(many.confidence[both]) > np.median(few.confidence[both])
+    off = checked([as_map(true_maps[0].range * 1.01), *true_maps[1:]])
+    both = (off.confidence >= 128) & (many.confidence >= 128)
+    assert np.median(off.confidence[both]) < np.median(many.confidence[both])
+
+
+def test_min_views_is_the_number_that_must_confirm(true_maps):
+    shares = [(checked(true_maps, min_views=views).confidence >= 128).mean() for views in (1, 2, 3, 4)]
+    assert shares == sorted(shares, reverse=True)
+    assert shares[2] > 0.5
+    assert shares[3] == 0
+
+
+def test_the_order_of_the_sources_does_not_matter(true_maps):
+    order = [2, 0, 1]
+    turned = check_consistency(
+        true_maps[0], POSES[0], [true_maps[1:][i] for i in order], [POSES[1:][i] for i in order], **LIMITS
+    )
+    np.testing.assert_array_equal(turned.confidence, checked(true_maps).confidence)
+
+
+def test_the_world_frame_does_not_matter(true_maps):
+    world_from_other = Rigid3(POSES[3].rotation, np.array([5.0, -3, 2]))
+    poses = [pose @ world_from_other for pose in POSES]
+    turned = check_consistency(true_maps[0], poses[0], true_maps[1:], poses[1:], **LIMITS)
+    np.testing.assert_allclose(turned.confidence, checked(true_maps).confidence, atol=1)
+
+
+@pytest.mark.parametrize("columns", [1, 100, 255])
+def test_rolling_the_reference_rolls_the_result(true_maps, columns):
+    _, new_from_old = roll_panorama(true_maps[0].range, columns)
+    pose = Rigid3(new_from_old, np.zeros(3)) @ POSES[0]
+    result = check_consistency(rolled(true_maps[0], columns), pose, true_maps[1:], POSES[1:], **LIMITS)
+    expected = rolled(checked(true_maps), columns).confidence
+    # Rays of a rolled picture differ by rounding, which tips pixels that lie between two surfaces.
+    assert (np.abs(result.confidence.astype(int) - expected) > 1).mean() < 1e-3
+
+
+@pytest.mark.parametrize("columns", [1, 100, 255])
+def test_rolling_a_source_changes_nothing(true_maps, columns):
+    _, new_from_old = roll_panorama(true_maps[1].range, columns)
+    maps = [true_maps[0], rolled(true_maps[1], columns), *true_maps[2:]]
+    poses = [POSES[0], Rigid3(new_from_old, np.zeros(3)) @ POSES[1], *POSES[2:]]
+    result = check_consistency(maps[0], poses[0], maps[1:], poses[1:], **LIMITS)
+    assert (np.abs(result.confidence.astype(int) - checked(true_maps).confidence) > 1).mean() < 1e-3
+
+
+def test_filled_pixels_neither_vote_nor_are_promoted(true_maps):
+    filled = [RangeMap(m.range, np.full(SIZE, 40, np.uint8)) for m in true_maps]
+    assert (checked([true_maps[0], *filled[1:]]).confidence < 128).all()
+    np.testing.assert_array_equal(checked([filled[0], *true_maps[1:]]).confidence, 40)
+    assert np.isnan(seen_ranges(filled[0], min_confidence=64)).all()
+
+
+def test_what_was_consistent_before_is_weak_when_nobody_confirms_it(true_maps):
+    alone = check_consistency(RangeMap(true_maps[0].range, np.full(SIZE, 250, np.uint8)), POSES[0], [], [])
+    np.testing.assert_array_equal(alone.confidence, 127)
+
+
+def test_any_number_of_threads_gives_the_same_bytes(true_maps):
+    numba = pytest.importorskip("numba")
+    before = numba.get_num_threads()
+    results = []
+    for threads in {1, before}:
+        numba.set_num_threads(threads)
+        results.append(checked(true_maps).confidence.tobytes())
+    numba.set_num_threads(before)
+    assert len(set(results)) == 1
+
+
+def test_impossible_calls_are_named(true_maps):
+    with pytest.raises(UsageError, match="one pose for each"):
+        check_consistency(true_maps[0], POSES[0], true_maps[1:], POSES[2:])
+    with pytest.raises(UsageError, match="must be positive"):
+        checked(true_maps, min_views=0)

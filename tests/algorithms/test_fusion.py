@@ -1,0 +1,230 @@
+"""Normals and the voted cloud."""
+
+import numpy as np
+import pytest
+
+from pano_mvs.algorithms.filters.sphere_steps import columns_per_step
+from pano_mvs.algorithms.fusion.normals import normals_from_range
+from pano_mvs.algorithms.fusion.vote import FusionView, fuse_reference, fuse_views, join_clouds
+from pano_mvs.algorithms.fusion.voxels import thin_by_voxels
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import Rigid3, angle_between, ray_grid
+from pano_mvs.scene import PointCloud
+from pano_mvs.testing.room import capture_poses, default_room, range_along
+from tests.algorithms.range_scenes import as_map, box_range, random_map, room_range
+from tests.oracles import normals as oracle
+
+SIZE = (128, 256)
+POSES = capture_poses(3, seed=2, spread=0.4)
+
+
+def painted(ranges, pose):
+    """A picture whose colours are a smooth function of the place in the world."""
+    points = pose.inverse().apply(ray_grid(ranges.shape) * ranges[..., None])
+    return np.rint(127 + 100 * np.sin(points)).clip(0, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def views():
+    room = default_room()
+    maps = [room_range(room, pose, SIZE) for pose in POSES]
+    return [FusionView(as_map(m), pose, painted(m, pose)) for m, pose in zip(maps, POSES, strict=True)]
+
+
+class TestNormals:
+    def test_equal_the_plain_fit(self):
+        size = (16, 32)
+        ranges = 2 + 0.3 * np.random.default_rng(0).random(size).astype(np.float32)
+        ranges[3, 5:9], ranges[8:, 20:] = np.nan, 5
+        expected = oracle.normals(ranges, 2, 0.05, columns_per_step(size, steps=5))
+        found = normals_from_range(ranges)
+        np.testing.assert_array_equal(np.isnan(found), np.isnan(expected))
+        defined = np.isfinite(expected[..., 0])
+        assert defined.mean() > 0.5
+        assert np.abs(found - expected)[defined].max() < 1e-3
+
+    def test_of_a_ball_around_the_camera_look_at_it(self):
+        found = normals_from_range(np.full(SIZE, 3.0, np.float32))
+        error = np.degrees(angle_between(found, -ray_grid(SIZE)))
+        # The window is not quite symmetric in the rows next to a pole.
+        assert error[4:-4].max() < 0.05
+        assert error.max() < 1
+
+    def test_of_a_ball_off_centre_are_its_radii(self):
+        center = np.array([0.5, 0.3, -0.4])
+        rays = ray_grid(SIZE)
+        along = rays @ center
+        ranges = along + np.sqrt(along**2 - center @ center + 4)
+        expected = center - ranges[..., None] * rays
+        found = normals_from_range(ranges.astype(np.float32))
+        assert np.degrees(angle_between(found, expected)).max() < 1
+
+    def test_of_walls_are_theirs_over_seam_and_poles(self):
+        ranges, expected = box_range((256, 512))
+        found = normals_from_range(ranges)
+        error = np.degrees(angle_between(found, expected))
+        same = np.ones(ranges.shape, bool)
+        for d_row in range(-6, 7):
+            for d_column in range(-6, 7):
+                same &= (np.roll(expected, (d_row, d_column), (0, 1)) == expected).all(-1)
+        same[:3], same[-3:] = True, True
+        assert same.mean() > 0.7
+        assert error[same].max() < 1
+        assert np.median(error) < 0.01
+
+    def test_do_not_mix_two_surfaces(self):
+        rays = ray_grid(SIZE)
+        ranges = (3 / np.maximum(rays[..., 2], 0.1)).astype(np.float32)  # a wall ahead
+        ranges[55:70, 110:140] = 2.5  # a piece of a ball before it
+        error_wall = np.degrees(angle_between(normals_from_range(ranges), (0, 0, -1)))
+        error_ball = np.degrees(angle_between(normals_from_range(ranges), -rays))
+        assert error_wall[50:75, [108, 109, 140, 141]].max() < 1
+        assert error_ball[55:70, 110:140].max() < 1
+
+    def test_face_the_camera_and_have_unit_length(self):
+        ranges = random_map(np.random.default_rng(4), (64, 128)).range
+        ranges = np.where(np.isfinite(ranges), 3 + 0.02 * ranges, np.nan).astype(np.float32)
+        found = normals_from_range(as_map(ranges))
+        defined = np.isfinite(found[..., 0])
+        assert (defined <= np.isfinite(ranges)).all()
+        np.testing.assert_allclose(np.linalg.norm(found[defined], axis=-1), 1, rtol=1e-5)
+        # A smooth wall with 1 % noise: more than nine of ten still look this way.
+        assert (np.sum(found * ray_grid((64, 128)), axis=-1)[defined] < 0).mean() > 0.9
+
+    def test_lonely_pixels_have_none(self):
+        ranges = np.full((16, 32), np.nan, np.float32)
+        ranges[8, 4:7] = 2
+        assert np.isnan(normals_from_range(ranges)).all()
+
+    def test_impossible_maps_are_named(self):
+        with pytest.raises(UsageError, match="even W"):
+            normals_from_range(np.ones((16, 31), np.float32))
+
+
+class TestFusion:
+    def test_true_ranges_give_the_true_surface_and_its_colours(self, views):
+        cloud = fuse_views(views)
+        cloud.check()
+        points = cloud.points_in_world.astype(np.float64)
+        # Distance to the surface along the ray from the first camera, where it is not hidden from there.
+        distance = np.linalg.norm(points, axis=1)
+        true = range_along(default_room(), np.zeros(3), points / distance[:, None])
+        visible = true > distance * 0.98
+        assert visible.mean() > 0.6
+        error = np.abs(true - distance)[visible] / distance[visible]
+        assert np.median(error) < 5e-4
+        assert np.quantile(error, 0.9) < 0.01
+        expected = np.rint(127 + 100 * np.sin(points))
+        assert np.median(np.abs(cloud.colors_rgb - expected)) <= 1
+        assert (np.sum(cloud.normals_in_world * points, axis=1)[visible] < 0).mean() > 0.98
+
+    def test_each_surface_is_written_once_and_none_is_lost(self, views):
+        cloud = fuse_views(views)
+        alone = [len(fuse_reference(view, [], [], min_views=1)) for view in views]
+        assert 0.4 * np.mean(alone) < len(cloud) < 1.3 * np.mean(alone)
+        truth = views[0].range_map.range
+        points = (ray_grid(SIZE) * truth[..., None])[::4, ::8].reshape(-1, 3)
+        spacing = (2 * np.pi / SIZE[1] * truth[::4, ::8]).ravel()
+        nearest = np.array([np.linalg.norm(cloud.points_in_world - point, axis=1).min() for point in points])
+        assert (nearest < 4 * spacing).mean() > 0.96
+
+    def test_the_view_that_sees_best_writes(self):
+        """Two cameras on the axis of a ball: each writes its own half."""
+        poses = [Rigid3.from_center(np.eye(3), (x, 0, 0)) for x in (-0.8, 0.8)]
+        views = []
+        for pose in poses:
+            rays = ray_grid(SIZE)
+            along = -(rays @ pose.center)
+            ranges = along + np.sqrt(along**2 - pose.center @ pose.center + 4)
+            views.append(FusionView(as_map(ranges), pose, np.zeros((*SIZE, 3), np.uint8)))
+        left = fuse_reference(views[0], [], views[1:])
+        right = fuse_reference(views[1], views[:1], [])
+        assert (left.points_in_world[:, 0] < 0.15).mean() > 0.99
+        assert (right.points_in_world[:, 0] > -0.15).mean() > 0.99
+        cloud = fuse_views(views)
+        np.testing.assert_allclose(np.linalg.norm(cloud.points_in_world, axis=1), 2, rtol=2e-3)
+        inwards = -cloud.points_in_world / 2
+        assert np.degrees(angle_between(cloud.normals_in_world, inwards)).max() < 1
+
+    def test_what_no_other_view_confirms_is_dropped(self, views):
+        wrong = np.zeros(SIZE, bool)
+        wrong[50:70, 100:140] = True
+        ranges = np.where(wrong, 0.7 * views[0].range_map.range, views[0].range_map.range)
+        broken = [FusionView(as_map(ranges), views[0].pose, views[0].image), *views[1:]]
+        points = fuse_views(broken).points_in_world
+        distance = np.linalg.norm(points, axis=1)
+        true = range_along(default_room(), np.zeros(3), points / distance[:, None].astype(np.float64))
+        assert (distance < 0.9 * true).mean() < 1e-3
+
+    def test_min_views_and_min_confidence_are_obeyed(self, views):
+        assert fuse_views(views, min_views=3).view_counts.min() == 3
+        assert len(fuse_views(views[:1])) == 0
+        assert len(fuse_views(views[:1], min_views=1)) > 0.5 * np.prod(SIZE)
+        filled = [FusionView(as_map(v.range_map.range, 63), v.pose, v.image) for v in views]
+        assert len(fuse_views(filled)) == 0
+        assert len(fuse_views(filled, min_confidence=1)) == len(fuse_views(views))
+        assert len(fuse_views([])) == 0
+
+    def test_points_are_even_over_the_sphere(self):
+        """A ball around the camera: as many points above 60° as its solid angle says, and so at the pole."""
+        view = FusionView(as_map(np.full(SIZE, 2.0)), Rigid3.identity(), np.zeros((*SIZE, 3), np.uint8))
+        for stride in (1, 2, 3):
+            points = fuse_views([view], min_views=1, stride=stride).points_in_world
+            for limit in (np.cos(np.radians(20)), np.sin(np.radians(60)), 0.0):
+                expected = (1 - limit) / 2
+                assert (points[:, 1] / 2 > limit).mean() == pytest.approx(expected, rel=0.15)
+            assert len(points) == pytest.approx(np.prod(SIZE) * 2 / np.pi / stride**2, rel=0.05)
+
+    def test_twice_gives_the_same_bytes(self, views):
+        first, second = fuse_views(views, voxel_size=0.05), fuse_views(iter(views), voxel_size=0.05)
+        assert first.points_in_world.tobytes() == second.points_in_world.tobytes()
+        assert first.colors_rgb.tobytes() == second.colors_rgb.tobytes()
+
+    def test_moving_the_world_moves_the_cloud(self, views):
+        other_from_world = Rigid3(POSES[1].rotation, np.array([3.0, -2, 7]))
+        moved = [FusionView(v.range_map, v.pose @ other_from_world.inverse(), v.image) for v in views]
+        first, second = fuse_views(views), fuse_views(moved)
+        assert len(second) == pytest.approx(len(first), rel=1e-3)
+        low, high = (other_from_world.apply(first.points_in_world), second.points_in_world)
+        np.testing.assert_allclose(np.median(low, 0), np.median(high, 0), atol=2e-3)
+
+    def test_impossible_calls_are_named(self, views):
+        with pytest.raises(UsageError, match="must be positive"):
+            fuse_views(views, min_views=0)
+        small = FusionView(views[0].range_map, views[0].pose, views[0].image[::2])
+        with pytest.raises(UsageError, match="image must be"):
+            fuse_views([small])
+
+
+class TestVoxels:
+    def cloud(self, points):
+        count = len(points)
+        normals = np.tile(np.float32([0, 0, 1]), (count, 1))
+        colors = np.arange(3 * count, dtype=np.uint8).reshape(count, 3)
+        return PointCloud(np.float32(points), normals, colors, np.arange(1, count + 1, dtype=np.uint8))
+
+    def test_one_point_is_left_in_each_voxel(self):
+        points = np.random.default_rng(0).uniform(-1, 1, (500, 3))
+        thin = thin_by_voxels(self.cloud(points), 0.25)
+        thin.check()
+        occupied = np.unique(np.floor(points / 0.25), axis=0)
+        assert len(thin) == len(occupied)
+        np.testing.assert_array_equal(np.unique(np.floor(thin.points_in_world / 0.25), axis=0), occupied)
+        np.testing.assert_allclose(np.linalg.norm(thin.normals_in_world, axis=1), 1, rtol=1e-6)
+
+    def test_points_are_averaged_by_their_views_in_order_of_appearance(self):
+        thin = thin_by_voxels(self.cloud([[5.1, 0.5, 0.5], [0.1, 0.5, 0.5], [5.4, 0.5, 0.5]]), 1.0)
+        np.testing.assert_allclose(thin.points_in_world, [[5.325, 0.5, 0.5], [0.1, 0.5, 0.5]], rtol=1e-6)
+        np.testing.assert_array_equal(thin.view_counts, [3, 2])
+        np.testing.assert_array_equal(thin.colors_rgb[0], np.rint((np.arange(3) + 3 * np.arange(6, 9)) / 4))
+
+    def test_normals_that_cancel_leave_the_first(self):
+        normals = np.float32([[0, 0, 1], [0, 0, -1]])
+        one = np.ones(2, np.uint8)
+        cloud = PointCloud(np.zeros((2, 3), np.float32), normals, np.zeros((2, 3), np.uint8), one)
+        np.testing.assert_array_equal(thin_by_voxels(cloud, 1.0).normals_in_world, [[0, 0, 1]])
+
+    def test_nothing_stays_nothing_and_a_bad_size_is_named(self):
+        assert len(thin_by_voxels(join_clouds([]), 0.1)) == 0
+        with pytest.raises(UsageError, match="voxel_size"):
+            thin_by_voxels(join_clouds([]), 0)
