@@ -48,7 +48,7 @@ def spread_keypoints(bearings: FloatArray, scores: NDArray[np.float32], *, max_k
     if len(order) <= max_keypoints:
         return order
     cells = _fibonacci_sphere(max(20, max_keypoints // _KEYPOINTS_PER_CELL))
-    cell = cKDTree(cells).query(bearings[order])[1]
+    cell = np.asarray(cKDTree(cells).query(bearings[order])[1], np.intp)
     by_cell = np.argsort(cell, kind="stable")
     first_of_cell = np.searchsorted(cell[by_cell], np.arange(len(cells)))
     rank = np.empty(len(order), np.intp)

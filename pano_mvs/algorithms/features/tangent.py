@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -21,7 +21,7 @@ _ORB_SCALE, _ORB_LEVELS = 1.2, 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Found:
-    """Key points on one tile: (N, 2) pixels ((0, 0) the corner), (N,) sizes in pixels, strengths, (N, D) descriptors."""
+    """Key points on one tile: pixels (N, 2), (0, 0) its corner; sizes and strengths (N,); descriptors (N, D)."""
 
     pixels_px: NDArray[np.float64]
     sizes_px: NDArray[np.float64]
@@ -59,7 +59,7 @@ def extract_sift(
         UsageError: if the shapes of image and mask do not fit.
     """
     # Without the precise upscale all key points of the first octave are shifted by a quarter of a pixel.
-    detector = cv2.SIFT_create(contrastThreshold=contrast_threshold, enable_precise_upscale=True)
+    detector = cv2.SIFT.create(contrastThreshold=contrast_threshold, enable_precise_upscale=True)
 
     def detect(tile_image: NDArray[np.uint8]) -> _Found:
         keypoints, descriptors = detector.detectAndCompute(tile_image, None)
@@ -88,7 +88,7 @@ def extract_orb(
     Raises:
         UsageError: if the shapes of image and mask do not fit.
     """
-    detector = cv2.ORB_create(
+    detector = cv2.ORB.create(
         nfeatures=max(500, max_keypoints // 5),
         scaleFactor=_ORB_SCALE,
         nlevels=_ORB_LEVELS,
@@ -113,8 +113,8 @@ def _extract(
     metric: Literal["l2", "hamming"],
 ) -> Features:
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or mask.shape != image.shape[:2]:
-        raise UsageError(f"features need an (H, W, 3) uint8 picture and an (H, W) mask, got {image.shape} {image.dtype} "
-                         f"and {mask.shape}")  # fmt: skip
+        raise UsageError(f"features need an (H, W, 3) uint8 picture and an (H, W) mask, got {image.shape} "
+                         f"{image.dtype} and {mask.shape}")  # fmt: skip
     size_hw = (image.shape[0], image.shape[1])
     gray: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     valid = mask.astype(np.uint8)
@@ -166,7 +166,7 @@ def _angular_sizes(tile: Tile, found: _Found) -> NDArray[np.float64]:
     return sizes
 
 
-def _sizes_and_scores(keypoints: list[cv2.KeyPoint]) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+def _sizes_and_scores(keypoints: Sequence[cv2.KeyPoint]) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     return np.array([k.size for k in keypoints]), np.array([k.response for k in keypoints], np.float32)
 
 
@@ -177,7 +177,7 @@ def _rooted(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
     return rooted
 
 
-def _orb_pixels(keypoints: list[cv2.KeyPoint], shape: tuple[int, ...]) -> NDArray[np.float64]:
+def _orb_pixels(keypoints: Sequence[cv2.KeyPoint], shape: tuple[int, ...]) -> NDArray[np.float64]:
     """Return ORB's key points in pixels with (0, 0) at the corner.
 
     OpenCV multiplies the level's coordinates, counted from its first pixel's CENTRE, by the level's scale; so all

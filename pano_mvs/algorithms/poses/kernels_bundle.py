@@ -12,7 +12,7 @@ from numba import njit
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _observation(rotation, center, point, basis, weight, camera_rows, point_rows, residual):
+def _observation(rotation, center, point, basis, weight, camera_rows, point_rows, residual):  # type: ignore[no-untyped-def]
     """Write √w-scaled derivatives by (ω, C), (2, 6), by X, (2, 3), and the residual, (2,)."""
     x = np.empty(3)
     for i in range(3):
@@ -41,7 +41,7 @@ def _observation(rotation, center, point, basis, weight, camera_rows, point_rows
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _invert_symmetric(matrix, inverse):
+def _invert_symmetric(matrix, inverse):  # type: ignore[no-untyped-def]
     """Write the inverse of a symmetric positive definite (3, 3) matrix."""
     a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
     d, e, f = matrix[1, 1], matrix[1, 2], matrix[2, 2]
@@ -59,7 +59,7 @@ def _invert_symmetric(matrix, inverse):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def reduced_system(rotations, centers, points, starts, image_idx, bases, weights, damping):
+def reduced_system(rotations, centers, points, starts, image_idx, bases, weights, damping):  # type: ignore[no-untyped-def]
     """Return the camera system after elimination of all points, and what is needed to get the points back.
 
     Observations are sorted by point; those of point p are starts[p] to starts[p + 1]. One thread, fixed order.

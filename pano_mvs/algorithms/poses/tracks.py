@@ -151,7 +151,7 @@ def _match_nodes(
     nodes, residuals = [np.zeros((0, 2), np.int64)], [np.zeros(0, np.float32)]
     for first, second in sorted(pair for pair, view in two_views.items() if view):
         view = two_views[first, second]
-        nodes.append(view.matches_idx.astype(np.int64) + [start[first], start[second]])
+        nodes.append((view.matches_idx + np.array([start[first], start[second]])).astype(np.int64))
         residuals.append(view.residuals_rad)
     return np.concatenate(nodes), np.concatenate(residuals)
 

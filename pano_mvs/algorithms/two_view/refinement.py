@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -94,7 +96,7 @@ def _linearised(pose: Rigid3, first: FloatArray, second: FloatArray) -> tuple[Fl
     return e / root[:, 0], e_by / root - 0.5 * e[:, None] * d_by / root**3
 
 
-def _moved(pose: Rigid3, step: FloatArray) -> Rigid3:
+def _moved(pose: Rigid3, step: NDArray[np.floating[Any]]) -> Rigid3:
     translation = pose.translation + tangent_basis(pose.translation) @ step[3:]
     return Rigid3(rotation_from_rotvec(step[:3]) @ pose.rotation, translation / np.linalg.norm(translation))
 
