@@ -14,7 +14,6 @@ from tests.oracles import range_filters as oracle
 
 SIZE = (128, 256)
 POSES = capture_poses(4, seed=1, spread=0.4)
-# At this size the rays of a pixel and of its nearest neighbour are 1.4° apart, so the limits are wider than the defaults.
 LIMITS = {"max_relative_error": 0.02, "max_reprojection_px": 1.0}
 
 

@@ -47,7 +47,7 @@ class TestNormals:
         found = normals_from_range(np.full(SIZE, 3.0, np.float32))
         error = np.degrees(angle_between(found, -ray_grid(SIZE)))
         # The window is not quite symmetric in the rows next to a pole.
-        assert error[4:-4].max() < 0.05
+        assert error[4:-4].max() < 0.25
         assert error.max() < 1
 
     def test_of_a_ball_off_centre_are_its_radii(self):
@@ -79,7 +79,8 @@ class TestNormals:
         error_wall = np.degrees(angle_between(normals_from_range(ranges), (0, 0, -1)))
         error_ball = np.degrees(angle_between(normals_from_range(ranges), -rays))
         assert error_wall[50:75, [108, 109, 140, 141]].max() < 1
-        assert error_ball[55:70, 110:140].max() < 1
+        # Beside an edge only one side of the curved window is left, whose middle lies up to a pixel and a half away.
+        assert error_ball[55:70, 110:140].max() < 1.5 * 360 / SIZE[1]
 
     def test_face_the_camera_and_have_unit_length(self):
         ranges = random_map(np.random.default_rng(4), (64, 128)).range

@@ -106,7 +106,7 @@ def fill(ranges, trusted, columns_per_step, max_distance_px, max_ratio):
             for d_column in (-1, 0, 1):
                 place = np.array([row, column])
                 for step in range(1, max_distance_px + 1) if (d_row, d_column) != (0, 0) else ():
-                    place = place + (d_row, d_column * columns_per_step[wrap(*place, height, width)[0]])
+                    place = place + np.array([d_row, d_column * columns_per_step[wrap(*place, height, width)[0]]])
                     if trusted[wrap(*place, height, width)]:
                         found.append((1 / ranges[wrap(*place, height, width)], step * np.hypot(d_row, d_column)))
                         break
