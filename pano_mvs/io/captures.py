@@ -8,10 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.io.exif_gps import find_gps
 from pano_mvs.io.gpano import GPano, find_gpano, read_head
 from pano_mvs.scene.image_file import decode_image
 
 PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp"})
+# A folder below the capture with this file and a report is the output of a run, with previews that are no panoramas.
+_OUTPUT_MARK = "run.json"
 _IGNORED_FOLDERS = frozenset({"masks"})
 # Start-of-frame markers of JPEG: C0–CF without the tables DHT (C4), JPG (C8) and DAC (CC).
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -28,6 +31,7 @@ class PictureInfo:
         crop_ltwh: (left, top, width, height) of the part of the sphere that the file holds, or None for all of it.
         gpano: its metadata, or None.
         warnings: what the user should know of it, without the file's name.
+        position_lla: (latitude deg, longitude deg, altitude m) from its EXIF metadata, or None.
     """
 
     size_hw: tuple[int, int]
@@ -35,19 +39,25 @@ class PictureInfo:
     crop_ltwh: tuple[int, int, int, int] | None
     gpano: GPano | None
     warnings: tuple[str, ...] = ()
+    position_lla: tuple[float, float, float] | None = None
 
 
 def list_pictures(folder: Path) -> list[Path]:
     """Return the pictures in a folder and below it, ordered as people order them (2 before 10, case aside).
 
-    Hidden files, hidden folders and folders called `masks` are left out.
+    Hidden files, hidden folders, folders called `masks` and output folders of earlier runs are left out.
 
     Raises:
         InputError: if the folder does not exist or holds no picture.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder. Give the folder that holds the panoramas")
-    pictures = [path for path in folder.rglob("*") if _is_picture(path, path.relative_to(folder))]
+    outputs = {path.parent for path in folder.rglob(_OUTPUT_MARK) if (path.parent / "report.html").is_file()}
+    pictures = [
+        path
+        for path in folder.rglob("*")
+        if _is_picture(path, path.relative_to(folder)) and outputs.isdisjoint(path.parents)
+    ]
     if not pictures:
         kinds = ", ".join(sorted(suffix.lstrip(".") for suffix in PICTURE_SUFFIXES))
         raise InputError(f"{folder}: no pictures here. Panoramas may be {kinds}; folders called masks are left out")
@@ -71,6 +81,7 @@ def describe_picture(path: Path) -> PictureInfo:
     """
     head = read_head(path)
     gpano, warnings = find_gpano(head)
+    position = find_gps(head)
     size = _jpeg_size(head) or _png_size(head) or decode_image(path).shape[:2]
     height, width = int(size[0]), int(size[1])
     if gpano is not None and gpano.projection_type != "equirectangular":
@@ -78,7 +89,7 @@ def describe_picture(path: Path) -> PictureInfo:
                          "Export it as an equirectangular panorama, or remove it")  # fmt: skip
     if gpano is not None and gpano.full_size_hw is not None and gpano.crop_ltwh is not None:
         sphere, crop, more = _placed(path, (height, width), gpano.full_size_hw, gpano.crop_ltwh)
-        return PictureInfo(sphere, (height, width), crop, gpano, (*warnings, *more))
+        return PictureInfo(sphere, (height, width), crop, gpano, (*warnings, *more), position)
     if width != 2 * height:
         raise InputError(
             f"{path}: {width}×{height} px is not a full sphere (the width must be twice the height) and no GPano "
@@ -88,7 +99,7 @@ def describe_picture(path: Path) -> PictureInfo:
     if gpano is None:
         warnings = (*warnings, "no GPano metadata; taken for a full equirectangular panorama because its width is "
                     "twice its height")  # fmt: skip
-    return PictureInfo((height, width), (height, width), None, gpano, warnings)
+    return PictureInfo((height, width), (height, width), None, gpano, warnings, position)
 
 
 def _is_picture(path: Path, inside: Path) -> bool:

@@ -70,6 +70,30 @@ def test_headers_are_read_without_decoding(tmp_path, monkeypatch):
         assert describe_picture(path).size_hw == (32, 64)
 
 
+def test_tables_before_the_frame_are_no_frame(tmp_path):
+    """Some encoders write their Huffman tables (marker C4, among the frames' markers) first."""
+    data = write_jpeg(tmp_path / "a.jpg", (32, 64)).read_bytes()
+    table = data[data.index(b"\xff\xc4") :]
+    table = table[: 2 + int.from_bytes(table[2:4], "big")]
+    (tmp_path / "a.jpg").write_bytes(data[:2] + table + data[2:])
+    assert describe_picture(tmp_path / "a.jpg").size_hw == (32, 64)
+
+
+def test_the_output_of_an_earlier_run_is_no_part_of_the_capture(tmp_path):
+    """Its previews lay among the pictures where the output folder was made below the capture."""
+    for name in (
+        "1.jpg",
+        "out/lobby/preview/1.jpg",
+        "out/lobby/run.json",
+        "out/lobby/report.html",
+        "b/run.json",
+        "b/2.jpg",
+    ):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    assert [path.relative_to(tmp_path).as_posix() for path in list_pictures(tmp_path)] == ["1.jpg", "b/2.jpg"]
+
+
 def test_a_thumbnail_within_the_metadata_is_not_the_picture(tmp_path):
     thumbnail = bytes(cv2.imencode(".jpg", picture((16, 20)))[1])
     data = write_jpeg(tmp_path / "a.jpg", (32, 64)).read_bytes()
