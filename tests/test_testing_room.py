@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_grid, roll_panorama, rotation_from_rotvec, sample_panorama
 from pano_mvs.testing.room import Room, capture_poses, default_room, range_along, render, write_capture
 from pano_mvs.testing.surfaces import Ball, Cuboid, Quad
+from pano_mvs.testing.texture import noise
 
 GREY = ((0.5, 0.5, 0.5), (0.4, 0.4, 0.4))
 SIZE = (64, 128)
@@ -148,3 +149,18 @@ def test_a_written_capture_is_the_same_bytes_twice(tmp_path):
     assert [str(path) for path in files] == ["images/000.png", "images/001.png", "truth/depth.npz", "truth/poses.json"]
     for path in files:
         assert (tmp_path / "a" / path).read_bytes() == (tmp_path / "b" / path).read_bytes()
+
+
+def test_the_texture_is_smooth_noise_of_the_wavelengths_that_are_asked_for():
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-3, 3, (20_000, 3))
+    values = noise(points, cells=((0.1, 1.0),), seed=3)
+    assert (values.mean(), values.std()) == (pytest.approx(0, abs=0.05), pytest.approx(0.9, abs=0.15))
+    aside = rng.normal(size=points.shape)
+    aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+    steps = {
+        length: noise(points + length * aside, cells=((0.1, 1.0),), seed=3) - values for length in (1e-6, 0.05, 0.5)
+    }
+    assert np.abs(steps[1e-6]).max() < 1e-4  # no jump anywhere
+    assert steps[0.05].std() < 0.6  # an eighth of the shortest wavelength away it is nearly the same
+    assert steps[0.5].std() > 1.0  # and half of a mean one away it is another
