@@ -21,7 +21,7 @@ def write_report(out_dir: Path, summary: Mapping[str, Any]) -> None:
         out_dir: the output folder; previews are looked up below it.
         summary: what run.json holds; every key may be missing:
             workflow {name, path}, version, started, seconds, exit_code,
-            stages [{name, use, units, run, cached, failed, seconds, metrics}],
+            stages [{name, use, units, run, cached, failed, blocked, seconds, metrics}],
             failures [{stage, item, cause, consequence, remedy}], notes [text],
             poses {registered [name], rejected {name: reason}, centers [[x, y, z]] in the order of `registered`, frame,
             scale, metric, up [x, y, z], links [[name, name, inliers]]},
@@ -50,7 +50,8 @@ def write_report(out_dir: Path, summary: Mapping[str, Any]) -> None:
 
 
 def _with_defaults(summary: Mapping[str, Any]) -> dict[str, Any]:
-    empty_stage = {"name": "", "use": "", "units": 0, "run": 0, "cached": 0, "failed": 0, "seconds": 0.0, "metrics": {}}
+    empty_stage: dict[str, Any] = {"name": "", "use": "", "units": 0, "run": 0, "cached": 0, "failed": 0, "blocked": 0}
+    empty_stage |= {"seconds": 0.0, "metrics": {}}
     empty_failure = {"stage": "", "item": "", "cause": "", "consequence": "", "remedy": ""}
     stages = [empty_stage | stage for stage in summary.get("stages") or []]
     return {
