@@ -17,6 +17,7 @@ from pano_mvs.geometry import pixel_from_ray
 from pano_mvs.scene import Features
 
 _ORB_SCALE, _ORB_LEVELS = 1.2, 8
+_EDGE_PX = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,9 +155,17 @@ def _unmasked(found: _Found, valid: NDArray[np.uint8], tile: Tile) -> _Found:
 
 
 def _owned(found: _Found, tile: Tile, tile_idx: int) -> _Found:
-    """Keep the key points whose nearest tile centre is this tile's."""
-    nearest = np.argmax(tile.bearings_from_pixels(found.pixels_px) @ face_centers().T, axis=1)
-    return found[nearest == tile_idx]
+    """Keep the key points whose nearest tile centre is this tile's.
+
+    Two tiles place a key point on their common edge a little differently, and each might leave it to the other; so
+    either takes what lies just beyond the edge too, and the weaker of two is dropped later on.
+    """
+    centers = face_centers()
+    across = centers - centers[tile_idx]
+    lengths = np.linalg.norm(across, axis=1)
+    lengths[tile_idx] = 1.0
+    beyond_rad = tile.bearings_from_pixels(found.pixels_px) @ (across / lengths[:, None]).T
+    return found[beyond_rad.max(axis=1) < _EDGE_PX / tile.focal_px]
 
 
 def _angular_sizes(tile: Tile, found: _Found) -> NDArray[np.float64]:

@@ -56,7 +56,7 @@ def build_tracks(features: Mapping[str, Features], two_views: TwoViews) -> Track
         two_views: verified pairs; those without a general geometry are ignored.
     """
     names = tuple(features)
-    offsets = np.concatenate([[0], np.cumsum([len(features[name]) for name in names])])
+    offsets = np.cumsum([0, *(len(features[name]) for name in names)])
     nodes, residuals = _match_nodes(names, offsets, two_views)
     image_of_node = np.repeat(np.arange(len(names)), np.diff(offsets))
     total = int(offsets[-1])
