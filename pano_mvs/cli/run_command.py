@@ -91,13 +91,31 @@ def _print_poses(summary: Mapping[str, Any], console: Console) -> None:
 
 def print_scores(scores: Mapping[str, Any], console: Console) -> None:
     """Print pose scores in a line and range scores in a table."""
-    if scores.get("poses"):
-        text = ", ".join(f"{name.replace('_', ' ')} {value:.4g}" for name, value in scores["poses"].items())
+    poses = scores.get("poses")
+    if poses:
+        text = (f"{poses['registered']} of {poses['of']} registered, median pair error "
+                f"{poses['median_pair_error_deg']:.3f}°")  # fmt: skip
+        if "scale_ratio_error_max" in poses:
+            text += f", translation scale ratios within {100 * poses['scale_ratio_error_max']:.2f} %"
         console.print(f"against the ground truth: {text}", highlight=False)
     if not scores.get("views"):
         return
-    columns = list(next(iter(scores["views"].values())))
-    table = Table("view", *(name.replace("_", " ") for name in columns))
+    table = Table("view", *_SHOWN_SCORES.values())
     for view, values in scores["views"].items():
-        table.add_row(view, *(f"{values[name]:.4g}" for name in columns))
+        table.add_row(view, *(_shown(values[name]) for name in _SHOWN_SCORES))
     console.print(table)
+
+
+_SHOWN_SCORES = {
+    "psnr_db": "PSNR dB",
+    "w_mae": "MAE",
+    "w_delta_105": "δ<1.05",
+    "completeness": "complete",
+    "constant_psnr_db": "constant: dB",
+    "constant_w_delta_105": "constant: δ<1.05",
+}
+"""Score to the heading under which it is printed; MAE and δ are weighted by solid angle."""
+
+
+def _shown(value: float) -> str:
+    return f"{value:.3g}" if abs(value) < 1 else f"{value:.2f}"

@@ -36,7 +36,8 @@ def summarise(run: Run, result: RunResult, *, started: datetime, seconds: float)
         },
         "stages": [_stage(summary, workflow) for summary in result.stages],
         "failures": [
-            {"stage": f.stage, "item": f.item, "cause": f.cause, "consequence": f.consequence} for f in result.failures
+            {"stage": f.stage, "item": f.item, "cause": f.cause, "consequence": f.consequence, "trace": f.trace}
+            for f in result.failures
         ],
         "rejected": {image: {"stage": stage, "reason": why} for image, (stage, why) in result.rejected.items()},
         "warnings": list(result.warnings),

@@ -260,7 +260,8 @@ def _failure(unit: Unit, error: Exception) -> Failure:
     if isinstance(error, PanoMvsError):
         return Failure(unit.entry.name, unit.item, f"{error}{notes}", consequence=consequence)
     frames = traceback.extract_tb(error.__traceback__)
-    own = unit.entry.spec.origin.rpartition(":")[0]
+    # The author of a plugin wants the line in the plugin; we want ours wherever it is.
+    own = unit.entry.spec.origin.rpartition(":")[0] if unit.entry.spec.code_digest else ""
     frame = next((f for f in reversed(frames) if f.filename == own), frames[-1])
     cause = f"{frame.filename}:{frame.lineno}: {type(error).__name__}: {error}{notes}"
     trace = "".join(traceback.format_exception(error))

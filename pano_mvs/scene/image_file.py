@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
 
+# What OpenCV prints of pictures that it cannot decode is said better by our own error.
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+
 # The JPEG decoder fills what a truncated file lacks with grey and only warns; the end marker tells.
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -11,7 +10,8 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.windows import column_stretch
-from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray
+from pano_mvs.algorithms.sweep.winner import Winners
+from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, ray_grid
 
 # Rec. 709 luma in 1/256.
 _LUMA = np.array([54, 183, 19])
@@ -86,25 +86,17 @@ def _spread_columns(blocked: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]
     return result
 
 
-def sees_winner(
-    ranges: NDArray[np.float32],
-    sources: Sequence[Rigid3],
-    source_valid: Sequence[NDArray[np.bool_]],
-    rays: NDArray[np.float64],
-) -> NDArray[np.bool_]:
-    """Return where at least one source may vote on the range that was found, (H, W).
-
-    Args:
-        ranges: (H, W) what was found.
-        sources: source_from_reference of each source.
-        source_valid: where each source may vote, (Hs, Ws).
-        rays: (H, W, 3) of the reference.
-    """
-    seen = np.zeros(ranges.shape, np.bool_)
-    for pose, valid in zip(sources, source_valid, strict=True):
+def sees_winner(winners: Winners, work: SweepInput) -> NDArray[np.bool_]:
+    """Return where at least one source may vote on the plane that won, (H, W)."""
+    seen = np.ones(winners.plane.shape, np.bool_)
+    if work.source_valid is None:
+        return seen
+    seen[:] = False
+    points = ray_grid((seen.shape[0], seen.shape[1])) * work.ranges[winners.plane][..., None]
+    for pose, valid in zip(work.source_from_reference, work.source_valid, strict=True):
         height, width = valid.shape
-        pixels = pixel_from_ray(pose.apply(rays * ranges[..., None]), (height, width))
+        pixels = pixel_from_ray(pose.apply(points), (height, width))
         column = np.floor(pixels[..., 0]).astype(np.intp) % width
         row = np.minimum(np.floor(pixels[..., 1]).astype(np.intp), height - 1)
         seen |= valid[row, column]
-    return seen
+    return seen & found
