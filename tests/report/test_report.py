@@ -21,8 +21,8 @@ SUMMARY = {
     "seconds": 187.2,
     "exit_code": 3,
     "stages": [
-        {"name": "depth", "use": "depth.sweep", "units": 4, "run": 2, "cached": 1, "failed": 1, "blocked": 9, "seconds": 90.0,
-         "metrics": {"planes": 128, "median_error_deg": 0.01234567}},
+        {"name": "depth", "use": "depth.sweep", "units": 4, "run": 2, "cached": 1, "failed": 1, "blocked": 9,
+         "seconds": 90.0, "metrics": {"planes": 128, "median_error_deg": 0.01234567}},
         {"name": "ply", "use": "export.ply", "units": 1, "run": 1, "cached": 0, "failed": 0, "seconds": 0.2},
     ],
     "failures": [{"stage": "depth", "item": "a/4.png", "cause": "it is truncated", "consequence": "no range map"}],
@@ -105,7 +105,8 @@ def test_everything_that_is_known_is_said(out_dir):
         "1.23 M points in the cloud", "0.012° median pose error", "3 % median range error", "Took 3 min 07 s",
         "5 units of work: 3 computed, 1 taken from the cache, 1 failed.", "it is truncated", "no range map",
         "too few matches", "one picture has no GPano metadata", "the first baseline is 1", "median error, °: 0.01235",
-        "the scale was fitted", "PSNR dB", "pano_mvs: 1 stages: {}", "numpy 2.1", "no preview", "1 min 30 s", "9 blocked",
+        "the scale was fitted", "PSNR dB", "pano_mvs: 1 stages: {}", "numpy 2.1", "no preview", "1 min 30 s",
+        "9 blocked",
     ):  # fmt: skip
         assert text in words, text
 
