@@ -212,6 +212,15 @@ def test_weights_follow_the_bands():
     assert weight[0] == 0
     assert weight[-1] == 1
     assert (np.diff(weight) > 0).all()
+    assert weight[5] > 20 * weight[4] > 20 * 5 * weight[2]
+
+
+def test_a_map_that_nobody_checked_is_solved_as_if_all_were_sure(view):
+    image, truth = view
+    weak, sure = as_map(harmed(truth).range, 100), as_map(harmed(truth).range, 200)
+    np.testing.assert_allclose(
+        fast_bilateral_solver(weak, image).range, fast_bilateral_solver(sure, image).range, rtol=1e-4
+    )
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.filters.sphere_cells import SphereCells, sphere_cells
 from pano_mvs.core.errors import UsageError
 from pano_mvs.scene import RangeMap
-from pano_mvs.scene.range_map import FILLED_CONFIDENCE
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, WEAK_CONFIDENCE
 
 FloatArray = NDArray[np.float64]
 
@@ -38,6 +38,8 @@ _BISTOCHASTIC_ITERATIONS = 10
 # A pixel without range is drawn towards a colour-blind guess this much, so that a colour that appears only inside a
 # hole has a value at all.
 _PRIOR_WEIGHT = 1e-4
+# Chosen on range maps of our own sweep after the consistency check, of two scenes; anything from 0.03 to 0.003 does.
+_WEAK_WEIGHT, _FILLED_WEIGHT = 0.01, 0.0005
 _TOLERANCE = 1e-4
 _SMALLEST_BIN = 2.1
 
@@ -76,16 +78,17 @@ def fast_bilateral_solver(
     sigma_spatial: float = 8.0,
     sigma_luma: float = 8.0,
     sigma_chroma: float = 8.0,
-    smoothness: float = 4.0,
+    smoothness: float = 1.0,
     iterations: int = 60,
     domain: Literal["range", "inverse"] = "inverse",
     fill: bool = True,
 ) -> RangeMap:
     """Return a range map smoothed within the surfaces that the picture shows, and filled where it is invalid.
 
-    The weight of a pixel in the data term is (confidence / 255)², so that a consistent one (128–255) weighs four times
-    a weak one or more, and a filled one next to nothing. Pixels keep their confidence; newly filled ones get 1–63 by
-    the share of weight among the pixels of like place and colour.
+    The weight of a pixel in the data term is that of `confidence_weight`, relative to the largest one in the map: where
+    other views have confirmed some pixels the rest has next to no say beside them, and a map that nobody has checked is
+    solved as it is. Pixels keep their confidence; newly filled ones get 1–63 by the share of weight among the pixels
+    of like place and colour.
 
     Args:
         range_map: (H, W) with even W, the full sphere.
@@ -117,6 +120,7 @@ def fast_bilateral_solver(
     if domain == "inverse":
         target[valid] = 1 / target[valid]
     weight = np.where(valid, confidence_weight(range_map.confidence), 0.0)
+    weight /= weight.max()
     cells = sphere_cells((height, width), sigma_spatial)
     colors = _color_bins(guide, sigma_luma, sigma_chroma)
     smooth, support = solve_bilateral(target, weight, colors, cells=cells, smoothness=smoothness, iterations=iterations)
@@ -131,8 +135,16 @@ def fast_bilateral_solver(
 
 
 def confidence_weight(confidence: NDArray[np.uint8]) -> FloatArray:
-    """Return the weight of the data term, in [0, 1], for each confidence."""
-    weight: FloatArray = (confidence / 255.0) ** 2
+    """Return the weight of the data term, in [0, 1], for each confidence c.
+
+    c / 255 for consistent pixels (128–255), a hundredth of c / 127 for weak ones (64–127), and a twentieth of that,
+    with c / 63, for filled ones (1–63). Weak pixels that no view confirms are wrong so often that a larger weight
+    costs more than it fills.
+    """
+    filled, weak = FILLED_CONFIDENCE[1], WEAK_CONFIDENCE[1]
+    c = confidence.astype(np.float64)
+    seen = np.where(confidence > weak, c / CONSISTENT_CONFIDENCE[1], _WEAK_WEIGHT * c / weak)
+    weight: FloatArray = np.where(confidence > filled, seen, _FILLED_WEIGHT * c / filled)
     return weight
 
 
@@ -149,7 +161,7 @@ def solve_bilateral(
 
     Args:
         target: (H, W) measured values, anything finite where the weight is 0.
-        weight: (H, W) confidences, not all 0.
+        weight: (H, W) confidences in [0, 1], not all 0.
         colors: (H, W) number of the colour bin.
         cells: spatial cells of the panorama.
         smoothness: λ.
@@ -159,7 +171,7 @@ def solve_bilateral(
 
     prior = _blind_guess(target, weight, cells)
     known = weight > 0
-    pull = np.where(known, weight, _PRIOR_WEIGHT * weight.max())
+    pull = np.where(known, weight, _PRIOR_WEIGHT)
     system = build_system(np.where(known, target, prior), pull, colors, cells)
     count = len(system.mass)
     diagonal_gram = np.ascontiguousarray(np.einsum("eaa->ea", system.gram))
