@@ -98,7 +98,7 @@ def test_turning_the_camera_keeps_every_point_in_its_place():
 
 
 def test_a_point_has_the_same_colour_from_two_places():
-    room, sizes = default_room(), (256, 512)
+    room, sizes = default_room(), (160, 320)
     first, second = Rigid3.identity(), capture_poses(2, seed=4)[1]
     image, range_map = render(room, first, sizes)
     other, other_range = render(room, second, sizes)

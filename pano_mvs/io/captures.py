@@ -97,8 +97,7 @@ def describe_picture(path: Path) -> PictureInfo:
             "cropped, write the GPano FullPano and CroppedArea fields into it"
         )
     if gpano is None:
-        warnings = (*warnings, "no GPano metadata; taken for a full equirectangular panorama because its width is "
-                    "twice its height")  # fmt: skip
+        warnings = (*warnings, "no GPano metadata; taken as full spheres, since the width is twice the height")
     return PictureInfo((height, width), (height, width), None, gpano, warnings, position)
 
 

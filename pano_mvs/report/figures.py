@@ -10,6 +10,7 @@ from typing import Any
 _WORDS = {
     "psnr_db": "PSNR dB",
     "constant_psnr_db": "PSNR dB of a constant",
+    "constant_w_delta_105": "within 5 % by a constant",
     "mae": "mean error",
     "w_mae": "mean error on the sphere",
     "abs_rel": "mean relative error",
