@@ -88,10 +88,9 @@ def _spread_columns(blocked: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]
 
 def sees_winner(winners: Winners, work: SweepInput) -> NDArray[np.bool_]:
     """Return where at least one source may vote on the plane that won, (H, W)."""
-    seen = np.ones(winners.plane.shape, np.bool_)
     if work.source_valid is None:
-        return seen
-    seen[:] = False
+        return np.ones(winners.plane.shape, np.bool_)
+    seen = np.zeros(winners.plane.shape, np.bool_)
     points = ray_grid((seen.shape[0], seen.shape[1])) * work.ranges[winners.plane][..., None]
     for pose, valid in zip(work.source_from_reference, work.source_valid, strict=True):
         height, width = valid.shape
@@ -99,4 +98,4 @@ def sees_winner(winners: Winners, work: SweepInput) -> NDArray[np.bool_]:
         column = np.floor(pixels[..., 0]).astype(np.intp) % width
         row = np.minimum(np.floor(pixels[..., 1]).astype(np.intp), height - 1)
         seen |= valid[row, column]
-    return seen & found
+    return seen
