@@ -148,6 +148,21 @@ def test_an_image_with_a_wrong_pair_alone_is_rejected(capture):
     assert set(poses.rejected) == {"3.jpg"}
 
 
+def test_an_image_that_fits_a_third_of_the_known_points_is_rejected(capture):
+    """Enough to compute a pose from, too few to believe it."""
+    _, features, views = capture
+    rng = np.random.default_rng(24)
+    kept = {pair: view for pair, view in views.items() if "3.jpg" not in pair}
+    view = views["2.jpg", "3.jpg"]
+    matches = view.matches_idx.copy()
+    wrong = rng.permutation(len(matches))[: int(0.68 * len(matches))]
+    matches[wrong, 1] = rng.permutation(matches[wrong, 1])
+    kept["2.jpg", "3.jpg"] = replace(view, matches_idx=matches)
+    poses = solve(features, kept)
+    assert poses.names == ("0.jpg", "1.jpg", "2.jpg", "4.jpg")
+    assert "seen where they should be" in poses.rejected["3.jpg"]
+
+
 def test_only_the_largest_group_is_kept():
     rng = np.random.default_rng(14)
     truth = random_poses(rng, 5)

@@ -17,6 +17,7 @@ from pano_mvs.scene import Features, Poses, TwoView
 _MAX_ERROR_DEG, _MIN_ANGLE_DEG = 0.4, 1.0
 _SEED_TRIALS = 5
 _POLISH_ROUNDS = 5
+_POLISH_GROWTH = 1.2  # all cameras are refined whenever there are a fifth more than at the last time
 _FULL_PARALLAX_DEG = 10.0
 
 
@@ -84,15 +85,18 @@ def _grown(model: GrowingModel, seed: Edge) -> tuple[GrowingModel, dict[int, str
     model.add(seed[0], Rigid3.identity())
     model.add(seed[1], relative_pose(model.edges, *seed))
     left = sorted({image for edge in model.edges for image in edge} - set(seed))
+    polished = 0
     while left:
         for image in sorted(left, key=lambda i: (-model.known_count(i), i)):
             if attachment := model.attach(image):
                 model.add(image, attachment.cam_from_world)
-                model.repolish()
                 left.remove(image)
                 break
         else:
             break
+        if len(model.cameras) > _POLISH_GROWTH * polished:
+            model.repolish()
+            polished = len(model.cameras)
     return model, {image: model.attach(image).reason for image in left}
 
 
