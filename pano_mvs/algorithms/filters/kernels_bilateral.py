@@ -121,26 +121,43 @@ def blur_graph(vertex_keys, starts, neighbours, strengths):  # type: ignore[no-u
     table, numbers = np.full(1 << bits, _EMPTY, np.int64), np.empty(1 << bits, np.int32)
     for vertex in range(count):
         _find_or_add(table, numbers, vertex_keys[vertex], bits, vertex)
-    row_starts = np.empty(count + 1, np.int64)
-    indices, values = np.empty(count * 16, np.int32), np.empty(count * 16, np.float64)
+    # Each edge is looked up from one end only: a look-up costs more than sorting edges by their ends.
+    heads, tails, values = np.empty(count * 9, np.int32), np.empty(count * 9, np.int32), np.empty(count * 9)
     used = 0
     for vertex in range(count):
-        row_starts[vertex] = used
         key = vertex_keys[vertex]
         cell, color = key // COLOR_BINS**3, key % COLOR_BINS**3
         for position in range(starts[cell], starts[cell + 1]):
-            other = _find(table, numbers, np.int64(neighbours[position]) * COLOR_BINS**3 + color, bits)
-            if other >= 0:
-                indices[used], values[used] = other, strengths[position]
-                used += 1
-        for step in (-_LUMA, _LUMA, -_BLUE, _BLUE, -_RED, _RED):
+            if neighbours[position] > cell:
+                other = _find(table, numbers, np.int64(neighbours[position]) * COLOR_BINS**3 + color, bits)
+                if other >= 0:
+                    heads[used], tails[used], values[used] = vertex, other, strengths[position]
+                    used += 1
+        for step in (_LUMA, _BLUE, _RED):
             # The outermost bins of the cube are never used, so that a step cannot run into the next row of it.
             other = _find(table, numbers, key + step, bits)
             if other >= 0:
-                indices[used], values[used] = other, 1.0
+                heads[used], tails[used], values[used] = vertex, other, 1.0
                 used += 1
-    row_starts[count] = used
-    return row_starts, indices[:used].copy(), values[:used].copy()
+    return _rows_from_edges(heads[:used], tails[:used], values[:used], count)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _rows_from_edges(heads, tails, values, count):  # type: ignore[no-untyped-def]
+    """Return a symmetric graph as compressed rows: starts, indices, strengths."""
+    starts = np.zeros(count + 1, np.int64)
+    for edge in range(len(heads)):
+        starts[heads[edge] + 1] += 1
+        starts[tails[edge] + 1] += 1
+    for vertex in range(count):
+        starts[vertex + 1] += starts[vertex]
+    free = starts[:-1].copy()
+    indices, strengths = np.empty(2 * len(heads), np.int32), np.empty(2 * len(heads))
+    for edge in range(len(heads)):
+        for near, far in ((heads[edge], tails[edge]), (tails[edge], heads[edge])):
+            indices[free[near]], strengths[free[near]] = far, values[edge]
+            free[near] += 1
+    return starts, indices, strengths
 
 
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
