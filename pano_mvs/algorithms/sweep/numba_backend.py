@@ -109,7 +109,7 @@ def _aggregate(pool: ThreadPoolExecutor, work: SweepInput, volume: NDArray[np.ui
     height, _, width = volume.shape
     settings = work.settings
     total = np.zeros(volume.shape, np.uint16)
-    p1 = np.uint16(settings.p1)
+    p1 = np.uint16(settings.penalties(height)[0])
     beyond_pole, before_seam = warm_up((height, width))
     for rows, columns in DIRECTIONS:
         penalties = step_penalties(work.reference, (rows, columns), settings)

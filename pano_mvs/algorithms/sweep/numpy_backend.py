@@ -107,7 +107,7 @@ def _aggregate(volume: NDArray[np.int64], work: SweepInput) -> NDArray[np.int64]
     """Return the sum of eight paths' costs, (H, D, W)."""
     height, _, width = volume.shape
     settings = work.settings
-    p1 = settings.p1
+    p1, _ = settings.penalties(height)
     before_pole, before_seam = warm_up((height, width))
     total = np.zeros_like(volume)
     for rows, columns in DIRECTIONS:

@@ -25,13 +25,14 @@ def step_penalties(
         settings: p1, p2, p2_contrast.
     """
     height, width = reference.shape[:2]
+    p1, p2 = settings.penalties(height)
     if settings.p2_contrast == 0:
-        return np.full((height, width), np.rint(settings.p2), np.uint16)
+        return np.full((height, width), p2, np.uint16)
     padded = pad_panorama(reference.mean(axis=-1), 1)
     rows, columns = direction
     before = padded[1 - rows : 1 - rows + height, 1 - columns : 1 - columns + width]
     contrast = np.abs(padded[1:-1, 1:-1] - before)
-    penalty = np.maximum(settings.p1, settings.p2 / (1 + contrast / settings.p2_contrast))
+    penalty = np.maximum(p1, p2 / (1 + contrast / settings.p2_contrast))
     return np.asarray(np.rint(penalty), dtype=np.uint16)
 
 
@@ -42,4 +43,4 @@ def warm_up(size_hw: tuple[int, int]) -> tuple[int, int]:
     there comes from the picture and not from where the columns happen to start.
     """
     height, width = size_hw
-    return height // 8, width // 2
+    return height // 8, width

@@ -91,7 +91,7 @@ def sees_winner(winners: Winners, work: SweepInput) -> NDArray[np.bool_]:
     if work.source_valid is None:
         return np.ones(winners.plane.shape, np.bool_)
     seen = np.zeros(winners.plane.shape, np.bool_)
-    points = ray_grid((seen.shape[0], seen.shape[1])) * work.ranges[winners.plane][..., None]
+    points = ray_grid((work.reference.shape[0], work.reference.shape[1])) * work.ranges[winners.plane][..., None]
     for pose, valid in zip(work.source_from_reference, work.source_valid, strict=True):
         height, width = valid.shape
         pixels = pixel_from_ray(pose.apply(points), (height, width))

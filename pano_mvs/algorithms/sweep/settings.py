@@ -8,6 +8,10 @@ from typing import Literal
 
 from pano_mvs.core.errors import UsageError
 
+_PENALTY_ROWS = 512
+# Eight paths of at most 255 + P2 each must fit uint16, and P1 on top of a plane that does not exist.
+_LARGEST_P1, _LARGEST_P2 = 5000, 7900
+
 
 @dataclass(frozen=True)
 class SweepSettings:
@@ -25,8 +29,9 @@ class SweepSettings:
         aggregation: "box": winner takes all after a box sum; "sgm": semi-global matching over eight paths.
         support: side in pixels, odd, of the box over which census costs are averaged before the decision; 1 is none.
             The box of SAD costs is the window itself.
-        p1: SGM's penalty of a step by one plane between neighbours; costs go from 0 to 255.
-        p2: SGM's penalty of a larger step.
+        p1: SGM's penalty of a step by one plane between neighbours, for a picture of 512 rows; costs go from 0 to 255.
+        p2: SGM's penalty of a larger step, likewise. Both grow with the rows: along the same angle, a path then pays
+            the same for the slant of a surface against what it gathers from the pixels.
         p2_contrast: grey levels of contrast between neighbours at which p2 is halved (never below p1); 0 keeps it.
         subplane: refine the winner between the planes by a parabola.
         prefilter_diameter: diameter of a bilateral filter of all pictures before the sweep; 0 is none (the paper: 3).
@@ -63,6 +68,11 @@ class SweepSettings:
         _require(self.p2_contrast >= 0, f"p2_contrast cannot be negative, got {self.p2_contrast}")
         _require(0 <= self.prefilter_diameter <= 31, f"prefilter_diameter must be 0 to 31, got "
                                                      f"{self.prefilter_diameter}")  # fmt: skip
+
+    def penalties(self, height: int) -> tuple[int, int]:
+        """Return P1 and the largest P2 for a picture of `height` rows, such that sums of paths fit 16 bits."""
+        scale = height / _PENALTY_ROWS
+        return min(round(self.p1 * scale), _LARGEST_P1), min(round(self.p2 * scale), _LARGEST_P2)
 
     @property
     def compare_radius(self) -> int:

@@ -8,6 +8,7 @@ S. Yang, K. Kim, Y. Lee, "Dense Depth Estimation from Multiple 360-degree Images
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import ceil
 from typing import Literal
 
 import numpy as np
@@ -20,7 +21,7 @@ from pano_mvs.algorithms.sweep.preparation import SweepInput, prepare_picture, s
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.winner import Winners, range_map_from_winners
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import Rigid3, ray_grid
+from pano_mvs.geometry import Rigid3
 from pano_mvs.scene.range_map import RangeMap
 
 __all__ = ["Backend", "SweepSettings", "sweep_range"]
@@ -76,17 +77,13 @@ def sweep_range(
         reference=prepare_picture(reference, settings),
         sources=tuple(prepare_picture(source, settings) for source in sources),
         source_from_reference=tuple(source_from_reference),
-        source_valid=_voting(masks, settings),
+        source_valid=_voting(masks, settings, rows=reference.shape[0]),
         ranges=ranges,
         settings=settings,
     )
     winners = _find_winners(work, backend)
-    valid = np.ones(reference.shape[:2], np.bool_) if reference_mask is None else reference_mask
-    result = range_map_from_winners(winners, near=near, far=far, settings=settings, seen=valid)
-    if work.source_valid is None:
-        return result
-    rays = ray_grid((reference.shape[0], reference.shape[1]))
-    seen = valid & sees_winner(result.range, work.source_from_reference, work.source_valid, rays)
+    seen = np.ones(reference.shape[:2], np.bool_) if reference_mask is None else reference_mask
+    seen = seen & sees_winner(winners, work)
     return range_map_from_winners(winners, near=near, far=far, settings=settings, seen=seen)
 
 
@@ -120,17 +117,19 @@ def _rough_range(
     return np.where(sure, found.range, np.nan).astype(np.float32)
 
 
-def _voting(masks: tuple[Mask, ...] | None, settings: SweepSettings) -> tuple[Mask, ...] | None:
+def _voting(masks: tuple[Mask, ...] | None, settings: SweepSettings, *, rows: int) -> tuple[Mask, ...] | None:
+    """Return where each source may vote: a window's radius in pixels of the reference away from what is masked."""
     if masks is None:
         return None
-    return tuple(voting_pixels(mask, settings.compare_radius + settings.box_radius) for mask in masks)
+    radius = settings.compare_radius + settings.box_radius
+    return tuple(voting_pixels(mask, ceil(radius * mask.shape[0] / rows)) for mask in masks)
 
 
 def _checked_sources(
     sources: Sequence[Picture], poses: Sequence[Rigid3], masks: Sequence[Mask | None] | None
 ) -> tuple[Mask, ...] | None:
     """Return the masks of all sources, or None if nothing is masked."""
-    if not sources or len(poses) != len(sources) or (masks is not None and len(masks) != len(sources)):
+    if len(sources) == 0 or len(poses) != len(sources) or (masks is not None and len(masks) != len(sources)):
         raise UsageError(f"a sweep needs one pose (and one mask, if any) for each of one or more sources, got "
                          f"{len(sources)} sources, {len(poses)} poses")  # fmt: skip
     given = masks if masks is not None else [None] * len(sources)

@@ -11,8 +11,8 @@ from pano_mvs.algorithms.sweep.hypotheses import range_at
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.scene.range_map import WEAK_CONFIDENCE, RangeMap
 
-# A best rival this much dearer than the winner, as a share of the winner's cost, counts as certainty.
-_SURE_MARGIN = 0.25
+# A winner cheaper than its best rival by this share of the rival's cost is as sure as can be.
+_SURE_MARGIN = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +69,10 @@ def confidence(winners: Winners) -> NDArray[np.uint8]:
     The uniqueness ratio 1 − cost/rival, which vanishes on bare surfaces, along the baseline (where no source can tell
     ranges apart) and between two equally good ranges.
     """
-    rival = np.maximum(winners.rival.astype(np.float64), 1e-6)
-    uniqueness = np.where(np.isfinite(rival), 1 - winners.cost / rival, 1.0)
+    no_rival = np.isinf(winners.rival)  # three planes or fewer
+    rival = np.where(no_rival, 1.0, winners.rival).astype(np.float64)
+    cost = np.where(no_rival, 0.0, winners.cost)
+    uniqueness = (rival - cost) / np.maximum(rival, 1e-6)
     low, high = WEAK_CONFIDENCE
     share = np.clip(uniqueness / _SURE_MARGIN, 0, 1)
     return np.asarray(np.rint(low + share * (high - low)), dtype=np.uint8)

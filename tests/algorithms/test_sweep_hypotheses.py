@@ -1,0 +1,59 @@
+"""Virtual ranges and their limits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pano_mvs.algorithms.sweep.hypotheses import range_at, range_limits, virtual_ranges
+from pano_mvs.core.errors import UsageError
+
+SPACINGS = ("inverse", "log", "uniform")
+
+
+@given(
+    near=st.floats(1e-3, 1e3), ratio=st.floats(1.01, 1e4), planes=st.integers(3, 300), spacing=st.sampled_from(SPACINGS)
+)
+def test_virtual_ranges_ascend_from_near_to_far(near, ratio, planes, spacing):
+    ranges = virtual_ranges(near, near * ratio, planes=planes, spacing=spacing)
+    assert ranges.shape == (planes,)
+    assert ranges[0] == pytest.approx(near)
+    assert ranges[-1] == pytest.approx(near * ratio)
+    assert (np.diff(ranges) > 0).all()
+
+
+@pytest.mark.parametrize(("spacing", "even"), [("inverse", np.reciprocal), ("log", np.log), ("uniform", np.array)])
+def test_virtual_ranges_are_even_in_what_the_spacing_names(spacing, even):
+    steps = np.diff(even(virtual_ranges(0.3, 9.0, planes=50, spacing=spacing)))
+    np.testing.assert_allclose(steps, steps[0])
+
+
+@pytest.mark.parametrize("limits", [(0.0, 1.0), (2.0, 1.0), (1.0, np.inf), (np.nan, 1.0)])
+def test_limits_that_are_none_are_refused(limits):
+    with pytest.raises(UsageError, match="0 < near < far"):
+        range_at([0.0], *limits, planes=8, spacing="inverse")
+
+
+def test_sparse_points_get_a_margin():
+    assert range_limits([0.5, 1.0], width=1024, near=2.0, far=8.0) == (1.0, 12.0)
+
+
+def test_without_points_the_longest_baseline_and_the_resolution_decide():
+    near, far = range_limits([0.2, 1.0], width=1024)
+    assert near == pytest.approx(0.3)
+    parallax_px = np.arctan(1.0 / far) / (2 * np.pi / 1024)
+    assert parallax_px == pytest.approx(0.5, rel=1e-3)
+    assert range_limits([2.0], width=1024) == pytest.approx((2 * near, 2 * far))
+
+
+def test_the_sweep_goes_no_farther_than_pictures_can_tell_unless_a_point_does():
+    assert range_limits([1.0], width=64, near=1.0, far=18.0)[1] == pytest.approx(64 / np.pi)
+    assert range_limits([1.0], width=64, near=1.0, far=30.0)[1] == 30.0
+
+
+@pytest.mark.parametrize("baselines", [[], [0.0], [np.nan]])
+def test_a_capture_from_one_place_is_refused(baselines):
+    with pytest.raises(UsageError, match="all baselines are zero"):
+        range_limits(baselines, width=1024)

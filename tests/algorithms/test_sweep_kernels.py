@@ -1,0 +1,180 @@
+"""Each compiled part of the sweep equals its slow and obvious form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pano_mvs.algorithms.sweep.kernels_band import store_row, warp_band
+from pano_mvs.algorithms.sweep.kernels_cost import box_rows, census_row, combine_row, difference_row
+from pano_mvs.algorithms.sweep.kernels_sgm import sweep_row, sweep_strip
+from pano_mvs.algorithms.sweep.kernels_winner import AFTER, BEFORE, BEST, RIVAL, STATES, update_winner, winners_of_rows
+from pano_mvs.algorithms.sweep.numba_backend import pack_plane
+from pano_mvs.algorithms.sweep.numpy_backend import path_step, winners_of
+from pano_mvs.algorithms.sweep.penalties import DIRECTIONS
+from pano_mvs.algorithms.sweep.windows import column_offsets
+from pano_mvs.geometry import pad_panorama, pixel_from_ray, ray_grid, rotation_from_rotvec, sample_panorama
+from tests.oracles import sweep as oracle
+
+SIZE = 16, 32
+
+
+def _picture(seed: int, size_hw: tuple[int, int] = SIZE) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, size_hw, dtype=np.uint8)
+
+
+@pytest.mark.parametrize("source_hw", [(16, 32), (24, 48), (16, 64)])
+@pytest.mark.parametrize("translation", [(0.0, 0.0, 0.0), (0.3, -0.2, 0.5), (0.0, 0.9, 0.0), (0.0, 0.0, -0.99)])
+def test_a_warped_band_equals_exact_sampling_even_beyond_the_poles(source_hw, translation):
+    height, width = SIZE
+    source = _picture(1, source_hw)
+    rotation = rotation_from_rotvec((0.4, -1.9, 0.7))
+    pose = np.column_stack([rotation, translation])
+    azimuth = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
+    sin_cos = np.stack([np.sin(azimuth), np.cos(azimuth)]).astype(np.float32)
+    halo, pad = 3, 4
+    warped = np.zeros((1, height + 2 * halo, width + 2 * pad), np.uint8)
+    votes = np.zeros((height + 2 * halo, width), np.uint8)
+    valid = np.ones((source_hw[0] + 1) * (source_hw[1] + 1), np.uint8)
+    warp_band(
+        -halo, height, sin_cos, pose, 1.3, pack_plane(source).ravel(), np.zeros(1, np.int64),
+        np.array(source_hw), valid, 0, pad, warped, votes,
+    )  # fmt: skip
+    points = ray_grid(SIZE) * 1.3 @ rotation.T + translation
+    exact = sample_panorama(source, pixel_from_ray(points, source_hw))
+    expected = np.pad(pad_panorama(exact, halo)[:, halo:-halo], ((0, 0), (pad, pad)), mode="wrap")
+    # Half a level is rounding; the rest is what 1e-4 px of float32 projection makes of white noise.
+    assert np.abs(warped[0] - expected).max() < 0.6
+    assert votes.all()
+
+
+def test_packed_patches_hold_the_four_neighbours_over_seam_and_poles():
+    source = _picture(2)
+    packed = pack_plane(source)
+    assert packed.shape == (SIZE[0] + 1, SIZE[1] + 1)
+    for row, column in [(0, 0), (0, 32), (16, 0), (16, 32), (7, 32), (5, 9)]:
+        corners = [oracle.pixel_at(source, row - 1 + j, column - 1 + i) for i in (0, 1) for j in (0, 1)]
+        assert list(packed[row, column : column + 1].view(np.uint8)) == corners
+
+
+@pytest.mark.parametrize("row", [0, 1, 8, 15])
+def test_census_counts_what_the_definition_counts(row):
+    reference, warped = _picture(3) // 16, _picture(4) // 16  # few levels: ties
+    offsets = column_offsets(SIZE, 2, spherical=True)
+    pad = 8
+    disagree = np.zeros(SIZE[1], np.uint8)
+    census_row(
+        pad_panorama(reference, pad), row + pad, pad_panorama(warped, pad), row + pad, offsets[row], pad, disagree
+    )
+    expected = [oracle.census_cost(reference, warped, row, column, offsets[row]) for column in range(SIZE[1])]
+    assert disagree.tolist() == expected
+
+
+def test_differences_add_up_over_colours():
+    reference, warped = _picture(5), _picture(6)
+    total = np.full(SIZE[1], 7, np.uint16)
+    difference_row(pad_panorama(reference, 2), 5, pad_panorama(warped, 2), 6, 2, total)
+    expected = 7 + np.abs(reference[3].astype(int) - warped[4])
+    assert total.tolist() == expected.tolist()
+
+
+@pytest.mark.parametrize("radius", [1, 3])
+def test_running_sums_equal_the_mean_over_each_window(radius):
+    cost = np.random.default_rng(7).integers(0, 766, SIZE).astype(np.uint16)
+    reach = column_offsets(SIZE, radius, spherical=True)[:, -1].copy()
+    pad = int(reach.max()) + 1
+    padded = np.ascontiguousarray(pad_panorama(cost, pad)[pad - radius : pad + SIZE[0] + radius])
+    scratch = np.zeros((2, SIZE[1] + 2 * pad), np.int32)
+    means = np.zeros(SIZE, np.float32)
+    box_rows(padded, reach, radius, pad, scratch[0], scratch[1], means)
+    expected = [
+        [oracle.box_mean(cost, row, column, radius=radius, reach=int(reach[row])) for column in range(SIZE[1])]
+        for row in range(SIZE[0])
+    ]
+    np.testing.assert_allclose(means, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("sources", [1, 2, 3, 5])
+@pytest.mark.parametrize("best_half", [True, False])
+@pytest.mark.parametrize("all_vote", [True, False])
+def test_sources_combine_to_the_mean_of_those_that_count(sources, best_half, all_vote):
+    rng = np.random.default_rng(sources)
+    costs = rng.random((sources, 2, 40)).astype(np.float32)
+    if not all_vote:
+        costs[rng.random(costs.shape) < 0.5] = np.inf
+    expected = []
+    for column in range(40):
+        voting = sorted(cost for cost in costs[:, 1, column].tolist() if cost < np.inf)
+        used = voting[: (len(voting) + 1) // 2] if best_half else voting
+        expected.append(np.mean(used) if used else 9.0)
+    result = np.zeros(40, np.float32)
+    combine_row(costs, 1, best_half, all_vote, np.float32(9), result)
+    np.testing.assert_allclose(result, expected, rtol=1e-6)
+
+
+def test_winners_of_a_stream_equal_those_of_the_volume():
+    rng = np.random.default_rng(8)
+    volume = rng.integers(0, 12, (3, 9, 500)).astype(np.uint16)  # few levels: ties, neighbours, both ends
+    expected = winners_of(volume.astype(np.float64))
+    streamed = np.full((STATES, 3, 500), np.inf, np.float32), np.zeros((3, 500), np.int32)
+    for d in range(9):
+        for row in range(3):
+            update_winner(volume[row, d].astype(np.float32), d, streamed[0], row, streamed[1])
+    stored = np.full((STATES, 3, 500), np.inf, np.float32), np.zeros((3, 500), np.int32)
+    winners_of_rows(volume, 0, *stored)
+    for state, plane in (streamed, stored):
+        np.testing.assert_array_equal(plane, expected.plane)
+        np.testing.assert_array_equal(state[BEST], expected.cost)
+        np.testing.assert_array_equal(np.where(plane == 0, state[BEST], state[BEFORE]), expected.before)
+        np.testing.assert_array_equal(state[AFTER], expected.after)
+        np.testing.assert_array_equal(state[RIVAL], expected.rival)
+
+
+def test_costs_are_stored_rounded_and_saturated():
+    voxels = np.zeros(5, np.uint8)
+    store_row(np.array([0.0, 1.24, 1.26, 100.0, 1e6], np.float32), np.float32(2.0), voxels)
+    assert voxels.tolist() == [0, 2, 3, 200, 255]
+
+
+@pytest.mark.parametrize("direction", DIRECTIONS)
+def test_paths_over_the_poles_equal_a_walk_pixel_by_pixel(direction):
+    rng = np.random.default_rng(9)
+    (height, width), depth, p1, warm = (8, 20), 5, 9, 3
+    volume = rng.integers(0, 200, (height, depth, width)).astype(np.uint8)
+    penalties = rng.integers(20, 90, (height, width)).astype(np.uint16)
+    total = np.zeros(volume.shape, np.uint16)
+    for first, lines in ((0, 7), (7, 13)):
+        sweep_strip(volume, total, penalties, np.uint16(p1), first, lines, direction[1], direction[0] < 0, warm)
+    for line in range(width):
+        path = oracle.path_pixels((height, width), direction, line, warm=(warm, 0))
+        costs = oracle.path_costs(volume, penalties, path, p1)
+        for (row, column), cost in list(zip(path, costs, strict=True))[warm:]:
+            assert total[row, :, column].tolist() == cost.tolist()
+
+
+def test_paths_along_a_row_equal_a_walk_pixel_by_pixel():
+    rng = np.random.default_rng(10)
+    (height, width), depth, p1, warm = (3, 20), 5, 9, 10
+    volume = rng.integers(0, 200, (height, depth, width)).astype(np.uint8)
+    penalties = rng.integers(20, 90, (2, height, width)).astype(np.uint16)
+    total, expected = np.zeros(volume.shape, np.uint16), np.zeros(volume.shape, np.int64)
+    for row in range(height):
+        sweep_row(volume, total, penalties, np.uint16(p1), row, warm)
+        for idx, step in enumerate((1, -1)):
+            path = oracle.path_pixels((height, width), (0, step), row, warm=(0, warm))
+            costs = oracle.path_costs(volume, penalties[idx], path, p1)
+            for (_, column), cost in list(zip(path, costs, strict=True))[warm:]:
+                expected[row, :, column] += cost
+    np.testing.assert_array_equal(total, expected)
+
+
+def test_one_step_of_many_paths_equals_each_alone():
+    rng = np.random.default_rng(11)
+    costs, before = rng.integers(0, 200, (2, 5, 30))
+    penalty = rng.integers(20, 90, 30)
+    together = path_step(costs, before, penalty, 9)
+    for k in range(30):
+        p2, floor = int(penalty[k]), int(before[:, k].min())
+        for d in range(5):
+            around = [before[e, k] + 9 for e in (d - 1, d + 1) if 0 <= e < 5]
+            assert together[d, k] == costs[d, k] + min([before[d, k], floor + p2, *around]) - floor

@@ -1,0 +1,77 @@
+"""The parts of the sweep, one pixel at a time: slow and obvious."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def pixel_at(picture: NDArray[np.generic], row: int, column: int) -> np.generic:
+    """Return the value at any row and column: the seam wraps, a pole reflects with half a turn."""
+    height, width = picture.shape[:2]
+    if row < 0:
+        row, column = -1 - row, column + width // 2
+    elif row >= height:
+        row, column = 2 * height - 1 - row, column + width // 2
+    return picture[row, column % width]
+
+
+def census_cost(
+    reference: NDArray[np.uint8], warped: NDArray[np.uint8], row: int, column: int, offsets: NDArray[np.int64]
+) -> int:
+    """Return how many neighbours are brighter than the centre in one picture but not in the other."""
+    radius = len(offsets) // 2
+    count = 0
+    for rows in range(-radius, radius + 1):
+        for columns in offsets:
+            in_reference = pixel_at(reference, row + rows, column + columns) > pixel_at(reference, row, column)
+            in_warped = pixel_at(warped, row + rows, column + columns) > pixel_at(warped, row, column)
+            count += bool(in_reference != in_warped)
+    return count
+
+
+def box_mean(cost: NDArray[np.generic], row: int, column: int, *, radius: int, reach: int) -> float:
+    """Return the mean over the window of 2 radius + 1 rows and 2 reach + 1 columns."""
+    window = [
+        float(pixel_at(cost, row + rows, column + columns))
+        for rows in range(-radius, radius + 1)
+        for columns in range(-reach, reach + 1)
+    ]
+    return float(np.mean(window))
+
+
+def path_pixels(
+    size_hw: tuple[int, int], direction: tuple[int, int], line: int, *, warm: tuple[int, int]
+) -> list[tuple[int, int]]:
+    """Return the pixels of one path of semi-global matching, with those before the pole or the seam."""
+    height, width = size_hw
+    rows, columns = direction
+    if rows == 0:
+        order = [i % width if columns > 0 else width - 1 - i % width for i in range(-warm[1], width)]
+        return [(line, column) for column in order]
+    path = []
+    for i in range(-warm[0], height):
+        row, column = i, line + columns * i
+        if row < 0:
+            row, column = -1 - row, column + width // 2
+        path.append((row if rows > 0 else height - 1 - row, column % width))
+    return path
+
+
+def path_costs(
+    volume: NDArray[np.uint8], penalties: NDArray[np.uint16], path: list[tuple[int, int]], p1: int
+) -> list[NDArray[np.int64]]:
+    """Return L(p, ·) along a path through a volume (H, D, W), Hirschmüller's equation 13 term by term."""
+    depth = volume.shape[1]
+    before = [0] * depth
+    result = []
+    for row, column in path:
+        p2 = int(penalties[row, column])
+        now = []
+        for d in range(depth):
+            options = [before[d], min(before) + p2]
+            options += [before[other] + p1 for other in (d - 1, d + 1) if 0 <= other < depth]
+            now.append(int(volume[row, d, column]) + min(options) - min(before))
+        result.append(np.array(now))
+        before = now
+    return result
