@@ -59,6 +59,47 @@ def _invert_symmetric(matrix, inverse):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
+def _add_observation(camera_rows, point_rows, residual, row, system, gradient, diagonal, coupling, block, by_point):  # type: ignore[no-untyped-def]
+    """Add one observation's products of derivatives to its camera's and its point's blocks."""
+    for i in range(6):
+        for j in range(6):
+            system[row + i, row + j] += camera_rows[0, i] * camera_rows[0, j] + camera_rows[1, i] * camera_rows[1, j]
+        for j in range(3):
+            coupling[i, j] = camera_rows[0, i] * point_rows[0, j] + camera_rows[1, i] * point_rows[1, j]
+        gradient[row + i] += camera_rows[0, i] * residual[0] + camera_rows[1, i] * residual[1]
+        diagonal[row + i] += camera_rows[0, i] ** 2 + camera_rows[1, i] ** 2
+    for i in range(3):
+        for j in range(3):
+            block[i, j] += point_rows[0, i] * point_rows[0, j] + point_rows[1, i] * point_rows[1, j]
+        by_point[i] += point_rows[0, i] * residual[0] + point_rows[1, i] * residual[1]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _eliminate(start, stop, image_idx, couplings, inverse, by_point, product, system, gradient):  # type: ignore[no-untyped-def]
+    """Take one point out of the system: S −= W V⁻¹ Wᵀ, g −= W V⁻¹ b, over all pairs of its observations."""
+    for t in range(start, stop):
+        row = 6 * image_idx[t]
+        for i in range(6):
+            for j in range(3):
+                product[i, j] = (
+                    couplings[t, i, 0] * inverse[0, j]
+                    + couplings[t, i, 1] * inverse[1, j]
+                    + couplings[t, i, 2] * inverse[2, j]
+                )
+            for j in range(3):
+                gradient[row + i] -= product[i, j] * by_point[j]
+        for s in range(start, stop):
+            column = 6 * image_idx[s]
+            for i in range(6):
+                for j in range(6):
+                    system[row + i, column + j] -= (
+                        product[i, 0] * couplings[s, j, 0]
+                        + product[i, 1] * couplings[s, j, 1]
+                        + product[i, 2] * couplings[s, j, 2]
+                    )
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def reduced_system(rotations, centers, points, starts, image_idx, bases, weights, damping):  # type: ignore[no-untyped-def]
     """Return the camera system after elimination of all points, and what is needed to get the points back.
 
@@ -69,55 +110,24 @@ def reduced_system(rotations, centers, points, starts, image_idx, bases, weights
         for back-substitution the couplings (T, 6, 3), inverse point blocks (P, 3, 3) and point gradients (P, 3).
     """
     cameras, count = len(centers), len(points)
-    system = np.zeros((6 * cameras, 6 * cameras))
-    gradient = np.zeros(6 * cameras)
-    diagonal = np.zeros(6 * cameras)
+    system, gradient, diagonal = np.zeros((6 * cameras, 6 * cameras)), np.zeros(6 * cameras), np.zeros(6 * cameras)
     couplings = np.zeros((len(image_idx), 6, 3))
-    inverses = np.zeros((count, 3, 3))
-    point_gradients = np.zeros((count, 3))
+    inverses, point_gradients = np.zeros((count, 3, 3)), np.zeros((count, 3))
     camera_rows, point_rows, residual = np.empty((2, 6)), np.empty((2, 3)), np.empty(2)
     block, product = np.empty((3, 3)), np.empty((6, 3))
     for p in range(count):
         block[:] = 0.0
         for t in range(starts[p], starts[p + 1]):
-            camera = image_idx[t]
-            _observation(
-                rotations[camera], centers[camera], points[p], bases[t], weights[t], camera_rows, point_rows, residual
-            )
-            for i in range(3):
-                for j in range(3):
-                    block[i, j] += point_rows[0, i] * point_rows[0, j] + point_rows[1, i] * point_rows[1, j]
-                point_gradients[p, i] += point_rows[0, i] * residual[0] + point_rows[1, i] * residual[1]
-            for i in range(6):
-                for j in range(6):
-                    system[6 * camera + i, 6 * camera + j] += (
-                        camera_rows[0, i] * camera_rows[0, j] + camera_rows[1, i] * camera_rows[1, j]
-                    )
-                for j in range(3):
-                    couplings[t, i, j] = camera_rows[0, i] * point_rows[0, j] + camera_rows[1, i] * point_rows[1, j]
-                gradient[6 * camera + i] += camera_rows[0, i] * residual[0] + camera_rows[1, i] * residual[1]
-                diagonal[6 * camera + i] += camera_rows[0, i] ** 2 + camera_rows[1, i] ** 2
+            k = image_idx[t]
+            _observation(rotations[k], centers[k], points[p], bases[t], weights[t], camera_rows, point_rows, residual)
+            _add_observation(
+                camera_rows, point_rows, residual, 6 * k, system, gradient, diagonal, couplings[t], block,
+                point_gradients[p],
+            )  # fmt: skip
         for i in range(3):
             block[i, i] *= 1.0 + damping
         _invert_symmetric(block, inverses[p])
-        for t in range(starts[p], starts[p + 1]):
-            row = 6 * image_idx[t]
-            for i in range(6):
-                for j in range(3):
-                    product[i, j] = (
-                        couplings[t, i, 0] * inverses[p, 0, j]
-                        + couplings[t, i, 1] * inverses[p, 1, j]
-                        + couplings[t, i, 2] * inverses[p, 2, j]
-                    )
-                for j in range(3):
-                    gradient[row + i] -= product[i, j] * point_gradients[p, j]
-            for s in range(starts[p], starts[p + 1]):
-                column = 6 * image_idx[s]
-                for i in range(6):
-                    for j in range(6):
-                        system[row + i, column + j] -= (
-                            product[i, 0] * couplings[s, j, 0]
-                            + product[i, 1] * couplings[s, j, 1]
-                            + product[i, 2] * couplings[s, j, 2]
-                        )
+        _eliminate(
+            starts[p], starts[p + 1], image_idx, couplings, inverses[p], point_gradients[p], product, system, gradient
+        )
     return system, gradient, diagonal, couplings, inverses, point_gradients
