@@ -1,7 +1,8 @@
 """The sweep, compiled: bands of rows in threads, no volume unless semi-global matching needs one.
 
-Memory beyond the pictures: for "box" about 0.3 MB a thread and 1,000 columns, whatever the planes; for "sgm" 3 bytes
-for each pixel and plane (a uint8 volume of costs and a uint16 volume of path sums; 201 MB at 512×1024×128).
+Memory beyond the pictures (a source's packed copy has 4 bytes a pixel and colour) and the result: for "box" about 2 MB
+a thread at 1,000 columns and 3 sources, whatever the planes and the rows; for "sgm" on top of it 3 bytes for each pixel
+and plane (a uint8 volume of costs and a uint16 volume of path sums; 201 MB at 512×1024×128).
 
 Bands and strips are handed to plain threads (the kernels release the GIL), as many as numba is told to use: they write
 disjoint parts in a fixed arithmetic order, so the number of threads changes no bit. numba's own parallel regions would
@@ -38,17 +39,27 @@ def find_winners(work: SweepInput) -> Winners:
     """Return the winning plane of every pixel and the costs around it; equals the numpy backend's but for rounding."""
     height, width = work.reference.shape[:2]
     settings = work.settings
-    bands = range(0, height, _BAND_ROWS)
-    state = [_fresh_state(min(_BAND_ROWS, height - first), width) for first in bands]
     with_volume = settings.aggregation == "sgm"
     volume = np.empty((height, settings.planes, width) if with_volume else (0, 0, 0), np.uint8)
+    found = _unset_winners((height, width))
     prepared = _band_arguments(work)
+
+    def sweep(first: int) -> None:
+        state, planes = _fresh_state(min(_BAND_ROWS, height - first), width)
+        sweep_band(first, *prepared, volume, state, planes)
+        _keep(found, first, state, planes)
+
+    def decide(first: int) -> None:
+        state, planes = _fresh_state(min(_BAND_ROWS, height - first), width)
+        winners_of_rows(total, first, state, planes)
+        _keep(found, first, state, planes)
+
     with ThreadPoolExecutor(numba.get_num_threads()) as pool:
-        _run(pool, lambda k: sweep_band(bands[k], *prepared, volume, *state[k]), range(len(bands)))
+        _run(pool, sweep, range(0, height, _BAND_ROWS))
         if with_volume:
             total = _aggregate(pool, work, volume)
-            _run(pool, lambda k: winners_of_rows(total, bands[k], *state[k]), range(len(bands)))
-    return _winners(state)
+            _run(pool, decide, range(0, height, _BAND_ROWS))
+    return found
 
 
 def pack_plane(plane: NDArray[np.uint8]) -> NDArray[np.uint32]:
@@ -134,8 +145,16 @@ def _run(pool: ThreadPoolExecutor, work: Callable[[Job], object], jobs: Iterable
         pass
 
 
-def _winners(state: list[tuple[NDArray[np.float32], NDArray[np.int32]]]) -> Winners:
-    costs = np.concatenate([band for band, _ in state], axis=1)
-    plane = np.concatenate([planes for _, planes in state])
-    before = np.where(plane == 0, costs[BEST], costs[BEFORE])
-    return Winners(plane, costs[BEST], before, costs[AFTER], costs[RIVAL])
+def _unset_winners(size_hw: tuple[int, int]) -> Winners:
+    costs = [np.empty(size_hw, np.float32) for _ in range(4)]
+    return Winners(np.empty(size_hw, np.int32), *costs)
+
+
+def _keep(found: Winners, first: int, state: NDArray[np.float32], planes: NDArray[np.int32]) -> None:
+    """Copy what a band found to where it belongs."""
+    rows = slice(first, first + len(planes))
+    found.plane[rows] = planes
+    found.cost[rows] = state[BEST]
+    found.before[rows] = np.where(planes == 0, state[BEST], state[BEFORE])
+    found.after[rows] = state[AFTER]
+    found.rival[rows] = state[RIVAL]
