@@ -18,6 +18,8 @@ from pano_mvs.scene import Features
 
 _ORB_SCALE, _ORB_LEVELS = 1.2, 8
 _EDGE_PX = 0.5
+# Twice the usual: on plain walls many a key point lies on an edge, and the geometry sorts out those that slide.
+_SIFT_EDGE_RATIO = 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +62,9 @@ def extract_sift(
         UsageError: if the shapes of image and mask do not fit.
     """
     # Without the precise upscale all key points of the first octave are shifted by a quarter of a pixel.
-    detector = cv2.SIFT.create(contrastThreshold=contrast_threshold, enable_precise_upscale=True)
+    detector = cv2.SIFT.create(
+        contrastThreshold=contrast_threshold, edgeThreshold=_SIFT_EDGE_RATIO, enable_precise_upscale=True
+    )
 
     def detect(tile_image: NDArray[np.uint8]) -> _Found:
         keypoints, descriptors = detector.detectAndCompute(tile_image, None)

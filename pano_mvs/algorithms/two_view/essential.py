@@ -37,6 +37,13 @@ def sampson_angles(essentials: FloatArray, first: FloatArray, second: FloatArray
     return residuals.reshape(*essentials.shape[:-2], len(first))
 
 
+def msac_costs(essentials: FloatArray, first: FloatArray, second: FloatArray, threshold_rad: float) -> FloatArray:
+    """Return Σ min(r² / threshold², 1) over all matches, for each of the essential matrices (..., 3, 3)."""
+    residuals = sampson_angles(essentials, first, second)
+    costs: FloatArray = np.sum(np.minimum((residuals / threshold_rad) ** 2, 1.0), axis=-1)
+    return costs
+
+
 def essential_from_bearings(first: FloatArray, second: FloatArray) -> FloatArray:
     """Return the essential matrices that solve qᵀ E p = 0 in the least-squares sense (8-point method).
 

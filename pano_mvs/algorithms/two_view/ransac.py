@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.two_view.essential import (
     essential_from_bearings,
     in_front,
+    msac_costs,
     poses_from_essential,
     sampson_angles,
 )
+from pano_mvs.algorithms.two_view.redirection import best_redirected
 from pano_mvs.algorithms.two_view.refinement import refine_relative_pose
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, angle_between, skew
@@ -23,6 +25,7 @@ _SAMPLE = 8
 _BATCH = 256
 _SCREEN = 400  # matches on which all hypotheses of a batch are compared
 _FINALISTS = 4  # hypotheses of a batch that are compared on all matches
+_LEADERS = 6  # hypotheses that are given new directions
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,14 +58,15 @@ def estimate_two_view(
     rng: np.random.Generator,
     threshold_rad: float,
     confidence: float = 0.9999,
-    max_iterations: int = 20_000,
+    max_iterations: int = 15_000,
 ) -> RelativePose:
     """Return the relative pose that most matches agree on.
 
     Spherical 8-point hypotheses, ranked by the truncated squared error (Torr & Zisserman 2000, "MLESAC") and refitted
     on their inliers whenever one leads (Chum et al. 2003, "Locally optimized RANSAC"); of the four decompositions the
-    one with most points in front of both cameras; last, the angular error is minimised over the five degrees of
-    freedom. Whether the result is more than chance is for `verify_pair` to judge.
+    one with most points in front of both cameras; the leaders are given new directions (see `best_redirected`); last,
+    the angular error is minimised over the five degrees of freedom. Whether the result is more than
+    chance is for `verify_pair` to judge.
 
     Args:
         bearings_first: (M, 3) unit rays in the first camera.
@@ -82,10 +86,11 @@ def estimate_two_view(
     count = len(first)
     if count < 2 * _SAMPLE:
         return _none(count, f"only {count} matches, {2 * _SAMPLE} needed for a hypothesis")
-    essential, iterations = _best_essential(
+    leaders, iterations = _leading_essentials(
         first, second, rng=rng, threshold_rad=threshold_rad, confidence=confidence, max_iterations=max_iterations
     )
-    pose = _facing_pose(essential, first, second, threshold_rad)
+    starts = [_facing_pose(essential, first, second, threshold_rad) for essential in leaders]
+    pose = best_redirected(starts, first, second, rng=rng, threshold_rad=threshold_rad)
     for _ in range(3):
         residuals = sampson_angles(skew(pose.translation) @ pose.rotation, first, second)
         near = (residuals < 2 * threshold_rad) & _plausible(first, second, pose, threshold_rad)
@@ -103,7 +108,7 @@ def _none(count: int, reason: str) -> RelativePose:
     return RelativePose(Rigid3.identity(), np.zeros(count, np.bool_), np.full(count, np.pi / 2), 0, reason)
 
 
-def _best_essential(
+def _leading_essentials(
     first: FloatArray,
     second: FloatArray,
     *,
@@ -111,23 +116,25 @@ def _best_essential(
     threshold_rad: float,
     confidence: float,
     max_iterations: int,
-) -> tuple[FloatArray, int]:
-    """Return the essential matrix with the least truncated squared error, and the number of hypotheses."""
-    best, best_cost, tried, needed = np.eye(3), np.inf, 0, float(max_iterations)
+) -> tuple[list[FloatArray], int]:
+    """Return the essential matrices with the least truncated squared error, best first, and how many were tried."""
+    leaders: list[tuple[float, int, FloatArray]] = []
+    tried, needed = 0, float(max_iterations)
     while tried < needed:
         samples = _samples(rng, len(first))
         hypotheses = essential_from_bearings(first[samples], second[samples])
         screen = rng.choice(len(first), min(_SCREEN, len(first)), replace=False)
-        screened = _msac_costs(hypotheses, first[screen], second[screen], threshold_rad)
+        screened = msac_costs(hypotheses, first[screen], second[screen], threshold_rad)
         finalists = hypotheses[np.argsort(screened, kind="stable")[:_FINALISTS]]
-        costs = _msac_costs(finalists, first, second, threshold_rad)
+        costs = msac_costs(finalists, first, second, threshold_rad)
         tried += _BATCH
-        if costs.min() < best_cost:
-            leader = finalists[np.argmin(costs)]
-            best, best_cost = _locally_optimised(leader, float(costs.min()), first, second, threshold_rad)
-            inlier_ratio = float(np.mean(sampson_angles(best, first, second) < threshold_rad))
+        leader, cost = finalists[np.argmin(costs)], float(costs.min())
+        if not leaders or cost < leaders[0][0]:
+            leader, cost = _locally_optimised(leader, cost, first, second, threshold_rad)
+            inlier_ratio = float(np.mean(sampson_angles(leader, first, second) < threshold_rad))
             needed = min(needed, _hypotheses_needed(inlier_ratio, confidence))
-    return best, tried
+        leaders = sorted([*leaders, (cost, tried, leader)], key=lambda item: item[:2])[:_LEADERS]
+    return [essential for _, _, essential in leaders], tried
 
 
 def _samples(rng: np.random.Generator, count: int) -> NDArray[np.int64]:
@@ -137,12 +144,6 @@ def _samples(rng: np.random.Generator, count: int) -> NDArray[np.int64]:
     for row in repeated:
         samples[row] = rng.choice(count, _SAMPLE, replace=False)
     return samples
-
-
-def _msac_costs(essentials: FloatArray, first: FloatArray, second: FloatArray, threshold_rad: float) -> FloatArray:
-    residuals = sampson_angles(essentials, first, second)
-    costs: FloatArray = np.sum(np.minimum((residuals / threshold_rad) ** 2, 1.0), axis=-1)
-    return costs
 
 
 def _locally_optimised(
@@ -155,7 +156,7 @@ def _locally_optimised(
         if inliers.sum() < _SAMPLE:
             break
         candidate = essential_from_bearings(first[inliers], second[inliers])
-        candidate_cost = float(_msac_costs(candidate[None], first, second, threshold_rad)[0])
+        candidate_cost = float(msac_costs(candidate[None], first, second, threshold_rad)[0])
         if candidate_cost < cost:
             essential, cost = candidate, candidate_cost
     return essential, cost

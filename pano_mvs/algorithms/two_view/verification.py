@@ -34,7 +34,7 @@ def verify_pair(
     rng: np.random.Generator,
     threshold_deg: float = 0.2,
     min_inliers: int = 20,
-    max_iterations: int = 20_000,
+    max_iterations: int = 15_000,
 ) -> TwoView:
     """Return what two pictures agree on: their relative pose and the matches that bear it out.
 
@@ -107,7 +107,11 @@ def _why_not(
     witnesses = independent_count(p[kept], q[kept]) if kept.any() else 0
     if witnesses < min_inliers:
         return f"{witnesses} independent matches of {count} agree on a relative pose, {min_inliers} needed"
-    chance = _chance(pose.second_from_first, p, q, rng=rng, threshold_rad=threshold_rad)
+    # Among the agreeing matches alone as well: where they crowd along one epipolar circle any match would agree.
+    chance = max(
+        _chance(pose.second_from_first, first, second, rng=rng, threshold_rad=threshold_rad)
+        for first, second in ((p, q), (p[kept], q[kept]))
+    )
     false_alarms = log10_false_alarms(witnesses, max(independent_count(p, q), witnesses), chance=chance, sample=8)
     if false_alarms > _MAX_LOG10_FALSE_ALARMS:
         return (f"{witnesses} independent matches of {count} agree on a relative pose, which may be chance: the "
