@@ -7,7 +7,7 @@ from pano_mvs.stages.depth import sweep
 from pano_mvs.stages.evaluate import truth
 from pano_mvs.stages.export import colmap, ply, previews, ranges
 from pano_mvs.stages.features import orb_tangent, sift_tangent
-from pano_mvs.stages.filters import bilateral_solver, consistency, gaussian, median, speckle
+from pano_mvs.stages.filters import bilateral_solver, consistency, fill, gaussian, median, speckle
 from pano_mvs.stages.fusion import vote
 from pano_mvs.stages.matches import brute_force
 from pano_mvs.stages.pairs import exhaustive, sequential
@@ -21,6 +21,7 @@ __all__ = [
     "colmap",
     "consistency",
     "exhaustive",
+    "fill",
     "folder",
     "from_model",
     "gaussian",

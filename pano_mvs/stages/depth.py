@@ -41,10 +41,10 @@ class SweepParams(Params):
     support: int = Field(
         default=5, ge=1, le=15, description="side of the box over which census costs are averaged, odd"
     )
-    p1: float = Field(default=6.0, ge=0, le=4000, description="SGM's penalty of a step by one plane")
-    p2: float = Field(default=60.0, ge=0, le=4000, description="SGM's penalty of a larger step")
+    p1: int = Field(default=80, ge=0, le=5000, description="SGM's penalty of a step by one plane, for 512 rows")
+    p2: int = Field(default=1600, ge=0, le=7900, description="SGM's penalty of a larger step, for 512 rows")
     p2_contrast: float = Field(
-        default=0.0, ge=0, description="grey levels of contrast at which p2 is halved; 0 keeps it"
+        default=15.0, ge=0, description="grey levels of contrast at which p2 is halved; 0 keeps it"
     )
     subplane: bool = Field(default=True, description="parabola between the planes")
     prefilter_diameter: int = Field(

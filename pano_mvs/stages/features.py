@@ -12,7 +12,7 @@ class SiftParams(Params):
     """Settings of features.sift_tangent."""
 
     max_keypoints: int = Field(default=8000, ge=8, description="the best so many, spread over the sphere")
-    contrast_threshold: float = Field(default=0.012, ge=0, description="lower finds more on plain walls")
+    contrast_threshold: float = Field(default=0.004, ge=0, description="lower finds more on plain walls")
     root: bool = Field(default=True, description="RootSIFT descriptors")
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import Literal
 
+import numpy as np
 from pydantic import Field
 
 from pano_mvs.algorithms.filters.bilateral_solver import fast_bilateral_solver
 from pano_mvs.algorithms.filters.consistency import check_consistency
+from pano_mvs.algorithms.filters.fill import fill_from_neighbours
 from pano_mvs.algorithms.filters.gaussian import gaussian_range
 from pano_mvs.algorithms.filters.median import median_range
 from pano_mvs.algorithms.filters.speckle import remove_speckles
@@ -89,11 +91,11 @@ def consistency(
 class BilateralSolverParams(Params):
     """Settings of filters.fast_bilateral_solver."""
 
-    sigma_spatial: float = Field(default=8.0, gt=0, description="spatial cells, in pixels at the equator")
-    sigma_luma: float = Field(default=8.0, gt=0, description="luma bins, in grey levels")
-    sigma_chroma: float = Field(default=8.0, gt=0, description="chroma bins, in grey levels")
+    sigma_spatial: float = Field(default=8.0, ge=1, description="spatial cells, in pixels at the equator")
+    sigma_luma: float = Field(default=8.0, ge=2.1, description="luma bins, in grey levels")
+    sigma_chroma: float = Field(default=8.0, ge=2.1, description="chroma bins, in grey levels")
     smoothness: float = Field(
-        default=4.0, gt=0, description="λ: weight of smoothness against a pixel of full confidence"
+        default=1.0, ge=0, description="λ: weight of smoothness against a pixel of full confidence"
     )
     domain: Literal["range", "inverse"] = Field(default="inverse", description="what is smoothed: range or 1/range")
     fill: bool = Field(default=True, description="give a range to pixels that had none (confidence 1–63)")
@@ -103,9 +105,38 @@ class BilateralSolverParams(Params):
 def bilateral_solver(
     range_map: Each[RangeMap], image: Each[Panorama], params: BilateralSolverParams, ctx: Context
 ) -> RangeMap:
-    """The Fast Bilateral Solver: smooth where the picture is smooth, edges where it has edges."""
+    """The Fast Bilateral Solver: smooth where the picture is smooth, edges where it has edges.
+
+    Masked pixels get no range, whatever `fill` says.
+    """
     solved = fast_bilateral_solver(range_map, image.load(), **params.model_dump())
-    return _measured(solved, ctx)
+    return _measured(_unmasked(solved, image), ctx)
+
+
+class FillParams(Params):
+    """Settings of filters.fill."""
+
+    max_distance_px: int = Field(default=48, ge=1, description="how far to look, in pixels at the equator")
+    min_confidence: int = Field(default=128, ge=1, le=255, description="pixels below are not trusted")
+
+
+@stage("filters.fill")
+def fill(range_map: Each[RangeMap], image: Each[Panorama], params: FillParams, ctx: Context) -> RangeMap:
+    """Give holes the range of the surface behind them, from trusted pixels only (confidence 1–63).
+
+    Masked pixels get no range.
+    """
+    filled = fill_from_neighbours(
+        range_map, max_distance_px=params.max_distance_px, min_confidence=params.min_confidence
+    )
+    return _measured(_unmasked(filled, image), ctx)
+
+
+def _unmasked(range_map: RangeMap, image: Panorama) -> RangeMap:
+    valid = image.load_mask()
+    return RangeMap(
+        np.where(valid, range_map.range, np.float32(np.nan)), np.where(valid, range_map.confidence, np.uint8(0))
+    )
 
 
 def _measured(range_map: RangeMap, ctx: Context) -> RangeMap:

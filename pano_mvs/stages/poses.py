@@ -55,8 +55,8 @@ class RefineParams(Params):
     """Settings of poses.refine."""
 
     loss: Literal["cauchy", "huber"] = Field(default="cauchy", description="robust loss of the angular residuals")
-    loss_scale_deg: float = Field(default=0.05, gt=0, description="residual at which the loss starts to bend")
-    max_error_deg: float = Field(default=0.3, gt=0, description="observations further off are dropped")
+    loss_scale_deg: float = Field(default=0.1, gt=0, description="residual at which the loss starts to bend")
+    max_error_deg: float = Field(default=0.4, gt=0, description="observations further off are dropped")
     max_iterations: int = Field(default=50, ge=1, description="of the optimiser, in each round")
 
 
@@ -104,7 +104,7 @@ def from_model(images: Names[Panorama], params: FromModelParams, ctx: Context) -
 class TriangulateParams(Params):
     """Settings of poses.triangulate."""
 
-    max_error_deg: float = Field(default=0.3, gt=0, description="observations further off are dropped")
+    max_error_deg: float = Field(default=0.4, gt=0, description="observations further off are dropped")
     min_angle_deg: float = Field(default=1.0, gt=0, description="rays of a point must meet at this angle or more")
 
 

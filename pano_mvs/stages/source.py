@@ -55,7 +55,7 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
     path = item.files["image"]
     info = describe_picture(path)
     for warning in info.warnings:
-        ctx.note(f"{item.name}: {warning}" if info.gpano is not None else f"pictures have {warning}")
+        ctx.note(f"{item.name}: {warning}" if info.gpano is not None else f"some pictures have {warning}")
     _check_decodes(path, info)
     mask = item.files.get("mask")
     if mask is not None:
@@ -70,6 +70,7 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
         zenith_deg=params.zenith_deg,
         up_in_cam=info.gpano.up_in_cam if info.gpano else None,
         heading_deg=info.gpano.heading_deg if info.gpano else None,
+        position_lla=info.position_lla,
     )
 
 
