@@ -58,6 +58,16 @@ def test_recovers_a_capture_under_noise_and_outliers(capture, estimator):
     assert len(poses.points_in_world) > 300
 
 
+def test_the_chain_alone_is_sound_and_adjustment_better(capture):
+    truth, features, views = capture
+    chained, adjusted = (
+        relative_pose_errors(cameras(solve(features, views, adjust=adjust)), truth) for adjust in (False, True)
+    )
+    assert chained.registered == adjusted.registered == 5
+    assert chained.median_pair_deg < 0.15
+    assert adjusted.median_pair_deg < chained.median_pair_deg
+
+
 def test_world_is_the_first_camera_and_its_first_baseline_is_one(capture):
     _, features, views = capture
     poses = solve(features, views)

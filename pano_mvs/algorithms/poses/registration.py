@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.poses.points import triangulate_observations
+from pano_mvs.algorithms.poses.bundle import Bundle, adjust_bundle
+from pano_mvs.algorithms.poses.points import Triangulated, triangulate_observations
 from pano_mvs.algorithms.poses.resection import refine_resection, resection_errors
 from pano_mvs.algorithms.poses.scale import ScaleEstimator, estimate_scale
 from pano_mvs.algorithms.poses.tracks import Tracks
@@ -25,6 +26,7 @@ _MIN_RATIOS = 6
 _MIN_POINTS = 15
 _MIN_SHARE = 0.4
 _MAX_PARTNERS = 8
+_ADJUST_STEPS = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +79,12 @@ class GrowingModel:
         self.cameras[image] = cam_from_world
         self.triangulate(self.tracks.track_idx[self._track_of_image[image]])
 
-    def triangulate(self, track_idx: NDArray[np.int32] | None = None) -> None:
-        """Compute the points of some tracks, or of all, from all registered cameras."""
+    def triangulate(self, track_idx: NDArray[np.int32] | None = None) -> tuple[NDArray[np.intp], Triangulated]:
+        """Compute the points of some tracks, or of all, from all registered cameras.
+
+        Returns:
+            The positions of the observations that were looked at, and what came of them.
+        """
         tracks = self.tracks
         chosen = np.ones(tracks.count, np.bool_)
         if track_idx is not None:
@@ -98,6 +104,34 @@ class GrowingModel:
             min_angle_rad=_MIN_ANGLE_RAD,
         )
         self._points[chosen] = found.points_in_world
+        return seen, found
+
+    def adjust(self) -> None:
+        """Refine all cameras but the first together with the points (bundle adjustment), and triangulate anew."""
+        seen, found = self.triangulate()
+        used = seen[found.used]
+        images = sorted(self.cameras)
+        position = np.zeros(len(self.tracks.names), np.int32)
+        position[images] = np.arange(len(images))
+        rotations, centers = self._arrays()
+        bundle = Bundle(
+            rotations=rotations[images],
+            centers=centers[images],
+            points=found.points_in_world[found.valid],
+            point_idx=(np.cumsum(found.valid) - 1)[self.tracks.track_idx[used]].astype(np.int32),
+            image_idx=position[self.tracks.image_idx[used]],
+            bearings=self.tracks.bearings[used],
+        )
+        bundle = adjust_bundle(
+            bundle,
+            loss="cauchy",
+            scale_rad=_MAX_ERROR_RAD / 4,
+            max_iterations=_ADJUST_STEPS,
+            fixed_camera=images.index(next(iter(self.cameras))),
+        )
+        for image, rotation, center in zip(images, bundle.rotations, bundle.centers, strict=True):
+            self.cameras[image] = Rigid3.from_center(rotation, center)
+        self.triangulate()
 
     def known_points(self, image: int) -> tuple[FloatArray, FloatArray]:
         """Return the triangulated points, (M, 3), that an image's tracks contain, and its rays to them, (M, 3)."""
@@ -132,15 +166,6 @@ class GrowingModel:
                 "that moved, or stitching errors",
             )  # fmt: skip
         return Attachment(pose, support, len(points))
-
-    def repolish(self) -> None:
-        """Refine every camera but the first against the points, and triangulate anew."""
-        fixed = next(iter(self.cameras))
-        for image in list(self.cameras):
-            points, bearings = self.known_points(image)
-            if image != fixed and len(points) >= _MIN_POINTS:
-                self.cameras[image] = _polished(self.cameras[image], points, bearings)
-        self.triangulate()
 
     def _partners(self, image: int) -> list[int]:
         """Return the registered partners of an image, those with most verified matches first."""

@@ -16,8 +16,7 @@ from pano_mvs.scene import Features, Poses, TwoView
 
 _MAX_ERROR_DEG, _MIN_ANGLE_DEG = 0.4, 1.0
 _SEED_TRIALS = 5
-_POLISH_ROUNDS = 5
-_POLISH_GROWTH = 1.2  # all cameras are refined whenever there are a fifth more than at the last time
+_ADJUST_GROWTH = 1.2  # all cameras are adjusted whenever there are a fifth more than at the last time
 _FULL_PARALLAX_DEG = 10.0
 
 
@@ -27,6 +26,7 @@ def solve_scaled_translation(
     *,
     scale_estimator: ScaleEstimator = "cauchy",
     kappa: float = 0.01,
+    adjust: bool = True,
     rng: np.random.Generator,
 ) -> Poses:
     """Return the poses of a capture from its verified pairs, by translation scale factors.
@@ -41,6 +41,8 @@ def solve_scaled_translation(
         two_views: verified pairs.
         scale_estimator: see `estimate_scale`; "kappa" is the paper's.
         kappa: the paper's κ.
+        adjust: whether to adjust all cameras and points together now and then, which keeps errors from piling up;
+            without it the poses are those of the chain, as in the paper.
         rng: not drawn from today; part of the contract of pose solvers.
 
     Returns:
@@ -58,13 +60,13 @@ def solve_scaled_translation(
     tracks = build_tracks(features, {**kept})
     models = []
     for seed in _seeds(inside):
-        model, reasons = _grown(GrowingModel(tracks, inside, scale_estimator, kappa), seed)
+        model, reasons = _grown(GrowingModel(tracks, inside, scale_estimator, kappa), seed, adjust=adjust)
         models.append((model, reasons))
         if len(model.cameras) == len(group):
             break
     model, reasons = max(models, key=lambda grown: len(grown[0].cameras))
-    for _ in range(_POLISH_ROUNDS):
-        model.repolish()
+    if adjust:
+        model.adjust()
     rejected = {names[image]: reason for image, reason in reasons.items()}
     rejected |= {name: _why_alone(name, two_views) for i, name in enumerate(names) if i not in group}
     return _finished(model, tracks, rejected)
@@ -80,12 +82,12 @@ def _seeds(edges: Mapping[Edge, TwoView]) -> list[Edge]:
     return sorted(edges, key=quality)[:_SEED_TRIALS]
 
 
-def _grown(model: GrowingModel, seed: Edge) -> tuple[GrowingModel, dict[int, str]]:
+def _grown(model: GrowingModel, seed: Edge, *, adjust: bool) -> tuple[GrowingModel, dict[int, str]]:
     """Attach image after image, the one that sees most known points first; return also why the rest was refused."""
     model.add(seed[0], Rigid3.identity())
     model.add(seed[1], relative_pose(model.edges, *seed))
     left = sorted({image for edge in model.edges for image in edge} - set(seed))
-    polished = 0
+    adjusted = 0
     while left:
         for image in sorted(left, key=lambda i: (-model.known_count(i), i)):
             if attachment := model.attach(image):
@@ -94,9 +96,9 @@ def _grown(model: GrowingModel, seed: Edge) -> tuple[GrowingModel, dict[int, str
                 break
         else:
             break
-        if len(model.cameras) > _POLISH_GROWTH * polished:
-            model.repolish()
-            polished = len(model.cameras)
+        if adjust and len(model.cameras) > _ADJUST_GROWTH * adjusted:
+            model.adjust()
+            adjusted = len(model.cameras)
     return model, {image: model.attach(image).reason for image in left}
 
 
