@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.settings import SweepSettings
-from pano_mvs.algorithms.sweep.windows import column_stretch
+from pano_mvs.algorithms.sweep.windows import column_offsets
 from pano_mvs.algorithms.sweep.winner import Winners
 from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, ray_grid
 
@@ -66,8 +66,9 @@ def voting_pixels(mask: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
     if mask.all() or radius == 0:
         return mask
     height, width = mask.shape
-    stretch = column_stretch(height, spherical=True)
-    reach = np.clip(np.rint(radius * stretch).astype(np.int64), radius, width // 4)
+    reach = column_offsets((height, width), radius, spherical=True)[:, -1]
+    around = np.pad(reach, radius, mode="symmetric")  # the widest window of all those that look into a row
+    reach = np.max([around[shift : shift + height] for shift in range(2 * radius + 1)], axis=0)
     wide = np.zeros_like(mask)
     for columns in np.unique(reach):
         rows = reach == columns
