@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,18 +30,15 @@ def consistent_edges(
         (first, second) positions in `names`, first < second, to the geometry second_from_first.
     """
     edges = _edges_by_position(names, two_views)
-    triangles = {t: _loop_error_rad(edges, t) < np.deg2rad(max_loop_deg) for t in _triangles(edges)}
-    while any(not closes for closes in triangles.values()):
-        good, bad = dict.fromkeys(edges, 0), dict.fromkeys(edges, 0)
-        for triangle, closes in triangles.items():
-            for edge in combinations(triangle, 2):
-                (good if closes else bad)[edge] += 1
-        worst = max(
-            (edge for edge in edges if bad[edge]),
-            key=lambda e: (bad[e] / (bad[e] + good[e]), -len(edges[e]), e),
-        )
-        del edges[worst]
-        triangles = {t: closes for t, closes in triangles.items() if not set(worst) <= set(t)}
+    keys = list(edges)
+    triangles = _triangles(keys)
+    closes = _loop_errors_rad(list(edges.values()), triangles) < np.deg2rad(max_loop_deg)
+    while not closes.all():
+        good, bad = (np.bincount(triangles[which].ravel(), minlength=len(keys)) for which in (closes, ~closes))
+        worst = max(np.flatnonzero(bad).tolist(), key=lambda e: (bad[e] / (bad[e] + good[e]), -len(edges[keys[e]]), e))
+        del edges[keys[worst]]
+        left = (triangles != worst).all(axis=1)
+        triangles, closes = triangles[left], closes[left]
     return edges
 
 
@@ -90,13 +86,20 @@ def _reversed(view: TwoView) -> TwoView:
     )  # fmt: skip
 
 
-def _triangles(edges: Mapping[Edge, TwoView]) -> list[tuple[int, int, int]]:
+def _triangles(keys: list[Edge]) -> NDArray[np.intp]:
+    """Return the triangles i < j < k as positions in `keys` of their edges (i, j), (j, k), (i, k); (T, 3)."""
+    number = {edge: idx for idx, edge in enumerate(keys)}
     after: dict[int, set[int]] = {}
-    for first, second in edges:
+    for first, second in keys:
         after.setdefault(first, set()).add(second)
-    return [(i, j, k) for i, j in edges for k in sorted(after[i] & after.get(j, set()))]
+    found = [
+        (number[i, j], number[j, k], number[i, k]) for i, j in keys for k in sorted(after[i] & after.get(j, set()))
+    ]
+    return np.array(found, np.intp).reshape(-1, 3)
 
 
-def _loop_error_rad(edges: Mapping[Edge, TwoView], triangle: tuple[int, int, int]) -> float:
-    i, j, k = triangle
-    return float(geodesic_angle(edges[j, k].rotation @ edges[i, j].rotation, edges[i, k].rotation))
+def _loop_errors_rad(views: list[TwoView], triangles: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Return the rotation left over around each triangle, (T,)."""
+    rotations = np.array([view.rotation for view in views]).reshape(-1, 3, 3)
+    there, on, directly = (rotations[triangles[:, side]] for side in range(3))
+    return geodesic_angle(on @ there, directly)
