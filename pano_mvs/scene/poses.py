@@ -12,9 +12,6 @@ from numpy.typing import NDArray
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene.record import Axis, Parts, Record, require, require_array
 
-# Range limits are rounded outward to these steps, so that a point more or less does not recompute a view.
-_LIMIT_STEPS_PER_OCTAVE = 4
-
 
 @dataclass(frozen=True, eq=False)
 class Pose(Record):
@@ -22,16 +19,11 @@ class Pose(Record):
 
     Attributes:
         cam_from_world: the rigid transform into the camera frame.
-        near: a range below which no sparse point of this image lies, rounded down to a quarter octave, or None
-            where the image has too few points.
-        far: likewise above which none lies, rounded up.
     """
 
     axis: ClassVar[Axis | None] = Axis.IMAGE
 
     cam_from_world: Rigid3
-    near: float | None = None
-    far: float | None = None
 
     def check(self) -> None:
         """Raise ContractError unless the rotation is one."""
@@ -43,16 +35,14 @@ class Pose(Record):
     def to_parts(self) -> Parts:
         """Return the pose as one JSON object (floats keep all their digits)."""
         pose = self.cam_from_world
-        meta = {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
-        return {"meta": meta | {"near": self.near, "far": self.far}}
+        return {"meta": {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}}
 
     @classmethod
     def from_parts(cls, parts: Parts) -> Self:
         """Return the pose that `to_parts` gave."""
         meta = parts["meta"]
         assert isinstance(meta, dict)
-        transform = Rigid3(np.array(meta["rotation"], np.float64), np.array(meta["translation"], np.float64))
-        return cls(transform, meta["near"], meta["far"])
+        return cls(Rigid3(np.array(meta["rotation"], np.float64), np.array(meta["translation"], np.float64)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,14 +120,8 @@ class Poses(Record):
         return centers
 
     def explode(self) -> Mapping[str, Pose]:
-        """Return the pose of each registered image, with the limits of its sparse points' ranges."""
-        points = np.asarray(self.points_in_world)[self.track_point_idx]
-        ranges = np.linalg.norm(points - self.centers[self.track_image_idx], axis=-1)
-        poses: dict[str, Pose] = {}
-        for idx, name in enumerate(self.names):
-            near, far = _range_limits(ranges[self.track_image_idx == idx])
-            poses[name] = Pose(self.cam_from_world(idx), near, far)
-        return poses
+        """Return the pose of each registered image."""
+        return {name: Pose(self.cam_from_world(idx)) for idx, name in enumerate(self.names)}
 
     def check(self) -> None:
         """Raise ContractError unless all arrays agree."""
@@ -158,12 +142,3 @@ class Poses(Record):
             require(
                 0 <= self.track_image_idx.min() <= self.track_image_idx.max() < images, self, "a track has no image"
             )
-
-
-def _range_limits(ranges: NDArray[np.float64], *, enough: int = 50) -> tuple[float | None, float | None]:
-    """Return robust limits of the ranges of an image's points, rounded outward, or None where points are few."""
-    if len(ranges) < enough:
-        return None, None
-    near, far = np.quantile(ranges, [0.005, 0.995])
-    steps = _LIMIT_STEPS_PER_OCTAVE
-    return float(2 ** (np.floor(np.log2(near) * steps) / steps)), float(2 ** (np.ceil(np.log2(far) * steps) / steps))

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import Literal
 
-import numpy as np
 from pydantic import Field
 
-from pano_mvs.algorithms.sweep.hypotheses import range_limits
+from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.sweep import sweep_range
 from pano_mvs.api import Context, Each, Near, Panorama, Params, Pose, RangeMap, stage
@@ -22,7 +21,7 @@ class SweepParams(Params):
         default="inverse", description="virtual ranges: even in 1/range, log range, or range (the paper)"
     )
     near: float | None = Field(
-        default=None, gt=0, description="nearest virtual range, scene units; else from the sparse points or baselines"
+        default=None, gt=0, description="nearest virtual range, scene units; else found by small sweeps"
     )
     far: float | None = Field(default=None, gt=0, description="farthest virtual range, likewise")
     cost: Literal["census", "sad"] = Field(
@@ -72,22 +71,29 @@ def sweep(
 ) -> RangeMap:
     """The sphere sweep over virtual ranges: for each the sources are looked up where the reference's rays would end.
 
-    Without `near` and `far` the limits come from the sparse points that the reference sees, else from its baselines.
+    Without `near` and `far` the limits come from small sweeps of the reference and its first sources, from what they
+    agree on.
     """
-    source_from_reference = [other.cam_from_world @ pose.cam_from_world.inverse() for other in source_poses]
-    baselines = [float(np.linalg.norm(transform.translation)) for transform in source_from_reference]
-    near, far = range_limits(baselines, width=ref.size_hw[1], near=pose.near, far=pose.far)
+    pictures = [ref.load(), *(source.load() for source in sources)]
+    masks = [ref.load_mask(), *(source.load_mask() for source in sources)]
+    poses = [pose.cam_from_world, *(other.cam_from_world for other in source_poses)]
+    near, far = params.near, params.far
+    if near is None or far is None:
+        found = limits_by_sweeping(pictures, poses, masks=masks, backend=params.backend)
+        near, far = near or found[0], far or found[1]
     range_map = sweep_range(
-        ref.load(),
-        [source.load() for source in sources],
-        source_from_reference,
-        near=params.near or near,
-        far=params.far or far,
+        pictures[0],
+        pictures[1:],
+        [other @ poses[0].inverse() for other in poses[1:]],
+        near=near,
+        far=far,
         settings=SweepSettings(**params.model_dump(exclude=_NOT_SETTINGS)),
         backend=params.backend,
-        reference_mask=ref.load_mask(),
-        source_masks=[source.load_mask() for source in sources],
+        reference_mask=masks[0],
+        source_masks=masks[1:],
     )
     ctx.metric("completeness", float(range_map.valid.mean()))
     ctx.metric("sources", len(sources))
+    ctx.metric("near", near)
+    ctx.metric("far", far)
     return range_map

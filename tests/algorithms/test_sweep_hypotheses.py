@@ -36,21 +36,12 @@ def test_limits_that_are_none_are_refused(limits):
         range_at([0.0], *limits, planes=8, spacing="inverse")
 
 
-def test_sparse_points_get_a_margin():
-    assert range_limits([0.5, 1.0], width=1024, near=2.0, far=8.0) == (1.0, 12.0)
-
-
-def test_without_points_the_longest_baseline_and_the_resolution_decide():
+def test_the_longest_baseline_and_the_resolution_decide():
     near, far = range_limits([0.2, 1.0], width=1024)
     assert near == pytest.approx(0.3)
     parallax_px = np.arctan(1.0 / far) / (2 * np.pi / 1024)
     assert parallax_px == pytest.approx(0.5, rel=1e-3)
     assert range_limits([2.0], width=1024) == pytest.approx((2 * near, 2 * far))
-
-
-def test_the_sweep_goes_no_farther_than_pictures_can_tell_unless_a_point_does():
-    assert range_limits([1.0], width=64, near=1.0, far=18.0)[1] == pytest.approx(64 / np.pi)
-    assert range_limits([1.0], width=64, near=1.0, far=30.0)[1] == 30.0
 
 
 @pytest.mark.parametrize("baselines", [[], [0.0], [np.nan]])

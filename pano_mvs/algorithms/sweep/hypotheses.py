@@ -12,9 +12,8 @@ from pano_mvs.core.errors import UsageError
 
 Spacing = Literal["inverse", "log", "uniform"]
 
-# What no sparse point shows: bare surfaces are nearer and farther than the textured ones.
 _NEAR_MARGIN, _FAR_MARGIN = 0.5, 1.5
-# Without points: nothing is nearer than this share of the longest baseline …
+# Nothing is nearer than this share of the longest baseline …
 _NEAREST_BASELINES = 0.3
 # … and a point this much parallax away from infinity cannot be told from it.
 _LEAST_PARALLAX_PX = 0.5
@@ -47,21 +46,16 @@ def range_at(positions: ArrayLike, near: float, far: float, *, planes: int, spac
     return result
 
 
-def range_limits(
-    baselines: Sequence[float], *, width: int, near: float | None = None, far: float | None = None
-) -> tuple[float, float]:
-    """Return the nearest and the farthest range that a sweep should try.
+def range_limits(baselines: Sequence[float], *, width: int) -> tuple[float, float]:
+    """Return the limits of what a sweep can see, from the cameras alone.
 
     Args:
         baselines: distances from the reference to its sources, in scene units; at least one positive.
         width: columns of the reference picture: one pixel at the equator is 2π/width.
-        near: the range of the reference's nearest sparse points, or None where there are too few.
-        far: likewise of its farthest.
 
     Returns:
-        (near, far). With sparse points the limits go half as near and half as far again; a limit that no point gives
-        is 0.3 of the longest baseline b, and the range b / (½ px) at which parallax falls under half a pixel. Farther
-        than the latter the pictures cannot tell, so no limit lies there unless a point does.
+        (near, far): 0.3 of the longest baseline b, and the range b / (½ px) at which parallax falls under half a
+        pixel; farther than that the pictures cannot tell.
 
     Raises:
         UsageError: if no baseline is positive.
@@ -69,8 +63,4 @@ def range_limits(
     longest = max(baselines, default=0.0)
     if not (longest > 0 and np.isfinite(longest)):
         raise UsageError("a sweep needs a source at some distance from the reference: all baselines are zero")
-    unseen = longest / (_LEAST_PARALLAX_PX * 2 * np.pi / width)
-    lower = _NEAREST_BASELINES * longest if near is None else _NEAR_MARGIN * near
-    upper = unseen if far is None else min(_FAR_MARGIN * far, max(unseen, far))
-    lower = min(lower, upper / 2)
-    return float(lower), float(upper)
+    return _NEAREST_BASELINES * longest, longest / (_LEAST_PARALLAX_PX * 2 * np.pi / width)

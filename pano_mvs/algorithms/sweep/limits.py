@@ -1,0 +1,130 @@
+"""Between which ranges to sweep, found by looking: small sweeps of the reference and its sources that must agree."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.filters.consistency import check_consistency
+from pano_mvs.algorithms.sweep.hypotheses import range_limits
+from pano_mvs.algorithms.sweep.settings import SweepSettings
+from pano_mvs.algorithms.sweep.sweep import Backend, sweep_range
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import Rigid3, pixel_solid_angle
+from pano_mvs.scene import RangeMap
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
+
+# Rounding the limits outward to steps of a quarter octave keeps the planes, and with them the ranges, the same when
+# the pictures change by next to nothing.
+_STEPS_PER_OCTAVE = 4
+_WIDTH = 256
+_PLANES = 96
+_MOST_PICTURES = 5
+_NEAREST_BASELINES = 0.15
+_NEAR_QUANTILE, _FAR_QUANTILE = 0.005, 0.995
+_NEAR_MARGIN, _FAR_MARGIN = 0.7, 1.3
+_LEAST_SHARE = 0.01
+
+
+def limits_by_sweeping(
+    pictures: Sequence[NDArray[np.uint8]],
+    cams_from_world: Sequence[Rigid3],
+    *,
+    masks: Sequence[NDArray[np.bool_]],
+    backend: Backend = "numba",
+) -> tuple[float, float]:
+    """Return the nearest and the farthest range worth trying, in scene units.
+
+    The reference and its first four sources are each swept at 256 columns between very wide limits. What two of them
+    agree on gives the limits: its 0.5 % and 99.5 % quantiles by solid angle, with a margin. Unlike sparse points this
+    sees plain and near surfaces too, and it does not care how the pictures are turned.
+
+    Args:
+        pictures: the reference, then its sources, (H, W, 3) uint8 RGB each.
+        cams_from_world: pose of each.
+        masks: (H, W) of each, False is ignored.
+        backend: of the small sweeps.
+
+    Returns:
+        (near, far); from the baselines and the angular resolution alone where less than 1 % of the sphere agrees.
+
+    Raises:
+        UsageError: if there is no source, or no source at another place.
+    """
+    if not len(pictures) == len(cams_from_world) == len(masks) or len(pictures) < 2:
+        raise UsageError("limits need a reference and at least one source, each with its pose and mask")
+    poses = list(cams_from_world[:_MOST_PICTURES])
+    width = pictures[0].shape[1]
+    small = [_small(picture) for picture in pictures[:_MOST_PICTURES]]
+    small_masks = [_small_mask(mask) for mask in masks[:_MOST_PICTURES]]
+    maps = [_coarse(idx, small, small_masks, poses, width=width, backend=backend) for idx in range(len(poses))]
+    checked = check_consistency(maps[0], poses[0], maps[1:], poses[1:], max_relative_error=0.1, max_reprojection_px=1.5)
+    agreed = checked.confidence >= CONSISTENT_CONFIDENCE[0]
+    solid_angle = np.broadcast_to(pixel_solid_angle(agreed.shape)[:, None], agreed.shape)
+    if solid_angle[agreed].sum() < _LEAST_SHARE * solid_angle.sum():
+        return range_limits(_baselines(0, poses), width=width)
+    near, far = _quantiles(checked.range[agreed], solid_angle[agreed])
+    return _outward(_NEAR_MARGIN * near, _FAR_MARGIN * far)
+
+
+def _coarse(
+    idx: int,
+    pictures: Sequence[NDArray[np.uint8]],
+    masks: Sequence[NDArray[np.bool_]],
+    poses: Sequence[Rigid3],
+    *,
+    width: int,
+    backend: Backend,
+) -> RangeMap:
+    """Return the small range map of one of the pictures, swept against all others."""
+    baselines = _baselines(idx, poses)
+    others = [other for other, baseline in enumerate(baselines) if baseline > 0]
+    near = _NEAREST_BASELINES * max(baselines)
+    far = range_limits(baselines, width=width)[1]
+    return sweep_range(
+        pictures[idx],
+        [pictures[other] for other in others],
+        [poses[other] @ poses[idx].inverse() for other in others],
+        near=near,
+        far=far,
+        settings=SweepSettings(planes=_PLANES),
+        backend=backend,
+        reference_mask=masks[idx],
+        source_masks=[masks[other] for other in others],
+    )
+
+
+def _baselines(idx: int, poses: Sequence[Rigid3]) -> list[float]:
+    """Return the distance of each camera from one of them (its own is 0)."""
+    return [float(np.linalg.norm(pose.center - poses[idx].center)) for pose in poses]
+
+
+def _small(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    if picture.shape[1] <= _WIDTH:
+        return picture
+    small: NDArray[np.uint8] = cv2.resize(picture, (_WIDTH, _WIDTH // 2), interpolation=cv2.INTER_AREA)
+    return small
+
+
+def _small_mask(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return where a small pixel has no ignored pixel in it."""
+    if mask.shape[1] <= _WIDTH:
+        return mask
+    share = cv2.resize(mask.astype(np.float32), (_WIDTH, _WIDTH // 2), interpolation=cv2.INTER_AREA)
+    valid: NDArray[np.bool_] = share > 1 - 1e-3
+    return valid
+
+
+def _quantiles(ranges: NDArray[np.float32], weights: NDArray[np.float64]) -> tuple[float, float]:
+    order = np.argsort(ranges, kind="stable")
+    below = np.cumsum(weights[order]) / weights.sum()
+    near, far = np.searchsorted(below, [_NEAR_QUANTILE, _FAR_QUANTILE])
+    return float(ranges[order[near]]), float(ranges[order[min(far, len(order) - 1)]])
+
+
+def _outward(near: float, far: float) -> tuple[float, float]:
+    steps = _STEPS_PER_OCTAVE
+    return float(2 ** (np.floor(np.log2(near) * steps) / steps)), float(2 ** (np.ceil(np.log2(far) * steps) / steps))
