@@ -1,1 +1,10 @@
-"""What the product exists for: arrays and scene records in, arrays and scene records out; no disk, no settings file."""
+"""What the product exists for: arrays and scene records in, arrays and scene records out; no settings file.
+
+Compiled kernels are kept in a folder of the user's, see `pano_mvs.core.kernel_cache`.
+"""
+
+from pathlib import Path
+
+from pano_mvs.core.kernel_cache import use_kernel_cache
+
+use_kernel_cache(Path(__file__).parent)
