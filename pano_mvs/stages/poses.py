@@ -35,6 +35,7 @@ class ScaledTranslationParams(Params):
         default="cauchy", description="how translation scale factors are estimated; kappa is the paper's"
     )
     kappa: float = Field(default=0.01, gt=0, description="width of the paper's clusters of scale factors")
+    adjust: bool = Field(default=True, description="adjust all cameras and points together as the model grows")
 
 
 @stage("poses.scaled_translation")
@@ -46,7 +47,12 @@ def scaled_translation(
     Pictures that cannot be joined soundly are left out, each with its reason.
     """
     poses = solve_scaled_translation(
-        features, matches, scale_estimator=params.scale_estimator, kappa=params.kappa, rng=ctx.rng
+        features,
+        matches,
+        scale_estimator=params.scale_estimator,
+        kappa=params.kappa,
+        adjust=params.adjust,
+        rng=ctx.rng,
     )
     return _checked(poses, ctx)
 
