@@ -24,9 +24,12 @@ class TwoView(Record):
         reason: what is wrong, where the geometry is not general.
         candidates: number of matches before verification.
         parallax_deg: median angle between the two rays of a verified match after de-rotation.
+        rotation_std_deg: standard deviation of the rotation about its least certain axis, as far as the matches tell.
+        direction_std_deg: the same of the direction; both are 0 unless the geometry is general.
     """
 
     axis: ClassVar[Axis | None] = Axis.PAIR
+    kind_version: ClassVar[int] = 2
 
     matches_idx: NDArray[np.int32]
     rotation: NDArray[np.float64]
@@ -36,6 +39,8 @@ class TwoView(Record):
     reason: str = ""
     candidates: int = 0
     parallax_deg: float = 0.0
+    rotation_std_deg: float = 0.0
+    direction_std_deg: float = 0.0
 
     @staticmethod
     def failed(reason: str, *, candidates: int = 0) -> TwoView:
@@ -50,6 +55,11 @@ class TwoView(Record):
     def __len__(self) -> int:
         """Return the number of verified matches."""
         return len(self.matches_idx)
+
+    @property
+    def residual_deg(self) -> float:
+        """Median residual of the verified matches; 0 if there are none."""
+        return float(np.rad2deg(np.median(self.residuals_rad))) if len(self) else 0.0
 
     def check(self) -> None:
         """Raise ContractError unless the arrays agree."""

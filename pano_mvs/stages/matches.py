@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from pano_mvs.algorithms.matching.brute_force import match_features
@@ -16,16 +18,31 @@ class BruteForceParams(Params):
     mutual: bool = Field(default=True, description="only pairs that are each other's best")
     threshold_deg: float = Field(default=0.2, gt=0, le=10, description="angular Sampson error of a match that agrees")
     min_inliers: int = Field(default=20, ge=8, description="agreeing matches that a pair needs")
+    solver: Literal["five_point", "eight_point"] = Field(
+        default="five_point", description="how hypotheses are made; eight_point is the paper's, and weak on one plane"
+    )
+    refine: bool = Field(default=True, description="false keeps the best hypothesis as it comes, as the paper does")
 
 
 @stage("matches.brute_force")
 def brute_force(features: Near[Features], params: BruteForceParams, ctx: Context) -> TwoView:
-    """Match all descriptors (ratio and mutual test), then verify by the spherical 8-point RANSAC."""
+    """Match all descriptors (ratio and mutual test), then verify by spherical RANSAC."""
     first, second = features
     candidates = match_features(first, second, ratio=params.ratio, mutual=params.mutual)
     two_view = verify_pair(
-        first, second, candidates, rng=ctx.rng, threshold_deg=params.threshold_deg, min_inliers=params.min_inliers
+        first,
+        second,
+        candidates,
+        rng=ctx.rng,
+        threshold_deg=params.threshold_deg,
+        min_inliers=params.min_inliers,
+        solver=params.solver,
+        refine=params.refine,
     )
     ctx.metric("candidates", len(candidates))
     ctx.metric("inliers", len(two_view) if two_view else 0)
+    if two_view:
+        ctx.metric("residual_deg", two_view.residual_deg)
+        ctx.metric("direction_std_deg", two_view.direction_std_deg)
+        ctx.metric("parallax_deg", two_view.parallax_deg)
     return two_view

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,10 +81,7 @@ def _edges_by_position(names: tuple[str, ...], two_views: Mapping[tuple[str, str
 def _reversed(view: TwoView) -> TwoView:
     inverse = Rigid3(view.rotation, view.direction).inverse()
     matches: NDArray[np.int32] = view.matches_idx[:, ::-1]
-    return TwoView(
-        matches, inverse.rotation, inverse.translation, view.residuals_rad, view.geometry, view.reason,
-        view.candidates, view.parallax_deg,
-    )  # fmt: skip
+    return replace(view, matches_idx=matches, rotation=inverse.rotation, direction=inverse.translation)
 
 
 def _triangles(keys: list[Edge]) -> NDArray[np.intp]:

@@ -7,25 +7,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.two_view.essential import (
-    essential_from_bearings,
-    in_front,
-    msac_costs,
-    poses_from_essential,
-    sampson_angles,
-)
+from pano_mvs.algorithms.two_view.cheirality import facing_costs, facing_pose, plausible
+from pano_mvs.algorithms.two_view.essential import essential_from_bearings, msac_costs, sampson_angles
+from pano_mvs.algorithms.two_view.hypotheses import SOLVERS, MinimalSolver, Solver, draw_samples, samples_needed
 from pano_mvs.algorithms.two_view.redirection import best_redirected
 from pano_mvs.algorithms.two_view.refinement import refine_relative_pose
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import Rigid3, angle_between, skew
+from pano_mvs.geometry import Rigid3, skew
 
 FloatArray = NDArray[np.float64]
 
-_SAMPLE = 8
-_BATCH = 256
+_MIN_MATCHES = 16
+_MIN_INLIERS = 8
 _SCREEN = 400  # matches on which all hypotheses of a batch are compared
 _FINALISTS = 4  # hypotheses of a batch that are compared on all matches
 _LEADERS = 6  # hypotheses that are given new directions
+_POLISH = 1000  # inliers on which a leader is polished
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,50 +54,52 @@ def estimate_two_view(
     *,
     rng: np.random.Generator,
     threshold_rad: float,
+    solver: Solver = "five_point",
+    refine: bool = True,
     confidence: float = 0.9999,
     max_iterations: int = 15_000,
 ) -> RelativePose:
     """Return the relative pose that most matches agree on.
 
-    Spherical 8-point hypotheses, ranked by the truncated squared error (Torr & Zisserman 2000, "MLESAC") and refitted
-    on their inliers whenever one leads (Chum et al. 2003, "Locally optimized RANSAC"); of the four decompositions the
-    one with most points in front of both cameras; the leaders are given new directions (see `best_redirected`); last,
-    the angular error is minimised over the five degrees of freedom. Whether the result is more than
-    chance is for `verify_pair` to judge.
+    Minimal hypotheses, ranked by the truncated squared error (Torr & Zisserman 2000, "MLESAC"), where a match behind
+    a camera counts as wrong, and optimised on their inliers whenever one leads (Chum et al. 2003, "Locally optimized
+    RANSAC"); the leaders are given new directions (see `best_redirected`); last, the angular error is minimised over
+    the five degrees of freedom. Whether the result is more than chance is for `verify_pair` to judge.
 
     Args:
         bearings_first: (M, 3) unit rays in the first camera.
         bearings_second: (M, 3) the matching unit rays in the second.
         rng: draws the samples.
         threshold_rad: Sampson error below which a match agrees.
+        solver: "five_point" needs fewer samples and does not mind a scene that is one plane; "eight_point" is linear
+            (the paper's), and many essential matrices fit a plane in it.
+        refine: False gives the best minimal hypothesis as it comes, as the paper does.
         confidence: stop once a better model would have been met with this probability.
         max_iterations: at most so many hypotheses.
 
     Raises:
-        UsageError: if the shapes differ, or the threshold is not positive.
+        UsageError: if the shapes differ, the threshold is not positive, or there is no such solver.
     """
     first, second = np.asarray(bearings_first, np.float64), np.asarray(bearings_second, np.float64)
     if first.shape != second.shape or first.ndim != 2 or first.shape[1] != 3 or threshold_rad <= 0:
         raise UsageError(f"two-view estimation needs two (M, 3) arrays of paired bearings and a positive threshold, "
                          f"got {first.shape}, {second.shape} and {threshold_rad}")  # fmt: skip
-    count = len(first)
-    if count < 2 * _SAMPLE:
-        return _none(count, f"only {count} matches, {2 * _SAMPLE} needed for a hypothesis")
-    leaders, iterations = _leading_essentials(
-        first, second, rng=rng, threshold_rad=threshold_rad, confidence=confidence, max_iterations=max_iterations
-    )
-    starts = [_facing_pose(essential, first, second, threshold_rad) for essential in leaders]
-    pose = best_redirected(starts, first, second, rng=rng, threshold_rad=threshold_rad)
-    for _ in range(3):
-        residuals = sampson_angles(skew(pose.translation) @ pose.rotation, first, second)
-        near = (residuals < 2 * threshold_rad) & _plausible(first, second, pose, threshold_rad)
-        if near.sum() < _SAMPLE:
-            return _none(count, "no relative pose is shared by eight matches")
-        core = residuals[near & (residuals < threshold_rad)]
-        scale_rad = max(2 * float(np.median(core)) if len(core) else threshold_rad, 0.05 * threshold_rad)
-        pose = refine_relative_pose(pose, first[near], second[near], scale_rad=scale_rad)
+    if solver not in SOLVERS:
+        raise UsageError(f"there is no solver {solver!r}; choose one of {', '.join(SOLVERS)}")
+    if len(first) < _MIN_MATCHES:
+        return _none(len(first), f"only {len(first)} matches, {_MIN_MATCHES} needed for a hypothesis")
+    search = _Search(first, second, rng, threshold_rad, SOLVERS[solver], optimise=refine)
+    leaders, iterations = search.run(confidence=confidence, max_iterations=max_iterations)
+    if not leaders:
+        return _none(len(first), "no sample of matches determines a relative pose")
+    pose: Rigid3 | None = leaders[0]
+    if refine:
+        pose = best_redirected(leaders, first, second, rng=rng, threshold_rad=threshold_rad)
+        pose = _refined(pose, first, second, threshold_rad)
+    if pose is None:
+        return _none(len(first), "no relative pose is shared by eight matches")
     residuals = sampson_angles(skew(pose.translation) @ pose.rotation, first, second)
-    inliers = (residuals < threshold_rad) & _plausible(first, second, pose, threshold_rad)
+    inliers = (residuals < threshold_rad) & plausible(first, second, pose, threshold_rad)
     return RelativePose(pose, inliers, residuals, iterations)
 
 
@@ -108,77 +107,98 @@ def _none(count: int, reason: str) -> RelativePose:
     return RelativePose(Rigid3.identity(), np.zeros(count, np.bool_), np.full(count, np.pi / 2), 0, reason)
 
 
-def _leading_essentials(
-    first: FloatArray,
-    second: FloatArray,
-    *,
-    rng: np.random.Generator,
-    threshold_rad: float,
-    confidence: float,
-    max_iterations: int,
-) -> tuple[list[FloatArray], int]:
-    """Return the essential matrices with the least truncated squared error, best first, and how many were tried."""
-    leaders: list[tuple[float, int, FloatArray]] = []
-    tried, needed = 0, float(max_iterations)
-    while tried < needed:
-        samples = _samples(rng, len(first))
-        hypotheses = essential_from_bearings(first[samples], second[samples])
-        screen = rng.choice(len(first), min(_SCREEN, len(first)), replace=False)
-        screened = msac_costs(hypotheses, first[screen], second[screen], threshold_rad)
+def _refined(pose: Rigid3, first: FloatArray, second: FloatArray, threshold_rad: float) -> Rigid3 | None:
+    """Minimise the angular error over the matches around the inliers; None if fewer than eight are left."""
+    for _ in range(3):
+        residuals = sampson_angles(skew(pose.translation) @ pose.rotation, first, second)
+        near = (residuals < 2 * threshold_rad) & plausible(first, second, pose, threshold_rad)
+        if near.sum() < _MIN_INLIERS:
+            return None
+        core = residuals[near & (residuals < threshold_rad)]
+        scale_rad = max(2 * float(np.median(core)) if len(core) else threshold_rad, 0.05 * threshold_rad)
+        pose = refine_relative_pose(pose, first[near], second[near], scale_rad=scale_rad)
+    return pose
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """The random search for the leading hypotheses."""
+
+    first: FloatArray
+    second: FloatArray
+    rng: np.random.Generator
+    threshold_rad: float
+    solver: MinimalSolver
+    optimise: bool
+
+    def run(self, *, confidence: float, max_iterations: int) -> tuple[list[Rigid3], int]:
+        """Return the poses with the least truncated squared error, best first, and how many were tried."""
+        leaders: list[tuple[float, int, Rigid3]] = []
+        samples, tried, needed = 0, 0, np.inf
+        while samples < needed and tried < max_iterations:
+            pose, cost, count = self._best_of_batch()
+            samples, tried = samples + self.solver.batch, tried + max(count, self.solver.batch)
+            if pose is None:
+                continue
+            if not leaders or cost < leaders[0][0]:
+                if self.optimise:
+                    pose, cost = self._optimised(pose, cost)
+                ratio = float(np.mean(self._residuals(pose) < self.threshold_rad))
+                needed = min(needed, samples_needed(ratio, confidence, sample=self.solver.sample))
+            leaders = sorted([*leaders, (cost, tried, pose)], key=lambda item: item[:2])[:_LEADERS]
+        return [pose for _, _, pose in leaders], tried
+
+    def _best_of_batch(self) -> tuple[Rigid3 | None, float, int]:
+        """Return the best pose of a batch of samples, its cost, and how many hypotheses there were."""
+        size = len(self.first)
+        drawn = draw_samples(self.rng, size, batch=self.solver.batch, sample=self.solver.sample)
+        hypotheses = self.solver.solve(self.first[drawn], self.second[drawn])
+        if not len(hypotheses):
+            return None, np.inf, 0
+        screen = self.rng.choice(size, min(_SCREEN, size), replace=False)
+        p, q = self.first[screen], self.second[screen]
+        screened = msac_costs(hypotheses, p, q, self.threshold_rad)
         finalists = hypotheses[np.argsort(screened, kind="stable")[:_FINALISTS]]
-        costs = msac_costs(finalists, first, second, threshold_rad)
-        tried += _BATCH
-        leader, cost = finalists[np.argmin(costs)], float(costs.min())
-        if not leaders or cost < leaders[0][0]:
-            leader, cost = _locally_optimised(leader, cost, first, second, threshold_rad)
-            inlier_ratio = float(np.mean(sampson_angles(leader, first, second) < threshold_rad))
-            needed = min(needed, _hypotheses_needed(inlier_ratio, confidence))
-        leaders = sorted([*leaders, (cost, tried, leader)], key=lambda item: item[:2])[:_LEADERS]
-    return [essential for _, _, essential in leaders], tried
+        poses = [facing_pose(essential, p, q, self.threshold_rad) for essential in finalists]
+        costs = facing_costs(poses, self.first, self.second, self.threshold_rad)
+        return poses[int(np.argmin(costs))], float(costs.min()), len(hypotheses)
 
+    def _optimised(self, pose: Rigid3, cost: float) -> tuple[Rigid3, float]:
+        """Refit on the inliers of a wide, then ever narrower band, and keep the best."""
+        candidates = self._polished(pose) if self.solver.sample == 5 else self._refitted(pose)
+        if not candidates:
+            return pose, cost
+        costs = facing_costs(candidates, self.first, self.second, self.threshold_rad)
+        best = int(np.argmin(costs))
+        return (candidates[best], float(costs[best])) if costs[best] < cost else (pose, cost)
 
-def _samples(rng: np.random.Generator, count: int) -> NDArray[np.int64]:
-    """Return samples of distinct matches, (batch, 8)."""
-    samples = rng.integers(count, size=(_BATCH, _SAMPLE))
-    repeated = np.flatnonzero((np.diff(np.sort(samples, axis=1), axis=1) == 0).any(axis=1))
-    for row in repeated:
-        samples[row] = rng.choice(count, _SAMPLE, replace=False)
-    return samples
+    def _polished(self, pose: Rigid3) -> list[Rigid3]:
+        """Minimise the angular error of the inliers: unlike the linear solution it is as sound on a plane."""
+        found: list[Rigid3] = []
+        for widen in (2.0, 1.0):
+            inliers = np.flatnonzero(self._residuals(pose) < widen * self.threshold_rad)
+            if len(inliers) < _MIN_INLIERS:
+                break
+            inliers = inliers[:: 1 + len(inliers) // _POLISH]
+            scale_rad = 0.5 * widen * self.threshold_rad
+            pose = refine_relative_pose(
+                pose, self.first[inliers], self.second[inliers], scale_rad=scale_rad, max_iterations=4
+            )
+            found.append(pose)
+        return found
 
+    def _refitted(self, pose: Rigid3) -> list[Rigid3]:
+        """Solve the linear equations of all inliers."""
+        found: list[Rigid3] = []
+        for widen in (2.0, 1.5, 1.0, 1.0):
+            inliers = self._residuals(pose) < widen * self.threshold_rad
+            if inliers.sum() < _MIN_INLIERS:
+                break
+            essential = essential_from_bearings(self.first[inliers], self.second[inliers])
+            some = np.flatnonzero(inliers)[:: 1 + int(inliers.sum()) // _POLISH]
+            pose = facing_pose(essential, self.first[some], self.second[some], self.threshold_rad)
+            found.append(pose)
+        return found
 
-def _locally_optimised(
-    essential: FloatArray, cost: float, first: FloatArray, second: FloatArray, threshold_rad: float
-) -> tuple[FloatArray, float]:
-    """Refit on the inliers of a wide, then ever narrower band, and keep the best."""
-    candidate = essential
-    for widen in (2.0, 1.5, 1.0, 1.0):
-        inliers = sampson_angles(candidate, first, second) < widen * threshold_rad
-        if inliers.sum() < _SAMPLE:
-            break
-        candidate = essential_from_bearings(first[inliers], second[inliers])
-        candidate_cost = float(msac_costs(candidate[None], first, second, threshold_rad)[0])
-        if candidate_cost < cost:
-            essential, cost = candidate, candidate_cost
-    return essential, cost
-
-
-def _hypotheses_needed(inlier_ratio: float, confidence: float) -> float:
-    """Return after how many samples one without outliers has been drawn with the wanted probability."""
-    clean = inlier_ratio**_SAMPLE
-    if clean >= 1:
-        return 0.0
-    return float(np.log1p(-confidence) / np.log1p(-clean)) if clean > 0 else np.inf
-
-
-def _facing_pose(essential: FloatArray, first: FloatArray, second: FloatArray, threshold_rad: float) -> Rigid3:
-    """Return the decomposition with most inliers in front of both cameras."""
-    inliers = sampson_angles(essential, first, second) < threshold_rad
-    poses = poses_from_essential(essential)
-    return max(poses, key=lambda pose: int(in_front(first[inliers], second[inliers], pose).sum()))
-
-
-def _plausible(first: FloatArray, second: FloatArray, pose: Rigid3, threshold_rad: float) -> NDArray[np.bool_]:
-    """Return which matches lie in front of both cameras, or so far away that noise decides their sign."""
-    far = angle_between(first @ pose.rotation.T, second) < 2 * threshold_rad
-    plausible: NDArray[np.bool_] = far | in_front(first, second, pose)
-    return plausible
+    def _residuals(self, pose: Rigid3) -> FloatArray:
+        return sampson_angles(skew(pose.translation) @ pose.rotation, self.first, self.second)

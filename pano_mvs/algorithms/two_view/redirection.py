@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.two_view.cheirality import facing_costs
 from pano_mvs.algorithms.two_view.essential import in_front, msac_costs, sampson_angles
 from pano_mvs.algorithms.two_view.refinement import refine_relative_pose
 from pano_mvs.geometry import Rigid3, skew
@@ -39,7 +40,7 @@ def best_redirected(
         for _ in range(_ROUNDS):
             moved = _redirected(moved, first, second, rng=rng, threshold_rad=threshold_rad)
             candidates.append(moved)
-    costs = msac_costs(np.array([_essential(pose) for pose in candidates]), first, second, threshold_rad)
+    costs = facing_costs(candidates, first, second, threshold_rad)
     return candidates[int(np.argmin(costs))]
 
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view.essential import in_front, sampson_angles
+from pano_mvs.algorithms.two_view.hypotheses import SOLVERS, Solver
 from pano_mvs.algorithms.two_view.ransac import RelativePose, estimate_two_view
 from pano_mvs.algorithms.two_view.refinement import pose_uncertainty
 from pano_mvs.algorithms.two_view.rotation_only import estimate_rotation
@@ -34,6 +35,8 @@ def verify_pair(
     rng: np.random.Generator,
     threshold_deg: float = 0.2,
     min_inliers: int = 20,
+    solver: Solver = "five_point",
+    refine: bool = True,
     max_iterations: int = 15_000,
 ) -> TwoView:
     """Return what two pictures agree on: their relative pose and the matches that bear it out.
@@ -48,6 +51,8 @@ def verify_pair(
         rng: draws the samples.
         threshold_deg: spherical Sampson error below which a match agrees.
         min_inliers: fewer independent agreeing matches are never enough.
+        solver: see `estimate_two_view`.
+        refine: False gives the best minimal hypothesis as it comes, as the paper does.
         max_iterations: at most so many hypotheses.
 
     Returns:
@@ -60,13 +65,24 @@ def verify_pair(
     if count < max(min_inliers, 16):
         return TwoView.failed(f"{count} matches, {max(min_inliers, 16)} needed", candidates=count)
     rotation, turned = estimate_rotation(p, q, rng=rng, threshold_rad=1.5 * threshold_rad)
-    pose = estimate_two_view(p, q, rng=rng, threshold_rad=threshold_rad, max_iterations=max_iterations)
+    pose = estimate_two_view(
+        p, q, rng=rng, threshold_rad=threshold_rad, solver=solver, refine=refine, max_iterations=max_iterations
+    )
     if turned.sum() >= max(min_inliers, _ROTATION_SHARE * pose.inliers.sum()):
         return _from_one_place(matches_idx, rotation, turned, angle_between(p @ rotation.T, q))
-    reason = pose.reason or _why_not(pose, p, q, rng=rng, threshold_rad=threshold_rad, min_inliers=min_inliers)
+    kept = pose.inliers
+    witnesses = independent_count(p[kept], q[kept]) if kept.any() else 0
+    if not pose or witnesses < min_inliers:
+        few = f"{witnesses} independent matches of {count} agree on a relative pose, {min_inliers} needed"
+        return TwoView.failed(pose.reason or few, candidates=count)
+    rotation_std_deg, direction_std_deg = _uncertainty_deg(pose, p, q, witnesses, threshold_rad)
+    reason = (
+        _why_chance(pose, p, q, witnesses, rng=rng, threshold_rad=threshold_rad, solver=solver)
+        or _why_no_parallax(pose, p, q, threshold_rad)
+        or _why_open(direction_std_deg)
+    )
     if reason:
         return TwoView.failed(reason, candidates=count)
-    kept = pose.inliers
     return TwoView(
         matches_idx=matches_idx[kept],
         rotation=pose.second_from_first.rotation,
@@ -75,6 +91,8 @@ def verify_pair(
         geometry="general",
         candidates=count,
         parallax_deg=float(np.rad2deg(np.median(_parallax(p[kept], q[kept], pose.second_from_first)))),
+        rotation_std_deg=rotation_std_deg,
+        direction_std_deg=direction_std_deg,
     )
 
 
@@ -93,41 +111,62 @@ def _from_one_place(
     )
 
 
-def _why_not(
+def _why_chance(
     pose: RelativePose,
     p: FloatArray,
     q: FloatArray,
+    witnesses: int,
     *,
     rng: np.random.Generator,
     threshold_rad: float,
-    min_inliers: int,
+    solver: Solver,
 ) -> str:
-    """Return why a relative pose is not to be believed, or nothing."""
-    kept, count = pose.inliers, len(p)
-    witnesses = independent_count(p[kept], q[kept]) if kept.any() else 0
-    if witnesses < min_inliers:
-        return f"{witnesses} independent matches of {count} agree on a relative pose, {min_inliers} needed"
+    """Say so if as many matches might agree on some relative pose by chance."""
     # Among the agreeing matches alone as well: where they crowd along one epipolar circle any match would agree.
     chance = max(
         _chance(pose.second_from_first, first, second, rng=rng, threshold_rad=threshold_rad)
-        for first, second in ((p, q), (p[kept], q[kept]))
+        for first, second in ((p, q), (p[pose.inliers], q[pose.inliers]))
     )
-    false_alarms = log10_false_alarms(witnesses, max(independent_count(p, q), witnesses), chance=chance, sample=8)
-    if false_alarms > _MAX_LOG10_FALSE_ALARMS:
-        return (f"{witnesses} independent matches of {count} agree on a relative pose, which may be chance: the "
-                "pictures may not overlap")  # fmt: skip
-    parallax = _parallax(p[kept], q[kept], pose.second_from_first)
-    moved = int((parallax > _MIN_PARALLAX * threshold_rad).sum())
-    if moved < _MIN_WITH_PARALLAX:
-        return (f"only {moved} of {kept.sum()} agreeing matches show parallax, {_MIN_WITH_PARALLAX} needed: the "
-                "pictures were taken too close together for what they see")  # fmt: skip
+    false_alarms = log10_false_alarms(
+        witnesses,
+        max(independent_count(p, q), witnesses),
+        chance=chance,
+        sample=SOLVERS[solver].sample,
+        models_per_sample=SOLVERS[solver].models,
+    )
+    if false_alarms <= _MAX_LOG10_FALSE_ALARMS:
+        return ""
+    return (f"{witnesses} independent matches of {len(p)} agree on a relative pose, which may be chance: the "
+            "pictures may not overlap")  # fmt: skip
+
+
+def _why_no_parallax(pose: RelativePose, p: FloatArray, q: FloatArray, threshold_rad: float) -> str:
+    """Say so if hardly any of the agreeing matches moved by more than the noise."""
+    kept = pose.inliers
+    moved = int((_parallax(p[kept], q[kept], pose.second_from_first) > _MIN_PARALLAX * threshold_rad).sum())
+    if moved >= _MIN_WITH_PARALLAX:
+        return ""
+    return (f"only {moved} of {kept.sum()} agreeing matches show parallax, {_MIN_WITH_PARALLAX} needed: the "
+            "pictures were taken too close together for what they see")  # fmt: skip
+
+
+def _why_open(direction_std_deg: float) -> str:
+    """Say so if the agreeing matches leave the direction open."""
+    if direction_std_deg <= _MAX_DIRECTION_STD_DEG:
+        return ""
+    return (f"the matches leave the direction between the pictures open by {direction_std_deg:.0f}°: they lie too "
+            "close together, or show too little parallax")  # fmt: skip
+
+
+def _uncertainty_deg(
+    pose: RelativePose, p: FloatArray, q: FloatArray, witnesses: int, threshold_rad: float
+) -> tuple[float, float]:
+    """Return the standard deviations of rotation and direction, a crowd of matches counting as one witness."""
+    kept = pose.inliers
     noise_rad = max(float(np.sqrt(np.mean(pose.residuals_rad[kept] ** 2))), 0.1 * threshold_rad)
     noise_rad *= np.sqrt(kept.sum() / witnesses)
-    direction_std_deg = np.rad2deg(pose_uncertainty(pose.second_from_first, p[kept], q[kept], noise_rad=noise_rad)[1])
-    if direction_std_deg > _MAX_DIRECTION_STD_DEG:
-        return (f"the matches leave the direction between the pictures open by {direction_std_deg:.0f}°: they lie too "
-                "close together, or show too little parallax")  # fmt: skip
-    return ""
+    rotation_rad, direction_rad = pose_uncertainty(pose.second_from_first, p[kept], q[kept], noise_rad=noise_rad)
+    return float(np.rad2deg(rotation_rad)), float(np.rad2deg(direction_rad))
 
 
 def _chance(pose: Rigid3, p: FloatArray, q: FloatArray, *, rng: np.random.Generator, threshold_rad: float) -> float:
