@@ -13,7 +13,7 @@ from pano_mvs.algorithms.sweep.hypotheses import range_limits
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.sweep import Backend, sweep_range
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import Rigid3, pixel_solid_angle
+from pano_mvs.geometry import Rigid3, pad_panorama, pixel_solid_angle
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
@@ -27,6 +27,8 @@ _NEAREST_BASELINES = 0.15
 _NEAR_QUANTILE, _FAR_QUANTILE = 0.005, 0.995
 _NEAR_MARGIN, _FAR_MARGIN = 0.7, 1.3
 _LEAST_SHARE = 0.01
+# Grey levels between the darkest and the brightest pixel of a 5×5 window; plain walls agree with each other anywhere.
+_LEAST_CONTRAST = 10
 
 
 def limits_by_sweeping(
@@ -39,7 +41,7 @@ def limits_by_sweeping(
     """Return the nearest and the farthest range worth trying, in scene units.
 
     The reference and its first four sources are each swept at 256 columns between very wide limits. What two of them
-    agree on gives the limits: its 0.5 % and 99.5 % quantiles by solid angle, with a margin. Unlike sparse points this
+    agree on, where there is texture, gives the limits: its 0.5 % and 99.5 % quantiles by solid angle, with a margin. Unlike sparse points this
     sees plain and near surfaces too, and it does not care how the pictures are turned.
 
     Args:
@@ -62,7 +64,7 @@ def limits_by_sweeping(
     small_masks = [_small_mask(mask) for mask in masks[:_MOST_PICTURES]]
     maps = [_coarse(idx, small, small_masks, poses, width=width, backend=backend) for idx in range(len(poses))]
     checked = check_consistency(maps[0], poses[0], maps[1:], poses[1:], max_relative_error=0.1, max_reprojection_px=1.5)
-    agreed = checked.confidence >= CONSISTENT_CONFIDENCE[0]
+    agreed = (checked.confidence >= CONSISTENT_CONFIDENCE[0]) & _textured(small[0])
     solid_angle = np.broadcast_to(pixel_solid_angle(agreed.shape)[:, None], agreed.shape)
     if solid_angle[agreed].sum() < _LEAST_SHARE * solid_angle.sum():
         return range_limits(_baselines(0, poses), width=width)
@@ -116,6 +118,15 @@ def _small_mask(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     share = cv2.resize(mask.astype(np.float32), (_WIDTH, _WIDTH // 2), interpolation=cv2.INTER_AREA)
     valid: NDArray[np.bool_] = share > 1 - 1e-3
     return valid
+
+
+def _textured(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Return the pixels, (H, W), in whose surroundings there is something to match."""
+    grey = pad_panorama(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), 2)
+    window = np.ones((5, 5), np.uint8)
+    contrast = cv2.dilate(grey, window).astype(np.int16) - cv2.erode(grey, window)
+    textured: NDArray[np.bool_] = contrast[2:-2, 2:-2] >= _LEAST_CONTRAST
+    return textured
 
 
 def _quantiles(ranges: NDArray[np.float32], weights: NDArray[np.float64]) -> tuple[float, float]:
