@@ -41,8 +41,8 @@ def limits_by_sweeping(
     """Return the nearest and the farthest range worth trying, in scene units.
 
     The reference and its first four sources are each swept at 256 columns between very wide limits. What two of them
-    agree on, where there is texture, gives the limits: its 0.5 % and 99.5 % quantiles by solid angle, with a margin. Unlike sparse points this
-    sees plain and near surfaces too, and it does not care how the pictures are turned.
+    agree on, where there is texture, gives the limits: its 0.5 % and 99.5 % quantiles by solid angle, with a margin.
+    Unlike sparse points this sees smooth and near surfaces too, and it does not care how the pictures are turned.
 
     Args:
         pictures: the reference, then its sources, (H, W, 3) uint8 RGB each.
