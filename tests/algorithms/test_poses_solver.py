@@ -7,6 +7,7 @@ import pytest
 
 from pano_mvs.algorithms.metrics.poses import relative_pose_errors
 from pano_mvs.algorithms.poses.bundle import Bundle, adjust_bundle, robust_cost, robust_weights
+from pano_mvs.algorithms.poses.camera_system import camera_span, dense_from_band
 from pano_mvs.algorithms.poses.gauge import first_neighbour, in_gauge_of, moved_poses
 from pano_mvs.algorithms.poses.kernels_bundle import reduced_system
 from pano_mvs.algorithms.poses.refine import refine_poses
@@ -232,9 +233,12 @@ def test_kernel_equals_the_dense_system():
     bases = tangent_basis(bundle.bearings)
     weights = rng.uniform(0.1, 1.0, size=len(bundle.bearings))
     starts = np.searchsorted(bundle.point_idx, np.arange(len(bundle.points) + 1))
-    system, gradient, diagonal, *_ = reduced_system(
-        bundle.rotations, bundle.centers, bundle.points, starts, bundle.image_idx, bases, weights, 0.01
+    width = 6 * (camera_span(starts, bundle.image_idx) + 1)
+    band, gradient, diagonal, *_ = reduced_system(
+        bundle.rotations, bundle.centers, bundle.points, starts, bundle.image_idx, bases, weights, 0.01, width
     )
+    lower = dense_from_band(band)
+    system = np.tril(lower) + np.tril(lower, -1).T
     expected_system, expected_gradient = reduced_system_dense(bundle, bases, weights, 0.01)
     np.testing.assert_allclose(system, expected_system, atol=1e-6 * np.abs(expected_system).max())
     np.testing.assert_allclose(gradient, expected_gradient, atol=1e-6 * np.abs(expected_gradient).max())

@@ -7,8 +7,9 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.linalg import LinAlgError
 
+from pano_mvs.algorithms.poses.camera_system import camera_order, camera_span, held, solve_cameras
 from pano_mvs.algorithms.two_view.refinement import tangent_basis
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import rotation_from_rotvec
@@ -76,6 +77,26 @@ def adjust_bundle(
     bundle.check()
     if not len(bundle.points):
         return bundle
+    order = camera_order(bundle.point_idx, bundle.image_idx, len(bundle.centers))
+    place = np.argsort(order)
+    ordered = _adjust_ordered(
+        _with_cameras(bundle, order, place), loss=loss, scale_rad=scale_rad, max_iterations=max_iterations,
+        fixed_camera=int(place[fixed_camera]),
+    )  # fmt: skip
+    return _with_cameras(ordered, place, order)
+
+
+def _with_cameras(bundle: Bundle, order: NDArray[np.intp], place: NDArray[np.intp]) -> Bundle:
+    """Return the bundle with its cameras in another order; place[order[n]] is n."""
+    return replace(
+        bundle,
+        rotations=bundle.rotations[order],
+        centers=bundle.centers[order],
+        image_idx=place[bundle.image_idx].astype(np.int32),
+    )
+
+
+def _adjust_ordered(bundle: Bundle, *, loss: Loss, scale_rad: float, max_iterations: int, fixed_camera: int) -> Bundle:
     bases = tangent_basis(bundle.bearings)
     errors = bundle.errors_rad()
     cost, damping = robust_cost(errors, loss=loss, scale_rad=scale_rad), 1e-4
@@ -117,16 +138,14 @@ def _step(bundle: Bundle, bases: FloatArray, weights: FloatArray, *, damping: fl
     from pano_mvs.algorithms.poses.kernels_bundle import reduced_system
 
     starts = np.searchsorted(bundle.point_idx, np.arange(len(bundle.points) + 1))
-    system, gradient, diagonal, couplings, inverses, point_gradients = reduced_system(
-        bundle.rotations, bundle.centers, bundle.points, starts, bundle.image_idx, bases, weights, damping
+    width = 6 * (camera_span(starts, bundle.image_idx) + 1)
+    band, gradient, diagonal, couplings, inverses, point_gradients = reduced_system(
+        bundle.rotations, bundle.centers, bundle.points, starts, bundle.image_idx, bases, weights, damping, width
     )
-    free = np.ones(len(diagonal), np.bool_)
-    free[6 * fixed_camera : 6 * fixed_camera + 6] = False
     # The small constant keeps a camera without observations in place.
-    system[np.diag_indices_from(system)] += damping * diagonal + 1e-12 * diagonal.mean()
-    camera_steps = np.zeros(len(diagonal))
+    band[:, 0] += damping * diagonal + 1e-12 * diagonal.mean()
     try:
-        camera_steps[free] = -cho_solve(cho_factor(system[np.ix_(free, free)]), gradient[free])
+        camera_steps = -solve_cameras(*held(band, gradient, fixed_camera))
     except LinAlgError:
         return bundle
     steps = camera_steps.reshape(-1, 6)

@@ -59,11 +59,11 @@ def _invert_symmetric(matrix, inverse):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _add_observation(camera_rows, point_rows, residual, row, system, gradient, diagonal, coupling, block, by_point):  # type: ignore[no-untyped-def]
+def _add_observation(camera_rows, point_rows, residual, row, band, gradient, diagonal, coupling, block, by_point):  # type: ignore[no-untyped-def]
     """Add one observation's products of derivatives to its camera's and its point's blocks."""
     for i in range(6):
-        for j in range(6):
-            system[row + i, row + j] += camera_rows[0, i] * camera_rows[0, j] + camera_rows[1, i] * camera_rows[1, j]
+        for j in range(i + 1):
+            band[row + j, i - j] += camera_rows[0, i] * camera_rows[0, j] + camera_rows[1, i] * camera_rows[1, j]
         for j in range(3):
             coupling[i, j] = camera_rows[0, i] * point_rows[0, j] + camera_rows[1, i] * point_rows[1, j]
         gradient[row + i] += camera_rows[0, i] * residual[0] + camera_rows[1, i] * residual[1]
@@ -75,7 +75,7 @@ def _add_observation(camera_rows, point_rows, residual, row, system, gradient, d
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _eliminate(start, stop, image_idx, couplings, inverse, by_point, product, system, gradient):  # type: ignore[no-untyped-def]
+def _eliminate(start, stop, image_idx, couplings, inverse, by_point, product, band, gradient):  # type: ignore[no-untyped-def]
     """Take one point out of the system: S −= W V⁻¹ Wᵀ, g −= W V⁻¹ b, over all pairs of its observations."""
     for t in range(start, stop):
         row = 6 * image_idx[t]
@@ -90,9 +90,11 @@ def _eliminate(start, stop, image_idx, couplings, inverse, by_point, product, sy
                 gradient[row + i] -= product[i, j] * by_point[j]
         for s in range(start, stop):
             column = 6 * image_idx[s]
-            for i in range(6):
-                for j in range(6):
-                    system[row + i, column + j] -= (
+            if column > row:
+                continue
+            for j in range(6):
+                for i in range(j if column == row else 0, 6):
+                    band[column + j, row + i - column - j] -= (
                         product[i, 0] * couplings[s, j, 0]
                         + product[i, 1] * couplings[s, j, 1]
                         + product[i, 2] * couplings[s, j, 2]
@@ -100,17 +102,20 @@ def _eliminate(start, stop, image_idx, couplings, inverse, by_point, product, sy
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def reduced_system(rotations, centers, points, starts, image_idx, bases, weights, damping):  # type: ignore[no-untyped-def]
+def reduced_system(rotations, centers, points, starts, image_idx, bases, weights, damping, width):  # type: ignore[no-untyped-def]
     """Return the camera system after elimination of all points, and what is needed to get the points back.
 
     Observations are sorted by point; those of point p are starts[p] to starts[p + 1]. One thread, fixed order.
 
+    `width` diagonals are kept: 6 (d + 1) where cameras d positions apart share a point.
+
     Returns:
-        system (6N, 6N) and right-hand side (6N,), undamped in the cameras; diagonal (6N,) of the cameras' own blocks;
+        band (6N, width), the lower half of the symmetric system: band[j, d] is its entry in row j + d, column j;
+        right-hand side (6N,), both undamped in the cameras; diagonal (6N,) of the cameras' own blocks;
         for back-substitution the couplings (T, 6, 3), inverse point blocks (P, 3, 3) and point gradients (P, 3).
     """
     cameras, count = len(centers), len(points)
-    system, gradient, diagonal = np.zeros((6 * cameras, 6 * cameras)), np.zeros(6 * cameras), np.zeros(6 * cameras)
+    band, gradient, diagonal = np.zeros((6 * cameras, width)), np.zeros(6 * cameras), np.zeros(6 * cameras)
     couplings = np.zeros((len(image_idx), 6, 3))
     inverses, point_gradients = np.zeros((count, 3, 3)), np.zeros((count, 3))
     camera_rows, point_rows, residual = np.empty((2, 6)), np.empty((2, 3)), np.empty(2)
@@ -121,13 +126,13 @@ def reduced_system(rotations, centers, points, starts, image_idx, bases, weights
             k = image_idx[t]
             _observation(rotations[k], centers[k], points[p], bases[t], weights[t], camera_rows, point_rows, residual)
             _add_observation(
-                camera_rows, point_rows, residual, 6 * k, system, gradient, diagonal, couplings[t], block,
+                camera_rows, point_rows, residual, 6 * k, band, gradient, diagonal, couplings[t], block,
                 point_gradients[p],
             )  # fmt: skip
         for i in range(3):
             block[i, i] *= 1.0 + damping
         _invert_symmetric(block, inverses[p])
         _eliminate(
-            starts[p], starts[p + 1], image_idx, couplings, inverses[p], point_gradients[p], product, system, gradient
+            starts[p], starts[p + 1], image_idx, couplings, inverses[p], point_gradients[p], product, band, gradient
         )
-    return system, gradient, diagonal, couplings, inverses, point_gradients
+    return band, gradient, diagonal, couplings, inverses, point_gradients

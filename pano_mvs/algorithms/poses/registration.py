@@ -70,9 +70,16 @@ class GrowingModel:
 
     def __post_init__(self) -> None:
         self._points = np.full((self.tracks.count, 3), np.nan)
-        self._track_of_image = [
-            np.flatnonzero(self.tracks.image_idx == idx) for idx in range(len(self.tracks.names))
-        ]  # positions of observations
+        # Positions of the observations of every image, and its pairs, those with most verified matches first.
+        by_image = np.argsort(self.tracks.image_idx, kind="stable")
+        sizes = np.bincount(self.tracks.image_idx, minlength=len(self.tracks.names))
+        self._track_of_image = np.split(by_image, np.cumsum(sizes)[:-1])
+        self._pairs: list[list[tuple[int, int]]] = [[] for _ in self.tracks.names]
+        for (first, second), view in self.edges.items():
+            self._pairs[first].append((-len(view), second))
+            self._pairs[second].append((-len(view), first))
+        for pairs in self._pairs:
+            pairs.sort()
 
     def add(self, image: int, cam_from_world: Rigid3) -> None:
         """Register an image and triangulate the tracks that it sees."""
@@ -140,9 +147,10 @@ class GrowingModel:
         known = np.isfinite(points[:, 0])
         return points[known], self.tracks.bearings[observations[known]]
 
-    def known_count(self, image: int) -> int:
-        """Return how many triangulated points an image's tracks contain."""
-        return int(np.isfinite(self._points[self.tracks.track_idx[self._track_of_image[image]], 0]).sum())
+    def known_counts(self) -> NDArray[np.intp]:
+        """Return how many triangulated points the tracks of each image contain, (N,)."""
+        known = np.isfinite(self._points[self.tracks.track_idx, 0])
+        return np.bincount(self.tracks.image_idx[known], minlength=len(self.tracks.names))
 
     def attach(self, image: int) -> Attachment:
         """Return the best pose of an image, from its pairs with registered images, and whether to trust it."""
@@ -169,9 +177,7 @@ class GrowingModel:
 
     def _partners(self, image: int) -> list[int]:
         """Return the registered partners of an image, those with most verified matches first."""
-        found = [(len(view), a + b - image) for (a, b), view in self.edges.items() if image in (a, b)]
-        registered = sorted(((-count, partner) for count, partner in found if partner in self.cameras))
-        return [partner for _, partner in registered[:_MAX_PARTNERS]]
+        return [partner for _, partner in self._pairs[image] if partner in self.cameras][:_MAX_PARTNERS]
 
     def _chained(self, image: int, partner: int) -> Rigid3 | None:
         """Return the pose through one partner: the pair's rotation and direction, the length by known points.
@@ -201,8 +207,7 @@ class GrowingModel:
         return scaled @ self.cameras[partner]
 
     def _too_few(self, image: int, known: int) -> str:
-        matches = [(len(view), a + b - image) for (a, b), view in self.edges.items() if image in (a, b)]
-        count, partner = max(matches)
+        count, partner = max((-negative, partner) for negative, partner in self._pairs[image])
         return (f"{known} of its points are known from two other pictures, {_MIN_POINTS} needed; its best partner is "
                 f"{self.tracks.names[partner]!r} with {count} matches: take pictures in between")  # fmt: skip
 

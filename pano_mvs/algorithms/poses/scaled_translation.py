@@ -89,7 +89,8 @@ def _grown(model: GrowingModel, seed: Edge, *, adjust: bool) -> tuple[GrowingMod
     left = sorted({image for edge in model.edges for image in edge} - set(seed))
     adjusted = 0
     while left:
-        for image in sorted(left, key=lambda i: (-model.known_count(i), i)):
+        known = model.known_counts()
+        for image in sorted(left, key=lambda i: (-known[i], i)):
             if attachment := model.attach(image):
                 model.add(image, attachment.cam_from_world)
                 left.remove(image)

@@ -1,0 +1,81 @@
+"""The cameras' part of bundle adjustment as a banded system: cameras in an order in which neighbours stand together.
+
+A walk of N cameras then costs about N in memory and time, where the whole matrix costs N² and N³. The band is stored by
+columns: band[j, d] is the entry in row j + d, column j (LAPACK's lower band storage, transposed).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int32]
+
+# A band wider than this share of the matrix is quicker solved as a whole one.
+_WIDE = 0.4
+
+
+def camera_order(point_idx: IndexArray, image_idx: IndexArray, count: int) -> NDArray[np.intp]:
+    """Return the order of cameras, (count,), in which those that share points stand near each other.
+
+    Cuthill & McKee, "Reducing the bandwidth of sparse symmetric matrices", 1969, reversed (George 1971).
+
+    Args:
+        point_idx: (T,) point of every observation.
+        image_idx: (T,) its camera.
+        count: number of cameras.
+    """
+    seen = csr_array(
+        (np.ones(len(point_idx), np.float32), (point_idx, image_idx)), shape=(int(point_idx[-1]) + 1, count)
+    )
+    shared = csr_array(seen.T @ seen)
+    return np.asarray(reverse_cuthill_mckee(shared, symmetric_mode=True), np.intp)
+
+
+def camera_span(starts: NDArray[np.intp], image_idx: IndexArray) -> int:
+    """Return how many positions apart two cameras that share a point are, at most.
+
+    Args:
+        starts: (P + 1,) the first observation of every point, and the number of observations; none is without.
+        image_idx: (T,) camera of every observation, sorted by point.
+    """
+    last = np.maximum.reduceat(image_idx, starts[:-1])
+    return int((last - np.minimum.reduceat(image_idx, starts[:-1])).max())
+
+
+def held(band: FloatArray, gradient: FloatArray, camera: int) -> tuple[FloatArray, FloatArray]:
+    """Return the system in which a camera does not move: its rows and columns are those of the identity."""
+    band, gradient = band.copy(), gradient.copy()
+    own = np.arange(6 * camera, 6 * camera + 6)
+    band[own] = 0
+    for row in own:
+        columns = np.arange(max(0, row - band.shape[1] + 1), row)
+        band[columns, row - columns] = 0
+    band[own, 0] = 1
+    gradient[own] = 0
+    return band, gradient
+
+
+def solve_cameras(band: FloatArray, right: FloatArray) -> FloatArray:
+    """Return the solution of the symmetric positive definite system, (6N,) or (6N, K) as the right-hand side is.
+
+    Raises:
+        LinAlgError: if the system is not positive definite.
+    """
+    size, width = band.shape
+    if width > _WIDE * size:
+        return np.asarray(cho_solve(cho_factor(dense_from_band(band), lower=True, overwrite_a=True), right))
+    return np.asarray(cho_solve_banded((cholesky_banded(band.T, lower=True), True), right))
+
+
+def dense_from_band(band: FloatArray) -> FloatArray:
+    """Return the lower half of the matrix, (6N, 6N), zero above the diagonal."""
+    size, width = band.shape
+    matrix = np.zeros((size, size))
+    for d in range(min(width, size)):
+        np.fill_diagonal(matrix[d:], band[: size - d, d])
+    return matrix
