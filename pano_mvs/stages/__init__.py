@@ -6,12 +6,14 @@ They are registered through the entry point `pano_mvs.plugins`, like anybody's.
 from pano_mvs.stages.depth import sweep
 from pano_mvs.stages.evaluate import truth
 from pano_mvs.stages.export import colmap, ply, previews, ranges
-from pano_mvs.stages.features import orb_tangent, sift_tangent
+from pano_mvs.stages.features import orb_tangent, sift_tangent, sphorb
 from pano_mvs.stages.filters import bilateral_solver, consistency, fill, gaussian, median, speckle
+from pano_mvs.stages.frame import level, scale
 from pano_mvs.stages.fusion import vote
 from pano_mvs.stages.matches import brute_force
 from pano_mvs.stages.pairs import exhaustive, sequential
 from pano_mvs.stages.poses import from_model, refine, scaled_translation, triangulate
+from pano_mvs.stages.poses_colmap import colmap_poses
 from pano_mvs.stages.source import folder
 from pano_mvs.stages.views import nearest
 
@@ -19,12 +21,14 @@ __all__ = [
     "bilateral_solver",
     "brute_force",
     "colmap",
+    "colmap_poses",
     "consistency",
     "exhaustive",
     "fill",
     "folder",
     "from_model",
     "gaussian",
+    "level",
     "median",
     "nearest",
     "orb_tangent",
@@ -32,10 +36,12 @@ __all__ = [
     "previews",
     "ranges",
     "refine",
+    "scale",
     "scaled_translation",
     "sequential",
     "sift_tangent",
     "speckle",
+    "sphorb",
     "sweep",
     "triangulate",
     "truth",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
+from pano_mvs.algorithms.features.sphorb import extract_sphorb
 from pano_mvs.algorithms.features.tangent import extract_orb, extract_sift
 from pano_mvs.api import Context, Each, Features, Panorama, Params, stage
 
@@ -40,5 +41,25 @@ class OrbParams(Params):
 def orb_tangent(image: Each[Panorama], params: OrbParams, ctx: Context) -> Features:
     """ORB on the overlapping tangent tiles of an icosahedron."""
     features = extract_orb(image.load(), image.load_mask(), max_keypoints=params.max_keypoints)
+    ctx.metric("keypoints", len(features))
+    return features
+
+
+class SphorbParams(Params):
+    """Settings of features.sphorb."""
+
+    max_keypoints: int = Field(default=10_000, ge=8, description="the best so many, spread over the sphere")
+    fast_threshold: int = Field(default=7, ge=1, le=254, description="lower finds more on plain walls")
+
+
+@stage("features.sphorb")
+def sphorb(image: Each[Panorama], params: SphorbParams, ctx: Context) -> Features:
+    """SPHORB: corners and binary descriptors on a geodesic grid of the sphere."""
+    features = extract_sphorb(
+        image.load(),
+        image.load_mask(),
+        max_keypoints=params.max_keypoints,
+        fast_threshold=params.fast_threshold,
+    )
     ctx.metric("keypoints", len(features))
     return features

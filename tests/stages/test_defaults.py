@@ -7,6 +7,7 @@ from dataclasses import fields
 
 import pytest
 
+from pano_mvs.algorithms.features.sphorb import extract_sphorb
 from pano_mvs.algorithms.features.tangent import extract_orb, extract_sift
 from pano_mvs.algorithms.filters.bilateral_solver import fast_bilateral_solver
 from pano_mvs.algorithms.filters.consistency import check_consistency
@@ -16,6 +17,7 @@ from pano_mvs.algorithms.filters.median import median_range
 from pano_mvs.algorithms.filters.speckle import remove_speckles
 from pano_mvs.algorithms.fusion.vote import fuse_views
 from pano_mvs.algorithms.matching.brute_force import match_features
+from pano_mvs.algorithms.poses.colmap import solve_colmap
 from pano_mvs.algorithms.poses.refine import refine_poses
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.poses.tracks import triangulate_tracks
@@ -27,7 +29,9 @@ from pano_mvs.engine.registry import Registry
 FUNCTIONS = {
     "features.sift_tangent": extract_sift,
     "features.orb_tangent": extract_orb,
+    "features.sphorb": extract_sphorb,
     "poses.scaled_translation": solve_scaled_translation,
+    "poses.colmap": solve_colmap,
     "poses.refine": refine_poses,
     "poses.triangulate": triangulate_tracks,
     "filters.median": median_range,

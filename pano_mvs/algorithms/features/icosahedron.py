@@ -64,6 +64,12 @@ def face_centers() -> FloatArray:
     return np.array([triangle.mean(axis=0) / np.linalg.norm(triangle.mean(axis=0)) for triangle in _faces()])
 
 
+@cache
+def face_corners() -> FloatArray:
+    """Return the unit corners of the twenty faces, (20, 3, 3): face, corner, axis."""
+    return np.array(_faces())
+
+
 def tangent_tiles(size_hw: tuple[int, int]) -> list[Tile]:
     """Return the twenty tiles for a panorama, at its own resolution at the equator (W / 2π px per radian)."""
     focal_px = size_hw[1] / (2 * np.pi)

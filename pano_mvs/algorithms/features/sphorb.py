@@ -1,0 +1,223 @@
+"""SPHORB: corners and binary descriptors on a geodesic grid, with neither seam nor pole.
+
+Zhao, Feng, Wan, Zhang: "SPHORB: A Fast and Robust Binary Feature on the Sphere", IJCV 113, 2015: a pyramid of geodesic
+grids, a FAST segment test on the grid's rings, an orientation by the intensity centroid, and rotated binary tests
+(Rublee et al., "ORB", 2011). Beyond the paper, corners are placed between the cells, at the peak of the Harris
+response, and patches are laid out in the tangent plane, so that they are alike on all parts of a face.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.features.geodesic import NEIGHBOURS, GeodesicGrid, hexagon_ring, plane_from_lattice
+from pano_mvs.algorithms.features.selection import distinct_keypoints, spread_keypoints
+from pano_mvs.algorithms.features.smoothing import smooth_panorama
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import pixel_from_ray
+from pano_mvs.scene import Features
+
+FloatArray = NDArray[np.float64]
+
+_SCALE = 1.2
+_FEWEST_STEPS = 24
+_PATCH_RADIUS = 15  # cells from the centre to the farthest test
+_TESTS = 256
+_MARGIN = 32  # no less than _CLEARANCE lattice steps, stretched 1.42 times, from 5 cells beyond a face
+_CLEARANCE = 18  # cells around a corner that must not be masked: its patch, and what smoothing brings into it
+_ANTIALIAS = 0.5
+_WINDOW_RADIUS, _WINDOW_SIGMA = 2, 1.3
+_PATCH_SIGMA = 2.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Corners:
+    """Corners of one level: faces (N,), lattice places (N, 2), unit bearings (N, 3), and responses (N,)."""
+
+    faces: NDArray[np.int64]
+    places_uv: FloatArray
+    bearings: FloatArray
+    responses: NDArray[np.float32]
+
+    def __getitem__(self, keep: NDArray[np.generic]) -> _Corners:
+        return _Corners(self.faces[keep], self.places_uv[keep], self.bearings[keep], self.responses[keep])
+
+
+def extract_sphorb(
+    image: NDArray[np.uint8],
+    mask: NDArray[np.bool_],
+    *,
+    max_keypoints: int = 10_000,
+    fast_threshold: int = 7,
+    levels: int = 7,
+) -> Features:
+    """Return the SPHORB key points of a panorama.
+
+    Args:
+        image: (H, W, 3) uint8 RGB, the full sphere.
+        mask: (H, W) bool; no key point's patch reaches a False pixel.
+        max_keypoints: at most so many are kept, spread evenly over the sphere.
+        fast_threshold: least brightness difference of a corner in the segment test.
+        levels: of the pyramid; cells grow by 1.2 from each to the next.
+
+    Returns:
+        Features with descriptors (N, 32) uint8, compared by Hamming distance.
+
+    Raises:
+        UsageError: if the shapes of image and mask do not fit.
+    """
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or mask.shape != image.shape[:2]:
+        raise UsageError(f"features need an (H, W, 3) uint8 picture and an (H, W) mask, got {image.shape} "
+                         f"{image.dtype} and {mask.shape}")  # fmt: skip
+    gray: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    grids = grid_pyramid(image.shape[1], levels)
+    scales = _SCALE ** np.arange(len(grids))
+    pictures = [
+        grid.sample(smoothed)
+        for grid, smoothed in zip(grids, smooth_panorama(gray, _ANTIALIAS * np.sqrt(scales**2 - 1)), strict=True)
+    ]
+    found = [_detect(p, g, threshold=fast_threshold) for p, g in zip(pictures, grids, strict=True)]
+    if not mask.all():
+        found = [_unmasked(f, g, mask) for f, g in zip(found, grids, strict=True)]
+    pixel_rad = 2 * np.pi / image.shape[1]
+    chosen = _chosen(found, max_keypoints=max_keypoints, radius_rad=0.5 * pixel_rad)
+    described = [_describe(p, g, c) for p, g, c in zip(pictures, grids, chosen, strict=True)]
+    sizes = np.concatenate([
+        np.full(len(c.faces), 2 * _PATCH_RADIUS * g.spacing_rad, np.float32) for g, c in zip(grids, chosen, strict=True)
+    ])  # fmt: skip
+    return _record(image, chosen, np.concatenate(described), sizes)
+
+
+def grid_pyramid(width: int, levels: int) -> list[GeodesicGrid]:
+    """Return geodesic grids for a panorama: cells of one pixel's area at the equator, then 1.2 times wider each."""
+    finest = width / np.sqrt(10 * np.pi)
+    steps = [max(_FEWEST_STEPS, round(finest / _SCALE**level)) for level in range(levels)]
+    return [GeodesicGrid(n, _MARGIN) for n in dict.fromkeys(steps)]
+
+
+def _detect(pictures: NDArray[np.uint8], grid: GeodesicGrid, *, threshold: int) -> _Corners:
+    from pano_mvs.algorithms.features import kernels_sphorb as kernels
+
+    scores = np.zeros_like(pictures)
+    neighbours = grid.flat_offsets(NEIGHBOURS)
+    # A corner on the common edge of two faces is found by both, so that neither leaves it to the other.
+    kernels.score_corners(pictures, grid.ring_offsets, grid.margin, 2, threshold, scores)
+    cells = np.empty((np.count_nonzero(scores), 3), np.int64)
+    cells = cells[: kernels.local_maxima(scores, neighbours, grid.margin, 1, cells)]
+    window, weights = _harris_window()
+    places, responses = np.empty((len(cells), 2)), np.empty(len(cells))
+    kernels.refine_corners(
+        pictures, cells, grid.flat_offsets(window), weights, neighbours, grid.margin, places, responses
+    )
+    faces = cells[:, 0]
+    corners = _Corners(faces, places, grid.bearings(faces, places), responses.astype(np.float32))
+    corners = corners[responses > 0]
+    return corners[distinct_keypoints(corners.bearings, corners.responses, radius_rad=grid.spacing_rad)]
+
+
+def _unmasked(corners: _Corners, grid: GeodesicGrid, mask: NDArray[np.bool_]) -> _Corners:
+    """Keep the corners whose surroundings have no masked cell."""
+    from pano_mvs.algorithms.features import kernels_sphorb as kernels
+
+    valid = grid.sample(mask.astype(np.uint8), interpolation=cv2.INTER_NEAREST)
+    clear = np.empty(len(corners.faces), np.bool_)
+    turns = grid.lattice_from_tangent(corners.faces, corners.places_uv)
+    kernels.disc_is_clear(valid, corners.faces, corners.places_uv, turns, _disc(_CLEARANCE), grid.margin, clear)
+    return corners[clear]
+
+
+def _chosen(found: list[_Corners], *, max_keypoints: int, radius_rad: float) -> list[_Corners]:
+    """Return the corners to keep of each level, spread over the sphere; coarse levels get fewer, as in ORB."""
+    shares = _SCALE ** -np.arange(len(found), dtype=np.float64)
+    chosen: list[_Corners] = []
+    room = max_keypoints
+    for level in reversed(range(len(found))):
+        quota = round(room * shares[level] / shares[: level + 1].sum())
+        corners = found[level]
+        chosen.insert(0, corners[spread_keypoints(corners.bearings, corners.responses, max_keypoints=quota)])
+        room -= len(chosen[0].faces)
+    bearings, responses = (np.concatenate([getattr(c, name) for c in chosen]) for name in ("bearings", "responses"))
+    kept = np.zeros(len(bearings), np.bool_)
+    kept[distinct_keypoints(bearings, responses, radius_rad=radius_rad)] = True
+    ends = np.cumsum([len(c.faces) for c in chosen])
+    return [c[part] for c, part in zip(chosen, np.split(kept, ends[:-1]), strict=True)]
+
+
+def _describe(pictures: NDArray[np.uint8], grid: GeodesicGrid, corners: _Corners) -> NDArray[np.uint8]:
+    from pano_mvs.algorithms.features import kernels_sphorb as kernels
+
+    side = grid.side
+    smoothed = np.stack([cv2.filter2D(p, -1, _smoothing_kernel()) for p in pictures]).reshape(20, side, side)
+    turns = grid.lattice_from_tangent(corners.faces, corners.places_uv)
+    angles, bits = np.empty(len(corners.faces)), np.empty((len(corners.faces), _TESTS // 8), np.uint8)
+    kernels.describe_corners(
+        smoothed, corners.faces, corners.places_uv, turns, _disc(_PATCH_RADIUS), binary_tests(), grid.margin, angles,
+        bits,
+    )  # fmt: skip
+    return bits
+
+
+def _record(
+    image: NDArray[np.uint8], chosen: list[_Corners], descriptors: NDArray[np.uint8], sizes_rad: NDArray[np.float32]
+) -> Features:
+    height, width = image.shape[:2]
+    bearings = np.concatenate([c.bearings for c in chosen])
+    scores = np.concatenate([c.responses for c in chosen])
+    order = np.argsort(-scores, kind="stable")
+    x, y = np.floor(pixel_from_ray(bearings[order], (height, width))).astype(np.intp).T
+    return Features(
+        bearings=bearings[order],
+        descriptors=descriptors[order],
+        sizes_rad=sizes_rad[order],
+        scores=scores[order],
+        colors_rgb=image[np.clip(y, 0, height - 1), x % width],
+        metric="hamming",
+        size_hw=(height, width),
+    )
+
+
+@cache
+def binary_tests() -> FloatArray:
+    """Return the places (256, 4) of the binary tests in the tangent plane, in cells, within the patch's radius.
+
+    Both places of a test are drawn from one Gaussian around the corner (Calonder et al., "BRIEF", 2010, layout II).
+    """
+    rng = np.random.default_rng(0x5B)
+    kept: list[FloatArray] = []
+    while len(kept) < _TESTS:
+        pair = rng.normal(scale=_PATCH_RADIUS / 2.5, size=(2, 2))
+        if np.all(np.hypot(*pair.T) <= _PATCH_RADIUS) and np.hypot(*(pair[0] - pair[1])) > 2:
+            kept.append(pair.ravel())
+    return np.array(kept)
+
+
+@cache
+def _disc(radius: int) -> FloatArray:
+    """Return a hexagonal lattice of steps (K, 2) within a radius in the tangent plane."""
+    cells = np.stack(np.meshgrid(*[np.arange(-2 * radius, 2 * radius + 1)] * 2), axis=-1).reshape(-1, 2)
+    plane = plane_from_lattice(cells)
+    return plane[np.hypot(plane[:, 0], plane[:, 1]) <= radius]
+
+
+@cache
+def _harris_window() -> tuple[NDArray[np.int64], FloatArray]:
+    rings = [np.zeros((1, 2), np.int64), *(hexagon_ring(r) for r in range(1, _WINDOW_RADIUS + 1))]
+    window = np.concatenate(rings)
+    squared = np.sum(plane_from_lattice(window) ** 2, axis=1)
+    return window, np.exp(-0.5 * squared / _WINDOW_SIGMA**2) / 255**2
+
+
+@cache
+def _smoothing_kernel() -> FloatArray:
+    """Return a Gaussian on the lattice, to be applied to a face's array."""
+    reach = int(np.ceil(2 * _PATCH_SIGMA))
+    v, u = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    kernel: FloatArray = np.exp(-0.5 * (u**2 + u * v + v**2) / _PATCH_SIGMA**2)
+    kernel[u**2 + u * v + v**2 > reach**2] = 0
+    kernel /= kernel.sum()
+    return kernel
