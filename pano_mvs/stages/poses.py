@@ -54,7 +54,7 @@ def scaled_translation(
         adjust=params.adjust,
         rng=ctx.rng,
     )
-    return _checked(poses, ctx)
+    return checked_poses(poses, ctx)
 
 
 class RefineParams(Params):
@@ -76,7 +76,7 @@ def refine(poses: One[Poses], params: RefineParams, ctx: Context) -> Poses:
         max_error_deg=params.max_error_deg,
         max_iterations=params.max_iterations,
     )
-    return _checked(refined, ctx)
+    return checked_poses(refined, ctx)
 
 
 class FromModelParams(Params):
@@ -104,7 +104,7 @@ def from_model(images: Names[Panorama], params: FromModelParams, ctx: Context) -
         scale=model.scale,
         metric=model.metric,
     )
-    return _checked(poses, ctx)
+    return checked_poses(poses, ctx)
 
 
 class TriangulateParams(Params):
@@ -122,10 +122,10 @@ def triangulate(
     points = triangulate_tracks(
         poses, features, matches, max_error_deg=params.max_error_deg, min_angle_deg=params.min_angle_deg
     )
-    return _checked(points, ctx)
+    return checked_poses(points, ctx)
 
 
-def _checked(poses: Poses, ctx: Context) -> Poses:
+def checked_poses(poses: Poses, ctx: Context) -> Poses:
     """Report what was left out; stop where less than two pictures are left.
 
     Raises:

@@ -1,0 +1,93 @@
+"""Register a capture through COLMAP's mappers, with our key points and verified matches."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pano_mvs.algorithms.poses.colmap_database import Cameras, TwoViews, write_database
+from pano_mvs.algorithms.poses.colmap_mapping import Mapper, poses_from_model, registered_panoramas, run_mapper
+from pano_mvs.algorithms.poses.gauge import normalised_poses
+from pano_mvs.scene import Features, Poses
+
+_SEED_LIMIT = 2**31 - 1
+
+
+def solve_colmap(
+    features: Mapping[str, Features],
+    two_views: TwoViews,
+    *,
+    mapper: Mapper = "incremental",
+    cameras: Cameras = "sphere",
+    rng: np.random.Generator,
+    scratch: Path,
+) -> Poses:
+    """Return the poses of a capture by COLMAP's incremental or global mapper.
+
+    Schönberger & Frahm, "Structure-from-Motion Revisited", 2016; Pan et al., "Global Structure-from-Motion
+    Revisited", 2024. The mapper runs on one thread with a seed, so that the same input gives the same poses.
+
+    Args:
+        features: key points by image name, in the capture's order.
+        two_views: verified pairs; those without a general geometry are left out.
+        mapper: "incremental" or "global".
+        cameras: "sphere": EQUIRECTANGULAR cameras; "faces": six pinhole faces, held together as one rig.
+        rng: gives COLMAP's seed.
+        scratch: an empty folder for COLMAP's files.
+
+    Returns:
+        Poses in the frame of the first registered camera, the first baseline being 1. Of several models the one with
+        most panoramas is kept; what it does not hold is in `rejected`, with the reason.
+    """
+    seed = int(rng.integers(1, _SEED_LIMIT))
+    (scratch / "models").mkdir()
+    images = write_database(scratch / "database.db", features, two_views, cameras=cameras)
+    try:
+        models = run_mapper(scratch / "database.db", scratch / "models", mapper=mapper, cameras=cameras, seed=seed)
+    except (RuntimeError, ValueError, IndexError) as error:
+        return _nothing(features, f"COLMAP's {mapper} mapper stopped: {error}")
+    members = [registered_panoramas(model, images).keys() for model in models]
+    if not models or len(members[0]) < 2:
+        return _nothing(features, f"COLMAP's {mapper} mapper found no model of two panoramas or more")
+    rejected = _rejected(features, two_views, members)
+    return normalised_poses(poses_from_model(models[0], features, images, rejected=rejected))
+
+
+def _nothing(features: Mapping[str, Features], reason: str) -> Poses:
+    return Poses.without_points(
+        {}, rejected=dict.fromkeys(features, reason), frame="the first registered camera",
+        scale="none: no image is registered", metric=False,
+    )  # fmt: skip
+
+
+def _rejected(
+    features: Mapping[str, Features], two_views: TwoViews, members: Sequence[Collection[int]]
+) -> dict[str, str]:
+    """Return the reason for every panorama that is not in the first of COLMAP's models, given who is in each."""
+    reasons: dict[str, str] = {}
+    for idx, name in enumerate(features):
+        if idx in members[0]:
+            continue
+        other = next((number for number, model in enumerate(members) if idx in model), 0)
+        if other:
+            reasons[name] = (
+                f"COLMAP put it into its sub-model {other + 1} of {len(members)}, of {len(members[other])} pictures; "
+                f"only the largest, of {len(members[0])}, is kept: take pictures in between"
+            )
+        else:
+            reasons[name] = why_unregistered(name, two_views)
+    return reasons
+
+
+def why_unregistered(name: str, two_views: TwoViews) -> str:
+    """Return what the pairs of an image say about its being left out."""
+    tried = [(bool(view), len(view), view.candidates, pair) for pair, view in two_views.items() if name in pair]
+    if not tried:
+        return "it was compared with no other picture"
+    sound, matches, _, pair = max(tried)
+    partner = pair[1] if pair[0] == name else pair[0]
+    if not sound:
+        return f"no sound pair; the best partner is {partner!r}: {two_views[pair].reason}"
+    return f"COLMAP did not register it, although its best partner, {partner!r}, shares {matches} verified matches"
