@@ -1,0 +1,145 @@
+"""Level surfaces among sparse points: floors, tables and ceilings are layers along the vertical."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+
+from pano_mvs.geometry import rotation_from_rotvec, rotation_from_two_vectors
+
+FloatArray = NDArray[np.float64]
+
+# Search around the given up direction: half width and step in degrees, width of a layer relative to the typical range.
+_ROUNDS = ((20.0, 2.0, 0.04), (2.0, 0.5, 0.02), (0.5, 0.1, 0.01))
+_FEWEST_POINTS = 100
+# How much sharper than the median over all directions searched the layers must be.
+_LEAST_CONTRAST = 1.25
+_BINS_PER_WIDTH = 2.0
+# The floor: density along the logarithm of the depth below the cameras, which makes it independent of the unit.
+_LOG_WIDTH = 0.03
+_LOG_STEP = 0.005
+_STEEPEST_SHARE = 0.25
+_FEWEST_FLOOR_POINTS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class Layers:
+    """The direction along which points lie in the sharpest layers, or why there is none (falsy then).
+
+    Attributes:
+        up: (3,) unit vector.
+        contrast: how much sharper the layers are than along the median direction searched.
+        reason: why there is none; else empty.
+    """
+
+    up: FloatArray
+    contrast: float
+    reason: str = ""
+
+    def __bool__(self) -> bool:
+        """Return whether there are layers."""
+        return not self.reason
+
+
+@dataclass(frozen=True)
+class Floor:
+    """How deep below the cameras the floor lies, or why it was not found (falsy then).
+
+    Attributes:
+        depth: median over the cameras of their height above the floor, scene units.
+        points: number of sparse points on it.
+        spread: median distance of these points from it, scene units.
+        reason: why it was not found; else empty.
+    """
+
+    depth: float
+    points: int = 0
+    spread: float = 0.0
+    reason: str = ""
+
+    def __bool__(self) -> bool:
+        """Return whether a floor was found."""
+        return not self.reason
+
+
+def sharpest_up(points: FloatArray, centers: FloatArray, up: FloatArray) -> Layers:
+    """Return the direction within 20° of `up` along which the points' heights are most concentrated.
+
+    Concentration is the integral of the squared density of heights (the exponential of the negative Rényi entropy of
+    order 2), which level surfaces make large and any tilt makes small.
+
+    Args:
+        points: (P, 3) in the world.
+        centers: (N, 3) camera centres in the world.
+        up: (3,) unit vector to search around.
+    """
+    if len(points) < _FEWEST_POINTS:
+        return Layers(up, 0.0, f"{len(points)} sparse points do not tell level surfaces; {_FEWEST_POINTS} are needed")
+    offsets = points - np.median(centers, axis=0)
+    ranges = np.linalg.norm(offsets, axis=1)
+    typical = float(np.median(ranges))
+    near = offsets[ranges < 3 * typical] / typical
+    best, contrast = up, 0.0
+    for number, (half_deg, step_deg, width) in enumerate(_ROUNDS):
+        candidates = _directions_around(best, half_deg, step_deg)
+        scores = np.array([_concentration(near @ candidate, width) for candidate in candidates])
+        best = candidates[int(np.argmax(scores))]
+        if number == 0:
+            contrast = float(scores.max() / np.median(scores))
+    if contrast < _LEAST_CONTRAST:
+        return Layers(up, contrast, f"the sparse points lie in no clear level surfaces (contrast {contrast:.2f})")
+    return Layers(best, contrast)
+
+
+def floor_below(points: FloatArray, centers: FloatArray, up: FloatArray) -> Floor:
+    """Return the lowest level surface that many points below the cameras lie on.
+
+    Args:
+        points: (P, 3) in the world.
+        centers: (N, 3) camera centres in the world, all about as high above one floor.
+        up: (3,) unit vector away from gravity.
+    """
+    heights = centers @ up
+    depths = float(np.median(heights)) - points @ up
+    lowest = float(np.median(heights) - heights.min())
+    offsets = points - np.median(centers, axis=0)
+    aside = np.linalg.norm(offsets - (offsets @ up)[:, None] * up, axis=1)
+    below = depths[(depths > lowest) & (depths > 0) & (depths > _STEEPEST_SHARE * aside)]
+    if len(below) < _FEWEST_FLOOR_POINTS:
+        return Floor(0.0, reason=f"only {len(below)} sparse points lie below the cameras")
+    logs = np.log(below)
+    counts = np.bincount(((logs - logs.min()) / _LOG_STEP).astype(np.int64))
+    density = gaussian_filter1d(np.pad(counts.astype(np.float64), 1), _LOG_WIDTH / _LOG_STEP, mode="constant")
+    peaks = 1 + np.flatnonzero((density[1:-1] >= density[:-2]) & (density[1:-1] > density[2:]))
+    strong = peaks[density[peaks] >= _STEEPEST_SHARE * density.max()]
+    depth_log = logs.min() + (strong[-1] - 0.5) * _LOG_STEP
+    on_floor = below[np.abs(logs - depth_log) < 2 * _LOG_WIDTH]
+    if len(on_floor) < _FEWEST_FLOOR_POINTS:
+        return Floor(0.0, reason=f"no level surface below the cameras holds {_FEWEST_FLOOR_POINTS} sparse points")
+    depth = float(np.median(on_floor))
+    return Floor(depth, len(on_floor), float(np.median(np.abs(on_floor - depth))))
+
+
+def _directions_around(up: FloatArray, half_deg: float, step_deg: float) -> FloatArray:
+    """Return unit vectors (K, 3) on a grid of tilts; the first is `up` turned the most one way, and so on."""
+    tilts = np.deg2rad(np.arange(-half_deg, half_deg + step_deg / 2, step_deg))
+    x, y = np.meshgrid(tilts, tilts, indexing="ij")
+    rotvecs = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    rotvecs = rotvecs[np.hypot(rotvecs[:, 0], rotvecs[:, 1]) <= np.deg2rad(half_deg) + 1e-9]
+    around_z: FloatArray = rotation_from_rotvec(rotvecs)[:, :, 2]
+    return around_z @ rotation_from_two_vectors(np.array([0.0, 0.0, 1.0]), up).T
+
+
+def _concentration(heights: FloatArray, width: float) -> float:
+    """Return the integral of the squared density of heights, smoothed to a width."""
+    step = width / _BINS_PER_WIDTH
+    positions = (heights - heights.min()) / step
+    lower = positions.astype(np.int64)
+    fractions = positions - lower
+    size = int(lower.max()) + 2
+    counts = np.bincount(lower, 1 - fractions, size) + np.bincount(lower + 1, fractions, size)
+    smooth = gaussian_filter1d(counts, _BINS_PER_WIDTH, mode="constant")
+    return float(np.sum(smooth**2)) / (step * len(heights) ** 2)
