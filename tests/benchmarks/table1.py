@@ -20,7 +20,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pano_mvs.algorithms.features.tangent import extract_orb, extract_sift
+from pano_mvs.algorithms.features.sphorb import extract_sphorb
+from pano_mvs.algorithms.features.tangent import extract_sift
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.poses.refine import refine_poses
 from pano_mvs.algorithms.poses.scale import ScaleEstimator
@@ -75,7 +76,7 @@ class Preset:
 
 
 PRESETS = {
-    "a: the paper (ORB on tangents)": Preset("orb", 0.75, False, "eight_point", False, "kappa", False),
+    "a: the paper, literally (SPHORB)": Preset("sphorb", 0.75, False, "eight_point", False, "kappa", False),
     "b: SIFT, refined pairs, chained": Preset("sift", 0.8, True, "five_point", True, "cauchy", False),
     "c: SIFT, adjusted and refined": Preset("sift", 0.8, True, "five_point", True, "cauchy", True),
 }
@@ -169,7 +170,7 @@ def run_set(number: int, *, trials: int, width: int, folder: Path | None) -> dic
         mask = np.ones(noisy[0].shape[:2], np.bool_)
         features = {
             kind: {f"{idx}": extract(picture, mask) for idx, picture in enumerate(noisy)}
-            for kind, extract in (("orb", extract_orb), ("sift", extract_sift))
+            for kind, extract in (("sphorb", extract_sphorb), ("sift", extract_sift))
         }
         for name, preset in PRESETS.items():
             found[name].append(errors(estimated_poses(features[preset.features], preset, rng), truth))

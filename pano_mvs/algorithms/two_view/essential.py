@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.geometry import Rigid3, ranges_from_bearings
+from pano_mvs.geometry import Rigid3
 
 FloatArray = NDArray[np.float64]
 
@@ -72,10 +72,15 @@ def poses_from_essential(essential: FloatArray) -> list[Rigid3]:
 
 
 def in_front(first: FloatArray, second: FloatArray, second_from_first: Rigid3) -> NDArray[np.bool_]:
-    """Return whether each pair of rays, (M, 3) and (M, 3), meets at positive range from both centres, (M,)."""
-    range_first, range_second = ranges_from_bearings(first, second, second_from_first)
-    with np.errstate(invalid="ignore"):
-        front: NDArray[np.bool_] = (range_first > 0) & (range_second > 0)
+    """Return whether each pair of rays, (M, 3) and (M, 3), meets at positive range from both centres, (M,).
+
+    The signs of `ranges_from_bearings`' numerators, with C the second centre in the first frame and q de-rotated:
+    (C × q)·(p × q) = C·p − (C·q)(p·q) and (C × p)·(p × q) = (C·p)(p·q) − C·q. Parallel rays do not meet.
+    """
+    q = second @ second_from_first.rotation
+    center = second_from_first.center
+    along_p, along_q, cosine = first @ center, q @ center, np.einsum("ni,ni->n", first, q)
+    front: NDArray[np.bool_] = (along_p > along_q * cosine) & (along_p * cosine > along_q)
     return front
 
 

@@ -132,11 +132,15 @@ class _Search:
     optimise: bool
 
     def run(self, *, confidence: float, max_iterations: int) -> tuple[list[Rigid3], int]:
-        """Return the poses with the least truncated squared error, best first, and how many were tried."""
+        """Return the leading poses, best first, and how many hypotheses were tried.
+
+        One if a better one would have been met by now, several if the search was given up.
+        """
         leaders: list[tuple[float, int, Rigid3]] = []
         samples, tried, needed = 0, 0, np.inf
         while samples < needed and tried < max_iterations:
-            pose, cost, count = self._best_of_batch()
+            worst = leaders[-1][0] if len(leaders) == _LEADERS else np.inf
+            pose, cost, count = self._best_of_batch(worst)
             samples, tried = samples + self.solver.batch, tried + max(count, self.solver.batch)
             if pose is None:
                 continue
@@ -146,10 +150,10 @@ class _Search:
                 ratio = float(np.mean(self._residuals(pose) < self.threshold_rad))
                 needed = min(needed, samples_needed(ratio, confidence, sample=self.solver.sample))
             leaders = sorted([*leaders, (cost, tried, pose)], key=lambda item: item[:2])[:_LEADERS]
-        return [pose for _, _, pose in leaders], tried
+        return [pose for _, _, pose in (leaders[:1] if samples >= needed else leaders)], tried
 
-    def _best_of_batch(self) -> tuple[Rigid3 | None, float, int]:
-        """Return the best pose of a batch of samples, its cost, and how many hypotheses there were."""
+    def _best_of_batch(self, worst: float) -> tuple[Rigid3 | None, float, int]:
+        """Return the best pose of a batch of samples if it costs less than `worst`, its cost, how many were tried."""
         size = len(self.first)
         drawn = draw_samples(self.rng, size, batch=self.solver.batch, sample=self.solver.sample)
         hypotheses = self.solver.solve(self.first[drawn], self.second[drawn])
@@ -159,6 +163,10 @@ class _Search:
         p, q = self.first[screen], self.second[screen]
         screened = msac_costs(hypotheses, p, q, self.threshold_rad)
         finalists = hypotheses[np.argsort(screened, kind="stable")[:_FINALISTS]]
+        # What a hypothesis costs without a look at the sides is the least that it can cost.
+        finalists = finalists[msac_costs(finalists, self.first, self.second, self.threshold_rad) < worst]
+        if not len(finalists):
+            return None, np.inf, len(hypotheses)
         poses = [facing_pose(essential, p, q, self.threshold_rad) for essential in finalists]
         costs = facing_costs(poses, self.first, self.second, self.threshold_rad)
         return poses[int(np.argmin(costs))], float(costs.min()), len(hypotheses)
