@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -24,6 +25,7 @@ from pano_mvs.engine.stat_cache import StatCache
 from pano_mvs.scene import Record
 
 LAYOUT_VERSION = 1
+_ABANDONED_AFTER_S = 7 * 24 * 3600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +111,7 @@ class Store:
         self.root = root
         self.damaged: list[str] = []
         self._open_layout()
+        self._clear_abandoned()
         self.stat_cache = StatCache(root / "stat-cache.json")
         self.blobs = BlobStore(root, self.stat_cache)
 
@@ -214,6 +217,20 @@ class Store:
                 f"cache {self.root} has layout {layout!r}, this version uses {LAYOUT_VERSION}. "
                 "Choose another with --cache DIR"
             )
+
+    def _clear_abandoned(self) -> None:
+        """Remove what runs that were killed long ago left half written; no unit takes that long."""
+        folder = self.root / "tmp"
+        for path in folder.iterdir() if folder.is_dir() else ():
+            try:
+                if time.time() - path.stat().st_mtime < _ABANDONED_AFTER_S:
+                    continue
+                if path.is_dir() and not path.is_symlink():
+                    shutil.rmtree(path, ignore_errors=True)
+                else:
+                    path.unlink(missing_ok=True)
+            except OSError:
+                continue  # another run is cleaning up too
 
     def _create(self, path: Path) -> None:
         try:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -96,6 +97,18 @@ def test_read_of_a_flipped_blob_is_refused_and_removes_it(tmp_path: Path) -> Non
     with pytest.raises(DamagedBlobError, match="damaged"):
         Store(tmp_path).load(ref, Sample)
     assert not path.exists()
+
+
+def test_what_killed_runs_left_long_ago_is_cleared(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    with store.scratch() as young:
+        old = young.parent / "old"
+        old.mkdir()
+        (old / "half").write_bytes(b"x")
+        os.utime(old, (0, 0))
+        Store(tmp_path)
+        assert young.is_dir()
+        assert not old.exists()
 
 
 def test_no_pickle_is_read(tmp_path: Path) -> None:
