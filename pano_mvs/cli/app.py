@@ -16,6 +16,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from pano_mvs.cli.default_command import RunByDefault
 from pano_mvs.core.errors import PanoMvsError, WorkflowError
 
 app = typer.Typer(
@@ -27,6 +28,12 @@ app = typer.Typer(
 )
 stage_app = typer.Typer(help="Look at one stage.", no_args_is_help=True)
 app.add_typer(stage_app, name="stage")
+evaluate_app = typer.Typer(
+    cls=RunByDefault,
+    help="Compare with the truth; `evaluate OUT --truth DIR` is `evaluate run OUT --truth DIR`.",
+    no_args_is_help=True,
+)
+app.add_typer(evaluate_app, name="evaluate")
 
 WorkflowArgument = Annotated[str, typer.Argument(metavar="WORKFLOW", help="A workflow file, or the name of a preset.")]
 ImagesOption = Annotated[Optional[Path], typer.Option("--images", help="Folder of panoramas to use instead.")]  # noqa: UP045
@@ -132,9 +139,9 @@ def stage_show(name: Annotated[str, typer.Argument(help="A stage's name, such as
     show_stage(name, Console())
 
 
-@app.command()
+@evaluate_app.command("run")
 @_guarded
-def evaluate(
+def evaluate_run(
     out: Annotated[Path, typer.Argument(help="The output folder of a run.")],
     truth: Annotated[Path, typer.Option("--truth", help="Folder with poses.json and depth.npz.")],
 ) -> None:
@@ -142,6 +149,19 @@ def evaluate(
     from pano_mvs.cli.evaluate import evaluate_folder
 
     evaluate_folder(out, truth, Console())
+
+
+@evaluate_app.command("poses")
+@_guarded
+def evaluate_model(
+    model: Annotated[Path, typer.Argument(help="COLMAP model, poses.json, transforms.json, CSV, or a run's output.")],
+    truth: Annotated[Path, typer.Option("--truth", help="The true poses, in any of these forms.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Compare the poses in any file with the truth, whatever their frames and units."""
+    from pano_mvs.cli.evaluate_poses import evaluate_poses
+
+    evaluate_poses(model, truth, Console(), as_json=as_json)
 
 
 def main() -> None:
