@@ -13,7 +13,7 @@ from pano_mvs.stages.fusion import vote
 from pano_mvs.stages.matches import brute_force
 from pano_mvs.stages.pairs import exhaustive, sequential
 from pano_mvs.stages.poses import from_model, refine, scaled_translation, triangulate
-from pano_mvs.stages.poses_colmap import colmap_poses
+from pano_mvs.stages.poses_colmap import colmap_poses, colmap_sift_poses, extend
 from pano_mvs.stages.source import folder
 from pano_mvs.stages.views import nearest
 
@@ -22,8 +22,10 @@ __all__ = [
     "brute_force",
     "colmap",
     "colmap_poses",
+    "colmap_sift_poses",
     "consistency",
     "exhaustive",
+    "extend",
     "fill",
     "folder",
     "from_model",

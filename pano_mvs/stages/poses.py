@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from typing import Literal
 
 from pydantic import Field
@@ -91,19 +93,9 @@ def from_model(images: Names[Panorama], params: FromModelParams, ctx: Context) -
 
     Image names are compared with and without their folders and extensions.
     """
-    model = read_poses(params.path)
-    known = match_image_names(images, model.names)
-    if not known:
-        raise InputError(f"{params.path}: none of its {len(model.names)} images is one of this capture (it has "
-                         f"{', '.join(model.names[:3])} …, the capture {', '.join(images[:3])} …)")  # fmt: skip
-    position = {name: idx for idx, name in enumerate(model.names)}
-    poses = Poses.without_points(
-        {name: model.cam_from_world(position[known[name]]) for name in images if name in known},
-        rejected={name: f"{params.path.name} has no pose for it" for name in images if name not in known},
-        frame=model.frame,
-        scale=model.scale,
-        metric=model.metric,
-    )
+    known = known_poses(params.path, images)
+    rejected = {name: f"{params.path.name} has no pose for it" for name in images if name not in known.names}
+    poses = replace(known, rejected=rejected)
     return checked_poses(poses, ctx)
 
 
@@ -141,3 +133,23 @@ def checked_poses(poses: Poses, ctx: Context) -> Poses:
         raise GateError("no two panoramas could be registered, so there is no model. Take pictures closer together "
                         f"(0.5–1 m indoors) with more in common. {reasons}")  # fmt: skip
     return poses
+
+
+def known_poses(path: Path, images: tuple[str, ...]) -> Poses:
+    """Return the poses that a file has for the images of a capture, in the capture's order, without points.
+
+    Raises:
+        InputError: if the file cannot be used, or knows none of the images.
+    """
+    model = read_poses(path)
+    known = match_image_names(images, model.names)
+    if not known:
+        raise InputError(f"{path}: none of its {len(model.names)} images is one of this capture (it has "
+                         f"{', '.join(model.names[:3])} …, the capture {', '.join(images[:3])} …)")  # fmt: skip
+    position = {name: idx for idx, name in enumerate(model.names)}
+    return Poses.without_points(
+        {name: model.cam_from_world(position[known[name]]) for name in images if name in known},
+        frame=model.frame,
+        scale=model.scale,
+        metric=model.metric,
+    )

@@ -1,4 +1,4 @@
-"""Pose solvers that run COLMAP."""
+"""Pose solvers that run COLMAP, and the one that extends a model whose cameras do not move."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from typing import Literal
 from pydantic import Field
 
 from pano_mvs.algorithms.poses.colmap import solve_colmap
-from pano_mvs.api import All, Context, Features, Params, Poses, TwoView, stage
-from pano_mvs.stages.poses import checked_poses
+from pano_mvs.algorithms.poses.colmap_sift import colmap_sift
+from pano_mvs.algorithms.poses.extension import extend_poses
+from pano_mvs.api import All, Context, Features, InputPath, Panorama, Params, Poses, TwoView, stage
+from pano_mvs.stages.poses import checked_poses, known_poses
 
 
 class ColmapParams(Params):
@@ -25,5 +27,40 @@ def colmap_poses(features: All[Features], matches: All[TwoView], params: ColmapP
     """COLMAP's incremental or global mapper, seeded with our key points and verified matches; one pose a panorama."""
     poses = solve_colmap(
         features, matches, mapper=params.mapper, cameras=params.cameras, rng=ctx.rng, scratch=ctx.scratch
+    )
+    return checked_poses(poses, ctx)
+
+
+class ColmapSiftParams(ColmapParams):
+    """Settings of poses.colmap_sift."""
+
+    max_keypoints: int = Field(default=8192, ge=8, description="of each picture, at most")
+
+
+@stage("poses.colmap_sift")
+def colmap_sift_poses(images: All[Panorama], params: ColmapSiftParams, ctx: Context) -> Poses:
+    """COLMAP on its own: its planar SIFT, exhaustive matching, and mapper. Masks are respected."""
+    pictures = ((name, image.load(), image.load_mask()) for name, image in images.items())
+    features, matches = colmap_sift(pictures, max_keypoints=params.max_keypoints, rng=ctx.rng, scratch=ctx.scratch)
+    poses = solve_colmap(
+        features, matches, mapper=params.mapper, cameras=params.cameras, rng=ctx.rng, scratch=ctx.scratch
+    )
+    return checked_poses(poses, ctx)
+
+
+class ExtendParams(Params):
+    """Settings of poses.extend."""
+
+    path: InputPath = Field(description="the known poses: whatever poses.from_model reads")
+    max_error_deg: float = Field(default=0.4, gt=0, description="observations further off are dropped")
+    min_angle_deg: float = Field(default=1.0, gt=0, description="rays of a point must meet at this angle or more")
+
+
+@stage("poses.extend")
+def extend(features: All[Features], matches: All[TwoView], params: ExtendParams, ctx: Context) -> Poses:
+    """Register new pictures against known cameras, which keep their poses to the last digit, with sparse points."""
+    known = known_poses(params.path, tuple(features))
+    poses = extend_poses(
+        known, features, matches, max_error_deg=params.max_error_deg, min_angle_deg=params.min_angle_deg
     )
     return checked_poses(poses, ctx)

@@ -18,6 +18,8 @@ from pano_mvs.algorithms.filters.speckle import remove_speckles
 from pano_mvs.algorithms.fusion.vote import fuse_views
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.poses.colmap import solve_colmap
+from pano_mvs.algorithms.poses.colmap_sift import colmap_sift
+from pano_mvs.algorithms.poses.extension import extend_poses
 from pano_mvs.algorithms.poses.refine import refine_poses
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.poses.tracks import triangulate_tracks
@@ -32,6 +34,8 @@ FUNCTIONS = {
     "features.sphorb": extract_sphorb,
     "poses.scaled_translation": solve_scaled_translation,
     "poses.colmap": solve_colmap,
+    "poses.colmap_sift": colmap_sift,
+    "poses.extend": extend_poses,
     "poses.refine": refine_poses,
     "poses.triangulate": triangulate_tracks,
     "filters.median": median_range,

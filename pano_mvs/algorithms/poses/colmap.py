@@ -10,6 +10,7 @@ import numpy as np
 from pano_mvs.algorithms.poses.colmap_database import Cameras, TwoViews, write_database
 from pano_mvs.algorithms.poses.colmap_mapping import Mapper, poses_from_model, registered_panoramas, run_mapper
 from pano_mvs.algorithms.poses.gauge import normalised_poses
+from pano_mvs.algorithms.poses.reasons import best_pair, why_no_pair
 from pano_mvs.scene import Features, Poses
 
 _SEED_LIMIT = 2**31 - 1
@@ -77,17 +78,14 @@ def _rejected(
                 f"only the largest, of {len(members[0])}, is kept: take pictures in between"
             )
         else:
-            reasons[name] = why_unregistered(name, two_views)
+            reasons[name] = _why_unregistered(name, two_views)
     return reasons
 
 
-def why_unregistered(name: str, two_views: TwoViews) -> str:
-    """Return what the pairs of an image say about its being left out."""
-    tried = [(bool(view), len(view), view.candidates, pair) for pair, view in two_views.items() if name in pair]
-    if not tried:
-        return "it was compared with no other picture"
-    sound, matches, _, pair = max(tried)
+def _why_unregistered(name: str, two_views: TwoViews) -> str:
+    pair = best_pair(name, two_views)
+    if pair is None or not two_views[pair]:
+        return why_no_pair(name, two_views)
     partner = pair[1] if pair[0] == name else pair[0]
-    if not sound:
-        return f"no sound pair; the best partner is {partner!r}: {two_views[pair].reason}"
-    return f"COLMAP did not register it, although its best partner, {partner!r}, shares {matches} verified matches"
+    return (f"COLMAP did not register it, although its best partner, {partner!r}, shares {len(two_views[pair])} "
+            "verified matches")  # fmt: skip
