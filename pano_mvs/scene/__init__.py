@@ -3,6 +3,7 @@
 from pano_mvs.scene.cloud import PointCloud
 from pano_mvs.scene.features import Features
 from pano_mvs.scene.files import Files
+from pano_mvs.scene.global_descriptor import GlobalDescriptor
 from pano_mvs.scene.index import Pairs, Views
 from pano_mvs.scene.panorama import Panorama
 from pano_mvs.scene.poses import Pose, Poses
@@ -16,6 +17,7 @@ __all__ = [
     "Features",
     "FilePart",
     "Files",
+    "GlobalDescriptor",
     "Pairs",
     "Panorama",
     "Part",

@@ -11,7 +11,7 @@ from pano_mvs.stages.filters import bilateral_solver, consistency, fill, gaussia
 from pano_mvs.stages.frame import level, scale
 from pano_mvs.stages.fusion import vote
 from pano_mvs.stages.matches import brute_force
-from pano_mvs.stages.pairs import exhaustive, sequential
+from pano_mvs.stages.pairs import exhaustive, position, retrieval, sequential, vlad
 from pano_mvs.stages.poses import from_model, refine, scaled_translation, triangulate
 from pano_mvs.stages.poses_colmap import colmap_poses, colmap_sift_poses, extend
 from pano_mvs.stages.source import folder
@@ -35,9 +35,11 @@ __all__ = [
     "nearest",
     "orb_tangent",
     "ply",
+    "position",
     "previews",
     "ranges",
     "refine",
+    "retrieval",
     "scale",
     "scaled_translation",
     "sequential",
@@ -47,5 +49,6 @@ __all__ = [
     "sweep",
     "triangulate",
     "truth",
+    "vlad",
     "vote",
 ]

@@ -7,6 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from pano_mvs.algorithms.matching.brute_force import match_features
+from pano_mvs.algorithms.matching.preemptive import hopeless_reason
 from pano_mvs.algorithms.two_view.verification import verify_pair
 from pano_mvs.api import Context, Features, Near, Params, TwoView, stage
 
@@ -16,6 +17,11 @@ class BruteForceParams(Params):
 
     ratio: float = Field(default=0.8, gt=0, le=1, description="best distance over second best, at most")
     mutual: bool = Field(default=True, description="only pairs that are each other's best")
+    preemptive: int = Field(
+        default=0,
+        ge=0,
+        description="leave a pair out if so many strongest key points hardly match (400, say); 0: never",
+    )
     threshold_deg: float = Field(default=0.2, gt=0, le=10, description="angular Sampson error of a match that agrees")
     min_inliers: int = Field(default=20, ge=8, description="agreeing matches that a pair needs")
     solver: Literal["five_point", "eight_point"] = Field(
@@ -28,6 +34,8 @@ class BruteForceParams(Params):
 def brute_force(features: Near[Features], params: BruteForceParams, ctx: Context) -> TwoView:
     """Match all descriptors (ratio and mutual test), then verify by spherical RANSAC."""
     first, second = features
+    if reason := hopeless_reason(first, second, preemptive=params.preemptive):
+        return TwoView.failed(reason)
     candidates = match_features(first, second, ratio=params.ratio, mutual=params.mutual)
     two_view = verify_pair(
         first,

@@ -17,6 +17,9 @@ from pano_mvs.algorithms.filters.median import median_range
 from pano_mvs.algorithms.filters.speckle import remove_speckles
 from pano_mvs.algorithms.fusion.vote import fuse_views
 from pano_mvs.algorithms.matching.brute_force import match_features
+from pano_mvs.algorithms.matching.neighbours import loop_closing_pairs, position_pairs, retrieval_pairs
+from pano_mvs.algorithms.matching.preemptive import hopeless_reason
+from pano_mvs.algorithms.matching.vlad import vlad_descriptor
 from pano_mvs.algorithms.poses.colmap import solve_colmap
 from pano_mvs.algorithms.poses.colmap_sift import colmap_sift
 from pano_mvs.algorithms.poses.extension import extend_poses
@@ -32,6 +35,10 @@ FUNCTIONS = {
     "features.sift_tangent": extract_sift,
     "features.orb_tangent": extract_orb,
     "features.sphorb": extract_sphorb,
+    "pairs.sequential": loop_closing_pairs,
+    "pairs.position": position_pairs,
+    "pairs.retrieval": retrieval_pairs,
+    "global.vlad": vlad_descriptor,
     "poses.scaled_translation": solve_scaled_translation,
     "poses.colmap": solve_colmap,
     "poses.colmap_sift": colmap_sift,
@@ -68,7 +75,7 @@ def test_defaults_are_those_of_the_algorithm(name: str) -> None:
 
 
 def test_matcher_and_sweep_and_views_too() -> None:
-    matcher = function_defaults(match_features) | function_defaults(verify_pair)
+    matcher = function_defaults(match_features) | function_defaults(hopeless_reason) | function_defaults(verify_pair)
     ours = stage_defaults("matches.brute_force")
     assert ours == {key: matcher[key] for key in ours}
     sweep = stage_defaults("depth.sweep")

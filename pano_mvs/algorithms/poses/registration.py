@@ -147,6 +147,10 @@ class GrowingModel:
         known = np.isfinite(points[:, 0])
         return points[known], self.tracks.bearings[observations[known]]
 
+    def known_count(self, image: int) -> int:
+        """Return how many triangulated points an image's tracks contain."""
+        return int(np.isfinite(self._points[self.tracks.track_idx[self._track_of_image[image]], 0]).sum())
+
     def known_counts(self) -> NDArray[np.intp]:
         """Return how many triangulated points the tracks of each image contain, (N,)."""
         known = np.isfinite(self._points[self.tracks.track_idx, 0])

@@ -1,0 +1,175 @@
+"""Which pairs of images to match, from where they were taken or from what they look like."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import minimum_spanning_tree
+
+from pano_mvs.algorithms.matching.pairs import sequential_pairs
+from pano_mvs.algorithms.poses.geodesy import local_from_lla
+from pano_mvs.core.errors import UsageError
+from pano_mvs.scene import GlobalDescriptor, Pairs
+
+FloatArray = NDArray[np.float64]
+
+
+def position_pairs(
+    names: Sequence[str], positions: Mapping[str, FloatArray], *, neighbours: int = 10, window: int = 3
+) -> Pairs:
+    """Return every image with its nearest ones, so that all hang together.
+
+    A pair is listed if either image is among the nearest of the other. Where that leaves groups apart, the shortest
+    links that join them are added.
+
+    Args:
+        names: image names in the capture's order.
+        positions: image name to position, (2,) or (3,), all in one frame and unit; some may be missing.
+        neighbours: so many nearest images each.
+        window: an image without position is paired with so many before and after it in the capture's order.
+
+    Raises:
+        UsageError: if a number of neighbours is less than 1.
+    """
+    _require_positive(neighbours=neighbours, window=window)
+    known = np.array([idx for idx, name in enumerate(names) if name in positions], np.intp)
+    places = np.array([positions[names[idx]] for idx in known], np.float64)
+    found = (
+        known[nearest_links(_squared_distances(places), neighbours)] if len(known) > 1 else np.zeros((0, 2), np.intp)
+    )
+    lost = set(range(len(names))) - set(known.tolist())
+    beside = {
+        (min(idx, other), max(idx, other))
+        for idx in lost
+        for other in range(max(0, idx - window), min(len(names), idx + window + 1))
+        if other != idx
+    }
+    return _named(names, beside | {(a, b) for a, b in found.tolist()})
+
+
+def retrieval_pairs(
+    names: Sequence[str], descriptors: Mapping[str, GlobalDescriptor], *, neighbours: int = 20
+) -> Pairs:
+    """Return every image with those that look most like it, so that all hang together.
+
+    A pair is listed if either image is among the most similar of the other. Where that leaves groups apart, the most
+    similar links that join them are added.
+
+    Args:
+        names: image names in the capture's order.
+        descriptors: image name to its global descriptor; those without one are paired with none.
+        neighbours: so many most similar images each.
+
+    Raises:
+        UsageError: if the number of neighbours is less than 1.
+    """
+    _require_positive(neighbours=neighbours)
+    known = [name for name in names if name in descriptors]
+    if len(known) < 2:
+        return Pairs(())
+    return _named(known, {(a, b) for a, b in nearest_links(_dissimilarities(known, descriptors), neighbours).tolist()})
+
+
+def loop_closing_pairs(
+    names: Sequence[str],
+    descriptors: Mapping[str, GlobalDescriptor],
+    *,
+    window: int = 5,
+    loop: bool = False,
+    loop_closure: int = 0,
+) -> Pairs:
+    """Return the sequential pairs and, for every image, those with the most similar images outside its window.
+
+    Args:
+        names: image names in the order in which they were taken.
+        descriptors: image name to its global descriptor.
+        window: each image is paired with so many that follow it.
+        loop: whether the last images are followed by the first.
+        loop_closure: number of similar images beyond the window to pair each image with.
+
+    Raises:
+        UsageError: if the window is less than 1.
+    """
+    pairs = set(sequential_pairs(names, window=window, loop=loop).pairs)
+    known = [name for name in names if name in descriptors]
+    if loop_closure and len(known) > 1:
+        place = {name: idx for idx, name in enumerate(names)}
+        number = {name: idx for idx, name in enumerate(known)}
+        apart = _dissimilarities(known, descriptors)
+        for a, b in pairs:
+            if a in number and b in number:
+                apart[number[a], number[b]] = apart[number[b], number[a]] = np.inf
+        links = _nearest(apart, loop_closure)
+        pairs |= {(known[a], known[b]) for a, b in links.tolist()}
+        return Pairs(tuple(sorted(pairs, key=lambda pair: (place[pair[0]], place[pair[1]]))))
+    return sequential_pairs(names, window=window, loop=loop)
+
+
+def nearest_links(distances: FloatArray, neighbours: int) -> NDArray[np.intp]:
+    """Return the links of each item to its nearest ones, and the shortest that join what would be apart.
+
+    Args:
+        distances: (N, N) symmetric, not negative.
+        neighbours: number of nearest items.
+
+    Returns:
+        (M, 2) positions, first before second, sorted, no link twice.
+    """
+    links = _nearest(distances, neighbours)
+    # A zero is no edge to scipy; what is linked already costs less than anything else.
+    cost = distances - distances.min() + distances.max() + 1.0
+    np.fill_diagonal(cost, 0)
+    cost[links[:, 0], links[:, 1]] = cost[links[:, 1], links[:, 0]] = 1e-3
+    tree = minimum_spanning_tree(csr_array(np.triu(cost))).tocoo()
+    joined = np.stack([np.minimum(tree.row, tree.col), np.maximum(tree.row, tree.col)], axis=1)
+    return np.unique(np.concatenate([links, joined]), axis=0)
+
+
+def east_north_m(positions_lla: Sequence[tuple[float, float, float]]) -> FloatArray:
+    """Return GPS positions as metres east and north of their mean, (N, 2), on its tangent plane.
+
+    Heights are left out: those of GPS are off by tens of metres, or missing and stored as zero.
+
+    Args:
+        positions_lla: latitude and longitude in degrees, altitude in metres.
+    """
+    if not positions_lla:
+        return np.zeros((0, 2))
+    east_down_north = local_from_lla(positions_lla, np.mean(positions_lla, axis=0))
+    return np.asarray(east_down_north[:, [0, 2]], np.float64)
+
+
+def _nearest(distances: FloatArray, neighbours: int) -> NDArray[np.intp]:
+    """Return links (first < second) of each item to its nearest; infinite distances are no links."""
+    apart = distances.copy()
+    np.fill_diagonal(apart, np.inf)
+    order = np.argsort(apart, axis=1, kind="stable")[:, :neighbours]
+    rows = np.repeat(np.arange(len(apart)), order.shape[1])
+    columns = order.ravel()
+    finite = np.isfinite(apart[rows, columns])
+    links = np.sort(np.stack([rows[finite], columns[finite]], axis=1), axis=1)
+    return np.unique(links, axis=0)
+
+
+def _squared_distances(places: FloatArray) -> FloatArray:
+    return np.asarray(np.sum([np.subtract.outer(axis, axis) ** 2 for axis in places.T], axis=0), np.float64)
+
+
+def _dissimilarities(names: Sequence[str], descriptors: Mapping[str, GlobalDescriptor]) -> FloatArray:
+    """Return how little alike images are, (N, N), not negative; whole numbers, so that no order of adding shows."""
+    vectors = np.array([descriptors[name].vector for name in names], np.float32)
+    alike = (vectors @ vectors.T).astype(np.float64)
+    return np.asarray(alike.max() - alike, np.float64)
+
+
+def _named(names: Sequence[str], links: set[tuple[int, int]]) -> Pairs:
+    return Pairs(tuple((names[first], names[second]) for first, second in sorted(links)))
+
+
+def _require_positive(**numbers: int) -> None:
+    for name, number in numbers.items():
+        if number < 1:
+            raise UsageError(f"{name} must be at least 1, got {number}")

@@ -1,0 +1,42 @@
+"""A quick look at a pair before all its descriptors are matched."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from pano_mvs.algorithms.matching.brute_force import match_features
+from pano_mvs.scene import Features
+
+_RATIO = 0.8
+_MIN_SHARE, _MIN_MATCHES = 0.02, 4
+
+
+def hopeless_reason(first: Features, second: Features, *, preemptive: int = 0) -> str:
+    """Return why a pair is not worth matching, by its strongest key points alone; "" if it may be.
+
+    Wu, "Towards Linear-time Incremental Structure from Motion", 2013, section 3: most pairs of a large set show
+    nothing in common, which some hundred key points tell.
+
+    Args:
+        first: key points of the first picture, strongest first.
+        second: of the second picture.
+        preemptive: how many to look at; 0 looks at none, and gives every pair a chance.
+    """
+    if not preemptive or min(len(first), len(second)) <= preemptive:
+        return ""
+    found = len(match_features(_strongest(first, preemptive), _strongest(second, preemptive), ratio=_RATIO))
+    needed = max(_MIN_MATCHES, int(_MIN_SHARE * preemptive))
+    if found >= needed:
+        return ""
+    return f"only {found} of their {preemptive} strongest key points match, {needed} needed for a closer look"
+
+
+def _strongest(features: Features, count: int) -> Features:
+    return replace(
+        features,
+        bearings=features.bearings[:count],
+        descriptors=features.descriptors[:count],
+        sizes_rad=features.sizes_rad[:count],
+        scores=features.scores[:count],
+        colors_rgb=features.colors_rgb[:count],
+    )
