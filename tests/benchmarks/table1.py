@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -24,19 +25,21 @@ from pano_mvs.algorithms.features.sphorb import extract_sphorb
 from pano_mvs.algorithms.features.tangent import extract_sift
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.poses.refine import refine_poses
-from pano_mvs.algorithms.poses.scale import ScaleEstimator
+from pano_mvs.algorithms.poses.scale import ScaleEstimator, estimate_scale
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.two_view import verify_pair
 from pano_mvs.algorithms.two_view.hypotheses import Solver
-from pano_mvs.geometry import Rigid3, angle_between, rotation_from_rotvec
-from pano_mvs.scene import Features, Poses, TwoView
+from pano_mvs.geometry import Rigid3, angle_between, ranges_from_bearings, rotation_from_rotvec
+from pano_mvs.scene import Features, TwoView
 from pano_mvs.testing.room import Room, render
 from pano_mvs.testing.surfaces import Ball, Cuboid, Quad
+
+Pair = tuple[str, str]
 
 BASELINE = 0.4
 NOISE = 2.0
 MAX_TURN_DEG = 35.0
-VIEWS = 5
+KAPPA = 0.01
 COLUMNS = ("roll °", "pitch °", "yaw °", "direction °", "scale 2 %", "scale 3 %", "scale 4 %")
 BARS = (0.01, 0.01, 0.01, 0.03, 0.1, 0.1, 0.1)
 PAPER = "a bias of up to 0.3° and a std of 0.08–0.17° in rotation, 2–3° in direction, 5–12 % std in scale"
@@ -63,22 +66,31 @@ SETS = (
 
 
 @dataclass(frozen=True)
-class Preset:
-    """How poses are found."""
+class Pairing:
+    """How pairs of pictures are matched and verified."""
 
-    features: str
     ratio: float
     mutual: bool
     solver: Solver
     refine: bool
+
+
+@dataclass(frozen=True)
+class Preset:
+    """How poses are found: pairs, and what joins them ("literal" is the paper's way, see `literal_cameras`)."""
+
+    pairing: Pairing
     estimator: ScaleEstimator
-    adjust: bool
+    joined: Literal["literal", "chained", "adjusted"]
 
 
+PAPER_PAIRS = Pairing(0.75, mutual=False, solver="eight_point", refine=False)
+OUR_PAIRS = Pairing(0.8, mutual=True, solver="five_point", refine=True)
 PRESETS = {
-    "a: the paper, literally (SPHORB)": Preset("sphorb", 0.75, False, "eight_point", False, "kappa", False),
-    "b: SIFT, refined pairs, chained": Preset("sift", 0.8, True, "five_point", True, "cauchy", False),
-    "c: SIFT, adjusted and refined": Preset("sift", 0.8, True, "five_point", True, "cauchy", True),
+    "0: the paper, pair by pair": Preset(PAPER_PAIRS, "kappa", "literal"),
+    "a: the paper's pairs, our chain": Preset(PAPER_PAIRS, "kappa", "chained"),
+    "b: SIFT, refined pairs, our chain": Preset(OUR_PAIRS, "cauchy", "chained"),
+    "c: SIFT, adjusted and refined": Preset(OUR_PAIRS, "cauchy", "adjusted"),
 }
 
 
@@ -137,22 +149,60 @@ def clean_pictures(number: int, width: int, folder: Path | None) -> list[np.ndar
     return pictures
 
 
-def estimated_poses(features: dict[str, Features], preset: Preset, rng: np.random.Generator) -> Poses:
-    """Return what a preset makes of the features of five pictures."""
-    views: dict[tuple[str, str], TwoView] = {}
+def pairs_of(features: dict[str, Features], pairing: Pairing, rng: np.random.Generator) -> dict[Pair, TwoView]:
+    """Return the verified pairs of all pictures."""
+    views: dict[Pair, TwoView] = {}
     for first, second in combinations(features, 2):
         one, two = features[first], features[second]
-        matches = match_features(one, two, ratio=preset.ratio, mutual=preset.mutual)
-        views[first, second] = verify_pair(one, two, matches, rng=rng, solver=preset.solver, refine=preset.refine)
-    poses = solve_scaled_translation(features, views, scale_estimator=preset.estimator, adjust=preset.adjust, rng=rng)
-    return refine_poses(poses) if preset.adjust else poses
+        matches = match_features(one, two, ratio=pairing.ratio, mutual=pairing.mutual)
+        views[first, second] = verify_pair(one, two, matches, rng=rng, solver=pairing.solver, refine=pairing.refine)
+    return views
 
 
-def errors(poses: Poses, truth: Sequence[Rigid3]) -> list[float]:
+def cameras_of(
+    features: dict[str, Features], views: dict[Pair, TwoView], preset: Preset, rng: np.random.Generator
+) -> list[Rigid3]:
+    """Return what a preset makes of five pictures: each camera from the first one; fewer if one was lost."""
+    if preset.joined == "literal":
+        return literal_cameras(features, views)
+    adjust = preset.joined == "adjusted"
+    poses = solve_scaled_translation(features, views, scale_estimator=preset.estimator, adjust=adjust, rng=rng)
+    poses = refine_poses(poses) if adjust else poses
+    cameras = [poses.cam_from_world(idx) for idx in range(len(poses.names))]
+    return [camera @ cameras[0].inverse() for camera in cameras]
+
+
+def literal_cameras(features: dict[str, Features], views: dict[Pair, TwoView]) -> list[Rigid3]:
+    """Return the paper's own reading: the pairs of view 0 as they are, each at its κ scale factor to the first."""
+    first, *others = features
+    pairs = [views[first, other] for other in others]
+    if not all(pairs):
+        return []
+    ranges = [
+        range_by_feature(features[first], features[other], view) for other, view in zip(others, pairs, strict=True)
+    ]
+    cameras = [Rigid3.identity()]
+    for view, found in zip(pairs, ranges, strict=True):
+        ratios = ranges[0] / found
+        ratios = ratios[np.isfinite(ratios) & (ranges[0] > 0) & (found > 0)]
+        scale = estimate_scale(ratios, np.ones(len(ratios)), estimator="kappa", kappa=KAPPA)
+        cameras.append(Rigid3(view.rotation, scale * view.direction))
+    return cameras
+
+
+def range_by_feature(first: Features, second: Features, view: TwoView) -> np.ndarray:
+    """Return the range of each key point of the first picture in units of the pair's baseline, NaN if not matched."""
+    one, two = view.matches_idx.T
+    ranges = np.full(len(first), np.nan)
+    pose = Rigid3(view.rotation, view.direction)
+    ranges[one] = ranges_from_bearings(first.bearings[one], second.bearings[two], pose)[0]
+    return ranges
+
+
+def errors(cameras: Sequence[Rigid3], truth: Sequence[Rigid3]) -> list[float]:
     """Return the errors in the order of COLUMNS; infinite where a picture was not registered."""
-    if len(poses.names) < len(truth):
+    if len(cameras) < len(truth):
         return [np.inf] * len(COLUMNS)
-    cameras = [poses.cam_from_world(idx) @ poses.cam_from_world(0).inverse() for idx in range(len(truth))]
     angles = angles_from_rotation(cameras[1].rotation) - angles_from_rotation(truth[1].rotation)
     direction = np.rad2deg(angle_between(cameras[1].translation, truth[1].translation))
     lengths, true_lengths = (np.array([np.linalg.norm(pose.translation) for pose in p[1:]]) for p in (cameras, truth))
@@ -168,12 +218,12 @@ def run_set(number: int, *, trials: int, width: int, folder: Path | None) -> dic
         rng = np.random.default_rng([number, trial])
         noisy = [np.clip(np.rint(p + rng.normal(0, NOISE, p.shape)), 0, 255).astype(np.uint8) for p in clean]
         mask = np.ones(noisy[0].shape[:2], np.bool_)
-        features = {
-            kind: {f"{idx}": extract(picture, mask) for idx, picture in enumerate(noisy)}
-            for kind, extract in (("sphorb", extract_sphorb), ("sift", extract_sift))
-        }
-        for name, preset in PRESETS.items():
-            found[name].append(errors(estimated_poses(features[preset.features], preset, rng), truth))
+        for pairing, extract in ((PAPER_PAIRS, extract_sphorb), (OUR_PAIRS, extract_sift)):
+            features = {f"{idx}": extract(picture, mask) for idx, picture in enumerate(noisy)}
+            views = pairs_of(features, pairing, rng)
+            for name, preset in PRESETS.items():
+                if preset.pairing is pairing:
+                    found[name].append(errors(cameras_of(features, views, preset, rng), truth))
     return {name: np.array(rows) for name, rows in found.items()}
 
 

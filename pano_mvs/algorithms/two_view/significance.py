@@ -69,7 +69,14 @@ def independent_count(first: FloatArray, second: FloatArray, *, cell_rad: float 
         second: (M, 3) unit bearings.
         cell_rad: width of a cell.
     """
-    return min(len(np.unique(np.floor(bearings / cell_rad).astype(np.int64), axis=0)) for bearings in (first, second))
+    return min(_cells(bearings, cell_rad) for bearings in (first, second))
+
+
+def _cells(bearings: FloatArray, cell_rad: float) -> int:
+    """Return in how many cells bearings lie; one number names a cell, since rows of three are slow to sort."""
+    cells = np.floor(bearings / cell_rad).astype(np.int64)
+    side = 2 * int(np.ceil(1 / cell_rad)) + 3
+    return len(np.unique(cells @ np.array([side * side, side, 1])))
 
 
 def _log_binomial(n: int, k: int) -> float:
