@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,10 +12,10 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.geometry import pixel_from_ray, ray_from_pixel
 from pano_mvs.io.captures import natural_key
+from pano_mvs.io.colmap_sphere import has_sphere_cameras, read_sphere_model
 from pano_mvs.scene import Poses
 
 _MODEL_FILES = (("cameras.bin", "images.bin", "points3D.bin"), ("cameras.txt", "images.txt", "points3D.txt"))
-_SPHERESFM_CAMERA = struct.Struct("<IiQQ3d")  # SphereSfM's SPHERE: id 11 as well, but three parameters (f, cx, cy)
 
 
 def write_colmap_model(folder: Path, poses: Poses, sizes_hw: Mapping[str, tuple[int, int]]) -> None:
@@ -62,12 +61,16 @@ def write_colmap_model(folder: Path, poses: Poses, sizes_hw: Mapping[str, tuple[
 def read_colmap_model(folder: Path) -> Poses:
     """Return the registered images, points and tracks of a COLMAP model of panoramas, in its own world and unit.
 
+    Of SphereSfM's models, whose cameras are SPHERE, the poses alone are read.
+
     Args:
         folder: holds cameras, images and points3D as .bin or .txt; images come in the natural order of their names.
 
     Raises:
         InputError: if the model cannot be read, has a camera that is no EQUIRECTANGULAR, or registers no image.
     """
+    if is_colmap_model(folder) and has_sphere_cameras(folder):
+        return read_sphere_model(folder)
     model = _loaded(folder)
     for camera_id, camera in sorted(model.cameras.items()):
         if camera.model_name != "EQUIRECTANGULAR":
@@ -134,24 +137,10 @@ def _loaded(folder: Path) -> Any:
     if not is_colmap_model(folder):
         raise InputError(f"{folder}: no COLMAP model here. Give the folder that holds cameras, images and points3D as "
                          ".bin or .txt (often sparse/0)")  # fmt: skip
-    if _is_spheresfm(folder / "cameras.bin"):
-        raise InputError(f"{folder}: the cameras are SphereSfM's SPHERE, whose number means another camera in COLMAP. "
-                         "Change them to EQUIRECTANGULAR: export the model as text and write width and height as "
-                         "their two parameters")  # fmt: skip
     try:
         return pycolmap.Reconstruction(str(folder))
     except (RuntimeError, ValueError, IndexError, MemoryError) as error:
         raise InputError(f"{folder}: the COLMAP model cannot be read ({error}). Is it complete?") from error
-
-
-def _is_spheresfm(cameras: Path) -> bool:
-    if not cameras.is_file():
-        return False
-    data = cameras.read_bytes()
-    count = (len(data) - 8) // _SPHERESFM_CAMERA.size
-    if len(data) < 8 or len(data) != 8 + count * _SPHERESFM_CAMERA.size or count == 0:
-        return False
-    return bool(struct.unpack_from("<Q", data)[0] == count and _SPHERESFM_CAMERA.unpack_from(data, 8)[1] == 11)
 
 
 def _observations(model: Any, image: Any, point_idx: dict[int, int]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:

@@ -10,19 +10,29 @@ import numpy as np
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
 from pano_mvs.io.colmap_model import is_colmap_model, read_colmap_model
-from pano_mvs.io.pose_json import read_json, read_posed_views, read_transforms, require_distinct, rigid_from_arrays
+from pano_mvs.io.opensfm import is_opensfm, opensfm_poses
+from pano_mvs.io.pose_json import (
+    read_json_value,
+    read_posed_views,
+    read_transforms,
+    require_distinct,
+    require_object,
+    rigid_from_arrays,
+)
 from pano_mvs.scene import Poses
 
 CSV_HEADER = ("name", "tx", "ty", "tz", "qw", "qx", "qy", "qz")
-_IN_A_FOLDER = ("transforms.json", "poses.json", "truth/poses.json", "poses.csv")
+_IN_A_FOLDER = ("transforms.json", "poses.json", "truth/poses.json", "poses.csv", "reconstruction.json")
 
 
 def read_poses(path: Path) -> Poses:
     """Return the poses in a file or folder. Image names are as written there: `match_image_names` pairs them.
 
     Understood are
-      * a folder with a COLMAP model of EQUIRECTANGULAR cameras (.bin or .txt), or with one in sparse/0;
+      * a folder with a COLMAP model of EQUIRECTANGULAR cameras (.bin or .txt), or with one in sparse/0; SphereSfM's,
+        with its SPHERE cameras, without its points;
       * nerfstudio's transforms.json (camera_model EQUIRECTANGULAR);
+      * OpenSfM's reconstruction.json with a spherical camera, of several reconstructions the largest;
       * our own poses.json: {"metric": true, "views": [{"image": …, "R": 3 × 3, "t": 3}]}, cam_from_world;
       * a CSV file whose first line is name,tx,ty,tz,qw,qx,qy,qz: cam_from_world as x_in_cam = R(q) x_in_world + t in
         the camera frame x right, y down, z forward; quaternions of any length; empty lines and lines that begin
@@ -34,20 +44,25 @@ def read_poses(path: Path) -> Poses:
     if path.is_dir():
         return _poses_from_folder(path)
     if not path.exists():
-        raise InputError(f"{path}: no such file or folder. Give a COLMAP model, a transforms.json, a poses.json or a "
-                         "CSV file")  # fmt: skip
+        raise InputError(f"{path}: no such file or folder. Give a COLMAP model, a transforms.json, a "
+                         "poses.json, a reconstruction.json or a CSV file")  # fmt: skip
     suffix = path.suffix.lower()
     if suffix == ".csv":
         return _from_file(read_csv(path), path, metric=False)
     if suffix != ".json":
         raise InputError(f"{path}: poses are read from a COLMAP model (its folder), .json and .csv, not {suffix!r}")
-    data = read_json(path)
+    value = read_json_value(path)
+    if is_opensfm(value):
+        poses, metric = opensfm_poses(value, path)
+        return _from_file(poses, path, metric=metric)
+    data = require_object(value, path)
     if "frames" in data:
         return _from_file(read_transforms(path), path, metric=False)
     if "views" in data:
         views, metric = read_posed_views(path)
         return _from_file({view.name: view.cam_from_world for view in views}, path, metric=metric)
-    raise InputError(f"{path}: neither key 'frames' (nerfstudio) nor key 'views' (pano-mvs): no poses here")
+    raise InputError(f"{path}: neither key 'frames' (nerfstudio) nor key 'views' (pano-mvs), nor a list with 'shots' "
+                     "(OpenSfM): no poses here")  # fmt: skip
 
 
 def read_csv(path: Path) -> dict[str, Rigid3]:

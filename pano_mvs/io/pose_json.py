@@ -41,14 +41,27 @@ def read_json(path: Path) -> dict[str, Any]:
     Raises:
         InputError: if the file cannot be read or holds no JSON object.
     """
+    return require_object(read_json_value(path), path)
+
+
+def read_json_value(path: Path) -> Any:
+    """Return what a JSON file holds, of whatever type.
+
+    Raises:
+        InputError: if the file cannot be read or is no JSON.
+    """
     try:
-        value = json.loads(path.read_text(encoding="utf-8-sig"))
+        return json.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
     except json.JSONDecodeError as error:
         raise InputError(f"{path}:{error.lineno}:{error.colno}: not JSON ({error.msg})") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not a text file in UTF-8") from error
+
+
+def require_object(value: Any, path: Path) -> dict[str, Any]:
+    """Return a JSON value after checking that it is an object, or raise InputError."""
     if not isinstance(value, dict):
         raise InputError(f"{path}: expected a JSON object, got {type(value).__name__}")
     return value
@@ -93,7 +106,7 @@ def read_transforms(path: Path) -> dict[str, Rigid3]:
         if model != "EQUIRECTANGULAR":
             raise InputError(f"{where} ({name}): camera_model is {model}, expected EQUIRECTANGULAR. Only panoramas "
                              "can be used")  # fmt: skip
-        matrix = _array(frame, "transform_matrix", (4, 4), where)
+        matrix = number_array(frame, "transform_matrix", (4, 4), where)
         world_from_cam = rigid_from_arrays(matrix[:3, :3] @ _CAM_FROM_OPENGL, matrix[:3, 3], where)
         poses.append((name, world_from_cam.inverse()))
     require_distinct([name for name, _ in poses], path)
@@ -129,7 +142,9 @@ def require_distinct(names: list[str], path: Path) -> None:
 
 def _posed_view(entry: Any, where: str) -> PosedView:
     name = _name(entry, "image", where)
-    pose = rigid_from_arrays(_array(entry, "R", (3, 3), where), _array(entry, "t", (3,), where), f"{where} ({name})")
+    pose = rigid_from_arrays(
+        number_array(entry, "R", (3, 3), where), number_array(entry, "t", (3,), where), f"{where} ({name})"
+    )
     number, digest = entry.get("id"), entry.get("sha256")
     return PosedView(name, pose, number if type(number) is int else None, digest if isinstance(digest, str) else None)
 
@@ -143,7 +158,12 @@ def _name(entry: Any, key: str, where: str) -> str:
     return name.replace("\\", "/").removeprefix("./")
 
 
-def _array(entry: dict[str, Any], key: str, shape: tuple[int, ...], where: str) -> NDArray[np.float64]:
+def number_array(entry: dict[str, Any], key: str, shape: tuple[int, ...], where: str) -> NDArray[np.float64]:
+    """Return the numbers under a key of a JSON object as an array.
+
+    Raises:
+        InputError: beginning with `where`, if they have not that shape.
+    """
     try:
         array = np.array(entry.get(key), dtype=np.float64)
     except (TypeError, ValueError):

@@ -1,7 +1,6 @@
 """COLMAP models: pycolmap reads what we write, and we read what COLMAP writes."""
 
 import dataclasses
-import struct
 import subprocess
 import sys
 
@@ -157,14 +156,6 @@ def test_other_cameras_are_refused(tmp_path):
 def test_a_model_without_images_is_refused(tmp_path):
     pycolmap.Reconstruction().write_binary(str(tmp_path))
     with pytest.raises(InputError, match="registers no image"):
-        read_colmap_model(tmp_path)
-
-
-def test_spheresfms_camera_is_told_by_its_number_of_parameters(model_folder, tmp_path):
-    for name in ("images", "points3D"):
-        (tmp_path / f"{name}.bin").write_bytes((model_folder / f"{name}.bin").read_bytes())
-    (tmp_path / "cameras.bin").write_bytes(struct.pack("<QIiQQ3d", 1, 1, 11, 1024, 512, 1.0, 512.0, 256.0))
-    with pytest.raises(InputError, match="SphereSfM's SPHERE"):
         read_colmap_model(tmp_path)
 
 
