@@ -63,9 +63,13 @@ class Poses(Record):
         frame: what the world frame is, in words.
         scale: where the unit of length comes from, in words.
         metric: whether the unit of length is the metre.
+        center_stds: (N,) float64 standard deviation of each camera's centre, scene units, relative to the first camera
+            and the first baseline, from noise in the rays alone; NaN where nothing is known; None if not computed.
+        rotation_stds_rad: (N,) float64 likewise of each camera's rotation.
     """
 
     axis: ClassVar[Axis | None] = Axis.ONE
+    kind_version: ClassVar[int] = 2
     explodes_into: ClassVar[type[Record] | None] = Pose
 
     names: tuple[str, ...]
@@ -81,6 +85,8 @@ class Poses(Record):
     frame: str = "the first registered camera"
     scale: str = "the first reference–neighbour baseline is 1"
     metric: bool = False
+    center_stds: NDArray[np.float64] | None = None
+    rotation_stds_rad: NDArray[np.float64] | None = None
 
     @staticmethod
     def without_points(
@@ -135,6 +141,9 @@ class Poses(Record):
         require_array(self, "track_point_idx", dtype=np.int32, shape=(tracks,))
         require_array(self, "track_image_idx", dtype=np.int32, shape=(tracks,))
         require_array(self, "track_bearings", dtype=np.float64, shape=(tracks, 3))
+        for name in ("center_stds", "rotation_stds_rad"):
+            if getattr(self, name) is not None:
+                require_array(self, name, dtype=np.float64, shape=(images,), finite=False)
         if tracks:
             require(
                 0 <= self.track_point_idx.min() <= self.track_point_idx.max() < points, self, "a track has no point"

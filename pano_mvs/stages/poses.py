@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 from pydantic import Field
 
 from pano_mvs.algorithms.poses.refine import refine_poses
@@ -78,6 +79,9 @@ def refine(poses: One[Poses], params: RefineParams, ctx: Context) -> Poses:
         max_error_deg=params.max_error_deg,
         max_iterations=params.max_iterations,
     )
+    if refined.center_stds is not None and refined.rotation_stds_rad is not None:
+        ctx.metric("center_std_median", np.nanmedian(refined.center_stds))
+        ctx.metric("rotation_std_median_deg", np.rad2deg(np.nanmedian(refined.rotation_stds_rad)))
     return checked_poses(refined, ctx)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError
 
-from pano_mvs.algorithms.poses.camera_system import camera_order, camera_span, held, solve_cameras
+from pano_mvs.algorithms.poses.camera_system import camera_order, camera_solver, camera_span, held
 from pano_mvs.algorithms.two_view.refinement import tangent_basis
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import rotation_from_rotvec
@@ -80,13 +80,13 @@ def adjust_bundle(
     order = camera_order(bundle.point_idx, bundle.image_idx, len(bundle.centers))
     place = np.argsort(order)
     ordered = _adjust_ordered(
-        _with_cameras(bundle, order, place), loss=loss, scale_rad=scale_rad, max_iterations=max_iterations,
+        with_camera_order(bundle, order, place), loss=loss, scale_rad=scale_rad, max_iterations=max_iterations,
         fixed_camera=int(place[fixed_camera]),
     )  # fmt: skip
-    return _with_cameras(ordered, place, order)
+    return with_camera_order(ordered, place, order)
 
 
-def _with_cameras(bundle: Bundle, order: NDArray[np.intp], place: NDArray[np.intp]) -> Bundle:
+def with_camera_order(bundle: Bundle, order: NDArray[np.intp], place: NDArray[np.intp]) -> Bundle:
     """Return the bundle with its cameras in another order; place[order[n]] is n."""
     return replace(
         bundle,
@@ -97,12 +97,11 @@ def _with_cameras(bundle: Bundle, order: NDArray[np.intp], place: NDArray[np.int
 
 
 def _adjust_ordered(bundle: Bundle, *, loss: Loss, scale_rad: float, max_iterations: int, fixed_camera: int) -> Bundle:
-    bases = tangent_basis(bundle.bearings)
     errors = bundle.errors_rad()
     cost, damping = robust_cost(errors, loss=loss, scale_rad=scale_rad), 1e-4
     for _ in range(max_iterations):
         weights = robust_weights(errors, loss=loss, scale_rad=scale_rad)
-        moved = _step(bundle, bases, weights, damping=damping, fixed_camera=fixed_camera)
+        moved = _step(bundle, weights, damping=damping, fixed_camera=fixed_camera)
         moved_errors = moved.errors_rad()
         moved_cost = robust_cost(moved_errors, loss=loss, scale_rad=scale_rad)
         if not moved_cost < cost:
@@ -132,30 +131,59 @@ def robust_cost(errors_rad: FloatArray, *, loss: Loss, scale_rad: float) -> floa
     return float(np.sum(np.where(relative < 1, relative**2, 2 * relative - 1)))
 
 
-def _step(bundle: Bundle, bases: FloatArray, weights: FloatArray, *, damping: float, fixed_camera: int) -> Bundle:
-    """Return the bundle after one damped step."""
+@dataclass(frozen=True, eq=False)
+class ReducedCameras:
+    """The system of the cameras after elimination of the points, and what gets the points back.
+
+    Attributes:
+        band: (6N, width), see `camera_system`.
+        gradient: (6N,).
+        diagonal: (6N,) of the cameras' own blocks, before elimination.
+        couplings: (T, 6, 3) of camera and point of every observation.
+        inverses: (P, 3, 3) of the points' own blocks.
+        point_gradients: (P, 3).
+    """
+
+    band: FloatArray
+    gradient: FloatArray
+    diagonal: FloatArray
+    couplings: FloatArray
+    inverses: FloatArray
+    point_gradients: FloatArray
+
+
+def reduced_cameras(bundle: Bundle, weights: FloatArray, *, damping: float) -> ReducedCameras:
+    """Return the cameras' system of a weighted bundle; points are damped, cameras are not."""
     # Importing numba takes most of a second; who adjusts nothing does not pay for it.
     from pano_mvs.algorithms.poses.kernels_bundle import reduced_system
 
     starts = np.searchsorted(bundle.point_idx, np.arange(len(bundle.points) + 1))
     width = 6 * (camera_span(starts, bundle.image_idx) + 1)
-    band, gradient, diagonal, couplings, inverses, point_gradients = reduced_system(
-        bundle.rotations, bundle.centers, bundle.points, starts, bundle.image_idx, bases, weights, damping, width
+    bases = tangent_basis(bundle.bearings)
+    return ReducedCameras(
+        *reduced_system(
+            bundle.rotations, bundle.centers, bundle.points, starts, bundle.image_idx, bases, weights, damping, width
+        )
     )
+
+
+def _step(bundle: Bundle, weights: FloatArray, *, damping: float, fixed_camera: int) -> Bundle:
+    """Return the bundle after one damped step."""
+    system = reduced_cameras(bundle, weights, damping=damping)
     # The small constant keeps a camera without observations in place.
-    band[:, 0] += damping * diagonal + 1e-12 * diagonal.mean()
+    system.band[:, 0] += damping * system.diagonal + 1e-12 * system.diagonal.mean()
+    band, gradient = held(system.band, system.gradient, fixed_camera)
     try:
-        camera_steps = -solve_cameras(*held(band, gradient, fixed_camera))
+        steps = -camera_solver(band)(gradient).reshape(-1, 6)
     except LinAlgError:
         return bundle
-    steps = camera_steps.reshape(-1, 6)
-    coupled = np.einsum("tij,ti->tj", couplings, steps[bundle.image_idx])
-    right = point_gradients + np.stack(
+    coupled = np.einsum("tij,ti->tj", system.couplings, steps[bundle.image_idx])
+    right = system.point_gradients + np.stack(
         [np.bincount(bundle.point_idx, column, len(bundle.points)) for column in coupled.T], axis=1
     )
     return replace(
         bundle,
         rotations=rotation_from_rotvec(steps[:, :3]) @ bundle.rotations,
         centers=bundle.centers + steps[:, 3:],
-        points=bundle.points - np.einsum("pij,pj->pi", inverses, right),
+        points=bundle.points - np.einsum("pij,pj->pi", system.inverses, right),
     )

@@ -6,6 +6,8 @@ columns: band[j, d] is the entry in row j + d, column j (LAPACK's lower band sto
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
@@ -60,16 +62,18 @@ def held(band: FloatArray, gradient: FloatArray, camera: int) -> tuple[FloatArra
     return band, gradient
 
 
-def solve_cameras(band: FloatArray, right: FloatArray) -> FloatArray:
-    """Return the solution of the symmetric positive definite system, (6N,) or (6N, K) as the right-hand side is.
+def camera_solver(band: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Return the function that solves the symmetric positive definite system for right-hand sides (6N,) or (6N, K).
 
     Raises:
         LinAlgError: if the system is not positive definite.
     """
     size, width = band.shape
     if width > _WIDE * size:
-        return np.asarray(cho_solve(cho_factor(dense_from_band(band), lower=True, overwrite_a=True), right))
-    return np.asarray(cho_solve_banded((cholesky_banded(band.T, lower=True), True), right))
+        whole = cho_factor(dense_from_band(band), lower=True, overwrite_a=True)
+        return lambda right: np.asarray(cho_solve(whole, right), np.float64)
+    factor = cholesky_banded(band.T, lower=True)
+    return lambda right: np.asarray(cho_solve_banded((factor, True), right), np.float64)
 
 
 def dense_from_band(band: FloatArray) -> FloatArray:

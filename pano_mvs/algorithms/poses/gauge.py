@@ -62,6 +62,7 @@ def moved_poses(poses: Poses, new_from_old: Similarity3) -> Poses:
         rotations=np.array([camera.rotation for camera in cameras]),
         translations=np.array([camera.translation for camera in cameras]),
         points_in_world=new_from_old.apply(poses.points_in_world),
+        center_stds=None if poses.center_stds is None else new_from_old.scale * poses.center_stds,
     )
 
 

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.bundle import Bundle, Loss, adjust_bundle
-from pano_mvs.algorithms.poses.gauge import in_gauge_of
+from pano_mvs.algorithms.poses.gauge import first_neighbour, in_gauge_of
 from pano_mvs.algorithms.poses.points import triangulate_observations
+from pano_mvs.algorithms.poses.uncertainty import camera_deviations
 from pano_mvs.core.errors import UsageError
 from pano_mvs.scene import Poses
 
@@ -33,6 +34,8 @@ def refine_poses(
     as it covers, and nothing happens at the seam. Between rounds points are triangulated anew, and observations that
     do not fit are dropped. The world frame is kept: the first camera does not move and neither does the length of its
     first baseline; where lengths are metres, the cameras as a whole stay where they were.
+    How sure each camera is, relative to the first camera and first baseline, is in `center_stds` and
+    `rotation_stds_rad`; see `camera_deviations`.
 
     Args:
         poses: poses with tracks; without tracks they are returned as they are.
@@ -56,7 +59,14 @@ def refine_poses(
             bundle, loss=loss, scale_rad=float(np.deg2rad(loss_scale_deg * widen)), max_iterations=max_iterations
         )
     bundle, colors = _without_outliers(bundle, colors, max_error_rad=float(np.deg2rad(max_error_deg)))
-    return in_gauge_of(_poses(poses, bundle, colors), poses.centers)
+    refined = _poses(poses, bundle, colors)
+    neighbour = first_neighbour(poses.centers)
+    if neighbour and len(bundle.points):
+        centers, rotations = camera_deviations(
+            bundle, loss=loss, scale_rad=float(np.deg2rad(loss_scale_deg)), neighbour=neighbour
+        )
+        refined = replace(refined, center_stds=centers, rotation_stds_rad=rotations)
+    return in_gauge_of(refined, poses.centers)
 
 
 def _bundle(poses: Poses) -> tuple[Bundle, NDArray[np.uint8]]:
