@@ -127,7 +127,7 @@ def _unmasked(corners: _Corners, grid: GeodesicGrid, mask: NDArray[np.bool_]) ->
     valid = grid.sample(mask.astype(np.uint8), interpolation=cv2.INTER_NEAREST)
     clear = np.empty(len(corners.faces), np.bool_)
     turns = grid.lattice_from_tangent(corners.faces, corners.places_uv)
-    kernels.disc_is_clear(valid, corners.faces, corners.places_uv, turns, _disc(_CLEARANCE), grid.margin, clear)
+    kernels.disc_is_clear(valid, corners.faces, corners.places_uv, turns, lattice_disc(_CLEARANCE), grid.margin, clear)
     return corners[clear]
 
 
@@ -156,7 +156,7 @@ def _describe(pictures: NDArray[np.uint8], grid: GeodesicGrid, corners: _Corners
     turns = grid.lattice_from_tangent(corners.faces, corners.places_uv)
     angles, bits = np.empty(len(corners.faces)), np.empty((len(corners.faces), _TESTS // 8), np.uint8)
     kernels.describe_corners(
-        smoothed, corners.faces, corners.places_uv, turns, _disc(_PATCH_RADIUS), binary_tests(), grid.margin, angles,
+        smoothed, corners.faces, corners.places_uv, turns, lattice_disc(_PATCH_RADIUS), binary_tests(), grid.margin, angles,
         bits,
     )  # fmt: skip
     return bits
@@ -197,7 +197,7 @@ def binary_tests() -> FloatArray:
 
 
 @cache
-def _disc(radius: int) -> FloatArray:
+def lattice_disc(radius: int) -> FloatArray:
     """Return a hexagonal lattice of steps (K, 2) within a radius in the tangent plane."""
     cells = np.stack(np.meshgrid(*[np.arange(-2 * radius, 2 * radius + 1)] * 2), axis=-1).reshape(-1, 2)
     plane = plane_from_lattice(cells)
