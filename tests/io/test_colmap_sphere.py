@@ -64,7 +64,7 @@ def test_the_same_number_with_other_parameters_is_colmaps_own(tmp_path: Path) ->
     write_binary(tmp_path)
     camera = struct.pack("<QIiQQ4d", 1, 1, 11, 1024, 512, 1.0, 512.0, 256.0, 0.0)
     (tmp_path / "cameras.bin").write_bytes(camera)
-    with pytest.raises(InputError, match="the COLMAP model cannot be read"):
+    with pytest.raises(InputError, match="RAD_TAN_THIN_PRISM_FISHEYE, expected"):
         read_poses(tmp_path)
 
 
