@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.metrics.poses import align_centers, relative_pose_errors
+from pano_mvs.algorithms.metrics.poses import align_centers, center_errors, relative_pose_errors
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec
 from tests.algorithms.synthetic_capture import random_poses, random_rotation
@@ -78,3 +78,45 @@ def test_too_few_images_are_refused():
         relative_pose_errors({}, {"a": pose})
     with pytest.raises(UsageError, match="only 1 images"):
         align_centers({"a": pose}, {"a": pose, "b": pose})
+
+
+@pytest.mark.parametrize("places", [[0, 1], [0, 1, 2], [0, 1, 1], [0, 0, 1, 1]])
+def test_alignment_is_whole_where_centres_leave_a_turn_open(places):
+    """Two images, images on a line and duplicate pictures once left the turn about the line to rounding."""
+    rng = np.random.default_rng(6)
+    line = random_rotation(rng)[0]
+    truth = {f"{n}": Rigid3.from_center(random_rotation(rng), place * line) for n, place in enumerate(places)}
+    there = Similarity3(0.25, random_rotation(rng), rng.normal(size=3))
+    identity = align_centers(moved(truth, there), truth) @ there
+    assert identity.scale == pytest.approx(1)
+    np.testing.assert_allclose(identity.rotation, np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(identity.translation, 0, atol=1e-6)
+
+
+def test_centre_errors_are_in_the_unit_of_the_truth():
+    x, y = np.eye(3)[0], np.eye(3)[1]
+    truth = {f"{n}": Rigid3.from_center(np.eye(3), c) for n, c in enumerate([-2 * x, 2 * x, -2 * y, 2 * y])}
+    wide = {name: Rigid3.from_center(np.eye(3), 10 * pose.center * (1, 1.5, 1)) for name, pose in truth.items()}
+    errors = center_errors(wide, truth)
+    assert errors.extent == pytest.approx(4)
+    scale = 10 * (1 + 1.5) / 10 / 10 / (1 + 1.5**2)  # Σ a·b / Σ a·a
+    assert errors.scale == pytest.approx(scale)
+    np.testing.assert_allclose(errors.distances, 2 * np.abs(1 - 10 * scale * np.array([1, 1, 1.5, 1.5])), rtol=1e-9)
+
+
+@pytest.mark.parametrize("which", ["estimated", "true"])
+def test_one_place_cannot_be_aligned(which):
+    poses = random_poses(np.random.default_rng(7), 3)
+    same = dict.fromkeys(poses, poses["0.jpg"])
+    with pytest.raises(UsageError, match=f"the {which} centres of all 3 images coincide"):
+        align_centers(*((same, poses) if which == "estimated" else (poses, same)))
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e4])
+def test_a_picture_that_is_there_twice_has_no_direction_in_any_unit(unit):
+    """Rounding of a duplicate's centre once counted as a baseline with a direction of its own."""
+    poses = random_poses(np.random.default_rng(8), 3)
+    truth = {**poses, "again": Rigid3.from_center(poses["0.jpg"].rotation, poses["0.jpg"].center + 1e-8)}
+    estimated = {**poses, "again": Rigid3.from_center(poses["0.jpg"].rotation, poses["0.jpg"].center + 1e-4)}
+    scaled = moved(truth, Similarity3(unit, np.eye(3), np.zeros(3)))
+    assert relative_pose_errors(estimated, scaled).direction_deg.max() < 0.1
