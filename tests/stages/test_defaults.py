@@ -23,6 +23,8 @@ from pano_mvs.algorithms.matching.vlad import vlad_descriptor
 from pano_mvs.algorithms.poses.colmap import solve_colmap
 from pano_mvs.algorithms.poses.colmap_sift import colmap_sift
 from pano_mvs.algorithms.poses.extension import extend_poses
+from pano_mvs.algorithms.poses.georeference import fit_gps
+from pano_mvs.algorithms.poses.levelling import level_poses
 from pano_mvs.algorithms.poses.refine import refine_poses
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.poses.tracks import triangulate_tracks
@@ -45,6 +47,8 @@ FUNCTIONS = {
     "poses.extend": extend_poses,
     "poses.refine": refine_poses,
     "poses.triangulate": triangulate_tracks,
+    "poses.level": level_poses,
+    "poses.scale": fit_gps,
     "filters.median": median_range,
     "filters.gaussian": gaussian_range,
     "filters.speckle": remove_speckles,
