@@ -18,7 +18,7 @@ STEP = 0.7  # between two cameras
 SIGHT = 6.0  # farther points are not found
 HALF_WIDTH, HALF_HEIGHT = 1.5, 1.25
 NEAREST = 0.7
-CODE_SIZE = 32
+CODE_SIZE = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +105,7 @@ def _described(rng: np.random.Generator, features: Features, codes: FloatArray) 
     noisy = codes + 0.3 * rng.normal(size=codes.shape)
     return Features(
         bearings=features.bearings,
-        descriptors=np.abs(100 * noisy / np.linalg.norm(noisy, axis=1, keepdims=True)).astype(np.float32),
+        descriptors=np.rint(np.clip(50 + 40 * noisy, 0, 255)).astype(np.float32),
         sizes_rad=features.sizes_rad,
         scores=features.scores,
         colors_rgb=features.colors_rgb,

@@ -34,12 +34,18 @@ def consistent_edges(
     keys = list(edges)
     triangles = _triangles(keys)
     closes = _loop_errors_rad(list(edges.values()), triangles) < np.deg2rad(max_loop_deg)
-    while not closes.all():
-        good, bad = (np.bincount(triangles[which].ravel(), minlength=len(keys)) for which in (closes, ~closes))
-        worst = max(np.flatnonzero(bad).tolist(), key=lambda e: (bad[e] / (bad[e] + good[e]), -len(edges[keys[e]]), e))
+    sizes = np.array([len(view) for view in edges.values()])
+    of_edge = _triangles_of_edges(triangles, len(keys))
+    good, bad = (np.bincount(triangles[which].ravel(), minlength=len(keys)) for which in (closes, ~closes))
+    there = np.ones(len(triangles), np.bool_)
+    while bad.any():
+        share = bad / np.maximum(bad + good, 1)
+        worst = int(np.lexsort((np.arange(len(keys)), -sizes, share))[-1])
         del edges[keys[worst]]
-        left = (triangles != worst).all(axis=1)
-        triangles, closes = triangles[left], closes[left]
+        gone = of_edge[worst][there[of_edge[worst]]]
+        there[gone] = False
+        np.subtract.at(good, triangles[gone[closes[gone]]].ravel(), 1)
+        np.subtract.at(bad, triangles[gone[~closes[gone]]].ravel(), 1)
     return edges
 
 
@@ -94,6 +100,13 @@ def _triangles(keys: list[Edge]) -> NDArray[np.intp]:
         (number[i, j], number[j, k], number[i, k]) for i, j in keys for k in sorted(after[i] & after.get(j, set()))
     ]
     return np.array(found, np.intp).reshape(-1, 3)
+
+
+def _triangles_of_edges(triangles: NDArray[np.intp], count: int) -> list[NDArray[np.intp]]:
+    """Return, for every edge, the positions of its triangles."""
+    edge_of_corner = triangles.ravel()
+    by_edge = np.argsort(edge_of_corner, kind="stable") // 3
+    return np.split(by_edge, np.cumsum(np.bincount(edge_of_corner, minlength=count))[:-1]) if count else []
 
 
 def _loop_errors_rad(views: list[TwoView], triangles: NDArray[np.intp]) -> NDArray[np.float64]:
