@@ -258,7 +258,8 @@ class WorkflowReader:
         else:
             message = problem["msg"].removeprefix("Value error, ")
             shown = json.dumps(problem["input"], default=str, ensure_ascii=False)[:80]
-            self._problem(found, f"stage {name!r}: {key}: {message} (got {shown})")
+            setting = f"{key}: " if key else ""
+            self._problem(found, f"stage {name!r}: {setting}{message} (got {shown})")
 
     def _place(self, node: Located) -> str:
         return f"{self.shown_as}:{node.line}:{node.column}"
