@@ -15,29 +15,11 @@ from pano_mvs.geometry import Rigid3, Similarity3
 from pano_mvs.io.pose_files import read_poses
 from pano_mvs.io.range_files import read_range_tiff
 from tests.algorithms.synthetic_capture import random_rotation
-from tests.cli.conftest import Command, run_json
+from tests.cli.conftest import SMALL, Command, run_json
 from tests.io.pictures import full_sphere, xmp
+from tests.test_docs_frames import block
 
 UP = np.array([0.0, -1.0, 0.0])
-
-METRES = """
-pano_mvs: 1
-stages:
-  images:   {use: source.folder, path: capture/images}
-  features: {use: features.sift_tangent, max_keypoints: 1500}
-  pairs:    {use: pairs.exhaustive}
-  matches:  {use: matches.brute_force}
-  poses:    {use: poses.scaled_translation}
-  refined:  {use: poses.refine}
-  levelled: {use: poses.level}
-  metres:   {use: poses.scale, baseline: {from: 000.png, to: 002.png, metres: BASELINE}}
-  views:    {use: views.nearest}
-  depth:    {use: depth.sweep, planes: 48}
-  checked:  {use: filters.consistency}
-  cloud:    {use: fusion.vote}
-  colmap:   {use: export.colmap}
-  ranges:   {use: export.ranges}
-"""
 
 KNOWN = """
 pano_mvs: 1
@@ -73,8 +55,10 @@ def test_a_known_baseline_makes_everything_metric(pano_mvs: Command, capture: Pa
     truth = true_poses(capture)
     baseline = float(np.linalg.norm(truth["002.png"].center - truth["000.png"].center))
     work = capture.parent
-    (work / "metres.yaml").write_text(METRES.replace("BASELINE", f"{baseline:.6f}"))
-    result = pano_mvs("run", work / "metres.yaml", "--out", "out")
+    page = block("workflow").replace("hall.jpg", "000.png").replace("kitchen.jpg", "002.png")
+    (work / "metres.yaml").write_text(page.replace("metres: 1.2", f"metres: {baseline:.6f}"))
+    run = ("run", work / "metres.yaml", "--images", capture / "images", "--out", "out", *SMALL)
+    result = pano_mvs(*run)
     assert result.code == 0, result.text
     told = run_json(Path("out"))["poses"]
     assert told["metric"] is True
@@ -95,7 +79,7 @@ def test_a_known_baseline_makes_everything_metric(pano_mvs: Command, capture: Pa
                     for image in model.images.values()])  # fmt: skip
     assert np.rad2deg(np.arccos(-ups[:, 1])).max() < 1.0
     assert len(points) > 50
-    again = pano_mvs("run", work / "metres.yaml", "--out", "out")
+    again = pano_mvs(*run)
     assert "0 units computed" in again.text
 
 
