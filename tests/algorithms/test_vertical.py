@@ -173,3 +173,17 @@ def test_layers_of_a_slanted_board_are_found_to_a_tenth_of_a_degree():
     tilt = rotation_from_rotvec(np.deg2rad([7.0, 0, -9.0]))
     layers = sharpest_up(np.concatenate([board, clutter]) @ tilt.T, np.zeros((3, 3)), UP)
     assert angle_deg(layers.up, tilt @ UP) < 0.15
+
+
+@pytest.mark.parametrize("count", [150, 600, 3000])
+def test_points_without_level_surfaces_have_no_layers(count):
+    rng = np.random.default_rng(count)
+    ball = rng.normal(size=(count, 3))
+    walls = rng.uniform(-3, 3, (count, 3))
+    axis = 2 * rng.integers(0, 2, count)
+    walls[np.arange(count), axis] = 3 * np.sign(walls[np.arange(count), axis])
+    sphere = 3 * ball / np.linalg.norm(ball, axis=1, keepdims=True)
+    for points in (ball, walls, sphere):
+        layers = sharpest_up(points, np.zeros((3, 3)), UP)
+        assert not layers
+        np.testing.assert_array_equal(layers.up, UP)
