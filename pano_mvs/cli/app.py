@@ -6,6 +6,8 @@
 
 from __future__ import annotations
 
+import io
+import sys
 import traceback
 from collections.abc import Callable
 from functools import wraps
@@ -16,6 +18,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from pano_mvs import __version__
 from pano_mvs.cli.default_command import RunByDefault
 from pano_mvs.core.errors import PanoMvsError, WorkflowError
 
@@ -70,6 +73,21 @@ def _guarded(command: Command) -> Command:
     return cast(Command, guarded)
 
 
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        print(f"pano-mvs {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Dense 3D from 360° photographs."""
+
+
 @app.command()
 @_guarded
 def run(
@@ -106,7 +124,7 @@ def check(workflow: WorkflowArgument, images: ImagesOption = None, overrides: Se
     from pano_mvs.cli.session import open_session
 
     session = open_session(workflow, overrides=overrides or [], images=images)
-    Console().print(f"{workflow}: {len(session.workflow.stages)} stages, no mistakes", highlight=False)
+    Console().print(f"{escape(workflow)}: {len(session.workflow.stages)} stages, no mistakes", highlight=False)
 
 
 @app.command()
@@ -166,4 +184,7 @@ def evaluate_model(
 
 def main() -> None:
     """Run the command line."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a log in another encoding is no reason to fail
     app()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -39,17 +40,24 @@ def show_status(session: Session, console: Console) -> None:
     path = session.out / "run.json"
     try:
         last = json.loads(path.read_bytes())
-    except FileNotFoundError:
+    except OSError:
         console.print(f"no finished run in {escape(str(session.out))}", highlight=False)
     except ValueError:
         console.print(f"{escape(str(path))} is damaged; run again to write it anew", highlight=False)
     else:
-        units = last["units"]
-        console.print(f"latest run {last['started']}: exit code {last['exit_code']}, {units['run']} computed, "
-                      f"{units['cached']} cached, {units['failed']} without a result", highlight=False)  # fmt: skip
-        for failure in last["failures"]:
-            console.print(escape(f"  {failure['stage']}:{failure['item']}: {failure['cause']}"), highlight=False)
+        try:
+            _print_last(last, console)
+        except (KeyError, TypeError):
+            console.print(f"{escape(str(path))} is not of this version; run again to write it anew", highlight=False)
     show_plan(session, console)
+
+
+def _print_last(last: Any, console: Console) -> None:
+    units = last["units"]
+    console.print(f"latest run {last['started']}: exit code {last['exit_code']}, {units['run']} computed, "
+                  f"{units['cached']} cached, {units['failed']} without a result", highlight=False)  # fmt: skip
+    for failure in last["failures"]:
+        console.print(escape(f"  {failure['stage']}:{failure['item']}: {failure['cause']}"), highlight=False)
 
 
 def _plans(session: Session) -> list[StagePlan]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import TracebackType
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from pano_mvs.engine.events import Outcome, StageSummary
@@ -45,7 +46,7 @@ class ProgressBars:
             self._progress.advance(self._tasks[name])
         if outcome == "failed":
             label = f"{name}:{item}" if item else name
-            self.console.print(f"[red]failed[/] {label} after {seconds:.1f} s", highlight=False)
+            self.console.print(f"[red]failed[/] {escape(label)} after {seconds:.1f} s", highlight=False)
 
     def stage_finished(self, summary: StageSummary) -> None:
         """Say what the stage did."""
@@ -61,4 +62,4 @@ class ProgressBars:
 
     def warn(self, text: str) -> None:
         """Show a warning."""
-        self.console.print(f"[yellow]warning:[/] {text}", highlight=False)
+        self.console.print(f"[yellow]warning:[/] {escape(text)}", highlight=False)

@@ -16,7 +16,10 @@ from rich.table import Table
 from pano_mvs.cli.progress import ProgressBars
 from pano_mvs.cli.session import Session
 from pano_mvs.cli.summary import summarise
+from pano_mvs.core.errors import UsageError
 from pano_mvs.core.files import write_text
+from pano_mvs.engine.blobs import DamagedBlobError
+from pano_mvs.engine.params import files_of
 from pano_mvs.engine.run import Run
 from pano_mvs.engine.store import Store
 from pano_mvs.report.page import write_report
@@ -27,24 +30,40 @@ _SHOWN_FAILURES = 20
 def run_workflow(session: Session, console: Console) -> int:
     """Run a workflow, write run.json and report.html, print what came out, and return the exit code."""
     started, clock = datetime.now(UTC), time.perf_counter()
+    _check_output(session)
     store = Store(session.store_root)
+    earlier = earlier_files(session.out)
     with ProgressBars(console) as bars:
         run = Run(session.workflow, session.graph, store, session.out, observer=bars)
-        result = run.execute(earlier_files=earlier_files(session.out))
-    summary = summarise(run, result, started=started, seconds=time.perf_counter() - clock)
-    write_text(session.out / "run.json", json.dumps(summary, indent=1) + "\n")
+        while True:
+            result = run.execute(earlier_files=earlier)
+            try:
+                summary = summarise(run, result, started=started, seconds=time.perf_counter() - clock)
+                break
+            except DamagedBlobError as error:  # found only now; it has been removed, so a further round computes it
+                bars.warn(str(error))
+    write_text(session.out / "run.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
     write_report(session.out, summary)
     print_summary(summary, session.out, console, written=len(result.written))
     return result.exit_code
 
 
+def _check_output(session: Session) -> None:
+    """Refuse an output folder that is itself read from."""
+    out = session.out.resolve()
+    for name, entry in session.workflow.stages.items():
+        if any(path.resolve() == out for paths in files_of(entry.params).values() for path in paths):
+            raise UsageError(f"--out {session.out}: stage {name!r} reads this very folder. Choose another folder")
+
+
 def earlier_files(out: Path) -> dict[str, str]:
     """Return the files, with their digests, that an earlier run wrote into a folder."""
     try:
-        files = json.loads((out / "run.json").read_bytes())["files"]
-    except (OSError, ValueError, KeyError, TypeError):
+        last = json.loads((out / "run.json").read_bytes())
+        files = {**last["files"], **last.get("left_over", {})}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return {}
-    return {str(name): str(digest) for name, digest in files.items()} if isinstance(files, dict) else {}
+    return {str(name): str(digest) for name, digest in files.items()}
 
 
 def print_summary(summary: Mapping[str, Any], out: Path, console: Console, *, written: int) -> None:
@@ -61,6 +80,11 @@ def print_summary(summary: Mapping[str, Any], out: Path, console: Console, *, wr
         console.print(f"note: {escape(note)}", highlight=False, soft_wrap=True)
     if summary["stopped"]:
         console.print(f"[red]stopped:[/] {escape(summary['stopped'])}", highlight=False, soft_wrap=True)
+    if summary["left_over"]:
+        count = len(summary["left_over"])
+        console.print(
+            f"{count} files of an earlier run, which this one did not write, are still there", highlight=False
+        )
     console.print(f"results in {escape(str(out))} ({len(summary['files'])} files, {written} written now): "
                   "open report.html", highlight=False, soft_wrap=True)  # fmt: skip
 
@@ -86,7 +110,7 @@ def _print_poses(summary: Mapping[str, Any], console: Console) -> None:
     if poses:
         total = len(poses["registered"]) + len(poses["rejected"])
         console.print(f"poses: {len(poses['registered'])} of {total} registered, {poses['points']} points; "
-                      f"scale: {poses['scale']}", highlight=False)  # fmt: skip
+                      f"scale: {escape(poses['scale'])}", highlight=False)  # fmt: skip
 
 
 def print_scores(scores: Mapping[str, Any], console: Console) -> None:
@@ -102,7 +126,7 @@ def print_scores(scores: Mapping[str, Any], console: Console) -> None:
         return
     table = Table("view", *_SHOWN_SCORES.values())
     for view, values in scores["views"].items():
-        table.add_row(view, *(_shown(values[name]) for name in _SHOWN_SCORES))
+        table.add_row(escape(view), *(_shown(values[name]) for name in _SHOWN_SCORES))
     console.print(table)
 
 

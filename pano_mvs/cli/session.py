@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pano_mvs
-from pano_mvs.core.errors import InputError
+from pano_mvs.core.errors import InputError, WorkflowError
 from pano_mvs.engine.registry import Registry
-from pano_mvs.engine.wiring import Graph, wire
-from pano_mvs.engine.workflow import Workflow, find_workflow, load_workflow
+from pano_mvs.engine.wiring import Graph, wire, wiring_problems
+from pano_mvs.engine.workflow import PartialWorkflowError, Workflow, find_workflow, load_workflow
 
 CACHE_VARIABLE = "PANO_MVS_CACHE"
 
@@ -55,7 +55,10 @@ def open_session(
     if images is not None and not images.is_dir():
         raise InputError(f"--images {images}: there is no such folder")
     registry = Registry.installed()
-    workflow = load_workflow(path, registry, overrides=overrides, images=images)
+    try:
+        workflow = load_workflow(path, registry, overrides=overrides, images=images)
+    except PartialWorkflowError as error:
+        raise WorkflowError([*error.problems, *wiring_problems(error.stages)]) from None
     graph = wire(workflow)
     variable = os.environ.get(CACHE_VARIABLE)
     beside = Path.cwd() if is_preset else path.parent

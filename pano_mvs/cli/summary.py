@@ -49,6 +49,7 @@ def summarise(run: Run, result: RunResult, *, started: datetime, seconds: float)
         "workflow_text": workflow.text,
         "versions": _versions(),
         "files": dict(sorted(result.published.items())),
+        "left_over": dict(sorted(result.left_over.items())),
     }
 
 
@@ -115,8 +116,11 @@ def _views(run: Run, result: RunResult) -> list[dict[str, Any]]:
     stage = _last_stage_of(run, result, RangeMap)
     if stage is None or run.states[stage.name].axis is not Axis.VIEW:
         return []
-    previews = {str(PurePosixPath(n).relative_to("preview").with_suffix("")): n for n in result.published
-                if n.startswith("preview/")}  # fmt: skip
+    previews: dict[str, str] = {}
+    for path in result.published:
+        _, folder, name = f"/{path}".rpartition("/preview/")
+        if folder:
+            previews.setdefault(str(PurePosixPath(name).with_suffix("")), path)
     return [
         {"name": item, "preview": previews.get(str(PurePosixPath(item).with_suffix("")), previews.get(item, ""))}
         | _rounded(stage.unit_metrics.get(item, {}))

@@ -11,6 +11,9 @@ from pathlib import Path
 
 from pano_mvs.core.errors import StoreError
 
+OUTPUT_MARK = ".pano-mvs-output"
+"""An empty file in every output folder, written first: no source takes what lies there for pictures."""
+
 
 @contextmanager
 def replacing(path: Path, *, temporary_in: Path | None = None) -> Iterator[Path]:

@@ -116,7 +116,7 @@ class BlobStore:
         if not sound:
             if not ref.external:
                 path.unlink(missing_ok=True)
-            raise DamagedBlobError(f"{path} is damaged or gone")
+            raise DamagedBlobError(f"{path} is damaged or gone; the same command computes it again")
         self._verified.add(ref.digest)
         return path
 

@@ -20,37 +20,39 @@ def code_digest(path: Path) -> str:
     return digest_from_value(trees)
 
 
-def local_imports(path: Path) -> list[Path]:
-    """Return the files beside a Python file that it imports, directly."""
-    tree = ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
-    return _imported_files(tree, path.parent)
-
-
 def _collect(path: Path, root: Path, trees: dict[str, str]) -> None:
-    name = path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name
+    name = path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
     if name in trees:
         return
     tree = ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
     trees[name] = ast.dump(_without_docstrings(tree), include_attributes=False)
-    for imported in _imported_files(tree, path.parent):
+    for imported in _imported_files(tree, path.parent, root):
         _collect(imported, root, trees)
 
 
-def _imported_files(tree: ast.Module, folder: Path) -> list[Path]:
-    names: list[str] = []
+def _imported_files(tree: ast.Module, folder: Path, root: Path) -> list[Path]:
+    """Return the local files that a syntax tree imports, wherever in it: absolute names are looked up from the root."""
+    files: list[Path] = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            names.extend(alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            names.append(node.module)
-            names.extend(f"{node.module}.{alias.name}" for alias in node.names)
+            for alias in node.names:
+                files.extend(_module_files(root, alias.name))
         elif isinstance(node, ast.ImportFrom):
-            names.extend(alias.name for alias in node.names)
-    files: list[Path] = []
-    for name in names:
-        stem = folder.joinpath(*name.split("."))
-        files.extend(candidate for candidate in (stem.with_suffix(".py"), stem / "__init__.py") if candidate.is_file())
+            base = folder.joinpath(*[".."] * (node.level - 1)).resolve() if node.level else root
+            module = node.module or ""
+            files.extend(_module_files(base, module))
+            for alias in node.names:
+                files.extend(_module_files(base, f"{module}.{alias.name}" if module else alias.name))
     return files
+
+
+def _module_files(base: Path, dotted: str) -> list[Path]:
+    """Return the files that importing a dotted name runs: its own, and the __init__.py of every package above it."""
+    parts = [part for part in dotted.split(".") if part]
+    candidates = [base.joinpath(*parts[: depth + 1], "__init__.py") for depth in range(len(parts))]
+    if parts:
+        candidates.append(base.joinpath(*parts).with_suffix(".py"))
+    return [candidate for candidate in candidates if candidate.is_file()]
 
 
 def _without_docstrings(tree: ast.Module) -> ast.Module:

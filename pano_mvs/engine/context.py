@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -29,8 +30,9 @@ class Context:
     rejected: dict[str, str] = field(default_factory=dict)
 
     def metric(self, name: str, value: float) -> None:
-        """Record a figure of this unit."""
-        self.metrics[name] = float(value)
+        """Record a figure of this unit; one that is not finite is left out, so that it passes no gate."""
+        if math.isfinite(value):
+            self.metrics[name] = float(value)
 
     def note(self, text: str) -> None:
         """Record what a user should know; a cached unit says it again."""

@@ -55,6 +55,7 @@ class RunResult:
         rejected: image to the stage that left it out and why.
         stopped: why the run ended early; empty if it did not.
         exit_code: 0 ok, 3 finished with failed items, 4 stopped by a gate.
+        left_over: files, with their digests, of earlier runs that this one did not write and that are still there.
         written: files written into the output folder by this run.
         warnings: damaged parts of the store that were computed again, and the like.
     """
@@ -67,6 +68,7 @@ class RunResult:
     written: list[str] = field(default_factory=list)
     removed: list[str] = field(default_factory=list)
     published: Mapping[str, str] = field(default_factory=dict)
+    left_over: Mapping[str, str] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
 
     @property

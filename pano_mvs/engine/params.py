@@ -27,7 +27,8 @@ NOT_IN_KEY = _NotInKey()
 
 
 def _resolve(path: Path, info: ValidationInfo) -> Path:
-    base = (info.context or {}).get("base")
+    context = info.context or {}
+    base = context.get("bases", {}).get(info.field_name, context.get("base"))
     path = path.expanduser()
     return path if base is None or path.is_absolute() else Path(base) / path
 
@@ -39,10 +40,10 @@ SourcePath: TypeAlias = Annotated[Path, AfterValidator(_resolve), NOT_IN_KEY]
 """A file or folder that a source stage lists; its items count, one by one, not the path."""
 
 
-def key_fields(params: Params) -> tuple[dict[str, Any], dict[str, Path]]:
+def key_fields(params: Params) -> tuple[dict[str, Any], dict[str, list[Path]]]:
     """Return the fields that count towards the cache key: plain values, and paths that count by content."""
     plain: dict[str, Any] = {}
-    paths: dict[str, Path] = {}
+    paths: dict[str, list[Path]] = {}
     dumped = params.model_dump(mode="json")
     for name, field in type(params).model_fields.items():
         marks = field.metadata
@@ -50,10 +51,35 @@ def key_fields(params: Params) -> tuple[dict[str, Any], dict[str, Path]]:
         if any(isinstance(mark, _NotInKey) for mark in marks):
             continue
         if _is_keyed_by_content(field.annotation, marks) and value is not None:
-            paths[name] = value
+            paths[name] = _paths_in(value)
         else:
             plain[name] = dumped[name]
     return plain, paths
+
+
+def files_of(params: Params) -> dict[str, list[Path]]:
+    """Return every setting that names files or folders to be read, with their paths."""
+    found: dict[str, list[Path]] = {}
+    for name, field in type(params).model_fields.items():
+        if _names_files(field.annotation, field.metadata):
+            found[name] = _paths_in(getattr(params, name))
+    return found
+
+
+def _paths_in(value: Any) -> list[Path]:
+    """Return the paths in a value: a path, a list or dict of them, or None."""
+    if isinstance(value, Path):
+        return [value]
+    if isinstance(value, dict):
+        return [path for key in sorted(value) for path in _paths_in(value[key])]
+    return [path for item in value or () for path in _paths_in(item)]
+
+
+def _names_files(annotation: Any, marks: list[Any]) -> bool:
+    if any(isinstance(mark, AfterValidator) and mark.func is _resolve for mark in marks):
+        return True
+    inner = [*getattr(annotation, "__args__", ()), *getattr(annotation, "__metadata__", ())]
+    return any(_names_files(part, [part]) for part in inner)
 
 
 def _is_keyed_by_content(annotation: Any, marks: list[Any]) -> bool:

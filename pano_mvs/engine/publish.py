@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
 from pano_mvs.core.errors import StoreError, UsageError
-from pano_mvs.core.files import copy_file
+from pano_mvs.core.files import OUTPUT_MARK, copy_file
 from pano_mvs.engine.blobs import BlobRef
 from pano_mvs.engine.store import ItemRef, Store
 
@@ -34,12 +34,18 @@ class Publisher:
             raise UsageError(_cannot_write(out, error.strerror or str(error))) from error
         if not os.access(out, os.W_OK | os.X_OK):
             raise UsageError(_cannot_write(out, "permission denied"))
+        (out / OUTPUT_MARK).touch()
 
     def name_items(self, names: Iterable[str]) -> None:
         """Fix the `{item}` of each image: its path without the extension, kept where two would collide."""
-        stems = {name: str(PurePosixPath(name).with_suffix("")) for name in names}
-        count = Counter(stem.casefold() for stem in stems.values())
-        self._stems.update({name: name if count[stem.casefold()] > 1 else stem for name, stem in stems.items()})
+        found = list(names)
+        self._stems = {name: str(PurePosixPath(name).with_suffix("")) for name in found}
+        while True:
+            count = Counter(stem.casefold() for stem in self._stems.values())
+            clashing = [name for name in found if count[self._stems[name].casefold()] > 1 and self._stems[name] != name]
+            if not clashing:
+                return
+            self._stems.update({name: name for name in clashing})
 
     def publish(self, stage: str, item: str, ref: ItemRef, *, to: str = "") -> None:
         """Write the files of one unit, unless they are there with the right bytes.
@@ -53,7 +59,7 @@ class Publisher:
         assert isinstance(meta, dict)
         for number, target in enumerate(meta["targets"]):
             name = str(PurePosixPath(to) / target.replace("{item}", self._stems.get(item, item)))
-            owner = self._owners.setdefault(name.casefold(), f"{stage}:{item}")
+            owner = self._owners.setdefault(name, f"{stage}:{item}")
             if owner != f"{stage}:{item}":
                 other = owner.partition(":")[0]
                 raise UsageError(f"stages {other!r} and {stage!r} both write {name}; give one a folder of its own "

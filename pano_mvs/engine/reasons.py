@@ -51,6 +51,8 @@ def _differences(what: str, before: Mapping[str, Any], now: Mapping[str, Any]) -
 
 def _inputs(unit: Unit, before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     changed: list[str] = []
+    if unit.source is not None and before.get("name") != now["name"]:
+        return [f"renamed from {before.get('name')}"]
     for port in sorted({*before, *now}):
         old, new = before.get(port), now.get(port)
         if old == new:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import sys
 import traceback
@@ -51,7 +52,7 @@ class Registry:
         Raises:
             PluginError: if a name is taken by another stage; the message names both places.
         """
-        for spec in _specs(module):
+        for spec in _specs(module, own_only=bool(code)):
             known = self.stages.get(spec.name)
             if known is not None and known.origin != spec.origin:
                 raise PluginError(
@@ -71,9 +72,9 @@ class Registry:
         try:
             digest = code_digest(path)
             module = _import_file(path)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise PluginError(f"plugin file {path} failed to import: {_where(error, path)}") from error
-        if not any(True for _ in _specs(module)):
+        if not any(True for _ in _specs(module, own_only=True)):
             raise PluginError(f'plugin file {path} defines no stage: decorate a function with @stage("kind.name")')
         self.add_module(module, str(path), code=digest)
 
@@ -89,27 +90,34 @@ class Registry:
         try:
             module = entry.load()
             self.add_module(module, origin)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             self.broken.append(BrokenPlugin(origin, f"{type(error).__name__}: {error}", traceback.format_exc()))
 
 
-def _specs(module: ModuleType) -> Iterator[StageSpec]:
+def _specs(module: ModuleType, *, own_only: bool) -> Iterator[StageSpec]:
+    """Find a module's stages; a user's file may also import stages of others, which are not its own."""
     for value in vars(module).values():
         spec = spec_of(value)
-        if spec is not None:
+        if spec is not None and (not own_only or spec.function.__module__ == module.__name__):
             yield spec
 
 
 def _import_file(path: Path) -> ModuleType:
-    """Import a file under a name of its own; its folder is importable only meanwhile."""
+    """Import a file under a name of its own; its folder is importable only meanwhile.
+
+    The helpers that it imports from its folder are forgotten afterwards, so that another plugin's `helper.py` is not
+    taken for this one's.
+    """
     name = f"pano_mvs_plugin_{digest_from_value(str(path.resolve()))[:12]}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise PluginError(f"{path} is not a Python file")
     module = importlib.util.module_from_spec(spec)
     folder = str(path.resolve().parent)
+    before = set(sys.modules)
     sys.modules[name] = module
     sys.path.insert(0, folder)
+    importlib.invalidate_caches()
     try:
         spec.loader.exec_module(module)
     except BaseException:
@@ -117,10 +125,13 @@ def _import_file(path: Path) -> ModuleType:
         raise
     finally:
         sys.path.remove(folder)
+        for helper in set(sys.modules) - before - {name}:
+            if str(getattr(sys.modules[helper], "__file__", None) or "").startswith(folder):
+                del sys.modules[helper]
     return module
 
 
-def _where(error: Exception, path: Path) -> str:
+def _where(error: BaseException, path: Path) -> str:
     """Return the error with the line of the plugin's own file in which it was raised."""
     if isinstance(error, SyntaxError):
         return f"{error.filename or path}:{error.lineno}: {error.msg}"

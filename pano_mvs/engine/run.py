@@ -20,7 +20,7 @@ from pano_mvs.engine.store import ItemRef, Store, UnitRecord
 from pano_mvs.engine.units import Resolution, StageState, Unit, resolve
 from pano_mvs.engine.wiring import Graph
 from pano_mvs.engine.workflow import StageEntry, Workflow
-from pano_mvs.scene import Axis, Files, Record
+from pano_mvs.scene import Files, Record
 
 _HEALING_ROUNDS = 3
 _SHOWN_CAUSES = 10
@@ -83,17 +83,30 @@ class Run:
             InputError: if the source cannot be listed.
             StoreError: if the store or the output folder cannot be written.
         """
+        earlier = dict(earlier_files or {})
         try:
             self._execute_healing()
             if self.result.exit_code == 0:
-                self.result.removed = self._publisher.remove_stale(dict(earlier_files or {}))
+                self.result.removed = self._publisher.remove_stale(earlier)
         finally:
-            last = self.store.last_keys(workflow_id(self.workflow))
-            self.store.save_last_keys(workflow_id(self.workflow), last | self._keys)
-            self.store.stat_cache.save()
+            self._remember()
             self.result.written = self._publisher.written
             self.result.published = self._publisher.published
+            self.result.left_over = {
+                name: digest
+                for name, digest in earlier.items()
+                if name not in self._publisher.published and (self.out / name).is_file()
+            }
         return self.result
+
+    def _remember(self) -> None:
+        """Keep what makes the next plan better; a run does not fail for want of it."""
+        name = workflow_id(self.workflow)
+        try:
+            self.store.save_last_keys(name, self.store.last_keys(name) | self._keys)
+            self.store.stat_cache.save()
+        except StoreError as error:
+            self._warn(f"the next run cannot be told why it computes something: {error}")
 
     def load(self, stage: str, kind: type[Record], item: str = "") -> Record | None:
         """Return a value that the run made, or None if there is none."""
@@ -112,7 +125,7 @@ class Run:
                 if found[str(error)] > _HEALING_ROUNDS:
                     raise StoreError(f"{error} again and again: check the disk, or choose another cache with "
                                      "--cache DIR")  from error  # fmt: skip
-                self._warn(f"{error}; computing it again")
+                self._warn(str(error))
 
     def _execute_once(self) -> None:
         self.result.stages.clear()
@@ -136,7 +149,7 @@ class Run:
         name = entry.name
         resolution = resolve(entry, self.graph.axes[name], self.graph.edges[name], self.states, self.store)
         state = self.states[name] = start_state(self.graph, name, resolution)
-        if self.graph.axes[name] is Axis.IMAGE:
+        if entry.spec.list_items is not None:
             self._publisher.name_items(resolution.members)
         summary = StageSummary(name, entry.spec.name, len(resolution.units) + len(resolution.blocked))
         self.result.stages.append(summary)
@@ -197,7 +210,7 @@ class Run:
                 record = execute_unit(unit, self.store, threads=self.threads)
             except (DamagedBlobError, StoreError, GateError):
                 raise
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 if attempt < policy.retries:
                     continue
                 failure = _failure(unit, error)
@@ -253,7 +266,7 @@ class Run:
         self.observer.warn(text)
 
 
-def _failure(unit: Unit, error: Exception) -> Failure:
+def _failure(unit: Unit, error: BaseException) -> Failure:
     """Describe a failed unit; errors raised on purpose speak for themselves, others get the line they came from."""
     consequence = _lost(unit.entry, unit.item)
     notes = "".join(f" ({note})" for note in getattr(error, "__notes__", []))
@@ -262,6 +275,8 @@ def _failure(unit: Unit, error: Exception) -> Failure:
     frames = traceback.extract_tb(error.__traceback__)
     # The author of a plugin wants the line in the plugin; we want ours wherever it is.
     own = unit.entry.spec.origin.rpartition(":")[0] if unit.entry.spec.code_digest else ""
+    if own and isinstance(error, ModuleNotFoundError):
+        notes += " (a plugin imports the files beside it at its top, not inside functions)"
     frame = next((f for f in reversed(frames) if f.filename == own), frames[-1])
     cause = f"{frame.filename}:{frame.lineno}: {type(error).__name__}: {error}{notes}"
     trace = "".join(traceback.format_exception(error))

@@ -117,7 +117,7 @@ def resolve_source(entry: StageEntry, store: Store) -> Resolution:
         except InputError as error:
             resolution.blocked[item.name] = str(error)
             continue
-        identity = static | {"inputs": {"files": digests}}
+        identity = static | {"inputs": {"files": digests, "name": item.name}}
         unit = Unit(entry, item.name, (item.name,), {}, digest_from_value(identity), identity, item)
         resolution.units.append(unit)
     return resolution
@@ -286,7 +286,7 @@ def _static_identity(entry: StageEntry, store: Store) -> dict[str, Any]:
         "stage": entry.spec.name,
         "version": entry.spec.version,
         "code": entry.spec.code_digest,
-        "params": plain | {name: store.stat_cache.digest(path) for name, path in paths.items()},
+        "params": plain | {name: [store.stat_cache.digest(path) for path in found] for name, found in paths.items()},
         "kinds": _kind_versions(entry),
     }
 

@@ -62,6 +62,15 @@ def wire(workflow: Workflow) -> Graph:
     return Graph(order, edges, axes)
 
 
+def wiring_problems(stages: Mapping[str, StageEntry]) -> list[str]:
+    """Return the mistakes in the wiring of stages whose settings may be wrong."""
+    try:
+        wire(Workflow("", None, "", dict(stages)))
+    except WorkflowError as error:
+        return error.problems
+    return []
+
+
 def _delivers(entry: StageEntry, port: Port) -> bool | None:
     """Return whether a stage feeds a port by its items (True), as a whole (False), or not at all (None)."""
     output = entry.spec.output

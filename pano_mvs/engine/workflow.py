@@ -12,7 +12,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from pano_mvs.core.errors import InputError, PluginError, UsageError, WorkflowError
-from pano_mvs.engine.params import Params
+from pano_mvs.engine.params import Params, files_of
 from pano_mvs.engine.registry import Registry
 from pano_mvs.engine.stage import StageSpec
 from pano_mvs.engine.yaml_text import Located, parse_yaml
@@ -118,6 +118,14 @@ def load_workflow(
     return WorkflowReader(str(path), path.parent, registry).read(text, overrides=overrides, images=images, path=path)
 
 
+class PartialWorkflowError(WorkflowError):
+    """A workflow with mistakes; `stages` are its entries where all could be named, for the wiring to be checked too."""
+
+    def __init__(self, problems: list[str], stages: dict[str, StageEntry]) -> None:
+        self.stages = stages
+        super().__init__(problems)
+
+
 class WorkflowReader:
     """Turns YAML into a workflow, collecting problems."""
 
@@ -140,7 +148,7 @@ class WorkflowReader:
         self._apply(entries, overrides, images)
         stages = {name: entry for name, node in entries.items() if (entry := self._stage(name, node)) is not None}
         if self.problems:
-            raise WorkflowError(self.problems)
+            raise PartialWorkflowError(self.problems, stages if len(stages) == len(entries) else {})
         name = root.value["name"].plain() if "name" in root.value else Path(self.shown_as).stem
         shown = ([f"images.path={images}"] if images else []) + list(overrides)
         return Workflow(str(name), path, text, stages, tuple(shown))
@@ -214,8 +222,7 @@ class WorkflowReader:
             except WorkflowError as error:
                 self.problems.extend(error.problems)
                 return
-            node = entries[stage_name]
-            node.value[param] = Located(value.value, node.line, node.column, node.key_line, node.key_column)
+            entries[stage_name].value[param] = Located(value.value, 0, 0, origin=f"--set {target.strip()}")
 
     def _stage(self, name: str, node: Located) -> StageEntry | None:
         use = node.value["use"]
@@ -229,22 +236,36 @@ class WorkflowReader:
         policy = self._validate(Policy, {key: values[key] for key in values if key in RESERVED_KEYS}, node, name)
         own = {key: value for key, value in values.items() if key not in RESERVED_KEYS}
         params = self._validate(spec.params_type, own, node, name)
+        if params is not None:
+            self._check_files(params, node, name)
         places = {key: self._place(item) for key, item in node.value.items()}
         wiring = node.value.get("in")
         if wiring is not None and isinstance(wiring.value, dict):
             places.update({f"in.{port}": self._place(item) for port, item in wiring.value.items()})
-        if policy is None or params is None:
-            return None
-        return StageEntry(name, spec, params, policy, self._key_place(node), places)
+        # Mistakes in settings do not keep the wiring from being checked, so that all are found in one go.
+        return StageEntry(
+            name, spec, params or Params(), policy or Policy(use=spec.name), self._key_place(node), places
+        )
+
+    def _check_files(self, params: Params, node: Located, name: str) -> None:
+        for key, paths in files_of(params).items():
+            for path in paths:
+                if not path.exists():
+                    self._problem(node.at((key,)), f"stage {name!r}: {key}: {path} does not exist")
 
     def _validate(self, model: type[Any], values: dict[str, Any], node: Located, name: str) -> Any:
         try:
-            return model.model_validate(values, context={"base": self.base})
+            return model.model_validate(values, context={"base": self.base, "bases": self._bases(node)})
         except ValidationError as error:
             known = [info.alias or field_name for field_name, info in model.model_fields.items()]
             for problem in error.errors(include_url=False):
                 self._report(problem, node, name, known)
             return None
+
+    @staticmethod
+    def _bases(node: Located) -> dict[str, Path]:
+        """Return the settings from the command line: their paths are relative to where it was typed."""
+        return {key: Path.cwd() for key, item in node.value.items() if item.origin}
 
     def _report(self, problem: Any, node: Located, name: str, known: list[str]) -> None:
         path = tuple(problem["loc"])
@@ -262,6 +283,8 @@ class WorkflowReader:
             self._problem(found, f"stage {name!r}: {setting}{message} (got {shown})")
 
     def _place(self, node: Located) -> str:
+        if node.origin:
+            return node.origin
         return f"{self.shown_as}:{node.line}:{node.column}"
 
     def _key_place(self, node: Located) -> str:

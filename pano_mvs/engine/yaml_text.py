@@ -26,6 +26,7 @@ class Located:
         column: 1-based column of the value.
         key_line: 1-based line of its key, if it is an entry of a mapping.
         key_column: likewise.
+        origin: what to show instead of the file and the place, for values from the command line.
     """
 
     value: Any
@@ -33,6 +34,7 @@ class Located:
     column: int
     key_line: int = 0
     key_column: int = 0
+    origin: str = ""
 
     def plain(self) -> Any:
         """Return the value without its places."""

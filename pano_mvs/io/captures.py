@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import re
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.core.files import OUTPUT_MARK
 from pano_mvs.io.exif_gps import find_gps
 from pano_mvs.io.gpano import GPano, find_gpano, read_head
 from pano_mvs.scene.image_file import decode_image
 
 PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp"})
-# A folder below the capture with this file and a report is the output of a run, with previews that are no panoramas.
-_OUTPUT_MARK = "run.json"
 _IGNORED_FOLDERS = frozenset({"masks"})
 # Start-of-frame markers of JPEG: C0–CF without the tables DHT (C4), JPG (C8) and DAC (CC).
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -52,12 +53,7 @@ def list_pictures(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder. Give the folder that holds the panoramas")
-    outputs = {path.parent for path in folder.rglob(_OUTPUT_MARK) if (path.parent / "report.html").is_file()}
-    pictures = [
-        path
-        for path in folder.rglob("*")
-        if _is_picture(path, path.relative_to(folder)) and outputs.isdisjoint(path.parents)
-    ]
+    pictures = [path for path in _files_below(folder) if path.suffix.lower() in PICTURE_SUFFIXES]
     if not pictures:
         kinds = ", ".join(sorted(suffix.lstrip(".") for suffix in PICTURE_SUFFIXES))
         raise InputError(f"{folder}: no pictures here. Panoramas may be {kinds}; folders called masks are left out")
@@ -101,10 +97,26 @@ def describe_picture(path: Path) -> PictureInfo:
     return PictureInfo((height, width), (height, width), None, gpano, warnings, position)
 
 
-def _is_picture(path: Path, inside: Path) -> bool:
-    if path.suffix.lower() not in PICTURE_SUFFIXES or any(part.startswith(".") for part in inside.parts):
-        return False
-    return not any(part.lower() in _IGNORED_FOLDERS for part in inside.parts[:-1]) and path.is_file()
+def _files_below(folder: Path) -> Iterator[Path]:
+    """Walk a capture, through links too; a folder that cannot be read is an error, not an empty one."""
+
+    def fail(error: OSError) -> None:
+        raise InputError(f"{error.filename}: cannot be listed ({error.strerror}). Mend its permissions or move it away")
+
+    seen: set[Path] = set()
+    for root, folders, files in os.walk(folder, followlinks=True, onerror=fail):
+        here = Path(root)
+        if here.resolve() in seen:
+            folders.clear()
+            continue
+        seen.add(here.resolve())
+        folders[:] = sorted(name for name in folders if not _is_left_out(here / name))
+        yield from (here / name for name in sorted(files) if not name.startswith(".") and (here / name).is_file())
+
+
+def _is_left_out(folder: Path) -> bool:
+    name = folder.name
+    return name.startswith(".") or name.lower() in _IGNORED_FOLDERS or (folder / OUTPUT_MARK).exists()
 
 
 def _placed(

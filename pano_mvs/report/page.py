@@ -8,6 +8,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from pano_mvs.core.files import write_text
 from pano_mvs.report import figures
 from pano_mvs.report.camera_map import camera_maps
 from pano_mvs.report.pictures import previews
@@ -46,7 +47,7 @@ def write_report(out_dir: Path, summary: Mapping[str, Any]) -> None:
         previews=previews(out_dir, summary.get("views") or []),
         scores=figures.score_tables(summary.get("scores") or {}),
     )
-    (out_dir / "report.html").write_text(page, encoding="utf-8")
+    write_text(out_dir / "report.html", page)
 
 
 def _with_defaults(summary: Mapping[str, Any]) -> dict[str, Any]:

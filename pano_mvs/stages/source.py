@@ -35,11 +35,17 @@ def list_folder(params: FolderParams) -> Iterator[SourceItem]:
     if len(pictures) < 2:
         raise InputError(f"{params.path}: holds one picture only ({pictures[0].name}); depth needs two or more "
                          "panoramas of the same place, taken from different positions")  # fmt: skip
+    if params.masks is not None and not params.masks.is_dir():
+        raise InputError(f"{params.masks}: masks must be a folder. Give one mask for all pictures as `mask`")
     for path in pictures:
         name = path.relative_to(params.path).as_posix()
-        problem = f"{path}: a file name with {_SEPARATOR!r} cannot be used; rename it" if _SEPARATOR in name else ""
+        printable = name.encode(errors="replace").decode()
+        problem = ""
+        if _SEPARATOR in name or printable != name:
+            what = repr(_SEPARATOR) if _SEPARATOR in name else "bytes that are no UTF-8"
+            problem, name = f"{printable}: a file name with {what} cannot be used; rename it", printable
         files = {"image": path}
-        mask = _mask_of(name, params)
+        mask = None if problem else _mask_of(name, params)
         if mask is not None:
             files["mask"] = mask
         yield SourceItem(name, files, problem)
@@ -58,6 +64,8 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
         ctx.note(f"{item.name}: {warning}" if info.gpano is not None else f"some pictures have {warning}")
     _check_decodes(path, info)
     mask = item.files.get("mask")
+    if mask is None and params.masks is not None:
+        ctx.note(f"{item.name} has no mask in {params.masks.name}; all of it is used")
     if mask is not None:
         decode_image(mask)
     return Panorama(

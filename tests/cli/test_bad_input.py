@@ -134,3 +134,75 @@ def test_pictures_of_two_places_make_no_false_model(pano_mvs: Command, capture: 
     summary = run_json(Path("out"))
     assert summary["poses"]["registered"] == ["000.png", "001.png"]
     assert set(summary["rejected"]) == {"002.png", "003.png"}
+
+
+def test_output_folder_that_is_the_capture(pano_mvs: Command, short: Path, capture: Path) -> None:
+    result = pano_mvs("run", short, "--out", capture / "images")
+    assert result.code == 2
+    assert "reads this very folder" in result.flat
+
+
+def test_outputs_of_an_interrupted_run_are_no_pictures(pano_mvs: Command, capture: Path) -> None:
+    out = capture / "images" / "out"
+    arguments = ("run", "quickstart", "--images", capture / "images", "--out", out, *SMALL)
+    assert pano_mvs(*arguments).code == 0
+    (out / "run.json").unlink()
+    (out / "report.html").unlink()
+    assert "0 units computed" in pano_mvs(*arguments).text
+
+
+def test_masks_that_are_not_there(pano_mvs: Command, short: Path) -> None:
+    result = pano_mvs("run", short, "--set", "images.masks=nowhere")
+    assert result.code == 2
+    assert "nowhere does not exist" in result.flat
+
+
+def test_picture_without_its_mask_is_noted(pano_mvs: Command, short: Path, capture: Path) -> None:
+    Path("masks").mkdir()
+    for name in ("000.png.png", "001.png"):
+        cv2.imwrite(f"masks/{name}", np.full((160, 320), 255, np.uint8))
+    result = pano_mvs("run", short, "--set", "images.masks=masks")
+    assert result.code == 0, result.text
+    assert "002.png has no mask" in result.flat
+    assert "001.png has no mask" not in result.flat
+
+
+@pytest.mark.skipif(os.name != "posix", reason="names of any bytes exist on POSIX systems only")
+def test_names_that_cannot_be_written_or_look_like_markup(pano_mvs: Command, short: Path, capture: Path) -> None:
+    images = capture / "images"
+    shutil.copy(images / "000.png", os.fsencode(images) + b"/gr\xf6sse.png")
+    (images / "a[").mkdir()
+    (images / "a[" / "b].jpg").write_bytes(b"broken")
+    result = pano_mvs("run", short, "--out", "out")
+    assert result.code == 3, result.text
+    assert "rename it" in result.flat
+    assert "a[/b].jpg" in result.flat
+
+
+def test_linked_folders_are_followed_and_loops_end(pano_mvs: Command, short: Path, capture: Path) -> None:
+    (capture / "links").mkdir()
+    (capture / "links" / "to").symlink_to(capture / "images", target_is_directory=True)
+    (capture / "links" / "loop").symlink_to(capture / "links", target_is_directory=True)
+    result = pano_mvs("run", short, "--images", capture / "links", "--out", "out")
+    assert result.code == 0, result.text
+    assert run_json(Path("out"))["stages"][0]["units"] == 4
+
+
+def test_damaged_poses_are_computed_again(pano_mvs: Command, capture: Path) -> None:
+    arguments = ("run", "quickstart", "--images", capture / "images", "--cache", "cache", "--out", "out", *SMALL)
+    assert pano_mvs(*arguments).code == 0
+    for blob in sorted(Path("cache/blobs").rglob("*.json")):
+        data = blob.read_bytes()
+        blob.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+    result = pano_mvs(*arguments)
+    assert result.code == 0, result.text
+    assert "computes it again" in result.flat
+
+
+def test_status_of_a_strange_run_json(pano_mvs: Command, short: Path) -> None:
+    Path("out").mkdir()
+    for text in ("{}", "[1]", "nonsense"):
+        Path("out/run.json").write_text(text)
+        result = pano_mvs("status", short, "--out", "out")
+        assert result.code == 0, result.text
+        assert "run again to write it anew" in result.flat

@@ -47,7 +47,7 @@ def test_quickstart_writes_what_the_contract_promises(quickstart: tuple[Path, st
     views = {f"{folder}/{name}.{suffix}" for name in NAMES
              for folder, suffix in (("range", "tiff"), ("confidence", "png"), ("preview", "jpg"))}  # fmt: skip
     files = {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}
-    assert files == model | views | {"cloud.ply", "report.html", "run.json"}
+    assert files == model | views | {"cloud.ply", "report.html", "run.json", ".pano-mvs-output"}
 
 
 def test_quickstart_tells_the_accuracy_and_where_the_results_are(quickstart: tuple[Path, str]) -> None:

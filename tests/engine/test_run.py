@@ -5,7 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from pano_mvs.core.errors import GateError, InputError, UsageError
+from pano_mvs.core.errors import GateError, InputError, StoreError, UsageError, WorkflowError
+from pano_mvs.engine.registry import Registry
+from pano_mvs.engine.store import Store
 from tests.engine.conftest import Toy, ran
 
 ALL_UNITS = {
@@ -73,7 +75,7 @@ def test_moving_and_renaming_recomputes_only_what_sees_names(toy: Toy) -> None:
     toy.edit("wf.yaml", lambda text: text.replace("path: capture", "path: elsewhere"))
     assert toy.run().computed == 0
     (toy.folder / "elsewhere" / "5.txt").rename(toy.folder / "elsewhere" / "5b.txt")
-    assert ran(toy.run()) == {"pairs": 1, "views": 1, "shifted": 1, "all": 1}
+    assert ran(toy.run()) == {"images": 1, "pairs": 1, "views": 1, "shifted": 1, "all": 1}
 
 
 def test_setting_changes_run_from_there_on_and_the_plan_says_why(toy: Toy) -> None:
@@ -192,3 +194,85 @@ def test_plan_of_an_empty_store_runs_the_source_and_waits_for_the_rest(toy: Toy)
     assert len(plan["scaled"].may_run) == 5
     assert plan["difference"].open
     assert plan["mean"].open
+
+
+def test_files_of_an_image_that_failed_meanwhile_are_not_forgotten(toy: Toy) -> None:
+    first = toy.run()
+    (toy.folder / "capture" / "5.txt").unlink()
+    toy.number("2.txt", "not a number")
+    failed = toy.run(earlier=dict(first.published))
+    assert set(failed.left_over) == {"mean/2.txt", "mean/5.txt"}
+    toy.number("2.txt", "20")
+    mended = toy.run(earlier={**failed.published, **failed.left_over})
+    assert mended.removed == ["mean/5.txt"]
+
+
+def test_names_that_meet_after_the_extension_is_dropped_stay_apart(toy: Toy) -> None:
+    for name in ("a.txt", "a.b.txt", "a.b.txt.txt"):
+        toy.number(name, "1")
+    toy.run()
+    names = {name for name in toy.deliverables() if name.startswith("mean/a")}
+    assert len(names) == 3
+
+
+def test_store_that_cannot_be_written_still_serves_what_it_has(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    toy.run()
+
+    def refuse(*_: object) -> None:
+        raise StoreError("read only")
+
+    monkeypatch.setattr(Store, "save_last_keys", refuse)
+    result = toy.run()
+    assert result.exit_code == 0
+    assert any("cannot be told why" in warning for warning in result.warnings)
+
+
+def test_metric_that_is_not_finite_passes_no_gate(toy: Toy) -> None:
+    toy.edit("plug.py", lambda text: text.replace('ctx.metric("value", x.value)', 'ctx.metric("value", float("nan"))'))
+    assert toy.run("scaled.gate={value: 1}").exit_code == GateError.exit_code
+
+
+@pytest.mark.parametrize("where", ["    if x.value == 13:", "class ScaleParams"])
+def test_plugin_that_exits_is_a_failure(toy: Toy, where: str) -> None:
+    indent = where[: len(where) - len(where.lstrip())]
+    toy.edit("plug.py", lambda text: text.replace(where, f"{indent}import sys; sys.exit(0)\n{where}"))
+    if indent:
+        assert toy.run().exit_code == 3
+    else:
+        with pytest.raises(WorkflowError, match="SystemExit"):
+            toy.run()
+
+
+def test_helpers_of_helpers_count_towards_the_code(toy: Toy) -> None:
+    (toy.folder / "lib").mkdir()
+    (toy.folder / "lib" / "__init__.py").write_text("")
+    (toy.folder / "lib" / "core.py").write_text("from lib.values import FACTOR\n")
+    (toy.folder / "lib" / "values.py").write_text("FACTOR = 2\n")
+    (toy.folder / "helper.py").write_text("from lib.core import FACTOR\n\ndef double(x):\n    return FACTOR * x\n")
+    toy.run()
+    (toy.folder / "lib" / "values.py").write_text("FACTOR = 20\n")
+    assert ran(toy.run())["scaled"] == 5
+    assert toy.deliverables()["mean/1.txt"] == b"450.0"
+    (toy.folder / "lib" / "__init__.py").write_text("import lib.values\nlib.values.FACTOR = 2\n")
+    assert ran(toy.run())["images"] == 5
+
+
+def test_helpers_of_one_plugin_are_not_those_of_another(toy: Toy) -> None:
+    for name, value in (("first", 1), ("second", 50)):
+        (toy.folder / name).mkdir()
+        (toy.folder / name / "settings.py").write_text(f"VALUE = {value}\n")
+        (toy.folder / name / "plugin.py").write_text(
+            "from pano_mvs.api import *\nfrom settings import VALUE\n"
+            f"@stage('{name}.pairs')\ndef pairs(names: Names[Panorama]) -> Pairs:\n    return VALUE\n"
+        )
+    registry = Registry()
+    for name in ("first", "second"):
+        registry.add_file(toy.folder / name / "plugin.py")
+    assert registry.stages["first.pairs"].function(()) == 1
+    assert registry.stages["second.pairs"].function(()) == 50
+
+
+def test_stage_that_a_plugin_only_imports_is_not_its_own(toy: Toy) -> None:
+    toy.edit("plug.py", lambda text: "from pano_mvs.stages.views import nearest\n" + text)
+    session = toy.session()
+    assert session.registry.stages["views.nearest"].code_digest == ""

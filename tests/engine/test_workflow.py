@@ -24,7 +24,7 @@ def problems(toy: Toy, text: str) -> list[str]:
 
 
 HEAD = "pano_mvs: 1\nplugins: [plug.py]\nstages:\n"
-SOURCE = "  i: {use: toy.source, path: x}\n"
+SOURCE = "  i: {use: toy.source, path: capture}\n"
 
 
 def test_every_mistake_is_found_in_one_go_with_its_place(toy: Toy) -> None:
@@ -49,7 +49,7 @@ def test_every_mistake_is_found_in_one_go_with_its_place(toy: Toy) -> None:
         ("stages: {a: {use: x}}", "wf.yaml:1:1", "`pano_mvs: 1` is missing"),
         ("pano_mvs: 7\nstages: {a: {use: x}}", "wf.yaml:1:11", "workflow format 7"),
         ("pano_mvs: 1\nstages: [a]", "wf.yaml:2:9", "must be a mapping"),
-        ("pano_mvs: 1\nstages: {a: {path: x}}", "wf.yaml:2:10", "needs `use: NAME`"),
+        ("pano_mvs: 1\nstages: {a: {path: capture}}", "wf.yaml:2:10", "needs `use: NAME`"),
         ("pano_mvs: 1\nstages: {../a: {use: x}}", "wf.yaml:2:10", "must be a word"),
         ("pano_mvs: !!python/object:os.system 1", "wf.yaml:1:11", "is not allowed"),
         ("pano_mvs: [1", "wf.yaml", "expected"),
@@ -79,7 +79,7 @@ def test_mistakes_of_form(toy: Toy, text: str, place: str, what: str) -> None:
             SOURCE + "  a: {use: toy.scale}\n  b: {use: toy.scale, in: {x: i}}\n  c: {use: toy.scale}\n",
             "could be fed by a, b; say which with `in: {x: …}`",
         ),
-        ("  i: {use: toy.source, path: x, to: ../up}\n", "inside the output folder"),
+        ("  i: {use: toy.source, path: capture, to: ../up}\n", "inside the output folder"),
     ],
 )
 def test_mistakes_of_wiring(toy: Toy, stages: str, what: str) -> None:
@@ -90,7 +90,8 @@ def test_mistakes_of_wiring(toy: Toy, stages: str, what: str) -> None:
 
 def test_an_input_is_wired_to_the_nearest_earlier_stage_of_a_chain(toy: Toy) -> None:
     text = (
-        HEAD + "  i: {use: toy.source, path: x}\n  a: {use: toy.scale}\n  b: {use: toy.scale}\n  c: {use: toy.scale}\n"
+        HEAD
+        + "  i: {use: toy.source, path: capture}\n  a: {use: toy.scale}\n  b: {use: toy.scale}\n  c: {use: toy.scale}\n"
     )
     (toy.folder / "wf.yaml").write_text(text)
     edges = toy.session().graph.edges
@@ -98,13 +99,13 @@ def test_an_input_is_wired_to_the_nearest_earlier_stage_of_a_chain(toy: Toy) -> 
 
 
 def test_a_stage_named_in_in_may_stand_below(toy: Toy) -> None:
-    text = HEAD + "  a: {use: toy.scale, in: {x: i}}\n  i: {use: toy.source, path: x}\n"
+    text = HEAD + "  a: {use: toy.scale, in: {x: i}}\n  i: {use: toy.source, path: capture}\n"
     (toy.folder / "wf.yaml").write_text(text)
     assert toy.session().graph.order == ("i", "a")
 
 
 def test_collections_feed_ports_that_want_their_items(toy: Toy) -> None:
-    text = HEAD + "  i: {use: toy.source, path: x}\n  s: {use: toy.shifted}\n  a: {use: toy.scale}\n"
+    text = HEAD + "  i: {use: toy.source, path: capture}\n  s: {use: toy.shifted}\n  a: {use: toy.scale}\n"
     (toy.folder / "wf.yaml").write_text(text)
     edge = toy.session().graph.edges["a"]["x"]
     assert (edge.producer, edge.exploded) == ("s", True)
@@ -180,3 +181,31 @@ def test_any_text_gives_a_list_of_problems(text: str) -> None:
     with pytest.raises(WorkflowError) as caught:  # no stage is registered, so no text can be a sound workflow
         wire(WorkflowReader("t", Path(), Registry()).read(text))
     assert caught.value.problems
+
+
+def test_wiring_is_checked_beside_wrong_settings(toy: Toy) -> None:
+    found = problems(toy, HEAD + SOURCE + "  a: {use: toy.scale, by: many, in: {y: i}}\n")
+    assert len(found) == 2
+    assert any("by:" in line for line in found)
+    assert any("no port 'y'" in line for line in found)
+
+
+def test_paths_that_do_not_exist_are_found_before_anything_runs(toy: Toy) -> None:
+    found = problems(toy, HEAD + "  i: {use: toy.source, path: gone}\n")
+    assert found == [f"wf.yaml:4:30: stage 'i': path: {toy.folder / 'gone'} does not exist"]
+
+
+def test_paths_from_the_command_line_are_relative_to_the_current_folder(
+    toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    (elsewhere / "mine").mkdir(parents=True)
+    monkeypatch.chdir(elsewhere)
+    params = toy.session("images.path=mine").workflow.stages["images"].params.model_dump()
+    assert params["path"] == elsewhere / "mine"
+
+
+def test_mistakes_on_the_command_line_are_not_blamed_on_the_file(toy: Toy) -> None:
+    with pytest.raises(WorkflowError) as caught:
+        toy.session("scaled.by=many")
+    assert caught.value.problems[0].startswith("--set scaled.by: stage 'scaled': by:")

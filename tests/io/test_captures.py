@@ -84,8 +84,7 @@ def test_the_output_of_an_earlier_run_is_no_part_of_the_capture(tmp_path):
     for name in (
         "1.jpg",
         "out/lobby/preview/1.jpg",
-        "out/lobby/run.json",
-        "out/lobby/report.html",
+        "out/lobby/.pano-mvs-output",
         "b/run.json",
         "b/2.jpg",
     ):
