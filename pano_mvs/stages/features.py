@@ -49,7 +49,7 @@ class SphorbParams(Params):
     """Settings of features.sphorb."""
 
     max_keypoints: int = Field(default=10_000, ge=8, description="the best so many, spread over the sphere")
-    fast_threshold: int = Field(default=7, ge=1, le=254, description="lower finds more on plain walls")
+    fast_threshold: int = Field(default=5, ge=1, le=254, description="lower finds more on plain walls")
 
 
 @stage("features.sphorb")

@@ -6,6 +6,7 @@ from scipy.spatial import cKDTree
 
 from pano_mvs.algorithms.features.icosahedron import face_centers, sample_tile, tangent_tiles
 from pano_mvs.algorithms.features.selection import distinct_keypoints, spread_keypoints
+from pano_mvs.algorithms.features.sphorb import extract_sphorb
 from pano_mvs.algorithms.features.tangent import extract_orb, extract_sift
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import (
@@ -21,7 +22,7 @@ from pano_mvs.testing.room import default_room, render
 
 SIZE = (256, 512)
 PIXEL = 2 * np.pi / SIZE[1]
-EXTRACTORS = {"sift": extract_sift, "orb": extract_orb}
+EXTRACTORS = {"sift": extract_sift, "orb": extract_orb, "sphorb": extract_sphorb}
 
 
 def spread_directions(rng, count, *, apart):

@@ -19,7 +19,8 @@ def smooth_panorama(panorama: NDArray[np.uint8], sigmas_px: FloatArray) -> list[
 
     Rows are smoothed by 1 / cos φ as many pixels as columns. Towards the poles a row's pixels are narrower than those
     of the equator; what that adds in sharpness along the row is taken away as well, so that noise and detail are alike
-    in all directions.
+    in all directions. Only within about two standard deviations of a pole is the smoothing weaker than elsewhere, for
+    there the rows are circles so small that they are smoothed towards no other place.
 
     Args:
         panorama: (H, W) uint8, the full sphere.

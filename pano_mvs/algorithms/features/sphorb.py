@@ -30,8 +30,9 @@ _PATCH_RADIUS = 15  # cells from the centre to the farthest test
 _TESTS = 256
 _MARGIN = 32  # no less than _CLEARANCE lattice steps, stretched 1.42 times, from 5 cells beyond a face
 _CLEARANCE = 18  # cells around a corner that must not be masked: its patch, and what smoothing brings into it
-_ANTIALIAS = 0.5
-_WINDOW_RADIUS, _WINDOW_SIGMA = 2, 1.3
+# Standard deviations in cells: of the smoothing that a wider cell asks for, and of that for steadier corners.
+_ANTIALIAS, _CORNER_SIGMA = 0.5, 0.65
+_WINDOW_RADIUS, _WINDOW_SIGMA = 2, 1.0
 _PATCH_SIGMA = 2.0
 
 
@@ -53,7 +54,7 @@ def extract_sphorb(
     mask: NDArray[np.bool_],
     *,
     max_keypoints: int = 10_000,
-    fast_threshold: int = 7,
+    fast_threshold: int = 5,
     levels: int = 7,
 ) -> Features:
     """Return the SPHORB key points of a panorama.
@@ -76,11 +77,9 @@ def extract_sphorb(
                          f"{image.dtype} and {mask.shape}")  # fmt: skip
     gray: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     grids = grid_pyramid(image.shape[1], levels)
-    scales = _SCALE ** np.arange(len(grids))
-    pictures = [
-        grid.sample(smoothed)
-        for grid, smoothed in zip(grids, smooth_panorama(gray, _ANTIALIAS * np.sqrt(scales**2 - 1)), strict=True)
-    ]
+    scales = np.array([grids[0].steps / grid.steps for grid in grids])
+    sigmas_px = np.sqrt(_ANTIALIAS**2 * (scales**2 - 1) + (_CORNER_SIGMA * scales) ** 2)
+    pictures = [grid.sample(smoothed) for grid, smoothed in zip(grids, smooth_panorama(gray, sigmas_px), strict=True)]
     found = [_detect(p, g, threshold=fast_threshold) for p, g in zip(pictures, grids, strict=True)]
     if not mask.all():
         found = [_unmasked(f, g, mask) for f, g in zip(found, grids, strict=True)]
@@ -155,10 +154,10 @@ def _describe(pictures: NDArray[np.uint8], grid: GeodesicGrid, corners: _Corners
     smoothed = np.stack([cv2.filter2D(p, -1, _smoothing_kernel()) for p in pictures]).reshape(20, side, side)
     turns = grid.lattice_from_tangent(corners.faces, corners.places_uv)
     angles, bits = np.empty(len(corners.faces)), np.empty((len(corners.faces), _TESTS // 8), np.uint8)
+    disc = lattice_disc(_PATCH_RADIUS)
     kernels.describe_corners(
-        smoothed, corners.faces, corners.places_uv, turns, lattice_disc(_PATCH_RADIUS), binary_tests(), grid.margin, angles,
-        bits,
-    )  # fmt: skip
+        smoothed, corners.faces, corners.places_uv, turns, disc, binary_tests(), grid.margin, angles, bits
+    )
     return bits
 
 

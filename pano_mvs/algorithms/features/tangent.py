@@ -17,6 +17,7 @@ from pano_mvs.geometry import pixel_from_ray
 from pano_mvs.scene import Features
 
 _ORB_SCALE, _ORB_LEVELS = 1.2, 8
+_ORB_SMOOTHING_PX = 1.2
 _EDGE_PX = 0.5
 # Twice the usual: on plain walls many a key point lies on an edge, and the geometry sorts out those that slide.
 _SIFT_EDGE_RATIO = 20
@@ -104,7 +105,7 @@ def extract_orb(
     def detect(tile_image: NDArray[np.uint8]) -> _Found:
         keypoints, descriptors = detector.detectAndCompute(tile_image, None)
         described = np.zeros((0, 32), np.uint8) if descriptors is None else descriptors
-        return _Found(_orb_pixels(keypoints, tile_image.shape), *_sizes_and_scores(keypoints), described)
+        return _Found(_orb_pixels(keypoints, tile_image), *_sizes_and_scores(keypoints), described)
 
     return _extract(image, mask, detect, max_keypoints=max_keypoints, metric="hamming")
 
@@ -190,15 +191,45 @@ def _rooted(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
     return rooted
 
 
-def _orb_pixels(keypoints: Sequence[cv2.KeyPoint], shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return ORB's key points in pixels with (0, 0) at the corner.
+def _orb_pixels(keypoints: Sequence[cv2.KeyPoint], tile_image: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Return ORB's key points in pixels with (0, 0) at the corner, placed between the pixels of their level.
 
-    OpenCV multiplies the level's coordinates, counted from its first pixel's CENTRE, by the level's scale; so all
-    but the lowest level are off by (s − 1) / 2 pixels. The scale that the level really has is that of its size.
+    OpenCV multiplies the level's whole coordinates, counted from its first pixel's CENTRE, by the level's scale; so
+    all but the lowest level are off by (s − 1) / 2 pixels. The scale that the level really has is that of its size.
     """
     points = np.array([k.pt for k in keypoints]).reshape(-1, 2)
-    nominal = _ORB_SCALE ** np.array([k.octave for k in keypoints], np.float64).reshape(-1, 1)
-    size_xy = np.array(shape[1::-1], np.float64)
-    actual = size_xy / np.rint(size_xy / nominal)
-    pixels: NDArray[np.float64] = (points / nominal + 0.5) * actual
+    levels = np.array([k.octave for k in keypoints], np.intp)
+    pixels = np.empty_like(points)
+    size_xy = np.array(tile_image.shape[1::-1], np.float64)
+    for level in np.unique(levels):
+        here = levels == level
+        nominal = _ORB_SCALE**level
+        level_size = np.rint(size_xy / nominal)
+        picture = cv2.resize(tile_image, [int(size) for size in level_size], interpolation=cv2.INTER_AREA)
+        whole = np.rint(points[here] / nominal).astype(np.intp)
+        pixels[here] = (_blob_tops(picture, whole) + 0.5) * (size_xy / level_size)
     return pixels
+
+
+def _blob_tops(picture: NDArray[np.uint8], whole_px: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Return where near whole pixels (N, 2) the Laplacian is strongest, (0, 0) the first pixel's centre.
+
+    The tops of the parabolas through its absolute value along x and along y, half a pixel away at most.
+    """
+    smooth = cv2.GaussianBlur(picture, (0, 0), _ORB_SMOOTHING_PX)
+    strength = np.abs(cv2.Laplacian(smooth, cv2.CV_64F))
+    x, y = whole_px.T
+    tops = [
+        _parabola_top(strength[y - dy, x - dx], strength[y, x], strength[y + dy, x + dx]) for dx, dy in ((1, 0), (0, 1))
+    ]
+    return whole_px + np.stack(tops, axis=-1)
+
+
+def _parabola_top(
+    before: NDArray[np.float64], center: NDArray[np.float64], after: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the place of the greatest value of a parabola through three values, in −0.5 … 0.5; 0 if it has none."""
+    curvature = before + after - 2 * center
+    peaked = curvature < 0
+    top = 0.5 * (before - after) / np.where(peaked, curvature, -1.0)
+    return np.where(peaked, np.clip(top, -0.5, 0.5), 0.0)
