@@ -222,7 +222,7 @@ def _blob_tops(picture: NDArray[np.uint8], whole_px: NDArray[np.intp]) -> NDArra
     tops = [
         _parabola_top(strength[y - dy, x - dx], strength[y, x], strength[y + dy, x + dx]) for dx, dy in ((1, 0), (0, 1))
     ]
-    return whole_px + np.stack(tops, axis=-1)
+    return whole_px.astype(np.float64) + np.stack(tops, axis=-1)
 
 
 def _parabola_top(
