@@ -160,6 +160,28 @@ def test_floor_is_found_under_tables_in_any_unit_and_world(scale):
         assert floor.points > 100
 
 
+def plate(rng, depth: float, half: float, count: int):
+    return np.stack(
+        [rng.uniform(-half, half, count), rng.normal(depth, 0.004, count), rng.uniform(-half, half, count)], 1
+    )
+
+
+def test_a_table_with_more_points_than_the_floor_is_not_the_floor():
+    rng = np.random.default_rng(5)
+    points = np.concatenate([plate(rng, 0.7, 0.8, 400), plate(rng, 1.5, 3.0, 200), plate(rng, 2.6, 3.0, 10)])
+    floor = floor_below(points, rng.normal(size=(4, 3)) * 0.1, UP)
+    assert floor.depth == pytest.approx(1.5, abs=0.1)
+    assert floor.points == pytest.approx(200, abs=20)
+
+
+def test_a_floor_lies_below_the_lowest_camera():
+    rng = np.random.default_rng(6)
+    centers = np.array([[0, 0, 0], [0.5, 0, 0], [1.0, 0, 0], [0.5, 1.2, 0]])
+    floor = floor_below(np.concatenate([plate(rng, 0.7, 0.8, 400), plate(rng, 2.0, 3.0, 50)]), centers, UP)
+    assert floor.depth == pytest.approx(2.0, abs=0.05)
+    assert not floor_below(plate(rng, 0.7, 0.8, 400), centers, UP)
+
+
 def test_where_nothing_lies_below_there_is_no_floor():
     above = np.random.default_rng(0).uniform(-1, 0, (200, 3))
     assert "lie below" in floor_below(above, np.zeros((2, 3)), UP).reason
