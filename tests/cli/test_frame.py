@@ -11,12 +11,14 @@ import numpy as np
 import pycolmap
 import pytest
 
+from pano_mvs.algorithms.poses.geodesy import lla_from_local
 from pano_mvs.geometry import Rigid3, Similarity3
 from pano_mvs.io.pose_files import read_poses
 from pano_mvs.io.range_files import read_range_tiff
 from tests.algorithms.synthetic_capture import random_rotation
 from tests.cli.conftest import SMALL, Command, run_json
 from tests.io.pictures import full_sphere, xmp
+from tests.io.test_exif_gps import exif
 from tests.test_docs_frames import block
 
 UP = np.array([0.0, -1.0, 0.0])
@@ -46,9 +48,23 @@ def write_sensors(picture: Path, up_in_cam: np.ndarray) -> None:
     data = picture.read_bytes()
     width, height = struct.unpack_from(">II", data, 16)
     packet = xmp(full_sphere(height, width, PosePitchDegrees=pitch, PoseRollDegrees=roll))
-    body = b"XML:com.adobe.xmp\0\0\0\0\0" + packet
-    chunk = struct.pack(">I", len(body)) + b"iTXt" + body + struct.pack(">I", zlib.crc32(b"iTXt" + body))
-    picture.write_bytes(data[:33] + chunk + data[33:])
+    insert_chunk(picture, b"iTXt" + b"XML:com.adobe.xmp\0\0\0\0\0" + packet)
+
+
+def write_gps(picture: Path, position_lla: np.ndarray) -> None:
+    """Put a position into a picture, to a millimetre."""
+    latitude, longitude = (
+        ((int(angle), 1), (0, 1), (round((angle % 1) * 3600e6), 10**6)) for angle in position_lla[:2]
+    )
+    altitude = (round(position_lla[2] * 1000), 1000)
+    insert_chunk(picture, b"eXIf" + exif(latitude=latitude, longitude=longitude, altitude=altitude))
+
+
+def insert_chunk(picture: Path, chunk: bytes) -> None:
+    """Put a chunk of a PNG, its type included, behind the header."""
+    data = picture.read_bytes()
+    whole = struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    picture.write_bytes(data[:33] + whole + data[33:])
 
 
 def test_a_known_baseline_makes_everything_metric(pano_mvs: Command, capture: Path) -> None:
@@ -104,6 +120,26 @@ def test_sensors_level_a_turned_world(pano_mvs: Command, capture: Path, turned: 
     assert told["scale"] == "metres, by the given factor 2"
     heights = [-pose.center[1] for pose in turned.values()]
     np.testing.assert_allclose(-np.array(told["centers"])[:, 1], np.array(heights) - heights[0], atol=1e-6)
+
+
+def test_gps_gives_metres_and_the_compass(pano_mvs: Command, capture: Path, turned: dict[str, Rigid3]) -> None:
+    """The room as a street: 60 m for each of its units, x to the east and z to the north."""
+    for name, pose in turned.items():
+        write_sensors(capture / "images" / name, pose.rotation @ UP)
+        write_gps(capture / "images" / name, lla_from_local(60 * pose.center, [47.5, 8.25, 410.0]))
+    workflow = capture.parent / "gps.yaml"
+    workflow.write_text(KNOWN + "  metres: {use: poses.scale, gps: true, align: gps, gps_noise_m: 0.5}\n")
+    result = pano_mvs("run", workflow, "--out", "out")
+    assert result.code == 0, result.text
+    told = run_json(Path("out"))["poses"]
+    assert told["metric"] is True
+    assert told["scale"].startswith("metres, by GPS of 4 of 4 panoramas")
+    assert told["frame"] == ("x east, y down, z north, by GPS; origin at the first registered camera (47.5000000°, "
+                             "8.2500000°, 410.0 m)")  # fmt: skip
+    np.testing.assert_allclose(told["centers"], [60 * pose.center for pose in turned.values()], atol=0.01)
+    indoors = pano_mvs("run", workflow, "--out", "out", "--set", "metres.gps_noise_m=20")
+    assert indoors.code != 0
+    assert "too close for GPS that is good to 20.0 m" in indoors.flat
 
 
 def test_what_gives_no_scale_stops_with_the_reason(pano_mvs: Command, capture: Path, turned: dict[str, Rigid3]) -> None:
