@@ -55,7 +55,7 @@ def show_status(session: Session, console: Console) -> None:
 def _print_last(last: Any, console: Console) -> None:
     units = last["units"]
     console.print(f"latest run {last['started']}: exit code {last['exit_code']}, {units['run']} computed, "
-                  f"{units['cached']} cached, {units['failed']} without a result", highlight=False)  # fmt: skip
+                  f"{units['cached']} cached, {units['failed']} failed", highlight=False)  # fmt: skip
     for failure in last["failures"]:
         console.print(escape(f"  {failure['stage']}:{failure['item']}: {failure['cause']}"), highlight=False)
 

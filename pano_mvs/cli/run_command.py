@@ -69,7 +69,7 @@ def earlier_files(out: Path) -> dict[str, str]:
 def print_summary(summary: Mapping[str, Any], out: Path, console: Console, *, written: int) -> None:
     """Print where the results are and how good they are known to be."""
     units = summary["units"]
-    failed = f", {units['failed']} without a result" if units["failed"] else ""
+    failed = f", {units['failed']} failed" if units["failed"] else ""
     cached = " (nothing to compute)" if not units["run"] and not units["failed"] else ""
     counts = f"{units['run']} units computed, {units['cached']} cached{failed}"
     console.print(f"\n{counts} in {summary['seconds']:.1f} s{cached}", highlight=False)
@@ -90,16 +90,15 @@ def print_summary(summary: Mapping[str, Any], out: Path, console: Console, *, wr
 
 
 def _print_failures(summary: Mapping[str, Any], console: Console) -> None:
-    causes = [failure for failure in summary["failures"] if not failure["cause"].startswith("not run:")]
+    causes = summary["failures"]
     for failure in causes[:_SHOWN_FAILURES]:
         label = f"{failure['stage']}:{failure['item']}" if failure["item"] else failure["stage"]
         text = f"{label}: {failure['cause']} — {failure['consequence']}"
         console.print(f"[red]failed:[/] {escape(text)}", highlight=False, soft_wrap=True)
     if len(causes) > _SHOWN_FAILURES:
         console.print(f"… and {len(causes) - _SHOWN_FAILURES} more, all in run.json", highlight=False)
-    dependent = len(summary["failures"]) - len(causes)
-    if dependent:
-        console.print(f"{dependent} further units could not run because of these", highlight=False)
+    if summary["blocked"]:
+        console.print(f"{len(summary['blocked'])} further units could not run because of these", highlight=False)
     for image, rejected in summary["rejected"].items():
         text = f"{image}: {rejected['reason']}"
         console.print(f"[yellow]left out:[/] {escape(text)}", highlight=False, soft_wrap=True)

@@ -32,13 +32,16 @@ def summarise(run: Run, result: RunResult, *, started: datetime, seconds: float)
         "units": {
             "run": result.computed,
             "cached": result.cached,
-            "failed": sum(stage.failed + stage.blocked for stage in result.stages),
+            "failed": sum(stage.failed for stage in result.stages),
+            "blocked": sum(stage.blocked for stage in result.stages),
         },
         "stages": [_stage(summary, workflow) for summary in result.stages],
         "failures": [
             {"stage": f.stage, "item": f.item, "cause": f.cause, "consequence": f.consequence, "trace": f.trace}
             for f in result.failures
+            if not f.blocked
         ],
+        "blocked": [{"stage": f.stage, "item": f.item, "cause": f.cause} for f in result.failures if f.blocked],
         "rejected": {image: {"stage": stage, "reason": why} for image, (stage, why) in result.rejected.items()},
         "warnings": list(result.warnings),
         "notes": [note for summary in result.stages for note in summary.notes],
@@ -95,6 +98,7 @@ def _poses(run: Run, result: RunResult) -> dict[str, Any]:
             links = [[*pair_from_name(pair), int(metrics.get("inliers", 0))] for pair, metrics in pairs]
     return {
         "registered": list(poses.names),
+        "blocked": [{"stage": f.stage, "item": f.item, "cause": f.cause} for f in result.failures if f.blocked],
         "rejected": {image: why for image, (_, why) in result.rejected.items()},
         "centers": poses.centers.tolist(),
         "points": len(poses.points_in_world),

@@ -19,6 +19,7 @@ class Failure:
         cause: what went wrong and what to do.
         trace: the Python traceback, if the stage's own code broke.
         consequence: what the result lacks because of it.
+        blocked: whether the unit did not even run, for want of an input that failed.
     """
 
     stage: str
@@ -26,6 +27,7 @@ class Failure:
     cause: str
     trace: str = ""
     consequence: str = ""
+    blocked: bool = False
 
 
 @dataclass(slots=True)

@@ -178,7 +178,7 @@ class Run:
                 self._fail(Failure(entry.name, item, reason, consequence="the run goes on without this image"))
             else:
                 summary.blocked += 1
-                self._fail(Failure(entry.name, item, f"not run: it {reason}", consequence=_lost(entry, item)))
+                self._fail(Failure(entry.name, item, f"it {reason}", consequence=_lost(entry, item), blocked=True))
 
     def _run_unit(self, unit: Unit, state: StageState, summary: StageSummary) -> UnitRecord | None:
         self._keys.setdefault(unit.entry.name, {})[unit.item] = unit.key
