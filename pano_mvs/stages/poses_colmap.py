@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from pano_mvs.algorithms.poses.colmap import solve_colmap
+from pano_mvs.algorithms.poses.colmap import extend_with_colmap, solve_colmap
 from pano_mvs.algorithms.poses.colmap_sift import colmap_sift
 from pano_mvs.algorithms.poses.extension import extend_poses
 from pano_mvs.api import All, Context, Features, InputPath, Panorama, Params, Poses, TwoView, stage
@@ -20,15 +21,21 @@ class ColmapParams(Params):
     cameras: Literal["sphere", "faces"] = Field(
         default="sphere", description="EQUIRECTANGULAR cameras, or a rig of six pinhole faces for each panorama"
     )
+    fixed: InputPath | None = Field(
+        default=None, description="known poses (whatever poses.from_model reads) that stay; incremental mapper only"
+    )
+
+    @model_validator(mode="after")
+    def _fixed_needs_incremental(self) -> ColmapParams:
+        if self.fixed is not None and self.mapper == "global":
+            raise ValueError("COLMAP's global mapper moves all cameras: take mapper: incremental to keep some fixed")
+        return self
 
 
 @stage("poses.colmap")
 def colmap_poses(features: All[Features], matches: All[TwoView], params: ColmapParams, ctx: Context) -> Poses:
     """COLMAP's incremental or global mapper, seeded with our key points and verified matches; one pose a panorama."""
-    poses = solve_colmap(
-        features, matches, mapper=params.mapper, cameras=params.cameras, rng=ctx.rng, scratch=ctx.scratch
-    )
-    return checked_poses(poses, ctx)
+    return checked_poses(_mapped(features, matches, params, ctx), ctx)
 
 
 class ColmapSiftParams(ColmapParams):
@@ -42,10 +49,7 @@ def colmap_sift_poses(images: All[Panorama], params: ColmapSiftParams, ctx: Cont
     """COLMAP on its own: its planar SIFT, exhaustive matching, and mapper. Masks are respected."""
     pictures = ((name, image.load(), image.load_mask()) for name, image in images.items())
     features, matches = colmap_sift(pictures, max_keypoints=params.max_keypoints, rng=ctx.rng, scratch=ctx.scratch)
-    poses = solve_colmap(
-        features, matches, mapper=params.mapper, cameras=params.cameras, rng=ctx.rng, scratch=ctx.scratch
-    )
-    return checked_poses(poses, ctx)
+    return checked_poses(_mapped(features, matches, params, ctx), ctx)
 
 
 class ExtendParams(Params):
@@ -64,3 +68,15 @@ def extend(features: All[Features], matches: All[TwoView], params: ExtendParams,
         known, features, matches, max_error_deg=params.max_error_deg, min_angle_deg=params.min_angle_deg
     )
     return checked_poses(poses, ctx)
+
+
+def _mapped(
+    features: Mapping[str, Features], matches: Mapping[tuple[str, str], TwoView], params: ColmapParams, ctx: Context
+) -> Poses:
+    """Run COLMAP's mapper from nothing, or from the poses that stay."""
+    if params.fixed is None:
+        return solve_colmap(
+            features, matches, mapper=params.mapper, cameras=params.cameras, rng=ctx.rng, scratch=ctx.scratch
+        )
+    known = known_poses(params.fixed, tuple(features))
+    return extend_with_colmap(known, features, matches, cameras=params.cameras, rng=ctx.rng, scratch=ctx.scratch)

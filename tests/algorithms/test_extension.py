@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pano_mvs.algorithms.metrics.poses import relative_pose_errors
+from pano_mvs.algorithms.poses.colmap import extend_with_colmap
+from pano_mvs.algorithms.poses.colmap_database import Cameras
 from pano_mvs.algorithms.poses.extension import extend_poses
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Features, Poses, TwoView
@@ -94,3 +97,38 @@ def test_wrong_known_poses_reject_the_new_one(capture: Capture) -> None:
     poses = extend_poses(wrong, features, two_views)
     assert list(poses.rejected) == ["5.jpg"]
     np.testing.assert_array_equal(poses.translations, wrong.translations)
+
+
+@pytest.mark.parametrize("cameras", ["sphere", "faces"])
+def test_colmap_adds_the_sixth_to_five_that_do_not_move(capture: Capture, tmp_path: Path, cameras: Cameras) -> None:
+    truth, features, two_views = capture
+    known = known_of(truth, [name for name in truth if name != "3.jpg"])
+    poses = extend_with_colmap(
+        known, features, two_views, cameras=cameras, rng=np.random.default_rng(0), scratch=tmp_path
+    )
+    poses.check()
+    assert poses.names == tuple(features)
+    assert (poses.frame, poses.scale, poses.metric) == ("the file's", "metres", True)
+    for idx, name in enumerate(poses.names):
+        if name != "3.jpg":
+            assert poses.rotations[idx].tobytes() == truth[name].rotation.tobytes()
+            assert poses.translations[idx].tobytes() == truth[name].translation.tobytes()
+    assert relative_pose_errors(found_by_name(poses), truth).pair_deg.max() < 0.1
+    assert len(poses.points_in_world) > 300
+
+
+def test_colmap_leaves_known_ones_alone_where_nothing_fits(capture: Capture, tmp_path: Path) -> None:
+    truth, features, two_views = capture
+    (tmp_path / "one").mkdir()
+    one = extend_with_colmap(
+        known_of(truth, ["0.jpg"]), features, two_views, rng=np.random.default_rng(0), scratch=tmp_path / "one"
+    )
+    assert one.names == ("0.jpg",)
+    assert set(one.rejected.values()) == {"the known pictures give no point that it could see"}
+    views = {pair: TwoView.failed("a blurred picture") if "5.jpg" in pair else view for pair, view in two_views.items()}
+    poses = extend_with_colmap(
+        known_of(truth, list(truth)[:4]), features, views, rng=np.random.default_rng(0), scratch=tmp_path
+    )
+    assert poses.names == tuple(truth)[:5]
+    assert list(poses.rejected) == ["5.jpg"]
+    assert "a blurred picture" in poses.rejected["5.jpg"]

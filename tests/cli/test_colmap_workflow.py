@@ -89,13 +89,14 @@ def test_colmaps_own_sift_registers_all(pano_mvs: Command, rendered: Path, cache
     assert found.median_pair_deg < 1
 
 
+@pytest.mark.parametrize("solver", ["poses.extend, path", "poses.colmap, fixed"])
 def test_a_new_picture_joins_known_poses_that_stay(
-    pano_mvs: Command, rendered: Path, cache: Path, tmp_path: Path
+    solver: str, pano_mvs: Command, rendered: Path, cache: Path, tmp_path: Path
 ) -> None:
     data = json.loads((rendered / "truth" / "poses.json").read_text())
     known = tmp_path / "known.json"
     known.write_text(json.dumps(data | {"views": data["views"][:3]}))
-    path = workflow(tmp_path, rendered, f"{MATCHED}  poses: {{use: poses.extend, path: {known}}}")
+    path = workflow(tmp_path, rendered, f"{MATCHED}  poses: {{use: {solver}: {known}}}")
     result = pano_mvs("run", path, "--out", "o", "--cache", cache)
     assert result.code == 0, result.text
     found = errors(Path("o"), rendered)
@@ -105,3 +106,11 @@ def test_a_new_picture_joins_known_poses_that_stay(
     assert summary["metric"] is True
     for center, view in zip(summary["centers"], data["views"][:3], strict=False):
         assert center == pytest.approx(-np.transpose(view["R"]) @ np.array(view["t"]), abs=1e-12)
+
+
+def test_the_global_mapper_holds_nothing_fixed(pano_mvs: Command, rendered: Path, cache: Path, tmp_path: Path) -> None:
+    known = rendered / "truth" / "poses.json"
+    path = workflow(tmp_path, rendered, f"{MATCHED}  poses: {{use: poses.colmap, mapper: global, fixed: {known}}}")
+    result = pano_mvs("run", path, "--out", "o", "--cache", cache)
+    assert result.code == 2
+    assert "take mapper: incremental" in result.flat

@@ -19,6 +19,7 @@ Mapper = Literal["incremental", "global"]
 
 # With more threads the order of Ceres' sums, and so the last digits, would depend on the scheduler.
 _THREADS = 1
+_WIDTH_OF_LIMITS_PX = 1024
 
 
 @contextmanager
@@ -34,7 +35,9 @@ def quiet_colmap() -> Iterator[None]:
         pycolmap.logging.minloglevel = before
 
 
-def run_mapper(database: Path, folder: Path, *, mapper: Mapper, cameras: Cameras, seed: int) -> list[Any]:
+def run_mapper(
+    database: Path, folder: Path, *, mapper: Mapper, cameras: Cameras, seed: int, width_px: float
+) -> list[Any]:
     """Return the models that a mapper makes of a database, the one with most panoramas first.
 
     Args:
@@ -43,20 +46,78 @@ def run_mapper(database: Path, folder: Path, *, mapper: Mapper, cameras: Cameras
         mapper: COLMAP's incremental or its global mapper (GLOMAP).
         cameras: what the database holds.
         seed: of COLMAP's random numbers, positive.
+        width_px: width of the panoramas, to which COLMAP's limits in pixels are fitted.
     """
     import pycolmap
 
     with quiet_colmap():
         if mapper == "incremental":
-            options = _incremental_options(cameras=cameras, seed=seed)
+            options = _incremental_options(cameras=cameras, seed=seed, width_px=width_px)
             models = pycolmap.incremental_mapping(database, folder, folder, options)
         else:
             models = pycolmap.global_mapping(database, folder, folder, _global_options(cameras=cameras, seed=seed))
     return [model for _, model in sorted(models.items(), key=_largest_first)]
 
 
+def extend_model(
+    database: Path, folder: Path, known: Mapping[int, Rigid3], images: Mapping[int, DatabaseImage], *,
+    cameras: Cameras, seed: int, width_px: float,
+) -> Any:  # fmt: skip
+    """Return the model that COLMAP's incremental mapper makes by adding panoramas to known ones.
+
+    Those do not move against each other; the world as a whole may be moved and scaled.
+
+    Args:
+        database: as `write_database` made it.
+        folder: an empty folder for COLMAP's own files.
+        known: cam_from_world by position of the panorama, two at least.
+        images: what each COLMAP image shows.
+        cameras: what the database holds.
+        seed: of COLMAP's random numbers, positive.
+        width_px: width of the panoramas, to which COLMAP's limits in pixels are fitted.
+
+    Returns:
+        The model, or None where the known panoramas give no point that a new one could see.
+    """
+    import pycolmap
+
+    options = _incremental_options(cameras=cameras, seed=seed, width_px=width_px)
+    options.fix_existing_frames = options.mapper.fix_existing_frames = True
+    with quiet_colmap():
+        begun = _posed_reconstruction(database, known, images)
+        begun = pycolmap.triangulate_points(begun, database, folder, folder, clear_points=True, options=options)
+        if not begun.num_points3D():
+            return None
+        begun.write(folder)
+        models = pycolmap.incremental_mapping(database, folder, folder, options, input_path=folder)
+    return min(models.items(), key=_largest_first)[1] if models else begun
+
+
+def _posed_reconstruction(database: Path, known: Mapping[int, Rigid3], images: Mapping[int, DatabaseImage]) -> Any:
+    """Return a model without points in which the known panoramas are registered."""
+    import pycolmap
+
+    opened = pycolmap.Database.open(database)
+    try:
+        model = pycolmap.Reconstruction()
+        model.load(pycolmap.DatabaseCache.create(opened, pycolmap.DatabaseCacheOptions()))
+    finally:
+        opened.close()
+    for image_id, image in images.items():
+        pose = known.get(image.panorama_idx)
+        frame = model.frames[model.images[image_id].frame_id] if model.exists_image(image_id) else None
+        if pose is not None and frame is not None and not frame.has_pose():
+            frame.rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(pose.rotation), pose.translation)
+            model.register_frame(frame.frame_id)
+    return model
+
+
 def poses_from_model(
-    model: Any, features: Mapping[str, Features], images: Mapping[int, DatabaseImage], *, rejected: Mapping[str, str]
+    model: Any,
+    features: Mapping[str, Features],
+    images: Mapping[int, DatabaseImage],
+    *,
+    rejected: Mapping[str, str],
 ) -> Poses:
     """Return the panoramas of a COLMAP model with its points, their rays and colours being those of the key points.
 
@@ -145,7 +206,7 @@ def _largest_first(item: tuple[int, Any]) -> tuple[int, int, int]:
     return -model.num_reg_frames(), -model.num_points3D(), number
 
 
-def _incremental_options(*, cameras: Cameras, seed: int) -> Any:
+def _incremental_options(*, cameras: Cameras, seed: int, width_px: float) -> Any:
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()
@@ -159,6 +220,14 @@ def _incremental_options(*, cameras: Cameras, seed: int) -> Any:
     # A panorama's camera has nothing to refine, and a face's is what we made it.
     options.ba_refine_focal_length = options.ba_refine_extra_params = options.ba_refine_sensor_from_rig = False
     options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    # COLMAP's limits are pixels of pinhole pictures. Held at what they are in a panorama of 1024 columns, they are
+    # angles: 4 px are 1.4°, and would be 4.5° in one of 320.
+    scale = width_px / _WIDTH_OF_LIMITS_PX
+    options.mapper.filter_max_reproj_error *= scale
+    options.mapper.abs_pose_max_error *= scale
+    options.mapper.init_max_error *= scale
+    options.triangulation.merge_max_reproj_error *= scale
+    options.triangulation.complete_max_reproj_error *= scale
     if cameras == "faces":
         # The verified matches of two panoramas are spread over many pairs of faces; only one pair begins the model,
         # which then has few points for the next panorama to be seen from.
