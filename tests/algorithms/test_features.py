@@ -84,7 +84,7 @@ def test_a_tile_shows_what_lies_in_its_directions():
         assert np.abs(sample_tile(image, tile) - expected).max() < 2.0
 
 
-@pytest.mark.parametrize(("name", "bias_px", "rms_px"), [("sift", 0.02, 0.06), ("orb", 0.1, 1.2)])
+@pytest.mark.parametrize(("name", "bias_px", "rms_px"), [("sift", 0.02, 0.06), ("orb", 0.1, 0.8), ("sphorb", 0.1, 1.0)])
 def test_key_points_have_no_bias(name, bias_px, rms_px):
     """A quarter of a pixel is what SIFT without the precise upscale, or ORB without its half pixel, would show."""
     rng = np.random.default_rng(1)
