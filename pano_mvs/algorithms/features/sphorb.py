@@ -132,6 +132,7 @@ def _unmasked(corners: _Corners, grid: GeodesicGrid, mask: NDArray[np.bool_]) ->
 
 def _chosen(found: list[_Corners], *, max_keypoints: int, radius_rad: float) -> list[_Corners]:
     """Return the corners to keep of each level, spread over the sphere; coarse levels get fewer, as in ORB."""
+    found = _distinct(found, radius_rad=radius_rad)
     shares = _SCALE ** -np.arange(len(found), dtype=np.float64)
     chosen: list[_Corners] = []
     room = max_keypoints
@@ -140,11 +141,16 @@ def _chosen(found: list[_Corners], *, max_keypoints: int, radius_rad: float) -> 
         corners = found[level]
         chosen.insert(0, corners[spread_keypoints(corners.bearings, corners.responses, max_keypoints=quota)])
         room -= len(chosen[0].faces)
-    bearings, responses = (np.concatenate([getattr(c, name) for c in chosen]) for name in ("bearings", "responses"))
+    return chosen
+
+
+def _distinct(found: list[_Corners], *, radius_rad: float) -> list[_Corners]:
+    """Keep the strongest of the corners that several levels found at one place."""
+    bearings, responses = (np.concatenate([getattr(c, name) for c in found]) for name in ("bearings", "responses"))
     kept = np.zeros(len(bearings), np.bool_)
     kept[distinct_keypoints(bearings, responses, radius_rad=radius_rad)] = True
-    ends = np.cumsum([len(c.faces) for c in chosen])
-    return [c[part] for c, part in zip(chosen, np.split(kept, ends[:-1]), strict=True)]
+    ends = np.cumsum([len(c.faces) for c in found])
+    return [c[part] for c, part in zip(found, np.split(kept, ends[:-1]), strict=True)]
 
 
 def _describe(pictures: NDArray[np.uint8], grid: GeodesicGrid, corners: _Corners) -> NDArray[np.uint8]:
