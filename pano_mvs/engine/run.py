@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from pano_mvs.core.digest import digest_from_value
-from pano_mvs.core.errors import GateError, InputError, PanoMvsError, StoreError
+from pano_mvs.core.errors import GateError, InputError, PanoMvsError, StoreError, UsageError
 from pano_mvs.engine.blobs import DamagedBlobError
 from pano_mvs.engine.events import Failure, Observer, RunResult, Silent, StageSummary
 from pano_mvs.engine.execute import execute_unit
@@ -20,10 +20,18 @@ from pano_mvs.engine.store import ItemRef, Store, UnitRecord
 from pano_mvs.engine.units import Resolution, StageState, Unit, resolve
 from pano_mvs.engine.wiring import Graph
 from pano_mvs.engine.workflow import StageEntry, Workflow
-from pano_mvs.scene import Files, Record
+from pano_mvs.scene import Axis, Files, Record
 
 _HEALING_ROUNDS = 3
 _SHOWN_CAUSES = 10
+
+
+class _StoppedError(GateError):
+    """What the user gave cannot be used by a stage on which all others wait."""
+
+    def __init__(self, message: str, exit_code: int) -> None:
+        super().__init__(message)
+        self.exit_code = exit_code
 
 
 def workflow_id(workflow: Workflow) -> str:
@@ -132,14 +140,15 @@ class Run:
         self.result.failures.clear()
         self.result.rejected.clear()
         self.states.clear()
+        self.result.stopped = ""
         try:
             for name in self.graph.order:
                 self._run_stage(self.workflow.stages[name])
         except GateError as error:
             self.result.stopped = str(error)
-        if self.result.stopped:
-            self.result.exit_code = GateError.exit_code
-        elif self.result.failures or self.result.rejected:
+            self.result.exit_code = error.exit_code
+            return
+        if self.result.failures or self.result.rejected:
             self.result.exit_code = 3
         else:
             self.result.exit_code = 0
@@ -217,6 +226,8 @@ class Run:
                 state.failed[unit.item] = failure.cause
                 self._fail(failure)
                 self.observer.unit_finished(unit.entry.name, unit.item, "failed", time.perf_counter() - started)
+                if self.graph.axes[unit.entry.name] is Axis.ONE and isinstance(error, InputError | UsageError):
+                    raise _StoppedError(f"{unit.entry.name}: {failure.cause}", error.exit_code) from error
                 if policy.on_error == "stop":
                     raise GateError(f"stage {unit.entry.name!r} has on_error: stop, and {unit.label} failed: "
                                     f"{failure.cause}")  from error  # fmt: skip

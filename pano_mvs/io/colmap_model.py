@@ -13,8 +13,10 @@ from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.geometry import pixel_from_ray, ray_from_pixel
 from pano_mvs.io.captures import natural_key
 from pano_mvs.io.colmap_sphere import has_sphere_cameras, read_sphere_model
+from pano_mvs.io.pose_json import require_distinct
 from pano_mvs.scene import Poses
 
+_MAX_QUAT_ERROR = 1e-3
 _MODEL_FILES = (("cameras.bin", "images.bin", "points3D.bin"), ("cameras.txt", "images.txt", "points3D.txt"))
 
 
@@ -79,6 +81,10 @@ def read_colmap_model(folder: Path) -> Poses:
     images = sorted((model.images[idx] for idx in model.reg_image_ids()), key=lambda image: natural_key(image.name))
     if not images:
         raise InputError(f"{folder}: the model registers no image")
+    require_distinct([image.name for image in images], folder)
+    for image in images:
+        if abs(np.linalg.norm(image.cam_from_world().rotation.quat) - 1) > _MAX_QUAT_ERROR:
+            raise InputError(f"{folder}: image {image.name}: its quaternion has not length 1. Write the model anew")
     point_ids = sorted(model.points3D)
     point_idx = {point_id: idx for idx, point_id in enumerate(point_ids)}
     points = [model.points3D[point_id] for point_id in point_ids]

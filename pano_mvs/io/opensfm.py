@@ -37,22 +37,23 @@ def opensfm_poses(data: list[dict[str, Any]], path: Path) -> tuple[dict[str, Rig
     Raises:
         InputError: naming the shot and the key that cannot be used.
     """
+    for item in data:
+        if not isinstance(item.get("cameras"), dict) or not isinstance(item["shots"], dict):
+            raise InputError(f"{path}: 'cameras' and 'shots' must be objects by name")
     part = max(data, key=lambda item: len(item["shots"]))
-    cameras, shots = part.get("cameras"), part["shots"]
-    if not isinstance(cameras, dict) or not isinstance(shots, dict):
-        raise InputError(f"{path}: 'cameras' and 'shots' must be objects by name")
+    cameras, shots = part["cameras"], part["shots"]
     poses = {name: _pose(name, shot, cameras, path) for name, shot in shots.items()}
     require_distinct(list(poses), path)
     reference = part.get("reference_lla")
-    nowhere = isinstance(reference, dict) and not reference.get("latitude") and not reference.get("longitude")
-    return poses, not nowhere
+    somewhere = isinstance(reference, dict) and bool(reference.get("latitude") or reference.get("longitude"))
+    return poses, somewhere
 
 
 def _pose(name: str, shot: Any, cameras: dict[str, Any], path: Path) -> Rigid3:
     where = f"{path}: shot {name!r}"
     if not isinstance(shot, dict):
         raise InputError(f"{where}: expected an object, got {type(shot).__name__}")
-    camera = cameras.get(shot.get("camera", ""))
+    camera = cameras.get(str(shot.get("camera", "")))
     projection = camera.get("projection_type") if isinstance(camera, dict) else None
     if projection not in _SPHERICAL:
         raise InputError(f"{where}: its camera's projection_type is {projection}, expected spherical. Only panoramas "

@@ -78,7 +78,10 @@ def read_csv(path: Path) -> dict[str, Rigid3]:
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not a text file in UTF-8") from error
     numbered = [(idx, line) for idx, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
-    rows = [(idx, [cell.strip() for cell in next(csv.reader([line]))]) for idx, line in numbered]
+    try:
+        rows = [(idx, [cell.strip() for cell in next(csv.reader([line]))]) for idx, line in numbered]
+    except csv.Error as error:
+        raise InputError(f"{path}: not a CSV file ({error})") from error
     if not rows or tuple(rows[0][1]) != CSV_HEADER:
         raise InputError(f"{path}:{rows[0][0] if rows else 1}: the first line must be {','.join(CSV_HEADER)}")
     poses = [(row[0], _pose_from_row(row, f"{path}:{line}")) for line, row in rows[1:]]

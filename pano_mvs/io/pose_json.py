@@ -15,6 +15,7 @@ from pano_mvs.geometry import Rigid3, nearest_rotation
 
 # OpenGL's camera frame is x right, y up, z backwards.
 _CAM_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
+_MAX_LENGTH = 1e12
 _ROTATION_TOLERANCE = 1e-3
 
 
@@ -58,6 +59,8 @@ def read_json_value(path: Path) -> Any:
         raise InputError(f"{path}:{error.lineno}:{error.colno}: not JSON ({error.msg})") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not a text file in UTF-8") from error
+    except (RecursionError, ValueError) as error:
+        raise InputError(f"{path}: nested too deeply, or a number with too many digits") from error
 
 
 def require_object(value: Any, path: Path) -> dict[str, Any]:
@@ -83,7 +86,10 @@ def read_posed_views(path: Path) -> tuple[list[PosedView], bool]:
         raise InputError(f"{path}: key 'views' must be a list of views, got {type(entries).__name__}")
     views = [_posed_view(entry, f"{path}: views[{idx}]") for idx, entry in enumerate(entries)]
     require_distinct([view.name for view in views], path)
-    return views, bool(data.get("metric", True))
+    metric = data.get("metric", True)
+    if not isinstance(metric, bool):
+        raise InputError(f"{path}: key 'metric' must be true or false, without quotes, got {metric!r}")
+    return views, metric
 
 
 def read_transforms(path: Path) -> dict[str, Rigid3]:
@@ -107,6 +113,8 @@ def read_transforms(path: Path) -> dict[str, Rigid3]:
             raise InputError(f"{where} ({name}): camera_model is {model}, expected EQUIRECTANGULAR. Only panoramas "
                              "can be used")  # fmt: skip
         matrix = number_array(frame, "transform_matrix", (4, 4), where)
+        if not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
+            raise InputError(f"{where}: the last row of transform_matrix must be 0 0 0 1. Is the matrix transposed?")
         world_from_cam = rigid_from_arrays(matrix[:3, :3] @ _CAM_FROM_OPENGL, matrix[:3, 3], where)
         poses.append((name, world_from_cam.inverse()))
     require_distinct([name for name, _ in poses], path)
@@ -121,6 +129,8 @@ def rigid_from_arrays(rotation: NDArray[np.float64], translation: NDArray[np.flo
     """
     if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
         raise InputError(f"{where}: the pose holds NaN or infinite numbers")
+    if np.abs(translation).max() > _MAX_LENGTH:
+        raise InputError(f"{where}: a translation of {np.abs(translation).max():.3g} is no place on Earth")
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     if error > _ROTATION_TOLERANCE:
         raise InputError(f"{where}: the rotation is not orthonormal (off by {error:.2g})")
@@ -166,7 +176,7 @@ def number_array(entry: dict[str, Any], key: str, shape: tuple[int, ...], where:
     """
     try:
         array = np.array(entry.get(key), dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         array = np.zeros(0)
     if array.shape != shape:
         wanted = " × ".join(str(length) for length in shape)

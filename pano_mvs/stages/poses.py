@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections import Counter
 from pathlib import Path
 from typing import Literal
 
@@ -88,7 +88,9 @@ def refine(poses: One[Poses], params: RefineParams, ctx: Context) -> Poses:
 class FromModelParams(Params):
     """Settings of poses.from_model."""
 
-    path: InputPath = Field(description="COLMAP model folder, poses.json, transforms.json or CSV file")
+    path: InputPath = Field(
+        description="model folder (COLMAP, SphereSfM), poses.json, transforms.json, reconstruction.json or CSV"
+    )
 
 
 @stage("poses.from_model")
@@ -98,9 +100,7 @@ def from_model(images: Names[Panorama], params: FromModelParams, ctx: Context) -
     Image names are compared with and without their folders and extensions.
     """
     known = known_poses(params.path, images)
-    rejected = {name: f"{params.path.name} has no pose for it" for name in images if name not in known.names}
-    poses = replace(known, rejected=rejected)
-    return checked_poses(poses, ctx)
+    return checked_poses(known, ctx, remedy=f"{params.path} must know two pictures of the capture at least")
 
 
 class TriangulateParams(Params):
@@ -121,7 +121,10 @@ def triangulate(
     return checked_poses(points, ctx)
 
 
-def checked_poses(poses: Poses, ctx: Context) -> Poses:
+_CLOSER = "Take pictures closer together (0.5–1 m indoors) with more in common"
+
+
+def checked_poses(poses: Poses, ctx: Context, *, remedy: str = _CLOSER) -> Poses:
     """Report what was left out; stop where less than two pictures are left.
 
     Raises:
@@ -134,16 +137,17 @@ def checked_poses(poses: Poses, ctx: Context) -> Poses:
     ctx.metric("points", len(poses.points_in_world))
     if registered < 2:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(poses.rejected.items())[:8])
-        raise GateError("no two panoramas could be registered, so there is no model. Take pictures closer together "
-                        f"(0.5–1 m indoors) with more in common. {reasons}")  # fmt: skip
+        raise GateError(f"no two panoramas could be registered, so there is no model. {remedy}. {reasons}")
     return poses
 
 
 def known_poses(path: Path, images: tuple[str, ...]) -> Poses:
     """Return the poses that a file has for the images of a capture, in the capture's order, without points.
 
+    Images without a pose, and images that share one name of the file, are rejected with the reason.
+
     Raises:
-        InputError: if the file cannot be used, or knows none of the images.
+        InputError: if the file cannot be used, knows none of the images, or has all of them in one place.
     """
     model = read_poses(path)
     known = match_image_names(images, model.names)
@@ -151,8 +155,25 @@ def known_poses(path: Path, images: tuple[str, ...]) -> Poses:
         raise InputError(f"{path}: none of its {len(model.names)} images is one of this capture (it has "
                          f"{', '.join(model.names[:3])} …, the capture {', '.join(images[:3])} …)")  # fmt: skip
     position = {name: idx for idx, name in enumerate(model.names)}
+    claims = Counter(known.values())
+    poses = {
+        name: model.cam_from_world(position[known[name]])
+        for name in images
+        if name in known and (claims[known[name]] == 1 or known[name] == name)
+    }
+    centers = np.array([pose.center for pose in poses.values()])
+    if len(centers) > 1 and np.ptp(centers, axis=0).max() <= 1e-9 * max(1.0, float(np.abs(centers).max())):
+        raise InputError(f"{path}: all {len(centers)} cameras stand in one place; depth needs different places")
+    rejected = {
+        name: f"{path.name} has one pose, {known[name]!r}, that several pictures could mean"
+        if name in known
+        else f"{path.name} has no pose for it"
+        for name in images
+        if name not in poses
+    }
     return Poses.without_points(
-        {name: model.cam_from_world(position[known[name]]) for name in images if name in known},
+        poses,
+        rejected=rejected,
         frame=model.frame,
         scale=model.scale,
         metric=model.metric,

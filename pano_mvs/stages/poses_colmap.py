@@ -67,7 +67,7 @@ def extend(features: All[Features], matches: All[TwoView], params: ExtendParams,
     poses = extend_poses(
         known, features, matches, max_error_deg=params.max_error_deg, min_angle_deg=params.min_angle_deg
     )
-    return checked_poses(poses, ctx)
+    return checked_poses(poses, ctx, remedy=f"{params.path} must know two pictures of the capture at least")
 
 
 def _mapped(

@@ -91,6 +91,8 @@ def _solve(
         points = np.linalg.solve(matrix, vector[..., None])[..., 0]
         squared_range = np.sum((points[idx] - c) ** 2, axis=1)
         mean = np.bincount(idx, squared_range, count) / np.maximum(np.bincount(idx, minlength=count), 1)
+        # Rays that cross in the very place of their cameras (one place for all) say nothing of a point.
+        enough &= ~(mean <= 0)
         weights = mean[idx] / np.maximum(squared_range, 1e-6 * mean[idx] + 1e-300)
     return points, enough
 
