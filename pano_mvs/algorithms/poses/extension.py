@@ -56,7 +56,7 @@ def extend_poses(
     for idx in range(len(names)):
         if idx not in joined:
             reasons.setdefault(idx, "its pairs contradict the pairs around them")
-    reasons |= _attached(model, sorted(joined - fixed.keys()))
+    reasons |= model.attach_all(sorted(joined - fixed.keys()))
     _settled(model, [idx for idx in model.cameras if idx not in fixed])
     poses = Poses.without_points(
         {names[idx]: model.cameras[idx] for idx in sorted(model.cameras)},
@@ -66,21 +66,6 @@ def extend_poses(
         metric=known.metric,
     )
     return poses_with_points(poses, tracks, max_error_deg=max_error_deg, min_angle_deg=min_angle_deg)
-
-
-def _attached(model: GrowingModel, left: list[int]) -> dict[int, str]:
-    """Attach one image after the other, that with most known points first; return why the rest was refused."""
-    left = list(left)
-    while left:
-        known = model.known_counts()
-        for image in sorted(left, key=lambda i: (-known[i], i)):
-            if attachment := model.attach(image):
-                model.add(image, attachment.cam_from_world)
-                left.remove(image)
-                break
-        else:
-            break
-    return {image: model.attach(image).reason for image in left}
 
 
 def _settled(model: GrowingModel, new: list[int]) -> None:

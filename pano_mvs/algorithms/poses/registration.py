@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -150,6 +150,21 @@ class GrowingModel:
     def known_count(self, image: int) -> int:
         """Return how many triangulated points an image's tracks contain."""
         return int(np.isfinite(self._points[self.tracks.track_idx[self._track_of_image[image]], 0]).sum())
+
+    def attach_all(self, images: Iterable[int], *, after_each: Callable[[], None] = lambda: None) -> dict[int, str]:
+        """Attach image after image, the one that sees most known points first; return why the rest was refused."""
+        left = list(images)
+        while left:
+            known = self.known_counts()
+            for image in sorted(left, key=lambda i: (-known[i], i)):
+                if attachment := self.attach(image):
+                    self.add(image, attachment.cam_from_world)
+                    left.remove(image)
+                    break
+            else:
+                break
+            after_each()
+        return {image: self.attach(image).reason for image in left}
 
     def known_counts(self) -> NDArray[np.intp]:
         """Return how many triangulated points the tracks of each image contain, (N,)."""

@@ -88,19 +88,14 @@ def _grown(model: GrowingModel, seed: Edge, *, adjust: bool) -> tuple[GrowingMod
     model.add(seed[1], relative_pose(model.edges, *seed))
     left = sorted({image for edge in model.edges for image in edge} - set(seed))
     adjusted = 0
-    while left:
-        known = model.known_counts()
-        for image in sorted(left, key=lambda i: (-known[i], i)):
-            if attachment := model.attach(image):
-                model.add(image, attachment.cam_from_world)
-                left.remove(image)
-                break
-        else:
-            break
+
+    def adjust_now_and_then() -> None:
+        nonlocal adjusted
         if adjust and len(model.cameras) > _ADJUST_GROWTH * adjusted:
             model.adjust()
             adjusted = len(model.cameras)
-    return model, {image: model.attach(image).reason for image in left}
+
+    return model, model.attach_all(left, after_each=adjust_now_and_then)
 
 
 def _finished(model: GrowingModel, tracks: Tracks, rejected: dict[str, str]) -> Poses:
