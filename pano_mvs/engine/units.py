@@ -129,10 +129,16 @@ def resolve(
     """Return the units of a stage, given the states of its producers."""
     if entry.spec.list_items is not None:
         return resolve_source(entry, store)
-    return _Resolver(entry, axis, edges, states, store).resolve()
+    return Resolver(entry, axis, edges, states, store).resolve()
 
 
-class _Resolver:
+class Resolver:
+    """Finds the units of a stage that is not a source: all at once for a plan, one by one in a run.
+
+    Attributes:
+        near: unit to its neighbours, once the unit names are known and where the stage has an index.
+    """
+
     def __init__(
         self, entry: StageEntry, axis: Axis, edges: Mapping[str, Edge], states: Mapping[str, StageState], store: Store
     ) -> None:
@@ -143,19 +149,27 @@ class _Resolver:
         self.store = store
         self.resolution = Resolution()
         self.near: Mapping[str, tuple[str, ...]] = {}
+        self._static: Mapping[str, Any] | None = None
 
     def resolve(self) -> Resolution:
-        names = self._unit_names()
+        """Return all units, as far as they are known."""
+        names = self.unit_names()
         if names is None:
             self.resolution.open = True
             return self.resolution
-        static = _static_identity(self.entry, self.store)
         for name, members in names.items():
             self.resolution.members[name] = members
-            self._add(name, members, static)
+            self._add(name, members)
         return self.resolution
 
-    def _unit_names(self) -> Mapping[str, tuple[str, ...]] | None:
+    def unit(self, name: str, members: tuple[str, ...]) -> Unit | str:
+        """Return a unit whose inputs have all been tried, or the reason why it cannot run."""
+        self.resolution = Resolution()
+        self._add(name, members)
+        assert not self.resolution.waiting, name
+        return self.resolution.units[0] if self.resolution.units else self.resolution.blocked[name]
+
+    def unit_names(self) -> Mapping[str, tuple[str, ...]] | None:
         """Return the stage's units and the images each is about, or None if they are not known yet."""
         if INDEX_PORT in self.edges:
             return self._units_of_index(self.edges[INDEX_PORT])
@@ -191,7 +205,7 @@ class _Resolver:
             return self.near
         return {name: (name,) for name in self.near}
 
-    def _add(self, name: str, members: tuple[str, ...], static: Mapping[str, Any]) -> None:
+    def _add(self, name: str, members: tuple[str, ...]) -> None:
         inputs: dict[str, UnitInput] = {}
         waiting = False
         for port in self.entry.spec.ports:
@@ -208,7 +222,9 @@ class _Resolver:
         if waiting:
             self.resolution.waiting.append(name)
             return
-        identity = dict(static) | {"inputs": {port: self._encode(port, value) for port, value in inputs.items()}}
+        if self._static is None:
+            self._static = _static_identity(self.entry, self.store)
+        identity = dict(self._static) | {"inputs": {port: self._encode(port, value) for port, value in inputs.items()}}
         key = digest_from_value(identity)
         self.resolution.units.append(Unit(self.entry, name, members, inputs, key, identity))
 
@@ -216,7 +232,6 @@ class _Resolver:
         """Return what a unit reads at a port, why it cannot, and whether that is not known yet."""
         state = self.states[edge.producer]
         items = state.exploded if edge.exploded else state.items
-        source_failed = WHOLE in state.failed
         match edge.port.cardinality:
             case Cardinality.ONE:
                 wanted: Sequence[str] = (WHOLE,)
@@ -245,7 +260,7 @@ class _Resolver:
             return (found, "", False) if usable else (None, self._why(edge, state, missing), False)
         if wanted[0] in items:
             return items[wanted[0]], "", False
-        return None, self._why(edge, state, WHOLE if source_failed else wanted[0]), False
+        return None, self._why(edge, state, wanted[0]), False
 
     def _near(self, name: str) -> list[str]:
         """Return a unit's neighbours that every Near port has or may come to have, so that all ports stay in step."""
@@ -261,8 +276,11 @@ class _Resolver:
 
     @staticmethod
     def _why(edge: Edge, state: StageState, item: str) -> str:
+        """Say what is missing; of a single item, whether others of its stage have failed meanwhile does not matter."""
+        item = WHOLE if WHOLE in state.failed else item
         what = f"{edge.producer}:{item}" if item else edge.producer
-        return f"needs {what}, which {'failed' if state.failed else 'has no result'}"
+        failed = item in state.failed if item else bool(state.failed)
+        return f"needs {what}, which {'failed' if failed else 'has no result'}"
 
     def _encode(self, port: str, value: UnitInput) -> Any:
         """Return what of an input counts towards the key: its digests, with names only where the stage sees them."""
