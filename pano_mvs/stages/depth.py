@@ -24,16 +24,20 @@ class SweepParams(Params):
         default=None, gt=0, description="nearest virtual range, scene units; else found by small sweeps"
     )
     far: float | None = Field(default=None, gt=0, description="farthest virtual range, likewise")
-    cost: Literal["census", "sad"] = Field(
-        default="census", description="census, or the paper's sum of absolute differences"
+    cost: Literal["census", "zncc", "sad", "sad_gradient"] = Field(
+        default="census",
+        description="census, correlation, the paper's sum of absolute differences, or colours with their gradients",
     )
     window: int = Field(default=7, ge=1, le=15, description="side of the cost's window in pixels, odd")
     spherical_window: bool = Field(
         default=True, description="widen windows towards the poles so that they keep their solid angle"
     )
-    combination: Literal["sum", "best_half"] = Field(
-        default="best_half", description="over sources: all (the paper), or the better half, which copes with occlusion"
+    combination: Literal["sum", "best_half", "best_k", "parallax_weighted"] = Field(
+        default="best_half",
+        description="over sources: all (the paper), the better half or the best few, which copes with occlusion, or "
+        "the better half by the parallax that each of them sees",
     )
+    best: int = Field(default=2, ge=1, description="how many sources best_k takes")
     aggregation: Literal["box", "sgm"] = Field(
         default="sgm", description="winner takes all after a box (the paper), or semi-global matching"
     )
@@ -45,7 +49,12 @@ class SweepParams(Params):
     p2_contrast: float = Field(
         default=15.0, ge=0, description="grey levels of contrast at which p2 is halved; 0 keeps it"
     )
-    subplane: bool = Field(default=True, description="parabola between the planes")
+    selection: Literal["winner", "parabola", "vfit"] = Field(
+        default="parabola", description="the cheapest plane (the paper), or the minimum of a parabola or a V around it"
+    )
+    confidence: Literal["peak_ratio", "curvature", "combined"] = Field(
+        default="peak_ratio", description="how much dearer the best rival is, how sharp the minimum is, or both"
+    )
     prefilter_diameter: int = Field(
         default=0,
         ge=0,
@@ -54,7 +63,12 @@ class SweepParams(Params):
     )
     prefilter_sigma_color: float = Field(default=25.0, gt=0, description="its width in grey levels")
     prefilter_sigma_space_px: float = Field(default=25.0, gt=0, description="its width in pixels")
-    exposure: bool = Field(default=True, description="match the exposure of sources to the reference's")
+    derotate: bool = Field(
+        default=False, description="resample each source to the reference's orientation first (the paper)"
+    )
+    exposure: bool = Field(
+        default=True, description="match the exposure of sources to the reference's where colours are compared"
+    )
 
 
 _NOT_SETTINGS = {"backend", "near", "far"}

@@ -17,7 +17,7 @@ NEAR, FAR = 0.5, 6.0
 FAST = SweepSettings(planes=24, window=5)
 PAPER = SweepSettings(
     planes=32, spacing="uniform", cost="sad", spherical_window=False, combination="sum", aggregation="box",
-    subplane=False,
+    selection="winner",
 )  # fmt: skip
 
 
@@ -49,8 +49,13 @@ def _share_within(result, truth, ratio):
         (SweepSettings(planes=20), True, 48),
         (SweepSettings(planes=20, aggregation="box", spacing="log", p2_contrast=0), True, 32),
         (SweepSettings(planes=20, cost="sad", aggregation="sgm", prefilter_diameter=3), False, 20),
+        (SweepSettings(planes=20, cost="zncc", combination="parallax_weighted", selection="vfit"), True, 32),
+        (SweepSettings(planes=20, cost="sad_gradient", combination="best_k", confidence="combined"), True, 24),
+        (SweepSettings(planes=20, aggregation="box", combination="parallax_weighted", derotate=True), True, 48),
+        (SweepSettings(planes=20, cost="sad_gradient", aggregation="box", confidence="curvature"), False, 32),
+        (PAPER.replace(cost="zncc"), False, 32),
         (PAPER.replace(exposure=False), False, 32),
-        (PAPER.replace(subplane=True, combination="best_half", spherical_window=True, exposure=False), True, 24),
+        (PAPER.replace(selection="parabola", combination="best_half", spherical_window=True, exposure=False), True, 24),
     ],
 )
 def test_the_compiled_sweep_equals_the_readable_one(settings, masked, source_height):
@@ -222,6 +227,8 @@ def test_calls_that_cannot_work_say_why():
         ({"window": 6}, "window must be odd"),
         ({"support": 17}, "support must be odd"),
         ({"window": 1}, "census needs"),
+        ({"window": 1, "cost": "zncc"}, "zncc needs"),
+        ({"best": 0}, "best must"),
         ({"p1": 9, "p2": 8}, "p1 ≤ p2"),
         ({"p2_contrast": -1.0}, "p2_contrast"),
         ({"prefilter_diameter": -1}, "prefilter_diameter"),

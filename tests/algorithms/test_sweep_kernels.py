@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.sweep.kernels_band import store_row, warp_band
-from pano_mvs.algorithms.sweep.kernels_cost import box_rows, census_row, combine_row, difference_row
+from pano_mvs.algorithms.sweep.kernels_combine import combine_row
+from pano_mvs.algorithms.sweep.kernels_cost import box_rows, census_row, difference_row
 from pano_mvs.algorithms.sweep.kernels_sgm import sweep_row, sweep_strip
 from pano_mvs.algorithms.sweep.kernels_winner import AFTER, BEFORE, BEST, RIVAL, STATES, update_winner, winners_of_rows
 from pano_mvs.algorithms.sweep.numba_backend import pack_plane
@@ -95,21 +96,23 @@ def test_running_sums_equal_the_mean_over_each_window(radius):
 
 
 @pytest.mark.parametrize("sources", [1, 2, 3, 5])
-@pytest.mark.parametrize("best_half", [True, False])
+@pytest.mark.parametrize(("share", "most"), [(0.5, 9), (1.0, 9), (1.0, 2)])
 @pytest.mark.parametrize("all_vote", [True, False])
-def test_sources_combine_to_the_mean_of_those_that_count(sources, best_half, all_vote):
+@pytest.mark.parametrize("weighted", [True, False])
+def test_sources_combine_to_the_mean_of_those_that_count(sources, share, most, all_vote, weighted):
     rng = np.random.default_rng(sources)
     costs = rng.random((sources, 2, 40)).astype(np.float32)
+    weights = rng.random((sources, 3, 40)).astype(np.float32) if weighted else np.zeros((0, 0, 0), np.float32)
     if not all_vote:
         costs[rng.random(costs.shape) < 0.5] = np.inf
     expected = []
     for column in range(40):
-        voting = sorted(cost for cost in costs[:, 1, column].tolist() if cost < np.inf)
-        used = voting[: (len(voting) + 1) // 2] if best_half else voting
-        expected.append(np.mean(used) if used else 9.0)
+        weight = weights[:, 2, column] if weighted else np.ones(sources)
+        voting = sorted((float(c), float(w)) for c, w in zip(costs[:, 1, column], weight, strict=True) if c < np.inf)
+        expected.append(oracle.combined_cost(voting, share=share, most=most, neutral=9.0))
     result = np.zeros(40, np.float32)
-    combine_row(costs, 1, best_half, all_vote, np.float32(9), result)
-    np.testing.assert_allclose(result, expected, rtol=1e-6)
+    combine_row(costs, 1, weights, 2, share, min(most, sources), all_vote, np.float32(9), result)
+    np.testing.assert_allclose(result, expected, rtol=1e-5)
 
 
 def test_winners_of_a_stream_equal_those_of_the_volume():

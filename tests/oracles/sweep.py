@@ -40,6 +40,16 @@ def box_mean(cost: NDArray[np.generic], row: int, column: int, *, radius: int, r
     return float(np.mean(window))
 
 
+def combined_cost(voting: list[tuple[float, float]], *, share: float, most: int, neutral: float) -> float:
+    """Return the weighted mean of the cheapest (cost, weight) that together hold a share of all weight."""
+    wanted = share * sum(weight for _, weight in voting)
+    taken: list[tuple[float, float]] = []
+    for cost, weight in voting:
+        if len(taken) < most and sum(held for _, held in taken) < wanted * (1 - 1e-5):
+            taken.append((cost, weight))
+    return sum(cost * weight for cost, weight in taken) / sum(weight for _, weight in taken) if taken else neutral
+
+
 def path_pixels(
     size_hw: tuple[int, int], direction: tuple[int, int], line: int, *, warm: tuple[int, int]
 ) -> list[tuple[int, int]]:

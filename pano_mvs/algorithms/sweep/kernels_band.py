@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from pano_mvs.algorithms.sweep.kernels_cost import box_rows, census_row, combine_row, difference_row
+from pano_mvs.algorithms.sweep.kernels_combine import combine_row
+from pano_mvs.algorithms.sweep.kernels_cost import CENSUS, SAD_GRADIENT, ZNCC, box_rows, census_row, difference_row
+from pano_mvs.algorithms.sweep.kernels_gradient import sad_gradient_row
 from pano_mvs.algorithms.sweep.kernels_warp import blend_row, gather_row, project_row, wrap_row
 from pano_mvs.algorithms.sweep.kernels_winner import update_winner
+from pano_mvs.algorithms.sweep.kernels_zncc import zncc_rows
 
 _F = np.float32
 _U = np.uint64
@@ -65,7 +68,7 @@ def warp_band(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def source_cost(  # type: ignore[no-untyped-def]
-    first, reference, warped, offsets, reach, compare_radius, box_radius, pad, pixel_costs, scratch, means
+    first, reference, warped, offsets, reach, cost, compare_radius, box_radius, pad, pixel_costs, scratch, means
 ):
     """Compare a band of the reference with a warped source and average over the box.
 
@@ -73,9 +76,10 @@ def source_cost(  # type: ignore[no-untyped-def]
         first: the first row of the band.
         reference: (C, H + 2 pad, W + 2 pad) uint8, padded over seam and poles.
         warped: (C, rows + 2 (compare_radius + box_radius), W + 2 pad) uint8.
-        offsets: (H, window) int64 columns of the census window; (H, 1) for differences.
+        offsets: (H, 2 compare_radius + 1) int64 columns of the window within which a pixel's cost looks around.
         reach: (H,) int64 columns of the box on either side.
-        compare_radius: 0 for differences.
+        cost: which cost, see `kernels_cost`.
+        compare_radius: rows on either side within which a pixel's cost looks around.
         box_radius: rows of the box on either side.
         pad: the margin.
         pixel_costs: (rows + 2 box_radius, W + 2 pad) uint16, scratch.
@@ -84,15 +88,22 @@ def source_cost(  # type: ignore[no-untyped-def]
     """
     rows, width = means.shape
     height = offsets.shape[0]
+    if cost == ZNCC:
+        zncc_rows(
+            first, reference[0], warped[0], reach[first : first + rows], box_radius, pad, pixel_costs, scratch, means
+        )
+        return
     disagree = np.empty(width, np.uint8)
     total = np.empty(width, np.uint16)
     for j in range(rows + 2 * box_radius):
         y = first - box_radius + j
-        if compare_radius > 0:
-            mirrored = -1 - y if y < 0 else (2 * height - 1 - y if y >= height else y)
+        mirrored = -1 - y if y < 0 else (2 * height - 1 - y if y >= height else y)
+        if cost == CENSUS:
             census_row(reference[0], y + pad, warped[0], j + compare_radius, offsets[mirrored], pad, disagree)
             for i in range(_U(width)):
                 total[i] = np.uint16(disagree[i])
+        elif cost == SAD_GRADIENT:
+            sad_gradient_row(reference, y + pad, warped, j + compare_radius, offsets[mirrored, 2], pad, total)
         else:
             total[:] = 0
             for c in range(reference.shape[0]):
@@ -118,7 +129,7 @@ def store_row(costs, scale, voxels):  # type: ignore[no-untyped-def]
 @njit(cache=True, error_model="numpy", nogil=True)
 def sweep_band(  # type: ignore[no-untyped-def]
     first, reference, sin_cos_azimuth, poses, ranges, packed, starts, shapes, valid, valid_starts,
-    offsets, reach, compare_radius, box_radius, pad, best_half, scale, neutral, volume, state, planes,
+    offsets, reach, cost, compare_radius, box_radius, pad, weights, share, most, scale, neutral, volume, state, planes,
 ):  # fmt: skip
     """Compute the costs of one band at all virtual ranges, into the volume or straight into the winners.
 
@@ -133,12 +144,15 @@ def sweep_band(  # type: ignore[no-untyped-def]
         shapes: (S, 2) int64.
         valid: (·,) uint8, or empty.
         valid_starts: (S,) int64.
-        offsets: (H, window) int64.
+        offsets: (H, 2 compare_radius + 1) int64.
         reach: (H,) int64.
-        compare_radius: of the census window, 0 for differences.
+        cost: which cost.
+        compare_radius: of the window of a pixel's cost.
         box_radius: of the box.
         pad: the margin, wider than every window reaches.
-        best_half: see `combine_row`.
+        weights: (S, H, W) float32, or empty; see `combine_row`.
+        share: likewise.
+        most: likewise.
         scale: float32 from mean costs to the volume's.
         neutral: float32 mean cost where no source votes.
         volume: (H, D, W) uint8, written; empty if the winner is wanted at once.
@@ -161,7 +175,7 @@ def sweep_band(  # type: ignore[no-untyped-def]
                 valid, valid_starts[s], pad, warped, votes,
             )  # fmt: skip
             source_cost(
-                first, reference, warped, offsets, reach, compare_radius, box_radius, pad, pixel_costs, scratch,
+                first, reference, warped, offsets, reach, cost, compare_radius, box_radius, pad, pixel_costs, scratch,
                 costs[s],
             )  # fmt: skip
             if len(valid):
@@ -170,7 +184,7 @@ def sweep_band(  # type: ignore[no-untyped-def]
                         if votes[j + halo, i] == 0:
                             costs[s, j, i] = np.inf
         for j in range(rows):
-            combine_row(costs, j, best_half, len(valid) == 0, neutral, combined)
+            combine_row(costs, j, weights, first + j, share, most, len(valid) == 0, neutral, combined)
             if len(volume):
                 store_row(combined, scale, volume[first + j, d])
             else:

@@ -8,6 +8,10 @@ from numba import njit
 _F = np.float32
 _U = np.uint64
 
+# What `source_cost` compares by.
+CENSUS, ZNCC, SAD, SAD_GRADIENT = range(4)
+COSTS = {"census": CENSUS, "zncc": ZNCC, "sad": SAD, "sad_gradient": SAD_GRADIENT}
+
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def census_row(reference, reference_row, warped, warped_row, offsets, pad, disagree):  # type: ignore[no-untyped-def]
@@ -83,53 +87,3 @@ def box_rows(pixel_costs, reach, radius, pad, column_sums, prefix, means):  # ty
             means[row, i] = _F(np.int32(prefix[right + i] - prefix[left + i])) * share
         for i in range(padded):
             column_sums[i] = np.int32(column_sums[i] - np.int32(pixel_costs[leaving, i]))
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def combine_row(costs, y, best_half, all_vote, neutral, result):  # type: ignore[no-untyped-def]
-    """Combine the sources' costs of one row, infinite where a source has no vote.
-
-    Args:
-        costs: (S, rows, W) float32; sorted in place if only the better half counts.
-        y: the row.
-        best_half: average the better half of the voting sources (rounded up), else all of them.
-        all_vote: that no cost is infinite.
-        neutral: the cost where no source has a vote.
-        result: (W,) float32, written.
-    """
-    sources = costs.shape[0]
-    row = _U(y)
-    if best_half:
-        for last in range(sources - 1, 0, -1):
-            for k in range(last):
-                a, b = _U(k), _U(k + 1)
-                for i in range(_U(result.shape[0])):
-                    p, q = costs[a, row, i], costs[b, row, i]
-                    costs[a, row, i] = p if p < q else q
-                    costs[b, row, i] = q if p < q else p
-    if all_vote:
-        _mean_of_first(costs, row, (sources + 1) // 2 if best_half else sources, result)
-        return
-    for i in range(_U(result.shape[0])):
-        votes = 0
-        for k in range(sources):
-            votes += costs[_U(k), row, i] < np.inf
-        used = (votes + 1) // 2 if best_half else votes
-        total = _F(0)
-        taken = 0
-        for k in range(sources):
-            cost = costs[_U(k), row, i]
-            if cost < np.inf and taken < used:
-                total += cost
-                taken += 1
-        result[i] = total / _F(used) if used else neutral
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _mean_of_first(costs, row, used, result):  # type: ignore[no-untyped-def]
-    result[:] = _F(0)
-    for k in range(used):
-        for i in range(_U(result.shape[0])):
-            result[i] += costs[_U(k), row, i]
-    for i in range(_U(result.shape[0])):
-        result[i] /= _F(used)

@@ -20,7 +20,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.sweep.combination import source_weights
 from pano_mvs.algorithms.sweep.kernels_band import sweep_band
+from pano_mvs.algorithms.sweep.kernels_cost import COSTS
 from pano_mvs.algorithms.sweep.kernels_sgm import sweep_row, sweep_strip
 from pano_mvs.algorithms.sweep.kernels_winner import AFTER, BEFORE, BEST, RIVAL, STATES, winners_of_rows
 from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, step_penalties, warm_up
@@ -95,8 +97,10 @@ def _band_arguments(work: SweepInput) -> tuple[object, ...]:
     shapes = np.array([source.shape[:2] for source in work.sources])
     return (
         reference, np.stack([np.sin(azimuth), np.cos(azimuth)]).astype(np.float32), poses, work.ranges,
-        packed, starts, shapes, valid, valid_starts, offsets, reach, settings.compare_radius, settings.box_radius, pad,
-        settings.combination == "best_half", np.float32(settings.cost_scale), np.float32(settings.neutral_cost),
+        packed, starts, shapes, valid, valid_starts, offsets, reach, COSTS[settings.cost], settings.compare_radius,
+        settings.box_radius, pad, source_weights((height, width), work.source_from_reference, settings),
+        settings.weight_share, settings.most_sources(len(work.sources)),
+        np.float32(settings.cost_scale), np.float32(settings.neutral_cost),
     )  # fmt: skip
 
 

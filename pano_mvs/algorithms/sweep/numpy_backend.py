@@ -5,13 +5,16 @@ The reference against which compiled backends are held. Memory: about 20 bytes f
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.sweep.combination import source_weights
 from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, step_penalties, warm_up
 from pano_mvs.algorithms.sweep.preparation import SweepInput
+from pano_mvs.algorithms.sweep.settings import LARGEST_COLOR_COST, LARGEST_GRADIENT_COST, ZNCC_NOISE_VARIANCE
 from pano_mvs.algorithms.sweep.windows import column_offsets
 from pano_mvs.algorithms.sweep.winner import Winners
 from pano_mvs.geometry import pad_panorama, pixel_from_ray, ray_grid, sample_panorama
@@ -47,12 +50,18 @@ def winners_of(volume: FloatArray) -> Winners:
 def _combined_cost(work: SweepInput, virtual_range: float) -> FloatArray:
     """Return the mean cost of one plane over the sources that count, (H, W)."""
     costs = np.stack([_source_cost(work, idx, virtual_range) for idx in range(len(work.sources))])
-    votes = np.isfinite(costs).sum(axis=0)
-    used = (votes + 1) // 2 if work.settings.combination == "best_half" else votes
-    ranked = np.sort(costs, axis=0)
-    taken = np.arange(len(costs))[:, None, None] < used
-    total = np.where(taken, ranked, 0.0).sum(axis=0)
-    return np.where(used > 0, total / np.maximum(used, 1), work.settings.neutral_cost)
+    votes = np.isfinite(costs)
+    weights = source_weights(costs.shape[1:], work.source_from_reference, work.settings)
+    weights = np.where(votes, weights if len(weights) else 1.0, 0.0)
+    order = np.argsort(costs, axis=0, kind="stable")
+    ranked = np.take_along_axis(weights, order, axis=0)
+    held_before = np.cumsum(ranked, axis=0) - ranked
+    wanted = work.settings.weight_share * (1 - 1e-5) * ranked.sum(axis=0)
+    place = np.arange(len(costs))[:, None, None]
+    taken = np.where((held_before < wanted) & (place < work.settings.most_sources(len(costs))), ranked, 0.0)
+    total = np.sum(taken * np.where(taken > 0, np.take_along_axis(costs, order, axis=0), 0.0), axis=0)
+    seen = votes.any(axis=0)
+    return np.where(seen, total / np.where(seen, taken.sum(axis=0), 1.0), work.settings.neutral_cost)
 
 
 def _source_cost(work: SweepInput, idx: int, virtual_range: float) -> FloatArray:
@@ -62,17 +71,55 @@ def _source_cost(work: SweepInput, idx: int, virtual_range: float) -> FloatArray
     points = work.source_from_reference[idx].apply(ray_grid(size_hw) * virtual_range)
     pixels = pixel_from_ray(points, (source.shape[0], source.shape[1]))
     warped = np.floor(sample_panorama(source, pixels) + 0.5)
-    pixel_cost = _census(work.reference[..., 0], warped[..., 0], work) if settings.cost == "census" else (
-        np.abs(work.reference.astype(np.float64) - warped).sum(axis=-1)
-    )  # fmt: skip
-    cost = _box_mean(pixel_cost, settings.box_radius, spherical=settings.spherical_window)
+    if settings.cost == "zncc":
+        cost = _zncc(work.reference[..., 0], warped[..., 0], work)
+    else:
+        pixel_cost = _PIXEL_COSTS[settings.cost](work.reference, warped, work)
+        cost = _box_mean(pixel_cost, settings.box_radius, spherical=settings.spherical_window)
     if work.source_valid is not None:
         cost[sample_panorama(work.source_valid[idx], pixels) < 1 - 1e-9] = np.inf
     return cost
 
 
-def _census(reference: NDArray[np.uint8], warped: FloatArray, work: SweepInput) -> FloatArray:
+def _differences(reference: NDArray[np.uint8], warped: FloatArray, _: SweepInput) -> FloatArray:
+    """Return the sum of absolute differences of all colours, (H, W)."""
+    difference: FloatArray = np.abs(reference.astype(np.float64) - warped).sum(axis=-1)
+    return difference
+
+
+def _sad_gradient(reference: NDArray[np.uint8], warped: FloatArray, work: SweepInput) -> FloatArray:
+    """Return the differences of colours and those of their gradients, each cut off, (H, W)."""
+    columns = column_offsets((reference.shape[0], reference.shape[1]), 1, spherical=work.settings.spherical_window)[
+        :, 2
+    ]
+    difference = np.moveaxis(reference.astype(np.float64) - warped, -1, 0)
+    gradient = np.zeros(reference.shape[:2])
+    for color in difference:
+        gradient += np.abs(_neighbours(color, 0, columns) - _neighbours(color, 0, -columns))
+        gradient += np.abs(
+            _neighbours(color, 1, np.zeros_like(columns)) - _neighbours(color, -1, np.zeros_like(columns))
+        )
+    colors = np.minimum(_differences(reference, warped, work), LARGEST_COLOR_COST)
+    return np.asarray(colors + np.minimum(gradient, LARGEST_GRADIENT_COST))
+
+
+def _zncc(reference: NDArray[np.uint8], warped: FloatArray, work: SweepInput) -> FloatArray:
+    """Return 1 − ρ, ρ the correlation over each pixel's window with some noise in both variances, (H, W)."""
+    ours = reference.astype(np.float64)
+
+    def mean(values: FloatArray) -> FloatArray:
+        return _box_mean(values, work.settings.box_radius, spherical=work.settings.spherical_window)
+
+    mean_r, mean_w = mean(ours), mean(warped)
+    variance_r = np.maximum(mean(ours**2) - mean_r**2, 0) + ZNCC_NOISE_VARIANCE
+    variance_w = np.maximum(mean(warped**2) - mean_w**2, 0) + ZNCC_NOISE_VARIANCE
+    rho = (mean(ours * warped) - mean_r * mean_w) / np.sqrt(variance_r * variance_w)
+    return np.asarray(1 - np.clip(rho, -1, 1))
+
+
+def _census(picture: NDArray[np.uint8], source: FloatArray, work: SweepInput) -> FloatArray:
     """Return how many neighbours have another order against the centre in one picture than in the other, (H, W)."""
+    reference, warped = picture[..., 0], source[..., 0]
     radius = work.settings.compare_radius
     offsets = column_offsets(reference.shape, radius, spherical=work.settings.spherical_window)
     differs = np.zeros(reference.shape)
@@ -81,6 +128,13 @@ def _census(reference: NDArray[np.uint8], warped: FloatArray, work: SweepInput) 
             above = _neighbours(reference, rows, offsets[:, k]) > reference
             differs += above != (_neighbours(warped, rows, offsets[:, k]) > warped)
     return differs
+
+
+_PIXEL_COSTS: dict[str, Callable[[NDArray[np.uint8], FloatArray, SweepInput], FloatArray]] = {
+    "census": _census,
+    "sad": _differences,
+    "sad_gradient": _sad_gradient,
+}
 
 
 def _box_mean(cost: FloatArray, radius: int, *, spherical: bool) -> FloatArray:

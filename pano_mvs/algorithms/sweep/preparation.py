@@ -1,7 +1,8 @@
-"""From pictures to what is compared: filtered, matched in exposure, grey for census."""
+"""From pictures to what is compared: filtered, matched in exposure, grey for census and correlation."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.windows import column_offsets
 from pano_mvs.algorithms.sweep.winner import Winners
-from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, ray_grid
+from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, ray_grid, rotate_panorama
 
 # Rec. 709 luma in 1/256.
 _LUMA = np.array([54, 183, 19])
@@ -22,7 +23,7 @@ class SweepInput:
     """Everything that a backend needs, checked and prepared.
 
     Attributes:
-        reference: (H, W, C) uint8: grey (C = 1) for census, RGB for differences.
+        reference: (H, W, C) uint8: grey (C = 1) for census and zncc, RGB for differences.
         sources: the sources likewise, each of its own size.
         source_from_reference: their poses.
         source_valid: for each source, where a sample may vote, (Hs, Ws); None if everywhere in all of them.
@@ -42,7 +43,7 @@ def prepare_picture(picture: NDArray[np.uint8], settings: SweepSettings) -> NDAr
     """Return the picture as it is compared, (H, W, 3) RGB to (H, W, 1) grey or (H, W, 3), prefiltered if asked for."""
     if settings.prefilter_diameter:
         picture = _bilateral(picture, settings)
-    if settings.cost == "sad":
+    if settings.compares_colors:
         return np.ascontiguousarray(picture)
     luma = (picture.astype(np.uint16) @ _LUMA.astype(np.uint16) + 128) >> 8
     return luma.astype(np.uint8)[..., None]
@@ -55,6 +56,23 @@ def _bilateral(picture: NDArray[np.uint8], settings: SweepSettings) -> NDArray[n
         padded, settings.prefilter_diameter, settings.prefilter_sigma_color, settings.prefilter_sigma_space_px
     )
     return np.asarray(filtered[pad:-pad, pad:-pad], dtype=np.uint8)
+
+
+def derotated(
+    sources: Sequence[NDArray[np.uint8]], poses: Sequence[Rigid3], masks: tuple[NDArray[np.bool_], ...] | None
+) -> tuple[list[NDArray[np.uint8]], tuple[Rigid3, ...], tuple[NDArray[np.bool_], ...] | None]:
+    """Return the sources as the same cameras would see them in the reference's orientation, their poses and masks.
+
+    X_source = R X + t becomes Rᵀ X_source = X + Rᵀ t. A resampled pixel is valid if all that it is made of is.
+    """
+    turned = [rotate_panorama(source, pose.rotation.T) for source, pose in zip(sources, poses, strict=True)]
+    straight = tuple(Rigid3(np.eye(3), pose.rotation.T @ pose.translation) for pose in poses)
+    if masks is None:
+        return turned, straight, None
+    shares = [
+        rotate_panorama(mask.astype(np.float64), pose.rotation.T) for mask, pose in zip(masks, poses, strict=True)
+    ]
+    return turned, straight, tuple(share > 1 - 1e-9 for share in shares)
 
 
 def voting_pixels(mask: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:

@@ -8,6 +8,13 @@ from typing import Literal
 
 from pano_mvs.core.errors import UsageError
 
+# Costs are cut off: what differs by more is simply wrong. Grey levels, summed over R, G and B …
+_LARGEST_SAD, LARGEST_COLOR_COST = 96, 30
+# … and differences over two pixels, summed over both directions as well.
+LARGEST_GRADIENT_COST = 60
+# The variance of noise, in grey levels squared, against which correlation has to stand out.
+ZNCC_NOISE_VARIANCE = 4.0
+
 _PENALTY_ROWS = 512
 # Eight paths of at most 255 + P2 each must fit uint16, and P1 on top of a plane that does not exist.
 _LARGEST_P1, _LARGEST_P2 = 5000, 7900
@@ -20,41 +27,54 @@ class SweepSettings:
     Attributes:
         planes: number of virtual ranges, at least 3.
         spacing: virtual ranges uniform in 1/range, in log range or in range (the paper's).
-        cost: "census" (Hamming distance of the signs of differences to the window's centre; blind to exposure) or
-            "sad" (sum of absolute differences of R, G and B; the paper's).
+        cost: "census" (Hamming distance of the signs of differences to the window's centre; blind to exposure), "zncc"
+            (1 − zero-mean normalised cross-correlation; blind to it too), "sad" (sum of absolute differences of R, G
+            and B; the paper's) or "sad_gradient" (differences of colours and of their gradients, both cut off).
         window: side in pixels, odd, of the window of either cost (the paper: 7).
         spherical_window: widen the windows' columns by 1/cos of the elevation, so that they keep their solid angle.
         combination: "sum" over the sources (the paper's), or the mean of the "best_half" of them at each pixel and
-            plane, which leaves out the sources in which the point is hidden.
+            plane, which leaves out the sources in which the point is hidden; or of the "best_k"; or
+            "parallax_weighted", the cheapest sources that hold half of all weight, a source's weight being the
+            parallax by which it would notice a change of range.
+        best: how many sources "best_k" takes.
         aggregation: "box": winner takes all after a box sum; "sgm": semi-global matching over eight paths.
         support: side in pixels, odd, of the box over which census costs are averaged before the decision; 1 is none.
-            The box of SAD costs is the window itself.
+            The box of all other costs is the window itself.
         p1: SGM's penalty of a step by one plane between neighbours, for a picture of 512 rows; costs go from 0 to 255.
         p2: SGM's penalty of a larger step, likewise. Both grow with the rows: along the same angle, a path then pays
             the same for the slant of a surface against what it gathers from the pixels.
         p2_contrast: grey levels of contrast between neighbours at which p2 is halved (never below p1); 0 keeps it.
-        subplane: refine the winner between the planes by a parabola.
+        selection: the cheapest plane, "winner" (the paper's), or where between the planes a "parabola" or a symmetric
+            V ("vfit") through its cost and its neighbours' has its minimum.
+        confidence: "peak_ratio" (how much dearer the best rival is), "curvature" (how sharp the minimum is) or
+            "combined", their geometric mean.
         prefilter_diameter: diameter of a bilateral filter of all pictures before the sweep; 0 is none (the paper: 3).
         prefilter_sigma_color: its width in grey levels (the paper: 25).
         prefilter_sigma_space_px: its width in pixels (the paper: 25).
-        exposure: match each source to the reference by a gain and an offset for each colour before comparing by SAD.
+        derotate: turn each source to the reference's orientation by resampling first (the paper), instead of looking
+            it up as it is.
+        exposure: match each source to the reference by a gain and an offset for each colour before comparing by
+            differences; census and zncc need none.
     """
 
     planes: int = 128
     spacing: Literal["inverse", "log", "uniform"] = "inverse"
-    cost: Literal["census", "sad"] = "census"
+    cost: Literal["census", "zncc", "sad", "sad_gradient"] = "census"
     window: int = 7
     spherical_window: bool = True
-    combination: Literal["sum", "best_half"] = "best_half"
+    combination: Literal["sum", "best_half", "best_k", "parallax_weighted"] = "best_half"
+    best: int = 2
     aggregation: Literal["box", "sgm"] = "sgm"
     support: int = 5
     p1: int = 80
     p2: int = 1600
     p2_contrast: float = 15.0
-    subplane: bool = True
+    selection: Literal["winner", "parabola", "vfit"] = "parabola"
+    confidence: Literal["peak_ratio", "curvature", "combined"] = "peak_ratio"
     prefilter_diameter: int = 0
     prefilter_sigma_color: float = 25.0
     prefilter_sigma_space_px: float = 25.0
+    derotate: bool = False
     exposure: bool = True
 
     def __post_init__(self) -> None:
@@ -63,7 +83,8 @@ class SweepSettings:
         for name in ("window", "support"):
             side = getattr(self, name)
             _require(side % 2 == 1 and 1 <= side <= 15, f"{name} must be odd and 1 to 15, got {side}")
-        _require(self.cost == "sad" or self.window >= 3, "census needs a window of at least 3")
+        _require(self.cost in ("sad", "sad_gradient") or self.window >= 3, f"{self.cost} needs a window of at least 3")
+        _require(self.best >= 1, f"best must be at least 1, got {self.best}")
         _require(0 <= self.p1 <= self.p2 <= 4000, f"0 ≤ p1 ≤ p2 ≤ 4000 must hold, got {self.p1} and {self.p2}")
         _require(self.p2_contrast >= 0, f"p2_contrast cannot be negative, got {self.p2_contrast}")
         _require(0 <= self.prefilter_diameter <= 31, f"prefilter_diameter must be 0 to 31, got "
@@ -77,7 +98,7 @@ class SweepSettings:
     @property
     def compare_radius(self) -> int:
         """Half side of the window within which one pixel's cost looks around."""
-        return self.window // 2 if self.cost == "census" else 0
+        return {"census": self.window // 2, "sad_gradient": 1}.get(self.cost, 0)
 
     @property
     def box_radius(self) -> int:
@@ -85,18 +106,37 @@ class SweepSettings:
         return self.support // 2 if self.cost == "census" else self.window // 2
 
     @property
-    def cost_scale(self) -> float:
-        """The factor that takes a pixel's mean cost to SGM's scale, where 255 is the worst there is.
+    def worst_cost(self) -> float:
+        """The mean cost that SGM takes for the worst there is, 255; half of it is that of a chance match.
 
-        A census cost is at most window² − 1. Absolute differences are cut off at 32 levels a colour: what differs by
-        more is simply wrong.
+        A census cost is at most window² − 1.
         """
-        return 255.0 / (self.window**2 - 1) if self.cost == "census" else 255.0 / 96.0
+        largest = {"sad": _LARGEST_SAD, "sad_gradient": LARGEST_COLOR_COST + LARGEST_GRADIENT_COST, "zncc": 2}
+        return float(largest.get(self.cost, self.window**2 - 1))
+
+    @property
+    def cost_scale(self) -> float:
+        """The factor that takes a pixel's mean cost to SGM's scale, where 255 is the worst there is."""
+        return 255.0 / self.worst_cost
 
     @property
     def neutral_cost(self) -> float:
         """The mean cost, before scaling, of a plane that no source sees: that of a chance match."""
-        return (self.window**2 - 1) / 2 if self.cost == "census" else 48.0
+        return self.worst_cost / 2
+
+    @property
+    def compares_colors(self) -> bool:
+        """Whether R, G and B are compared, and exposure matters, rather than grey values alone."""
+        return self.cost in ("sad", "sad_gradient")
+
+    @property
+    def weight_share(self) -> float:
+        """The share of the sources' weight that counts, the cheapest ones first."""
+        return 0.5 if self.combination in ("best_half", "parallax_weighted") else 1.0
+
+    def most_sources(self, count: int) -> int:
+        """Return how many of `count` sources count at most."""
+        return min(self.best, count) if self.combination == "best_k" else count
 
     def replace(self, **changes: object) -> SweepSettings:
         """Return the same settings but for those named."""

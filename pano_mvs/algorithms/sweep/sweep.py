@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.sweep import numpy_backend
 from pano_mvs.algorithms.sweep.exposure import match_all, shrink
 from pano_mvs.algorithms.sweep.hypotheses import virtual_ranges
-from pano_mvs.algorithms.sweep.preparation import SweepInput, prepare_picture, sees_winner, voting_pixels
+from pano_mvs.algorithms.sweep.preparation import SweepInput, derotated, prepare_picture, sees_winner, voting_pixels
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.winner import Winners, range_map_from_winners
 from pano_mvs.core.errors import UsageError
@@ -70,13 +70,16 @@ def sweep_range(
     _check_picture("reference", reference, reference_mask)
     masks = _checked_sources(sources, source_from_reference, source_masks)
     ranges = virtual_ranges(near, far, planes=settings.planes, spacing=settings.spacing)
-    if settings.exposure and settings.cost == "sad":
+    if settings.exposure and settings.compares_colors:
         rough = _rough_range(reference, sources, source_from_reference, near=near, far=far, backend=backend)
         sources = match_all(reference, sources, source_from_reference, rough, masks)
+    poses = tuple(source_from_reference)
+    if settings.derotate:
+        sources, poses, masks = derotated(sources, poses, masks)
     work = SweepInput(
         reference=prepare_picture(reference, settings),
         sources=tuple(prepare_picture(source, settings) for source in sources),
-        source_from_reference=tuple(source_from_reference),
+        source_from_reference=poses,
         source_valid=_voting(masks, settings, rows=reference.shape[0]),
         ranges=ranges,
         settings=settings,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,8 @@ from pano_mvs.scene.range_map import WEAK_CONFIDENCE, RangeMap
 
 # A winner cheaper than its best rival by this share of the rival's cost is as sure as can be.
 _SURE_MARGIN = 0.8
+# Likewise one that is cheaper than the planes next to it.
+_SHARP_MARGIN = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,36 +46,47 @@ def range_map_from_winners(
         winners: of all pixels.
         near: the first virtual range.
         far: the last one.
-        settings: planes, spacing and whether to refine between planes.
+        settings: planes, spacing, selection and confidence.
         seen: (H, W) where the reference is valid and at least one source saw the winner.
     """
     position = winners.plane.astype(np.float64)
-    if settings.subplane:
-        position += subplane_offset(winners, planes=settings.planes)
+    if settings.selection != "winner":
+        position += subplane_offset(winners, planes=settings.planes, shape=settings.selection)
     ranges = range_at(position, near, far, planes=settings.planes, spacing=settings.spacing)
     result = np.where(seen, ranges, np.nan).astype(np.float32)
-    return RangeMap(result, np.where(seen, confidence(winners), 0).astype(np.uint8))
+    return RangeMap(result, np.where(seen, confidence(winners, measure=settings.confidence), 0).astype(np.uint8))
 
 
-def subplane_offset(winners: Winners, *, planes: int) -> NDArray[np.float64]:
-    """Return where between −½ and ½ plane the parabola through three costs has its minimum, (H, W); 0 at the ends."""
+def subplane_offset(winners: Winners, *, planes: int, shape: Literal["parabola", "vfit"]) -> NDArray[np.float64]:
+    """Return where between −½ and ½ plane the minimum of a curve through three costs is, (H, W); 0 at the ends.
+
+    With the steps a and b from the winner's cost up to that before and after it, the parabola has its minimum at
+    ½ (a − b)/(a + b), and two lines of opposite slopes meet at ½ (a − b)/max(a, b).
+    """
     before, after = winners.before.astype(np.float64), winners.after.astype(np.float64)
-    curvature = before + after - 2.0 * winners.cost
-    inner = (winners.plane > 0) & (winners.plane < planes - 1) & (curvature > 0)
-    offset = 0.5 * (before - after) / np.where(inner, curvature, 1.0)
+    steps = before - winners.cost, after - winners.cost
+    scale = steps[0] + steps[1] if shape == "parabola" else np.maximum(*steps)
+    inner = (winners.plane > 0) & (winners.plane < planes - 1) & (scale > 0)
+    offset = 0.5 * (before - after) / np.where(inner, scale, 1.0)
     return np.where(inner, np.clip(offset, -0.5, 0.5), 0.0)
 
 
-def confidence(winners: Winners) -> NDArray[np.uint8]:
-    """Return how sure the winner is, (H, W) uint8 in 64–127: how much dearer the best rival is.
+def confidence(winners: Winners, *, measure: Literal["peak_ratio", "curvature", "combined"]) -> NDArray[np.uint8]:
+    """Return how sure the winner is, (H, W) uint8 in 64–127.
 
-    The uniqueness ratio 1 − cost/rival, which vanishes on bare surfaces, along the baseline (where no source can tell
-    ranges apart) and between two equally good ranges.
+    "peak_ratio" is the uniqueness 1 − cost/rival: how much dearer the best rival is. It vanishes on bare surfaces,
+    along the baseline (where no source can tell ranges apart) and between two equally good ranges. "curvature" is
+    1 − 2 cost/(before + after): how sharp the minimum is. "combined" is their geometric mean.
     """
-    no_rival = np.isinf(winners.rival)  # three planes or fewer
-    rival = np.where(no_rival, 1.0, winners.rival).astype(np.float64)
-    cost = np.where(no_rival, 0.0, winners.cost)
-    uniqueness = (rival - cost) / np.maximum(rival, 1e-6)
+    shares = []
+    if measure != "curvature":
+        no_rival = np.isinf(winners.rival)  # three planes or fewer
+        rival = np.where(no_rival, 1.0, winners.rival).astype(np.float64)
+        cost = np.where(no_rival, 0.0, winners.cost)
+        shares.append((rival - cost) / np.maximum(rival, 1e-6) / _SURE_MARGIN)
+    if measure != "peak_ratio":
+        around = winners.before.astype(np.float64) + winners.after
+        shares.append((around - 2.0 * winners.cost) / np.maximum(around, 1e-6) / _SHARP_MARGIN)
     low, high = WEAK_CONFIDENCE
-    share = np.clip(uniqueness / _SURE_MARGIN, 0, 1)
+    share = np.prod(np.clip(shares, 0, 1), axis=0) ** (1 / len(shares))
     return np.asarray(np.rint(low + share * (high - low)), dtype=np.uint8)
