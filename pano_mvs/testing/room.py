@@ -4,32 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.geometry import Rigid3, ray_from_pixel, rotation_from_rotvec
+from pano_mvs.testing.paint import Texture, albedo_at, sky_color
 from pano_mvs.testing.surfaces import Ball, Cuboid, FloatArray, Quad, Surface, Vector
-from pano_mvs.testing.texture import noise
 
-Texture = Literal["strong", "weak", "isotropic"]
-
-# Cell sizes in scene units with the strength of the noise on each.
-_LIGHTNESS: dict[Texture, tuple[tuple[float, float], ...]] = {
-    "strong": ((0.018, 0.4), (0.055, 0.5), (0.19, 0.5)),
-    "weak": ((0.047, 0.03), (0.16, 0.05)),
-    "isotropic": ((0.015, 0.7), (0.047, 0.7)),
-}
-_HUE: dict[Texture, tuple[tuple[float, float], ...]] = {
-    "strong": ((0.06, 1.0),),
-    "weak": ((0.2, 0.15),),
-    "isotropic": ((0.06, 0.6),),
-}
 _RAYS_AT_ONCE = 1 << 17
 
 
@@ -39,15 +25,21 @@ class Room:
 
     Attributes:
         surfaces: in any order.
-        texture: "strong" (features everywhere), "weak" (nearly plain walls), or "isotropic".
+        texture: of all surfaces: "strong" (features everywhere), "weak" (nearly plain walls), "isotropic", "outdoor"
+            (coarse and fine, the fine fading with the distance) or "none" (paint).
         seed: of the texture.
         lamp: where the light comes from; the shading is diffuse, without shadows.
+        textures: of each surface, where they differ; empty: all have `texture`.
+        sky: its colours at the zenith and at the horizon where a ray meets nothing, with clouds that are infinitely
+            far away; None: black.
     """
 
     surfaces: tuple[Surface, ...]
     texture: Texture = "strong"
     seed: int = 0
     lamp: Vector = (0.4, -1.2, 0.3)
+    textures: tuple[Texture, ...] = ()
+    sky: tuple[Vector, Vector] | None = None
 
 
 def default_room(seed: int = 0, texture: Texture = "strong") -> Room:
@@ -123,12 +115,20 @@ def write_capture(folder: Path, room: Room, poses: Sequence[Rigid3], size_hw: tu
     The truth has the form that `pano_mvs.io.truth.read_truth` reads: poses are cam_from_world, ranges are float32
     with inf where there is no surface, and each view carries the SHA-256 of its picture.
     """
+    write_views(folder, (render(room, pose, size_hw) for pose in poses), poses)
+
+
+def write_views(
+    folder: Path, pictures: Iterable[tuple[NDArray[np.uint8], NDArray[np.float32]]], poses: Sequence[Rigid3]
+) -> None:
+    """Write views, each a picture and its true ranges as `render` returns them, in the form of `write_capture`."""
     (folder / "images").mkdir(parents=True, exist_ok=True)
     (folder / "truth").mkdir(exist_ok=True)
     views: list[dict[str, object]] = []
     ranges: dict[str, NDArray[np.float32]] = {}
-    for number, pose in enumerate(poses):
-        image, range_map = render(room, pose, size_hw)
+    size_hw = (0, 0)
+    for number, ((image, range_map), pose) in enumerate(zip(pictures, poses, strict=True)):
+        size_hw = range_map.shape[0], range_map.shape[1]
         name = f"{number:03d}"
         data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
         (folder / "images" / f"{name}.png").write_bytes(data)
@@ -155,7 +155,7 @@ def _traced(
         rays = ray_from_pixel(pixels, size_hw) @ cam_from_world.rotation
         distances[block], surface_idx, normals = _first_hit(room, origin, rays)
         if shaded:
-            colors[block] = _shaded(room, origin + distances[block, None] * rays, surface_idx, normals)
+            colors[block] = _shaded(room, origin, rays, (distances[block], surface_idx, normals), np.pi / height)
     return distances, colors
 
 
@@ -169,19 +169,28 @@ def _first_hit(room: Room, origin: FloatArray, rays: FloatArray) -> tuple[FloatA
     return best, which, normals
 
 
-def _shaded(room: Room, points: FloatArray, surface_idx: NDArray[np.int64], normals: FloatArray) -> FloatArray:
-    """Return the colours (N, 3) in [0, 1] of points on surfaces; black where there is none."""
-    colors = np.zeros_like(points)
+def _shaded(
+    room: Room,
+    origin: FloatArray,
+    rays: FloatArray,
+    hits: tuple[FloatArray, NDArray[np.int64], FloatArray],
+    pixel_rad: float,
+) -> FloatArray:
+    """Return the colours (N, 3) in [0, 1] of what rays meet; the sky's, or black, where they meet nothing."""
+    distances, surface_idx, normals = hits
+    colors = np.zeros_like(rays)
     for idx, surface in enumerate(room.surfaces):
         on = surface_idx == idx
+        points = origin + distances[on, None] * rays[on]
+        texture = room.textures[idx] if room.textures else room.texture
         seed = 1000 * room.seed + 2 * idx
-        share = 0.5 + 0.5 * np.tanh(noise(points[on], cells=_HUE[room.texture], seed=seed))
-        lightness = np.tanh(noise(points[on], cells=_LIGHTNESS[room.texture], seed=seed + 1))
-        first, second = np.array(surface.colors_rgb)
-        albedo = share[:, None] * first + (1 - share[:, None]) * second
-        to_lamp = np.array(room.lamp) - points[on]
+        albedo = albedo_at(points, surface.colors_rgb, texture, seed=seed, footprint=pixel_rad * distances[on])
+        to_lamp = np.array(room.lamp) - points
         facing = np.abs(np.sum(to_lamp * normals[on], axis=1)) / np.maximum(np.linalg.norm(to_lamp, axis=1), 1e-9)
-        colors[on] = albedo * (0.55 + 0.45 * facing[:, None]) * (1 + 0.65 * lightness[:, None])
+        colors[on] = albedo * (0.55 + 0.45 * facing[:, None])
+    if room.sky is not None:
+        nothing = surface_idx < 0
+        colors[nothing] = sky_color(rays[nothing], room.sky, seed=room.seed)
     return np.clip(colors, 0, 1)
 
 
