@@ -125,7 +125,7 @@ def print_scores(scores: Mapping[str, Any], console: Console) -> None:
         return
     table = Table("view", *_SHOWN_SCORES.values())
     for view, values in scores["views"].items():
-        table.add_row(escape(view), *(_shown(values[name]) for name in _SHOWN_SCORES))
+        table.add_row(escape(view), *(_shown(values.get(name)) for name in _SHOWN_SCORES))
     console.print(table)
 
 
@@ -134,11 +134,17 @@ _SHOWN_SCORES = {
     "w_mae": "MAE",
     "w_delta_105": "δ<1.05",
     "completeness": "complete",
+    "ause": "AUSE",
     "constant_psnr_db": "constant: dB",
     "constant_w_delta_105": "constant: δ<1.05",
 }
-"""Score to the heading under which it is printed; MAE and δ are weighted by solid angle."""
+"""Score to the heading under which it is printed; MAE and δ are weighted by solid angle.
+
+AUSE is the area between the sparsification curve of the confidence and that of the true errors.
+"""
 
 
-def _shown(value: float) -> str:
+def _shown(value: float | None) -> str:
+    if value is None:
+        return "–"
     return f"{value:.3g}" if abs(value) < 1 else f"{value:.2f}"

@@ -34,11 +34,7 @@ def read_range_tiff(path: Path) -> NDArray[np.float32]:
     Raises:
         InputError: if the file cannot be read or is no one-channel float32 picture.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
-    array = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    array = _decoded(path)
     if array is None or array.dtype != np.float32 or array.ndim != 2:
         what = "no picture" if array is None else f"{array.shape} {array.dtype}"
         raise InputError(f"{path}: a range map is a one-channel float32 TIFF, this is {what}. Write it again")
@@ -54,6 +50,31 @@ def write_confidence_png(path: Path, confidence: NDArray[np.uint8]) -> None:
     if confidence.dtype != np.uint8 or confidence.ndim != 2:
         raise UsageError(f"a confidence map is (H, W) uint8, got {confidence.shape} {confidence.dtype}")
     path.write_bytes(_encoded(".png", confidence, []))
+
+
+def read_confidence_png(path: Path) -> NDArray[np.uint8]:
+    """Return the confidences (H, W) uint8 in a PNG file, 0 = invalid.
+
+    Raises:
+        InputError: if the file cannot be read or is no 8-bit grey picture.
+    """
+    array = _decoded(path)
+    if array is None or array.dtype != np.uint8 or array.ndim != 2:
+        what = "no picture" if array is None else f"{array.shape} {array.dtype}"
+        raise InputError(f"{path}: a confidence map is an 8-bit grey PNG, this is {what}. Write it again")
+    return np.asarray(array)
+
+
+def _decoded(path: Path) -> NDArray[np.generic] | None:
+    """Return the picture in a file as it is stored; None if it is no picture."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
+    if not data:
+        return None
+    array: NDArray[np.generic] | None = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    return array
 
 
 def _encoded(suffix: str, array: NDArray[np.generic], options: list[int]) -> bytes:

@@ -17,6 +17,9 @@ _WORDS = {
     "delta_105": "within 5 %",
     "w_delta_105": "within 5 % on the sphere",
     "bad_5": "off by more than 5 %",
+    "sparsification_area": "sparsification area",
+    "sparsification_oracle_area": "sparsification area of an oracle",
+    "ause": "area between the two (AUSE)",
     "of": "of panoramas with truth",
 }
 _UNITS = {"deg": "°", "rad": "rad", "px": "px", "s": "s", "db": "dB", "mb": "MB"}

@@ -39,5 +39,6 @@ def truth(images: All[Panorama], poses: One[Poses], ranges: All[RangeMap], param
         {name: view.cam_from_world for name, view in matched.items()},
         {name: ranges[name].range for name in matched if name in ranges},
         {name: partial(known.range_map, view) for name, view in matched.items()},
+        confidences={name: ranges[name].confidence for name in matched if name in ranges},
     )
     return Scores(scores.poses, scores.views, (*scores.notes, *notes))

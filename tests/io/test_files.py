@@ -8,7 +8,7 @@ from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.ply import read_ply, write_ply
 from pano_mvs.io.preview import color_mapped, range_limits, scale_ticks, write_preview
-from pano_mvs.io.range_files import read_range_tiff, write_confidence_png, write_range_tiff
+from pano_mvs.io.range_files import read_confidence_png, read_range_tiff, write_confidence_png, write_range_tiff
 from pano_mvs.scene import PointCloud
 from pano_mvs.testing.room import default_room, render
 
@@ -31,6 +31,15 @@ def test_a_range_map_keeps_every_bit_and_its_nans(tmp_path):
 def test_another_array_is_no_range_map(tmp_path, array):
     with pytest.raises(UsageError, match=r"a range map is \(H, W\) float32"):
         write_range_tiff(tmp_path / "a.tiff", array)
+
+
+def test_a_confidence_map_comes_back(tmp_path):
+    confidence = np.random.default_rng(1).integers(0, 256, (6, 12), dtype=np.uint8)
+    write_confidence_png(tmp_path / "a.png", confidence)
+    np.testing.assert_array_equal(read_confidence_png(tmp_path / "a.png"), confidence)
+    cv2.imwrite(str(tmp_path / "colour.png"), np.zeros((4, 4, 3), np.uint8))
+    with pytest.raises(InputError, match=r"colour\.png: a confidence map is an 8-bit grey PNG"):
+        read_confidence_png(tmp_path / "colour.png")
 
 
 def test_another_file_is_no_range_map(tmp_path):

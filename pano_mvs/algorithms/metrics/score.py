@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.metrics.depth import constant_baseline, depth_metrics
 from pano_mvs.algorithms.metrics.poses import align_centers, relative_pose_errors
+from pano_mvs.algorithms.metrics.sparsification import sparsify
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Scores
@@ -21,6 +22,8 @@ def score_capture(
     true_poses: Mapping[str, Rigid3],
     estimated_ranges: Mapping[str, NDArray[np.float32]],
     true_ranges: Mapping[str, RangeReader],
+    *,
+    confidences: Mapping[str, NDArray[np.uint8]] | None = None,
 ) -> Scores:
     """Return pose and depth scores.
 
@@ -33,6 +36,7 @@ def score_capture(
         true_poses: cam_from_world by image, in the truth's unit.
         estimated_ranges: (H, W) by image, NaN invalid.
         true_ranges: image to a function that returns its (H, W) true range, or None where it is not known.
+        confidences: (H, W) by image: how well they rank the errors is scored too where they are given.
     """
     if len(true_poses) < 2:
         return Scores({}, {}, ("no ground truth is known for these pictures",))
@@ -62,6 +66,10 @@ def score_capture(
             notes.append(f"{name}: no true range map of its size")
             continue
         views[name] = _view_scores(np.asarray(estimated), truth, scale)
+        confidence = (confidences or {}).get(name)
+        judged = np.isfinite(estimated) & np.isfinite(truth)
+        if confidence is not None and confidence.shape == truth.shape and judged.any():
+            views[name] |= _confidence_scores(np.asarray(estimated), np.asarray(confidence), truth, scale)
     return Scores(poses, views, tuple(notes))
 
 
@@ -78,3 +86,10 @@ def _view_scores(estimated: NDArray[np.float32], truth: NDArray[np.float32], sca
         "constant_psnr_db": constant.psnr_db,
         "constant_w_delta_105": constant.w_delta_105,
     }
+
+
+def _confidence_scores(
+    estimated: NDArray[np.float32], confidence: NDArray[np.uint8], truth: NDArray[np.float32], scale: float
+) -> dict[str, float]:
+    curve = sparsify(estimated, confidence, truth, scale=scale)
+    return {"sparsification_area": curve.area, "sparsification_oracle_area": curve.oracle_area, "ause": curve.ause}

@@ -1,0 +1,80 @@
+"""Sparsification: the order that confidence gives against the order of the errors."""
+
+import numpy as np
+import pytest
+
+from pano_mvs.algorithms.metrics.score import score_capture
+from pano_mvs.algorithms.metrics.sparsification import sparsify
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import Rigid3
+
+SIZE = (16, 32)
+
+
+def noisy(seed=0):
+    rng = np.random.default_rng(seed)
+    truth = rng.uniform(1, 4, SIZE)
+    return truth, truth * (1 + rng.normal(0, 0.1, SIZE)), rng
+
+
+def ranks(values):
+    return np.argsort(np.argsort(values.ravel())).reshape(values.shape)
+
+
+def test_confidence_in_the_order_of_the_errors_is_as_good_as_can_be():
+    truth, estimated, _ = noisy()
+    error = np.abs(estimated - truth) / truth
+    best, worst = (sparsify(estimated, ranks(order), truth) for order in (-error, error))
+    assert best.ause == pytest.approx(0, abs=1e-12)
+    np.testing.assert_allclose(best.error, best.oracle_error)
+    assert (np.diff(best.error) >= 0).all()
+    assert best.kept[-1] == pytest.approx(1)
+    assert worst.ause > 2 * sparsify(estimated, np.zeros(SIZE, np.uint8), truth).ause > 0
+
+
+def test_no_confidence_at_all_keeps_the_mean_error_whatever_is_kept():
+    truth, estimated, rng = noisy()
+    flat = sparsify(estimated, np.full(SIZE, 9), truth)
+    assert flat.area == pytest.approx(flat.error[-1])
+    shuffled = sparsify(estimated, rng.permutation(SIZE[0] * SIZE[1]).reshape(SIZE), truth)
+    assert shuffled.area == pytest.approx(flat.area, rel=0.15)
+
+
+def test_coarse_confidence_has_the_area_of_a_random_order_within_each_level():
+    truth, estimated, rng = noisy()
+    coarse = ranks(-np.abs(estimated - truth) / truth) // 100
+    drawn = [
+        sparsify(estimated, coarse * 1000 + rng.permutation(SIZE[0] * SIZE[1]).reshape(SIZE) % 1000, truth).area
+        for _ in range(20)
+    ]
+    assert sparsify(estimated, coarse, truth).area == pytest.approx(np.mean(drawn), rel=0.02)
+
+
+def test_pixels_without_truth_or_estimate_do_not_count_and_scale_does():
+    truth, estimated, rng = noisy()
+    confidence = rng.integers(1, 255, SIZE)
+    expected = sparsify(estimated[:, :16], confidence[:, :16], truth[:, :16])
+    truth[:, 16:24], estimated[:, 24:] = np.inf, np.nan
+    found = sparsify(estimated / 3, confidence, truth, scale=3.0)
+    assert (found.area, found.ause) == pytest.approx((expected.area, expected.ause))
+    nothing = sparsify(np.full(SIZE, np.nan), confidence, truth)
+    assert np.isnan(nothing.ause)
+    assert len(nothing.kept) == 0
+
+
+def test_shapes_that_differ_are_refused():
+    truth, estimated, _ = noisy()
+    with pytest.raises(UsageError, match="one size"):
+        sparsify(estimated, np.zeros((3, 3), np.uint8), truth)
+
+
+def test_scores_of_a_capture_tell_how_confidence_ranks_if_it_is_given():
+    truth, estimated, rng = noisy()
+    confidence = rng.integers(1, 255, SIZE).astype(np.uint8)
+    poses = {name: Rigid3(np.eye(3), np.array([x, 0.0, 0.0])) for name, x in (("a", 0.0), ("b", 1.0))}
+    known = {"a": lambda: truth.astype(np.float32)}
+    ranges = {"a": estimated.astype(np.float32)}
+    told = score_capture(poses, poses, ranges, known, confidences={"a": confidence}).views["a"]
+    assert told["ause"] == pytest.approx(sparsify(estimated, confidence, truth).ause, rel=1e-3)
+    assert told["ause"] == pytest.approx(told["sparsification_area"] - told["sparsification_oracle_area"])
+    assert "ause" not in score_capture(poses, poses, ranges, known).views["a"]
