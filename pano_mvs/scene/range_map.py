@@ -23,12 +23,16 @@ class RangeMap(Record):
         range: (H, W) float32 distance along the ray in scene units; NaN is invalid.
         confidence: (H, W) uint8: 0 invalid, 1–63 filled (interpolated, not seen), 64–127 seen but weak, 128–255
             consistent with other views.
+        normals_in_cam: (H, W, 3) float16 unit normals of the surfaces in the camera frame, towards the camera; NaN
+            where unknown. None if whoever made the ranges did not look for them.
     """
 
     axis: ClassVar[Axis | None] = Axis.VIEW
+    kind_version: ClassVar[int] = 2
 
     range: NDArray[np.float32]
     confidence: NDArray[np.uint8]
+    normals_in_cam: NDArray[np.float16] | None = None
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -45,3 +49,7 @@ class RangeMap(Record):
         require(
             bool(np.array_equal(confidence > 0, valid)), self, "confidence must be 0 exactly where the range is NaN"
         )
+        if self.normals_in_cam is not None:
+            normals = require_array(self, "normals_in_cam", dtype=np.float16, shape=(*array.shape, 3), finite=False)
+            length = np.linalg.norm(normals.astype(np.float32), axis=-1)
+            require(not np.any(np.abs(length - 1) > 0.01), self, "a normal is not of unit length; unknown is NaN")
