@@ -40,6 +40,39 @@ def box_mean(cost: NDArray[np.generic], row: int, column: int, *, radius: int, r
     return float(np.mean(window))
 
 
+def zncc_cost(
+    reference: NDArray[np.uint8],
+    warped: NDArray[np.uint8],
+    row: int,
+    column: int,
+    *,
+    radius: int,
+    reach: int,
+    noise: float,
+) -> float:
+    """Return 1 − ρ over the window of 2 radius + 1 rows and 2 reach + 1 columns."""
+    places = [(row + j, column + i) for j in range(-radius, radius + 1) for i in range(-reach, reach + 1)]
+    r, w = (np.array([float(pixel_at(picture, *place)) for place in places]) for picture in (reference, warped))
+    return float(1 - np.mean((r - r.mean()) * (w - w.mean())) / np.sqrt((r.var() + noise) * (w.var() + noise)))
+
+
+def sad_gradient_cost(
+    reference: NDArray[np.uint8],
+    warped: NDArray[np.uint8],
+    row: int,
+    column: int,
+    *,
+    reach: int,
+    limits: tuple[int, int],
+) -> int:
+    """Return the absolute differences of colours and of gradients across and down, each sum cut off."""
+    difference = reference.astype(int) - warped
+    across = np.array(pixel_at(difference, row, column + reach)) - pixel_at(difference, row, column - reach)
+    down = np.array(pixel_at(difference, row + 1, column)) - pixel_at(difference, row - 1, column)
+    color = int(np.abs(difference[row, column]).sum())
+    return min(color, limits[0]) + min(int(np.abs(across).sum() + np.abs(down).sum()), limits[1])
+
+
 def combined_cost(voting: list[tuple[float, float]], *, share: float, most: int, neutral: float) -> float:
     """Return the weighted mean of the cheapest (cost, weight) that together hold a share of all weight."""
     wanted = share * sum(weight for _, weight in voting)
