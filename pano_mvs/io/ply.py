@@ -10,27 +10,37 @@ import numpy as np
 from pano_mvs.core.errors import InputError
 from pano_mvs.scene import PointCloud
 
-_VERTEX = np.dtype([
+_PLAIN = np.dtype([
     ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("nx", "<f4"), ("ny", "<f4"), ("nz", "<f4"),
     ("red", "u1"), ("green", "u1"), ("blue", "u1"),
 ])  # fmt: skip
+_WITH_QUALITY = np.dtype([*_PLAIN.descr, ("views", "u1"), ("confidence", "u1")])
 _PLY_TYPES = {"f": "float", "u": "uchar"}
 
 
-def write_ply(path: Path, cloud: PointCloud) -> None:
-    """Write a cloud as binary little-endian PLY: x y z nx ny nz (float), red green blue (uchar)."""
-    vertices = np.empty(len(cloud), _VERTEX)
+def write_ply(path: Path, cloud: PointCloud, *, quality: bool = False) -> None:
+    """Write a cloud as binary little-endian PLY: x y z nx ny nz (float), red green blue (uchar).
+
+    Args:
+        path: the file to write.
+        cloud: the points.
+        quality: whether each point is followed by views, how many agree on it, and confidence (uchar).
+    """
+    vertices = np.zeros(len(cloud), _WITH_QUALITY if quality else _PLAIN)
     for idx, name in enumerate("xyz"):
         vertices[name], vertices[f"n{name}"] = cloud.points_in_world[:, idx], cloud.normals_in_world[:, idx]
     for idx, name in enumerate(("red", "green", "blue")):
         vertices[name] = cloud.colors_rgb[:, idx]
+    if quality:
+        vertices["views"] = cloud.view_counts
+        vertices["confidence"] = 0 if cloud.confidence is None else cloud.confidence
     with path.open("wb") as stream:
-        stream.write(_header(len(cloud)))
+        stream.write(_header(len(cloud), vertices.dtype))
         vertices.tofile(stream)
 
 
 def read_ply(path: Path) -> PointCloud:
-    """Return the cloud in a PLY file of the layout that `write_ply` writes; view counts, which it lacks, are 0.
+    """Return the cloud in a PLY file of a layout that `write_ply` writes; view counts, where it lacks them, are 0.
 
     Raises:
         InputError: if the file cannot be read, has another layout, or ends early.
@@ -42,19 +52,22 @@ def read_ply(path: Path) -> PointCloud:
     head, mark, body = data.partition(b"end_header\n")
     counted = re.search(rb"^element vertex ([0-9]+)$", head, re.MULTILINE)
     count = int(counted[1]) if counted else 0
-    if head + mark != _header(count):
+    layout = next((known for known in (_PLAIN, _WITH_QUALITY) if head + mark == _header(count, known)), None)
+    if layout is None:
         raise InputError(f"{path}: not a PLY file of pano-mvs (binary little endian, x y z nx ny nz red green blue)")
-    if len(body) != count * _VERTEX.itemsize:
-        raise InputError(f"{path}: its header promises {count} points, but it holds {len(body) // _VERTEX.itemsize}. "
+    if len(body) != count * layout.itemsize:
+        raise InputError(f"{path}: its header promises {count} points, but it holds {len(body) // layout.itemsize}. "
                          "Write it again")  # fmt: skip
-    vertices = np.frombuffer(body, _VERTEX)
+    vertices = np.frombuffer(body, layout)
     points, normals, colors = (
         np.stack([vertices[name] for name in names], axis=-1)
         for names in (("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue"))
     )
-    return PointCloud(points, normals, colors, np.zeros(count, np.uint8))
+    if layout == _PLAIN:
+        return PointCloud(points, normals, colors, np.zeros(count, np.uint8))
+    return PointCloud(points, normals, colors, vertices["views"].copy(), vertices["confidence"].copy())
 
 
-def _header(count: int) -> bytes:
-    properties = "".join(f"property {_PLY_TYPES[_VERTEX[name].kind]} {name}\n" for name in _VERTEX.names or ())
+def _header(count: int, layout: np.dtype[np.void]) -> bytes:
+    properties = "".join(f"property {_PLY_TYPES[layout[name].kind]} {name}\n" for name in layout.names or ())
     return f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}end_header\n".encode()

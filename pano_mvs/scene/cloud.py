@@ -20,14 +20,17 @@ class PointCloud(Record):
         normals_in_world: (N, 3) float32 unit vectors towards the side from which the surface was seen.
         colors_rgb: (N, 3) uint8.
         view_counts: (N,) uint8 number of views that agree on the point.
+        confidence: (N,) uint8, as of the range maps: the largest of the views that agree; None if not known.
     """
 
     axis: ClassVar[Axis | None] = Axis.ONE
+    kind_version: ClassVar[int] = 2
 
     points_in_world: NDArray[np.float32]
     normals_in_world: NDArray[np.float32]
     colors_rgb: NDArray[np.uint8]
     view_counts: NDArray[np.uint8]
+    confidence: NDArray[np.uint8] | None = None
 
     def __len__(self) -> int:
         """Return the number of points."""
@@ -40,3 +43,5 @@ class PointCloud(Record):
         require_array(self, "normals_in_world", dtype=np.float32, shape=(count, 3))
         require_array(self, "colors_rgb", dtype=np.uint8, shape=(count, 3))
         require_array(self, "view_counts", dtype=np.uint8, shape=(count,))
+        if self.confidence is not None:
+            require_array(self, "confidence", dtype=np.uint8, shape=(count,))

@@ -1,0 +1,95 @@
+"""The points of anybody's PLY file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import InputError
+
+# PLY's names of number types, old and new.
+_NUMBERS = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
+    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "float32": "f4", "float64": "f8",
+}  # fmt: skip
+_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+_MARK = b"end_header"
+
+
+class _Layout(NamedTuple):
+    """How the vertices of a file lie: their number, their properties, and whether they are text."""
+
+    count: int
+    vertex: np.dtype[np.void]
+    text: bool
+
+
+def read_ply_points(path: Path) -> NDArray[np.float32]:
+    """Return the places of the vertices, (N, 3) float32, in a PLY file of any program.
+
+    Text or binary, of either byte order, with any other properties and elements, as long as the vertices come first
+    and have no lists.
+
+    Raises:
+        InputError: if the file cannot be read, is no such PLY file, or ends early.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
+    head, mark, rest = data.partition(_MARK)
+    if not mark:
+        raise InputError(f"{path}: not a PLY file: it has no end_header line")
+    layout = _layout(head.decode("ascii", "replace").splitlines(), path)
+    body = rest[rest.find(b"\n") + 1 :]
+    vertices = _text_vertices(body, layout) if layout.text else _binary_vertices(body, layout)
+    if vertices is None:
+        raise InputError(f"{path}: its header promises {layout.count} points, but it holds fewer. Write it again")
+    points = np.stack([vertices[name] for name in "xyz"], axis=-1).astype(np.float32)
+    if not np.isfinite(points).all():
+        raise InputError(f"{path}: a point has no finite place. Leave such points out")
+    return points
+
+
+def _binary_vertices(body: bytes, layout: _Layout) -> NDArray[np.void] | None:
+    if len(body) < layout.count * layout.vertex.itemsize:
+        return None
+    return np.frombuffer(body, layout.vertex, layout.count)
+
+
+def _text_vertices(body: bytes, layout: _Layout) -> NDArray[np.void] | None:
+    lines = body.splitlines()[: layout.count]
+    try:
+        rows = [tuple(float(number) for number in line.split()) for line in lines]
+        return (
+            np.array(rows, [(name, "f8") for name in layout.vertex.names or ()]) if len(rows) == layout.count else None
+        )
+    except ValueError:  # a line that is cut off, or holds no numbers
+        return None
+
+
+def _layout(lines: list[str], path: Path) -> _Layout:
+    """Return how the vertices lie, by the header's lines.
+
+    Raises:
+        InputError: if the header is no PLY header, or its vertices are not plain.
+    """
+    words = [line.split() for line in lines if line.strip() and not line.startswith(("comment", "obj_info"))]
+    form = next((word[1] for word in words if word[0] == "format" and len(word) == 3), "")
+    elements = [idx for idx, word in enumerate(words) if word[0] == "element"]
+    if words[:1] != [["ply"]] or form not in _ORDERS or not elements:
+        raise InputError(f"{path}: not a PLY file: its header names no known format or no element")
+    first = words[elements[0]]
+    if first[1] != "vertex" or not first[2].isdigit():
+        raise InputError(f"{path}: the first element of a PLY file must be its vertices, this has '{' '.join(first)}'")
+    properties = words[elements[0] + 1 : elements[1] if len(elements) > 1 else len(words)]
+    if not all(len(word) == 3 and word[0] == "property" and word[1] in _NUMBERS for word in properties):
+        raise InputError(f"{path}: its vertices have lists or properties of unknown types: write plain numbers")
+    vertex = np.dtype([(word[2], _ORDERS[form] + _NUMBERS[word[1]]) for word in properties])
+    if not {"x", "y", "z"} <= set(vertex.names or ()):
+        raise InputError(f"{path}: its vertices lack x, y or z")
+    return _Layout(int(first[2]), vertex, form == "ascii")
