@@ -10,9 +10,14 @@ def my_sweep(ref: Each[Panorama], pose: Each[Pose], sources: Near[Panorama], sou
              params: MySweepParams, ctx: Context) -> RangeMap: ...
 """
 
+from pano_mvs.algorithms.sweep.backends import register_sweep_backend
+from pano_mvs.algorithms.sweep.costs import CostWindow, register_sweep_cost
+from pano_mvs.algorithms.sweep.preparation import SweepInput
+from pano_mvs.algorithms.sweep.winner import Winners
 from pano_mvs.core.errors import GateError, InputError, PanoMvsError, UsageError
+from pano_mvs.core.parts import Parts
 from pano_mvs.engine.context import Context
-from pano_mvs.engine.params import NOT_IN_KEY, InputPath, Params, SourcePath
+from pano_mvs.engine.params import NOT_IN_KEY, InputPath, Params, PartOf, SourcePath
 from pano_mvs.engine.ports import All, Each, Names, Near, One
 from pano_mvs.engine.stage import SourceItem, source, stage
 from pano_mvs.geometry import Rigid3, Similarity3
@@ -39,6 +44,7 @@ __all__ = [
     "All",
     "Axis",
     "Context",
+    "CostWindow",
     "Each",
     "Features",
     "FilePart",
@@ -54,6 +60,8 @@ __all__ = [
     "PanoMvsError",
     "Panorama",
     "Params",
+    "PartOf",
+    "Parts",
     "PointCloud",
     "Pose",
     "Poses",
@@ -64,9 +72,13 @@ __all__ = [
     "Similarity3",
     "SourceItem",
     "SourcePath",
+    "SweepInput",
     "TwoView",
     "UsageError",
     "Views",
+    "Winners",
+    "register_sweep_backend",
+    "register_sweep_cost",
     "source",
     "stage",
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from dataclasses import dataclass
 from pathlib import Path
 
 from pano_mvs.core.digest import digest_from_value
@@ -16,33 +17,66 @@ def code_digest(path: Path) -> str:
         SyntaxError: if it is not Python.
     """
     trees: dict[str, str] = {}
-    _collect(path.resolve(), path.resolve().parent, trees)
+    _collect(path.resolve(), _Roots.of(path.resolve()), trees)
     return digest_from_value(trees)
 
 
-def _collect(path: Path, root: Path, trees: dict[str, str]) -> None:
-    name = path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
+@dataclass(frozen=True, slots=True)
+class _Roots:
+    """Where absolute imports are looked up.
+
+    Attributes:
+        folder: the file's own folder, on the path while a workflow's plugin file is imported.
+        package: the outermost package that the file is in, if any; what else is installed beside it does not count.
+    """
+
+    folder: Path
+    package: Path | None
+
+    @staticmethod
+    def of(path: Path) -> _Roots:
+        package = None
+        for folder in path.parents:
+            if not (folder / "__init__.py").is_file():
+                break
+            package = folder
+        return _Roots(path.parent, package)
+
+    def name_of(self, path: Path) -> str:
+        """Return a file's name as it counts: not with the folder into which a package happens to be installed."""
+        base = self.package.parent if self.package is not None else self.folder
+        return path.relative_to(base).as_posix() if path.is_relative_to(base) else str(path)
+
+    def files(self, dotted: str) -> list[Path]:
+        found = _module_files(self.folder, dotted)
+        if self.package is not None and dotted.partition(".")[0] == self.package.name:
+            found.extend(_module_files(self.package.parent, dotted))
+        return found
+
+
+def _collect(path: Path, roots: _Roots, trees: dict[str, str]) -> None:
+    name = roots.name_of(path)
     if name in trees:
         return
     tree = ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
     trees[name] = ast.dump(_without_docstrings(tree), include_attributes=False)
-    for imported in _imported_files(tree, path.parent, root):
-        _collect(imported, root, trees)
+    for imported in _imported_files(tree, path.parent, roots):
+        _collect(imported, roots, trees)
 
 
-def _imported_files(tree: ast.Module, folder: Path, root: Path) -> list[Path]:
+def _imported_files(tree: ast.Module, folder: Path, roots: _Roots) -> list[Path]:
     """Return the local files that a syntax tree imports, wherever in it: absolute names are looked up from the root."""
     files: list[Path] = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             for alias in node.names:
-                files.extend(_module_files(root, alias.name))
+                files.extend(roots.files(alias.name))
         elif isinstance(node, ast.ImportFrom):
-            base = folder.joinpath(*[".."] * (node.level - 1)).resolve() if node.level else root
             module = node.module or ""
-            files.extend(_module_files(base, module))
-            for alias in node.names:
-                files.extend(_module_files(base, f"{module}.{alias.name}" if module else alias.name))
+            dotted = [module, *(f"{module}.{alias.name}" if module else alias.name for alias in node.names)]
+            base = folder.joinpath(*[".."] * (node.level - 1)).resolve() if node.level else None
+            for name in dotted:
+                files.extend(roots.files(name) if base is None else _module_files(base, name))
     return files
 
 

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationInfo
+from pydantic import AfterValidator, BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationInfo
+from pydantic_core import CoreSchema, core_schema
+
+from pano_mvs.core.parts import Parts
+from pano_mvs.engine.code_digest import code_digest
 
 
 class Params(BaseModel):
@@ -40,6 +45,25 @@ SourcePath: TypeAlias = Annotated[Path, AfterValidator(_resolve), NOT_IN_KEY]
 """A file or folder that a source stage lists; its items count, one by one, not the path."""
 
 
+@dataclass(frozen=True)
+class PartOf:
+    """Marks a field that names a part, ours or a plugin's: `cost: Annotated[str, PartOf(SWEEP_COSTS)] = "census"`.
+
+    A name that there is not is a mistake in the workflow. The code of a plugin's part counts towards the cache key.
+    """
+
+    parts: Parts[Any]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Return the schema of a name that is checked."""
+        return core_schema.no_info_after_validator_function(self.parts.check, handler(source))
+
+    def identity(self, name: str) -> str:
+        """Return what counts towards the cache key: the name of a built-in part, or it with the digest of the code."""
+        file = self.parts.code_file(name)
+        return name if file is None else f"{name} (code {code_digest(file)[:16]})"
+
+
 def key_fields(params: Params) -> tuple[dict[str, Any], dict[str, list[Path]]]:
     """Return the fields that count towards the cache key: plain values, and paths that count by content."""
     plain: dict[str, Any] = {}
@@ -52,6 +76,8 @@ def key_fields(params: Params) -> tuple[dict[str, Any], dict[str, list[Path]]]:
             continue
         if _is_keyed_by_content(field.annotation, marks) and value is not None:
             paths[name] = _paths_in(value)
+        elif part := next((mark for mark in marks if isinstance(mark, PartOf)), None):
+            plain[name] = part.identity(value)
         else:
             plain[name] = dumped[name]
     return plain, paths

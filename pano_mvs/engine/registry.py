@@ -1,4 +1,4 @@
-"""Which stages there are: built-in, installed, or in a file that the workflow names."""
+"""Which stages, and other parts with names, there are: built-in, installed, or in a file that the workflow names."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from types import ModuleType
 
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import PluginError
+from pano_mvs.core.parts import PartMark, marks_of
 from pano_mvs.engine.code_digest import code_digest
 from pano_mvs.engine.stage import StageSpec, spec_of
 
@@ -32,9 +33,10 @@ class BrokenPlugin:
 
 @dataclass(slots=True)
 class Registry:
-    """All stages by name, and the plugins that failed to load."""
+    """All stages by name, the parts that plugins add (by kind and name), and the plugins that failed to load."""
 
     stages: dict[str, StageSpec] = field(default_factory=dict)
+    parts: dict[tuple[str, str], PartMark] = field(default_factory=dict)
     origins: dict[str, str] = field(default_factory=dict)
     broken: list[BrokenPlugin] = field(default_factory=list)
 
@@ -47,11 +49,17 @@ class Registry:
         return registry
 
     def add_module(self, module: ModuleType, origin: str, *, code: str = "") -> None:
-        """Register all stages that a module holds.
+        """Register all stages and parts that a module holds.
 
         Raises:
-            PluginError: if a name is taken by another stage; the message names both places.
+            PluginError: if a name is taken by another one; the message names both places.
         """
+        for mark in _marks(module, own_only=bool(code)):
+            taken = self.parts.setdefault((mark.kind, mark.name), mark)
+            if taken.origin != mark.origin:
+                raise PluginError(
+                    f"{mark.kind} {mark.name!r} is defined twice: {taken.origin} and {mark.origin}. Rename one of them"
+                )
         for spec in _specs(module, own_only=bool(code)):
             known = self.stages.get(spec.name)
             if known is not None and known.origin != spec.origin:
@@ -62,10 +70,10 @@ class Registry:
             self.origins[spec.name] = origin
 
     def add_file(self, path: Path) -> None:
-        """Register the stages of one user file; its code counts towards the cache keys of its stages.
+        """Register the stages and parts of one user file; its code counts towards the cache keys of its stages.
 
         Raises:
-            PluginError: if the file cannot be read or imported, or defines no stage.
+            PluginError: if the file cannot be read or imported, or defines neither.
         """
         if not path.is_file():
             raise PluginError(f"plugin file {path} does not exist")
@@ -74,7 +82,7 @@ class Registry:
             module = _import_file(path)
         except (Exception, SystemExit) as error:
             raise PluginError(f"plugin file {path} failed to import: {_where(error, path)}") from error
-        if not any(True for _ in _specs(module, own_only=True)):
+        if not any(_specs(module, own_only=True)) and not any(_marks(module, own_only=False)):
             raise PluginError(f'plugin file {path} defines no stage: decorate a function with @stage("kind.name")')
         self.add_module(module, str(path), code=digest)
 
@@ -100,6 +108,13 @@ def _specs(module: ModuleType, *, own_only: bool) -> Iterator[StageSpec]:
         spec = spec_of(value)
         if spec is not None and (not own_only or spec.function.__module__ == module.__name__):
             yield spec
+
+
+def _marks(module: ModuleType, *, own_only: bool) -> Iterator[PartMark]:
+    """Find what a module, or a helper of it, registers beside stages."""
+    for value in vars(module).values():
+        if not own_only or getattr(value, "__module__", "") == module.__name__:
+            yield from marks_of(value)
 
 
 def _import_file(path: Path) -> ModuleType:

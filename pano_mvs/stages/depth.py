@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
+from pano_mvs.algorithms.sweep.backends import SWEEP_BACKENDS, backend_for
+from pano_mvs.algorithms.sweep.costs import SWEEP_COSTS
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.sweep import sweep_range
-from pano_mvs.api import Context, Each, Near, Panorama, Params, Pose, RangeMap, stage
+from pano_mvs.api import NOT_IN_KEY, Context, Each, Near, Panorama, Params, PartOf, Pose, RangeMap, stage
 
 
 class SweepParams(Params):
     """Settings of depth.sweep."""
 
-    backend: Literal["numba", "numpy"] = Field(default="numba", description="numpy is the slow, readable reference")
+    backend: Annotated[str, PartOf(SWEEP_BACKENDS)] = Field(
+        default="numba", description="numpy is the slow, readable reference; opencv; a plugin's"
+    )
+    device: Annotated[str, NOT_IN_KEY] = Field(
+        default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="where a backend that can choose computes"
+    )
     planes: int = Field(default=128, ge=3, le=4096, description="number of virtual ranges")
     spacing: Literal["inverse", "log", "uniform"] = Field(
         default="inverse", description="virtual ranges: even in 1/range, log range, or range (the paper)"
@@ -24,9 +31,10 @@ class SweepParams(Params):
         default=None, gt=0, description="nearest virtual range, scene units; else found by small sweeps"
     )
     far: float | None = Field(default=None, gt=0, description="farthest virtual range, likewise")
-    cost: Literal["census", "zncc", "sad", "sad_gradient"] = Field(
+    cost: Annotated[str, PartOf(SWEEP_COSTS)] = Field(
         default="census",
-        description="census, correlation, the paper's sum of absolute differences, or colours with their gradients",
+        description="census, zncc (correlation), sad (the paper's sum of absolute differences), sad_gradient (colours "
+        "with their gradients), or a plugin's",
     )
     window: int = Field(default=7, ge=1, le=15, description="side of the cost's window in pixels, odd")
     spherical_window: bool = Field(
@@ -42,7 +50,7 @@ class SweepParams(Params):
         default="sgm", description="winner takes all after a box (the paper), or semi-global matching"
     )
     support: int = Field(
-        default=5, ge=1, le=15, description="side of the box over which census costs are averaged, odd"
+        default=5, ge=1, le=15, description="side of the box over which census costs, and plugins', are averaged, odd"
     )
     p1: int = Field(default=80, ge=0, le=5000, description="SGM's penalty of a step by one plane, for 512 rows")
     p2: int = Field(default=1600, ge=0, le=7900, description="SGM's penalty of a larger step, for 512 rows")
@@ -70,8 +78,13 @@ class SweepParams(Params):
         default=True, description="match the exposure of sources to the reference's where colours are compared"
     )
 
+    @model_validator(mode="after")
+    def _backend_has_cost(self) -> SweepParams:
+        backend_for(self.backend, self.cost)
+        return self
 
-_NOT_SETTINGS = {"backend", "near", "far"}
+
+_NOT_SETTINGS = {"backend", "device", "near", "far"}
 
 
 @stage("depth.sweep")
@@ -93,7 +106,7 @@ def sweep(
     poses = [pose.cam_from_world, *(other.cam_from_world for other in source_poses)]
     near, far = params.near, params.far
     if near is None or far is None:
-        found = limits_by_sweeping(pictures, poses, masks=masks, backend=params.backend)
+        found = limits_by_sweeping(pictures, poses, masks=masks, backend=params.backend, device=params.device)
         near, far = near or found[0], far or found[1]
     range_map = sweep_range(
         pictures[0],
@@ -103,6 +116,7 @@ def sweep(
         far=far,
         settings=SweepSettings(**params.model_dump(exclude=_NOT_SETTINGS)),
         backend=params.backend,
+        device=params.device,
         reference_mask=masks[0],
         source_masks=masks[1:],
     )

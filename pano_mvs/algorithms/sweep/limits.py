@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.consistency import check_consistency
+from pano_mvs.algorithms.sweep.backends import helper_backend
 from pano_mvs.algorithms.sweep.hypotheses import range_limits
 from pano_mvs.algorithms.sweep.settings import SweepSettings
-from pano_mvs.algorithms.sweep.sweep import Backend, sweep_range
+from pano_mvs.algorithms.sweep.sweep import sweep_range
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pad_panorama, pixel_solid_angle
 from pano_mvs.scene import RangeMap
@@ -36,7 +37,8 @@ def limits_by_sweeping(
     cams_from_world: Sequence[Rigid3],
     *,
     masks: Sequence[NDArray[np.bool_]],
-    backend: Backend = "numba",
+    backend: str = "numba",
+    device: str = "auto",
 ) -> tuple[float, float]:
     """Return the nearest and the farthest range worth trying, in scene units.
 
@@ -48,7 +50,8 @@ def limits_by_sweeping(
         pictures: the reference, then its sources, (H, W, 3) uint8 RGB each.
         cams_from_world: pose of each.
         masks: (H, W) of each, False is ignored.
-        backend: of the small sweeps.
+        backend: of the small sweeps; numba where it does not have their cost.
+        device: where it computes, if it can choose.
 
     Returns:
         (near, far); from the baselines and the angular resolution alone where less than 1 % of the sphere agrees.
@@ -62,7 +65,10 @@ def limits_by_sweeping(
     width = pictures[0].shape[1]
     small = [_small(picture) for picture in pictures[:_MOST_PICTURES]]
     small_masks = [_small_mask(mask) for mask in masks[:_MOST_PICTURES]]
-    maps = [_coarse(idx, small, small_masks, poses, width=width, backend=backend) for idx in range(len(poses))]
+    maps = [
+        _coarse(idx, small, small_masks, poses, width=width, backend=helper_backend(backend), device=device)
+        for idx in range(len(poses))
+    ]
     checked = check_consistency(maps[0], poses[0], maps[1:], poses[1:], max_relative_error=0.1, max_reprojection_px=1.5)
     agreed = (checked.confidence >= CONSISTENT_CONFIDENCE[0]) & _textured(small[0])
     solid_angle = np.broadcast_to(pixel_solid_angle(agreed.shape)[:, None], agreed.shape)
@@ -79,7 +85,8 @@ def _coarse(
     poses: Sequence[Rigid3],
     *,
     width: int,
-    backend: Backend,
+    backend: str,
+    device: str,
 ) -> RangeMap:
     """Return the small range map of one of the pictures, swept against all others."""
     baselines = _baselines(idx, poses)
@@ -94,6 +101,7 @@ def _coarse(
         far=far,
         settings=SweepSettings(planes=_PLANES),
         backend=backend,
+        device=device,
         reference_mask=masks[idx],
         source_masks=[masks[other] for other in others],
     )

@@ -6,21 +6,20 @@ The reference against which compiled backends are held. Memory: about 20 bytes f
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.combination import source_weights
+from pano_mvs.algorithms.sweep.costs import CostWindow, checked_cost, plugin_cost
 from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, step_penalties, warm_up
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.settings import LARGEST_COLOR_COST, LARGEST_GRADIENT_COST, ZNCC_NOISE_VARIANCE
-from pano_mvs.algorithms.sweep.windows import column_offsets
+from pano_mvs.algorithms.sweep.windows import column_offsets, neighbours
 from pano_mvs.algorithms.sweep.winner import Winners
-from pano_mvs.geometry import pad_panorama, pixel_from_ray, ray_grid, sample_panorama
+from pano_mvs.geometry import pixel_from_ray, ray_grid, sample_panorama
 
 FloatArray = NDArray[np.float64]
-Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 def find_winners(work: SweepInput) -> Winners:
@@ -74,11 +73,22 @@ def _source_cost(work: SweepInput, idx: int, virtual_range: float) -> FloatArray
     if settings.cost == "zncc":
         cost = _zncc(work.reference[..., 0], warped[..., 0], work)
     else:
-        pixel_cost = _PIXEL_COSTS[settings.cost](work.reference, warped, work)
+        pixel_cost = _pixel_cost(work.reference, warped, work)
         cost = _box_mean(pixel_cost, settings.box_radius, spherical=settings.spherical_window)
     if work.source_valid is not None:
         cost[sample_panorama(work.source_valid[idx], pixels) < 1 - 1e-9] = np.inf
     return cost
+
+
+def _pixel_cost(reference: NDArray[np.uint8], warped: FloatArray, work: SweepInput) -> FloatArray:
+    """Return what each pixel costs by itself, (H, W), by one of our costs or a plugin's."""
+    settings = work.settings
+    own = plugin_cost(settings.cost)
+    if own is None:
+        return _PIXEL_COSTS[settings.cost](reference, warped, work)
+    size_hw = reference.shape[0], reference.shape[1]
+    window = CostWindow.of(size_hw, settings.window // 2, spherical=settings.spherical_window)
+    return checked_cost(own.function(reference, warped, window), size_hw, settings.cost)
 
 
 def _differences(reference: NDArray[np.uint8], warped: FloatArray, _: SweepInput) -> FloatArray:
@@ -95,10 +105,8 @@ def _sad_gradient(reference: NDArray[np.uint8], warped: FloatArray, work: SweepI
     difference = np.moveaxis(reference.astype(np.float64) - warped, -1, 0)
     gradient = np.zeros(reference.shape[:2])
     for color in difference:
-        gradient += np.abs(_neighbours(color, 0, columns) - _neighbours(color, 0, -columns))
-        gradient += np.abs(
-            _neighbours(color, 1, np.zeros_like(columns)) - _neighbours(color, -1, np.zeros_like(columns))
-        )
+        gradient += np.abs(neighbours(color, 0, columns) - neighbours(color, 0, -columns))
+        gradient += np.abs(neighbours(color, 1, np.zeros_like(columns)) - neighbours(color, -1, np.zeros_like(columns)))
     colors = np.minimum(_differences(reference, warped, work), LARGEST_COLOR_COST)
     return np.asarray(colors + np.minimum(gradient, LARGEST_GRADIENT_COST))
 
@@ -125,8 +133,8 @@ def _census(picture: NDArray[np.uint8], source: FloatArray, work: SweepInput) ->
     differs = np.zeros(reference.shape)
     for rows in range(-radius, radius + 1):
         for k in range(2 * radius + 1):
-            above = _neighbours(reference, rows, offsets[:, k]) > reference
-            differs += above != (_neighbours(warped, rows, offsets[:, k]) > warped)
+            above = neighbours(reference, rows, offsets[:, k]) > reference
+            differs += above != (neighbours(warped, rows, offsets[:, k]) > warped)
     return differs
 
 
@@ -140,21 +148,13 @@ _PIXEL_COSTS: dict[str, Callable[[NDArray[np.uint8], FloatArray, SweepInput], Fl
 def _box_mean(cost: FloatArray, radius: int, *, spherical: bool) -> FloatArray:
     """Return the mean over windows of 2 radius + 1 rows, as wide as the centre's row asks for, (H, W)."""
     reach = column_offsets((cost.shape[0], cost.shape[1]), radius, spherical=spherical)[:, -1]
-    rows = np.sum([_neighbours(cost, row, np.zeros_like(reach)) for row in range(-radius, radius + 1)], axis=0)
+    rows = np.sum([neighbours(cost, row, np.zeros_like(reach)) for row in range(-radius, radius + 1)], axis=0)
     result = np.zeros_like(cost)
     for columns in np.unique(reach):
         here = reach == columns
         shifted = [np.roll(rows[here], shift, axis=1) for shift in range(-columns, columns + 1)]
         result[here] = np.sum(shifted, axis=0) / ((2 * radius + 1) * (2 * columns + 1))
     return result
-
-
-def _neighbours(picture: NDArray[Scalar], rows: int, columns: NDArray[np.int64]) -> NDArray[Scalar]:
-    """Return for every pixel the one that lies `rows` below and `columns` (H,) to its right, (H, W)."""
-    height, width = picture.shape
-    pad = abs(rows)
-    shifted = pad_panorama(picture, pad)[pad + rows : pad + rows + height, pad : pad + width]
-    return np.take_along_axis(shifted, (np.arange(width) + columns[:, None]) % width, axis=1)
 
 
 def _aggregate(volume: NDArray[np.int64], work: SweepInput) -> NDArray[np.int64]:

@@ -29,6 +29,7 @@ class SweepInput:
         source_valid: for each source, where a sample may vote, (Hs, Ws); None if everywhere in all of them.
         ranges: (D,) float64 virtual ranges, ascending.
         settings: what was asked for.
+        device: where a backend that can choose computes.
     """
 
     reference: NDArray[np.uint8]
@@ -37,6 +38,7 @@ class SweepInput:
     source_valid: tuple[NDArray[np.bool_], ...] | None
     ranges: NDArray[np.float64]
     settings: SweepSettings
+    device: str = "auto"
 
 
 def prepare_picture(picture: NDArray[np.uint8], settings: SweepSettings) -> NDArray[np.uint8]:

@@ -6,6 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Literal
 
+from pano_mvs.algorithms.sweep.costs import plugin_cost
 from pano_mvs.core.errors import UsageError
 
 # Costs are cut off: what differs by more is simply wrong. Grey levels, summed over R, G and B …
@@ -29,7 +30,8 @@ class SweepSettings:
         spacing: virtual ranges uniform in 1/range, in log range or in range (the paper's).
         cost: "census" (Hamming distance of the signs of differences to the window's centre; blind to exposure), "zncc"
             (1 − zero-mean normalised cross-correlation; blind to it too), "sad" (sum of absolute differences of R, G
-            and B; the paper's) or "sad_gradient" (differences of colours and of their gradients, both cut off).
+            and B; the paper's), "sad_gradient" (differences of colours and of their gradients, both cut off) or a
+            plugin's.
         window: side in pixels, odd, of the window of either cost (the paper: 7).
         spherical_window: widen the windows' columns by 1/cos of the elevation, so that they keep their solid angle.
         combination: "sum" over the sources (the paper's), or the mean of the "best_half" of them at each pixel and
@@ -38,8 +40,8 @@ class SweepSettings:
             parallax by which it would notice a change of range.
         best: how many sources "best_k" takes.
         aggregation: "box": winner takes all after a box sum; "sgm": semi-global matching over eight paths.
-        support: side in pixels, odd, of the box over which census costs are averaged before the decision; 1 is none.
-            The box of all other costs is the window itself.
+        support: side in pixels, odd, of the box over which census costs, and plugins', are averaged before the
+            decision; 1 is none. The box of all other costs is the window itself.
         p1: SGM's penalty of a step by one plane between neighbours, for a picture of 512 rows; costs go from 0 to 255.
         p2: SGM's penalty of a larger step, likewise. Both grow with the rows: along the same angle, a path then pays
             the same for the slant of a surface against what it gathers from the pixels.
@@ -59,7 +61,7 @@ class SweepSettings:
 
     planes: int = 128
     spacing: Literal["inverse", "log", "uniform"] = "inverse"
-    cost: Literal["census", "zncc", "sad", "sad_gradient"] = "census"
+    cost: str = "census"
     window: int = 7
     spherical_window: bool = True
     combination: Literal["sum", "best_half", "best_k", "parallax_weighted"] = "best_half"
@@ -79,11 +81,12 @@ class SweepSettings:
 
     def __post_init__(self) -> None:
         """Raise UsageError for values that no sweep can use."""
+        plugin_cost(self.cost)
         _require(3 <= self.planes <= 4096, f"planes must be 3 to 4096, got {self.planes}")
         for name in ("window", "support"):
             side = getattr(self, name)
             _require(side % 2 == 1 and 1 <= side <= 15, f"{name} must be odd and 1 to 15, got {side}")
-        _require(self.cost in ("sad", "sad_gradient") or self.window >= 3, f"{self.cost} needs a window of at least 3")
+        _require(self.cost not in ("census", "zncc") or self.window >= 3, f"{self.cost} needs a window of at least 3")
         _require(self.best >= 1, f"best must be at least 1, got {self.best}")
         _require(0 <= self.p1 <= self.p2 <= 4000, f"0 ≤ p1 ≤ p2 ≤ 4000 must hold, got {self.p1} and {self.p2}")
         _require(self.p2_contrast >= 0, f"p2_contrast cannot be negative, got {self.p2_contrast}")
@@ -98,21 +101,26 @@ class SweepSettings:
     @property
     def compare_radius(self) -> int:
         """Half side of the window within which one pixel's cost looks around."""
-        return {"census": self.window // 2, "sad_gradient": 1}.get(self.cost, 0)
+        return {"zncc": 0, "sad": 0, "sad_gradient": 1}.get(self.cost, self.window // 2)
 
     @property
     def box_radius(self) -> int:
         """Half side of the box over which pixel costs are averaged."""
-        return self.support // 2 if self.cost == "census" else self.window // 2
+        return self.window // 2 if self.cost in ("zncc", "sad", "sad_gradient") else self.support // 2
 
     @property
     def worst_cost(self) -> float:
         """The mean cost that SGM takes for the worst there is, 255; half of it is that of a chance match.
 
-        A census cost is at most window² − 1.
+        A census cost is at most window² − 1, a plugin's 1.
         """
-        largest = {"sad": _LARGEST_SAD, "sad_gradient": LARGEST_COLOR_COST + LARGEST_GRADIENT_COST, "zncc": 2}
-        return float(largest.get(self.cost, self.window**2 - 1))
+        largest = {
+            "census": self.window**2 - 1,
+            "sad": _LARGEST_SAD,
+            "sad_gradient": LARGEST_COLOR_COST + LARGEST_GRADIENT_COST,
+            "zncc": 2,
+        }
+        return float(largest.get(self.cost, 1))
 
     @property
     def cost_scale(self) -> float:
@@ -127,7 +135,8 @@ class SweepSettings:
     @property
     def compares_colors(self) -> bool:
         """Whether R, G and B are compared, and exposure matters, rather than grey values alone."""
-        return self.cost in ("sad", "sad_gradient")
+        own = plugin_cost(self.cost)
+        return own.colors if own is not None else self.cost in ("sad", "sad_gradient")
 
     @property
     def weight_share(self) -> float:

@@ -9,24 +9,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import ceil
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep import numpy_backend
+from pano_mvs.algorithms.sweep.backends import backend_for, helper_backend
 from pano_mvs.algorithms.sweep.exposure import match_all, shrink
 from pano_mvs.algorithms.sweep.hypotheses import virtual_ranges
 from pano_mvs.algorithms.sweep.preparation import SweepInput, derotated, prepare_picture, sees_winner, voting_pixels
 from pano_mvs.algorithms.sweep.settings import SweepSettings
-from pano_mvs.algorithms.sweep.winner import Winners, range_map_from_winners
+from pano_mvs.algorithms.sweep.winner import range_map_from_winners
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene.range_map import RangeMap
 
-__all__ = ["Backend", "SweepSettings", "sweep_range"]
+__all__ = ["SweepSettings", "sweep_range"]
 
-Backend = Literal["numba", "numpy"]
 Mask = NDArray[np.bool_]
 Picture = NDArray[np.uint8]
 
@@ -42,7 +40,8 @@ def sweep_range(
     near: float,
     far: float,
     settings: SweepSettings | None = None,
-    backend: Backend = "numba",
+    backend: str = "numba",
+    device: str = "auto",
     reference_mask: Mask | None = None,
     source_masks: Sequence[Mask | None] | None = None,
 ) -> RangeMap:
@@ -55,7 +54,9 @@ def sweep_range(
         near: the first virtual range, in scene units.
         far: the last one.
         settings: how to sample, compare and decide.
-        backend: "numba", compiled, or "numpy", the readable reference (the whole volume in memory).
+        backend: "numba", compiled; "numpy", the readable reference (the whole volume in memory); "opencv"; or the
+            name of a plugin's.
+        device: where a backend that can choose computes: "auto", "cpu", "cuda", "cuda:1".
         reference_mask: (H, W) False where the reference is to be ignored: NaN in the result.
         source_masks: for each source (Hs, Ws), False where it has no vote, or None.
 
@@ -67,11 +68,14 @@ def sweep_range(
         UsageError: if shapes, types or numbers do not fit together, or near and far are no limits.
     """
     settings = settings or SweepSettings()
+    compute = backend_for(backend, settings.cost).find_winners
     _check_picture("reference", reference, reference_mask)
     masks = _checked_sources(sources, source_from_reference, source_masks)
     ranges = virtual_ranges(near, far, planes=settings.planes, spacing=settings.spacing)
     if settings.exposure and settings.compares_colors:
-        rough = _rough_range(reference, sources, source_from_reference, near=near, far=far, backend=backend)
+        rough = _rough_range(
+            reference, sources, source_from_reference, near=near, far=far, backend=backend, device=device
+        )
         sources = match_all(reference, sources, source_from_reference, rough, masks)
     poses = tuple(source_from_reference)
     if settings.derotate:
@@ -83,21 +87,12 @@ def sweep_range(
         source_valid=_voting(masks, settings, rows=reference.shape[0]),
         ranges=ranges,
         settings=settings,
+        device=device,
     )
-    winners = _find_winners(work, backend)
+    winners = compute(work)
     seen = np.ones(reference.shape[:2], np.bool_) if reference_mask is None else reference_mask
     seen = seen & sees_winner(winners, work)
     return range_map_from_winners(winners, near=near, far=far, settings=settings, seen=seen)
-
-
-def _find_winners(work: SweepInput, backend: Backend) -> Winners:
-    if backend == "numpy":
-        return numpy_backend.find_winners(work)
-    if backend == "numba":
-        from pano_mvs.algorithms.sweep import numba_backend  # on use: numba is slow to import
-
-        return numba_backend.find_winners(work)
-    raise UsageError(f"there is no sweep backend {backend!r}: use 'numba' or 'numpy'")
 
 
 def _rough_range(
@@ -107,14 +102,15 @@ def _rough_range(
     *,
     near: float,
     far: float,
-    backend: Backend,
+    backend: str,
+    device: str,
 ) -> NDArray[np.float32]:
     """Return ranges at low resolution by census, which exposure does not disturb; the surer half of them."""
     settings = SweepSettings(planes=_ROUGH_PLANES, window=5, aggregation="box")
     small = [shrink(source, _ROUGH_ROWS) for source in sources]
     found = sweep_range(
         shrink(reference, _ROUGH_ROWS), small, source_from_reference,
-        near=near, far=far, settings=settings, backend=backend,
+        near=near, far=far, settings=settings, backend=helper_backend(backend), device=device,
     )  # fmt: skip
     sure = found.confidence >= np.median(found.confidence)
     return np.where(sure, found.range, np.nan).astype(np.float32)

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.geometry import pad_panorama
+
 WIDEST = 8.0
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 def column_stretch(height: int, *, spherical: bool) -> NDArray[np.float64]:
@@ -29,3 +34,11 @@ def column_offsets(size_hw: tuple[int, int], radius: int, *, spherical: bool) ->
     stretch = column_stretch(height, spherical=spherical)
     offsets = np.rint(np.arange(-radius, radius + 1) * stretch[:, None]).astype(np.int64)
     return np.clip(offsets, -(width // 4), width // 4)
+
+
+def neighbours(picture: NDArray[Scalar], rows: int, columns: NDArray[np.int64]) -> NDArray[Scalar]:
+    """Return for every pixel the one that lies `rows` below and `columns` (H,) to its right, (H, W)."""
+    height, width = picture.shape
+    pad = abs(rows)
+    shifted = pad_panorama(picture, pad)[pad + rows : pad + rows + height, pad : pad + width]
+    return np.take_along_axis(shifted, (np.arange(width) + columns[:, None]) % width, axis=1)
