@@ -5,16 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.sweep.kernels_band import store_row, warp_band
+from pano_mvs.algorithms.sweep.kernels_band import store_row
 from pano_mvs.algorithms.sweep.kernels_combine import combine_row
 from pano_mvs.algorithms.sweep.kernels_cost import box_rows, census_row, difference_row
 from pano_mvs.algorithms.sweep.kernels_sgm import sweep_row, sweep_strip
 from pano_mvs.algorithms.sweep.kernels_winner import AFTER, BEFORE, BEST, RIVAL, STATES, update_winner, winners_of_rows
-from pano_mvs.algorithms.sweep.numba_backend import pack_plane
 from pano_mvs.algorithms.sweep.numpy_backend import path_step, winners_of
 from pano_mvs.algorithms.sweep.penalties import DIRECTIONS
 from pano_mvs.algorithms.sweep.windows import column_offsets
-from pano_mvs.geometry import pad_panorama, pixel_from_ray, ray_grid, rotation_from_rotvec, sample_panorama
+from pano_mvs.geometry import pad_panorama
 from tests.oracles import sweep as oracle
 
 SIZE = 16, 32
@@ -22,40 +21,6 @@ SIZE = 16, 32
 
 def _picture(seed: int, size_hw: tuple[int, int] = SIZE) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, size_hw, dtype=np.uint8)
-
-
-@pytest.mark.parametrize("source_hw", [(16, 32), (24, 48), (16, 64)])
-@pytest.mark.parametrize("translation", [(0.0, 0.0, 0.0), (0.3, -0.2, 0.5), (0.0, 0.9, 0.0), (0.0, 0.0, -0.99)])
-def test_a_warped_band_equals_exact_sampling_even_beyond_the_poles(source_hw, translation):
-    height, width = SIZE
-    source = _picture(1, source_hw)
-    rotation = rotation_from_rotvec((0.4, -1.9, 0.7))
-    pose = np.column_stack([rotation, translation])
-    azimuth = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
-    sin_cos = np.stack([np.sin(azimuth), np.cos(azimuth)]).astype(np.float32)
-    halo, pad = 3, 4
-    warped = np.zeros((1, height + 2 * halo, width + 2 * pad), np.uint8)
-    votes = np.zeros((height + 2 * halo, width), np.uint8)
-    valid = np.ones((source_hw[0] + 1) * (source_hw[1] + 1), np.uint8)
-    warp_band(
-        -halo, height, sin_cos, pose, 1.3, pack_plane(source).ravel(), np.zeros(1, np.int64),
-        np.array(source_hw), valid, 0, pad, warped, votes,
-    )  # fmt: skip
-    points = ray_grid(SIZE) * 1.3 @ rotation.T + translation
-    exact = sample_panorama(source, pixel_from_ray(points, source_hw))
-    expected = np.pad(pad_panorama(exact, halo)[:, halo:-halo], ((0, 0), (pad, pad)), mode="wrap")
-    # Half a level is rounding; the rest is what 1e-4 px of float32 projection makes of white noise.
-    assert np.abs(warped[0] - expected).max() < 0.6
-    assert votes.all()
-
-
-def test_packed_patches_hold_the_four_neighbours_over_seam_and_poles():
-    source = _picture(2)
-    packed = pack_plane(source)
-    assert packed.shape == (SIZE[0] + 1, SIZE[1] + 1)
-    for row, column in [(0, 0), (0, 32), (16, 0), (16, 32), (7, 32), (5, 9)]:
-        corners = [oracle.pixel_at(source, row - 1 + j, column - 1 + i) for i in (0, 1) for j in (0, 1)]
-        assert list(packed[row, column : column + 1].view(np.uint8)) == corners
 
 
 @pytest.mark.parametrize("row", [0, 1, 8, 15])

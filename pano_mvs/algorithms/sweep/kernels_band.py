@@ -8,62 +8,14 @@ from numba import njit
 from pano_mvs.algorithms.sweep.kernels_combine import combine_row
 from pano_mvs.algorithms.sweep.kernels_cost import CENSUS, SAD_GRADIENT, ZNCC, box_rows, census_row, difference_row
 from pano_mvs.algorithms.sweep.kernels_gradient import sad_gradient_row
-from pano_mvs.algorithms.sweep.kernels_warp import blend_row, gather_row, project_row, wrap_row
+from pano_mvs.algorithms.sweep.kernels_lookup import warp_band
+from pano_mvs.algorithms.sweep.kernels_project import knot_rows
+from pano_mvs.algorithms.sweep.kernels_warp import wrap_row
 from pano_mvs.algorithms.sweep.kernels_winner import update_winner
 from pano_mvs.algorithms.sweep.kernels_zncc import zncc_rows
 
 _F = np.float32
 _U = np.uint64
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def warp_band(  # type: ignore[no-untyped-def]
-    first, height, sin_cos_azimuth, pose, virtual_range, packed, starts, shape, valid, valid_start, pad, warped, votes
-):
-    """Look up the rows `first` … of the reference, at one virtual range, in one source.
-
-    Rows before the first or after the last one of the picture lie beyond a pole: elevations over 90° turn the ray
-    around by themselves.
-
-    Args:
-        first: the first row, may be negative.
-        height: rows of the reference picture.
-        sin_cos_azimuth: (2, W) float32.
-        pose: (3, 4) float64 source_from_reference.
-        virtual_range: in scene units.
-        packed: (·,) uint32 the packed planes of all sources, see `pack_plane`.
-        starts: (C,) int64 where the planes of this source begin.
-        shape: (2,) int64 of the source picture.
-        valid: (·,) uint8 like a packed plane: whether a patch may vote; empty if all may.
-        valid_start: where this source's begins.
-        pad: width of the wrapped margin of the result.
-        warped: (C, rows, W + 2 pad) uint8, written.
-        votes: (rows, W) uint8, written unless `valid` is empty.
-    """
-    channels, rows = warped.shape[:2]
-    width = sin_cos_azimuth.shape[1]
-    index = np.empty(width, np.int32)
-    weight_x = np.empty(width, np.float32)
-    weight_y = np.empty(width, np.float32)
-    patches = np.empty(width, np.uint32)
-    matrix = np.empty((3, 2), np.float32)
-    offset = np.empty(3, np.float32)
-    for j in range(rows):
-        elevation = np.pi * (0.5 - (first + j + 0.5) / height)
-        level, dip = np.cos(elevation), -np.sin(elevation)
-        for a in range(3):
-            matrix[a, 0] = _F(level * pose[a, 0])
-            matrix[a, 1] = _F(level * pose[a, 2])
-            offset[a] = _F(dip * pose[a, 1] + pose[a, 3] / virtual_range)
-        project_row(sin_cos_azimuth, matrix, offset, shape, index, weight_x, weight_y)
-        for c in range(channels):
-            gather_row(packed, starts[c], index, patches)
-            blend_row(patches, weight_x, weight_y, warped[c, j], pad)
-            wrap_row(warped[c, j], width, pad)
-        if len(valid):
-            row = _U(j)
-            for i in range(_U(width)):
-                votes[row, i] = valid[_U(valid_start) + _U(index[i])]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -128,7 +80,7 @@ def store_row(costs, scale, voxels):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def sweep_band(  # type: ignore[no-untyped-def]
-    first, reference, sin_cos_azimuth, poses, ranges, packed, starts, shapes, valid, valid_starts,
+    first, reference, sin_cos_azimuth, poses, ranges, packed, colors, starts, shapes, valid, valid_starts, vector,
     offsets, reach, cost, compare_radius, box_radius, pad, weights, share, most, scale, neutral, volume, state, planes,
 ):  # fmt: skip
     """Compute the costs of one band at all virtual ranges, into the volume or straight into the winners.
@@ -139,11 +91,13 @@ def sweep_band(  # type: ignore[no-untyped-def]
         sin_cos_azimuth: (2, W) float32.
         poses: (S, 3, 4) float64 source_from_reference.
         ranges: (D,) float64.
-        packed: (·,) uint32, all sources.
-        starts: (S, C) int64.
+        packed: (·,) uint32, all sources, or empty.
+        colors: (·,) uint64, all sources, or empty.
+        starts: (S, ·) int64.
         shapes: (S, 2) int64.
         valid: (·,) uint8, or empty.
         valid_starts: (S,) int64.
+        vector: whether to use vector instructions.
         offsets: (H, 2 compare_radius + 1) int64.
         reach: (H,) int64.
         cost: which cost.
@@ -160,10 +114,11 @@ def sweep_band(  # type: ignore[no-untyped-def]
         planes: (rows, W) int32, written if the volume is empty.
     """
     rows, width = planes.shape
-    sources, channels = starts.shape
+    sources, channels = starts.shape[0], reference.shape[0]
     halo = compare_radius + box_radius
     warped = np.empty((channels, rows + 2 * halo, width + 2 * pad), np.uint8)
     votes = np.empty((rows + 2 * halo, width), np.uint8)
+    knots = np.empty((2, knot_rows(rows + 2 * halo), width), np.float32)
     pixel_costs = np.empty((rows + 2 * box_radius, width + 2 * pad), np.uint16)
     scratch = np.empty((2, width + 2 * pad), np.int32)
     costs = np.empty((sources, rows, width), np.float32)
@@ -171,8 +126,8 @@ def sweep_band(  # type: ignore[no-untyped-def]
     for d in range(len(ranges)):
         for s in range(sources):
             warp_band(
-                first - halo, offsets.shape[0], sin_cos_azimuth, poses[s], ranges[d], packed, starts[s], shapes[s],
-                valid, valid_starts[s], pad, warped, votes,
+                first - halo, offsets.shape[0], sin_cos_azimuth, poses[s], ranges[d], packed, colors, starts[s],
+                shapes[s], valid, valid_starts[s], vector, pad, knots, warped, votes,
             )  # fmt: skip
             source_cost(
                 first, reference, warped, offsets, reach, cost, compare_radius, box_radius, pad, pixel_costs, scratch,

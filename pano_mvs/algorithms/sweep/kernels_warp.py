@@ -19,6 +19,10 @@ _A2, _A4, _A6, _A8 = _F(-0.3333314528), _F(0.1999355085), _F(-0.1420889944), _F(
 _A10, _A12, _A14, _A16 = _F(-0.0752896400), _F(0.0429096138), _F(-0.0161657367), _F(0.0028662257)
 _ONE = _F(1)
 
+# Weights in integers, see `blend_row`.
+UNIT, HALFWAY_SHIFT, SHIFT = 16384, 6, 22
+HALFWAY_ROUND, ROUND = 1 << (HALFWAY_SHIFT - 1), 1 << (SHIFT - 1)
+
 
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
 def _atan_unit(a):  # type: ignore[no-untyped-def]
@@ -29,28 +33,25 @@ def _atan_unit(a):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def project_row(  # type: ignore[no-untyped-def]
-    sin_cos_azimuth, matrix, offset, shape, index, weight_x, weight_y
-):
-    """Find where a row of rays, of azimuth θ, arrives in a packed source.
+def project_row(sin_cos_azimuth, matrix, offset, shape, start, stop, x_px, y_px):  # type: ignore[no-untyped-def]
+    """Find where the columns `start` … `stop` − 1 of a row of rays, of azimuth θ, arrive in a packed source.
 
     Args:
         sin_cos_azimuth: (2, W) float32 sin θ and cos θ.
         matrix: (3, 2) float32: x_in_source = matrix @ (sin θ, cos θ) + offset, of any positive length.
         offset: (3,) float32.
         shape: (2,) int64 rows and columns of the source picture.
-        index: (W,) int32, written: position in the packed source (rows + 1 by columns + 1).
-        weight_x: (W,) float32, written: the weight of the right neighbours.
-        weight_y: (W,) float32, written: the weight of the lower neighbours.
+        start: the first column.
+        stop: the column after the last.
+        x_px: (W,) float32, written: ½ to columns + ½, the position among the packed patches.
+        y_px: (W,) float32, written: ½ to rows + ½.
     """
     m00, m01, o0 = matrix[0, 0], matrix[0, 1], offset[0]
     m10, m11, o1 = matrix[1, 0], matrix[1, 1], offset[1]
     m20, m21, o2 = matrix[2, 0], matrix[2, 1], offset[2]
     x_scale, y_scale = _F(shape[1] / (2 * np.pi)), _F(shape[0] / np.pi)
     x_middle, y_middle = _F(shape[1] / 2 + 0.5), _F(shape[0] / 2 + 0.5)
-    stride = np.int32(shape[1] + 1)
-    last_row, last_column = np.int32(shape[0]), np.int32(shape[1])
-    for i in range(_U(index.shape[0])):
+    for i in range(_U(start), _U(stop)):
         s, c = sin_cos_azimuth[0, i], sin_cos_azimuth[1, i]
         x = m00 * s + m01 * c + o0
         y = m10 * s + m11 * c + o1
@@ -68,14 +69,37 @@ def project_row(  # type: ignore[no-untyped-def]
         dip = _atan_unit(small / (large + _TINY))
         dip = _HALF_PI - dip if ay > level else dip
         dip = -dip if y < _F(0) else dip
-        px = turn * x_scale + x_middle
-        py = dip * y_scale + y_middle
-        column, row = np.int32(px), np.int32(py)
-        column = last_column if column > last_column else column
-        row = last_row if row > last_row else row
+        x_px[i] = turn * x_scale + x_middle
+        y_px[i] = dip * y_scale + y_middle
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def place_row(x_px, y_px, shape, index, weight_x, weight_y):  # type: ignore[no-untyped-def]
+    """Turn positions among packed patches into an index and integer weights.
+
+    Args:
+        x_px: (W,) float32, less than one turn away from where `project_row` puts it.
+        y_px: (W,) float32.
+        shape: (2,) int64 of the source picture.
+        index: (W,) int32, written: of the patch, in rows of columns + 2.
+        weight_x: (W,) int32, written: two words, left and right, of 16384 in all.
+        weight_y: (W,) int32, written: likewise upper and lower.
+    """
+    turn, least, last = _F(shape[1]), _HALF, _F(shape[1] + 0.5)
+    stride = np.int32(shape[1] + 2)
+    last_row, last_column = np.int32(shape[0]), np.int32(shape[1])
+    for i in range(_U(index.shape[0])):
+        x, y = x_px[i], y_px[i]
+        x = x + turn if x < least else x
+        x = x - turn if x >= last else x
+        column, row = np.int32(x), np.int32(y)
+        column = min(max(column, np.int32(0)), last_column)
+        row = min(max(row, np.int32(0)), last_row)
+        right = np.int32((x - _F(column)) * _F(UNIT) + _HALF)
+        lower = np.int32((y - _F(row)) * _F(UNIT) + _HALF)
         index[i] = np.int32(row * stride + column)
-        weight_x[i] = px - _F(column)
-        weight_y[i] = py - _F(row)
+        weight_x[i] = np.int32(np.int32(UNIT) + right * np.int32(65535))
+        weight_y[i] = np.int32(np.int32(UNIT) + lower * np.int32(65535))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -87,18 +111,26 @@ def gather_row(packed, start, index, patches):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def blend_row(patches, weight_x, weight_y, row, pad):  # type: ignore[no-untyped-def]
-    """Blend 2×2 patches bilinearly into `row[pad:pad + W]`, uint8, rounded."""
-    first = _U(pad)
+def blend_row(patches, weight_x, weight_y, out, out_at):  # type: ignore[no-untyped-def]
+    """Blend 2×2 patches bilinearly into `out[out_at:out_at + W]`, uint8, rounded.
+
+    A patch holds values less 128 in four signed bytes, upper left, lower left, upper right and lower right. Weights are
+    in 1/16384; between rows and columns there are 8 bits behind the point.
+    """
+    word = np.int32(65535)
     for i in range(_U(patches.shape[0])):
-        patch = patches[i]
-        upper_left = _F(np.int32(patch & np.uint32(255)))
-        lower_left = _F(np.int32((patch >> np.uint32(8)) & np.uint32(255)))
-        upper_right = _F(np.int32((patch >> np.uint32(16)) & np.uint32(255)))
-        lower_right = _F(np.int32(patch >> np.uint32(24)))
-        left = upper_left + weight_y[i] * (lower_left - upper_left)
-        right = upper_right + weight_y[i] * (lower_right - upper_right)
-        row[first + i] = np.uint8(np.int32(left + weight_x[i] * (right - left) + _HALF))
+        patch, across, down = np.int32(patches[i]), weight_x[i], weight_y[i]
+        upper, lower = np.int32(down & word), np.int32(down >> np.int32(16))
+        upper_left = np.int32(np.int32(patch << np.int32(24)) >> np.int32(24))
+        lower_left = np.int32(np.int32(patch << np.int32(16)) >> np.int32(24))
+        upper_right = np.int32(np.int32(patch << np.int32(8)) >> np.int32(24))
+        lower_right = np.int32(patch >> np.int32(24))
+        left = np.int32(upper * upper_left + lower * lower_left + np.int32(HALFWAY_ROUND))
+        right = np.int32(upper * upper_right + lower * lower_right + np.int32(HALFWAY_ROUND))
+        left, right = np.int32(left >> np.int32(HALFWAY_SHIFT)), np.int32(right >> np.int32(HALFWAY_SHIFT))
+        blended = np.int32(left * np.int32(across & word) + right * np.int32(across >> np.int32(16)))
+        blended = np.int32(np.int32(blended + np.int32(ROUND)) >> np.int32(SHIFT))
+        out[_U(out_at) + i] = np.uint8(blended + np.int32(128))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

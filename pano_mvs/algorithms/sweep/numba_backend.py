@@ -24,7 +24,9 @@ from pano_mvs.algorithms.sweep.combination import source_weights
 from pano_mvs.algorithms.sweep.kernels_band import sweep_band
 from pano_mvs.algorithms.sweep.kernels_cost import COSTS
 from pano_mvs.algorithms.sweep.kernels_sgm import sweep_row, sweep_strip
+from pano_mvs.algorithms.sweep.kernels_vector import HAS_VECTOR
 from pano_mvs.algorithms.sweep.kernels_winner import AFTER, BEFORE, BEST, RIVAL, STATES, winners_of_rows
+from pano_mvs.algorithms.sweep.packing import pack_sources, pack_votes
 from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, step_penalties, warm_up
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.windows import column_offsets
@@ -64,19 +66,6 @@ def find_winners(work: SweepInput) -> Winners:
     return found
 
 
-def pack_plane(plane: NDArray[np.uint8]) -> NDArray[np.uint32]:
-    """Return all 2×2 patches of one colour of a panorama, (H, W) to (H + 1, W + 1), four bytes each.
-
-    Patch (j, i) holds the pixels of rows j − 1, j and columns i − 1, i, over the seam and over the poles, as upper
-    left | lower left << 8 | upper right << 16 | lower right << 24: one load then fetches all that a bilinear sample
-    needs, and no sample lies at a border.
-    """
-    padded = pad_panorama(plane, 1).astype(np.uint32)
-    upper, lower = padded[:-1], padded[1:]
-    patches = upper[:, :-1] | lower[:, :-1] << 8 | upper[:, 1:] << 16 | lower[:, 1:] << 24
-    return np.asarray(patches, dtype=np.uint32)
-
-
 def _fresh_state(rows: int, width: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     return np.full((STATES, rows, width), np.inf, np.float32), np.zeros((rows, width), np.int32)
 
@@ -91,32 +80,19 @@ def _band_arguments(work: SweepInput) -> tuple[object, ...]:
     pad = max(int(offsets.max()), int(reach.max()) + 1, halo)
     reference = np.stack([pad_panorama(plane, pad) for plane in np.moveaxis(work.reference, -1, 0)])
     azimuth = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
-    packed, starts = _packed([np.moveaxis(source, -1, 0) for source in work.sources])
-    valid, valid_starts = _packed_valid(work)
+    vector = HAS_VECTOR
+    packed, colors, starts = pack_sources(work.sources, vector=vector)
+    valid, valid_starts = pack_votes(work)
     poses = np.stack([np.column_stack([pose.rotation, pose.translation]) for pose in work.source_from_reference])
     shapes = np.array([source.shape[:2] for source in work.sources])
     return (
         reference, np.stack([np.sin(azimuth), np.cos(azimuth)]).astype(np.float32), poses, work.ranges,
-        packed, starts, shapes, valid, valid_starts, offsets, reach, COSTS[settings.cost], settings.compare_radius,
-        settings.box_radius, pad, source_weights((height, width), work.source_from_reference, settings),
+        packed, colors, starts, shapes, valid, valid_starts, vector, offsets, reach,
+        COSTS[settings.cost], settings.compare_radius, settings.box_radius, pad,
+        source_weights((height, width), work.source_from_reference, settings),
         settings.weight_share, settings.most_sources(len(work.sources)),
         np.float32(settings.cost_scale), np.float32(settings.neutral_cost),
     )  # fmt: skip
-
-
-def _packed(sources: list[NDArray[np.uint8]]) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
-    """Return all planes of all sources packed in one array, and where each begins, (S, C)."""
-    planes = [pack_plane(plane).ravel() for source in sources for plane in source]
-    starts = np.concatenate([[0], np.cumsum([len(plane) for plane in planes])[:-1]])
-    return np.concatenate(planes), starts.reshape(len(sources), -1).astype(np.int64)
-
-
-def _packed_valid(work: SweepInput) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-    """Return whether each patch of each source may vote (all four pixels may); empty if all may."""
-    if work.source_valid is None:
-        return np.zeros(0, np.uint8), np.zeros(len(work.sources), np.int64)
-    packed, starts = _packed([mask.astype(np.uint8)[None] for mask in work.source_valid])
-    return (packed == 0x01010101).astype(np.uint8), starts[:, 0].copy()
 
 
 def _aggregate(pool: ThreadPoolExecutor, work: SweepInput, volume: NDArray[np.uint8]) -> NDArray[np.uint16]:

@@ -1,0 +1,122 @@
+"""Compiled: a band of rows of the reference, at one virtual range, looked up in one source."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from pano_mvs.algorithms.sweep.kernels_project import (
+    EVERY,
+    fit_group,
+    follow_curve,
+    project_knots,
+    ray_row,
+    replace_rough,
+    rough_runs,
+)  # fmt: skip
+from pano_mvs.algorithms.sweep.kernels_vector import PIXELS, blend_grey_block, sample_rgb_block
+from pano_mvs.algorithms.sweep.kernels_warp import blend_row, gather_row, place_row, project_row, wrap_row
+
+_F = np.float32
+_U = np.uint64
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _sample_planes(packed, starts, vector, index, weight_y, weight_x, patches, warped, row, pad):  # type: ignore[no-untyped-def]
+    """Sample each colour on its own, from packed planes."""
+    channels, _, padded = warped.shape
+    flat = warped.reshape(-1)
+    for c in range(channels):
+        gather_row(packed, starts[c], index, patches)
+        at = (c * warped.shape[1] + row) * padded + pad
+        if vector:
+            _blend_blocks(patches, weight_y, weight_x, flat, at)
+        else:
+            blend_row(patches, weight_x, weight_y, flat, at)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _blend_blocks(patches, weight_y, weight_x, out, out_at):  # type: ignore[no-untyped-def]
+    """Do what `blend_row` does; the last block overlaps the one before it."""
+    width = patches.shape[0]
+    for i in range(0, width - PIXELS + 1, PIXELS):
+        blend_grey_block(patches, weight_y, weight_x, _U(i), out, _U(out_at + i))
+    last = width - PIXELS
+    blend_grey_block(patches, weight_y, weight_x, _U(last), out, _U(out_at + last))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _sample_rgb(colors, start, index, weight_y, weight_x, warped, row, pad):  # type: ignore[no-untyped-def]
+    """Sample three colours at once, from interleaved patches."""
+    flat = warped.reshape(-1)
+    step = _U(warped.shape[1] * warped.shape[2])
+    out_at = row * warped.shape[2] + pad
+    base = _U(start)
+    width = index.shape[0]
+    for i in range(0, width - PIXELS + 1, PIXELS):
+        sample_rgb_block(colors, base, index, weight_y, weight_x, _U(i), flat, _U(out_at + i), step)
+    last = width - PIXELS
+    sample_rgb_block(colors, base, index, weight_y, weight_x, _U(last), flat, _U(out_at + last), step)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def warp_band(  # type: ignore[no-untyped-def]
+    first, height, sin_cos_azimuth, pose, virtual_range, packed, colors, starts, shape, valid, valid_start, vector, pad,
+    knots, warped, votes,
+):  # fmt: skip
+    """Look up the rows `first` … of the reference, at one virtual range, in one source.
+
+    Rows before the first or after the last one of the picture lie beyond a pole: elevations over 90° turn the ray
+    around by themselves.
+
+    Args:
+        first: the first row, may be negative.
+        height: rows of the reference picture.
+        sin_cos_azimuth: (2, W) float32.
+        pose: (3, 4) float64 source_from_reference.
+        virtual_range: in scene units.
+        packed: (·,) uint32 `pack_plane` of all planes of all sources.
+        colors: (·,) uint64 `pack_colors` of all sources, instead of `packed`; needs vector instructions.
+        starts: (C,) int64 where the planes of this source begin, or its colours.
+        shape: (2,) int64 of the source picture.
+        valid: (·,) uint8 like a packed plane: whether a patch may vote; empty if all may.
+        valid_start: where this source's begins.
+        vector: whether to use vector instructions; the result is the same.
+        pad: width of the wrapped margin of the result.
+        knots: (2, `knot_rows`(rows), W) float32, scratch.
+        warped: (C, rows, W + 2 pad) uint8, written.
+        votes: (rows, W) uint8, written unless `valid` is empty.
+    """
+    rows = warped.shape[1]
+    width = sin_cos_azimuth.shape[1]
+    x_px, y_px = np.empty(width, np.float32), np.empty(width, np.float32)
+    index = np.empty(width, np.int32)
+    weight_x, weight_y = np.empty(width, np.int32), np.empty(width, np.int32)
+    patches = np.empty(width, np.uint32)
+    matrix, offset = np.empty((3, 2), np.float32), np.empty(3, np.float32)
+    exact = np.empty((2, width), np.float32)
+    curve, rough = np.empty((2, 3, width), np.float32), np.empty(width, np.uint8)
+    runs = np.empty((width // 16 + 1, 2), np.int64)
+    count = 0
+    project_knots(first, height, sin_cos_azimuth, pose, virtual_range, shape, knots)
+    for j in range(rows):
+        base = min(max(j // EVERY - 1, 0), knots.shape[1] - 4)
+        if j % EVERY == 0:
+            fit_group(knots, base, height, _F(shape[1]), curve, rough)
+            count = rough_runs(rough, runs)
+        follow_curve(knots, base, curve, j / EVERY - base, x_px, y_px)
+        if count:
+            ray_row(first + j, height, pose, virtual_range, matrix, offset)
+            for k in range(count):
+                project_row(sin_cos_azimuth, matrix, offset, shape, runs[k, 0], runs[k, 1], exact[0], exact[1])
+                replace_rough(rough, exact, runs[k, 0], runs[k, 1], x_px, y_px)
+        place_row(x_px, y_px, shape, index, weight_x, weight_y)
+        if len(colors):
+            _sample_rgb(colors, starts[0], index, weight_y, weight_x, warped, j, pad)
+        else:
+            _sample_planes(packed, starts, vector, index, weight_y, weight_x, patches, warped, j, pad)
+        for c in range(warped.shape[0]):
+            wrap_row(warped[c, j], width, pad)
+        if len(valid):
+            for i in range(_U(width)):
+                votes[_U(j), i] = valid[_U(valid_start) + _U(index[i])]

@@ -1,0 +1,84 @@
+"""A band of rows looked up in a source: packed, projected and blended by any path, equals exact sampling."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pano_mvs.algorithms.sweep.kernels_lookup import warp_band
+from pano_mvs.algorithms.sweep.kernels_project import knot_rows
+from pano_mvs.algorithms.sweep.kernels_vector import HAS_VECTOR
+from pano_mvs.algorithms.sweep.packing import pack_colors, pack_plane, pack_sources
+from pano_mvs.geometry import pad_panorama, pixel_from_ray, ray_grid, rotation_from_rotvec, sample_panorama
+from tests.oracles import sweep as oracle
+
+SIZE = 16, 32
+ROTATION = rotation_from_rotvec((0.4, -1.9, 0.7))
+TRANSLATIONS = [(0.0, 0.0, 0.0), (0.3, -0.2, 0.5), (0.0, 0.9, 0.0), (0.0, 0.0, -0.99)]
+
+
+def _picture(seed: int, shape: tuple[int, ...]) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
+
+
+def _warped(source, translation, size_hw, *, vector, halo=3, pad=4, first=0, rows=None):
+    height, width = size_hw
+    rows = rows or height
+    azimuth = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
+    sin_cos = np.stack([np.sin(azimuth), np.cos(azimuth)]).astype(np.float32)
+    packed, colors, starts = pack_sources([source], vector=vector)
+    warped = np.zeros((source.shape[2], rows + 2 * halo, width + 2 * pad), np.uint8)
+    votes = np.zeros((rows + 2 * halo, width), np.uint8)
+    knots = np.zeros((2, knot_rows(rows + 2 * halo), width), np.float32)
+    valid = np.ones((source.shape[0] + 1) * (source.shape[1] + 2), np.uint8)
+    warp_band(
+        first - halo, height, sin_cos, np.column_stack([ROTATION, translation]), 1.3, packed, colors, starts[0],
+        np.array(source.shape[:2]), valid, 0, vector, pad, knots, warped, votes,
+    )  # fmt: skip
+    assert votes.all()
+    return warped
+
+
+@pytest.mark.parametrize("source_hw", [(16, 32), (24, 48), (16, 64)])
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("translation", TRANSLATIONS)
+@pytest.mark.parametrize("vector", [False, HAS_VECTOR])
+def test_a_warped_band_equals_exact_sampling_even_beyond_the_poles(source_hw, channels, translation, vector):
+    source = _picture(1, (*source_hw, channels))
+    warped = _warped(source, translation, SIZE, vector=vector)
+    exact = sample_panorama(source, pixel_from_ray(ray_grid(SIZE) * 1.3 @ ROTATION.T + translation, source_hw))
+    for color in range(channels):
+        expected = np.pad(pad_panorama(exact[..., color], 3)[:, 3:-3], ((0, 0), (4, 4)), mode="wrap")
+        # Half a level is rounding; the rest is what 1e-4 px of float32 projection makes of white noise.
+        assert np.abs(warped[color] - expected).max() < 0.6
+
+
+@pytest.mark.parametrize("translation", TRANSLATIONS)
+def test_interpolated_positions_miss_by_little(translation):
+    height, width = 256, 16  # positions are interpolated along columns
+    ramp = (np.arange(height)[:, None] % 32 * 4 + np.abs(np.arange(512) % 64 - 32) * 3).astype(np.uint8)[..., None]
+    warped = _warped(ramp, translation, (height, width), vector=HAS_VECTOR)
+    pixels = pixel_from_ray(ray_grid((height, width)) * 1.3 @ ROTATION.T + translation, ramp.shape[:2])
+    difference = np.abs(warped[0, 3:-3, 4:-4] - sample_panorama(ramp, pixels)[..., 0])
+    assert np.mean(difference < 0.75) > 0.99
+    assert difference.max() < 124 * 0.08 + 0.5  # 0.08 px over the steepest step
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_vector_instructions_give_what_loops_give(channels):
+    source = _picture(2, (64, 128, channels))
+    loops = _warped(source, TRANSLATIONS[1], (48, 100), vector=False, first=5, rows=8)
+    instructions = _warped(source, TRANSLATIONS[1], (48, 100), vector=HAS_VECTOR, first=5, rows=8)
+    assert loops.tobytes() == instructions.tobytes()
+    assert loops.std() > 30
+
+
+def test_packed_patches_hold_the_four_neighbours_over_seam_and_poles():
+    source = _picture(2, (*SIZE, 3))
+    packed, colors = pack_plane(source[..., 1]), pack_colors(source)
+    assert packed.shape == colors.shape == (SIZE[0] + 1, SIZE[1] + 2)
+    for row, column in [(0, 0), (0, 32), (16, 0), (16, 32), (7, 32), (5, 9)]:
+        corners = [oracle.pixel_at(source[..., 1], row - 1 + j, column - 1 + i) for i in (0, 1) for j in (0, 1)]
+        assert list(packed[row, column : column + 1].view(np.uint8) ^ 128) == corners
+        both = colors[row, column : column + 2].view(np.uint8).reshape(2, 4, 2) ^ 128
+        assert both[:, 1].ravel().tolist() == corners
