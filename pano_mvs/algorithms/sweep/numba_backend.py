@@ -53,16 +53,24 @@ def find_winners(work: SweepInput) -> Winners:
         sweep_band(first, *prepared, volume, state, planes)
         _keep(found, first, state, planes)
 
+    with ThreadPoolExecutor(numba.get_num_threads()) as pool:
+        _run(pool, sweep, range(0, height, _BAND_ROWS))
+    return winners_by_paths(work, volume) if with_volume else found
+
+
+def winners_by_paths(work: SweepInput, volume: NDArray[np.uint8]) -> Winners:
+    """Return the winners after semi-global matching of a volume of costs, (H, D, W), whoever made it."""
+    height, _, width = volume.shape
+    found = _unset_winners((height, width))
+
     def decide(first: int) -> None:
         state, planes = _fresh_state(min(_BAND_ROWS, height - first), width)
         winners_of_rows(total, first, state, planes)
         _keep(found, first, state, planes)
 
     with ThreadPoolExecutor(numba.get_num_threads()) as pool:
-        _run(pool, sweep, range(0, height, _BAND_ROWS))
-        if with_volume:
-            total = _aggregate(pool, work, volume)
-            _run(pool, decide, range(0, height, _BAND_ROWS))
+        total = _aggregate(pool, work, volume)
+        _run(pool, decide, range(0, height, _BAND_ROWS))
     return found
 
 
