@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from pano_mvs.core.errors import ContractError
 from pano_mvs.engine.context import Context
+from pano_mvs.engine.gather import Gather
 from pano_mvs.engine.ports import Cardinality, Names, Port
 from pano_mvs.engine.store import ItemRef, Store, UnitRecord
 from pano_mvs.engine.units import Unit, UnitInput
@@ -63,7 +65,8 @@ def _load(port: Port, value: UnitInput, store: Store) -> object:
         return [store.load(ref, port.kind) for ref in value.values()]
     if port.cardinality is Cardinality.NAMES:
         return Names(value)
-    return {_gathered_key(port, name): store.load(ref, port.kind) for name, ref in value.items()}
+    refs = {_gathered_key(port, name): ref for name, ref in value.items()}
+    return Gather(refs, partial(store.load, kind=port.kind))
 
 
 def _gathered_key(port: Port, name: str) -> str | tuple[str, ...]:

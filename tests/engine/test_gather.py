@@ -1,0 +1,57 @@
+"""Items of a gather are loaded when they are asked for."""
+
+import pytest
+
+from pano_mvs.engine.gather import Gather
+
+
+@pytest.fixture
+def loaded():
+    return []
+
+
+@pytest.fixture
+def gather(loaded):
+    def load(ref):
+        loaded.append(ref)
+        return [ref]
+
+    return Gather({f"{idx:03d}": idx for idx in range(200)}, load)
+
+
+def test_names_length_and_membership_load_nothing(gather, loaded):
+    assert list(gather) == [f"{idx:03d}" for idx in range(200)]
+    assert len(gather) == 200
+    assert "007" in gather
+    assert "200" not in gather
+    assert loaded == []
+
+
+def test_it_is_a_mapping_with_the_items_in_order(gather):
+    assert dict(gather) == {f"{idx:03d}": [idx] for idx in range(200)}
+    assert gather.get("200") is None
+    with pytest.raises(KeyError, match="200"):
+        gather["200"]
+
+
+def test_what_was_asked_for_a_moment_ago_is_not_loaded_again(gather, loaded):
+    for _ in range(3):
+        assert gather["001"] is gather["001"]
+    assert loaded == [1]
+
+
+def test_only_the_latest_few_are_kept(gather, loaded):
+    for name in gather:
+        gather[name], gather["000"]
+    assert loaded == list(range(200))
+    assert len(gather._latest) < 100
+    gather["100"]
+    assert loaded[-1] == 100
+
+
+def test_a_failure_comes_out_of_the_access():
+    def load(ref):
+        raise OSError(f"no {ref}")
+
+    with pytest.raises(OSError, match="no 1"):
+        Gather({"a": 1}, load)["a"]
