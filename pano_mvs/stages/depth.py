@@ -58,10 +58,14 @@ class SweepParams(Params):
         default=15.0, ge=0, description="grey levels of contrast at which p2 is halved; 0 keeps it"
     )
     selection: Literal["winner", "parabola", "vfit"] = Field(
-        default="parabola", description="the cheapest plane (the paper), or the minimum of a parabola or a V around it"
+        default="vfit", description="the cheapest plane (the paper), or the minimum of a parabola or a V around it"
     )
     confidence: Literal["peak_ratio", "curvature", "combined"] = Field(
         default="peak_ratio", description="how much dearer the best rival is, how sharp the minimum is, or both"
+    )
+    no_match: Literal["invalid", "keep"] = Field(
+        default="invalid",
+        description="bare pixels that run to the nearest or farthest plane, and the sky; the paper keeps them",
     )
     prefilter_diameter: int = Field(
         default=0,

@@ -155,8 +155,9 @@ def test_the_surer_half_is_much_the_better_one(settings):
 
 def test_nothing_is_sure_where_there_is_nothing_to_see():
     plain = np.full((32, 64, 3), 128, np.uint8)
-    result = _sweep((plain, plain), [Rigid3(np.eye(3), np.array([0.3, 0, 0]))])
-    assert result.confidence.max() == 64
+    pose = Rigid3(np.eye(3), np.array([0.3, 0, 0]))
+    assert _sweep((plain, plain), [pose], FAST.replace(no_match="keep")).confidence.max() == 64
+    assert not _sweep((plain, plain), [pose]).valid.any()
 
 
 @pytest.mark.parametrize("backend", ["numba", "numpy"])
@@ -197,7 +198,7 @@ def test_another_exposure_does_not_ruin_differences():
 def test_small_pictures_and_large_windows_work(size_hw, settings):
     rng = np.random.default_rng(0)
     pictures = rng.integers(0, 256, (2, *size_hw, 3), dtype=np.uint8)
-    result = _sweep(pictures, [Rigid3(np.eye(3), np.array([0.3, 0.1, 0]))], settings)
+    result = _sweep(pictures, [Rigid3(np.eye(3), np.array([0.3, 0.1, 0]))], settings.replace(no_match="keep"))
     result.check()
     assert np.isfinite(result.range).all()
     assert result.range.min() >= np.float32(NEAR)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.sweep.combination import parallax_weights
+from pano_mvs.algorithms.sweep.costs import BUILTIN_COSTS
 from pano_mvs.algorithms.sweep.kernels_gradient import sad_gradient_row
 from pano_mvs.algorithms.sweep.kernels_zncc import zncc_rows
 from pano_mvs.algorithms.sweep.settings import LARGEST_COLOR_COST, LARGEST_GRADIENT_COST, ZNCC_NOISE_VARIANCE
@@ -20,7 +21,9 @@ from pano_mvs.testing.room import capture_poses, default_room, render
 from tests.oracles import sweep as oracle
 
 SIZE = 16, 32
-NAMES = {name: get_args(hint) for name, hint in get_type_hints(SweepSettings).items() if get_args(hint)}
+NAMES = {"cost": tuple(sorted(BUILTIN_COSTS))} | {
+    name: get_args(hint) for name, hint in get_type_hints(SweepSettings).items() if get_args(hint)
+}
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +107,9 @@ def test_all_names_go_together(capture):
     tiny = [picture[::4, ::4] for picture in capture[0]], capture[1], None
     for names in itertools.product(*NAMES.values()):
         settings = dict(zip(NAMES, names, strict=True))
-        if settings["spacing"] == "inverse" or settings["cost"] == "census":
+        if [settings[name] for name in ("spacing", "no_match")] == ["inverse", "invalid"] or settings[
+            "cost"
+        ] == "census":
             swept(tiny, planes=5, **settings).check()
 
 

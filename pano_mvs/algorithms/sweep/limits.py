@@ -28,6 +28,9 @@ _NEAREST_BASELINES = 0.15
 _NEAR_QUANTILE, _FAR_QUANTILE = 0.005, 0.995
 _NEAR_MARGIN, _FAR_MARGIN = 0.7, 1.3
 _LEAST_SHARE = 0.01
+# Outdoors this share of the sphere is sky. What ends there, at a third of the farthest range that the pictures can
+# tell or beyond, sets no quantile, and with planes even in 1/range it costs next to none to go all the way.
+_OPEN_SHARE, _OPEN_RANGE = 0.1, 1 / 3
 # Grey levels between the darkest and the brightest pixel of a 5×5 window; plain walls agree with each other anywhere.
 _LEAST_CONTRAST = 10
 
@@ -45,6 +48,7 @@ def limits_by_sweeping(
     The reference and its first four sources are each swept at 256 columns between very wide limits. What two of them
     agree on, where there is texture, gives the limits: its 0.5 % and 99.5 % quantiles by solid angle, with a margin.
     Unlike sparse points this sees smooth and near surfaces too, and it does not care how the pictures are turned.
+    Where a tenth of the sphere lies as good as infinitely far (the sky), the farthest range is the resolution's limit.
 
     Args:
         pictures: the reference, then its sources, (H, W, 3) uint8 RGB each.
@@ -75,7 +79,10 @@ def limits_by_sweeping(
     if solid_angle[agreed].sum() < _LEAST_SHARE * solid_angle.sum():
         return range_limits(_baselines(0, poses), width=width)
     near, far = _quantiles(checked.range[agreed], solid_angle[agreed])
-    return _outward(_NEAR_MARGIN * near, _FAR_MARGIN * far)
+    near, far = _outward(_NEAR_MARGIN * near, _FAR_MARGIN * far)
+    farthest = range_limits(_baselines(0, poses), width=width)[1]
+    open_angle = solid_angle[maps[0].range > _OPEN_RANGE * farthest].sum()
+    return near, max(far, farthest) if open_angle > _OPEN_SHARE * solid_angle.sum() else far
 
 
 def _coarse(
@@ -99,7 +106,7 @@ def _coarse(
         [poses[other] @ poses[idx].inverse() for other in others],
         near=near,
         far=far,
-        settings=SweepSettings(planes=_PLANES),
+        settings=SweepSettings(planes=_PLANES, no_match="keep"),
         backend=backend,
         device=device,
         reference_mask=masks[idx],

@@ -50,6 +50,8 @@ class SweepSettings:
             V ("vfit") through its cost and its neighbours' has its minimum.
         confidence: "peak_ratio" (how much dearer the best rival is), "curvature" (how sharp the minimum is) or
             "combined", their geometric mean.
+        no_match: what becomes of bare pixels that run to the nearest or the farthest plane, and of all that run to a
+            farthest plane which cannot be told from infinity (the sky): "invalid", or "keep" the plane (the paper).
         prefilter_diameter: diameter of a bilateral filter of all pictures before the sweep; 0 is none (the paper: 3).
         prefilter_sigma_color: its width in grey levels (the paper: 25).
         prefilter_sigma_space_px: its width in pixels (the paper: 25).
@@ -71,8 +73,9 @@ class SweepSettings:
     p1: int = 80
     p2: int = 1600
     p2_contrast: float = 15.0
-    selection: Literal["winner", "parabola", "vfit"] = "parabola"
+    selection: Literal["winner", "parabola", "vfit"] = "vfit"
     confidence: Literal["peak_ratio", "curvature", "combined"] = "peak_ratio"
+    no_match: Literal["invalid", "keep"] = "invalid"
     prefilter_diameter: int = 0
     prefilter_sigma_color: float = 25.0
     prefilter_sigma_space_px: float = 25.0

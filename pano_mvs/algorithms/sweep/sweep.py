@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.sweep.backends import backend_for, helper_backend
 from pano_mvs.algorithms.sweep.exposure import match_all, shrink
 from pano_mvs.algorithms.sweep.hypotheses import virtual_ranges
+from pano_mvs.algorithms.sweep.no_match import has_match
 from pano_mvs.algorithms.sweep.preparation import SweepInput, derotated, prepare_picture, sees_winner, voting_pixels
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.winner import range_map_from_winners
@@ -62,7 +63,8 @@ def sweep_range(
 
     Returns:
         Ranges in scene units and confidence 64–127 ("seen but weak": a sweep alone cannot say that other views
-        agree); NaN and 0 where the reference is masked or no source sees the winning range.
+        agree); NaN and 0 where the reference is masked, no source sees the winning range, or nothing was found (see
+        `has_match`).
 
     Raises:
         UsageError: if shapes, types or numbers do not fit together, or near and far are no limits.
@@ -92,6 +94,8 @@ def sweep_range(
     winners = compute(work)
     seen = np.ones(reference.shape[:2], np.bool_) if reference_mask is None else reference_mask
     seen = seen & sees_winner(winners, work)
+    if settings.no_match == "invalid":
+        seen &= has_match(winners, work)
     return range_map_from_winners(winners, near=near, far=far, settings=settings, seen=seen)
 
 
@@ -106,7 +110,7 @@ def _rough_range(
     device: str,
 ) -> NDArray[np.float32]:
     """Return ranges at low resolution by census, which exposure does not disturb; the surer half of them."""
-    settings = SweepSettings(planes=_ROUGH_PLANES, window=5, aggregation="box")
+    settings = SweepSettings(planes=_ROUGH_PLANES, window=5, aggregation="box", no_match="keep")
     small = [shrink(source, _ROUGH_ROWS) for source in sources]
     found = sweep_range(
         shrink(reference, _ROUGH_ROWS), small, source_from_reference,
