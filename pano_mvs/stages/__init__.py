@@ -7,8 +7,17 @@ from pano_mvs.stages.depth import sweep
 from pano_mvs.stages.evaluate import truth
 from pano_mvs.stages.export import colmap, ply, previews, ranges
 from pano_mvs.stages.features import orb_tangent, sift_tangent, sphorb
-from pano_mvs.stages.filters import bilateral_solver, consistency, fill, gaussian, median, speckle
-from pano_mvs.stages.frame import level, scale
+from pano_mvs.stages.filters import (
+    bilateral_solver,
+    confidence,
+    consistency,
+    fill,
+    gaussian,
+    guided,
+    median,
+    speckle,
+)
+from pano_mvs.stages.frame import level, scale, unit_translations
 from pano_mvs.stages.fusion import vote
 from pano_mvs.stages.matches import brute_force
 from pano_mvs.stages.pairs import exhaustive, position, retrieval, sequential, vlad
@@ -23,6 +32,7 @@ __all__ = [
     "colmap",
     "colmap_poses",
     "colmap_sift_poses",
+    "confidence",
     "consistency",
     "exhaustive",
     "extend",
@@ -30,6 +40,7 @@ __all__ = [
     "folder",
     "from_model",
     "gaussian",
+    "guided",
     "level",
     "median",
     "nearest",
@@ -49,6 +60,7 @@ __all__ = [
     "sweep",
     "triangulate",
     "truth",
+    "unit_translations",
     "vlad",
     "vote",
 ]

@@ -5,13 +5,17 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from pano_mvs.algorithms.filters.bilateral_solver import fast_bilateral_solver
+from pano_mvs.algorithms.filters.confidence import require_confidence
 from pano_mvs.algorithms.filters.consistency import check_consistency
 from pano_mvs.algorithms.filters.fill import fill_from_neighbours
 from pano_mvs.algorithms.filters.gaussian import gaussian_range
+from pano_mvs.algorithms.filters.guided import guided_range
 from pano_mvs.algorithms.filters.median import median_range
+from pano_mvs.algorithms.filters.replacement import with_ranges
 from pano_mvs.algorithms.filters.speckle import remove_speckles
 from pano_mvs.api import Context, Each, Near, Panorama, Params, Pose, RangeMap, stage
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
@@ -40,6 +44,34 @@ class GaussianParams(Params):
 def gaussian(range_map: Each[RangeMap], params: GaussianParams, ctx: Context) -> RangeMap:
     """Gaussian mean of the valid ranges in a window; invalid pixels stay invalid."""
     return _measured(gaussian_range(range_map, window=params.window, sigma_px=params.sigma_px), ctx)
+
+
+class GuidedParams(Params):
+    """Settings of filters.guided."""
+
+    radius: int = Field(default=4, ge=1, description="of the windows, in pixels at the equator")
+    epsilon: float = Field(default=4.0, gt=0, description="grey levels: larger contrasts are edges")
+    domain: Literal["range", "inverse"] = Field(default="inverse", description="what is smoothed: range or 1/range")
+    fill: bool = Field(default=False, description="give a range to pixels near valid ones (confidence 1–63)")
+
+
+@stage("filters.guided")
+def guided(range_map: Each[RangeMap], image: Each[Panorama], params: GuidedParams, ctx: Context) -> RangeMap:
+    """The guided filter: in every window ranges follow the colours of the picture. Masked pixels get no range."""
+    smoothed = guided_range(range_map, image.load(), **params.model_dump())
+    return _measured(_unmasked(smoothed, image), ctx)
+
+
+class ConfidenceParams(Params):
+    """Settings of filters.confidence."""
+
+    min_confidence: int = Field(default=128, ge=1, le=255, description="pixels below are removed; 128: confirmed ones")
+
+
+@stage("filters.confidence")
+def confidence(range_map: Each[RangeMap], params: ConfidenceParams, ctx: Context) -> RangeMap:
+    """Remove what is not sure enough: by default all that no other view confirms."""
+    return _measured(require_confidence(range_map, min_confidence=params.min_confidence), ctx)
 
 
 class SpeckleParams(Params):
@@ -99,6 +131,12 @@ class BilateralSolverParams(Params):
     )
     domain: Literal["range", "inverse"] = Field(default="inverse", description="what is smoothed: range or 1/range")
     fill: bool = Field(default=True, description="give a range to pixels that had none (confidence 1–63)")
+    max_hole_deg: float = Field(
+        default=20.0, ge=0, description="larger holes, such as a sky, stay holes (diameter of a disc); 0 fills all"
+    )
+    keep_confidence: int = Field(
+        default=128, ge=1, le=256, description="pixels of at least this confidence keep their range; 256 smooths all"
+    )
 
 
 @stage("filters.fast_bilateral_solver")
@@ -118,6 +156,9 @@ class FillParams(Params):
 
     max_distance_px: int = Field(default=48, ge=1, description="how far to look, in pixels at the equator")
     min_confidence: int = Field(default=128, ge=1, le=255, description="pixels below are not trusted")
+    max_hole_deg: float = Field(
+        default=20.0, ge=0, description="larger holes, such as a sky, stay holes (diameter of a disc); 0 fills all"
+    )
 
 
 @stage("filters.fill")
@@ -126,17 +167,14 @@ def fill(range_map: Each[RangeMap], image: Each[Panorama], params: FillParams, c
 
     Masked pixels get no range.
     """
-    filled = fill_from_neighbours(
-        range_map, max_distance_px=params.max_distance_px, min_confidence=params.min_confidence
-    )
+    filled = fill_from_neighbours(range_map, **params.model_dump())
     return _measured(_unmasked(filled, image), ctx)
 
 
 def _unmasked(range_map: RangeMap, image: Panorama) -> RangeMap:
     valid = image.load_mask()
-    return RangeMap(
-        np.where(valid, range_map.range, np.float32(np.nan)), np.where(valid, range_map.confidence, np.uint8(0))
-    )
+    ranges: NDArray[np.float32] = np.where(valid, range_map.range, np.float32(np.nan))
+    return with_ranges(range_map, ranges, np.where(valid, range_map.confidence, np.uint8(0)))
 
 
 def _measured(range_map: RangeMap, ctx: Context) -> RangeMap:

@@ -11,6 +11,7 @@ from pydantic import ConfigDict, Field, model_validator
 from pano_mvs.algorithms.poses.georeference import fit_gps, georeferenced_poses, scaled_by_gps
 from pano_mvs.algorithms.poses.levelling import level_poses
 from pano_mvs.algorithms.poses.metric_scale import scaled_by_baseline, scaled_by_camera_height, scaled_poses
+from pano_mvs.algorithms.poses.unit_translations import unit_translations as without_scale_factors
 from pano_mvs.algorithms.poses.vertical import find_vertical
 from pano_mvs.api import All, Context, InputError, One, Panorama, Params, Poses, stage
 from pano_mvs.io.names import match_image_names
@@ -111,6 +112,18 @@ def scale(poses: One[Poses], images: All[Panorama], params: ScaleParams, ctx: Co
         metric = _by_gps(poses, images, params, ctx)
     ctx.note(f"unit of length: {metric.scale}")
     return metric
+
+
+class UnitTranslationsParams(Params):
+    """Settings of poses.unit_translations."""
+
+    enabled: bool = Field(default=True, description="false passes the poses on as they are")
+
+
+@stage("poses.unit_translations")
+def unit_translations(poses: One[Poses], params: UnitTranslationsParams) -> Poses:
+    """Forget the translation scale factors: every camera at distance 1 from the first. The paper's ablation."""
+    return without_scale_factors(poses) if params.enabled else poses
 
 
 def _by_baseline(poses: Poses, images: All[Panorama], baseline: BaselineParams) -> Poses:

@@ -1,9 +1,12 @@
 """The bilateral solver: its cells, its linear system against dense elimination, and what it does to ranges."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.filters.bilateral_solver import confidence_weight, fast_bilateral_solver, solve_bilateral
+from pano_mvs.algorithms.filters.bilateral_solver import fast_bilateral_solver, solve_bilateral
+from pano_mvs.algorithms.filters.confidence import confidence_weight
 from pano_mvs.algorithms.filters.kernels_bilateral import COLOR_BINS
 from pano_mvs.algorithms.filters.sphere_cells import sphere_cells
 from pano_mvs.algorithms.metrics.depth import depth_metrics
@@ -15,6 +18,8 @@ from tests.algorithms.range_scenes import as_map, rolled
 from tests.oracles.bilateral import corner_weights, dense_system
 
 SIZE = (128, 256)
+
+smooth_all = partial(fast_bilateral_solver, keep_confidence=256, max_hole_deg=0)
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +96,7 @@ def test_it_recovers_ranges_from_noise_outliers_and_holes(view, domain):
     image, truth = view
     broken = harmed(truth)
     before = depth_metrics(np.nan_to_num(broken.range, nan=2.5), truth)
-    solved = fast_bilateral_solver(broken, image, domain=domain, sigma_spatial=4)
+    solved = smooth_all(broken, image, domain=domain, sigma_spatial=4)
     solved.check()
     after = depth_metrics(solved.range, truth)
     assert after.completeness == 1
@@ -108,16 +113,16 @@ def test_it_keeps_an_edge_that_the_picture_shows_and_smooths_one_that_it_does_no
     ranges[:, 64:128] = 2.0
     rng = np.random.default_rng(1)
     noisy = as_map(ranges * (1 + 0.05 * rng.standard_normal(SIZE)), 200)
-    kept = fast_bilateral_solver(noisy, image, smoothness=50).range
+    kept = smooth_all(noisy, image, smoothness=50).range
     assert np.abs(kept / ranges - 1)[40:90].max() < 0.03
-    blurred = fast_bilateral_solver(noisy, np.full_like(image, 60), smoothness=50).range
+    blurred = smooth_all(noisy, np.full_like(image, 60), smoothness=50).range
     assert np.abs(blurred / ranges - 1)[40:90, 60:68].mean() > 0.15
 
 
 @pytest.mark.parametrize("domain", ["inverse", "range"])
 def test_a_sphere_stays_a_sphere(domain):
     image = np.random.default_rng(0).integers(0, 256, (64, 128, 3)).astype(np.uint8)
-    solved = fast_bilateral_solver(as_map(np.full((64, 128), 2.5)), image, domain=domain, smoothness=100)
+    solved = smooth_all(as_map(np.full((64, 128), 2.5)), image, domain=domain, smoothness=100)
     np.testing.assert_allclose(solved.range, 2.5, rtol=1e-5)
 
 
@@ -126,7 +131,7 @@ def test_a_plane_keeps_its_slant():
     size = (256, 512)
     down = np.abs(ray_grid(size)[..., 1])
     ranges = np.minimum(1.5 / np.maximum(down, 0.1), 15)
-    solved = fast_bilateral_solver(as_map(ranges, 200), np.full((*size, 3), 128, np.uint8), smoothness=4).range
+    solved = smooth_all(as_map(ranges, 200), np.full((*size, 3), 128, np.uint8), smoothness=4).range
     steep = down > 0.3
     assert np.median(np.abs(solved / ranges - 1)[steep]) < 0.005
     assert np.abs(solved / ranges - 1)[steep].max() < 0.02
@@ -137,8 +142,8 @@ def test_rolling_the_input_rolls_the_output(view, columns):
     """Cells begin somewhere, so a roll by part of a cell changes a little; a crack at the seam would be large."""
     image, truth = view
     broken = harmed(truth)
-    solved = fast_bilateral_solver(broken, image).range
-    turned = fast_bilateral_solver(rolled(broken, columns), np.roll(image, columns, 1)).range
+    solved = smooth_all(broken, image).range
+    turned = smooth_all(rolled(broken, columns), np.roll(image, columns, 1)).range
     change = np.abs(turned / np.roll(solved, columns, 1) - 1)
     assert np.median(change) < (0.001 if columns % 8 == 0 else 0.01)
     assert np.quantile(change, 0.9) < (0.02 if columns % 8 == 0 else 0.06)
@@ -150,7 +155,7 @@ def test_rolling_the_input_rolls_the_output(view, columns):
 def test_no_crack_at_the_seam_and_the_poles():
     """Noise around a ball is smoothed over the seam and the poles as it is elsewhere."""
     noisy = harmed(np.full(SIZE, 2.0))
-    solved = fast_bilateral_solver(noisy, np.full((*SIZE, 3), 90, np.uint8)).range
+    solved = smooth_all(noisy, np.full((*SIZE, 3), 90, np.uint8)).range
     seam = np.abs(solved[:, 0] - solved[:, -1])[20:-20]
     assert seam.mean() < 2 * np.abs(np.diff(solved, axis=1))[20:-20].mean()
     for pole in (0, -1):
@@ -161,12 +166,12 @@ def test_no_crack_at_the_seam_and_the_poles():
 def test_holes_are_filled_and_marked_and_nothing_else_is(view):
     image, truth = view
     broken = harmed(truth)
-    filled = fast_bilateral_solver(broken, image)
+    filled = smooth_all(broken, image)
     new = ~broken.valid
     assert filled.valid.all()
     assert 1 <= filled.confidence[new].min() <= filled.confidence[new].max() <= 63
     np.testing.assert_array_equal(filled.confidence[~new], broken.confidence[~new])
-    left = fast_bilateral_solver(broken, image, fill=False)
+    left = smooth_all(broken, image, fill=False)
     left.check()
     np.testing.assert_array_equal(left.valid, broken.valid)
     np.testing.assert_array_equal(left.range[~new], filled.range[~new])
@@ -177,12 +182,12 @@ def test_a_colour_that_has_no_range_at_all_gets_one():
     image[20:40, 30:60] = (250, 20, 20)
     ranges = np.full((64, 128), 3.0)
     ranges[20:40, 30:60] = np.nan
-    np.testing.assert_allclose(fast_bilateral_solver(as_map(ranges), image).range, 3.0, rtol=1e-3)
+    np.testing.assert_allclose(smooth_all(as_map(ranges), image).range, 3.0, rtol=1e-3)
 
 
 def test_no_range_anywhere_is_returned_as_it_is():
     empty = as_map(np.full((16, 32), np.nan))
-    assert fast_bilateral_solver(empty, np.zeros((16, 32, 3), np.uint8)) is empty
+    assert smooth_all(empty, np.zeros((16, 32, 3), np.uint8)) is empty
 
 
 def test_units_do_not_matter(view):
@@ -191,8 +196,8 @@ def test_units_do_not_matter(view):
     thousand = RangeMap(broken.range * np.float32(1000), broken.confidence)
     for domain in ("inverse", "range"):
         np.testing.assert_allclose(
-            fast_bilateral_solver(thousand, image, domain=domain).range,
-            1000 * fast_bilateral_solver(broken, image, domain=domain).range,
+            smooth_all(thousand, image, domain=domain).range,
+            1000 * smooth_all(broken, image, domain=domain).range,
             rtol=1e-3,
         )
 
@@ -201,7 +206,7 @@ def test_more_smoothness_is_smoother(view):
     image, truth = view
     broken = harmed(truth)
     rough = [
-        np.abs(np.diff(fast_bilateral_solver(broken, image, smoothness=smoothness).range, axis=1)).mean()
+        np.abs(np.diff(smooth_all(broken, image, smoothness=smoothness).range, axis=1)).mean()
         for smoothness in (0.5, 8, 128)
     ]
     assert rough == sorted(rough, reverse=True)
@@ -218,9 +223,7 @@ def test_weights_follow_the_bands():
 def test_a_map_that_nobody_checked_is_solved_as_if_all_were_sure(view):
     image, truth = view
     weak, sure = as_map(harmed(truth).range, 100), as_map(harmed(truth).range, 200)
-    np.testing.assert_allclose(
-        fast_bilateral_solver(weak, image).range, fast_bilateral_solver(sure, image).range, rtol=1e-4
-    )
+    np.testing.assert_allclose(smooth_all(weak, image).range, smooth_all(sure, image).range, rtol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -233,9 +236,9 @@ def test_a_map_that_nobody_checked_is_solved_as_if_all_were_sure(view):
 )
 def test_impossible_settings_are_named(view, settings, words):
     with pytest.raises(UsageError, match=words):
-        fast_bilateral_solver(as_map(view[1]), view[0], **settings)
+        smooth_all(as_map(view[1]), view[0], **settings)
 
 
 def test_a_guide_of_another_size_is_refused(view):
     with pytest.raises(UsageError, match="guide must be"):
-        fast_bilateral_solver(as_map(view[1]), view[0][::2, ::2])
+        smooth_all(as_map(view[1]), view[0][::2, ::2])

@@ -21,7 +21,7 @@ FILTERS = {
     "median_7": lambda range_map: median_range(range_map, window=7),
     "gaussian": gaussian_range,
     "speckle": lambda range_map: remove_speckles(range_map, max_size_px=4, max_relative_step=0.5),
-    "fill": lambda range_map: fill_from_neighbours(range_map, max_distance_px=6),
+    "fill": lambda range_map: fill_from_neighbours(range_map, max_distance_px=6, max_hole_deg=0),
 }
 
 
@@ -112,7 +112,7 @@ def test_fill_equals_the_plain_paths():
     range_map = random_map(np.random.default_rng(8), SIZE, holes=0.6)
     trusted = range_map.valid & (range_map.confidence >= 128)
     expected = oracle.fill(range_map.range, trusted, columns_per_step(SIZE, steps=8), 6, 1.25)
-    filled = fill_from_neighbours(range_map, max_distance_px=6)
+    filled = fill_from_neighbours(range_map, max_distance_px=6, max_hole_deg=0)
     new = filled.valid & ~range_map.valid
     np.testing.assert_allclose(filled.range[~range_map.valid], expected[~range_map.valid], rtol=1e-6)
     assert filled.confidence[new].min() >= 1
@@ -124,7 +124,7 @@ def test_fill_restores_walls_over_seam_and_poles():
     ranges, _ = box_range((64, 128))
     holed = ranges.copy()
     holed[:5], holed[-4:], holed[20:30, -4:], holed[20:30, :5] = np.nan, np.nan, np.nan, np.nan
-    filled = fill_from_neighbours(as_map(holed, TRUSTED), max_distance_px=16)
+    filled = fill_from_neighbours(as_map(holed, TRUSTED), max_distance_px=16, max_hole_deg=0)
     assert filled.valid.all()
     error = np.abs(filled.range / ranges - 1)
     # A chord of 14° under the zenith is 3 % nearer than the ceiling.
@@ -143,8 +143,8 @@ def test_fill_takes_the_background_beside_an_occluder():
 def test_fill_does_not_trust_weak_pixels():
     ranges = np.full(SIZE, 3.0)
     ranges[10:14, 10:14] = np.nan
-    assert not fill_from_neighbours(as_map(ranges, 127)).valid[10:14, 10:14].any()
-    assert fill_from_neighbours(as_map(ranges, 128)).valid.all()
+    assert not fill_from_neighbours(as_map(ranges, 127), max_hole_deg=0).valid[10:14, 10:14].any()
+    assert fill_from_neighbours(as_map(ranges, 128), max_hole_deg=0).valid.all()
 
 
 @pytest.mark.parametrize(

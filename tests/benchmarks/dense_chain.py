@@ -173,4 +173,5 @@ def score_view(range_map: RangeMap, truth: NDArray[np.float32], *, scale: float 
 
 def mean_of(scores: Sequence[ViewScores], protocol: str, figure: str) -> float:
     """Return the mean over views of one figure of "filled" or "consistent"."""
-    return float(np.nanmean([getattr(getattr(score, protocol), figure) for score in scores]))
+    values = np.array([getattr(getattr(score, protocol), figure) for score in scores])
+    return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")

@@ -10,9 +10,11 @@ import pytest
 from pano_mvs.algorithms.features.sphorb import extract_sphorb
 from pano_mvs.algorithms.features.tangent import extract_orb, extract_sift
 from pano_mvs.algorithms.filters.bilateral_solver import fast_bilateral_solver
+from pano_mvs.algorithms.filters.confidence import require_confidence
 from pano_mvs.algorithms.filters.consistency import check_consistency
 from pano_mvs.algorithms.filters.fill import fill_from_neighbours
 from pano_mvs.algorithms.filters.gaussian import gaussian_range
+from pano_mvs.algorithms.filters.guided import guided_range
 from pano_mvs.algorithms.filters.median import median_range
 from pano_mvs.algorithms.filters.speckle import remove_speckles
 from pano_mvs.algorithms.fusion.vote import fuse_views
@@ -51,6 +53,8 @@ FUNCTIONS = {
     "poses.scale": fit_gps,
     "filters.median": median_range,
     "filters.gaussian": gaussian_range,
+    "filters.guided": guided_range,
+    "filters.confidence": require_confidence,
     "filters.speckle": remove_speckles,
     "filters.consistency": check_consistency,
     "filters.fast_bilateral_solver": fast_bilateral_solver,

@@ -25,10 +25,13 @@ import scipy.sparse
 import scipy.sparse.linalg
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.filters.confidence import confidence_weight
+from pano_mvs.algorithms.filters.holes import large_holes
+from pano_mvs.algorithms.filters.replacement import with_ranges
 from pano_mvs.algorithms.filters.sphere_cells import SphereCells, sphere_cells
 from pano_mvs.core.errors import UsageError
 from pano_mvs.scene import RangeMap
-from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, WEAK_CONFIDENCE
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE
 
 FloatArray = NDArray[np.float64]
 
@@ -38,8 +41,6 @@ _BISTOCHASTIC_ITERATIONS = 10
 # A pixel without range is drawn towards a colour-blind guess this much, so that a colour that appears only inside a
 # hole has a value at all.
 _PRIOR_WEIGHT = 1e-4
-# Chosen on range maps of our own sweep after the consistency check, of two scenes; anything from 0.03 to 0.003 does.
-_WEAK_WEIGHT, _FILLED_WEIGHT = 0.01, 0.0005
 _TOLERANCE = 1e-4
 _SMALLEST_BIN = 2.1
 
@@ -82,6 +83,8 @@ def fast_bilateral_solver(
     iterations: int = 60,
     domain: Literal["range", "inverse"] = "inverse",
     fill: bool = True,
+    max_hole_deg: float = 20.0,
+    keep_confidence: int = CONSISTENT_CONFIDENCE[0],
 ) -> RangeMap:
     """Return a range map smoothed within the surfaces that the picture shows, and filled where it is invalid.
 
@@ -101,6 +104,10 @@ def fast_bilateral_solver(
         domain: what is smooth: "inverse" (1/range, linear in the ray on every plane, and in which the errors of stereo
             are even) or "range".
         fill: whether invalid pixels get a range; else they stay invalid.
+        max_hole_deg: holes that hold a disc of a larger diameter stay invalid (`large_holes`): a sky has no range. 0
+            fills all.
+        keep_confidence: pixels of at least this confidence keep the range that they have, and lend it to the others;
+            256 smooths all.
 
     Raises:
         UsageError: if guide and range map differ in size, or a parameter is out of bounds.
@@ -127,25 +134,15 @@ def fast_bilateral_solver(
     # The solution is a weighted mean of the targets up to the tolerance of the solver: hold it within their limits.
     smooth = np.clip(smooth, target[valid].min(), target[valid].max())
     ranges = (1 / smooth if domain == "inverse" else smooth).astype(np.float32)
+    kept = range_map.confidence >= keep_confidence
+    ranges[kept] = range_map.range[kept]
     if not fill:
-        return RangeMap(np.where(valid, ranges, np.float32(np.nan)), range_map.confidence)
+        return with_ranges(range_map, np.where(valid, ranges, np.float32(np.nan)))
     low, high = FILLED_CONFIDENCE
     filled = np.rint(low + (high - low) * np.clip(support, 0, 1)).astype(np.uint8)
-    return RangeMap(ranges, np.where(valid, range_map.confidence, filled))
-
-
-def confidence_weight(confidence: NDArray[np.uint8]) -> FloatArray:
-    """Return the weight of the data term, in [0, 1], for each confidence c.
-
-    c / 255 for consistent pixels (128–255), a hundredth of c / 127 for weak ones (64–127), and a twentieth of that,
-    with c / 63, for filled ones (1–63). Weak pixels that no view confirms are wrong so often that a larger weight
-    costs more than it fills.
-    """
-    filled, weak = FILLED_CONFIDENCE[1], WEAK_CONFIDENCE[1]
-    c = confidence.astype(np.float64)
-    seen = np.where(confidence > weak, c / CONSISTENT_CONFIDENCE[1], _WEAK_WEIGHT * c / weak)
-    weight: FloatArray = np.where(confidence > filled, seen, _FILLED_WEIGHT * c / filled)
-    return weight
+    large = large_holes(valid, max_hole_deg)
+    ranges[large], filled[large] = np.nan, 0
+    return with_ranges(range_map, ranges, np.where(valid, range_map.confidence, filled))
 
 
 def solve_bilateral(

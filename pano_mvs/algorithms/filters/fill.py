@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from pano_mvs.algorithms.filters.holes import large_holes
+from pano_mvs.algorithms.filters.replacement import with_ranges
 from pano_mvs.algorithms.filters.sphere_steps import columns_per_step
 from pano_mvs.core.errors import UsageError
 from pano_mvs.scene import RangeMap
@@ -14,7 +16,11 @@ _MAX_RATIO = 1.25
 
 
 def fill_from_neighbours(
-    range_map: RangeMap, *, max_distance_px: int = 48, min_confidence: int = CONSISTENT_CONFIDENCE[0]
+    range_map: RangeMap,
+    *,
+    max_distance_px: int = 48,
+    min_confidence: int = CONSISTENT_CONFIDENCE[0],
+    max_hole_deg: float = 20.0,
 ) -> RangeMap:
     """Return a range map whose invalid pixels have the range of the surface behind them.
 
@@ -29,19 +35,21 @@ def fill_from_neighbours(
         range_map: (H, W) with even W, the full sphere.
         max_distance_px: how far a path runs, in pixels at the equator; no path runs further than from pole to pole.
         min_confidence: trusted pixels have at least this confidence; 128 is consistent.
+        max_hole_deg: holes that hold a disc of a larger diameter stay invalid (`large_holes`): a sky has no range. 0
+            fills all.
 
     Returns:
         The range map; filled pixels have confidence 63, when next to a trusted pixel, down to 1.
 
     Raises:
-        UsageError: if max_distance_px is not positive
+        UsageError: if max_distance_px is not positive.
     """
     height, width = range_map.range.shape
     if max_distance_px < 1:
         raise UsageError(f"max_distance_px must be positive, got {max_distance_px}")
     from pano_mvs.algorithms.filters.kernels_fill import fill_holes  # compiles on import
 
-    wanted = ~range_map.valid
+    wanted = ~range_map.valid & ~large_holes(range_map.valid, max_hole_deg)
     trusted = range_map.valid & (range_map.confidence >= min_confidence)
     known = 1 / range_map.range.astype(np.float64)
     columns = columns_per_step((height, width), steps=8)
@@ -52,4 +60,4 @@ def fill_from_neighbours(
     low, high = FILLED_CONFIDENCE
     share = np.clip((distance[filled] - 1) / max_distance_px, 0, 1)
     confidence[filled] = np.rint(high - (high - low) * share)
-    return RangeMap(ranges, confidence)
+    return with_ranges(range_map, ranges, confidence)

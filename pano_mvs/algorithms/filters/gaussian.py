@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import cv2
 import numpy as np
 
+from pano_mvs.algorithms.filters.replacement import with_ranges
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import pad_panorama
 from pano_mvs.scene import RangeMap
@@ -40,4 +39,4 @@ def gaussian_range(range_map: RangeMap, *, window: int = 5, sigma_px: float = 1.
     kept = range_map.valid
     smoothed = np.full((height, width), np.nan, np.float32)
     smoothed[kept] = weighted[kept] / weight[kept]
-    return dataclasses.replace(range_map, range=smoothed)
+    return with_ranges(range_map, smoothed)

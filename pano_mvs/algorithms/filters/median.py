@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.filters.replacement import with_ranges
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import pad_panorama
 from pano_mvs.scene import RangeMap
@@ -41,7 +40,7 @@ def median_range(range_map: RangeMap, *, window: int = 5) -> RangeMap:
         for row, windows in enumerate(sliding_window_view(padded, (window, window))):
             filtered[row] = _median_of_windows(windows)
     filtered[~range_map.valid] = np.nan
-    return dataclasses.replace(range_map, range=filtered)
+    return with_ranges(range_map, filtered)
 
 
 def _check_window(window: int) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from pano_mvs.algorithms.filters.replacement import with_ranges
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import pixel_solid_angle
 from pano_mvs.scene import RangeMap
@@ -34,6 +36,5 @@ def remove_speckles(range_map: RangeMap, *, max_size_px: float = 60.0, max_relat
     sizes = np.bincount(labels[seen], weights=np.repeat(equator_px, width)[seen], minlength=height * width)
     small = seen & (sizes[np.maximum(labels, 0)] <= max_size_px)
     removed = small.reshape(height, width)
-    return RangeMap(
-        np.where(removed, np.float32(np.nan), range_map.range), np.where(removed, np.uint8(0), range_map.confidence)
-    )
+    ranges: NDArray[np.float32] = np.where(removed, np.float32(np.nan), range_map.range)
+    return with_ranges(range_map, ranges, np.where(removed, np.uint8(0), range_map.confidence))

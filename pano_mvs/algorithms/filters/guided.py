@@ -1,0 +1,135 @@
+"""The guided filter on the sphere: ranges that are, window by window, a linear function of the picture's colours.
+
+He, Sun and Tang, "Guided Image Filtering", TPAMI 2013, with a colour guide (section 3.5). Each pixel of the data term
+is weighted by its confidence, windows keep their solid angle up to the poles, and neither seam nor poles are borders.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.filters.confidence import confidence_weight
+from pano_mvs.algorithms.filters.replacement import with_ranges
+from pano_mvs.algorithms.filters.sphere_box import box_spread, box_sum
+from pano_mvs.core.errors import UsageError
+from pano_mvs.scene import RangeMap
+from pano_mvs.scene.range_map import FILLED_CONFIDENCE
+
+FloatArray = NDArray[np.float64]
+
+# Of the weight that a window would have with every pixel at its full: less than this says nothing.
+_LEAST_SUPPORT = 1e-6
+
+
+def guided_range(
+    range_map: RangeMap,
+    guide: NDArray[np.uint8],
+    *,
+    radius: int = 4,
+    epsilon: float = 4.0,
+    domain: Literal["range", "inverse"] = "inverse",
+    fill: bool = False,
+) -> RangeMap:
+    """Return a range map smoothed within what the picture shows as one surface.
+
+    In every window ω the values p are fitted by p ≈ a · I + b, minimising Σ w (a · I + b − p)² + ε² |a|² Σ w, I the
+    colours and w the weight of `confidence_weight`; a pixel then gets the mean of a and b over the windows that hold
+    it, each by the weight it has. Neither value leaves the limits of all values given.
+
+    Args:
+        range_map: (H, W) with even W, the full sphere.
+        guide: (H, W, 3) RGB picture.
+        radius: of the windows, in pixels at the equator.
+        epsilon: ε in grey levels: contrasts below are smoothed over, contrasts above are edges.
+        domain: what is linear in the colours: "inverse" (1/range) or "range".
+        fill: whether invalid pixels within reach of a window with data get a range (confidence 1–63); else they stay
+            invalid.
+
+    Raises:
+        UsageError: if guide and range map differ in size, the radius does not fit, or epsilon is not positive.
+    """
+    height, width = range_map.range.shape
+    if guide.shape != (height, width, 3) or guide.dtype != np.uint8:
+        raise UsageError(f"the guide must be ({height}, {width}, 3) uint8 like the range map, got {guide.shape} "
+                         f"{guide.dtype}")  # fmt: skip
+    if not 1 <= radius < height // 2 or not epsilon > 0:
+        raise UsageError(f"a guided filter needs 1 ≤ radius < H / 2 and a positive epsilon, got {radius}, {epsilon}")
+    valid = range_map.valid
+    if not valid.any():
+        return range_map
+    target = np.zeros((height, width))
+    target[valid] = range_map.range[valid]
+    if domain == "inverse":
+        target[valid] = 1 / target[valid]
+    weight = np.where(valid, confidence_weight(range_map.confidence), 0.0)
+    weight /= weight.max()
+    smooth, support = guided_values(target, weight, guide.astype(np.float64), radius=radius, epsilon=epsilon)
+    kept = support > 0 if fill else valid & (support > 0)
+    smooth = np.clip(smooth, target[valid].min(), target[valid].max())
+    ranges = np.full((height, width), np.nan, np.float32)
+    ranges[kept] = 1 / smooth[kept] if domain == "inverse" else smooth[kept]
+    ranges[valid & ~kept] = range_map.range[valid & ~kept]
+    low, high = FILLED_CONFIDENCE
+    filled = np.where(kept, np.rint(low + (high - low) * np.clip(support, 0, 1)), 0).astype(np.uint8)
+    return with_ranges(range_map, ranges, np.where(valid, range_map.confidence, filled))
+
+
+def guided_values(
+    target: FloatArray, weight: FloatArray, guide: FloatArray, *, radius: int, epsilon: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the filtered values and the mean weight within reach, (H, W) each; no value where the latter is 0.
+
+    Args:
+        target: (H, W) values, anything finite where the weight is 0.
+        weight: (H, W) in [0, 1].
+        guide: (H, W, 3) colours.
+        radius: of the windows.
+        epsilon: ε.
+    """
+    # Colours about the middle of their scale lose no digits in the differences of sums below.
+    colors = guide - 128.0
+    area = box_sum(np.ones_like(target), radius)
+    total = box_sum(weight, radius)
+    sure = total > _LEAST_SUPPORT * area
+    share = 1 / np.where(sure, total, 1)
+    mean_color = share[..., None] * box_sum(weight[..., None] * colors, radius)
+    mean = share * box_sum(weight * target, radius)
+    covariance = (
+        share[..., None] * box_sum((weight * target)[..., None] * colors, radius) - mean[..., None] * mean_color
+    )
+    slope = _solve_symmetric(_color_covariance(colors, weight, mean_color, share, radius), epsilon**2, covariance)
+    offset = mean - np.sum(slope * mean_color, axis=-1)
+    lines = np.concatenate([slope, offset[..., None]], axis=-1)
+    counted = np.where(sure, total / area, 0)
+    averaged = box_spread(counted[..., None] * lines, radius)
+    reach = box_spread(counted, radius)
+    known = reach > _LEAST_SUPPORT * area
+    averaged /= np.where(known, reach, 1)[..., None]
+    values = np.sum(averaged[..., :3] * colors, axis=-1) + averaged[..., 3]
+    return values, np.where(known, reach / np.maximum(box_spread(np.ones_like(target), radius), 1), 0)
+
+
+def _color_covariance(
+    colors: FloatArray, weight: FloatArray, mean: FloatArray, share: FloatArray, radius: int
+) -> FloatArray:
+    """Return the weighted covariance of the colours in each window, (H, W, 6): rr, rg, rb, gg, gb, bb."""
+    first, second = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
+    products = box_sum(weight[..., None] * colors[..., first] * colors[..., second], radius)
+    covariance: FloatArray = share[..., None] * products - mean[..., first] * mean[..., second]
+    return covariance
+
+
+def _solve_symmetric(matrix: FloatArray, ridge: float, right: FloatArray) -> FloatArray:
+    """Return (matrix + ridge) x = right by cofactors, for (…, 6) upper triangles and (…, 3) right sides."""
+    rr, rg, rb, gg, gb, bb = np.moveaxis(matrix, -1, 0)
+    rr, gg, bb = rr + ridge, gg + ridge, bb + ridge
+    cofactors = (gg * bb - gb * gb, gb * rb - rg * bb, rg * gb - gg * rb,
+                 rr * bb - rb * rb, rb * rg - rr * gb, rr * gg - rg * rg)  # fmt: skip
+    determinant = rr * cofactors[0] + rg * cofactors[1] + rb * cofactors[2]
+    x, y, z = np.moveaxis(right, -1, 0)
+    a, b, c, d, e, f = cofactors
+    solved = np.stack([a * x + b * y + c * z, b * x + d * y + e * z, c * x + e * y + f * z], axis=-1)
+    return np.asarray(solved / determinant[..., None], np.float64)

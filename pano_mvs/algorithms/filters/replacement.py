@@ -1,0 +1,21 @@
+"""Put new ranges into a range map."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.scene import RangeMap
+
+
+def with_ranges(
+    range_map: RangeMap, ranges: NDArray[np.float32], confidence: NDArray[np.uint8] | None = None
+) -> RangeMap:
+    """Return a range map with other ranges (H, W), and other confidences if given.
+
+    Normals stay where the range stayed.
+    """
+    normals = range_map.normals_in_cam
+    if normals is not None:
+        normals = np.where((ranges == range_map.range)[..., None], normals, np.float16(np.nan))
+    return RangeMap(ranges, range_map.confidence if confidence is None else confidence, normals)

@@ -1,0 +1,59 @@
+"""Sums over windows that are as wide on the sphere as they are high."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.filters.sphere_steps import columns_per_step
+from pano_mvs.geometry import pad_panorama
+
+FloatArray = NDArray[np.float64]
+
+
+def box_sum(values: FloatArray, radius: int) -> FloatArray:
+    """Return the sum over the window around each pixel, (H, W) or (H, W, C) as given; no NaN.
+
+    The window has 2 radius + 1 rows, over the poles where it must. Its columns are as many times more as a column of
+    the row at the window's own centre is narrower than one at the equator (whole numbers), and at most the full circle.
+
+    Args:
+        values: (H, W) or (H, W, C), the full sphere, even W.
+        radius: of the window in pixels at the equator, at least 1 and less than H / 2.
+    """
+    flat = _channels(values)
+    return _row_sums(_column_sums(flat, radius), _half_columns(values, radius)).reshape(values.shape)
+
+
+def box_spread(values: FloatArray, radius: int) -> FloatArray:
+    """Return the sum over all pixels whose window holds each pixel: the transpose of `box_sum`."""
+    flat = _channels(values)
+    return _column_sums(_row_sums(flat, _half_columns(values, radius)), radius).reshape(values.shape)
+
+
+def _channels(values: FloatArray) -> FloatArray:
+    return values.reshape(*values.shape[:2], -1).astype(np.float64)
+
+
+def _half_columns(values: FloatArray, radius: int) -> NDArray[np.int64]:
+    height, width = values.shape[:2]
+    wide = radius * columns_per_step((height, width), steps=2 * radius + 1)
+    return np.asarray(np.minimum(wide, (width - 1) // 2), np.int64)
+
+
+def _column_sums(values: FloatArray, radius: int) -> FloatArray:
+    """Return the sums over 2 radius + 1 rows around each pixel, over the poles where it must."""
+    padded = pad_panorama(values, radius)[:, radius:-radius]
+    above = np.concatenate([np.zeros_like(padded[:1]), np.cumsum(padded, axis=0)])
+    return np.asarray(above[2 * radius + 1 :] - above[: -2 * radius - 1])
+
+
+def _row_sums(values: FloatArray, half_columns: NDArray[np.int64]) -> FloatArray:
+    """Return the sums over 2 h + 1 columns around each pixel, h of each row its own; rows wrap."""
+    result = np.empty_like(values)
+    for half in np.unique(half_columns):
+        rows = half_columns == half
+        part = np.pad(values[rows], ((0, 0), (half + 1, half), (0, 0)), mode="wrap")
+        sums = np.cumsum(part, axis=1)
+        result[rows] = sums[:, 2 * half + 1 :] - sums[:, : -2 * half - 1]
+    return result

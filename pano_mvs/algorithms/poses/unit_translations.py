@@ -1,0 +1,31 @@
+"""Poses without translation scale factors: what the paper's ablation supposes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pano_mvs.geometry import Rigid3
+from pano_mvs.scene import Poses
+
+
+def unit_translations(poses: Poses) -> Poses:
+    """Return poses in which every camera stands at distance 1 from the first, in the direction where it was.
+
+    That is all that the essential matrices of the pairs with the first picture say (Yang, Kim & Lee, "Dense Depth
+    Estimation from Multiple 360-degree Images Using Virtual Depth", section 3.2: the scale factors of all views are
+    taken as 1). Sparse points do not fit such cameras and are left out; a camera at the first one's place stays there.
+    """
+    centers = poses.centers
+    moved: dict[str, Rigid3] = {}
+    for idx, name in enumerate(poses.names):
+        offset = centers[idx] - centers[0]
+        length = float(np.linalg.norm(offset))
+        center = centers[0] + (offset / length if length > 0 else offset)
+        moved[name] = Rigid3.from_center(poses.rotations[idx], center)
+    return Poses.without_points(
+        moved,
+        rejected=poses.rejected,
+        frame=poses.frame,
+        scale="every camera is at distance 1 from the first: no scale factors",
+        metric=False,
+    )

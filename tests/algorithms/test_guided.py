@@ -1,0 +1,233 @@
+"""The guided filter, windows and holes on the sphere, and what filters leave alone."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pano_mvs.algorithms.filters.bilateral_solver import fast_bilateral_solver
+from pano_mvs.algorithms.filters.confidence import confidence_weight, require_confidence
+from pano_mvs.algorithms.filters.fill import fill_from_neighbours
+from pano_mvs.algorithms.filters.gaussian import gaussian_range
+from pano_mvs.algorithms.filters.guided import guided_range, guided_values
+from pano_mvs.algorithms.filters.holes import large_holes
+from pano_mvs.algorithms.filters.median import median_range
+from pano_mvs.algorithms.filters.speckle import remove_speckles
+from pano_mvs.algorithms.filters.sphere_box import box_spread, box_sum
+from pano_mvs.algorithms.filters.sphere_steps import columns_per_step
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import Rigid3, ray_grid
+from pano_mvs.scene import RangeMap
+from pano_mvs.testing.room import default_room, render
+from tests.algorithms.range_scenes import SEEN, TRUSTED, as_map, random_map, rolled
+
+SIZE = (24, 48)
+COLORS = np.random.default_rng(7).integers(0, 256, (*SIZE, 3), np.uint8)
+
+
+def window(row, column, radius, size_hw):
+    """The pixels of a window, by the definition: rows over the poles, columns as wide as at the window's centre."""
+    height, width = size_hw
+    half = min(radius * columns_per_step(size_hw, steps=2 * radius + 1)[row], (width - 1) // 2)
+    pixels = []
+    for y in range(row - radius, row + radius + 1):
+        turn = 0 if 0 <= y < height else width // 2
+        inside = -1 - y if y < 0 else 2 * height - 1 - y if y >= height else y
+        pixels += [(inside, (x + turn) % width) for x in range(column - half, column + half + 1)]
+    return tuple(np.array(pixels).T)
+
+
+@pytest.mark.parametrize("radius", [1, 4])
+@pytest.mark.parametrize("shape", [SIZE, (*SIZE, 2)])
+def test_sums_are_those_of_the_windows(radius, shape):
+    values = np.random.default_rng(0).normal(size=shape)
+    plain = [[values[window(y, x, radius, SIZE)].sum(axis=0) for x in range(SIZE[1])] for y in range(SIZE[0])]
+    np.testing.assert_allclose(box_sum(values, radius), plain, atol=1e-10)
+    other = np.random.default_rng(1).normal(size=shape)
+    assert np.sum(box_sum(values, radius) * other) == pytest.approx(np.sum(values * box_spread(other, radius)))
+
+
+def test_guided_values_are_least_squares_in_every_window():
+    rng = np.random.default_rng(1)
+    target, weight = rng.uniform(0.2, 1, SIZE), rng.uniform(0, 1, SIZE) * (rng.random(SIZE) < 0.6)
+    radius, epsilon = 2, 10.0
+    lines, share = np.zeros((*SIZE, 4)), np.zeros(SIZE)
+    holders = {place: [] for place in np.ndindex(SIZE)}
+    for y in range(SIZE[0]):
+        for x in range(SIZE[1]):
+            at = window(y, x, radius, SIZE)
+            for place in zip(*at, strict=True):
+                holders[place].append((y, x))
+            w, total = weight[at], weight[at].sum()
+            design = np.c_[COLORS[at] - 128.0, np.ones(len(w))]
+            normal = design.T @ (w[:, None] * design) + epsilon**2 * total * np.diag([1, 1, 1, 0])
+            lines[y, x] = np.linalg.solve(normal, design.T @ (w * target[at]))
+            share[y, x] = total / len(w)
+    holding = {place: tuple(np.array(windows).T) for place, windows in holders.items()}
+    values, support = guided_values(target, weight, COLORS.astype(float), radius=radius, epsilon=epsilon)
+    for y, x in [(0, 0), (0, 30), (5, 47), (12, 20), (23, 3)]:
+        at = holding[y, x]
+        mean = (share[at][:, None] * lines[at]).sum(axis=0) / share[at].sum()
+        assert values[y, x] == pytest.approx(mean @ np.append(COLORS[y, x] - 128.0, 1), rel=1e-6)
+        assert support[y, x] == pytest.approx(share[at].mean())
+
+
+def test_guided_smooths_noise_within_what_looks_alike_and_keeps_edges():
+    image, ranges = render(default_room(texture="weak"), Rigid3.identity(), (96, 192))
+    noisy = ranges * (1 + 0.05 * np.random.default_rng(0).standard_normal(ranges.shape)).astype(np.float32)
+    inner = np.s_[20:76]
+    before, after = (
+        np.median(np.abs(found / ranges - 1)[inner])
+        for found in (noisy, guided_range(as_map(noisy), image, radius=3, epsilon=8).range)
+    )
+    assert after < 0.5 * before
+    two = np.where(np.arange(192) < 96, 1.0, 3.0) * np.ones((96, 1))
+    picture = np.repeat((60 * two[..., None]).astype(np.uint8), 3, axis=-1)
+    kept = guided_range(as_map(two), picture, epsilon=1).range
+    np.testing.assert_allclose(kept[inner], two[inner], rtol=2e-3)
+    flat = guided_range(as_map(two), np.full_like(picture, 90)).range
+    assert 1.2 < flat[48, 96] < 2.5, "without an edge in the picture there is none in the ranges"
+
+
+def test_guided_follows_the_sure_pixels_and_fills_only_when_asked():
+    confidence, ranges = np.full(SIZE, TRUSTED), np.full(SIZE, 2.0)
+    ranges[10:13, 20:23], confidence[10:13, 20:23] = 7.0, 70
+    ranges[5, 5] = np.nan
+    range_map = as_map(ranges, confidence)
+    smoothed = guided_range(range_map, COLORS)
+    assert np.nanmax(smoothed.range) < 2.3
+    assert np.isnan(smoothed.range[5, 5])
+    np.testing.assert_array_equal(smoothed.confidence, range_map.confidence)
+    filled = guided_range(range_map, COLORS, fill=True)
+    assert filled.range[5, 5] == pytest.approx(2.0, rel=0.05)
+    assert 1 <= filled.confidence[5, 5] <= 63
+    filled.check()
+
+
+def brute_holes(valid, max_hole_deg):
+    """Opening of the hole by a disc, by all pairs of pixels."""
+    rays = ray_grid(valid.shape).reshape(-1, 3)
+    angle_deg = np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1)))
+    within = angle_deg <= max_hole_deg / 2
+    core = ~(within & valid.ravel()[None]).any(axis=1)
+    return (within & core[None]).any(axis=1).reshape(valid.shape) & ~valid
+
+
+@pytest.mark.parametrize("diameter", [5.1, 13.3, 40.7, 121.9])  # no two pixels are as far apart as half of these
+@pytest.mark.parametrize("share", [0.02, 0.2, 0.5, 0.9])
+def test_large_holes_are_the_opening_by_a_disc(diameter, share):
+    rng = np.random.default_rng(round(100 * share))
+    valid = np.kron(rng.random((6, 12)) < share, np.ones((4, 4))) > 0
+    assert valid.any()
+    np.testing.assert_array_equal(large_holes(valid, diameter), brute_holes(valid, diameter))
+
+
+def test_rims_of_single_pixels_are_found():
+    valid = np.random.default_rng(5).random(SIZE) < 0.7
+    np.testing.assert_array_equal(large_holes(valid, 15.7), brute_holes(valid, 15.7))
+
+
+def test_no_hole_is_large_at_zero_and_all_is_where_nothing_is_valid():
+    valid = np.zeros(SIZE, bool)
+    assert not large_holes(valid, 0).any()
+    assert large_holes(valid, 20).all()
+    assert not large_holes(~valid, 20).any()
+    with pytest.raises(UsageError, match="max_hole_deg"):
+        large_holes(valid, -1)
+
+
+@pytest.mark.parametrize("solve", [fast_bilateral_solver, lambda m, _, **settings: fill_from_neighbours(m, **settings)])
+def test_a_sky_stays_a_hole_and_cracks_are_filled(solve):
+    ranges = np.full((64, 128), 3.0)
+    ranges[:20] = np.nan  # all above 34° elevation
+    ranges[40:43, 50:53] = np.nan
+    ranges[30] = np.nan
+    range_map, image = as_map(ranges, TRUSTED), np.full((64, 128, 3), 100, np.uint8)
+    filled = solve(range_map, image, max_hole_deg=30)
+    np.testing.assert_array_equal(np.isnan(filled.range), np.arange(64)[:, None] * np.ones(128) < 20)
+    filled.check()
+    everything = solve(range_map, image, max_hole_deg=0)
+    assert everything.valid[12:].all()
+
+
+def test_what_is_confirmed_keeps_its_range_in_the_solver():
+    rng = np.random.default_rng(3)
+    confidence = np.where(rng.random(SIZE) < 0.5, TRUSTED, SEEN)
+    range_map = as_map(rng.uniform(1, 4, SIZE), confidence)
+    plain = np.full((*SIZE, 3), 100, np.uint8)
+    solved = fast_bilateral_solver(range_map, plain, smoothness=30)
+    sure = confidence == TRUSTED
+    np.testing.assert_array_equal(solved.range[sure], range_map.range[sure])
+    assert np.mean(solved.range[~sure] == range_map.range[~sure]) < 0.01
+    smoothed = fast_bilateral_solver(range_map, plain, smoothness=30, keep_confidence=256)
+    assert np.mean(smoothed.range[sure] == range_map.range[sure]) < 0.01
+    np.testing.assert_array_equal(smoothed.range[~sure], solved.range[~sure])
+
+
+@pytest.mark.parametrize("least", [64, 128, 200])
+def test_only_what_is_sure_enough_is_left(least):
+    range_map = random_map(np.random.default_rng(0), SIZE)
+    left = require_confidence(range_map, min_confidence=least)
+    left.check()
+    np.testing.assert_array_equal(left.valid, range_map.confidence >= least)
+    np.testing.assert_array_equal(left.range[left.valid], range_map.range[left.valid])
+    assert np.all(np.diff(confidence_weight(np.arange(256, dtype=np.uint8))) > 0)
+
+
+FILTERS = {
+    "median": median_range,
+    "gaussian": gaussian_range,
+    "speckle": partial(remove_speckles, max_size_px=4, max_relative_step=0.5),
+    "fill": partial(fill_from_neighbours, max_distance_px=6),
+    "confidence": require_confidence,
+    "guided": partial(guided_range, guide=COLORS, radius=2),
+    "solver": partial(fast_bilateral_solver, guide=COLORS, sigma_spatial=4),
+}
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_normals_stay_where_the_range_stayed_and_are_unknown_elsewhere(name):
+    range_map = random_map(np.random.default_rng(2), SIZE)
+    normals = np.where(range_map.valid[..., None], -ray_grid(SIZE), np.nan).astype(np.float16)
+    given = RangeMap(range_map.range, range_map.confidence, normals)
+    filtered = FILTERS[name](given)
+    filtered.check()
+    stayed = filtered.range == range_map.range
+    np.testing.assert_array_equal(filtered.normals_in_cam[stayed], normals[stayed])
+    assert np.isnan(filtered.normals_in_cam[~stayed]).all()
+
+
+@pytest.mark.parametrize(
+    "order", [list(FILTERS), list(FILTERS)[::-1], ["solver", "fill", "guided", "speckle", "median"]]
+)
+def test_any_chain_of_filters_gives_a_sound_map(order):
+    range_map = random_map(np.random.default_rng(4), SIZE)
+    for name in order:
+        range_map = FILTERS[name](range_map)
+        range_map.check()
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 1000), columns=st.integers(-60, 60))
+def test_rolling_rolls_guided_and_limited_fill(seed, columns):
+    range_map = random_map(np.random.default_rng(seed), SIZE, holes=0.7)
+    for run in (
+        lambda m, colors: guided_range(m, colors, radius=2, fill=True),
+        lambda m, _: fill_from_neighbours(m, max_distance_px=6, max_hole_deg=25),
+    ):
+        expected = rolled(run(range_map, COLORS), columns)
+        got = run(rolled(range_map, columns), np.roll(COLORS, columns, 1))
+        np.testing.assert_allclose(got.range, expected.range, rtol=1e-4)
+        np.testing.assert_array_equal(got.confidence > 0, expected.confidence > 0)
+
+
+@pytest.mark.parametrize("harm", [{"radius": 0}, {"radius": 12}, {"epsilon": 0.0}])
+def test_bad_settings_are_refused(harm):
+    with pytest.raises(UsageError, match="guided filter needs"):
+        guided_range(as_map(np.ones(SIZE)), COLORS, **harm)
+    with pytest.raises(UsageError, match="guide must be"):
+        guided_range(as_map(np.ones(SIZE)), COLORS[::2])
+    with pytest.raises(UsageError, match="min_confidence"):
+        require_confidence(as_map(np.ones(SIZE)), min_confidence=0)
