@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
-from pano_mvs.algorithms.sweep import numpy_backend
+from pano_mvs.algorithms.sweep import numpy_backend, opencv_backend
 from pano_mvs.algorithms.sweep.costs import BUILTIN_COSTS, SWEEP_COSTS
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.winner import Winners
@@ -57,7 +57,11 @@ def _numba(work: SweepInput) -> Winners:
 
 SWEEP_BACKENDS = Parts(
     "sweep backend",
-    {"numba": SweepBackend(_numba, BUILTIN_COSTS), "numpy": SweepBackend(numpy_backend.find_winners)},
+    {
+        "numba": SweepBackend(_numba, BUILTIN_COSTS),
+        "numpy": SweepBackend(numpy_backend.find_winners),
+        "opencv": SweepBackend(opencv_backend.find_winners),
+    },
 )
 
 

@@ -48,7 +48,11 @@ def winners_of(volume: FloatArray) -> Winners:
 
 def _combined_cost(work: SweepInput, virtual_range: float) -> FloatArray:
     """Return the mean cost of one plane over the sources that count, (H, W)."""
-    costs = np.stack([_source_cost(work, idx, virtual_range) for idx in range(len(work.sources))])
+    return combine_costs(np.stack([_source_cost(work, idx, virtual_range) for idx in range(len(work.sources))]), work)
+
+
+def combine_costs(costs: NDArray[np.floating], work: SweepInput) -> FloatArray:
+    """Return the mean cost of the sources that count, (S, H, W) to (H, W); infinite stands for no vote."""
     votes = np.isfinite(costs)
     weights = source_weights(costs.shape[1:], work.source_from_reference, work.settings)
     weights = np.where(votes, weights if len(weights) else 1.0, 0.0)
@@ -73,14 +77,14 @@ def _source_cost(work: SweepInput, idx: int, virtual_range: float) -> FloatArray
     if settings.cost == "zncc":
         cost = _zncc(work.reference[..., 0], warped[..., 0], work)
     else:
-        pixel_cost = _pixel_cost(work.reference, warped, work)
-        cost = _box_mean(pixel_cost, settings.box_radius, spherical=settings.spherical_window)
+        per_pixel = pixel_cost(work.reference, warped, work)
+        cost = _box_mean(per_pixel, settings.box_radius, spherical=settings.spherical_window)
     if work.source_valid is not None:
         cost[sample_panorama(work.source_valid[idx], pixels) < 1 - 1e-9] = np.inf
     return cost
 
 
-def _pixel_cost(reference: NDArray[np.uint8], warped: FloatArray, work: SweepInput) -> FloatArray:
+def pixel_cost(reference: NDArray[np.uint8], warped: FloatArray, work: SweepInput) -> FloatArray:
     """Return what each pixel costs by itself, (H, W), by one of our costs or a plugin's."""
     settings = work.settings
     own = plugin_cost(settings.cost)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -42,3 +44,53 @@ def neighbours(picture: NDArray[Scalar], rows: int, columns: NDArray[np.int64]) 
     pad = abs(rows)
     shifted = pad_panorama(picture, pad)[pad + rows : pad + rows + height, pad : pad + width]
     return np.take_along_axis(shifted, (np.arange(width) + columns[:, None]) % width, axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class WindowBands:
+    """The rows of a picture in bands within which all windows are equally wide, to be worked on by slices.
+
+    Attributes:
+        radius: rows on either side of a window's centre.
+        columns: (H, 2 radius + 1) columns of a window's pixels against its centre.
+        width: of the picture.
+    """
+
+    radius: int
+    columns: NDArray[np.int64]
+    width: int
+
+    @staticmethod
+    def of(size_hw: tuple[int, int], radius: int, *, spherical: bool) -> WindowBands:
+        """Return the bands of a picture."""
+        return WindowBands(radius, column_offsets(size_hw, radius, spherical=spherical), size_hw[1])
+
+    @property
+    def margin(self) -> int:
+        """The columns that `pad` adds on either side."""
+        return int(np.abs(self.columns).max())
+
+    def pad(self, picture: NDArray[Scalar]) -> NDArray[Scalar]:
+        """Return a picture (H, W) with `radius` rows more at either pole and `margin` columns more at the seam."""
+        rows = pad_panorama(picture, self.radius)[:, self.radius : self.radius + picture.shape[1]]
+        return np.pad(rows, ((0, 0), (self.margin, self.margin)), mode="wrap")
+
+    def reaches(self) -> Iterator[tuple[slice, int]]:
+        """Yield the rows of each band, and the columns of its windows on either side."""
+        starts = np.flatnonzero(np.any(np.diff(self.columns, axis=0, prepend=self.columns[:1] - 1), axis=1))
+        for start, stop in zip(starts, [*starts[1:], len(self.columns)], strict=True):
+            yield slice(int(start), int(stop)), int(self.columns[start, -1])
+
+    def places(self) -> Iterator[tuple[slice, list[tuple[slice, slice]]]]:
+        """Yield the rows of each band, and where in a padded picture lies each place of the window, row by row."""
+        for rows, _ in self.reaches():
+            firsts = [self.margin + int(column) for column in self.columns[rows.start]]
+            columns = [slice(first, first + self.width) for first in firsts]
+            yield (
+                rows,
+                [
+                    (slice(rows.start + step, rows.stop + step), column)
+                    for step in range(2 * self.radius + 1)
+                    for column in columns
+                ],
+            )
