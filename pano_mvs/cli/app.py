@@ -7,6 +7,8 @@
 from __future__ import annotations
 
 import io
+import os
+import shlex
 import sys
 import traceback
 from collections.abc import Callable
@@ -21,6 +23,7 @@ from rich.markup import escape
 from pano_mvs import __version__
 from pano_mvs.cli.default_command import RunByDefault
 from pano_mvs.core.errors import PanoMvsError, WorkflowError
+from pano_mvs.engine.executors.threads import available_threads, bound_environment
 
 app = typer.Typer(
     name="pano-mvs",
@@ -61,7 +64,8 @@ def _guarded(command: Command) -> Command:
                 errors.print(f"[red]error:[/] {escape(problem)}", highlight=False, soft_wrap=True)
             raise typer.Exit(error.exit_code) from None
         except KeyboardInterrupt:
-            errors.print("interrupted; what was finished is kept: the same command goes on from here")
+            errors.print("interrupted; what was finished is kept: the same command goes on from here:", highlight=False)
+            errors.print(f"  {escape(shlex.join(['pano-mvs', *sys.argv[1:]]))}", highlight=False, soft_wrap=True)
             raise typer.Exit(130) from None
         except typer.Exit:
             raise
@@ -96,13 +100,22 @@ def run(
     out: OutOption = None,
     overrides: SetOption = None,
     cache: CacheOption = None,
-) -> None:
+    executor: Annotated[str, typer.Option("--executor", help="serial, processes or dask; by default processes where "
+                                          "there is more than one core.", show_default=False)] = "",
+    workers: Annotated[int, typer.Option("--workers", min=0, help="Units at a time; 0: as many as there are cores "
+                                         "for.")] = 0,
+    threads: Annotated[int, typer.Option("--threads-per-worker", min=0, help="Threads of each; 0: an equal share of "
+                                         "the cores.")] = 0,
+    scheduler: Annotated[str, typer.Option("--scheduler", metavar="ADDRESS", help="An existing dask scheduler, such as "
+                                           "tcp://host:8786, whose workers see the cache.", show_default=False)] = "",
+    as_json: Annotated[bool, typer.Option("--json", help="Print events, one JSON object in a line.")] = False,
+) -> None:  # fmt: skip
     """Run a workflow; the same command resumes it."""
-    from pano_mvs.cli.run_command import run_workflow
+    from pano_mvs.cli.run_command import Execution, run_workflow
     from pano_mvs.cli.session import open_session
 
     session = open_session(workflow, overrides=overrides or [], images=images, cache=cache, out=out)
-    raise typer.Exit(run_workflow(session, Console()))
+    raise typer.Exit(run_workflow(session, Execution(executor, workers, threads, scheduler, as_json)))
 
 
 @app.command()
@@ -182,8 +195,46 @@ def evaluate_model(
     evaluate_poses(model, truth, Console(), as_json=as_json)
 
 
+@evaluate_app.command("cloud")
+@_guarded
+def evaluate_points(
+    cloud: Annotated[Path, typer.Argument(help="A PLY file, or the output folder of a run.")],
+    truth: Annotated[Path, typer.Option("--truth", help="Folder with poses.json and depth.npz, or a reference PLY.")],
+    poses: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--poses", help="The poses it was made with; without, a PLY lies in the truth's frame."),
+    ] = None,
+    true_poses: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--true-poses", help="The true poses in the frame of a reference PLY."),
+    ] = None,
+    thresholds: Annotated[
+        list[float], typer.Option("--threshold", help="A tolerance in the truth's unit; may be given repeatedly.")
+    ] = [0.05, 0.02],  # noqa: B006  # typer reads it and never changes it
+    picture: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--picture", help="A PNG to write of where the errors are."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Compare a cloud with the true surface: accuracy, completeness, F-score."""
+    from pano_mvs.cli.evaluate_cloud import evaluate_cloud
+
+    evaluate_cloud(
+        cloud,
+        truth,
+        Console(),
+        poses=poses,
+        true_poses=true_poses,
+        thresholds=thresholds,
+        picture=picture,
+        as_json=as_json,
+    )
+
+
 def main() -> None:
     """Run the command line."""
+    bound_environment(os.environ, available_threads())  # before a command loads the libraries
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a log in another encoding is no reason to fail

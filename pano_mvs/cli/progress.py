@@ -1,23 +1,32 @@
-"""A progress bar per stage on a terminal, plain lines elsewhere."""
+"""A progress bar per stage and one for the run on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
+import time
 from types import TracebackType
 
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from pano_mvs.engine.events import Outcome, StageSummary
+from pano_mvs.cli.estimate import Estimate
+from pano_mvs.engine.events import Failure, Outcome, StageSummary
+
+_LINE_EVERY_S = 30.0
+_SHOWN_LINES = 5
 
 
 class ProgressBars:
     """An observer of a run that draws it."""
 
-    def __init__(self, console: Console) -> None:
+    def __init__(self, console: Console, *, stages: int = 0, workers: int = 1) -> None:
         self.console = console
+        self._stages = stages
+        self._estimate = Estimate(workers)
         self._tasks: dict[str, TaskID] = {}
+        self._run: TaskID | None = None
         self._progress: Progress | None = None
+        self._next_line_s = time.monotonic() + _LINE_EVERY_S
         if console.is_terminal:
             columns = (TextColumn("{task.description:<14}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
             self._progress = Progress(*columns, TextColumn("{task.fields[state]}"), console=console)
@@ -26,6 +35,7 @@ class ProgressBars:
         """Start drawing."""
         if self._progress is not None:
             self._progress.start()
+            self._run = self._progress.add_task("[bold]all[/]", total=0, state="")
         return self
 
     def __exit__(
@@ -36,17 +46,43 @@ class ProgressBars:
             self._progress.stop()
 
     def stage_started(self, name: str, units: int) -> None:
-        """Add a bar."""
-        if self._progress is not None:
-            self._tasks[name] = self._progress.add_task(name, total=units, state="")
+        """Add a bar, or begin it anew."""
+        self._estimate.start(name, units)
+        if self._progress is None or self._run is None:
+            return
+        if name in self._tasks:
+            self._progress.reset(self._tasks[name], total=units, state="")
+        else:
+            self._tasks[name] = self._progress.add_task(escape(name), total=units, state="")
+        known = self._estimate.stages.values()
+        self._progress.update(
+            self._run, total=sum(clock.units for clock in known), completed=sum(c.done for c in known)
+        )
+
+    def unit_started(self, name: str, item: str) -> None:
+        """Say nothing: the bars show what is done."""
+
+    def unit_failed(self, failure: Failure) -> None:
+        """Say at once what failed, and what it printed last."""
+        label = f"{failure.stage}:{failure.item}" if failure.item else failure.stage
+        self.console.print(f"[red]failed[/] {escape(label)}", highlight=False, soft_wrap=True)
+        for line in failure.said[-_SHOWN_LINES:]:
+            self.console.print(f"  | {escape(line)}", highlight=False, soft_wrap=True)
 
     def unit_finished(self, name: str, item: str, outcome: Outcome, seconds: float) -> None:
-        """Move the bar on; say at once what failed."""
-        if self._progress is not None:
-            self._progress.advance(self._tasks[name])
-        if outcome == "failed":
-            label = f"{name}:{item}" if item else name
-            self.console.print(f"[red]failed[/] {escape(label)} after {seconds:.1f} s", highlight=False)
+        """Move the bars on; which unit it was, they do not show."""
+        del item
+        self._estimate.count(name, seconds, computed=outcome in ("run", "failed"))
+        if self._progress is not None and self._run is not None:
+            self._progress.update(self._tasks[name], advance=1, state=self._estimate.of_stage(name))
+            self._progress.update(self._run, advance=1, state=self._estimate.of_run(self._stages))
+        elif time.monotonic() > self._next_line_s:
+            self._next_line_s = time.monotonic() + _LINE_EVERY_S
+            clock = self._estimate.stages[name]
+            left = ", ".join(
+                text for text in (self._estimate.of_stage(name), self._estimate.of_run(self._stages)) if text
+            )
+            self.console.print(f"{name:<14} {clock.done} of {clock.units}  {left}", highlight=False)
 
     def stage_finished(self, summary: StageSummary) -> None:
         """Say what the stage did."""

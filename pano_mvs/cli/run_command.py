@@ -3,49 +3,140 @@
 from __future__ import annotations
 
 import json
+import signal
+import sys
+import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from pano_mvs.cli.json_events import SCHEMA, JsonEvents
 from pano_mvs.cli.progress import ProgressBars
 from pano_mvs.cli.session import Session
+from pano_mvs.cli.streams import apart
 from pano_mvs.cli.summary import summarise
-from pano_mvs.core.errors import UsageError
+from pano_mvs.core.errors import PanoMvsError, UsageError
 from pano_mvs.core.files import write_text
 from pano_mvs.engine.blobs import DamagedBlobError
+from pano_mvs.engine.events import Observer, RunResult
+from pano_mvs.engine.executors.choose import make_executor
+from pano_mvs.engine.executors.protocol import Executor
 from pano_mvs.engine.params import files_of
 from pano_mvs.engine.run import Run
 from pano_mvs.engine.store import Store
 from pano_mvs.report.page import write_report
 
+INTERRUPTED = 130
 _SHOWN_FAILURES = 20
 
 
-def run_workflow(session: Session, console: Console) -> int:
+@dataclass(frozen=True, slots=True)
+class Execution:
+    """How a run is to be carried out.
+
+    Attributes:
+        executor: `serial`, `processes`, `dask`; empty for what fits the rest and this host.
+        workers: units at a time; 0 for as many as there are cores for.
+        threads: of each worker; 0 for an equal share of the cores.
+        scheduler: address of a dask scheduler.
+        as_json: whether to write events for programs to the standard output, instead of lines for people.
+    """
+
+    executor: str = ""
+    workers: int = 0
+    threads: int = 0
+    scheduler: str = ""
+    as_json: bool = False
+
+
+def run_workflow(session: Session, execution: Execution = Execution()) -> int:
     """Run a workflow, write run.json and report.html, print what came out, and return the exit code."""
-    started, clock = datetime.now(UTC), time.perf_counter()
+    stream = apart(sys.stdout)
     _check_output(session)
     store = Store(session.store_root)
-    earlier = earlier_files(session.out)
-    with ProgressBars(console) as bars:
-        run = Run(session.workflow, session.graph, store, session.out, observer=bars)
-        while True:
-            result = run.execute(earlier_files=earlier)
-            try:
-                summary = summarise(run, result, started=started, seconds=time.perf_counter() - clock)
-                break
-            except DamagedBlobError as error:  # found only now; it has been removed, so a further round computes it
-                bars.warn(str(error))
-    write_text(session.out / "run.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
-    write_report(session.out, summary)
+    executor = make_executor(store, execution.executor, workers=execution.workers, threads=execution.threads,
+                             scheduler=execution.scheduler)  # fmt: skip
+    try:
+        with interrupted_by_termination():
+            if execution.as_json:
+                return _run_for_programs(session, store, executor, JsonEvents(stream))
+            return _run_for_people(session, store, executor, Console(file=stream))
+    finally:
+        executor.close()
+
+
+def _run_for_people(session: Session, store: Store, executor: Executor, console: Console) -> int:
+    bars = ProgressBars(console, stages=len(session.workflow.stages), workers=executor.capacity)
+    with bars:
+        result, summary = _run(session, store, executor, bars)
     print_summary(summary, session.out, console, written=len(result.written))
     return result.exit_code
+
+
+def _run_for_programs(session: Session, store: Store, executor: Executor, events: JsonEvents) -> int:
+    clock = time.perf_counter()
+    counts: Mapping[str, int] = {}
+    exit_code, stopped = 1, "internal error"
+    events.write("run_started", schema=SCHEMA, workflow=session.workflow.name, stages=list(session.graph.order),
+                 executor=executor.name, workers=executor.capacity, threads=executor.threads,
+                 out=str(session.out))  # fmt: skip
+    try:
+        result, summary = _run(session, store, executor, events)
+        exit_code, stopped, counts = result.exit_code, result.stopped, summary["units"]
+    except PanoMvsError as error:
+        exit_code, stopped = error.exit_code, str(error)
+        raise
+    except KeyboardInterrupt:
+        exit_code, stopped = INTERRUPTED, "interrupted"
+        raise
+    finally:
+        events.write("run_finished", exit_code=exit_code, stopped=stopped,
+                     **{name: counts.get(name, 0) for name in ("run", "cached", "failed", "blocked")},
+                     seconds=round(time.perf_counter() - clock, 3), out=str(session.out))  # fmt: skip
+    return exit_code
+
+
+def _run(session: Session, store: Store, executor: Executor, observer: Observer) -> tuple[RunResult, dict[str, Any]]:
+    """Run, and write what there is to say of it into the output folder."""
+    started, clock = datetime.now(UTC), time.perf_counter()
+    earlier = earlier_files(session.out)
+    run = Run(session.workflow, session.graph, store, session.out, observer=observer, executor=executor)
+    while True:
+        result = run.execute(earlier_files=earlier)
+        try:
+            summary = summarise(run, result, started=started, seconds=time.perf_counter() - clock)
+            break
+        except DamagedBlobError as error:  # found only now; it has been removed, so a further round computes it
+            observer.warn(str(error))
+    write_text(session.out / "run.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
+    write_report(session.out, summary)
+    return result, summary
+
+
+@contextmanager
+def interrupted_by_termination() -> Iterator[None]:
+    """Let a request to terminate (SIGTERM) end a run as an interrupt does."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only a main thread is told
+        return
+
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _check_output(session: Session) -> None:
@@ -95,6 +186,8 @@ def _print_failures(summary: Mapping[str, Any], console: Console) -> None:
         label = f"{failure['stage']}:{failure['item']}" if failure["item"] else failure["stage"]
         text = f"{label}: {failure['cause']} — {failure['consequence']}"
         console.print(f"[red]failed:[/] {escape(text)}", highlight=False, soft_wrap=True)
+        if failure["log"]:
+            console.print(f"  what it printed is in {escape(failure['log'])}", highlight=False, soft_wrap=True)
     if len(causes) > _SHOWN_FAILURES:
         console.print(f"… and {len(causes) - _SHOWN_FAILURES} more, all in run.json", highlight=False)
     if summary["blocked"]:

@@ -26,6 +26,7 @@ def summarise(run: Run, result: RunResult, *, started: datetime, seconds: float)
         "workflow": {"name": workflow.name, "path": str(workflow.path or ""), "overrides": list(workflow.overrides)},
         "version": pano_mvs.__version__,
         "started": started.isoformat(timespec="seconds"),
+        "executor": {"name": run.executor.name, "workers": run.executor.capacity, "threads": run.executor.threads},
         "seconds": round(seconds, 3),
         "exit_code": result.exit_code,
         "stopped": result.stopped,
@@ -37,7 +38,14 @@ def summarise(run: Run, result: RunResult, *, started: datetime, seconds: float)
         },
         "stages": [_stage(summary, workflow) for summary in result.stages],
         "failures": [
-            {"stage": f.stage, "item": f.item, "cause": f.cause, "consequence": f.consequence, "trace": f.trace}
+            {
+                "stage": f.stage,
+                "item": f.item,
+                "cause": f.cause,
+                "consequence": f.consequence,
+                "trace": f.trace,
+                "log": f.log,
+            }
             for f in result.failures
             if not f.blocked
         ],
@@ -78,6 +86,7 @@ def _stage(summary: StageSummary, workflow: Workflow) -> dict[str, Any]:
         "failed": summary.failed,
         "blocked": summary.blocked,
         "seconds": round(summary.seconds, 3),
+        "unit_seconds": round(summary.unit_seconds, 3),
         "metrics": summary.metrics,
     }
 

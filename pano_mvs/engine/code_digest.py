@@ -21,6 +21,22 @@ def code_digest(path: Path) -> str:
     return digest_from_value(trees)
 
 
+def code_texts(path: Path) -> tuple[str, dict[str, str]]:
+    """Return the name of a Python file and the texts, by name, of it and of the local files that it imports.
+
+    The names are relative to one folder: written anywhere in the same places, the files are the same plugin.
+
+    Raises:
+        OSError: if a file cannot be read.
+        SyntaxError: if one is not Python.
+    """
+    path = path.resolve()
+    roots, trees = _Roots.of(path), dict[str, str]()
+    _collect(path, roots, trees)
+    base = roots.package.parent if roots.package is not None else roots.folder
+    return roots.name_of(path), {name: (base / name).read_text(encoding="utf-8") for name in trees}
+
+
 @dataclass(frozen=True, slots=True)
 class _Roots:
     """Where absolute imports are looked up.

@@ -20,6 +20,8 @@ class Failure:
         trace: the Python traceback, if the stage's own code broke.
         consequence: what the result lacks because of it.
         blocked: whether the unit did not even run, for want of an input that failed.
+        log: file with what the unit printed, if it printed anything.
+        said: the last lines of it.
     """
 
     stage: str
@@ -28,11 +30,17 @@ class Failure:
     trace: str = ""
     consequence: str = ""
     blocked: bool = False
+    log: str = ""
+    said: tuple[str, ...] = ()
 
 
 @dataclass(slots=True)
 class StageSummary:
-    """What happened in one stage; metrics are means over its units, `unit_metrics` each unit's own."""
+    """What happened in one stage; metrics are means over its units, `unit_metrics` each unit's own.
+
+    `seconds` passed from its first unit to its last, in which units of other stages may have run too; its own units
+    took `unit_seconds` together.
+    """
 
     name: str
     use: str
@@ -42,6 +50,7 @@ class StageSummary:
     failed: int = 0
     blocked: int = 0
     seconds: float = 0.0
+    unit_seconds: float = 0.0
     metrics: dict[str, float] = field(default_factory=dict)
     unit_metrics: dict[str, dict[str, float]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -52,7 +61,7 @@ class RunResult:
     """What a run did.
 
     Attributes:
-        stages: in the order in which they ran.
+        stages: those that were begun, in the order of the workflow.
         failures: units without a result.
         rejected: image to the stage that left it out and why.
         stopped: why the run ended early; empty if it did not.
@@ -85,13 +94,22 @@ class RunResult:
 
 
 class Observer(Protocol):
-    """Hears what a run does; the command line's progress bars are one."""
+    """Hears what a run does; the command line's progress bars are one.
+
+    Stages overlap. Where a damaged part of the store is found, the run starts over and its stages start again.
+    """
 
     def stage_started(self, name: str, units: int) -> None:
         """A stage's units are known."""
 
+    def unit_started(self, name: str, item: str) -> None:
+        """A unit is being computed; one that is cached or blocked is not."""
+
+    def unit_failed(self, failure: Failure) -> None:
+        """A unit has failed, after all its tries; `unit_finished` follows."""
+
     def unit_finished(self, name: str, item: str, outcome: Outcome, seconds: float) -> None:
-        """A unit is done."""
+        """A unit is done; `seconds` is how long it took to compute."""
 
     def stage_finished(self, summary: StageSummary) -> None:
         """A stage is done."""
@@ -104,6 +122,12 @@ class Silent:
     """An observer that says nothing."""
 
     def stage_started(self, name: str, units: int) -> None:
+        """Say nothing."""
+
+    def unit_started(self, name: str, item: str) -> None:
+        """Say nothing."""
+
+    def unit_failed(self, failure: Failure) -> None:
         """Say nothing."""
 
     def unit_finished(self, name: str, item: str, outcome: Outcome, seconds: float) -> None:

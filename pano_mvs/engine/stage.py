@@ -11,6 +11,7 @@ from typing import Any, Literal, TypeVar
 
 from pano_mvs.core.errors import PluginError
 from pano_mvs.engine.context import Context
+from pano_mvs.engine.memory import bytes_from_size
 from pano_mvs.engine.params import Params
 from pano_mvs.engine.ports import Cardinality, Port, port_from_annotation
 from pano_mvs.scene import Axis, Pairs, Record, Views
@@ -52,6 +53,7 @@ class StageSpec:
         origin: where it was defined, `file:line`.
         code_digest: digest of the code, for stages from user files; else empty.
         extras: argument name to what it takes beside the ports.
+        memory_bytes: what one unit needs, if the author says so.
     """
 
     name: str
@@ -64,6 +66,7 @@ class StageSpec:
     origin: str = ""
     code_digest: str = ""
     extras: Mapping[str, Literal["params", "ctx", "item"]] = field(default_factory=dict)
+    memory_bytes: int = 0
 
     @property
     def doc(self) -> str:
@@ -100,11 +103,12 @@ class _Signature:
     extras: Mapping[str, Literal["params", "ctx", "item"]]
 
 
-def stage(name: str, *, version: int = 1) -> Callable[[Function], Function]:
+def stage(name: str, *, version: int = 1, memory: str | int = 0) -> Callable[[Function], Function]:
     """Declare a function as a stage.
 
     The function takes ports annotated `One/Each/Near/All[Kind]`, `params` annotated with a `Params` model (optional),
-    and `ctx: Context` (optional), and is annotated to return a kind. It is called with keywords.
+    and `ctx: Context` (optional), and is annotated to return a kind. It is called with keywords. `memory`, such as
+    "2GB", is what one unit needs at most; no more of them run at a time than there is room for.
 
     Raises:
         PluginError: if the signature is not that of a stage.
@@ -112,7 +116,7 @@ def stage(name: str, *, version: int = 1) -> Callable[[Function], Function]:
 
     def decorate(function: Function) -> Function:
         signature = _read_signature(function, name)
-        setattr(function, _ATTRIBUTE, _spec(name, version, function, signature, None))
+        setattr(function, _ATTRIBUTE, _spec(name, version, function, signature, None, memory))
         return function
 
     return decorate
@@ -140,7 +144,12 @@ def spec_of(value: object) -> StageSpec | None:
 
 
 def _spec(
-    name: str, version: int, function: Callable[..., Any], signature: _Signature, list_items: ListItems | None
+    name: str,
+    version: int,
+    function: Callable[..., Any],
+    signature: _Signature,
+    list_items: ListItems | None,
+    memory: str | int = 0,
 ) -> StageSpec:
     return StageSpec(
         name=name,
@@ -152,6 +161,7 @@ def _spec(
         list_items=list_items,
         origin=_origin(function),
         extras=signature.extras,
+        memory_bytes=bytes_from_size(memory),
     )
 
 

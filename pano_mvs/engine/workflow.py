@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path, PurePosixPath
@@ -12,6 +12,8 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from pano_mvs.core.errors import InputError, PluginError, UsageError, WorkflowError
+from pano_mvs.engine.code_digest import code_digest
+from pano_mvs.engine.memory import bytes_from_size
 from pano_mvs.engine.params import Params, files_of
 from pano_mvs.engine.registry import Registry
 from pano_mvs.engine.stage import StageSpec
@@ -31,6 +33,8 @@ class Policy(BaseModel):
         retries: further tries of a failed unit.
         min_success: share of units that must succeed, else the run stops (exit code 4).
         gate: metric to the least value with which the run goes on (exit code 4).
+        timeout_s: seconds after which a unit is ended and counts as failed; 0 for no limit.
+        memory: what one unit needs, such as `2GB`; no more units run at a time than the host has free memory for.
         to: folder under the output folder into which the stage's files go.
     """
 
@@ -42,7 +46,20 @@ class Policy(BaseModel):
     retries: int = Field(default=0, ge=0, le=100)
     min_success: float = Field(default=0.0, ge=0, le=1)
     gate: dict[str, float] = {}
+    timeout_s: float = Field(default=0.0, ge=0)
+    memory: str | int = 0
     to: str = ""
+
+    @property
+    def memory_bytes(self) -> int:
+        """What one unit needs; 0 if the workflow does not say."""
+        return bytes_from_size(self.memory)
+
+    @field_validator("memory")
+    @classmethod
+    def _is_size(cls, memory: str | int) -> str | int:
+        bytes_from_size(memory)
+        return memory
 
     @field_validator("to")
     @classmethod
@@ -87,6 +104,7 @@ class Workflow:
         text: the YAML as written.
         stages: in the order of the file.
         overrides: the `--set` and `--images` that were applied.
+        plugins: the plugin files that it names, with the digests of their code.
     """
 
     name: str
@@ -94,6 +112,7 @@ class Workflow:
     text: str
     stages: dict[str, StageEntry]
     overrides: tuple[str, ...] = ()
+    plugins: Mapping[Path, str] = field(default_factory=dict)
 
 
 def load_workflow(
@@ -134,6 +153,7 @@ class WorkflowReader:
         self.base = base
         self.registry = registry
         self.problems: list[str] = []
+        self.plugins: dict[Path, str] = {}
 
     def read(
         self, text: str, *, overrides: Sequence[str] = (), images: Path | None = None, path: Path | None = None
@@ -151,7 +171,7 @@ class WorkflowReader:
             raise PartialWorkflowError(self.problems, stages if len(stages) == len(entries) else {})
         name = root.value["name"].plain() if "name" in root.value else Path(self.shown_as).stem
         shown = ([f"images.path={images}"] if images else []) + list(overrides)
-        return Workflow(str(name), path, text, stages, tuple(shown))
+        return Workflow(str(name), path, text, stages, tuple(shown), self.plugins)
 
     def _check_top(self, root: Located) -> None:
         for key, node in root.value.items():
@@ -179,6 +199,7 @@ class WorkflowReader:
                 continue
             try:
                 self.registry.add_file(self.base / item.value)
+                self.plugins[self.base / item.value] = code_digest(self.base / item.value)
             except PluginError as error:
                 self._problem(item, str(error))
 

@@ -1,0 +1,83 @@
+"""Send everything that a unit prints to a file: Python's streams, logging, and what C and C++ write to descriptors."""
+
+from __future__ import annotations
+
+import ctypes
+import io
+import logging
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+_STDOUT, _STDERR = 1, 2
+_TAIL_BYTES = 8192
+
+
+@contextmanager
+def captured(log: Path) -> Iterator[None]:
+    """Send what is written to the standard streams inside to a file, which is removed if nothing was.
+
+    The descriptors 1 and 2 of the whole process are turned; who wants to be heard meanwhile writes to a duplicate.
+    """
+    log.parent.mkdir(parents=True, exist_ok=True)
+    target = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o666)
+    kept_streams = sys.stdout, sys.stderr
+    kept = [os.dup(_STDOUT), os.dup(_STDERR)]
+    stream = io.TextIOWrapper(
+        os.fdopen(os.dup(target), "wb", 0), "utf-8", errors="backslashreplace", write_through=True
+    )
+    try:
+        _flush()
+        os.dup2(target, _STDOUT)
+        os.dup2(target, _STDERR)
+        sys.stdout = sys.stderr = stream
+        with _logging_to(stream):
+            yield
+    finally:
+        sys.stdout, sys.stderr = kept_streams
+        _flush()
+        os.dup2(kept[0], _STDOUT)
+        os.dup2(kept[1], _STDERR)
+        stream.close()
+        for descriptor in (target, *kept):
+            os.close(descriptor)
+        with suppress(OSError):
+            if log.stat().st_size == 0:
+                log.unlink()
+
+
+def tail(log: Path, lines: int) -> tuple[str, ...]:
+    """Return the last lines of a log, or none if there is no log."""
+    try:
+        with log.open("rb") as file:
+            file.seek(max(0, log.stat().st_size - _TAIL_BYTES))
+            text = file.read().decode("utf-8", errors="replace")
+    except OSError:
+        return ()
+    return tuple(text.replace("\r", "\n").rstrip().splitlines()[-lines:])
+
+
+@contextmanager
+def _logging_to(stream: io.TextIOBase) -> Iterator[None]:
+    root = logging.getLogger()
+    handler = logging.StreamHandler(stream)
+    handler.setFormatter(logging.Formatter("%(levelname)s %(name)s: %(message)s"))
+    level = root.level
+    root.addHandler(handler)
+    root.setLevel(min(level, logging.INFO) if level else logging.INFO)
+    try:
+        yield
+    finally:
+        root.removeHandler(handler)
+        root.setLevel(level)
+
+
+def _flush() -> None:
+    """Empty the buffers of Python's and of C's streams, so that each text lands on the side where it was written."""
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError, AttributeError):
+            stream.flush()
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL("ucrtbase" if os.name == "nt" else None).fflush(None)

@@ -1,0 +1,44 @@
+"""From what is asked for on the command line to an executor."""
+
+from __future__ import annotations
+
+from pano_mvs.core.errors import UsageError
+from pano_mvs.engine.executors.processes import ProcessExecutor
+from pano_mvs.engine.executors.protocol import Executor
+from pano_mvs.engine.executors.serial import SerialExecutor
+from pano_mvs.engine.executors.threads import available_threads, share_cores
+from pano_mvs.engine.store import Store
+
+EXECUTORS = ("serial", "processes", "dask")
+
+
+def make_executor(store: Store, name: str = "", *, workers: int = 0, threads: int = 0, scheduler: str = "") -> Executor:
+    """Return an executor; whoever asks closes it.
+
+    Args:
+        store: where values are.
+        name: of the executor; by default that which the other settings ask for, else processes where there is more
+            than one core.
+        workers: units at a time; 0 for as many as there are cores for.
+        threads: threads of each worker; 0 for an equal share of the cores.
+        scheduler: address of a dask scheduler; without one, dask starts a cluster on this host.
+
+    Raises:
+        UsageError: if the settings contradict each other, or the executor is not installed or cannot be reached.
+    """
+    cores = available_threads()
+    name = name or ("dask" if scheduler else "processes" if workers > 1 or (cores > 1 and workers != 1) else "serial")
+    if name not in EXECUTORS:
+        raise UsageError(f"there is no executor {name!r}; there are {', '.join(EXECUTORS)}")
+    if scheduler and name != "dask":
+        raise UsageError(f"--scheduler is dask's; --executor {name} has none")
+    if name == "serial":
+        if workers > 1:
+            raise UsageError("--executor serial runs one unit at a time; for more use --executor processes")
+        return SerialExecutor(store, threads=threads)
+    workers, threads = share_cores(cores, workers=workers, threads=threads)
+    if name == "processes":
+        return ProcessExecutor(store, workers=workers, threads=threads)
+    from pano_mvs.engine.executors.dask_cluster import DaskExecutor
+
+    return DaskExecutor(store, workers=workers, threads=threads, scheduler=scheduler)

@@ -1,0 +1,182 @@
+"""Units on a dask cluster: one on this host, or one that exists and shares the store with us.
+
+dask carries requests and answers, in JSON, and says who is free; values travel through the store alone. We keep a
+bounded number of units out, name each by its key, and try again ourselves: dask is asked not to.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import queue
+import uuid
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from pano_mvs.core.errors import UsageError
+from pano_mvs.engine.code_digest import code_texts
+from pano_mvs.engine.executors.dask_task import differences, end_workers, introduce, run_unit, versions
+from pano_mvs.engine.executors.protocol import Job, Outcome
+from pano_mvs.engine.executors.unit_text import request_to_json
+from pano_mvs.engine.memory import free_memory_bytes
+from pano_mvs.engine.store import Store
+
+_LARGE_BYTES = 200_000
+_CONNECT_S = 20.0
+_LISTEN_S = 0.5
+_ANSWER_S = 60.0
+
+
+class DaskExecutor:
+    """Hands units to a dask scheduler."""
+
+    name = "dask"
+    enforces_timeouts = True
+
+    def __init__(self, store: Store, *, workers: int = 1, threads: int = 0, scheduler: str = "") -> None:
+        """Connect, and see whether every worker can do our work.
+
+        Args:
+            store: where values are; for an existing cluster, in a folder that all hosts see under the same path.
+            workers: how many, of a cluster on this host.
+            threads: threads of each; 0 for an equal share of each host's cores.
+            scheduler: address of an existing scheduler.
+
+        Raises:
+            UsageError: if dask is not installed, the scheduler does not answer, or a worker has other versions or does
+                not see the store.
+        """
+        distributed = _import_distributed()
+        self._store = store
+        self._run = uuid.uuid4().hex
+        self._ended: queue.SimpleQueue[tuple[int, int, Any]] = queue.SimpleQueue()
+        self._out: dict[int, tuple[int, Any]] = {}  # job to its try and its future
+        self._tries = 0
+        self._sources: dict[str, Any] = {}
+        self._cluster: Any = None
+        if not scheduler:
+            # Threads will do for dask's own workers, as each has a process of ours that computes.
+            self._cluster = distributed.LocalCluster(
+                n_workers=1, threads_per_worker=workers, processes=False, dashboard_address=None
+            )
+        try:
+            self._client = distributed.Client(scheduler or self._cluster, timeout=_CONNECT_S, set_as_default=False)
+        except (OSError, ValueError, TimeoutError) as error:
+            raise UsageError(f"--scheduler {scheduler}: it does not answer ({error})") from error
+        try:
+            places, share = self._check_workers()
+        except UsageError:
+            self.close()
+            raise
+        self.capacity = places + (places + 1) // 2 if scheduler else places
+        self.threads = threads or share
+        self._is_remote = bool(scheduler)
+
+    def submit(self, job: Job) -> None:
+        """Take a job."""
+        request = request_to_json(job, self._store, self.threads)
+        request["plugin_texts"] = {str(path.absolute()): self._texts(path) for path in job.plugins}
+        text = json.dumps(request)
+        if len(text) > _LARGE_BYTES:
+            path = job.log.with_suffix(".json").absolute()
+            path.write_text(text, encoding="utf-8")
+            text = str(path)
+        self._tries += 1
+        number, attempt = job.number, self._tries
+        key = f"pano-mvs-{job.unit.key}-{self._run}-{attempt}"
+        future = self._client.submit(run_unit, self._run, text, key=key, pure=False, retries=0)
+        self._out[number] = attempt, future
+        future.add_done_callback(lambda done: self._ended.put((number, attempt, done)))
+
+    def wait(self, timeout_s: float | None = None) -> tuple[int, Outcome] | None:
+        """Return a job that has ended."""
+        while self._out:
+            try:
+                number, attempt, future = self._ended.get(timeout=_LISTEN_S if timeout_s is None else timeout_s or 0.0)
+            except queue.Empty:
+                if timeout_s is None:
+                    continue
+                return None
+            if number in self._out and self._out[number][0] == attempt:
+                del self._out[number]
+                return number, _outcome(future)
+        return None
+
+    def free_memory_bytes(self) -> int:
+        """Return what is free on this host, or what the smallest worker of a cluster may use."""
+        if not self._is_remote:
+            return free_memory_bytes()
+        limits = [worker["memory_limit"] for worker in self._client.scheduler_info(n_workers=-1)["workers"].values()]
+        return int(min(limits, default=0)) * len(limits)
+
+    def cancel(self) -> None:
+        """Forget all jobs, and end the processes that are at work."""
+        if self._out:
+            self._client.cancel([future for _, future in self._out.values()], force=True)
+            self._out.clear()
+            self._client.run(end_workers, self._run, on_error="ignore")
+
+    def close(self) -> None:
+        """End our processes, and the cluster if it is our own."""
+        self._out.clear()
+        self._client.run(end_workers, self._run, on_error="ignore")
+        self._client.close()
+        if self._cluster is not None:
+            self._cluster.close()
+
+    def _texts(self, path: Path) -> Any:
+        key = str(path)
+        if key not in self._sources:
+            self._sources[key] = code_texts(path)
+        return self._sources[key]
+
+    def _check_workers(self) -> tuple[int, int]:
+        """Return how many units the workers take at a time, and how many threads each of these may use."""
+        token = f"hello-{uuid.uuid4().hex}"
+        folder = self._store.blobs.temporary
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / token).write_text(token, encoding="ascii")
+        try:
+            found = self._client.run(introduce, str(self._store.root.absolute()), token, on_error="return")
+            for worker, answer in found.items():
+                self._check(worker, answer, token)
+        finally:
+            for path in folder.glob(f"{token}*"):
+                path.unlink(missing_ok=True)
+        if not found:
+            raise UsageError("--scheduler: it has no workers; start some with `dask worker`")
+        places = self._client.nthreads()
+        on_host: Counter[str] = Counter()
+        for worker, answer in found.items():
+            on_host[answer["host"]] += places[worker]
+        cores = {answer["host"]: answer["cores"] for answer in found.values()}
+        return sum(places.values()), max(1, min(cores[host] // count for host, count in on_host.items()))
+
+    def _check(self, worker: str, answer: Any, token: str) -> None:
+        if isinstance(answer, BaseException):
+            raise UsageError(f"dask worker {worker} cannot run pano_mvs: {answer}. Install it there") from answer
+        place = f"dask worker {worker} on {answer['host']}"
+        others = differences(versions(), answer["versions"])
+        if others:
+            raise UsageError(f"{place}: {'; '.join(others)}. Results would depend on who computes them: install the "
+                             "same versions there")  # fmt: skip
+        if answer["token"] != token or not (self._store.blobs.temporary / answer["answer"]).is_file():
+            reason = answer["reason"] or "it is another folder there"
+            raise UsageError(f"{place} does not see the cache {self._store.root.absolute()} ({reason}). Choose "
+                             "one with --cache DIR that all hosts share under the same path")  # fmt: skip
+
+
+def _outcome(future: Any) -> Outcome:
+    if future.status == "finished":
+        return Outcome.from_json(json.loads(future.result()))
+    if future.status == "error":
+        return Outcome("failed", cause=f"its dask worker failed: {future.exception()}", died=True)
+    return Outcome("failed", cause=f"the dask cluster lost it ({future.status})", died=True)
+
+
+def _import_distributed() -> Any:
+    try:
+        return importlib.import_module("distributed")
+    except ImportError as error:
+        raise UsageError("--executor dask needs dask: pip install 'pano-mvs[dask]'") from error

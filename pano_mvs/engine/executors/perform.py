@@ -1,0 +1,36 @@
+"""Compute one unit here and say what became of it; every executor ends in this function."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from pano_mvs.core.errors import GateError, InputError, StoreError, UsageError
+from pano_mvs.engine.blobs import DamagedBlobError
+from pano_mvs.engine.execute import execute_unit
+from pano_mvs.engine.executors.capture import captured
+from pano_mvs.engine.executors.protocol import Outcome
+from pano_mvs.engine.executors.threads import bound_threads
+from pano_mvs.engine.failures import cause_of
+from pano_mvs.engine.store import Store
+from pano_mvs.engine.units import Unit
+
+
+def perform(unit: Unit, store: Store, *, threads: int, log: Path) -> Outcome:
+    """Run a unit, with its output in `log`, and put its result into the store."""
+    started = time.perf_counter()
+    try:
+        with captured(log):
+            bound_threads(threads)
+            record = execute_unit(unit, store, threads=threads)
+    except DamagedBlobError as error:
+        return Outcome("damaged", cause=str(error))
+    except (StoreError, GateError) as error:
+        kind = StoreError if isinstance(error, StoreError) else GateError
+        return Outcome("stopped", cause=str(error), error=kind.__name__, exit_code=error.exit_code)
+    except (Exception, SystemExit) as error:
+        cause, trace = cause_of(unit, error)
+        exit_code = error.exit_code if isinstance(error, InputError | UsageError) else 0
+        seconds = time.perf_counter() - started
+        return Outcome("failed", cause=cause, trace=trace, exit_code=exit_code, seconds=seconds)
+    return Outcome("done", record, seconds=record.seconds)

@@ -1,0 +1,115 @@
+"""Units side by side in worker processes of this host."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+import uuid
+from dataclasses import replace
+from typing import Any
+
+from pano_mvs.engine.executors.protocol import Job, Outcome
+from pano_mvs.engine.executors.unit_text import request_to_json
+from pano_mvs.engine.executors.worker_process import WorkerProcess
+from pano_mvs.engine.memory import free_memory_bytes
+from pano_mvs.engine.store import Store
+
+UNITS_PER_PROCESS = 500
+"""After so many a worker is replaced, so that what libraries leak does not add up."""
+
+_FALSE_STARTS = 3
+_LISTEN_S = 0.5  # some systems notice an interrupt only between two waits
+
+
+class ProcessExecutor:
+    """A pool of long-lived workers, started when they are needed, each looked after by a thread of ours."""
+
+    name = "processes"
+    enforces_timeouts = True
+
+    def __init__(self, store: Store, *, workers: int, threads: int, units_per_process: int = UNITS_PER_PROCESS) -> None:
+        self.capacity = workers
+        self.threads = threads
+        self._store = store
+        self._units_per_process = units_per_process
+        self._jobs: queue.SimpleQueue[tuple[Job, dict[str, Any]] | None] = queue.SimpleQueue()
+        self._ended: queue.SimpleQueue[tuple[int, Outcome]] = queue.SimpleQueue()
+        self._out: set[int] = set()
+        self._keepers: list[tuple[threading.Thread, WorkerProcess]] = []
+        self._false_starts = 0
+        self._closing = False
+
+    def submit(self, job: Job) -> None:
+        """Take a job; a further worker is started if all are busy."""
+        request = request_to_json(job, self._store, self.threads)
+        if len(self._out) == len(self._keepers):
+            self._add_keeper()
+        self._out.add(job.number)
+        self._jobs.put((job, request))
+
+    def wait(self, timeout_s: float | None = None) -> tuple[int, Outcome] | None:
+        """Return a job that has ended."""
+        deadline = None if timeout_s is None else time.monotonic() + timeout_s
+        while self._out:
+            left = _LISTEN_S if deadline is None else deadline - time.monotonic()
+            try:
+                number, outcome = (
+                    self._ended.get(timeout=min(left, _LISTEN_S)) if left > 0 else self._ended.get_nowait()
+                )
+            except queue.Empty:
+                if left <= 0:
+                    return None
+                continue
+            if number in self._out:
+                self._out.remove(number)
+                return number, outcome
+        return None
+
+    def free_memory_bytes(self) -> int:
+        """Return what is free on this host."""
+        return free_memory_bytes()
+
+    def cancel(self) -> None:
+        """End the processes that are at work; the next jobs get new ones."""
+        self._out.clear()
+        while not self._jobs.empty():
+            self._jobs.get()
+        for _, worker in self._keepers:
+            worker.kill()
+
+    def close(self) -> None:
+        """End all processes."""
+        self._closing = True
+        if self._out:
+            self.cancel()
+        for _ in self._keepers:
+            self._jobs.put(None)
+        for thread, _ in self._keepers:
+            thread.join()
+        self._keepers.clear()
+
+    def _add_keeper(self) -> None:
+        errors = self._store.blobs.temporary / f"worker-{uuid.uuid4().hex}.txt"
+        errors.parent.mkdir(parents=True, exist_ok=True)
+        worker = WorkerProcess(self.threads, errors)
+        thread = threading.Thread(target=self._keep, args=(worker,), daemon=True)
+        self._keepers.append((thread, worker))
+        thread.start()
+
+    def _keep(self, worker: WorkerProcess) -> None:
+        """Give one worker its units until there are no more, and replace it in time."""
+        while (taken := self._jobs.get()) is not None and not self._closing:
+            job, request = taken
+            outcome = worker.run(request)
+            self._ended.put((job.number, self._judged(outcome, was_ready=worker.ready)))
+            if worker.served >= self._units_per_process:
+                worker.stop()
+        worker.stop()
+
+    def _judged(self, outcome: Outcome, *, was_ready: bool) -> Outcome:
+        """Return the outcome; if workers do not even start, again and again, nothing can go on."""
+        self._false_starts = 0 if was_ready else self._false_starts + 1
+        if self._false_starts < _FALSE_STARTS:
+            return outcome
+        return replace(outcome, status="stopped", cause=f"workers do not start: {outcome.cause}", error="PanoMvsError")

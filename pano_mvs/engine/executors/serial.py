@@ -1,0 +1,44 @@
+"""One unit after another, in this process: nothing to start, and a debugger sees everything."""
+
+from __future__ import annotations
+
+from pano_mvs.engine.executors.perform import perform
+from pano_mvs.engine.executors.protocol import Job, Outcome
+from pano_mvs.engine.executors.threads import available_threads
+from pano_mvs.engine.memory import free_memory_bytes
+from pano_mvs.engine.store import Store
+
+
+class SerialExecutor:
+    """Computes each job when it is waited for."""
+
+    name = "serial"
+    capacity = 1
+    enforces_timeouts = False
+
+    def __init__(self, store: Store, *, threads: int = 0) -> None:
+        self.threads = threads or available_threads()
+        self._store = store
+        self._jobs: list[Job] = []
+
+    def submit(self, job: Job) -> None:
+        """Take a job."""
+        self._jobs.append(job)
+
+    def wait(self, timeout_s: float | None = None) -> tuple[int, Outcome] | None:
+        """Compute the job that was taken, however long it takes."""
+        if not self._jobs or timeout_s == 0:
+            return None
+        job = self._jobs.pop(0)
+        return job.number, perform(job.unit, self._store, threads=self.threads, log=job.log)
+
+    def free_memory_bytes(self) -> int:
+        """Return what is free on this host."""
+        return free_memory_bytes()
+
+    def cancel(self) -> None:
+        """Forget the job."""
+        self._jobs.clear()
+
+    def close(self) -> None:
+        """There is nothing to let go of."""

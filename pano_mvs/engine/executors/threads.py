@@ -1,0 +1,66 @@
+"""Share the processors: workers × threads = cores, and numba, OpenCV and BLAS keep to it.
+
+BLAS gets one thread everywhere: how it splits its sums depends on their number, and the same input must give the same
+bytes with any number of workers.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import sys
+from collections.abc import MutableMapping
+from functools import cache
+from pathlib import Path
+
+_BLAS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS", "BLIS_NUM_THREADS")
+_OTHERS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")
+
+
+def available_threads() -> int:
+    """Return the number of processors that this process may use."""
+    found = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    quota = _container_quota()
+    return max(1, min(found, quota)) if quota else found
+
+
+def share_cores(cores: int, *, workers: int = 0, threads: int = 0) -> tuple[int, int]:
+    """Return how many workers and how many threads for each; 0 stands for what the other leaves over."""
+    if not workers:
+        workers = max(1, cores // threads) if threads else cores
+    return workers, threads or max(1, cores // workers)
+
+
+def bound_environment(environment: MutableMapping[str, str], threads: int) -> None:
+    """Bound libraries that are loaded later, by the environment; what the user set lower stays."""
+    for names, bound in ((_BLAS, 1), (_OTHERS, threads)):
+        for name in names:
+            value = environment.get(name, "")
+            environment[name] = str(min(int(value), bound) if value.isdigit() and int(value) else bound)
+
+
+def bound_threads(threads: int) -> None:
+    """Bound libraries that are loaded already, as far as they let themselves be bound."""
+    if "cv2" in sys.modules:
+        sys.modules["cv2"].setNumThreads(threads)
+    if "numba" in sys.modules:
+        numba = sys.modules["numba"]
+        numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+    _bound_blas()
+
+
+@cache
+def _bound_blas() -> None:
+    """Bound a BLAS that is loaded already; without threadpoolctl the environment alone bounds it, from the start."""
+    if importlib.util.find_spec("threadpoolctl") is not None:
+        importlib.import_module("threadpoolctl").threadpool_limits(1, user_api="blas")
+
+
+def _container_quota() -> int:
+    """Return how many processors a container may use, 0 if that is not limited."""
+    try:
+        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text(encoding="ascii").split()
+        return 0 if quota == "max" else -(-int(quota) // int(period))
+    except (OSError, ValueError):
+        return 0

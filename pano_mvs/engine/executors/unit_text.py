@@ -1,0 +1,145 @@
+"""A unit of work as JSON, for workers that share nothing with us but the store; and back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from pano_mvs.core.errors import UsageError
+from pano_mvs.engine.executors.protocol import Job
+from pano_mvs.engine.params import Params
+from pano_mvs.engine.ports import Cardinality
+from pano_mvs.engine.stage import SourceItem, StageSpec
+from pano_mvs.engine.store import ItemRef, Store
+from pano_mvs.engine.units import PENDING, Unit, UnitInput
+from pano_mvs.engine.workflow import Policy, StageEntry
+
+TEXT_VERSION = 1
+
+
+def request_to_json(job: Job, store: Store, threads: int) -> dict[str, Any]:
+    """Return what a worker is asked: the unit, and where its plugins, its store and its log are."""
+    return {
+        "unit": unit_to_json(job.unit, store),
+        "plugins": {str(path.absolute()): digest for path, digest in job.plugins.items()},
+        "store": str(store.root.absolute()),
+        "log": str(job.log.absolute()),
+        "threads": threads,
+        "timeout_s": job.timeout_s,
+    }
+
+
+def unit_to_json(unit: Unit, store: Store) -> dict[str, Any]:
+    """Return everything that a worker needs to compute a unit, beside the store; paths are absolute.
+
+    Raises:
+        UsageError: if the stage's settings do not survive being written as JSON.
+    """
+    spec = unit.entry.spec
+    return {
+        "text_version": TEXT_VERSION,
+        "stage": unit.entry.name,
+        "use": spec.name,
+        "version": spec.version,
+        "code": spec.code_digest,
+        "params": params_to_json(unit.entry),
+        "item": unit.item,
+        "members": list(unit.members),
+        "inputs": {port: _input_to_json(unit, port, value) for port, value in unit.inputs.items()},
+        "external": {ref.digest: str(store.blobs.path(ref).absolute()) for ref in _external(unit)},
+        "source": None if unit.source is None else _source_to_json(unit.source),
+        "key": unit.key,
+        "identity": dict(unit.identity),
+    }
+
+
+def unit_from_json(text: Mapping[str, Any], spec: StageSpec, store: Store) -> Unit:
+    """Return the unit that `unit_to_json` described, and make the user's own files that it reads findable.
+
+    Raises:
+        UsageError: if it was written by another version, or for another version of the stage.
+    """
+    found = (text["version"], text["code"], text["text_version"])
+    if found != (spec.version, spec.code_digest, TEXT_VERSION):
+        raise UsageError(f"stage {spec.name!r} is not the same in the worker ({spec.origin}): it was changed while the "
+                         "workflow ran, or another version is installed there. Run the same command again")  # fmt: skip
+    for path in text["external"].values():
+        store.blobs.register_external(Path(path))
+    params = spec.params_type.model_validate(text["params"])
+    return Unit(
+        entry=StageEntry(text["stage"], spec, params, Policy(use=spec.name), ""),
+        item=text["item"],
+        members=tuple(text["members"]),
+        inputs={port: _input_from_json(value) for port, value in text["inputs"].items()},
+        key=text["key"],
+        identity=text["identity"],
+        source=None if text["source"] is None else _source_from_json(text["source"]),
+    )
+
+
+def params_to_json(entry: StageEntry) -> dict[str, Any]:
+    """Return a stage's settings as JSON values that make the same settings again.
+
+    Raises:
+        UsageError: if they do not.
+    """
+    values = _plain(entry.params)
+    if _plain(entry.spec.params_type.model_validate(values)) != values:
+        raise UsageError(f"stage {entry.name!r} ({entry.spec.origin}): its settings change when they are validated a "
+                         "second time, so that they cannot be sent to a worker. Use --executor serial")  # fmt: skip
+    return values
+
+
+def _plain(params: Params) -> dict[str, Any]:
+    plain = _with_absolute_paths(params.model_dump(mode="python"), params.model_dump(mode="json"))
+    assert isinstance(plain, dict)
+    return plain
+
+
+def _with_absolute_paths(value: Any, as_json: Any) -> Any:
+    """Return the JSON form of a value in which all paths hold wherever they are read."""
+    if isinstance(value, Path):
+        return str(value.absolute())
+    if isinstance(as_json, dict) and isinstance(value, dict):
+        pairs = zip(value.values(), as_json.items(), strict=True)
+        return {name: _with_absolute_paths(inner, inner_json) for inner, (name, inner_json) in pairs}
+    if isinstance(as_json, list) and isinstance(value, list | tuple):
+        return [_with_absolute_paths(*pair) for pair in zip(value, as_json, strict=True)]
+    return as_json
+
+
+def _input_to_json(unit: Unit, port: str, value: UnitInput) -> Any:
+    if value is None:
+        return None
+    if isinstance(value, ItemRef):
+        return {"one": value.to_json()}
+    cardinality = next(found.cardinality for found in unit.entry.spec.ports if found.name == port)
+    if cardinality is Cardinality.NAMES:
+        return {"names": list(value)}
+    return {"many": {name: ref.to_json() for name, ref in value.items()}}
+
+
+def _input_from_json(value: Any) -> UnitInput:
+    if value is None:
+        return None
+    if "one" in value:
+        return ItemRef.from_json(value["one"])
+    if "names" in value:
+        return dict.fromkeys(value["names"], PENDING)
+    return {name: ItemRef.from_json(ref) for name, ref in value["many"].items()}
+
+
+def _external(unit: Unit) -> Iterator[Any]:
+    for value in unit.inputs.values():
+        items = [value] if isinstance(value, ItemRef) else (value or {}).values()
+        for item in items:
+            yield from (ref for ref in item.parts.values() if ref.external)
+
+
+def _source_to_json(item: SourceItem) -> dict[str, Any]:
+    return {"name": item.name, "files": {role: str(path.absolute()) for role, path in item.files.items()}}
+
+
+def _source_from_json(value: Mapping[str, Any]) -> SourceItem:
+    return SourceItem(value["name"], {role: Path(path) for role, path in value["files"].items()})

@@ -1,0 +1,52 @@
+"""A worker process: reads requests from its standard input, answers on its standard output, a JSON object in a line.
+
+It answers a request with `{"started": true}` and then with the outcome, and says `{"ready": true}` at its beginning.
+It ends at once when its input does, whatever it is doing: nobody would hear of the result.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import signal
+import sys
+import threading
+from typing import Any, BinaryIO
+
+
+def main() -> None:
+    """Serve requests until the input ends."""
+    requests_in, answers_out = _take_streams()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the one who started us decides what an interrupt means
+    requests: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    threading.Thread(target=_read, args=(requests_in, requests), daemon=True).start()
+    from pano_mvs.engine.executors.workplace import run_request  # after the streams: what it imports may print
+
+    _answer(answers_out, {"ready": True})
+    while True:
+        request = json.loads(requests.get())
+        _answer(answers_out, {"started": True})
+        _answer(answers_out, run_request(request).to_json())
+
+
+def _take_streams() -> tuple[BinaryIO, BinaryIO]:
+    """Keep the standard streams for ourselves: what a stage prints goes to the error stream, and it reads nothing."""
+    requests_in, answers_out = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nothing, 0)
+    os.close(nothing)
+    os.dup2(2, 1)
+    sys.stdout = sys.stderr
+    return requests_in, answers_out
+
+
+def _read(requests_in: BinaryIO, requests: queue.SimpleQueue[bytes]) -> None:
+    for line in requests_in:
+        requests.put(line)
+    os._exit(0)
+
+
+def _answer(answers_out: BinaryIO, value: dict[str, Any]) -> None:
+    answers_out.write(json.dumps(value).encode() + b"\n")
+    answers_out.flush()

@@ -1,0 +1,155 @@
+"""One worker process, seen from the one who started it.
+
+Each has pipes of its own: whenever and however it dies, nobody else's words are lost and no lock is left behind. (The
+pools of the standard library and pebble share one pipe under one lock among all workers, and a worker that is killed
+with the lock in its hand takes the others with it.) It is started afresh by name, never forked: no thread, lock or open
+file of ours comes with it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pano_mvs.engine.executors.capture import tail
+from pano_mvs.engine.executors.protocol import Outcome
+from pano_mvs.engine.executors.threads import bound_environment
+
+_BOOT = (
+    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from pano_mvs.engine.executors.worker import main; main()"
+)
+_STOP_S = 5.0
+
+
+class WorkerProcess:
+    """A process that computes one unit at a time; it is started when the first comes.
+
+    Attributes:
+        served: units that the present process has been given.
+        ready: whether the present process has ever come so far as to wait for a unit.
+    """
+
+    def __init__(self, threads: int, errors: Path) -> None:
+        """Prepare a worker.
+
+        Args:
+            threads: how many threads its libraries may use.
+            errors: file for what it prints outside units, such as why it cannot start.
+        """
+        self.threads = threads
+        self.errors = errors
+        self.served = 0
+        self.ready = False
+        self._process: subprocess.Popen[bytes] | None = None
+        self._too_late = False
+
+    def run(self, request: Mapping[str, Any]) -> Outcome:
+        """Compute a unit, and wait for it; a process that dies or takes too long costs this unit and no other."""
+        process = self._process or self._start()
+        self.served += 1
+        timeout_s = float(request["timeout_s"])
+        timer = threading.Timer(timeout_s, self._end_late) if timeout_s else None
+        try:
+            assert process.stdin is not None
+            process.stdin.write(json.dumps(request).encode() + b"\n")
+            process.stdin.flush()
+            outcome = self._listen(process, timer)
+        except OSError:
+            outcome = None
+        if timer is not None:
+            timer.cancel()
+        if outcome is None:
+            return self._death(process, timeout_s)
+        if self._too_late:  # it was done at the very moment when it was ended
+            self.stop()
+        return outcome
+
+    def stop(self) -> None:
+        """Let the process end; nothing is being computed."""
+        process, self._process = self._process, None
+        if process is not None:
+            _close(process)
+        self.errors.unlink(missing_ok=True)
+
+    def kill(self) -> None:
+        """End the process at once, from any thread."""
+        process = self._process
+        if process is not None:
+            process.kill()
+
+    def _start(self) -> subprocess.Popen[bytes]:
+        environment = dict(os.environ)
+        bound_environment(environment, self.threads)
+        path = json.dumps([place for place in sys.path if place])  # "" would be the folder where it happens to run
+        self.served, self.ready, self._too_late = 0, False, False
+        with self.errors.open("wb") as errors:
+            self._process = subprocess.Popen(  # noqa: S603 (it is ourselves)
+                [sys.executable, "-P", "-X", "faulthandler", "-c", _BOOT, path],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                env=environment,
+                # Ctrl-C in a terminal goes to a whole group; it is for the one who started us to pass on.
+                start_new_session=os.name == "posix",
+                creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
+            )
+        return self._process
+
+    def _listen(self, process: subprocess.Popen[bytes], timer: threading.Timer | None) -> Outcome | None:
+        """Return what the worker answers, or None if it dies first."""
+        assert process.stdout is not None
+        for line in process.stdout:
+            if not line.endswith(b"\n"):
+                return None
+            answer = json.loads(line)
+            if "status" in answer:
+                return Outcome.from_json(answer)
+            self.ready = True
+            if "started" in answer and timer is not None:
+                timer.start()
+        return None
+
+    def _end_late(self) -> None:
+        self._too_late = True
+        self.kill()
+
+    def _death(self, process: subprocess.Popen[bytes], timeout_s: float) -> Outcome:
+        self._process = None
+        _close(process)
+        if self._too_late:
+            return Outcome(
+                "failed", cause=f"it took longer than timeout_s: {timeout_s:g}, and was ended", error="Timeout"
+            )
+        said = () if self.ready else tail(self.errors, 3)
+        cause = f"its worker process died ({_how(process.returncode)})" + "".join(f"\n  {line}" for line in said)
+        return Outcome("failed", cause=cause, died=True)
+
+
+def _close(process: subprocess.Popen[bytes]) -> None:
+    """Wait for a process to end, of itself or not, and let go of its pipes."""
+    for pipe in (process.stdin, process.stdout):
+        try:
+            if pipe is not None:
+                pipe.close()
+        except OSError:
+            continue  # what was not sent is not wanted any more
+    try:
+        process.wait(_STOP_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def _how(code: int) -> str:
+    if code >= 0:
+        return f"exit code {code}"
+    name = signal.Signals(-code).name if -code in {number.value for number in signal.Signals} else f"signal {-code}"
+    want = ", as the system does for want of memory: declare `memory:` or use fewer --workers"
+    return f"killed by {name}{want if name == 'SIGKILL' else ''}"

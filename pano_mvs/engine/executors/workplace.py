@@ -1,0 +1,84 @@
+"""What a worker keeps between units: the stages that it has loaded and the stores that it has opened."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from pano_mvs.core.errors import PanoMvsError, PluginError, UsageError
+from pano_mvs.engine.code_digest import code_digest
+from pano_mvs.engine.executors.perform import perform
+from pano_mvs.engine.executors.protocol import Outcome
+from pano_mvs.engine.executors.unit_text import unit_from_json
+from pano_mvs.engine.registry import Registry
+from pano_mvs.engine.stage import StageSpec
+from pano_mvs.engine.store import Store
+
+
+def run_request(request: Mapping[str, Any]) -> Outcome:
+    """Compute the unit of a request, see `request_to_json`."""
+    try:
+        store = _store(request["store"])
+        plugins = _with_texts(request["plugins"], request.get("plugin_texts", {}))
+        unit = unit_from_json(request["unit"], _spec(request["unit"]["use"], plugins), store)
+    except PanoMvsError as error:
+        return Outcome("stopped", cause=str(error), error="UsageError")
+    return perform(unit, store, threads=request["threads"], log=Path(request["log"]))
+
+
+def _with_texts(plugins: Mapping[str, str], texts: Mapping[str, Any]) -> dict[str, str]:
+    """Return the plugin files, with those whose text came along in a folder of our own: their host may be another."""
+    return {_written(digest, *texts[path]) if path in texts else path: digest for path, digest in plugins.items()}
+
+
+_folders: dict[str, TemporaryDirectory[str]] = {}
+
+
+def _written(digest: str, name: str, texts: Mapping[str, str]) -> str:
+    if digest not in _folders:
+        folder = _folders[digest] = TemporaryDirectory(prefix="pano-mvs-plugin-")
+        for relative, text in texts.items():
+            path = Path(folder.name) / relative
+            if not path.resolve().is_relative_to(Path(folder.name).resolve()):
+                raise UsageError(f"plugin {name} imports {relative}, which is not beside it: it cannot be sent along")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+    return str(Path(_folders[digest].name) / name)
+
+
+@cache
+def _store(root: str) -> Store:
+    return Store(Path(root))
+
+
+@cache
+def _installed() -> Registry:
+    return Registry.installed()
+
+
+@cache
+def _of_files(plugins: tuple[tuple[str, str], ...]) -> Registry:
+    """Load plugin files; those whose code has changed are others.
+
+    Raises:
+        UsageError: if their code is not what was asked for.
+        PluginError: if one cannot be loaded.
+    """
+    registry = Registry()
+    for path, digest in plugins:
+        registry.add_file(Path(path))
+        if code_digest(Path(path)) != digest:
+            raise UsageError(f"plugin {path} is not the same in the worker: it was changed while the workflow ran. Run "
+                             "the same command again")  # fmt: skip
+    return registry
+
+
+def _spec(name: str, plugins: Mapping[str, str]) -> StageSpec:
+    """Return a stage, a plugin's or an installed one; whichever it is, it may use parts that plugins add."""
+    spec = _of_files(tuple(plugins.items())).stages.get(name) or _installed().stages.get(name)
+    if spec is None:
+        raise PluginError(f"the worker knows no stage {name!r}; {_installed().suggest(name)}")
+    return spec

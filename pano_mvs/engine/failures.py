@@ -1,0 +1,33 @@
+"""Say of a unit that failed what went wrong, where, and what the result lacks because of it."""
+
+from __future__ import annotations
+
+import traceback
+
+from pano_mvs.core.errors import PanoMvsError
+from pano_mvs.engine.units import Unit
+from pano_mvs.engine.workflow import StageEntry
+
+
+def cause_of(unit: Unit, error: BaseException) -> tuple[str, str]:
+    """Return what went wrong, and the traceback if it is the code's fault.
+
+    Errors raised on purpose speak for themselves, others get the line they came from.
+    """
+    notes = "".join(f" ({note})" for note in getattr(error, "__notes__", []))
+    if isinstance(error, PanoMvsError):
+        return f"{error}{notes}", ""
+    frames = traceback.extract_tb(error.__traceback__)
+    # The author of a plugin wants the line in the plugin; we want ours wherever it is.
+    own = unit.entry.spec.origin.rpartition(":")[0] if unit.entry.spec.code_digest else ""
+    if own and isinstance(error, ModuleNotFoundError):
+        notes += " (a plugin imports the files beside it at its top, not inside functions)"
+    frame = next((f for f in reversed(frames) if f.filename == own), frames[-1])
+    cause = f"{frame.filename}:{frame.lineno}: {type(error).__name__}: {error}{notes}"
+    return cause, "".join(traceback.format_exception(error))
+
+
+def lost(entry: StageEntry, item: str) -> str:
+    """Return what the result lacks for want of a unit."""
+    kind = entry.spec.output.kind_name()
+    return f"there is no {kind} for {item}" if item else f"there is no {kind}"

@@ -1,0 +1,158 @@
+"""Take units from the board, find them in the store or have them computed, and act on what comes back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from pano_mvs.core.errors import GateError, PanoMvsError, StoreError, UsageError
+from pano_mvs.engine.blobs import DamagedBlobError
+from pano_mvs.engine.board import Board
+from pano_mvs.engine.desk import Desk, Ended
+from pano_mvs.engine.events import Failure
+from pano_mvs.engine.executors.protocol import Outcome
+from pano_mvs.engine.failures import lost
+from pano_mvs.engine.publish import Publisher
+from pano_mvs.engine.store import Store, UnitRecord
+from pano_mvs.engine.tally import Tally
+from pano_mvs.engine.units import Unit
+from pano_mvs.scene import Axis, Files
+
+_STOPPING = {error.__name__: error for error in (StoreError, GateError, UsageError)}
+
+
+class StoppedError(GateError):
+    """What the user gave cannot be used by a stage on which all others wait."""
+
+    def __init__(self, message: str, exit_code: int) -> None:
+        super().__init__(message)
+        self.exit_code = exit_code
+
+
+class Scheduler:
+    """One pass through a workflow.
+
+    Attributes:
+        keys: stage to unit to cache key, of all units seen.
+        computed: key to what was computed rather than found, in this pass or in those before it.
+    """
+
+    def __init__(
+        self,
+        board: Board,
+        tally: Tally,
+        desk: Desk,
+        publisher: Publisher,
+        *,
+        keys: dict[str, dict[str, str]],
+        computed: dict[str, UnitRecord],
+        warn: Callable[[str], None],
+    ) -> None:
+        self.keys = keys
+        self.computed = computed
+        self._board = board
+        self._tally = tally
+        self._desk = desk
+        self._publisher = publisher
+        self._store: Store = publisher.store
+        self._warn = warn
+        self._twins: dict[str, list[Unit]] = {}  # key that is being computed to other units that have the same
+
+    def work(self) -> None:
+        """Go on until every unit is settled.
+
+        Raises:
+            DamagedBlobError: if something stored turned out damaged; it has been removed.
+            GateError: if the workflow says that the run stops here.
+            StoreError: if the store or the output folder cannot be written.
+            UsageError: if workers know another version of a stage.
+        """
+        held: Unit | None = None  # waits for memory, and all behind it with it, so that its turn comes
+        while True:
+            nothing_runs = False
+            if held is None and self._desk.has_room:
+                unit = self._board.next_unit()
+                nothing_runs = unit is None
+                held = unit if unit is not None and not self._find(unit) else None
+            if held is not None and self._hand_out(held):
+                held = None
+            if nothing_runs and not self._desk:
+                return
+            must_wait = nothing_runs or held is not None or not self._desk.has_room
+            ended = self._desk.take(None if must_wait else 0)
+            if ended is not None:
+                self._end(ended)
+
+    def drain(self) -> None:
+        """Wait for what is being computed; its results are in the store."""
+        while (ended := self._desk.take()) is not None:
+            if ended.outcome.record is not None:
+                self.computed[ended.unit.key] = ended.outcome.record
+
+    def _find(self, unit: Unit) -> bool:
+        """Settle a unit that is in the store; return whether it was, or soon will be."""
+        if unit.key in self._twins:
+            self._twins[unit.key].append(unit)
+            return True
+        self.keys.setdefault(unit.entry.name, {})[unit.item] = unit.key
+        seen = len(self._store.damaged)
+        record = self._store.find(unit.key)
+        for path in self._store.damaged[seen:]:
+            self._warn(f"{path} is damaged; computing it again")
+        if record is not None:
+            self._accept(unit, record, was_computed=unit.key in self.computed)
+        return record is not None
+
+    def _hand_out(self, unit: Unit) -> bool:
+        """Have a unit computed as soon as there is memory for it; return whether it is off our hands."""
+        if not self._desk.fits(unit):
+            if self._desk:
+                return False
+            self._tally.unit_started(unit.entry, unit.item)
+            self._fail(Ended(unit, Outcome("failed", cause=self._desk.refusal(unit)), None, ()))
+            return True
+        self._twins[unit.key] = []
+        self._tally.unit_started(unit.entry, unit.item)
+        self._desk.hand_out(unit)
+        return True
+
+    def _end(self, ended: Ended) -> None:
+        outcome, unit = ended.outcome, ended.unit
+        twins = self._twins.pop(unit.key)
+        if outcome.status == "damaged":
+            raise DamagedBlobError(outcome.cause)
+        if outcome.status == "stopped":
+            raise _STOPPING.get(outcome.error, PanoMvsError)(outcome.cause)
+        if outcome.record is not None:
+            self.computed[unit.key] = outcome.record
+            self._accept(unit, outcome.record, was_computed=True)
+        else:
+            self._fail(ended)
+        for twin in twins:
+            if not self._find(twin):
+                self._fail(Ended(twin, outcome, ended.log, ended.said))
+
+    def _accept(self, unit: Unit, record: UnitRecord, *, was_computed: bool) -> None:
+        if issubclass(unit.entry.spec.output, Files):
+            self._publisher.publish(unit.entry.name, unit.item, record.output, to=unit.entry.policy.to)
+        self._tally.unit_done(unit.entry, unit.item, record, "run" if was_computed else "cached")
+        self._board.finish(unit, record)
+
+    def _fail(self, ended: Ended) -> None:
+        """List a unit that failed; stop if the workflow wants it so, or if all others wait for it."""
+        unit, outcome = ended.unit, ended.outcome
+        entry = unit.entry
+        failure = Failure(
+            entry.name,
+            unit.item,
+            outcome.cause,
+            outcome.trace,
+            lost(entry, unit.item),
+            log="" if ended.log is None else str(ended.log),
+            said=ended.said,
+        )
+        self._tally.unit_failed(failure, outcome.seconds)
+        if outcome.exit_code and self._board.states[entry.name].axis is Axis.ONE:
+            raise StoppedError(f"{entry.name}: {outcome.cause}", outcome.exit_code)
+        if entry.policy.on_error == "stop":
+            raise GateError(f"stage {entry.name!r} has on_error: stop, and {unit.label} failed: {outcome.cause}")
+        self._board.fail(unit, outcome.cause)
