@@ -21,6 +21,7 @@ from pano_mvs.stages.frame import level, scale, unit_translations
 from pano_mvs.stages.fusion import vote
 from pano_mvs.stages.matches import brute_force
 from pano_mvs.stages.pairs import exhaustive, position, retrieval, sequential, vlad
+from pano_mvs.stages.patchmatch import patchmatch
 from pano_mvs.stages.poses import from_model, refine, scaled_translation, triangulate
 from pano_mvs.stages.poses_colmap import colmap_poses, colmap_sift_poses, extend
 from pano_mvs.stages.source import folder
@@ -45,6 +46,7 @@ __all__ = [
     "median",
     "nearest",
     "orb_tangent",
+    "patchmatch",
     "ply",
     "position",
     "previews",

@@ -17,11 +17,12 @@ from pano_mvs.algorithms.filters.gaussian import gaussian_range
 from pano_mvs.algorithms.filters.guided import guided_range
 from pano_mvs.algorithms.filters.median import median_range
 from pano_mvs.algorithms.filters.speckle import remove_speckles
-from pano_mvs.algorithms.fusion.vote import fuse_views
+from pano_mvs.algorithms.fusion.settings import FusionSettings
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.matching.neighbours import loop_closing_pairs, position_pairs, retrieval_pairs
 from pano_mvs.algorithms.matching.preemptive import hopeless_reason
 from pano_mvs.algorithms.matching.vlad import vlad_descriptor
+from pano_mvs.algorithms.patchmatch.refine import refine_range
 from pano_mvs.algorithms.poses.colmap import solve_colmap
 from pano_mvs.algorithms.poses.colmap_sift import colmap_sift
 from pano_mvs.algorithms.poses.extension import extend_poses
@@ -59,7 +60,7 @@ FUNCTIONS = {
     "filters.consistency": check_consistency,
     "filters.fast_bilateral_solver": fast_bilateral_solver,
     "filters.fill": fill_from_neighbours,
-    "fusion.vote": fuse_views,
+    "fusion.vote": FusionSettings,
 }
 
 

@@ -1,0 +1,1 @@
+"""Refinement of range maps by slanted planes."""

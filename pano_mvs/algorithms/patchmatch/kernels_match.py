@@ -1,0 +1,247 @@
+"""Compiled: how well planes through the pixels of a stretch of a row match the sources, and which way is better.
+
+A plane p holds the points X with p · X = 1, so that a ray d meets it at 1 / range = p · d, and a source sees the ray in
+the direction (R + t pᵀ) d: a homography of rays. Pixels of a stretch are computed together, one window sample at a
+time, in short separate loops (project, gather, blend, sum), as in the sweep.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+_F = np.float32
+_U = np.uint64
+_HALF_PI, _PI, _TINY, _ONE = _F(np.pi / 2), _F(np.pi), _F(1e-30), _F(1)
+# Abramowitz and Stegun, Handbook of Mathematical Functions, 4.4.49: |error| ≤ 2e-8 on [0, 1].
+_A2, _A4, _A6, _A8 = _F(-0.3333314528), _F(0.1999355085), _F(-0.1420889944), _F(0.1065626393)
+_A10, _A12, _A14, _A16 = _F(-0.0752896400), _F(0.0429096138), _F(-0.0161657367), _F(0.0028662257)
+_LOW, _STEP = _U(65535), _F(1 / 256)
+
+# Rows of the sums over a window, per source: samples b (less the reference's mean), products with the reference a
+# (centred), and their slopes g = db / dq against the inverse range q, with the basis f = (1, columns, rows).
+SUM_B, SUM_BB, SUM_AB = 0, 1, 2
+SUM_G, SUM_GG, SUM_GB, SUM_GA = 3, 6, 12, 15
+SUMS = 18
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def _atan_unit(a):  # type: ignore[no-untyped-def]
+    """Return atan of a number in [0, 1], float32."""
+    s = a * a
+    tail = _A8 + s * (_A10 + s * (_A12 + s * (_A14 + s * _A16)))
+    return a * (_ONE + s * (_A2 + s * (_A4 + s * (_A6 + s * tail))))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def weigh_window(grey, place, color_scale, weights, centred, moments):  # type: ignore[no-untyped-def]
+    """Weigh the window samples of a stretch of pixels by likeness to the window's centre.
+
+    Args:
+        grey: (H + 2 pad, W + 2 pad) float32.
+        place: row, first column, H, columns a step, pad, (side,) rows and (side,) columns of the window.
+        color_scale: 1 / the difference of grey levels at which the weight is halved.
+        weights: (side², n) float32, written; they sum to 1.
+        centred: (side², n) float32, written: the samples less their mean.
+        moments: (2, n) float32, written: mean and variance.
+    """
+    row, first, _, _, pad, rows, columns = place
+    n, side = weights.shape[1], len(rows)
+    moments[:] = _F(0)
+    total = np.zeros(n, np.float32)
+    center, start = _U(pad + row), _U(pad + first)
+    for k in range(side * side):
+        y, x = _U(pad + row + rows[k // side]), _U(pad + first + columns[k % side])
+        for i in range(_U(n)):
+            value = grey[y, x + i]
+            difference = (value - grey[center, start + i]) * color_scale
+            weight = _ONE / (_ONE + difference * difference)
+            weights[k, i] = weight
+            centred[k, i] = value
+            total[i] += weight
+            moments[0, i] += weight * value
+    for i in range(_U(n)):
+        total[i] = _ONE / total[i]
+        moments[0, i] *= total[i]
+    for k in range(side * side):
+        for i in range(_U(n)):
+            weight = weights[k, i] * total[i]
+            value = centred[k, i] - moments[0, i]
+            weights[k, i] = weight
+            centred[k, i] = value
+            moments[1, i] += weight * value * value
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def inverse_ranges(planes, azimuth, first, level, dip, inverse):  # type: ignore[no-untyped-def]
+    """Write q = p · d, (n,), for planes (3, n) and rays of one row: sin θ and cos θ from column `first` on."""
+    start = _U(first)
+    for i in range(_U(inverse.shape[0])):
+        across = planes[0, i] * azimuth[0, start + i] + planes[2, i] * azimuth[1, start + i]
+        inverse[i] = level * across + dip * planes[1, i]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def project_samples(  # type: ignore[no-untyped-def]
+    azimuth, first, inverse, matrix, shape, index, weights, slopes
+):
+    """Find where rays of one row, of inverse ranges q, arrive in a packed source, and how fast that moves with q.
+
+    Args:
+        azimuth: (2, ·) float32 sin θ and cos θ of the columns.
+        first: the first column.
+        inverse: (n,) float32 q.
+        matrix: (3, 4) float32: direction = matrix @ (sin θ, cos θ, 1, q).
+        shape: (2,) int64 rows and columns of the source.
+        index: (n,) int32, written: position in the packed source.
+        weights: (2, n) float32, written: of the right and of the lower neighbours.
+        slopes: (2, n) float32, written: dx/dq and dy/dq in pixels.
+    """
+    m00, m01, o0, t0 = matrix[0, 0], matrix[0, 1], matrix[0, 2], matrix[0, 3]
+    m10, m11, o1, t1 = matrix[1, 0], matrix[1, 1], matrix[1, 2], matrix[1, 3]
+    m20, m21, o2, t2 = matrix[2, 0], matrix[2, 1], matrix[2, 2], matrix[2, 3]
+    x_scale, y_scale = _F(shape[1] / (2 * np.pi)), _F(shape[0] / np.pi)
+    x_middle, y_middle = _F(shape[1] / 2 + 0.5), _F(shape[0] / 2 + 0.5)
+    stride = np.int32(shape[1] + 1)
+    last_row, last_column = np.int32(shape[0]), np.int32(shape[1])
+    start = _U(first)
+    for i in range(_U(inverse.shape[0])):
+        s, c, q = azimuth[0, start + i], azimuth[1, start + i], inverse[i]
+        x = m00 * s + m01 * c + o0 + t0 * q
+        y = m10 * s + m11 * c + o1 + t1 * q
+        z = m20 * s + m21 * c + o2 + t2 * q
+        ax, ay, az = abs(x), abs(y), abs(z)
+        small = ax if ax < az else az
+        large = az if ax < az else ax
+        turn = _atan_unit(small / (large + _TINY))
+        turn = _HALF_PI - turn if ax > az else turn
+        turn = _PI - turn if z < _F(0) else turn
+        turn = -turn if x < _F(0) else turn
+        level_squared = x * x + z * z + _TINY
+        level = np.sqrt(level_squared)
+        small = ay if ay < level else level
+        large = level if ay < level else ay
+        dip = _atan_unit(small / (large + _TINY))
+        dip = _HALF_PI - dip if ay > level else dip
+        dip = -dip if y < _F(0) else dip
+        px = turn * x_scale + x_middle
+        py = dip * y_scale + y_middle
+        column, row = np.int32(px), np.int32(py)
+        column = last_column if column > last_column else column
+        row = last_row if row > last_row else row
+        index[i] = np.int32(row * stride + column)
+        weights[0, i] = px - _F(column)
+        weights[1, i] = py - _F(row)
+        slopes[0, i] = x_scale * (z * t0 - x * t2) / level_squared
+        slopes[1, i] = y_scale * (level * t1 - y * (x * t0 + z * t2) / level) / (level_squared + y * y)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def gather_samples(packed, start, index, patches):  # type: ignore[no-untyped-def]
+    """Fetch the 2×2 patches, four numbers of 16 bits each, at `start + index`; all (n,) but `packed`."""
+    base = _U(start)
+    for i in range(_U(index.shape[0])):
+        patches[i] = packed[base + _U(index[i])]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def blend_samples(patches, weights, slopes, means, samples, gradients):  # type: ignore[no-untyped-def]
+    """Blend 2×2 patches into samples less `means`, and their slopes along the epipolar curve against q; all (n,)."""
+    for i in range(_U(patches.shape[0])):
+        patch = patches[i]
+        upper_left = _F(np.int32(patch & _LOW)) * _STEP
+        lower_left = _F(np.int32((patch >> _U(16)) & _LOW)) * _STEP
+        upper_right = _F(np.int32((patch >> _U(32)) & _LOW)) * _STEP
+        lower_right = _F(np.int32(patch >> _U(48))) * _STEP
+        wx, wy = weights[0, i], weights[1, i]
+        left = upper_left + wy * (lower_left - upper_left)
+        right = upper_right + wy * (lower_right - upper_right)
+        down_left, down_right = lower_left - upper_left, lower_right - upper_right
+        samples[i] = left + wx * (right - left) - means[i]
+        gradients[i] = slopes[0, i] * (right - left) + slopes[1, i] * (down_left + wx * (down_right - down_left))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def add_samples(samples, window_weights, reference, sums):  # type: ignore[no-untyped-def]
+    """Add one window sample of each pixel to the sums of one source; (n,) each, sums (SUMS, n)."""
+    for i in range(_U(samples.shape[0])):
+        b = samples[i]
+        wb = window_weights[i] * b
+        sums[SUM_B, i] += wb
+        sums[SUM_BB, i] += wb * b
+        sums[SUM_AB, i] += wb * reference[i]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def add_gradients(samples, gradients, window_weights, reference, u, v, sums):  # type: ignore[no-untyped-def]
+    """Add the slopes of one window sample, at columns u and rows v from the centre, to the sums of one source."""
+    for i in range(_U(samples.shape[0])):
+        g = gradients[i]
+        wg = window_weights[i] * g
+        wgg, wgb, wga = wg * g, wg * samples[i], wg * reference[i]
+        sums[SUM_G, i] += wg
+        sums[SUM_G + 1, i] += u * wg
+        sums[SUM_G + 2, i] += v * wg
+        sums[SUM_GG, i] += wgg
+        sums[SUM_GG + 1, i] += u * wgg
+        sums[SUM_GG + 2, i] += v * wgg
+        sums[SUM_GG + 3, i] += u * u * wgg
+        sums[SUM_GG + 4, i] += u * v * wgg
+        sums[SUM_GG + 5, i] += v * v * wgg
+        sums[SUM_GB, i] += wgb
+        sums[SUM_GB + 1, i] += u * wgb
+        sums[SUM_GB + 2, i] += v * wgb
+        sums[SUM_GA, i] += wga
+        sums[SUM_GA + 1, i] += u * wga
+        sums[SUM_GA + 2, i] += v * wga
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def row_matrix(pose, elevation, matrix):  # type: ignore[no-untyped-def]
+    """Write the (3, 4) matrix that takes (sin θ, cos θ, 1, q) of a row to directions in a source of pose (3, 4)."""
+    level, dip = np.cos(elevation), -np.sin(elevation)
+    for a in range(3):
+        matrix[a, 0] = _F(level * pose[a, 0])
+        matrix[a, 1] = _F(level * pose[a, 2])
+        matrix[a, 2] = _F(dip * pose[a, 1])
+        matrix[a, 3] = _F(pose[a, 3])
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def sum_windows(planes, place, azimuth, window, sources, sums, votes):  # type: ignore[no-untyped-def]
+    """Sum up the windows of a stretch of pixels, on their planes, over each source.
+
+    Args:
+        planes: (3, n) float32.
+        place: row, first column, H, columns a step, pad, (side,) rows and (side,) columns of the window.
+        azimuth: (2, W + 2 pad) float32 sin θ and cos θ of the columns.
+        window: weights and centred samples, (side², n) float32, and means (n,), of the reference.
+        sources: (·,) uint64 packed pictures, (S,) where each begins, (S, 2) their sizes, (S, 3, 4) float64
+            source_from_reference, (·,) uint8 which patches may vote, empty if all may, and (S,) where each begins.
+        sums: (S, SUMS, n) float32, written.
+        votes: (S, n) bool, written: whether the source may vote on the pixel.
+    """
+    row, first, height, stretch, pad, rows, columns = place
+    weights, centred, means = window
+    packed, starts, shapes, poses, valid, valid_starts = sources
+    n, side = planes.shape[1], len(rows)
+    inverse, values, gradients = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
+    index, patches = np.empty(n, np.int32), np.empty(n, np.uint64)
+    blend, slopes = np.empty((2, n), np.float32), np.empty((2, n), np.float32)
+    matrix = np.empty((3, 4), np.float32)
+    sums[:] = _F(0)
+    for k in range(side * side):
+        v, column = rows[k // side], columns[k % side]
+        elevation = np.pi * (0.5 - (row + v + 0.5) / height)
+        start = pad + first + column
+        inverse_ranges(planes, azimuth, start, _F(np.cos(elevation)), _F(-np.sin(elevation)), inverse)
+        for s in range(len(starts)):
+            row_matrix(poses[s], elevation, matrix)
+            project_samples(azimuth, start, inverse, matrix, shapes[s], index, blend, slopes)
+            gather_samples(packed, starts[s], index, patches)
+            blend_samples(patches, blend, slopes, means, values, gradients)
+            add_samples(values, weights[k], centred[k], sums[s])
+            add_gradients(values, gradients, weights[k], centred[k], _F(column / stretch), _F(v), sums[s])
+            if v == 0 and column == 0:
+                for i in range(n):
+                    votes[s, i] = len(valid) == 0 or valid[_U(valid_starts[s]) + _U(index[i])] != 0

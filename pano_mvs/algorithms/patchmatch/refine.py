@@ -1,0 +1,211 @@
+"""Refinement of a range map by slanted planes: ranges between the planes of a sweep, and normals.
+
+A sweep compares fronto-parallel windows at fixed ranges; what it finds is right to a fraction of a plane and bent on
+slanted surfaces. Here two steps alternate, the data and the smoothness of one energy:
+
+* a plane is laid through the ranges around each pixel, robustly (planes of disparity: Bleyer, Rhemann and Rother,
+  "PatchMatch stereo", 2011, section 3; the sphere's counterpart of disparity is the inverse range q, linear in the ray
+  on a plane: q = p · d);
+* a window on that plane is looked up in the sources through the homography R + t pᵀ of rays, and q is moved to where
+  it is most likely: a Gauss–Newton step on the zero-mean normalised correlation (Lucas and Kanade, 1981) in q and its
+  two slopes, with the plane as a prior whose weight against the pictures is that of the texture they show.
+
+Nothing is drawn at random, so that a rolled panorama gives the rolled result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from math import ceil
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.sweep.preparation import voting_pixels
+from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import Rigid3, pad_panorama, ray_grid
+from pano_mvs.scene import RangeMap
+from pano_mvs.scene.range_map import WEAK_CONFIDENCE
+
+Picture = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+FloatImage = NDArray[np.float32]
+
+_LUMA = np.array([0.2126, 0.7152, 0.0722])
+_BAND_ROWS = 32
+# Samples of a window are neighbours, and not independent: of 25 so many count.
+_SAMPLES = 10.0
+# No step is larger, in pixels of the reference at the widest baseline: beyond that pictures are not linear.
+_LARGEST_STEP_PX = 0.5
+# Neighbours on a plane differ in range by less than this share a pixel.
+_MAX_STEP = 0.01
+_FIT_RADIUS = 3
+_SMALLEST_SIDE = 16
+
+
+def refine_range(
+    range_map: RangeMap,
+    reference: Picture,
+    sources: Sequence[Picture],
+    source_from_reference: Sequence[Rigid3],
+    *,
+    rounds: int = 4,
+    window: int = 5,
+    prior_px: float = 0.6,
+    prior_slope: float = 0.1,
+    noise: float = 0.4,
+    sigma_color: float = 25.0,
+    source_masks: Sequence[Mask | None] | None = None,
+) -> RangeMap:
+    """Return a range map with the ranges between those that were tried, and with normals.
+
+    Args:
+        range_map: (H, W) of the reference, full sphere, right to about a pixel of parallax; pixels that were filled
+            (confidence 1–63) stay as they are, and invalid ones stay invalid.
+        reference: (H, W, 3) uint8 RGB.
+        sources: one or more (Hs, Ws, 3) uint8 RGB, each of its own size.
+        source_from_reference: the pose of each source.
+        rounds: how often planes are laid and matched.
+        window: samples along either side of the window that is matched, odd; they are two pixels apart.
+        prior_px: standard deviation of a plane's range before the pictures are looked at, in pixels of parallax at the
+            widest baseline.
+        prior_slope: the same of its slopes, in pixels of parallax for each pixel.
+        noise: standard deviation of a grey level where pictures agree as well as they can.
+        sigma_color: samples that differ from the window's centre by so many grey levels count half.
+        source_masks: for each source (Hs, Ws), False where it has no vote, or None.
+
+    Returns:
+        Ranges and normals; confidences are those given.
+
+    Raises:
+        UsageError: if shapes do not fit together or a parameter is out of bounds.
+    """
+    _check(range_map, reference, sources, source_from_reference, source_masks)
+    if rounds < 0 or window < 3 or window % 2 == 0 or min(prior_px, prior_slope, noise, sigma_color) <= 0:
+        raise UsageError(f"rounds must not be negative, window odd and at least 3, the others positive, got {rounds}, "
+                         f"{window}, {prior_px}, {prior_slope}, {noise}, {sigma_color}")  # fmt: skip
+    from pano_mvs.algorithms.patchmatch import kernels_planes, kernels_refine  # compile on import
+
+    height, width = range_map.range.shape
+    # The inverse range that moves a point by one pixel at the widest baseline.
+    pixel_q = 2 * np.pi / width / max(float(np.linalg.norm(pose.translation)) for pose in source_from_reference)
+    numbers = (np.float32(1 / sigma_color), np.float32(noise**2), (prior_px * pixel_q) ** -2,
+               (prior_slope * pixel_q) ** -2, _SAMPLES, np.float32(_LARGEST_STEP_PX * pixel_q))  # fmt: skip
+    offsets = column_offsets((height, width), 2 * (window // 2), spherical=True)[:, ::2].copy()
+    stretches = column_stretch(height, spherical=True)
+    near_offsets = column_offsets((height, width), _FIT_RADIUS, spherical=True)
+    views = (
+        _reference_arrays(reference, offsets, stretches),
+        _source_arrays(sources, source_from_reference, source_masks, reach=(window - 1) / height),
+    )
+    seen = range_map.confidence >= WEAK_CONFIDENCE[0]
+    inverse = np.where(seen, 1 / range_map.range, np.float32(np.nan)).astype(np.float32)
+    planes = np.empty((3, height, width), np.float32)
+
+    def lay(first: int) -> None:
+        rows = min(_BAND_ROWS, height - first)
+        kernels_planes.fit_planes(inverse, first, rows, near_offsets, stretches, _MAX_STEP, planes)
+
+    def match(first: int) -> None:
+        kernels_refine.refine_rows(first, min(_BAND_ROWS, height - first), planes, *views, numbers, inverse)
+
+    for _ in range(rounds):
+        _in_bands(lay, height)
+        _in_bands(match, height)
+        inverse[~seen] = np.nan
+    _in_bands(lay, height)
+    return _range_map_from_planes(planes, range_map, seen)
+
+
+def _range_map_from_planes(planes: FloatImage, before: RangeMap, seen: Mask) -> RangeMap:
+    """Return the ranges along the rays and the normals of planes (3, H, W) where they mean something."""
+    height, width = before.range.shape
+    inverse = np.einsum("ahw,hwa->hw", planes.astype(np.float64), ray_grid((height, width)))
+    met = seen & (inverse > 0)
+    ranges = np.divide(1.0, inverse, out=before.range.astype(np.float64), where=met)
+    length = np.linalg.norm(planes, axis=0)
+    normals = np.full((height, width, 3), np.nan, np.float16)
+    # p · ray > 0 at the surface, so −p looks back at the camera.
+    normals[met] = -(planes[:, met] / length[met]).T
+    return RangeMap(ranges.astype(np.float32), before.confidence, normals)
+
+
+def _reference_arrays(
+    reference: Picture, offsets: NDArray[np.int64], stretches: NDArray[np.float64]
+) -> tuple[object, ...]:
+    """Return what the kernels read of the reference picture, see `refine_rows`."""
+    width = reference.shape[1]
+    rows = offsets[len(offsets) // 2]
+    pad = max(int(offsets.max()), int(rows[-1]))
+    azimuth = 2 * np.pi * ((np.arange(-pad, width + pad) + 0.5) / width - 0.5)
+    grey = pad_panorama((reference @ _LUMA).astype(np.float32), pad)
+    return grey, np.stack([np.sin(azimuth), np.cos(azimuth)]).astype(np.float32), pad, stretches, rows, offsets
+
+
+def _source_arrays(
+    sources: Sequence[Picture], poses: Sequence[Rigid3], masks: Sequence[Mask | None] | None, *, reach: float
+) -> tuple[object, ...]:
+    """Return what the kernels read of the sources, see `sum_windows`; windows reach so many picture heights far."""
+    pictures = [_packed(np.rint(256 * (source @ _LUMA)).astype(np.uint64)).ravel() for source in sources]
+    starts = np.cumsum([0, *(len(picture) for picture in pictures)])[:-1]
+    valid = np.zeros(0, np.uint8)
+    if masks is not None and not all(mask is None or mask.all() for mask in masks):
+        given = [np.ones(s.shape[:2], np.bool_) if m is None else m for s, m in zip(sources, masks, strict=True)]
+        voting = [voting_pixels(mask, ceil(reach * mask.shape[0])) for mask in given]
+        patches = [_packed(mask.astype(np.uint64)).ravel() for mask in voting]
+        valid = (np.concatenate(patches) == 0x0001000100010001).astype(np.uint8)
+    matrices = np.stack([np.column_stack([pose.rotation, pose.translation]) for pose in poses])
+    shapes = np.array([source.shape[:2] for source in sources])
+    return np.concatenate(pictures), starts, shapes, matrices, valid, starts
+
+
+def _packed(plane: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Return all 2×2 patches of a plane of 16-bit numbers, (H, W) to (H + 1, W + 1), over the seam and the poles.
+
+    Patch (j, i) is upper left | lower left << 16 | upper right << 32 | lower right << 48 of rows j − 1, j and columns
+    i − 1, i.
+    """
+    padded = pad_panorama(plane, 1)
+    upper, lower = padded[:-1], padded[1:]
+    patches = upper[:, :-1] | lower[:, :-1] << 16 | upper[:, 1:] << 32 | lower[:, 1:] << 48
+    return np.asarray(patches, dtype=np.uint64)
+
+
+def _in_bands(work: Callable[[int], None], height: int) -> None:
+    """Do the work on all bands of rows, by their first row, in threads: they write disjoint rows."""
+    import numba
+
+    with ThreadPoolExecutor(numba.get_num_threads()) as pool:
+        for _ in pool.map(work, range(0, height, _BAND_ROWS)):
+            pass
+
+
+def _check(
+    range_map: RangeMap,
+    reference: Picture,
+    sources: Sequence[Picture],
+    poses: Sequence[Rigid3],
+    masks: Sequence[Mask | None] | None,
+) -> None:
+    """Raise UsageError unless shapes and numbers fit together."""
+    if len(sources) == 0 or len(poses) != len(sources) or (masks is not None and len(masks) != len(sources)):
+        raise UsageError(f"refinement needs one pose (and one mask, if any) for each of one or more sources, got "
+                         f"{len(sources)} sources, {len(poses)} poses")  # fmt: skip
+    if reference.shape != (*range_map.range.shape, 3):
+        raise UsageError(f"the reference must have the size of its range map, (*{range_map.range.shape}, 3), got "
+                         f"{reference.shape}")  # fmt: skip
+    for name, picture in [("reference", reference), *((f"source {idx}", s) for idx, s in enumerate(sources))]:
+        if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or picture.shape[1] % 2:
+            raise UsageError(f"{name}: refinement needs (H, W, 3) uint8 RGB of even width, got {picture.shape} "
+                             f"{picture.dtype}")  # fmt: skip
+        if min(picture.shape[:2]) < _SMALLEST_SIDE:
+            raise UsageError(
+                f"{name}: refinement needs at least {_SMALLEST_SIDE} pixels on a side, got {picture.shape}"
+            )
+    for idx, mask in enumerate(masks or ()):
+        if mask is not None and mask.shape != sources[idx].shape[:2]:
+            raise UsageError(f"source {idx}: its mask must be {sources[idx].shape[:2]}, got {mask.shape}")
+    if not any(np.linalg.norm(pose.translation) > 0 for pose in poses):
+        raise UsageError("no source was taken from another place than the reference: ranges cannot be seen")

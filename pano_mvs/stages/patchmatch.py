@@ -1,0 +1,51 @@
+"""Refinement of swept ranges by slanted planes."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from pano_mvs.algorithms.patchmatch.refine import refine_range
+from pano_mvs.api import Context, Each, Near, Panorama, Params, Pose, RangeMap, stage
+
+
+class PatchMatchParams(Params):
+    """Settings of depth.patchmatch."""
+
+    rounds: int = Field(default=4, ge=0, le=32, description="how often planes are laid and matched")
+    window: int = Field(
+        default=5, ge=3, le=15, description="samples along either side of the window, two pixels apart, odd"
+    )
+    prior_px: float = Field(
+        default=0.6, gt=0, description="how far pictures may move a plane, in pixels of parallax (standard deviation)"
+    )
+    prior_slope: float = Field(
+        default=0.1, gt=0, description="how far they may tilt it, in pixels of parallax for each pixel"
+    )
+    noise: float = Field(default=0.4, gt=0, description="standard deviation of a grey level, at best")
+    sigma_color: float = Field(
+        default=25.0, gt=0, description="samples that differ from the centre by so many grey levels count half"
+    )
+
+
+@stage("depth.patchmatch")
+def patchmatch(
+    range_map: Each[RangeMap],
+    ref: Each[Panorama],
+    pose: Each[Pose],
+    sources: Near[Panorama],
+    source_poses: Near[Pose],
+    params: PatchMatchParams,
+    ctx: Context,
+) -> RangeMap:
+    """Lay slanted planes through the ranges and move them to where the pictures match; gives normals."""
+    refined = refine_range(
+        range_map,
+        ref.load(),
+        [source.load() for source in sources],
+        [other.cam_from_world @ pose.cam_from_world.inverse() for other in source_poses],
+        source_masks=[source.load_mask() for source in sources],
+        **params.model_dump(),
+    )
+    ctx.metric("completeness", float(refined.valid.mean()))
+    ctx.metric("sources", len(sources))
+    return refined
