@@ -52,6 +52,7 @@ FUNCTIONS = {
     "poses.triangulate": triangulate_tracks,
     "poses.level": level_poses,
     "poses.scale": fit_gps,
+    "depth.patchmatch": refine_range,
     "filters.median": median_range,
     "filters.gaussian": gaussian_range,
     "filters.guided": guided_range,
