@@ -1,0 +1,59 @@
+"""How long a whole capture takes: `python -m tests.benchmarks.end_to_end --images DIR [--workflow quality]`.
+
+Runs the command line on a folder of pictures twice with stores of their own, so that the second run finds its kernels
+compiled and nothing else, and prints wall and CPU seconds of the second: in all, and of each stage as the run itself
+recorded them. CPU seconds include worker processes; on a busy machine they say more than wall seconds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+
+def run_once(arguments: list[str], out: Path) -> tuple[float, float, dict[str, Any]]:
+    """Return wall and CPU seconds of one run with a store of its own, and its summary."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    started = time.perf_counter()
+    command = [sys.executable, "-m", "pano_mvs", "run", *arguments, "--out", str(out), "--cache", str(out / "store")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    wall = time.perf_counter() - started
+    if done.returncode not in (0, 3):  # 3: finished, some pictures were left out
+        raise SystemExit(done.stdout + done.stderr)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return wall, cpu, json.loads((out / "run.json").read_text(encoding="utf-8"))
+
+
+def main() -> None:
+    """Print the times of one workflow on one capture as Markdown."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--images", type=Path, required=True)
+    parser.add_argument("--workflow", default="quickstart")
+    parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="STAGE.PARAM=VALUE")
+    parser.add_argument("--warm", action="store_true", help="the kernels are compiled: one run is enough")
+    given = parser.parse_args()
+    arguments = [given.workflow, "--images", str(given.images)]
+    for override in given.overrides:
+        arguments += ["--set", override]
+    with tempfile.TemporaryDirectory() as scratch:
+        if not given.warm:
+            run_once(arguments, Path(scratch) / "first")
+        wall, cpu, summary = run_once(arguments, Path(scratch) / "second")
+    name = " ".join([given.workflow, *given.overrides])
+    print(f"`{name}`: {wall:.1f} s wall, {cpu:.1f} s CPU, {os.cpu_count()} cores\n")
+    print("| stage | units | seconds in units |\n|---|---|---|")
+    for stage in summary["stages"]:
+        print(f"| {stage['name']} | {stage['run']} | {stage['unit_seconds']:.1f} |")
+
+
+if __name__ == "__main__":
+    main()
