@@ -56,7 +56,7 @@ HEADER = "| cameras | window | poses | MSE ×10⁻² | PSNR | the paper | wδ<1.
 ABLATIONS = {
     "no bilateral filter of the pictures": ["depth.prefilter_diameter=0"],
     "sources looked up where they are, not turned first": ["depth.derotate=false"],
-    "no bilateral solver (raw winner)": ["smooth.smoothness=0"],
+    "no bilateral solver (raw winner)": ["smooth.keep_confidence=1"],
     **{f"solver λ {value}": [f"smooth.smoothness={value}"] for value in (4, 16, 64, 128, 256, 512)},
     "λ 128, solver on 1/range": ["smooth.domain=inverse"],
     "λ 16, solver on 1/range": ["smooth.domain=inverse", "smooth.smoothness=16"],

@@ -53,9 +53,9 @@ def test_each_ablation_is_one_switch(run) -> None:  # type: ignore[no-untyped-de
     lengths = [np.linalg.norm(center) for center in unscaled["poses"]["centers"]]
     np.testing.assert_allclose(lengths, [0, 1, 1, 1], atol=1e-9)
     assert np.ptp(np.linalg.norm(full["poses"]["centers"], axis=1)[1:]) > 0.01
-    plain = run("depth.prefilter_diameter=0", "depth.derotate=false", "smooth.smoothness=0", out="plain")
+    plain = run("depth.prefilter_diameter=0", "depth.derotate=false", "smooth.keep_confidence=1", out="plain")
     stages = {stage["name"]: stage["params"] for stage in plain["stages"]}
-    assert stages["depth"]["prefilter_diameter"] == stages["smooth"]["smoothness"] == 0
+    assert (stages["depth"]["prefilter_diameter"], stages["smooth"]["keep_confidence"]) == (0, 1)
     runs = [summary["scores"]["views"]["000.png"]["psnr_db"] for summary in (full, unscaled, plain)]
     assert len(set(runs)) == 3
     wrong = [summary["scores"]["poses"]["scale_ratio_error_max"] for summary in (full, unscaled)]
