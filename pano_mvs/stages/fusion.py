@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from pano_mvs.algorithms.fusion.vote import FusionView, fuse_views
+from pano_mvs.algorithms.fusion.settings import FusionSettings
+from pano_mvs.algorithms.fusion.view import FusionView
+from pano_mvs.algorithms.fusion.vote import fuse_stream
 from pano_mvs.api import All, Context, Panorama, Params, PointCloud, Pose, RangeMap, stage
 
 
@@ -13,28 +15,36 @@ class VoteParams(Params):
 
     min_views: int = Field(default=2, ge=1, description="views that must agree on a point")
     max_relative_error: float = Field(default=0.02, gt=0, description="ranges that agree differ by at most this share")
-    voxel_size: float | None = Field(default=None, gt=0, description="thin to one point per cube, in scene units")
+    min_support: float | None = Field(
+        default=0.1, gt=0, le=1, description="share of the surface around a pixel that vouches for one missing view"
+    )
+    merge_within: float = Field(default=0.01, ge=0, description="points of views that differ by less are averaged")
+    max_footprint_ratio: float = Field(
+        default=4.0, ge=1, description="a view leaves to another what that sees this much better; 1: no point twice"
+    )
+    even_density: bool = Field(default=True, description="thin rows away from the equator to points per solid angle")
+    stride: int = Field(default=1, ge=1, description="write every stride-th pixel in both directions")
     min_confidence: int = Field(
         default=64, ge=1, le=255, description="pixels below have no vote (64: seen, 128: consistent)"
     )
+    neighbours: int = Field(default=8, ge=0, description="views, the nearest ones, that vote on a view's pixels")
+    voxel_size: float | None = Field(default=None, gt=0, description="thin to one point per cube, in scene units")
 
 
-@stage("fusion.vote")
+@stage("fusion.vote", version=2)
 def vote(
     ranges: All[RangeMap], poses: All[Pose], images: All[Panorama], params: VoteParams, ctx: Context
 ) -> PointCloud:
     """One coloured cloud with normals of all points on which several views agree."""
-    views = [
-        FusionView(range_map, poses[name].cam_from_world, images[name].load())
-        for name, range_map in ranges.items()
-        if name in poses and name in images
-    ]
-    cloud = fuse_views(
-        views,
-        min_views=min(params.min_views, len(views)),
-        max_relative_error=params.max_relative_error,
-        voxel_size=params.voxel_size,
-        min_confidence=params.min_confidence,
+    names = [name for name in ranges if name in poses and name in images]
+    settings = params.model_dump() | {"min_views": min(params.min_views, max(1, len(names)))}
+
+    def load(idx: int) -> FusionView:
+        name, image = names[idx], images[names[idx]]
+        return FusionView(ranges[name], poses[name].cam_from_world, image.load(), image.load_mask())
+
+    cloud = fuse_stream(
+        [poses[name].cam_from_world for name in names], load, FusionSettings(**settings), threads=ctx.threads
     )
     ctx.metric("points", len(cloud))
     return cloud

@@ -4,18 +4,22 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.filters.sphere_steps import columns_per_step
+from pano_mvs.algorithms.fusion import voxels
 from pano_mvs.algorithms.fusion.normals import normals_from_range
-from pano_mvs.algorithms.fusion.vote import FusionView, fuse_reference, fuse_views, join_clouds
+from pano_mvs.algorithms.fusion.settings import FusionSettings
+from pano_mvs.algorithms.fusion.view import FusionView, nearest_views
+from pano_mvs.algorithms.fusion.vote import fuse_reference, fuse_stream, fuse_views, join_clouds
 from pano_mvs.algorithms.fusion.voxels import thin_by_voxels
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, angle_between, ray_grid
-from pano_mvs.scene import PointCloud
+from pano_mvs.scene import PointCloud, RangeMap
 from pano_mvs.testing.room import capture_poses, default_room, range_along
 from tests.algorithms.range_scenes import as_map, box_range, random_map, room_range
 from tests.oracles import normals as oracle
 
 SIZE = (128, 256)
 POSES = capture_poses(3, seed=2, spread=0.4)
+ONCE = FusionSettings(max_footprint_ratio=1)
 
 
 def painted(ranges, pose):
@@ -120,8 +124,8 @@ class TestFusion:
         assert (np.sum(cloud.normals_in_world * points, axis=1)[visible] < 0).mean() > 0.98
 
     def test_each_surface_is_written_once_and_none_is_lost(self, views):
-        cloud = fuse_views(views)
-        alone = [len(fuse_reference(view, [], [], min_views=1)) for view in views]
+        cloud = fuse_views(views, ONCE)
+        alone = [len(fuse_reference(view, [], [], FusionSettings(min_views=1))) for view in views]
         assert 0.4 * np.mean(alone) < len(cloud) < 1.3 * np.mean(alone)
         truth = views[0].range_map.range
         points = (ray_grid(SIZE) * truth[..., None])[::4, ::8].reshape(-1, 3)
@@ -138,11 +142,11 @@ class TestFusion:
             along = -(rays @ pose.center)
             ranges = along + np.sqrt(along**2 - pose.center @ pose.center + 4)
             views.append(FusionView(as_map(ranges), pose, np.zeros((*SIZE, 3), np.uint8)))
-        left = fuse_reference(views[0], [], views[1:])
-        right = fuse_reference(views[1], views[:1], [])
+        left = fuse_reference(views[0], [], views[1:], ONCE)
+        right = fuse_reference(views[1], views[:1], [], ONCE)
         assert (left.points_in_world[:, 0] < 0.15).mean() > 0.99
         assert (right.points_in_world[:, 0] > -0.15).mean() > 0.99
-        cloud = fuse_views(views)
+        cloud = fuse_views(views, ONCE)
         np.testing.assert_allclose(np.linalg.norm(cloud.points_in_world, axis=1), 2, rtol=2e-3)
         inwards = -cloud.points_in_world / 2
         assert np.degrees(angle_between(cloud.normals_in_world, inwards)).max() < 1
@@ -158,26 +162,29 @@ class TestFusion:
         assert (distance < 0.9 * true).mean() < 1e-3
 
     def test_min_views_and_min_confidence_are_obeyed(self, views):
-        assert fuse_views(views, min_views=3).view_counts.min() == 3
+        assert fuse_views(views, FusionSettings(min_views=3, min_support=None)).view_counts.min() == 3
         assert len(fuse_views(views[:1])) == 0
-        assert len(fuse_views(views[:1], min_views=1)) > 0.5 * np.prod(SIZE)
+        assert len(fuse_views(views[:1], FusionSettings(min_views=1))) > 0.5 * np.prod(SIZE)
         filled = [FusionView(as_map(v.range_map.range, 63), v.pose, v.image) for v in views]
         assert len(fuse_views(filled)) == 0
-        assert len(fuse_views(filled, min_confidence=1)) == len(fuse_views(views))
+        assert len(fuse_views(filled, FusionSettings(min_confidence=1))) == len(fuse_views(views))
         assert len(fuse_views([])) == 0
 
     def test_points_are_even_over_the_sphere(self):
         """A ball around the camera: as many points above 60° as its solid angle says, and so at the pole."""
         view = FusionView(as_map(np.full(SIZE, 2.0)), Rigid3.identity(), np.zeros((*SIZE, 3), np.uint8))
         for stride in (1, 2, 3):
-            points = fuse_views([view], min_views=1, stride=stride).points_in_world
+            points = fuse_views([view], FusionSettings(min_views=1, stride=stride)).points_in_world
             for limit in (np.cos(np.radians(20)), np.sin(np.radians(60)), 0.0):
                 expected = (1 - limit) / 2
                 assert (points[:, 1] / 2 > limit).mean() == pytest.approx(expected, rel=0.15)
             assert len(points) == pytest.approx(np.prod(SIZE) * 2 / np.pi / stride**2, rel=0.05)
 
     def test_twice_gives_the_same_bytes(self, views):
-        first, second = fuse_views(views, voxel_size=0.05), fuse_views(iter(views), voxel_size=0.05)
+        first, second = (
+            fuse_views(views, FusionSettings(voxel_size=0.05)),
+            fuse_views(views, FusionSettings(voxel_size=0.05)),
+        )
         assert first.points_in_world.tobytes() == second.points_in_world.tobytes()
         assert first.colors_rgb.tobytes() == second.colors_rgb.tobytes()
 
@@ -191,10 +198,136 @@ class TestFusion:
 
     def test_impossible_calls_are_named(self, views):
         with pytest.raises(UsageError, match="must be positive"):
-            fuse_views(views, min_views=0)
+            fuse_views(views, FusionSettings(min_views=0))
         small = FusionView(views[0].range_map, views[0].pose, views[0].image[::2])
         with pytest.raises(UsageError, match="image must be"):
             fuse_views([small])
+
+
+def ball_views(count, ranges_of=lambda ranges, idx: ranges, **fields):
+    """Cameras near the middle of a ball of radius 2."""
+    views = []
+    for idx in range(count):
+        center = 0.25 * np.array([np.cos(2 * idx), 0.3 * np.sin(3 * idx), np.sin(2 * idx)])
+        along = -(ray_grid(SIZE) @ center)
+        ranges = along + np.sqrt(along**2 - center @ center + 4)
+        pose = Rigid3.from_center(np.eye(3), center)
+        views.append(FusionView(as_map(ranges_of(ranges, idx)), pose, np.zeros((*SIZE, 3), np.uint8), **fields))
+    return views
+
+
+def from_ball(cloud):
+    return np.linalg.norm(cloud.points_in_world.astype(np.float64), axis=1) - 2
+
+
+class TestMerging:
+    @pytest.mark.parametrize("count", [2, 4, 6])
+    def test_noise_goes_down_with_the_root_of_the_number_of_views(self, count):
+        def noisy(ranges, idx):
+            return ranges * (1 + 0.001 * np.random.default_rng(idx).normal(size=SIZE))
+
+        views = ball_views(count, noisy)
+        alone = from_ball(fuse_views(views, FusionSettings(merge_within=0.0))).std()
+        merged = from_ball(fuse_views(views, FusionSettings(merge_within=0.02)))
+        assert alone == pytest.approx(0.002, rel=0.05)
+        # Between its pixels a source is interpolated, which averages as well.
+        assert 0.6 / np.sqrt(count) < merged.std() / alone < 1.1 / np.sqrt(count)
+        assert abs(merged.mean()) < 2e-4
+
+    def test_what_lies_apart_is_not_averaged_though_it_agrees(self):
+        views = ball_views(2, lambda ranges, idx: ranges * (1 + 0.015 * idx))
+        cloud = fuse_views(views)
+        assert cloud.view_counts.min() == 2
+        error = from_ball(cloud)
+        assert np.minimum(np.abs(error), np.abs(error - 0.03)).max() < 5e-3
+
+    def test_confidence_is_the_largest_of_the_views_that_agree(self):
+        views = ball_views(3)
+        sure = FusionView(as_map(views[2].range_map.range, 200), views[2].pose, views[2].image)
+        assert set(fuse_views(views).confidence) == {100}
+        assert set(fuse_views([*views[:2], sure]).confidence) == {200}
+
+
+class TestOutliers:
+    def test_a_point_that_most_see_through_is_removed_though_one_agrees(self):
+        """Two views share a false wall before the ball, three that are sure of themselves look through it."""
+
+        def walled(ranges, idx):
+            center = ball_poses[idx].center
+            rays = ray_grid(SIZE)
+            wall = (1.2 - center[2]) / np.maximum(rays[..., 2], 1e-3)
+            return np.where((rays[..., 2] > 0.9) & (idx < 2), wall, ranges)
+
+        ball_poses = [view.pose for view in ball_views(5)]
+        views = [FusionView(as_map(view.range_map.range, 200), view.pose, view.image) for view in ball_views(5, walled)]
+        false = np.abs(from_ball(fuse_views(views[:3]))) > 0.3
+        assert false.sum() > 300
+        assert (np.abs(from_ball(fuse_views(views))) > 0.3).sum() == 0
+        unsure = [FusionView(as_map(view.range_map.range, 100), view.pose, view.image) for view in views]
+        assert (np.abs(from_ball(fuse_views(unsure))) > 0.3).sum() > 300
+
+    def test_a_surface_vouches_for_its_own_pixels_only(self):
+        """One view alone sees a strip beside what both see, and an island of its own before the ball."""
+        island = np.zeros(SIZE, bool)
+        island[60:70, 100:110] = True
+
+        def partly(ranges, idx):
+            ranges = np.where(island & (idx == 0), 0.7 * ranges, ranges)
+            return np.where((np.arange(SIZE[1]) > 128) & (idx == 1), np.nan, ranges)
+
+        views = ball_views(2, partly)
+        strict = fuse_reference(views[0], [], views[1:], FusionSettings(min_support=None))
+        cloud = fuse_reference(views[0], [], views[1:])
+        assert strict.view_counts.min() == 2
+        added = cloud.view_counts == 1
+        assert SIZE[0] * 0.5 < added.sum() < SIZE[0] * 4
+        assert np.abs(from_ball(cloud)).max() < 3e-3
+
+    def test_no_point_comes_from_a_masked_pixel_nor_by_its_vote(self):
+        mask = ray_grid(SIZE)[..., 1] < 0.5
+        views = ball_views(3, mask=mask)
+        cloud = fuse_views(views, FusionSettings(even_density=False))
+        below = [(cloud.points_in_world - view.pose.center) for view in views]
+        shares = np.array([points[:, 1] / np.linalg.norm(points, axis=1) for points in below])
+        assert (shares < 0.55).sum(axis=0).min() >= 2
+        assert len(cloud) > 0.6 * mask.sum() * 3
+        half = [views[0], *(FusionView(v.range_map, v.pose, v.image) for v in views[1:])]
+        written = fuse_reference(half[0], [], half[1:])
+        direction = written.points_in_world - views[0].pose.center
+        assert (direction[:, 1] / np.linalg.norm(direction, axis=1)).max() < 0.51
+        with pytest.raises(UsageError, match="mask must have the size"):
+            fuse_views(ball_views(2, mask=mask[1:]))
+
+
+class TestStreaming:
+    @pytest.mark.parametrize("settings", [FusionSettings(neighbours=2), FusionSettings(neighbours=3, voxel_size=0.05)])
+    def test_equals_all_at_once_and_holds_few(self, settings):
+        views = ball_views(7)
+        loads = []
+
+        def load(idx):
+            loads.append(idx)
+            return views[idx]
+
+        streamed = fuse_stream([view.pose for view in views], load, settings)
+        whole = fuse_views(views, settings, threads=3)
+        for name, values in vars(streamed).items():
+            assert values.tobytes() == getattr(whole, name).tobytes()
+        assert set(loads) == set(range(7))
+        assert len(loads) > 7  # some were dropped and loaded again
+
+    def test_neighbours_are_the_nearest_in_rising_order(self):
+        poses = [Rigid3.from_center(np.eye(3), (x, 0, 0)) for x in (0, 10, 1, 3, 3)]
+        assert nearest_views(poses, 2) == [[2, 3], [3, 4], [0, 3], [2, 4], [2, 3]]
+        assert nearest_views(poses, 9) == [[o for o in range(5) if o != i] for i in range(5)]
+
+    def test_normals_that_came_with_the_ranges_are_taken(self):
+        ahead = np.tile(np.float16([0, 0, -1]), (*SIZE, 1))
+        views = [
+            FusionView(RangeMap(v.range_map.range, v.range_map.confidence, ahead), v.pose, v.image)
+            for v in ball_views(2)
+        ]
+        np.testing.assert_array_equal(np.unique(fuse_views(views).normals_in_world, axis=0), [[0, 0, -1]])
 
 
 class TestVoxels:
@@ -218,6 +351,19 @@ class TestVoxels:
         np.testing.assert_allclose(thin.points_in_world, [[5.325, 0.5, 0.5], [0.1, 0.5, 0.5]], rtol=1e-6)
         np.testing.assert_array_equal(thin.view_counts, [3, 2])
         np.testing.assert_array_equal(thin.colors_rgb[0], np.rint((np.arange(3) + 3 * np.arange(6, 9)) / 4))
+
+    def test_clouds_added_in_turn_are_one_cloud(self, monkeypatch):
+        rng = np.random.default_rng(1)
+        parts = [self.cloud(rng.uniform(-1, 1, (200, 3))) for _ in range(5)]
+        whole = thin_by_voxels(join_clouds(parts), 0.3)
+        for waiting in (10, 10**9):
+            monkeypatch.setattr(voxels, "_FEWEST_WAITING", waiting)
+            grid = voxels.VoxelGrid(0.3)
+            for part in parts:
+                grid.add(part)
+            for name, values in vars(grid.cloud()).items():
+                if values is not None:
+                    np.testing.assert_allclose(values, getattr(whole, name), rtol=1e-5, atol=1e-6)
 
     def test_normals_that_cancel_leave_the_first(self):
         normals = np.float32([[0, 0, 1], [0, 0, -1]])

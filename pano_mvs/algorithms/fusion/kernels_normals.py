@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from pano_mvs.algorithms.filters.kernels_reprojection import wrapped_column, wrapped_row
 
@@ -32,8 +32,6 @@ def fit_plane(inverse, rays, row, column, stretch, radius, max_step, a, b):  # t
     `a` (6,) and `b` (3,) are scratch space.
     """
     height, width = inverse.shape
-    # prange counts in unsigned integers, and unsigned plus signed would be a float.
-    row, column = np.int64(row), np.int64(column)
     center = inverse[row, column]
     a[:] = 0.0
     b[:] = 0.0
@@ -66,15 +64,16 @@ def fit_plane(inverse, rays, row, column, stretch, radius, max_step, a, b):  # t
     return solve_symmetric(a, b)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
-def fit_normals(inverse, rays, stretches, radius, max_step):  # type: ignore[no-untyped-def]
-    """Return unit normals towards the camera, (H, W, 3) float32, NaN where no plane is defined."""
-    height, width = inverse.shape
-    normals = np.full((height, width, 3), np.nan, np.float32)
-    for row in prange(height):
-        a, b = np.empty(6), np.empty(3)
-        for column in range(width):
-            if math.isfinite(inverse[row, column]):
+@njit(cache=True, error_model="numpy", nogil=True)
+def fit_normals(inverse, rays, stretches, radius, max_step, rows, normals):  # type: ignore[no-untyped-def]
+    """Write unit normals towards the camera of the rows [first, end) into (H, W, 3) float32.
+
+    Pixels that have a normal already keep it; where no plane is defined nothing is written.
+    """
+    a, b = np.empty(6), np.empty(3)
+    for row in range(rows[0], rows[1]):
+        for column in range(inverse.shape[1]):
+            if math.isfinite(inverse[row, column]) and not math.isfinite(normals[row, column, 0]):
                 x, y, z, ok = fit_plane(inverse, rays, row, column, stretches[row], radius, max_step, a, b)
                 length = math.sqrt(x * x + y * y + z * z)
                 if ok and length > 0:
@@ -82,4 +81,3 @@ def fit_normals(inverse, rays, stretches, radius, max_step):  # type: ignore[no-
                     normals[row, column, 0] = -x / length
                     normals[row, column, 1] = -y / length
                     normals[row, column, 2] = -z / length
-    return normals

@@ -1,13 +1,14 @@
-"""Compiled: which pixels of a reference view become points of the cloud, and where those points lie."""
+"""Compiled: what one source says about the pixels of a reference view, and what its points add to theirs."""
 
 from __future__ import annotations
 
 import math
 
-from numba import njit, prange
+from numba import njit
 
 from pano_mvs.algorithms.filters.kernels_reprojection import (
     AGREES,
+    CONTRADICTS,
     judge_point,
     wrapped_column,
     wrapped_row,
@@ -15,19 +16,20 @@ from pano_mvs.algorithms.filters.kernels_reprojection import (
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def sample_color(image, x, y, channel):  # type: ignore[no-untyped-def]
-    """Return one channel of a picture between its pixels, bilinear."""
+def add_color(image, x, y, weight, color):  # type: ignore[no-untyped-def]
+    """Add the colour between the pixels of a picture, bilinear, times a weight, to color (4,): r, g, b, weight."""
     height, width = image.shape[0], image.shape[1]
     left, top = math.floor(x - 0.5), math.floor(y - 0.5)
     weight_x, weight_y = x - 0.5 - left, y - 0.5 - top
     row_0, row_1 = wrapped_row(top, height), wrapped_row(top + 1, height)
-    upper = (1 - weight_x) * image[row_0, wrapped_column(top, left, height, width), channel] + weight_x * image[
-        row_0, wrapped_column(top, left + 1, height, width), channel
-    ]
-    lower = (1 - weight_x) * image[row_1, wrapped_column(top + 1, left, height, width), channel] + weight_x * image[
-        row_1, wrapped_column(top + 1, left + 1, height, width), channel
-    ]
-    return (1 - weight_y) * upper + weight_y * lower
+    column_00, column_01 = wrapped_column(top, left, height, width), wrapped_column(top, left + 1, height, width)
+    column_10 = wrapped_column(top + 1, left, height, width)
+    column_11 = wrapped_column(top + 1, left + 1, height, width)
+    for channel in range(3):
+        upper = (1 - weight_x) * image[row_0, column_00, channel] + weight_x * image[row_0, column_01, channel]
+        lower = (1 - weight_x) * image[row_1, column_10, channel] + weight_x * image[row_1, column_11, channel]
+        color[channel] += weight * ((1 - weight_y) * upper + weight_y * lower)
+    color[3] += weight
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -41,37 +43,52 @@ def pixel_footprint(view, normal):  # type: ignore[no-untyped-def]
     return squared / max(cosine, 0.05)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
-def vote(reference, source, limits, most_worse, tallies):  # type: ignore[no-untyped-def]
-    """Add one source's vote on every pixel of a reference view.
+@njit(cache=True, error_model="numpy", nogil=True)
+def confidence_at(confidence, x, y):  # type: ignore[no-untyped-def]
+    """Return the confidence of the pixel that holds a place."""
+    height, width = confidence.shape
+    row = min(max(math.floor(y), 0), height - 1)
+    return confidence[row, math.floor(x) % width]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def vote(reference, source, limits, rows, tallies):  # type: ignore[no-untyped-def]
+    """Add one source's vote on the pixels of the rows [first, end) of a reference view.
 
     `reference` is (ranges, rays, normals); `source` is (rotation, translation of source_from_reference, ranges,
-    image); `limits` that of `judge_point`. `tallies` changes in place: kept (H, W) bool is cleared where this view's
-    footprint on the surface is over `most_worse` times the source's; counts (H, W) uint8 of agreeing views; sums
-    (H, W, 4) of weighted points in the reference frame and their weights; colors (H, W, 3) of weighted colours.
+    confidence, image); `limits` holds the three of `judge_point`, how many times larger than the source's this view's
+    footprint may be, the relative difference up to which points are merged, and the confidence from which on a
+    contradiction counts. `tallies` changes in place: yields (H, W) bool is set where the footprint is too large;
+    counts, violations and confidence (H, W) uint8 of agreeing views, of contradicting ones, and the largest confidence;
+    sums (H, W, 4) of weighted points in the reference frame and their weights; colors (H, W, 4) likewise.
     """
     ranges, rays, normals = reference
-    rotation, translation, source_ranges, image = source
-    kept, counts, sums, colors = tallies
-    height, width = ranges.shape
+    rotation, translation, source_ranges, source_confidence, image = source
+    yields, counts, violations, confidence, sums, colors = tallies
     center = -(rotation.T @ translation)
-    for row in prange(height):
-        for column in range(width):
+    for row in range(rows[0], rows[1]):
+        for column in range(ranges.shape[1]):
             r = ranges[row, column]
             if not math.isfinite(r):
                 continue
             ray, normal = rays[row, column], normals[row, column]
             point = (r * ray[0], r * ray[1], r * ray[2])
-            verdict, _, x, y, seen = judge_point(point, rotation, translation, center, source_ranges, limits)
+            verdict, error, x, y, seen = judge_point(point, rotation, translation, center, source_ranges, limits)
+            if verdict == CONTRADICTS and confidence_at(source_confidence, x, y) >= limits[5]:
+                violations[row, column] += 1
             if verdict != AGREES:
                 continue
-            view = (point[0] - center[0], point[1] - center[1], point[2] - center[2])
-            if pixel_footprint(point, normal) > most_worse * pixel_footprint(view, normal):
-                kept[row, column] = False
-            squared = view[0] * view[0] + view[1] * view[1] + view[2] * view[2]
-            weight, ratio = 1 / squared, seen / math.sqrt(squared)
-            for axis in range(3):
-                sums[row, column, axis] += weight * (center[axis] + ratio * view[axis])
-                colors[row, column, axis] += weight * sample_color(image, x, y, axis)
-            sums[row, column, 3] += weight
             counts[row, column] += 1
+            confidence[row, column] = max(confidence[row, column], confidence_at(source_confidence, x, y))
+            view = (point[0] - center[0], point[1] - center[1], point[2] - center[2])
+            footprint = pixel_footprint(view, normal)
+            if pixel_footprint(point, normal) > limits[3] * footprint:
+                yields[row, column] = True
+            add_color(image, x, y, 1 / footprint, colors[row, column])
+            if error < limits[4]:
+                squared = view[0] * view[0] + view[1] * view[1] + view[2] * view[2]
+                share = error / limits[4]
+                weight, ratio = (1 - share * share) ** 2 / squared, seen / math.sqrt(squared)
+                for axis in range(3):
+                    sums[row, column, axis] += weight * (center[axis] + ratio * view[axis])
+                sums[row, column, 3] += weight

@@ -6,13 +6,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.sphere_steps import columns_per_step
+from pano_mvs.algorithms.fusion.bands import for_bands
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import ray_grid
 from pano_mvs.scene import RangeMap
 
 
 def normals_from_range(
-    range_map: RangeMap | NDArray[np.float32], *, radius: int = 2, max_relative_step: float = 0.05
+    range_map: RangeMap | NDArray[np.float32],
+    *,
+    radius: int = 2,
+    max_relative_step: float = 0.05,
+    given: NDArray[np.float32] | None = None,
+    threads: int = 1,
 ) -> NDArray[np.float32]:
     """Return the unit normal of the surface at each pixel, towards the camera.
 
@@ -26,6 +32,8 @@ def normals_from_range(
         range_map: a range map, or its ranges (H, W) with even W; NaN is invalid.
         radius: half the width of the window in pixels at the equator.
         max_relative_step: largest relative step of the range from one pixel to the next on one surface.
+        given: (H, W, 3) normals that are known already, NaN where not; None: none are.
+        threads: how many to use; they change no bit.
 
     Returns:
         (H, W, 3) float32 in the camera frame; NaN where the range is invalid or fewer than 5 pixels of the window are
@@ -44,5 +52,11 @@ def normals_from_range(
     height, width = ranges.shape
     inverse = 1 / ranges.astype(np.float64)
     stretches = columns_per_step((height, width), steps=2 * radius + 1)
-    normals: NDArray[np.float32] = fit_normals(inverse, ray_grid((height, width)), stretches, radius, max_relative_step)
+    rays = ray_grid((height, width))
+    normals = np.full((height, width, 3), np.nan, np.float32) if given is None else given.astype(np.float32)
+
+    def fit(rows: tuple[int, int]) -> None:
+        fit_normals(inverse, rays, stretches, radius, max_relative_step, rows, normals)
+
+    for_bands(fit, height, threads=threads)
     return normals

@@ -1,196 +1,255 @@
-"""From range maps to one cloud: points on which views agree, each written once."""
+"""From range maps to one cloud: points on which views agree."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.consistency import seen_ranges
+from pano_mvs.algorithms.filters.sphere_steps import columns_per_step
+from pano_mvs.algorithms.fusion.bands import for_bands
 from pano_mvs.algorithms.fusion.normals import normals_from_range
-from pano_mvs.algorithms.fusion.voxels import thin_by_voxels
-from pano_mvs.core.errors import UsageError
+from pano_mvs.algorithms.fusion.settings import FusionSettings
+from pano_mvs.algorithms.fusion.view import FusionView, Sight, SightWindow, nearest_views, sight_of
+from pano_mvs.algorithms.fusion.voxels import VoxelGrid
 from pano_mvs.geometry import Rigid3, ray_grid
-from pano_mvs.scene import PointCloud, RangeMap
+from pano_mvs.scene import PointCloud
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
 _MAX_SURFACE_STEP = 0.05
 _MAX_REPROJECTION_PX = 1.0
 # Where two views see a surface about equally well the earlier one keeps it: it may be 5 % worse, and the later one must
 # be 3 % better. The zone between the two is written twice, so that small errors of the footprints leave no gap.
 _EARLIER_MAY_BE_WORSE, _LATER_MUST_BE_BETTER = 1.05, 0.97
+_SUPPORT_RADIUS = 2
+_MAX_SUPPORT_STEP = 0.03
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FusionView:
-    """One view of a fusion.
-
-    Attributes:
-        range_map: (H, W) range map.
-        pose: cam_from_world.
-        image: (H, W, 3) uint8 RGB.
-    """
-
-    range_map: RangeMap
-    pose: Rigid3
-    image: NDArray[np.uint8]
-
-
-def fuse_views(
-    views: Iterable[FusionView],
-    *,
-    min_views: int = 2,
-    max_relative_error: float = 0.02,
-    stride: int = 1,
-    voxel_size: float | None = None,
-    min_confidence: int = 64,
-) -> PointCloud:
-    """Return the cloud of all points on which at least `min_views` views agree.
-
-    Each view in turn is the reference of `fuse_reference`, with all others as its sources; the clouds are joined in
-    the order of the views.
+def fuse_views(views: Sequence[FusionView], settings: FusionSettings | None = None, *, threads: int = 1) -> PointCloud:
+    """Return the cloud of all points on which views agree.
 
     Args:
-        views: the views; all are held in memory.
-        min_views: how many views, the one that writes the point included, must agree.
-        max_relative_error: largest relative difference of two views' ranges of one point.
-        stride: write every stride-th pixel in both directions.
-        voxel_size: edge, in scene units, of voxels in which points are joined into one; None joins none.
-        min_confidence: pixels of a lower confidence neither write nor vote.
+        views: the views; see `fuse_stream` for many.
+        settings: which points and how; None: the defaults.
+        threads: how many to use; they change no bit.
 
     Raises:
-        UsageError: if a parameter is out of bounds, or a view's arrays disagree.
+        UsageError: if a view's arrays disagree.
     """
-    held = list(views)
-    clouds = [
-        fuse_reference(
-            view,
-            held[:idx],
-            held[idx + 1 :],
-            min_views=min_views,
-            max_relative_error=max_relative_error,
-            stride=stride,
-            min_confidence=min_confidence,
-        )
-        for idx, view in enumerate(held)
-    ]
-    cloud = join_clouds(clouds)
-    return cloud if voxel_size is None else thin_by_voxels(cloud, voxel_size)
+    return fuse_stream([view.pose for view in views], views.__getitem__, settings, threads=threads)
+
+
+def fuse_stream(
+    poses: Sequence[Rigid3],
+    load: Callable[[int], FusionView],
+    settings: FusionSettings | None = None,
+    *,
+    threads: int = 1,
+) -> PointCloud:
+    """Return the cloud of views that are loaded one after the other; no more than a view and its neighbours are held.
+
+    Each view in turn is the reference of `fuse_reference`, with its neighbours as sources; the clouds are joined in
+    the order of the views, voxel by voxel if the settings say so. The result does not depend on what is held.
+
+    Args:
+        poses: cam_from_world of all views.
+        load: position of a view to the view; called again if it was dropped since.
+        settings: as in `fuse_views`.
+        threads: as in `fuse_views`.
+
+    Raises:
+        UsageError: as `fuse_views`.
+    """
+    chosen = settings or FusionSettings()
+    window = SightWindow(load, min_confidence=chosen.min_confidence, size=chosen.neighbours + 1)
+    grid = None if chosen.voxel_size is None else VoxelGrid(chosen.voxel_size)
+    clouds: list[PointCloud] = []
+    for idx, neighbours in enumerate(nearest_views(poses, chosen.neighbours)):
+        sources = [(window, other, _tie(is_earlier=other < idx)) for other in neighbours]
+        cloud = _points_of(window[idx], sources, chosen, threads)
+        if grid is None:
+            clouds.append(cloud)
+        else:
+            grid.add(cloud)
+    return join_clouds(clouds) if grid is None else grid.cloud()
 
 
 def fuse_reference(
     reference: FusionView,
     earlier: Sequence[FusionView],
     later: Sequence[FusionView],
+    settings: FusionSettings | None = None,
     *,
-    min_views: int = 2,
-    max_relative_error: float = 0.02,
-    stride: int = 1,
-    min_confidence: int = 64,
+    threads: int = 1,
 ) -> PointCloud:
     """Return the points that one view contributes to the cloud.
 
-    A pixel becomes a point if `min_views` views agree on it, by the test of `check_consistency`, and none of those that
-    agree sees the surface with a clearly smaller footprint r² / cosine: that one will write it. Position and colour are
-    averages over the agreeing views, weighted by 1 / r². Rows away from the equator are thinned so that pixels per
-    solid angle are even. The result depends on the reference and the sources only, so a caller may hold just those.
+    A pixel becomes a point if `min_views` views agree on it, by the test of `check_consistency`, unless more views
+    whose own pixel is consistent see through it than agree: it then hangs in free space. One that lacks a single view
+    enters on the support of its surface (`min_support`), unless a consistent pixel contradicts. What another agreeing
+    view sees clearly better is left to that one. A point is the mean, weighted by 1 / r², of where the views put it
+    (`merge_within`); its colour that of all views that agree, weighted by cos / r², the inverse of what a pixel covers
+    there; its confidence the largest of theirs.
 
     Args:
         reference: the view that writes.
         earlier: neighbouring views that come before it.
         later: neighbouring views that come after it.
-        min_views: as in `fuse_views`.
-        max_relative_error: as in `fuse_views`.
-        stride: as in `fuse_views`.
-        min_confidence: as in `fuse_views`.
+        settings: as in `fuse_views`; `neighbours` and `voxel_size` have no meaning here.
+        threads: as in `fuse_views`.
 
     Returns:
         The points in the world frame, in the order of the reference's pixels.
 
     Raises:
-        UsageError: if a parameter is out of bounds, or a view's arrays disagree.
+        UsageError: as `fuse_views`.
     """
-    if min_views < 1 or stride < 1 or not max_relative_error > 0:
-        raise UsageError(f"min_views, stride and max_relative_error must be positive, got {min_views}, {stride}, "
-                         f"{max_relative_error}")  # fmt: skip
-    for view in (reference, *earlier, *later):
-        if view.image.shape != (*view.range_map.range.shape, 3) or view.image.dtype != np.uint8:
-            raise UsageError(f"a view's image must be (H, W, 3) uint8 in the size of its range map "
-                             f"{view.range_map.range.shape}, got {view.image.shape} {view.image.dtype}")  # fmt: skip
-    height, width = reference.range_map.range.shape
-    ranges = seen_ranges(reference.range_map, min_confidence=min_confidence)
-    rays = ray_grid((height, width))
-    normals = _normals_or_views(ranges, rays)
-    kept = np.isfinite(ranges) & _even_pixels((height, width), stride)
-    ranges[~kept] = np.nan
-    counts, sums, colors = _vote_of_sources(
-        (ranges, rays, normals), reference, [(view, _EARLIER_MAY_BE_WORSE) for view in later]
-        + [(view, _LATER_MUST_BE_BETTER) for view in earlier], kept, max_relative_error, min_confidence,
-    )  # fmt: skip
-    kept &= counts >= min_views
-    weight = sums[kept][:, 3:]
-    world_from_cam = reference.pose.inverse()
-    return PointCloud(
-        points_in_world=world_from_cam.apply(sums[kept][:, :3] / weight).astype(np.float32),
-        normals_in_world=(normals[kept].astype(np.float64) @ world_from_cam.rotation.T).astype(np.float32),
-        colors_rgb=np.rint(colors[kept] / weight).clip(0, 255).astype(np.uint8),
-        view_counts=counts[kept],
-    )
+    chosen = settings or FusionSettings()
+    views = [*earlier, *later]
+    window = SightWindow(views.__getitem__, min_confidence=chosen.min_confidence, size=1)
+    sources = [(window, idx, _tie(is_earlier=idx < len(earlier))) for idx in range(len(views))]
+    return _points_of(sight_of(reference, min_confidence=chosen.min_confidence), sources, chosen, threads)
 
 
 def join_clouds(clouds: Sequence[PointCloud]) -> PointCloud:
-    """Return one cloud of the points of several, in order."""
+    """Return one cloud of the points of several, in order; their confidence is kept if all have it."""
     empty = np.zeros((0, 3), np.float32)
+    confidences = [cloud.confidence for cloud in clouds if cloud.confidence is not None]
     return PointCloud(
         np.concatenate([empty, *(cloud.points_in_world for cloud in clouds)]),
         np.concatenate([empty, *(cloud.normals_in_world for cloud in clouds)]),
         np.concatenate([empty.astype(np.uint8), *(cloud.colors_rgb for cloud in clouds)]),
         np.concatenate([np.zeros(0, np.uint8), *(cloud.view_counts for cloud in clouds)]),
+        np.concatenate([np.zeros(0, np.uint8), *confidences]) if len(confidences) == len(clouds) else None,
     )
 
 
-def _vote_of_sources(
-    pixels: tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float32]],
-    reference: FusionView,
-    sources: Sequence[tuple[FusionView, float]],
-    kept: NDArray[np.bool_],
-    max_relative_error: float,
-    min_confidence: int,
-) -> tuple[NDArray[np.uint8], NDArray[np.float64], NDArray[np.float64]]:
-    """Return counts, weighted points with weights, and weighted colours; clear `kept` where a source sees better."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Tallies:
+    """What the sources say of each pixel, as `kernels_vote.vote` fills it in."""
+
+    yields: NDArray[np.bool_]
+    counts: NDArray[np.uint8]
+    violations: NDArray[np.uint8]
+    confidence: NDArray[np.uint8]
+    sums: NDArray[np.float64]
+    colors: NDArray[np.float64]
+
+    def arrays(self) -> tuple[NDArray[np.generic], ...]:
+        """Return all arrays in the kernel's order."""
+        return self.yields, self.counts, self.violations, self.confidence, self.sums, self.colors
+
+
+def _points_of(
+    reference: Sight, sources: Sequence[tuple[SightWindow, int, float]], settings: FusionSettings, threads: int
+) -> PointCloud:
+    """Return the points of one view; sources are (where to get it, its position there, its `_tie`)."""
+    height, width = reference.ranges.shape
+    rays = ray_grid((height, width))
+    normals = _normals_or_views(reference, rays, threads)
+    tallies = _own_tallies(reference, rays, normals)
+    for window, idx, tie in sources:
+        _add_votes(window[idx], tie, (reference, rays, normals), settings, tallies, threads)
+    kept = _kept(reference, tallies, settings)
+    position = tallies.sums[kept]
+    color = tallies.colors[kept]
+    world_from_cam = reference.pose.inverse()
+    return PointCloud(
+        points_in_world=world_from_cam.apply(position[:, :3] / position[:, 3:]).astype(np.float32),
+        normals_in_world=(normals[kept].astype(np.float64) @ world_from_cam.rotation.T).astype(np.float32),
+        colors_rgb=np.rint(color[:, :3] / color[:, 3:]).clip(0, 255).astype(np.uint8),
+        view_counts=tallies.counts[kept],
+        confidence=tallies.confidence[kept],
+    )
+
+
+def _own_tallies(reference: Sight, rays: NDArray[np.float64], normals: NDArray[np.float32]) -> _Tallies:
+    """Return the tallies with nothing but the reference's own pixels in them."""
+    shape = reference.ranges.shape
+    ranges = reference.ranges.astype(np.float64)
+    weight = 1 / ranges**2
+    # As in the kernel: a pixel's footprint is r² / cosine.
+    color_weight = weight * (-np.einsum("hwc,hwc->hw", rays, normals, dtype=np.float64)).clip(0.05)
+    return _Tallies(
+        yields=np.zeros(shape, np.bool_),
+        counts=np.isfinite(ranges).astype(np.uint8),
+        violations=np.zeros(shape, np.uint8),
+        confidence=reference.confidence.copy(),
+        sums=np.concatenate([rays * (weight * ranges)[..., None], weight[..., None]], axis=-1),
+        colors=np.concatenate([reference.image * color_weight[..., None], color_weight[..., None]], axis=-1),
+    )
+
+
+def _add_votes(
+    source: Sight,
+    tie: float,
+    pixels: tuple[Sight, NDArray[np.float64], NDArray[np.float32]],
+    settings: FusionSettings,
+    tallies: _Tallies,
+    threads: int,
+) -> None:
     from pano_mvs.algorithms.fusion.kernels_vote import vote  # compiles on import
 
-    ranges, rays, _ = pixels
-    weight = 1 / ranges.astype(np.float64) ** 2
-    counts = np.isfinite(ranges).astype(np.uint8)
-    sums = np.concatenate([rays * (weight * ranges)[..., None], weight[..., None]], axis=-1)
-    colors = reference.image * weight[..., None]
-    limits = np.array([max_relative_error, _MAX_REPROJECTION_PX * 2 * np.pi / ranges.shape[1], _MAX_SURFACE_STEP])
-    for view, most_worse in sources:
-        source_from_reference = view.pose @ reference.pose.inverse()
-        source = (
-            np.ascontiguousarray(source_from_reference.rotation),
-            np.ascontiguousarray(source_from_reference.translation),
-            seen_ranges(view.range_map, min_confidence=min_confidence),
-            np.ascontiguousarray(view.image),
+    reference, rays, normals = pixels
+    height, width = reference.ranges.shape
+    max_angle = _MAX_REPROJECTION_PX * 2 * np.pi / width
+    limits = np.array([
+        settings.max_relative_error, max_angle, _MAX_SURFACE_STEP, settings.max_footprint_ratio * tie,
+        settings.merge_within, CONSISTENT_CONFIDENCE[0],
+    ])  # fmt: skip
+    source_from_reference = source.pose @ reference.pose.inverse()
+    relation = (
+        np.ascontiguousarray(source_from_reference.rotation),
+        np.ascontiguousarray(source_from_reference.translation),
+    )
+    arrays = (*relation, source.ranges, source.confidence, source.image)
+
+    def of_rows(rows: tuple[int, int]) -> None:
+        vote((reference.ranges, rays, normals), arrays, limits, rows, tallies.arrays())
+
+    for_bands(of_rows, height, threads=threads)
+
+
+def _kept(reference: Sight, tallies: _Tallies, settings: FusionSettings) -> NDArray[np.bool_]:
+    """Return the pixels, (H, W), that become points."""
+    from pano_mvs.algorithms.fusion.kernels_support import find_supported  # compiles on import
+
+    shape = reference.ranges.shape
+    seen = np.isfinite(reference.ranges)
+    agreeing = tallies.counts.astype(np.int64)
+    confirmed = seen & (agreeing >= settings.min_views) & (tallies.violations <= agreeing - 1)
+    kept = confirmed
+    if settings.min_support is not None and settings.min_views > 1:
+        stretches = columns_per_step((shape[0], shape[1]), steps=2 * _SUPPORT_RADIUS + 1)
+        supported = find_supported(
+            reference.ranges, confirmed, stretches, _SUPPORT_RADIUS, _MAX_SUPPORT_STEP, settings.min_support
         )
-        vote(pixels, source, limits, most_worse, (kept, counts, sums, colors))
-    return counts, sums, colors
+        kept = confirmed | (supported & (agreeing == settings.min_views - 1) & (tallies.violations == 0))
+    return kept & ~tallies.yields & _chosen_pixels((shape[0], shape[1]), settings)
 
 
-def _normals_or_views(ranges: NDArray[np.float32], rays: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return unit normals, (H, W, 3); where no plane is defined, the direction to the camera."""
-    normals = normals_from_range(ranges)
-    return np.where(np.isfinite(normals), normals, -rays).astype(np.float32)
+def _tie(*, is_earlier: bool) -> float:
+    """Return the factor on the largest footprint ratio that settles ties with an earlier or a later source."""
+    return _LATER_MUST_BE_BETTER if is_earlier else _EARLIER_MAY_BE_WORSE
 
 
-def _even_pixels(size_hw: tuple[int, int], stride: int) -> NDArray[np.bool_]:
-    """Return the pixels, (H, W), that sample the sphere evenly: in a row at elevation φ the share cos φ of them."""
+def _normals_or_views(reference: Sight, rays: NDArray[np.float64], threads: int) -> NDArray[np.float32]:
+    """Return unit normals, (H, W, 3): given or fitted ones, else the direction to the camera."""
+    normals = normals_from_range(reference.ranges, given=reference.normals, threads=threads)
+    unknown = ~np.isfinite(normals[..., 0])
+    normals[unknown] = -rays[unknown]
+    return normals
+
+
+def _chosen_pixels(size_hw: tuple[int, int], settings: FusionSettings) -> NDArray[np.bool_]:
+    """Return every stride-th pixel, (H, W); of even density, a row at elevation φ has the share cos φ of them."""
     height, width = size_hw
     rows = np.arange(height)
-    samples = np.maximum(1, np.rint(width * np.cos(np.pi * (0.5 - (rows + 0.5) / height)) / stride))
+    share = np.cos(np.pi * (0.5 - (rows + 0.5) / height)) if settings.even_density else np.ones(height)
+    samples = np.maximum(1, np.rint(width * share / settings.stride))
     number = np.floor(np.arange(width) * samples[:, None] / width)
     first = np.diff(number, axis=1, prepend=-1) > 0
-    even: NDArray[np.bool_] = first & (rows % stride == stride // 2)[:, None]
-    return even
+    chosen: NDArray[np.bool_] = first & (rows % settings.stride == settings.stride // 2)[:, None]
+    return chosen

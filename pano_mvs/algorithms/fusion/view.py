@@ -1,0 +1,113 @@
+"""A view as fusion reads it, and the few that it holds at a time."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import Rigid3
+from pano_mvs.scene import RangeMap
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FusionView:
+    """One view of a fusion.
+
+    Attributes:
+        range_map: (H, W) range map.
+        pose: cam_from_world.
+        image: (H, W, 3) uint8 RGB.
+        mask: (H, W) bool, False where the view is to be ignored; None: nowhere.
+    """
+
+    range_map: RangeMap
+    pose: Rigid3
+    image: NDArray[np.uint8]
+    mask: NDArray[np.bool_] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """What a view has seen well enough to write and to vote, laid out for compiled loops.
+
+    Attributes:
+        pose: cam_from_world.
+        ranges: (H, W) float32, NaN where there is nothing to go by.
+        confidence: (H, W) uint8.
+        image: (H, W, 3) uint8.
+        normals: (H, W, 3) float32 normals that came with the ranges, or None.
+    """
+
+    pose: Rigid3
+    ranges: NDArray[np.float32]
+    confidence: NDArray[np.uint8]
+    image: NDArray[np.uint8]
+    normals: NDArray[np.float32] | None
+
+
+def sight_of(view: FusionView, *, min_confidence: int) -> Sight:
+    """Return what a view has seen with at least that confidence and outside of its mask.
+
+    Raises:
+        UsageError: if its arrays disagree in size.
+    """
+    ranges, confidence = view.range_map.range, view.range_map.confidence
+    if view.image.shape != (*ranges.shape, 3) or view.image.dtype != np.uint8:
+        raise UsageError(f"a view's image must be (H, W, 3) uint8 in the size of its range map {ranges.shape}, got "
+                         f"{view.image.shape} {view.image.dtype}")  # fmt: skip
+    good = confidence >= min_confidence
+    if view.mask is not None:
+        if view.mask.shape != ranges.shape:
+            raise UsageError(f"a view's mask must have the size of its range map {ranges.shape}, got {view.mask.shape}")
+        good &= view.mask
+    given = view.range_map.normals_in_cam
+    return Sight(
+        view.pose,
+        np.where(good, ranges, np.float32(np.nan)),
+        np.ascontiguousarray(confidence),
+        np.ascontiguousarray(view.image),
+        None if given is None else np.where(good[..., None], given, np.float16(np.nan)).astype(np.float32),
+    )
+
+
+class SightWindow:
+    """Loads views when they are needed and keeps the latest few."""
+
+    def __init__(self, load: Callable[[int], FusionView], *, min_confidence: int, size: int) -> None:
+        """Keep at most `size` views."""
+        self._load = load
+        self._min_confidence = min_confidence
+        self._size = size
+        self._held: OrderedDict[int, Sight] = OrderedDict()
+
+    def __getitem__(self, view_idx: int) -> Sight:
+        """Return a view, loaded again if it was dropped."""
+        if view_idx in self._held:
+            self._held.move_to_end(view_idx)
+        else:
+            while len(self._held) >= self._size:
+                self._held.popitem(last=False)
+            self._held[view_idx] = sight_of(self._load(view_idx), min_confidence=self._min_confidence)
+        return self._held[view_idx]
+
+
+def nearest_views(poses: Sequence[Rigid3], count: int) -> list[list[int]]:
+    """Return for each view the positions of the `count` others with the nearest centres, in rising order.
+
+    Where distances are equal the earlier view comes first.
+    """
+    if len(poses) <= count + 1:
+        return [[other for other in range(len(poses)) if other != idx] for idx in range(len(poses))]
+    centers = np.array([pose.center for pose in poses])
+    distances, found = cKDTree(centers).query(centers, k=count + 1)
+    nearest = []
+    for idx in range(len(poses)):
+        others = [(distance, other) for distance, other in zip(distances[idx], found[idx], strict=True) if other != idx]
+        nearest.append(sorted(int(other) for _, other in sorted(others)[:count]))
+    return nearest
