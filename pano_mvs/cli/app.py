@@ -8,21 +8,19 @@ from __future__ import annotations
 
 import io
 import os
-import shlex
 import sys
-import traceback
-from collections.abc import Callable
-from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, Optional, TypeVar, cast
+from typing import Annotated, Optional
 
 import typer
 from rich.console import Console
 from rich.markup import escape
 
 from pano_mvs import __version__
+from pano_mvs.cli.cache_app import cache_app
 from pano_mvs.cli.default_command import RunByDefault
-from pano_mvs.core.errors import PanoMvsError, WorkflowError
+from pano_mvs.cli.guard import guarded
+from pano_mvs.cli.options import CacheOption, ImagesOption, OutOption, SetOption, WorkflowArgument
 from pano_mvs.engine.executors.threads import available_threads, bound_environment
 
 app = typer.Typer(
@@ -40,41 +38,7 @@ evaluate_app = typer.Typer(
     no_args_is_help=True,
 )
 app.add_typer(evaluate_app, name="evaluate")
-
-WorkflowArgument = Annotated[str, typer.Argument(metavar="WORKFLOW", help="A workflow file, or the name of a preset.")]
-ImagesOption = Annotated[Optional[Path], typer.Option("--images", help="Folder of panoramas to use instead.")]  # noqa: UP045
-SetOption = Annotated[Optional[list[str]], typer.Option("--set", metavar="STAGE.PARAM=VALUE", help="Change a setting.")]  # noqa: UP045
-CacheOption = Annotated[Optional[Path], typer.Option("--cache", help="Folder of the cache.")]  # noqa: UP045
-OutOption = Annotated[Optional[Path], typer.Option("--out", help="Folder of the results; default out/<workflow>.")]  # noqa: UP045
-
-
-Command = TypeVar("Command", bound=Callable[..., None])
-
-
-def _guarded(command: Command) -> Command:
-    """Turn exceptions into messages and exit codes; the only place where that is done."""
-
-    @wraps(command)
-    def guarded(*args: Any, **kwargs: Any) -> None:
-        errors = Console(stderr=True)
-        try:
-            command(*args, **kwargs)
-        except PanoMvsError as error:
-            for problem in error.problems if isinstance(error, WorkflowError) else [str(error)]:
-                errors.print(f"[red]error:[/] {escape(problem)}", highlight=False, soft_wrap=True)
-            raise typer.Exit(error.exit_code) from None
-        except KeyboardInterrupt:
-            errors.print("interrupted; what was finished is kept: the same command goes on from here:", highlight=False)
-            errors.print(f"  {escape(shlex.join(['pano-mvs', *sys.argv[1:]]))}", highlight=False, soft_wrap=True)
-            raise typer.Exit(130) from None
-        except typer.Exit:
-            raise
-        except Exception:
-            traceback.print_exc()
-            errors.print("[red]internal error:[/] this is a bug in pano_mvs; what was finished is kept")
-            raise typer.Exit(1) from None
-
-    return cast(Command, guarded)
+app.add_typer(cache_app, name="cache")
 
 
 def _show_version(wanted: bool) -> None:
@@ -93,7 +57,7 @@ def options(
 
 
 @app.command()
-@_guarded
+@guarded
 def run(
     workflow: WorkflowArgument,
     images: ImagesOption = None,
@@ -119,7 +83,7 @@ def run(
 
 
 @app.command()
-@_guarded
+@guarded
 def plan(
     workflow: WorkflowArgument, images: ImagesOption = None, overrides: SetOption = None, cache: CacheOption = None
 ) -> None:
@@ -131,7 +95,7 @@ def plan(
 
 
 @app.command()
-@_guarded
+@guarded
 def check(workflow: WorkflowArgument, images: ImagesOption = None, overrides: SetOption = None) -> None:
     """Show every mistake in a workflow at once, with its line and column."""
     from pano_mvs.cli.session import open_session
@@ -141,7 +105,7 @@ def check(workflow: WorkflowArgument, images: ImagesOption = None, overrides: Se
 
 
 @app.command()
-@_guarded
+@guarded
 def status(
     workflow: WorkflowArgument, images: ImagesOption = None, out: OutOption = None, cache: CacheOption = None
 ) -> None:
@@ -153,7 +117,7 @@ def status(
 
 
 @app.command()
-@_guarded
+@guarded
 def plugins() -> None:
     """List all stages, where they come from, and the plugins that failed to load."""
     from pano_mvs.cli.show import show_plugins
@@ -162,7 +126,7 @@ def plugins() -> None:
 
 
 @stage_app.command("show")
-@_guarded
+@guarded
 def stage_show(name: Annotated[str, typer.Argument(help="A stage's name, such as depth.sweep.")]) -> None:
     """Show a stage's ports, settings and documentation."""
     from pano_mvs.cli.show import show_stage
@@ -171,7 +135,7 @@ def stage_show(name: Annotated[str, typer.Argument(help="A stage's name, such as
 
 
 @evaluate_app.command("run")
-@_guarded
+@guarded
 def evaluate_run(
     out: Annotated[Path, typer.Argument(help="The output folder of a run.")],
     truth: Annotated[Path, typer.Option("--truth", help="Folder with poses.json and depth.npz.")],
@@ -183,7 +147,7 @@ def evaluate_run(
 
 
 @evaluate_app.command("poses")
-@_guarded
+@guarded
 def evaluate_model(
     model: Annotated[Path, typer.Argument(help="COLMAP model, poses.json, transforms.json, CSV, or a run's output.")],
     truth: Annotated[Path, typer.Option("--truth", help="The true poses, in any of these forms.")],
@@ -196,7 +160,7 @@ def evaluate_model(
 
 
 @evaluate_app.command("cloud")
-@_guarded
+@guarded
 def evaluate_points(
     cloud: Annotated[Path, typer.Argument(help="A PLY file, or the output folder of a run.")],
     truth: Annotated[Path, typer.Option("--truth", help="Folder with poses.json and depth.npz, or a reference PLY.")],

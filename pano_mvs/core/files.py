@@ -15,13 +15,23 @@ OUTPUT_MARK = ".pano-mvs-output"
 """An empty file in every output folder, written first: no source takes what lies there for pictures."""
 
 
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+_UMASK = _umask()  # once: to ask is to set it for a moment, for all threads
+
+
 @contextmanager
-def replacing(path: Path, *, temporary_in: Path | None = None) -> Iterator[Path]:
+def replacing(path: Path, *, temporary_in: Path | None = None, durable: bool = False) -> Iterator[Path]:
     """Yield a temporary path to write; on success it takes the name `path` in one step, else it is removed.
 
     Args:
         path: the file to create or replace; its folder is made.
         temporary_in: folder for the temporary file, on the same file system; default beside `path`.
+        durable: return only when the bytes and the name are on the disk itself, so that a power cut loses neither.
 
     Raises:
         StoreError: if the file cannot be written (no permission, disk full).
@@ -35,8 +45,12 @@ def replacing(path: Path, *, temporary_in: Path | None = None) -> Iterator[Path]
         os.close(handle)
         temporary = Path(name)
         yield temporary
-        temporary.chmod(0o666 & ~_umask())
-        temporary.replace(path)
+        temporary.chmod(0o666 & ~_UMASK)
+        if durable:
+            _flush(temporary)
+        _take_name(temporary, path)
+        if durable and os.name == "posix":
+            _flush(path.parent)
     except OSError as error:
         if isinstance(error, StoreError):
             raise
@@ -48,9 +62,9 @@ def replacing(path: Path, *, temporary_in: Path | None = None) -> Iterator[Path]
             temporary.unlink(missing_ok=True)
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a text file in one step (UTF-8, as given)."""
-    with replacing(path) as temporary:
+def write_text(path: Path, text: str, *, durable: bool = False) -> None:
+    """Write a text file in one step (UTF-8, as given); see `replacing`."""
+    with replacing(path, durable=durable) as temporary:
         temporary.write_bytes(text.encode())
 
 
@@ -60,7 +74,20 @@ def copy_file(source: Path, target: Path) -> None:
         shutil.copyfile(source, temporary)
 
 
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+def _take_name(temporary: Path, path: Path) -> None:
+    """Rename; where a reader holds a file of the same content open, some systems refuse, and there is nothing to do."""
+    try:
+        temporary.replace(path)
+    except PermissionError:
+        if not path.is_file() or path.stat().st_size != temporary.stat().st_size:
+            raise
+        if path.read_bytes() != temporary.read_bytes():
+            raise
+
+
+def _flush(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
+import os
+import re
 import shutil
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pano_mvs.core.digest import digest_from_bytes, digest_from_file
+from pano_mvs.core.digest import DIGEST_BYTES, digest_from_bytes, digest_from_file
 from pano_mvs.core.errors import StoreError
 from pano_mvs.core.files import replacing
 from pano_mvs.engine.stat_cache import StatCache
 from pano_mvs.scene import FilePart, Part
+
+_DIGEST = re.compile(rf"[0-9a-f]{{{2 * DIGEST_BYTES}}}")
+_SUFFIX = re.compile(r"(\.[a-z0-9_+-]{1,16})?")
+_LARGEST_BYTES = 1 << 50
 
 
 class DamagedBlobError(StoreError):
@@ -44,16 +52,26 @@ class BlobRef:
 
     @staticmethod
     def from_json(value: list[Any]) -> BlobRef:
-        """Return the reference that `to_json` gave."""
+        """Return the reference that `to_json` gave.
+
+        Raises:
+            ValueError: if it is none: what it names could lie outside the store.
+        """
         digest, size_bytes, suffix, external = value
-        return BlobRef(str(digest), int(size_bytes), str(suffix), bool(external))
+        sound = isinstance(digest, str) and _DIGEST.fullmatch(digest) and isinstance(suffix, str)
+        if not sound or not _SUFFIX.fullmatch(suffix) or type(size_bytes) is not int or type(external) is not bool:
+            raise ValueError(f"no reference to a blob: {value!r}")
+        if not 0 <= size_bytes < _LARGEST_BYTES:
+            raise ValueError(f"a blob of {size_bytes} bytes")
+        return BlobRef(digest, size_bytes, suffix, external)
 
 
 class BlobStore:
     """A folder of blobs. External files are known by digest and found through the paths registered in this run."""
 
-    def __init__(self, root: Path, stat_cache: StatCache) -> None:
+    def __init__(self, root: Path, stat_cache: StatCache, *, durable: bool = False) -> None:
         self.root = root
+        self.durable = durable
         self.temporary = root / "tmp"
         self.stat_cache = stat_cache
         self._external: dict[str, Path] = {}
@@ -95,14 +113,26 @@ class BlobStore:
             DamagedBlobError: if the bytes are not those that were stored; the blob is removed.
         """
         path = self.verified_path(ref)
-        if ref.suffix == ".npy" and not ref.external:
-            array: np.ndarray[Any, Any] = np.load(path, mmap_mode="r", allow_pickle=False)
-            return array
-        if ref.suffix == ".json" and not ref.external:
-            value = json.loads(path.read_bytes())
-            assert isinstance(value, dict)
-            return value
+        try:
+            if ref.suffix == ".npy" and not ref.external:
+                array: np.ndarray[Any, Any] = np.load(path, mmap_mode="r", allow_pickle=False)
+                return array
+            if ref.suffix == ".json" and not ref.external:
+                value = json.loads(path.read_bytes())
+                if not isinstance(value, dict):
+                    raise ValueError("not an object")
+                return value
+        except (ValueError, RecursionError) as error:
+            raise self.discard(ref, f"holds nothing that pano_mvs writes ({error})") from error
         return FilePart(path, external=ref.external, digest=ref.digest)
+
+    def discard(self, ref: BlobRef, why: str) -> DamagedBlobError:
+        """Remove a blob that is of no use, unless it is the user's own file, and return the error that says so."""
+        path = self.path(ref)
+        if not ref.external:
+            path.unlink(missing_ok=True)
+        self._verified.discard(ref.digest)
+        return DamagedBlobError(f"{path} {why}; the same command computes it again")
 
     def verified_path(self, ref: BlobRef) -> Path:
         """Return a blob's path after checking its bytes, once in the life of this object."""
@@ -114,31 +144,62 @@ class BlobStore:
         except OSError:
             sound = False
         if not sound:
-            if not ref.external:
-                path.unlink(missing_ok=True)
-            raise DamagedBlobError(f"{path} is damaged or gone; the same command computes it again")
+            raise self.discard(ref, "is damaged or gone")
         self._verified.add(ref.digest)
         return path
 
     def _put_bytes(self, data: bytes, suffix: str) -> BlobRef:
         ref = BlobRef(digest_from_bytes(data), len(data), suffix)
-        if not self.exists(ref):
-            with replacing(self.path(ref), temporary_in=self.temporary) as temporary:
+        if not self._keep(ref):
+            with self._writing(ref) as temporary:
                 temporary.write_bytes(data)
         return ref
 
     def _put_array(self, array: np.ndarray[Any, Any]) -> BlobRef:
+        """Store an array as .npy without a second copy of it in memory."""
+        array = np.ascontiguousarray(array)
         buffer = io.BytesIO()
-        np.lib.format.write_array(buffer, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
-        return self._put_bytes(buffer.getvalue(), ".npy")
+        np.lib.format.write_array_header_1_0(buffer, np.lib.format.header_data_from_array_1_0(array))
+        header = buffer.getvalue()
+        if array.dtype.hasobject:
+            raise TypeError("an array of Python objects")
+        data = array.reshape(-1).view(np.uint8).data if array.size else memoryview(b"")
+        hasher = hashlib.blake2b(header, digest_size=DIGEST_BYTES)
+        hasher.update(data)
+        ref = BlobRef(hasher.hexdigest(), len(header) + array.nbytes, ".npy")
+        if not self._keep(ref):
+            with self._writing(ref) as temporary, temporary.open("wb") as stream:
+                stream.write(header)
+                stream.write(data)
+        return ref
 
     def _put_file(self, part: FilePart) -> BlobRef:
         suffix = part.path.suffix.lower()
+        if not _SUFFIX.fullmatch(suffix):
+            suffix = ""
         if part.external:
             digest = self.register_external(part.path)
             return BlobRef(digest, part.path.stat().st_size, suffix, external=True)
         ref = BlobRef(digest_from_file(part.path), part.path.stat().st_size, suffix)
-        if not self.exists(ref):
-            with replacing(self.path(ref), temporary_in=self.temporary) as temporary:
+        if not self._keep(ref):
+            with self._writing(ref) as temporary:
                 shutil.copyfile(part.path, temporary)
         return ref
+
+    def _keep(self, ref: BlobRef) -> bool:
+        """Return whether a sound copy is there already, and mark it as used now, so that no collection takes it."""
+        if not self.exists(ref):
+            return False
+        try:
+            self.verified_path(ref)
+            os.utime(self.path(ref))
+        except (DamagedBlobError, OSError):
+            return False
+        return True
+
+    def _writing(self, ref: BlobRef) -> AbstractContextManager[Path]:
+        path = self.path(ref)
+        if path.parent.is_symlink():
+            raise StoreError(f"{path.parent} is a link, which no cache has: remove it, or choose another cache "
+                             "with --cache DIR")  # fmt: skip
+        return replacing(path, temporary_in=self.temporary, durable=self.durable)

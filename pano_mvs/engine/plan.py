@@ -41,7 +41,7 @@ def make_plan(workflow: Workflow, graph: Graph, store: Store, workflow_id: str) 
     Raises:
         InputError: if the source cannot be listed.
     """
-    last = store.last_keys(workflow_id)
+    last = store.runs.last_keys(workflow_id)
     states: dict[str, StageState] = {}
     plans: list[StagePlan] = []
     for name in graph.order:

@@ -114,7 +114,8 @@ class Run:
         """Keep what makes the next plan better; a run does not fail for want of it."""
         name = workflow_id(self.workflow)
         try:
-            self.store.save_last_keys(name, self.store.last_keys(name) | self._keys)
+            finished = self.result.exit_code in {0, 3} and not self.result.stopped
+            self.store.runs.remember(name, self._keys, workflow=self.workflow.name, out=self.out, finished=finished)
             self.store.stat_cache.save()
         except StoreError as error:
             self._warn(f"the next run cannot be told why it computes something: {error}")

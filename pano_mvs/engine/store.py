@@ -1,12 +1,16 @@
 """The cache: small records by key, written last and in one step, over immutable blobs.
 
-Layout under the root: `blobs/ab/<digest><suffix>`, `records/ab/<key>.json`, `last/<id>.json` (which key each unit had
-in a workflow's latest run, for the reasons that the plan gives), `stat-cache.json`, `tmp/`, `layout.json`.
+Layout under the root: `blobs/ab/<digest><suffix>`, `records/ab/<key>.json`, `runs/<id>.json` (which key each unit had
+in the latest run of a workflow into a folder: for the reasons that the plan gives, and what a collection keeps),
+`pins/` (runs kept whatever happens), `stat-cache.json`, `tmp/`, `layout.json`.
 What is cached is derived from the records: there is no status file that could be wrong and nothing to unlock.
+Names are taken in one step by renaming, nothing is ever changed in place, and no link is made: any number of runs, on
+several hosts, may share a store.
 """
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 import tempfile
@@ -21,11 +25,15 @@ from pano_mvs.core.digest import digest_from_bytes, digest_from_value
 from pano_mvs.core.errors import ContractError, StoreError, UsageError
 from pano_mvs.core.files import write_text
 from pano_mvs.engine.blobs import BlobRef, BlobStore, DamagedBlobError
+from pano_mvs.engine.runs import RunBook
 from pano_mvs.engine.stat_cache import StatCache
 from pano_mvs.scene import Record
 
 LAYOUT_VERSION = 1
+LEAST_FREE_BYTES = 200_000_000
 _ABANDONED_AFTER_S = 7 * 24 * 3600.0
+_FOLDERS = ("blobs", "records", "runs", "pins", "tmp")
+_FULL = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,63 +94,83 @@ class UnitRecord:
 
     @staticmethod
     def from_json(value: Mapping[str, Any]) -> UnitRecord:
-        """Return the record that `to_json` gave."""
+        """Return the record that `to_json` gave.
+
+        Raises:
+            ValueError, KeyError, TypeError, AttributeError: if it is none.
+        """
+        identity, rejected = value["identity"], value["rejected"]
+        if not isinstance(identity, dict) or not isinstance(rejected, dict):
+            raise TypeError("a record's identity and its rejected images are objects")
         return UnitRecord(
             key=str(value["key"]),
-            identity=value["identity"],
+            identity=identity,
             output=ItemRef.from_json(value["output"]),
             items={name: ItemRef.from_json(item) for name, item in value["items"].items()},
-            metrics=value["metrics"],
-            notes=tuple(value["notes"]),
-            rejected=value["rejected"],
+            metrics={str(name): float(metric) for name, metric in value["metrics"].items()},
+            notes=tuple(str(note) for note in value["notes"]),
+            rejected={str(name): str(reason) for name, reason in rejected.items()},
             seconds=float(value["seconds"]),
         )
+
+    def blobs(self) -> Iterator[BlobRef]:
+        """Yield every blob that the record names."""
+        for item in (self.output, *self.items.values()):
+            yield from item.parts.values()
 
 
 class Store:
     """The cache of one or many workflows."""
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, *, durable: bool = False, least_free_bytes: int = LEAST_FREE_BYTES) -> None:
         """Open or create a store.
+
+        Args:
+            root: its folder.
+            durable: flush every blob and record to the disk before going on, for machines that lose power.
+            least_free_bytes: room on the disk below which no unit is begun; 0 for no such guard.
 
         Raises:
             UsageError: if the folder cannot be written, or was made by a version with another layout.
         """
         self.root = root
+        self.durable = durable
+        self.least_free_bytes = least_free_bytes
         self.damaged: list[str] = []
         self._open_layout()
         self._clear_abandoned()
+        self.runs = RunBook(root)
         self.stat_cache = StatCache(root / "stat-cache.json")
-        self.blobs = BlobStore(root, self.stat_cache)
+        self.blobs = BlobStore(root, self.stat_cache, durable=durable)
 
     def find(self, key: str) -> UnitRecord | None:
         """Return the record of a key if it is sound and all its blobs are there, else None."""
         record = self.read_record(key)
         if record is None:
             return None
-        refs = [*record.output.parts.values(), *(ref for item in record.items.values() for ref in item.parts.values())]
-        return record if all(self.blobs.exists(ref) for ref in refs) else None
+        return record if all(self.blobs.exists(ref) for ref in record.blobs()) else None
 
     def read_record(self, key: str) -> UnitRecord | None:
         """Return the record of a key whether or not its blobs are there; a damaged record is a miss."""
-        path = self._record_path(key)
+        path = self.record_path(key)
         try:
             data = path.read_bytes()
         except OSError:
             return None
-        checksum, _, body = data.partition(b"\n")
-        try:
-            if checksum.decode() != digest_from_bytes(body):
-                raise ValueError("checksum")
-            return UnitRecord.from_json(json.loads(body))
-        except (ValueError, KeyError, TypeError):
+        record = record_from_bytes(data)
+        if record is None or record.key != key:
             self.damaged.append(str(path))
             return None
+        return record
 
     def put(self, record: UnitRecord) -> None:
         """Write a record; its blobs must be there already."""
         body = json.dumps(record.to_json(), sort_keys=True)
-        write_text(self._record_path(record.key), f"{digest_from_bytes(body.encode())}\n{body}")
+        path = self.record_path(record.key)
+        if path.parent.is_symlink():
+            raise StoreError(f"{path.parent} is a link, which no cache has: remove it, or choose another cache "
+                             "with --cache DIR")  # fmt: skip
+        write_text(path, f"{digest_from_bytes(body.encode())}\n{body}", durable=self.durable)
 
     def put_value(self, value: Record) -> ItemRef:
         """Store a value's parts and return its reference.
@@ -166,14 +194,36 @@ class Store:
             DamagedBlobError: if a blob is damaged; it has been removed, so that the next run computes it again.
         """
         try:
-            return kind.from_parts({name: self.blobs.get(part) for name, part in ref.parts.items()})
+            parts = {name: self.blobs.get(part) for name, part in ref.parts.items()}
+            try:
+                return kind.from_parts(parts)
+            except (TypeError, ValueError, KeyError, AttributeError, AssertionError) as error:
+                errors = [
+                    self.blobs.discard(part, f"is no part of a {kind.kind_name()}") for part in ref.parts.values()
+                ]
+                raise errors[0] from error
         except DamagedBlobError as error:
             self.damaged.append(str(error))
             raise
 
+    def require_room(self) -> None:
+        """Raise StoreError if there is too little room on the disk to begin anything."""
+        free = shutil.disk_usage(self.root).free
+        if free < self.least_free_bytes:
+            raise StoreError(
+                f"{free / 1e6:.0f} MB are free where the cache {self.root} is, {self.least_free_bytes / 1e6:.0f} MB "
+                "are kept (--min-free). Make room (`pano-mvs cache gc` shows what can go) and run the same command "
+                "again: what was finished is kept"
+            )
+
     @contextmanager
     def scratch(self) -> Iterator[Path]:
-        """Yield an empty folder inside the store, removed afterwards."""
+        """Yield an empty folder inside the store, removed afterwards.
+
+        Raises:
+            StoreError: if the disk is too full to begin, or was filled by what was done inside.
+        """
+        self.require_room()
         try:
             self.blobs.temporary.mkdir(parents=True, exist_ok=True)
             folder = Path(tempfile.mkdtemp(dir=self.blobs.temporary))
@@ -182,35 +232,30 @@ class Store:
                              "--cache DIR")  from error  # fmt: skip
         try:
             yield folder
+        except OSError as error:
+            if error.errno in _FULL:
+                raise StoreError(f"the disk of the cache {self.root} is full. Make room and run the same command "
+                                 "again: what was finished is kept")  from error  # fmt: skip
+            raise
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 
-    def last_keys(self, workflow_id: str) -> dict[str, dict[str, str]]:
-        """Return the keys of a workflow's latest run: stage to unit to key."""
-        try:
-            keys = json.loads(self._last_path(workflow_id).read_bytes())
-        except (OSError, ValueError):
-            return {}
-        return keys if isinstance(keys, dict) else {}
-
-    def save_last_keys(self, workflow_id: str, keys: Mapping[str, Mapping[str, str]]) -> None:
-        """Remember the keys of a workflow's run."""
-        write_text(self._last_path(workflow_id), json.dumps(keys))
-
-    def _record_path(self, key: str) -> Path:
+    def record_path(self, key: str) -> Path:
+        """Return where the record of a key is or would be."""
         return self.root / "records" / key[:2] / f"{key}.json"
 
-    def _last_path(self, workflow_id: str) -> Path:
-        return self.root / "last" / f"{workflow_id}.json"
-
     def _open_layout(self) -> None:
+        for name in _FOLDERS:
+            if (self.root / name).is_symlink():
+                raise UsageError(f"cache {self.root}: {name} is a link: what is written there would land elsewhere. "
+                                 "Remove it, or choose another cache with --cache DIR")  # fmt: skip
         path = self.root / "layout.json"
         try:
             layout = json.loads(path.read_bytes())
         except FileNotFoundError:
             self._create(path)
             return
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise UsageError(f"cache {self.root} cannot be read: {error}. Choose another with --cache DIR") from error
         if not isinstance(layout, dict) or layout.get("layout") != LAYOUT_VERSION:
             raise UsageError(
@@ -237,3 +282,14 @@ class Store:
             write_text(path, json.dumps({"layout": LAYOUT_VERSION}))
         except StoreError as error:
             raise UsageError(f"cache {self.root} cannot be written. Choose another with --cache DIR") from error
+
+
+def record_from_bytes(data: bytes) -> UnitRecord | None:
+    """Return the record in a file's bytes, or None if they are damaged: the first line is a digest of the rest."""
+    checksum, _, body = data.partition(b"\n")
+    try:
+        if checksum.decode() != digest_from_bytes(body):
+            return None
+        return UnitRecord.from_json(json.loads(body))
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return None

@@ -7,7 +7,7 @@ import pytest
 
 from pano_mvs.core.errors import GateError, InputError, StoreError, UsageError, WorkflowError
 from pano_mvs.engine.registry import Registry
-from pano_mvs.engine.store import Store
+from pano_mvs.engine.runs import RunBook
 from tests.engine.conftest import Toy, ran
 
 ALL_UNITS = {
@@ -218,10 +218,10 @@ def test_names_that_meet_after_the_extension_is_dropped_stay_apart(toy: Toy) -> 
 def test_store_that_cannot_be_written_still_serves_what_it_has(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
     toy.run()
 
-    def refuse(*_: object) -> None:
+    def refuse(*_: object, **__: object) -> None:
         raise StoreError("read only")
 
-    monkeypatch.setattr(Store, "save_last_keys", refuse)
+    monkeypatch.setattr(RunBook, "remember", refuse)
     result = toy.run()
     assert result.exit_code == 0
     assert any("cannot be told why" in warning for warning in result.warnings)

@@ -1,0 +1,44 @@
+"""From exceptions to messages and exit codes: the only place where that is done."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+import traceback
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, TypeVar, cast
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from pano_mvs.core.errors import PanoMvsError, WorkflowError
+
+Command = TypeVar("Command", bound=Callable[..., None])
+
+
+def guarded(command: Command) -> Command:
+    """Turn exceptions into messages and exit codes."""
+
+    @wraps(command)
+    def run_guarded(*args: Any, **kwargs: Any) -> None:
+        errors = Console(stderr=True)
+        try:
+            command(*args, **kwargs)
+        except PanoMvsError as error:
+            for problem in error.problems if isinstance(error, WorkflowError) else [str(error)]:
+                errors.print(f"[red]error:[/] {escape(problem)}", highlight=False, soft_wrap=True)
+            raise typer.Exit(error.exit_code) from None
+        except KeyboardInterrupt:
+            errors.print("interrupted; what was finished is kept: the same command goes on from here:", highlight=False)
+            errors.print(f"  {escape(shlex.join(['pano-mvs', *sys.argv[1:]]))}", highlight=False, soft_wrap=True)
+            raise typer.Exit(130) from None
+        except typer.Exit:
+            raise
+        except Exception:
+            traceback.print_exc()
+            errors.print("[red]internal error:[/] this is a bug in pano_mvs; what was finished is kept")
+            raise typer.Exit(1) from None
+
+    return cast(Command, run_guarded)

@@ -1,0 +1,14 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+WorkflowArgument = Annotated[str, typer.Argument(metavar="WORKFLOW", help="A workflow file, or the name of a preset.")]
+ImagesOption = Annotated[Optional[Path], typer.Option("--images", help="Folder of panoramas to use instead.")]  # noqa: UP045
+SetOption = Annotated[Optional[list[str]], typer.Option("--set", metavar="STAGE.PARAM=VALUE", help="Change a setting.")]  # noqa: UP045
+CacheOption = Annotated[Optional[Path], typer.Option("--cache", help="Folder of the cache.")]  # noqa: UP045
+OutOption = Annotated[Optional[Path], typer.Option("--out", help="Folder of the results; default out/<workflow>.")]  # noqa: UP045

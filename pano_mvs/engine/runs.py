@@ -1,0 +1,145 @@
+"""What the latest run of each workflow into each folder used: for the plan's reasons, and what a collection keeps."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from pano_mvs.core.digest import digest_from_bytes, digest_from_value
+from pano_mvs.core.errors import StoreError, UsageError
+from pano_mvs.core.files import write_text
+
+Keys: TypeAlias = "dict[str, dict[str, str]]"
+"""Stage to unit to cache key."""
+
+_PIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+
+
+@dataclass(frozen=True, slots=True)
+class RunEntry:
+    """One run, or one pin.
+
+    Attributes:
+        name: under which it is listed: the run's id, or the pin's name.
+        workflow: name of the workflow.
+        out: folder of the results.
+        when: the end of the run, ISO 8601, UTC.
+        keys: what it used.
+        pinned: whether it is a pin.
+    """
+
+    name: str
+    workflow: str
+    out: str
+    when: str
+    keys: Keys
+    pinned: bool = False
+
+    @property
+    def units(self) -> int:
+        """The number of units that it used."""
+        return sum(len(units) for units in self.keys.values())
+
+    def age_s(self) -> float:
+        """Return how long ago the run ended."""
+        return (datetime.now(UTC) - datetime.fromisoformat(self.when)).total_seconds()
+
+
+class RunBook:
+    """The runs and the pins of one store."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    def remember(self, workflow_id: str, keys: Keys, *, workflow: str, out: Path, finished: bool = True) -> None:
+        """Keep what a run used; it takes the place of the run before of the same workflow into the same folder.
+
+        What a run that did not get to its end had not reached yet stays as it was known.
+        """
+        if not finished:
+            before = self.last_keys(workflow_id)
+            keys = before | {stage: before.get(stage, {}) | units for stage, units in keys.items()}
+        name = f"{workflow_id[:16]}-{digest_from_value(str(out.resolve()))[:16]}"
+        when = datetime.now(UTC).isoformat(timespec="seconds")
+        self._write("runs", RunEntry(name, workflow, str(out.resolve()), when, keys))
+
+    def last_keys(self, workflow_id: str) -> Keys:
+        """Return the keys of the latest run of a workflow, empty if there is none."""
+        found = sorted(self._paths("runs", f"{workflow_id[:16]}-*.json"), key=lambda path: path.stat().st_mtime_ns)
+        entry = _read(found[-1]) if found else None
+        return entry.keys if entry is not None else {}
+
+    def entries(self) -> list[RunEntry]:
+        """Return all runs and pins, the latest first.
+
+        Raises:
+            StoreError: if one is damaged: what it protects is not known.
+        """
+        found: list[RunEntry] = []
+        for folder in ("runs", "pins"):
+            for path in self._paths(folder, "*.json"):
+                entry = _read(path)
+                if entry is None:
+                    raise StoreError(f"{path} is damaged, so what it keeps is not known. Run its workflow again, or "
+                                     "delete the file if nothing of it is wanted")  # fmt: skip
+                found.append(entry)
+        return sorted(found, key=lambda entry: (entry.when, entry.name), reverse=True)
+
+    def pin(self, run: str, name: str) -> RunEntry:
+        """Keep what a run used, whatever runs after it.
+
+        Args:
+            run: the beginning of its id, or its output folder.
+            name: of the pin: letters, digits, dots, hyphens and underscores.
+
+        Raises:
+            UsageError: if there is no such run, more than one, or no such name.
+        """
+        if not _PIN_NAME.fullmatch(name):
+            raise UsageError(f"{name!r} is no name for a pin: use letters, digits, dots, hyphens and underscores")
+        runs = [entry for entry in self.entries() if not entry.pinned]
+        found = [entry for entry in runs if entry.name.startswith(run) or entry.out == str(Path(run).resolve())]
+        if len(found) != 1:
+            known = ", ".join(entry.name for entry in found or runs) or "none"
+            raise UsageError(f"{len(found)} runs are called {run!r}; there are: {known}")
+        old = found[0]
+        pin = RunEntry(name, old.workflow, old.out, old.when, old.keys, pinned=True)
+        self._write("pins", pin)
+        return pin
+
+    def forget(self, entry: RunEntry) -> None:
+        """Remove a run or a pin from the book; what it used stays until it is collected."""
+        self._path(entry).unlink(missing_ok=True)
+
+    def _write(self, folder: str, entry: RunEntry) -> None:
+        value = {"workflow": entry.workflow, "out": entry.out, "when": entry.when, "keys": entry.keys}
+        body = json.dumps(value, sort_keys=True)
+        write_text(self.root / folder / f"{entry.name}.json", f"{digest_from_bytes(body.encode())}\n{body}")
+
+    def _path(self, entry: RunEntry) -> Path:
+        return self.root / ("pins" if entry.pinned else "runs") / f"{entry.name}.json"
+
+    def _paths(self, folder: str, pattern: str) -> list[Path]:
+        return sorted((self.root / folder).glob(pattern))
+
+
+def _read(path: Path) -> RunEntry | None:
+    try:
+        checksum, _, body = path.read_bytes().partition(b"\n")
+        if checksum.decode() != digest_from_bytes(body):
+            return None
+        value = json.loads(body)
+        workflow, out, when = (str(value[name]) for name in ("workflow", "out", "when"))
+        datetime.fromisoformat(when)
+        return RunEntry(path.stem, workflow, out, when, _keys(value["keys"]), pinned=path.parent.name == "pins")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return None
+
+
+def _keys(value: Mapping[str, Mapping[str, Any]]) -> Keys:
+    return {str(stage): {str(item): str(key) for item, key in units.items()} for stage, units in value.items()}
