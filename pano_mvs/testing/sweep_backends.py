@@ -1,0 +1,101 @@
+"""The contract of a sweep backend: the winners of the readable one, on any settings; for the authors of backends."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.sweep.settings import SweepSettings
+from pano_mvs.algorithms.sweep.sweep import sweep_range
+from pano_mvs.geometry import Rigid3
+from pano_mvs.scene import RangeMap
+from pano_mvs.testing.room import capture_poses, default_room, render
+
+NEAR, FAR = 0.5, 6.0
+_SIZES_HW = [(16, 32), (18, 36), (25, 50), (32, 64), (20, 30), (40, 24)]
+_COSTS = ("census", "zncc", "sad", "sad_gradient")
+_COMBINATIONS = ("sum", "best_half", "best_k", "parallax_weighted")
+_COMBINED = list(itertools.product(_COSTS, _COMBINATIONS, ("box", "sgm")))
+CASES = len(_COMBINED)
+"""How many cases there are: every cost with every combination and aggregation, all else drawn at random."""
+
+
+@dataclass(frozen=True, eq=False)
+class SweepCase:
+    """What a sweep is given: small views of a synthetic room, of different sizes, with or without masks."""
+
+    pictures: tuple[NDArray[np.uint8], ...]
+    source_from_reference: tuple[Rigid3, ...]
+    masks: tuple[NDArray[np.bool_], ...]
+    settings: SweepSettings
+
+    def swept(self, backend: str, *, device: str = "auto") -> RangeMap:
+        """Return the range map that a backend makes of it."""
+        return sweep_range(
+            self.pictures[0], self.pictures[1:], self.source_from_reference, near=NEAR, far=FAR,
+            settings=self.settings, backend=backend, device=device,
+            reference_mask=self.masks[0], source_masks=self.masks[1:],
+        )  # fmt: skip
+
+
+@functools.cache
+def sweep_case(number: int) -> SweepCase:
+    """Return one of the `CASES`; the same at every call."""
+    rng = np.random.default_rng([2026, number])
+    cost, combination, aggregation = _COMBINED[number]
+    settings = SweepSettings(planes=int(rng.integers(3, 24))).replace(
+        spacing=str(rng.choice(["inverse", "log", "uniform"])),
+        cost=cost,
+        window=int(rng.choice([3, 5, 7])),
+        spherical_window=bool(rng.integers(2)),
+        combination=combination,
+        best=int(rng.integers(1, 4)),
+        aggregation=aggregation,
+        support=int(rng.choice([1, 3, 5])),
+        p2_contrast=float(rng.choice([0.0, 15.0])),
+        derotate=bool(rng.integers(4) == 0),
+        exposure=bool(rng.integers(4) == 0),
+    )
+    count = int(rng.integers(2, 6))
+    poses = capture_poses(count, seed=number, spread=0.4)
+    sizes = [_SIZES_HW[idx] for idx in rng.integers(0, len(_SIZES_HW), count)]
+    room = default_room(number % 3)
+    pictures = tuple(render(room, pose, size)[0] for pose, size in zip(poses, sizes, strict=True))
+    masks = tuple(np.ones(size, np.bool_) for size in sizes)
+    for mask in masks if rng.integers(2) else ():
+        mask[-mask.shape[0] // 5 :] = False
+        mask[4:9, 3:11] = False
+    return SweepCase(pictures, tuple(pose @ poses[0].inverse() for pose in poses[1:]), masks, settings)
+
+
+@functools.cache
+def _readable(number: int) -> RangeMap:
+    return sweep_case(number).swept("numpy")
+
+
+def agreement(number: int, backend: str, *, device: str = "auto") -> float:
+    """Return the share of pixels of a case in which a backend is within half a level of the readable one.
+
+    Pixels without a range in both agree too. The contract is a mean of 0.99 over all cases: sums in another order, and
+    positions rounded otherwise, decide some pixels on bare walls differently.
+    """
+    case, plain = sweep_case(number), _readable(number)
+    found = case.swept(backend, device=device)
+    found.check()
+    with np.errstate(invalid="ignore"):
+        close = np.abs(_level(found, case.settings) - _level(plain, case.settings)) < 0.5
+    return float((close | (np.isnan(found.range) & np.isnan(plain.range))).mean())
+
+
+def _level(range_map: RangeMap, settings: SweepSettings) -> NDArray[np.float64]:
+    """Return where between the planes the ranges are, (H, W)."""
+    ranges = range_map.range.astype(np.float64)
+    scaled = {"inverse": 1 / ranges, "log": np.log(ranges), "uniform": ranges}[settings.spacing]
+    near, far = {"inverse": (1 / NEAR, 1 / FAR), "log": (np.log(NEAR), np.log(FAR)), "uniform": (NEAR, FAR)}[
+        settings.spacing
+    ]
+    return np.asarray((scaled - near) / (far - near) * (settings.planes - 1))

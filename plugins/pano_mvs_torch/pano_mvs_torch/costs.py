@@ -1,0 +1,152 @@
+"""The costs of a band of rows, many virtual ranges at a time; in whole numbers, so that no order of sums matters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pano_mvs.algorithms.sweep.preparation import SweepInput
+from pano_mvs.algorithms.sweep.settings import LARGEST_COLOR_COST, LARGEST_GRADIENT_COST, ZNCC_NOISE_VARIANCE
+from pano_mvs.algorithms.sweep.windows import WindowBands, column_offsets
+from pano_mvs.geometry import pad_panorama
+from torch import Tensor
+
+
+class BandCost:
+    """What the rows `first` to `last` of the reference cost.
+
+    Attributes:
+        halo: rows on either side of the band that a lookup has to cover too.
+    """
+
+    def __init__(self, work: SweepInput, first: int, last: int, device: torch.device) -> None:
+        settings = work.settings
+        height, width = work.reference.shape[:2]
+        self.compare_radius, self.box_radius = settings.compare_radius, settings.box_radius
+        self.halo = self.compare_radius + self.box_radius
+        spherical = settings.spherical_window
+        columns = column_offsets((height, width), self.compare_radius, spherical=spherical)
+        compared = _mirrored(np.arange(first - self.box_radius, last + self.box_radius), height)
+        self.windows = WindowBands(self.compare_radius, columns[compared], width)
+        boxes = column_offsets((height, width), self.box_radius, spherical=spherical)[first:last]
+        self.boxes = WindowBands(self.box_radius, boxes, width)
+        around = pad_panorama(work.reference, self.halo)[first : last + 2 * self.halo, self.halo : self.halo + width]
+        self.reference = torch.from_numpy(np.ascontiguousarray(np.moveaxis(around, -1, 0))).to(device, torch.int32)
+        kinds: dict[str, Callable[[Tensor], Tensor]] = {
+            "census": self._census, "zncc": self._zncc, "sad": self._sad, "sad_gradient": self._sad_gradient,
+        }  # fmt: skip
+        self._cost = kinds[settings.cost]
+        self._signs = self._signs_of(self.reference[0]) if settings.cost == "census" else []
+
+    def of(self, warped: Tensor) -> Tensor:
+        """Return the mean costs of the band against a warped source.
+
+        Args:
+            warped: (P, rows + 2 halo, W, C) int32 grey levels.
+
+        Returns:
+            (P, rows, W) float32.
+        """
+        return self._cost(warped)
+
+    def _census(self, warped: Tensor) -> Tensor:
+        picture = warped[..., 0]
+        centre = self._inner(picture)
+        padded = _wrapped(picture, self.windows.margin)
+        differs = torch.zeros(centre.shape, dtype=torch.uint8, device=warped.device)
+        for rows, places in self.windows.places():
+            for sign, (lines, columns) in zip(self._signs, places, strict=True):
+                differs[:, rows] += sign[rows] != (padded[:, lines, columns] > centre[:, rows])
+        return self._box_mean(differs.to(torch.int32))
+
+    def _signs_of(self, picture: Tensor) -> list[Tensor]:
+        """Return for each place of the window whether the pixel there is brighter than the centre, (rows, W)."""
+        centre = self._inner(picture)
+        padded = _wrapped(picture, self.windows.margin)
+        result = [torch.empty_like(centre, dtype=torch.bool) for _ in range((2 * self.compare_radius + 1) ** 2)]
+        for rows, places in self.windows.places():
+            for sign, (lines, columns) in zip(result, places, strict=True):
+                sign[rows] = padded[lines, columns] > centre[rows]
+        return result
+
+    def _sad(self, warped: Tensor) -> Tensor:
+        return self._box_mean(self._absolute(warped))
+
+    def _absolute(self, warped: Tensor) -> Tensor:
+        """Return the sum of absolute differences of all colours, (P, rows, W), of the rows that the box needs."""
+        total = torch.zeros(1, dtype=torch.int32, device=warped.device)
+        for color in range(warped.shape[-1]):
+            total = total + (self._inner(self.reference[color]) - self._inner(warped[..., color])).abs_()
+        return total
+
+    def _sad_gradient(self, warped: Tensor) -> Tensor:
+        """Return differences of colours and of their gradients, each cut off."""
+        colors = self._absolute(warped).clamp_(max=LARGEST_COLOR_COST)
+        gradient = torch.zeros_like(colors)
+        for color in range(warped.shape[-1]):
+            difference = self.reference[color] - warped[..., color]
+            gradient += (difference[..., 2:, :] - difference[..., :-2, :]).abs_()
+            padded = _wrapped(difference, self.windows.margin)
+            for rows, places in self.windows.places():
+                (lines, left), (_, right) = places[3], places[5]  # the window's middle row: its first and last
+                gradient[..., rows, :] += (padded[..., lines, right] - padded[..., lines, left]).abs_()
+        return self._box_mean(colors + gradient.clamp_(max=LARGEST_GRADIENT_COST))
+
+    def _zncc(self, warped: Tensor) -> Tensor:
+        """Return 1 − ρ; with n pixels in a window n² times each (co)variance is a whole number."""
+        ours, theirs = self.reference[0].to(torch.int64), warped[..., 0].to(torch.int64)
+        counts = torch.from_numpy(self._box_counts()).to(warped.device)[:, None]
+        sum_r, sum_w = self._box_sum(ours), self._box_sum(theirs)
+        variances = [
+            ((counts * self._box_sum(picture**2) - total**2).float() / counts**2 + ZNCC_NOISE_VARIANCE)
+            for picture, total in ((ours, sum_r), (theirs, sum_w))
+        ]
+        covariance = (counts * self._box_sum(ours * theirs) - sum_r * sum_w).float() / counts**2
+        return 1 - (covariance / (variances[0] * variances[1]).sqrt()).clamp_(-1, 1)
+
+    def _inner(self, pictures: Tensor) -> Tensor:
+        """Return the rows that the box needs, (…, rows + 2 box_radius, W), of those that were looked up."""
+        return pictures[..., self.compare_radius : pictures.shape[-2] - self.compare_radius, :]
+
+    def _box_counts(self) -> NDArray[np.int64]:
+        """Return how many pixels the box around a pixel of each row has, (rows,)."""
+        return (2 * self.box_radius + 1) * (2 * self.boxes.columns[:, -1] + 1)
+
+    def _box_mean(self, costs: Tensor) -> Tensor:
+        """Return the mean over the box, (P, rows + 2 box_radius, W) to (P, rows, W) float32."""
+        shares = torch.from_numpy((1 / self._box_counts()).astype(np.float32)).to(costs.device)
+        return self._box_sum(costs).float() * shares[:, None]
+
+    def _box_sum(self, costs: Tensor) -> Tensor:
+        """Return the sum over the box, of the same type; by differences of running sums along the columns."""
+        rows = costs.shape[-2] - 2 * self.box_radius
+        summed = costs[..., :rows, :].clone()
+        for step in range(1, 2 * self.box_radius + 1):
+            summed += costs[..., step : step + rows, :]
+        if self.box_radius == 0:
+            return summed
+        margin = self.boxes.margin + 1
+        running = _wrapped(summed, margin).cumsum(dim=-1, dtype=summed.dtype)
+        width = costs.shape[-1]
+        for lines, reach in self.boxes.reaches():
+            right, left = margin + reach, margin - reach - 1
+            torch.sub(
+                running[..., lines, right : right + width], running[..., lines, left : left + width],
+                out=summed[..., lines, :],
+            )  # fmt: skip
+        return summed
+
+
+def _wrapped(pictures: Tensor, margin: int) -> Tensor:
+    """Return pictures (…, W) with columns of the other side of the seam on either side."""
+    if margin == 0:
+        return pictures
+    return torch.cat([pictures[..., -margin:], pictures, pictures[..., :margin]], dim=-1)
+
+
+def _mirrored(rows: NDArray[np.int64], height: int) -> NDArray[np.int64]:
+    """Return the rows of the picture in which rows beyond a pole come to lie."""
+    below = np.where(rows < 0, -1 - rows, rows)
+    return np.where(below >= height, 2 * height - 1 - below, below)
