@@ -33,8 +33,8 @@ class SweepParams(Params):
     far: float | None = Field(default=None, gt=0, description="farthest virtual range, likewise")
     cost: Annotated[str, PartOf(SWEEP_COSTS)] = Field(
         default="census",
-        description="census, zncc (correlation), sad (the paper's sum of absolute differences), sad_gradient (colours "
-        "with their gradients), or a plugin's",
+        description="census, census_gradient (with grey levels and their gradients), zncc (correlation), sad (the "
+        "paper's sum of absolute differences), sad_gradient (colours with their gradients), or a plugin's",
     )
     window: int = Field(default=7, ge=1, le=15, description="side of the cost's window in pixels, odd")
     spherical_window: bool = Field(

@@ -54,6 +54,8 @@ def _share_within(result, truth, ratio):
         (SweepSettings(planes=20, aggregation="box", combination="parallax_weighted", derotate=True), True, 48),
         (SweepSettings(planes=20, cost="sad_gradient", aggregation="box", confidence="curvature"), False, 32),
         (PAPER.replace(cost="zncc"), False, 32),
+        (SweepSettings(planes=20, cost="census_gradient"), True, 48),
+        (SweepSettings(planes=20, cost="census_gradient", window=5, support=3, aggregation="box"), False, 32),
         (PAPER.replace(exposure=False), False, 32),
         (PAPER.replace(selection="parabola", combination="best_half", spherical_window=True, exposure=False), True, 24),
     ],

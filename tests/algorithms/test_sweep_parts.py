@@ -94,7 +94,9 @@ def test_every_cost_recovers_the_room(capture, cost, aggregation):
     assert good_share(swept(capture, cost=cost, aggregation=aggregation), capture[2]) > 0.75
 
 
-@pytest.mark.parametrize(("cost", "exposure"), [("census", False), ("zncc", False), ("sad_gradient", True)])
+@pytest.mark.parametrize(
+    ("cost", "exposure"), [("census", False), ("zncc", False), ("sad_gradient", True), ("census_gradient", True)]
+)
 def test_no_cost_minds_another_exposure(capture, cost, exposure):
     pictures, _, truth = capture
     others = [np.clip(np.rint(0.8 * picture + 10), 0, 255).astype(np.uint8) for picture in pictures[1:]]

@@ -13,7 +13,7 @@ from pano_mvs.algorithms.sweep.windows import column_offsets, neighbours
 from pano_mvs.core.errors import ContractError
 from pano_mvs.core.parts import Parts
 
-BUILTIN_COSTS = frozenset({"census", "zncc", "sad", "sad_gradient"})
+BUILTIN_COSTS = frozenset({"census", "census_gradient", "zncc", "sad", "sad_gradient"})
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 

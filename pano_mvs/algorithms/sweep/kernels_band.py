@@ -6,8 +6,16 @@ import numpy as np
 from numba import njit
 
 from pano_mvs.algorithms.sweep.kernels_combine import combine_row
-from pano_mvs.algorithms.sweep.kernels_cost import CENSUS, SAD_GRADIENT, ZNCC, box_rows, census_row, difference_row
-from pano_mvs.algorithms.sweep.kernels_gradient import sad_gradient_row
+from pano_mvs.algorithms.sweep.kernels_cost import (
+    CENSUS,
+    CENSUS_GRADIENT,
+    SAD_GRADIENT,
+    ZNCC,
+    box_rows,
+    census_row,
+    difference_row,
+)
+from pano_mvs.algorithms.sweep.kernels_gradient import census_gradient_row, sad_gradient_row
 from pano_mvs.algorithms.sweep.kernels_lookup import warp_band
 from pano_mvs.algorithms.sweep.kernels_project import knot_rows
 from pano_mvs.algorithms.sweep.kernels_warp import wrap_row
@@ -20,8 +28,9 @@ _U = np.uint64
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def source_cost(  # type: ignore[no-untyped-def]
-    first, reference, warped, offsets, reach, cost, compare_radius, box_radius, pad, pixel_costs, scratch, means
-):
+    first, reference, warped, offsets, reach, cost, census_weight, compare_radius, box_radius, pad, pixel_costs,
+    scratch, means,
+):  # fmt: skip
     """Compare a band of the reference with a warped source and average over the box.
 
     Args:
@@ -31,6 +40,7 @@ def source_cost(  # type: ignore[no-untyped-def]
         offsets: (H, 2 compare_radius + 1) int64 columns of the window within which a pixel's cost looks around.
         reach: (H,) int64 columns of the box on either side.
         cost: which cost, see `kernels_cost`.
+        census_weight: of census beside grey levels.
         compare_radius: rows on either side within which a pixel's cost looks around.
         box_radius: rows of the box on either side.
         pad: the margin.
@@ -54,6 +64,11 @@ def source_cost(  # type: ignore[no-untyped-def]
             census_row(reference[0], y + pad, warped[0], j + compare_radius, offsets[mirrored], pad, disagree)
             for i in range(_U(width)):
                 total[i] = np.uint16(disagree[i])
+        elif cost == CENSUS_GRADIENT:
+            census_gradient_row(
+                reference[0], y + pad, warped[0], j + compare_radius, offsets[mirrored], census_weight, pad, disagree,
+                total,
+            )  # fmt: skip
         elif cost == SAD_GRADIENT:
             sad_gradient_row(reference, y + pad, warped, j + compare_radius, offsets[mirrored, 2], pad, total)
         else:
@@ -81,7 +96,8 @@ def store_row(costs, scale, voxels):  # type: ignore[no-untyped-def]
 @njit(cache=True, error_model="numpy", nogil=True)
 def sweep_band(  # type: ignore[no-untyped-def]
     first, reference, sin_cos_azimuth, poses, ranges, packed, colors, starts, shapes, valid, valid_starts, vector,
-    offsets, reach, cost, compare_radius, box_radius, pad, weights, share, most, scale, neutral, volume, state, planes,
+    offsets, reach, cost, census_weight, compare_radius, box_radius, pad, weights, share, most, scale, neutral, volume,
+    state, planes,
 ):  # fmt: skip
     """Compute the costs of one band at all virtual ranges, into the volume or straight into the winners.
 
@@ -101,6 +117,7 @@ def sweep_band(  # type: ignore[no-untyped-def]
         offsets: (H, 2 compare_radius + 1) int64.
         reach: (H,) int64.
         cost: which cost.
+        census_weight: of census beside grey levels.
         compare_radius: of the window of a pixel's cost.
         box_radius: of the box.
         pad: the margin, wider than every window reaches.
@@ -130,8 +147,8 @@ def sweep_band(  # type: ignore[no-untyped-def]
                 shapes[s], valid, valid_starts[s], vector, pad, knots, warped, votes,
             )  # fmt: skip
             source_cost(
-                first, reference, warped, offsets, reach, cost, compare_radius, box_radius, pad, pixel_costs, scratch,
-                costs[s],
+                first, reference, warped, offsets, reach, cost, census_weight, compare_radius, box_radius, pad,
+                pixel_costs, scratch, costs[s],
             )  # fmt: skip
             if len(valid):
                 for j in range(rows):

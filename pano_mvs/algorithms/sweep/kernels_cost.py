@@ -9,8 +9,10 @@ _F = np.float32
 _U = np.uint64
 
 # What `source_cost` compares by.
-CENSUS, ZNCC, SAD, SAD_GRADIENT = range(4)
-COSTS = {"census": CENSUS, "zncc": ZNCC, "sad": SAD, "sad_gradient": SAD_GRADIENT}
+CENSUS, ZNCC, SAD, SAD_GRADIENT, CENSUS_GRADIENT = range(5)
+COSTS = {
+    "census": CENSUS, "zncc": ZNCC, "sad": SAD, "sad_gradient": SAD_GRADIENT, "census_gradient": CENSUS_GRADIENT,
+}  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -1,12 +1,12 @@
-"""Compiled: truncated differences of colour and of gradient."""
+"""Compiled: truncated differences of colour and of gradient, alone and beside census."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
-from pano_mvs.algorithms.sweep.kernels_cost import difference_row
-from pano_mvs.algorithms.sweep.settings import LARGEST_COLOR_COST, LARGEST_GRADIENT_COST
+from pano_mvs.algorithms.sweep.kernels_cost import census_row, difference_row
+from pano_mvs.algorithms.sweep.settings import GREY_WEIGHT, LARGEST_COLOR_COST, LARGEST_GRADIENT_COST
 
 _U = np.uint64
 
@@ -50,3 +50,32 @@ def sad_gradient_row(reference, reference_row, warped, warped_row, reach, pad, t
     for i in range(_U(total.shape[0])):
         color = min(np.int32(total[i]), np.int32(LARGEST_COLOR_COST))
         total[i] = np.uint16(color + min(np.int32(gradient[i]), np.int32(LARGEST_GRADIENT_COST)))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def census_gradient_row(  # type: ignore[no-untyped-def]
+    reference, reference_row, warped, warped_row, offsets, census_weight, pad, disagree, total
+):
+    """Write the census cost of one row, its weight times, plus that of grey levels and of their gradients.
+
+    Args:
+        reference: (rows, W + 2 pad) uint8 grey, wrapped.
+        reference_row: its row.
+        warped: likewise, the source.
+        warped_row: its row.
+        offsets: (window,) int64 columns of the census window against its centre.
+        census_weight: see `SweepSettings.census_weight`.
+        pad: width of the wrapped margin.
+        disagree: (W,) uint8, scratch.
+        total: (W,) uint16, written.
+    """
+    census_row(reference, reference_row, warped, warped_row, offsets, pad, disagree)
+    gradient = np.zeros(total.shape[0], np.uint16)
+    total[:] = 0
+    difference_row(reference, reference_row, warped, warped_row, pad, total)
+    reach = offsets[offsets.shape[0] // 2 + 1]
+    gradient_row(reference, reference_row, warped, warped_row, reach, pad, gradient)
+    largest_level, largest_gradient = np.int32(LARGEST_COLOR_COST // 3), np.int32(LARGEST_GRADIENT_COST // 3)
+    for i in range(_U(total.shape[0])):
+        grey = min(np.int32(total[i]), largest_level) + min(np.int32(gradient[i]), largest_gradient)
+        total[i] = np.uint16(np.int32(census_weight) * np.int32(disagree[i]) + np.int32(GREY_WEIGHT) * grey)

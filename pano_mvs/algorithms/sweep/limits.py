@@ -106,7 +106,7 @@ def _coarse(
         [poses[other] @ poses[idx].inverse() for other in others],
         near=near,
         far=far,
-        settings=SweepSettings(planes=_PLANES, no_match="keep"),
+        settings=SweepSettings(planes=_PLANES, cost="census", no_match="keep"),
         backend=backend,
         device=device,
         reference_mask=masks[idx],

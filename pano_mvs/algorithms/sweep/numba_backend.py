@@ -96,7 +96,7 @@ def _band_arguments(work: SweepInput) -> tuple[object, ...]:
     return (
         reference, np.stack([np.sin(azimuth), np.cos(azimuth)]).astype(np.float32), poses, work.ranges,
         packed, colors, starts, shapes, valid, valid_starts, vector, offsets, reach,
-        COSTS[settings.cost], settings.compare_radius, settings.box_radius, pad,
+        COSTS[settings.cost], settings.census_weight, settings.compare_radius, settings.box_radius, pad,
         source_weights((height, width), work.source_from_reference, settings),
         settings.weight_share, settings.most_sources(len(work.sources)),
         np.float32(settings.cost_scale), np.float32(settings.neutral_cost),

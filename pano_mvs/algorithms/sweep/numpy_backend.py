@@ -14,7 +14,12 @@ from pano_mvs.algorithms.sweep.combination import source_weights
 from pano_mvs.algorithms.sweep.costs import CostWindow, checked_cost, plugin_cost
 from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, step_penalties, warm_up
 from pano_mvs.algorithms.sweep.preparation import SweepInput
-from pano_mvs.algorithms.sweep.settings import LARGEST_COLOR_COST, LARGEST_GRADIENT_COST, ZNCC_NOISE_VARIANCE
+from pano_mvs.algorithms.sweep.settings import (
+    GREY_WEIGHT,
+    LARGEST_COLOR_COST,
+    LARGEST_GRADIENT_COST,
+    ZNCC_NOISE_VARIANCE,
+)
 from pano_mvs.algorithms.sweep.windows import column_offsets, neighbours
 from pano_mvs.algorithms.sweep.winner import Winners
 from pano_mvs.geometry import pixel_from_ray, ray_grid, sample_panorama
@@ -115,6 +120,13 @@ def _sad_gradient(reference: NDArray[np.uint8], warped: FloatArray, work: SweepI
     return np.asarray(colors + np.minimum(gradient, LARGEST_GRADIENT_COST))
 
 
+def _census_gradient(reference: NDArray[np.uint8], warped: FloatArray, work: SweepInput) -> FloatArray:
+    """Return the census cost plus the differences of grey levels and of their gradients, each cut off, (H, W)."""
+    # Of one colour instead of three, everything is a third.
+    grey = _sad_gradient(np.repeat(reference, 3, axis=-1), np.repeat(warped, 3, axis=-1), work) / 3
+    return np.asarray(work.settings.census_weight * _census(reference, warped, work) + GREY_WEIGHT * grey)
+
+
 def _zncc(reference: NDArray[np.uint8], warped: FloatArray, work: SweepInput) -> FloatArray:
     """Return 1 − ρ, ρ the correlation over each pixel's window with some noise in both variances, (H, W)."""
     ours = reference.astype(np.float64)
@@ -144,6 +156,7 @@ def _census(picture: NDArray[np.uint8], source: FloatArray, work: SweepInput) ->
 
 _PIXEL_COSTS: dict[str, Callable[[NDArray[np.uint8], FloatArray, SweepInput], FloatArray]] = {
     "census": _census,
+    "census_gradient": _census_gradient,
     "sad": _differences,
     "sad_gradient": _sad_gradient,
 }

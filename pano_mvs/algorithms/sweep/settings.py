@@ -13,6 +13,9 @@ from pano_mvs.core.errors import UsageError
 _LARGEST_SAD, LARGEST_COLOR_COST = 96, 30
 # … and differences over two pixels, summed over both directions as well.
 LARGEST_GRADIENT_COST = 60
+# A level of grey differences counts this much beside census, and both are the same at their worst.
+GREY_WEIGHT = 8
+_LARGEST_GREY = GREY_WEIGHT * (LARGEST_COLOR_COST + LARGEST_GRADIENT_COST) // 3
 # The variance of noise, in grey levels squared, against which correlation has to stand out.
 ZNCC_NOISE_VARIANCE = 4.0
 
@@ -30,8 +33,9 @@ class SweepSettings:
         spacing: virtual ranges uniform in 1/range, in log range or in range (the paper's).
         cost: "census" (Hamming distance of the signs of differences to the window's centre; blind to exposure), "zncc"
             (1 − zero-mean normalised cross-correlation; blind to it too), "sad" (sum of absolute differences of R, G
-            and B; the paper's), "sad_gradient" (differences of colours and of their gradients, both cut off) or a
-            plugin's.
+            and B; the paper's), "sad_gradient" (differences of colours and of their gradients, both cut off),
+            "census_gradient" (census and, with the same weight, differences of grey levels and of their gradients, cut
+            off) or a plugin's.
         window: side in pixels, odd, of the window of either cost (the paper: 7).
         spherical_window: widen the windows' columns by 1/cos of the elevation, so that they keep their solid angle.
         combination: "sum" over the sources (the paper's), or the mean of the "best_half" of them at each pixel and
@@ -81,6 +85,7 @@ class SweepSettings:
     prefilter_sigma_space_px: float = 25.0
     derotate: bool = False
     exposure: bool = True
+    levels: int = 1
 
     def __post_init__(self) -> None:
         """Raise UsageError for values that no sweep can use."""
@@ -89,7 +94,9 @@ class SweepSettings:
         for name in ("window", "support"):
             side = getattr(self, name)
             _require(side % 2 == 1 and 1 <= side <= 15, f"{name} must be odd and 1 to 15, got {side}")
-        _require(self.cost not in ("census", "zncc") or self.window >= 3, f"{self.cost} needs a window of at least 3")
+        least = 3 if self.cost in ("census", "census_gradient", "zncc") else 1
+        _require(self.window >= least, f"{self.cost} needs a window of at least {least}")
+        _require(1 <= self.levels <= 4, f"levels must be 1 to 4, got {self.levels}")
         _require(self.best >= 1, f"best must be at least 1, got {self.best}")
         _require(0 <= self.p1 <= self.p2 <= 4000, f"0 ≤ p1 ≤ p2 ≤ 4000 must hold, got {self.p1} and {self.p2}")
         _require(self.p2_contrast >= 0, f"p2_contrast cannot be negative, got {self.p2_contrast}")
@@ -119,11 +126,17 @@ class SweepSettings:
         """
         largest = {
             "census": self.window**2 - 1,
+            "census_gradient": self.census_weight * (self.window**2 - 1) + _LARGEST_GREY,
             "sad": _LARGEST_SAD,
             "sad_gradient": LARGEST_COLOR_COST + LARGEST_GRADIENT_COST,
             "zncc": 2,
         }
         return float(largest.get(self.cost, 1))
+
+    @property
+    def census_weight(self) -> int:
+        """What a disagreement counts beside grey levels in "census_gradient", so that both can be as bad."""
+        return max(1, round(_LARGEST_GREY / max(1, self.window**2 - 1)))
 
     @property
     def cost_scale(self) -> float:
@@ -140,6 +153,11 @@ class SweepSettings:
         """Whether R, G and B are compared, and exposure matters, rather than grey values alone."""
         own = plugin_cost(self.cost)
         return own.colors if own is not None else self.cost in ("sad", "sad_gradient")
+
+    @property
+    def minds_exposure(self) -> bool:
+        """Whether levels are compared as they are, so that exposures have to be matched first."""
+        return self.compares_colors or self.cost == "census_gradient"
 
     @property
     def weight_share(self) -> float:

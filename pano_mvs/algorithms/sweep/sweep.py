@@ -74,7 +74,7 @@ def sweep_range(
     _check_picture("reference", reference, reference_mask)
     masks = _checked_sources(sources, source_from_reference, source_masks)
     ranges = virtual_ranges(near, far, planes=settings.planes, spacing=settings.spacing)
-    if settings.exposure and settings.compares_colors:
+    if settings.exposure and settings.minds_exposure:
         rough = _rough_range(
             reference, sources, source_from_reference, near=near, far=far, backend=backend, device=device
         )
@@ -110,7 +110,7 @@ def _rough_range(
     device: str,
 ) -> NDArray[np.float32]:
     """Return ranges at low resolution by census, which exposure does not disturb; the surer half of them."""
-    settings = SweepSettings(planes=_ROUGH_PLANES, window=5, aggregation="box", no_match="keep")
+    settings = SweepSettings(planes=_ROUGH_PLANES, cost="census", window=5, aggregation="box", no_match="keep")
     small = [shrink(source, _ROUGH_ROWS) for source in sources]
     found = sweep_range(
         shrink(reference, _ROUGH_ROWS), small, source_from_reference,
