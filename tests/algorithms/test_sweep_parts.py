@@ -10,9 +10,14 @@ import pytest
 
 from pano_mvs.algorithms.sweep.combination import parallax_weights
 from pano_mvs.algorithms.sweep.costs import BUILTIN_COSTS
-from pano_mvs.algorithms.sweep.kernels_gradient import sad_gradient_row
+from pano_mvs.algorithms.sweep.kernels_gradient import census_gradient_row, sad_gradient_row
 from pano_mvs.algorithms.sweep.kernels_zncc import zncc_rows
-from pano_mvs.algorithms.sweep.settings import LARGEST_COLOR_COST, LARGEST_GRADIENT_COST, ZNCC_NOISE_VARIANCE
+from pano_mvs.algorithms.sweep.settings import (
+    GREY_WEIGHT,
+    LARGEST_COLOR_COST,
+    LARGEST_GRADIENT_COST,
+    ZNCC_NOISE_VARIANCE,
+)
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.algorithms.sweep.windows import column_offsets
 from pano_mvs.algorithms.sweep.winner import Winners, confidence, subplane_offset
@@ -86,6 +91,32 @@ def test_differences_of_colours_and_gradients_equal_the_definition(row):
     ]
     assert total.tolist() == expected
     assert len(set(expected)) > 5
+
+
+def test_census_beside_grey_levels_equals_the_definition():
+    rng = np.random.default_rng(5)
+    reference = rng.integers(0, 256, SIZE, dtype=np.uint8)
+    warped = np.clip(reference + rng.integers(-9, 10, SIZE), 0, 255).astype(np.uint8)
+    offsets, row, pad = column_offsets(SIZE, 2, spherical=True), 3, 16
+    disagree, total = np.zeros(SIZE[1], np.uint8), np.zeros(SIZE[1], np.uint16)
+    padded = [pad_panorama(picture, pad) for picture in (reference, warped)]
+    census_gradient_row(padded[0], row + pad, padded[1], row + pad, offsets[row], 10, pad, disagree, total)
+    limits = LARGEST_COLOR_COST // 3, LARGEST_GRADIENT_COST // 3
+    expected = []
+    for column in range(SIZE[1]):
+        census = oracle.census_cost(reference, warped, row, column, offsets[row])
+        grey = oracle.sad_gradient_cost(
+            reference[..., None], warped[..., None], row, column, reach=int(offsets[row, 3]), limits=limits
+        )
+        expected.append(10 * census + GREY_WEIGHT * grey)
+    assert total.tolist() == expected
+
+
+@pytest.mark.parametrize("window", [3, 5, 7, 9, 15])
+def test_census_and_grey_levels_are_as_bad_as_each_other_at_their_worst(window):
+    settings = SweepSettings(cost="census_gradient", window=window)
+    census = settings.census_weight * (window**2 - 1)
+    assert census == pytest.approx(settings.worst_cost / 2, rel=0.1)
 
 
 @pytest.mark.parametrize("cost", NAMES["cost"])
