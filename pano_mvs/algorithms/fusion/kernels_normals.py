@@ -65,15 +65,18 @@ def fit_plane(inverse, rays, row, column, stretch, radius, max_step, a, b):  # t
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def fit_normals(inverse, rays, stretches, radius, max_step, rows, normals):  # type: ignore[no-untyped-def]
+def fit_normals(pixels, stretches, radius, max_step, rows, normals):  # type: ignore[no-untyped-def]
     """Write unit normals towards the camera of the rows [first, end) into (H, W, 3) float32.
 
-    Pixels that have a normal already keep it; where no plane is defined nothing is written.
+    `pixels` is (inverse ranges, rays, bool where a normal is wanted), (H, W, ...). Pixels that have a normal already
+    keep it; where no plane is defined nothing is written.
     """
+    inverse, rays, wanted = pixels
     a, b = np.empty(6), np.empty(3)
     for row in range(rows[0], rows[1]):
         for column in range(inverse.shape[1]):
-            if math.isfinite(inverse[row, column]) and not math.isfinite(normals[row, column, 0]):
+            open_yet = wanted[row, column] and not math.isfinite(normals[row, column, 0])
+            if open_yet and math.isfinite(inverse[row, column]):
                 x, y, z, ok = fit_plane(inverse, rays, row, column, stretches[row], radius, max_step, a, b)
                 length = math.sqrt(x * x + y * y + z * z)
                 if ok and length > 0:

@@ -55,14 +55,15 @@ def confidence_at(confidence, x, y):  # type: ignore[no-untyped-def]
 def vote(reference, source, limits, rows, tallies):  # type: ignore[no-untyped-def]
     """Add one source's vote on the pixels of the rows [first, end) of a reference view.
 
-    `reference` is (ranges, rays, normals); `source` is (rotation, translation of source_from_reference, ranges,
-    confidence, image); `limits` holds the three of `judge_point`, how many times larger than the source's this view's
-    footprint may be, the relative difference up to which points are merged, and the confidence from which on a
-    contradiction counts. `tallies` changes in place: yields (H, W) bool is set where the footprint is too large;
-    counts, violations and confidence (H, W) uint8 of agreeing views, of contradicting ones, and the largest confidence;
-    sums (H, W, 4) of weighted points in the reference frame and their weights; colors (H, W, 4) likewise.
+    `reference` is (ranges, rays, normals, bool where a point may be written); `source` is (rotation, translation of
+    source_from_reference, ranges, confidence, image); `limits` holds the three of `judge_point`, how many times larger
+    than the source's this view's footprint may be, the relative difference up to which points are merged, and the
+    confidence from which on a contradiction counts. `tallies` changes in place: yields (H, W) bool is set where the
+    footprint is too large; counts, violations and confidence (H, W) uint8 of agreeing views, of contradicting ones, and
+    the largest confidence; sums (H, W, 4) of weighted points in the reference frame and their weights; colors (H, W, 4)
+    likewise. Where no point may be written only counts and violations are kept.
     """
-    ranges, rays, normals = reference
+    ranges, rays, normals, written = reference
     rotation, translation, source_ranges, source_confidence, image = source
     yields, counts, violations, confidence, sums, colors = tallies
     center = -(rotation.T @ translation)
@@ -71,7 +72,7 @@ def vote(reference, source, limits, rows, tallies):  # type: ignore[no-untyped-d
             r = ranges[row, column]
             if not math.isfinite(r):
                 continue
-            ray, normal = rays[row, column], normals[row, column]
+            ray = rays[row, column]
             point = (r * ray[0], r * ray[1], r * ray[2])
             verdict, error, x, y, seen = judge_point(point, rotation, translation, center, source_ranges, limits)
             if verdict == CONTRADICTS and confidence_at(source_confidence, x, y) >= limits[5]:
@@ -79,6 +80,9 @@ def vote(reference, source, limits, rows, tallies):  # type: ignore[no-untyped-d
             if verdict != AGREES:
                 continue
             counts[row, column] += 1
+            if not written[row, column]:
+                continue
+            normal = normals[row, column]
             confidence[row, column] = max(confidence[row, column], confidence_at(source_confidence, x, y))
             view = (point[0] - center[0], point[1] - center[1], point[2] - center[2])
             footprint = pixel_footprint(view, normal)

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.sphere_steps import columns_per_step
 from pano_mvs.algorithms.fusion.bands import for_bands
+from pano_mvs.algorithms.fusion.view import held_rays
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import ray_grid
 from pano_mvs.scene import RangeMap
 
 
@@ -18,6 +18,7 @@ def normals_from_range(
     radius: int = 2,
     max_relative_step: float = 0.05,
     given: NDArray[np.float32] | None = None,
+    wanted: NDArray[np.bool_] | None = None,
     threads: int = 1,
 ) -> NDArray[np.float32]:
     """Return the unit normal of the surface at each pixel, towards the camera.
@@ -33,6 +34,7 @@ def normals_from_range(
         radius: half the width of the window in pixels at the equator.
         max_relative_step: largest relative step of the range from one pixel to the next on one surface.
         given: (H, W, 3) normals that are known already, NaN where not; None: none are.
+        wanted: (H, W) the pixels to fit a plane at; None: all.
         threads: how many to use; they change no bit.
 
     Returns:
@@ -52,11 +54,12 @@ def normals_from_range(
     height, width = ranges.shape
     inverse = 1 / ranges.astype(np.float64)
     stretches = columns_per_step((height, width), steps=2 * radius + 1)
-    rays = ray_grid((height, width))
+    rays = held_rays((height, width))
+    at = np.ones((height, width), np.bool_) if wanted is None else wanted
     normals = np.full((height, width, 3), np.nan, np.float32) if given is None else given.astype(np.float32)
 
     def fit(rows: tuple[int, int]) -> None:
-        fit_normals(inverse, rays, stretches, radius, max_relative_step, rows, normals)
+        fit_normals((inverse, rays, at), stretches, radius, max_relative_step, rows, normals)
 
     for_bands(fit, height, threads=threads)
     return normals

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import Rigid3
+from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap
 
 
@@ -49,6 +50,14 @@ class Sight:
     confidence: NDArray[np.uint8]
     image: NDArray[np.uint8]
     normals: NDArray[np.float32] | None
+
+
+@lru_cache(maxsize=1)
+def held_rays(size_hw: tuple[int, int]) -> NDArray[np.float64]:
+    """Return the ray of each pixel, (H, W, 3), read-only: the views of a capture are of one size."""
+    rays = ray_grid(size_hw)
+    rays.setflags(write=False)
+    return rays
 
 
 def sight_of(view: FusionView, *, min_confidence: int) -> Sight:

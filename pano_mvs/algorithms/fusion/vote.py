@@ -12,9 +12,9 @@ from pano_mvs.algorithms.filters.sphere_steps import columns_per_step
 from pano_mvs.algorithms.fusion.bands import for_bands
 from pano_mvs.algorithms.fusion.normals import normals_from_range
 from pano_mvs.algorithms.fusion.settings import FusionSettings
-from pano_mvs.algorithms.fusion.view import FusionView, Sight, SightWindow, nearest_views, sight_of
+from pano_mvs.algorithms.fusion.view import FusionView, Sight, SightWindow, held_rays, nearest_views, sight_of
 from pano_mvs.algorithms.fusion.voxels import VoxelGrid
-from pano_mvs.geometry import Rigid3, ray_grid
+from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import PointCloud
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
@@ -147,12 +147,13 @@ def _points_of(
 ) -> PointCloud:
     """Return the points of one view; sources are (where to get it, its position there, its `_tie`)."""
     height, width = reference.ranges.shape
-    rays = ray_grid((height, width))
-    normals = _normals_or_views(reference, rays, threads)
+    rays = held_rays((height, width))
+    written = _chosen_pixels((height, width), settings)
+    normals = _normals_or_views(reference, rays, written, threads)
     tallies = _own_tallies(reference, rays, normals)
     for window, idx, tie in sources:
-        _add_votes(window[idx], tie, (reference, rays, normals), settings, tallies, threads)
-    kept = _kept(reference, tallies, settings)
+        _add_votes(window[idx], tie, (reference, rays, normals, written), settings, tallies, threads)
+    kept = _kept(reference, tallies, settings) & written
     position = tallies.sums[kept]
     color = tallies.colors[kept]
     world_from_cam = reference.pose.inverse()
@@ -185,14 +186,14 @@ def _own_tallies(reference: Sight, rays: NDArray[np.float64], normals: NDArray[n
 def _add_votes(
     source: Sight,
     tie: float,
-    pixels: tuple[Sight, NDArray[np.float64], NDArray[np.float32]],
+    pixels: tuple[Sight, NDArray[np.float64], NDArray[np.float32], NDArray[np.bool_]],
     settings: FusionSettings,
     tallies: _Tallies,
     threads: int,
 ) -> None:
     from pano_mvs.algorithms.fusion.kernels_vote import vote  # compiles on import
 
-    reference, rays, normals = pixels
+    reference, *grids = pixels
     height, width = reference.ranges.shape
     max_angle = _MAX_REPROJECTION_PX * 2 * np.pi / width
     limits = np.array([
@@ -207,7 +208,7 @@ def _add_votes(
     arrays = (*relation, source.ranges, source.confidence, source.image)
 
     def of_rows(rows: tuple[int, int]) -> None:
-        vote((reference.ranges, rays, normals), arrays, limits, rows, tallies.arrays())
+        vote((reference.ranges, *grids), arrays, limits, rows, tallies.arrays())
 
     for_bands(of_rows, height, threads=threads)
 
@@ -227,7 +228,7 @@ def _kept(reference: Sight, tallies: _Tallies, settings: FusionSettings) -> NDAr
             reference.ranges, confirmed, stretches, _SUPPORT_RADIUS, _MAX_SUPPORT_STEP, settings.min_support
         )
         kept = confirmed | (supported & (agreeing == settings.min_views - 1) & (tallies.violations == 0))
-    return kept & ~tallies.yields & _chosen_pixels((shape[0], shape[1]), settings)
+    return kept & ~tallies.yields
 
 
 def _tie(*, is_earlier: bool) -> float:
@@ -235,9 +236,11 @@ def _tie(*, is_earlier: bool) -> float:
     return _LATER_MUST_BE_BETTER if is_earlier else _EARLIER_MAY_BE_WORSE
 
 
-def _normals_or_views(reference: Sight, rays: NDArray[np.float64], threads: int) -> NDArray[np.float32]:
-    """Return unit normals, (H, W, 3): given or fitted ones, else the direction to the camera."""
-    normals = normals_from_range(reference.ranges, given=reference.normals, threads=threads)
+def _normals_or_views(
+    reference: Sight, rays: NDArray[np.float64], wanted: NDArray[np.bool_], threads: int
+) -> NDArray[np.float32]:
+    """Return unit normals, (H, W, 3): given or, where wanted, fitted ones, else the direction to the camera."""
+    normals = normals_from_range(reference.ranges, given=reference.normals, wanted=wanted, threads=threads)
     unknown = ~np.isfinite(normals[..., 0])
     normals[unknown] = -rays[unknown]
     return normals
