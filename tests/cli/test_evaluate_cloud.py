@@ -1,0 +1,109 @@
+"""`evaluate cloud` against true range maps and against reference clouds, in whatever frame the cloud is."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pano_mvs.algorithms.metrics.surface import TrueView, view_points
+from pano_mvs.geometry import Rigid3, Similarity3
+from pano_mvs.io.ply import write_ply
+from pano_mvs.io.truth import read_truth
+from pano_mvs.scene import PointCloud
+from tests.algorithms.synthetic_capture import random_rotation
+from tests.cli.conftest import Command
+from tests.cli.test_evaluate_poses import write_json
+
+
+def save(path: Path, points: np.ndarray) -> Path:
+    count = len(points)
+    up = np.tile(np.float32([0, -1, 0]), (count, 1))
+    grey = np.full((count, 3), 99, np.uint8)
+    write_ply(path, PointCloud(points.astype(np.float32), up, grey, np.ones(count, np.uint8)))
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(rendered: Path) -> Path:
+    return next(path.parent for path in rendered.rglob("poses.json"))
+
+
+@pytest.fixture(scope="module")
+def surface(folder: Path) -> np.ndarray:
+    """The true surface of all views."""
+    truth = read_truth(folder)
+    return np.concatenate([
+        view_points(TrueView(view.cam_from_world, ranges))
+        for view in truth.views.values()
+        if (ranges := truth.range_map(view)) is not None
+    ])  # fmt: skip
+
+
+def test_the_truth_is_perfect_in_its_own_frame_and_in_any_other(
+    pano_mvs: Command, tmp_path: Path, folder: Path, surface: np.ndarray
+) -> None:
+    plain = pano_mvs("evaluate", "cloud", save(tmp_path / "a.ply", surface), "--truth", folder, "--json")
+    assert plain.code == 0, plain.text
+    told = json.loads(plain.text)
+    assert [score["threshold"] for score in told["scores"]] == [0.05, 0.02]
+    assert [score["accuracy"] for score in told["scores"]] == [1, 1]
+    assert told["scores"][0]["completeness"] > 0.9
+    assert (told["views_with_truth"], len(told["cameras"]), told["points"]) == (4, 4, len(surface))
+    moved = Similarity3(0.3, random_rotation(np.random.default_rng(1)), np.array([1.0, 2, 3]))
+    poses = {name: moved.move_camera(pose) for name, pose in read_truth(folder).poses.items()}
+    arguments = (save(tmp_path / "b.ply", moved.apply(surface)), "--poses", write_json(tmp_path / "m.json", poses))
+    other = json.loads(pano_mvs("evaluate", "cloud", *arguments, "--truth", folder, "--json").text)
+    for ours, theirs in zip(other["scores"], told["scores"], strict=True):
+        assert ours == pytest.approx(theirs, abs=2e-3)
+    # A reference cloud knows no cameras; with true poses the frame is found all the same.
+    reference = ("--truth", tmp_path / "a.ply", "--true-poses", folder / "poses.json")
+    against = json.loads(pano_mvs("evaluate", "cloud", *arguments, *reference, "--json").text)
+    assert [score["f_score"] for score in against["scores"]] == pytest.approx([1, 1], abs=1e-3)
+    failed = pano_mvs("evaluate", "cloud", *arguments, "--truth", tmp_path / "a.ply")
+    assert failed.code == 2
+    assert "give --true-poses" in failed.flat
+
+
+def test_only_what_the_cameras_used_see_must_be_found(
+    pano_mvs: Command, tmp_path: Path, folder: Path, surface: np.ndarray
+) -> None:
+    two = dict(list(read_truth(folder).poses.items())[:2])
+    half = surface[surface[:, 0] > 0]
+    arguments = ("--poses", write_json(tmp_path / "two.json", two), "--truth", folder, "--threshold", "0.1")
+    text = pano_mvs("evaluate", "cloud", save(tmp_path / "a.ply", half), *arguments).flat
+    assert f"{len(half)} points against the surface that 4 views see" in text
+    assert "at least 2 of 2 cameras see" in text
+    (score,) = json.loads(
+        pano_mvs("evaluate", "cloud", tmp_path / "a.ply", *arguments, "--json").text
+    )["scores"]  # fmt: skip
+    assert 0.3 < score["completeness"] < 0.7
+    assert score["accuracy"] == 1
+
+
+def test_the_picture_shows_each_view_and_the_cloud(
+    pano_mvs: Command, tmp_path: Path, folder: Path, surface: np.ndarray
+) -> None:
+    off = np.where(surface[:, :1] > 0, surface, surface * 1.2)
+    arguments = (save(tmp_path / "a.ply", off), "--truth", folder, "--picture", tmp_path / "new" / "a.png")
+    assert pano_mvs("evaluate", "cloud", *arguments).code == 0
+    picture = cv2.imread(str(tmp_path / "new" / "a.png"))
+    assert picture is not None
+    height, width = picture.shape[:2]
+    assert (width, height > 4 * 512) == (1024, True)
+    red = (picture == (45, 30, 190)).all(axis=-1)
+    assert 0.1 < red[28 : 4 * 512].mean() < 0.9
+
+
+def test_what_cannot_be_compared_is_named(pano_mvs: Command, tmp_path: Path, folder: Path) -> None:
+    cloud = save(tmp_path / "a.ply", np.zeros((1, 3)))
+    none = pano_mvs("evaluate", "cloud", cloud, "--truth", folder, "--threshold", "0")
+    assert (none.code, "tolerances must be positive" in none.flat) == (2, True)
+    strange = write_json(tmp_path / "s.json", {"else.jpg": Rigid3.identity()})
+    lost = pano_mvs("evaluate", "cloud", cloud, "--truth", folder, "--poses", strange)
+    assert (lost.code, "cannot be brought into the frame of the truth" in lost.flat) == (2, True)
+    gone = pano_mvs("evaluate", "cloud", tmp_path / "no.ply", "--truth", folder)
+    assert (gone.code, "no.ply: cannot be read" in gone.flat) == (2, True)

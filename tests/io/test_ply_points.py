@@ -1,0 +1,74 @@
+"""PLY files of other programs."""
+
+import numpy as np
+import pytest
+
+from pano_mvs.core.errors import InputError
+from pano_mvs.io.ply import read_ply, write_ply
+from pano_mvs.io.ply_points import read_ply_points
+from pano_mvs.scene import PointCloud
+
+POINTS = np.float32([[1, 2, 3], [-4.5, 0.25, 1e6]])
+
+
+def header(form, properties, count=2, more=()):
+    lines = ["ply", f"format {form} 1.0", "comment of element vertex 7", f"element vertex {count}"]
+    return "\n".join([*lines, *(f"property {text}" for text in properties), *more, "end_header", ""]).encode()
+
+
+@pytest.mark.parametrize(("form", "order"), [("binary_little_endian", "<"), ("binary_big_endian", ">")])
+def test_binary_files_of_either_order_with_other_properties_and_faces(tmp_path, form, order):
+    layout = [("confidence", f"{order}f4"), ("z", f"{order}f8"), ("x", f"{order}f4"), ("id", "u1"), ("y", f"{order}f4")]
+    vertices = np.zeros(2, layout)
+    for idx, name in enumerate("xyz"):
+        vertices[name] = POINTS[:, idx]
+    properties = ["float32 confidence", "double z", "float x", "uchar id", "float y"]
+    faces = ["element face 1", "property list uchar int vertex_indices"]
+    path = tmp_path / "a.ply"
+    path.write_bytes(header(form, properties, more=faces) + vertices.tobytes() + b"\3" + bytes(12))
+    np.testing.assert_array_equal(read_ply_points(path), POINTS)
+
+
+def test_text_files(tmp_path):
+    path = tmp_path / "a.ply"
+    path.write_bytes(header("ascii", ["float x", "float y", "float z", "uchar red"]) + b"1 2 3 9\n-4.5 0.25 1e6 8\n")
+    np.testing.assert_array_equal(read_ply_points(path), POINTS)
+    path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
+    np.testing.assert_array_equal(read_ply_points(path), POINTS)
+
+
+@pytest.mark.parametrize("quality", [False, True])
+def test_our_own_files(tmp_path, quality):
+    one = np.ones((2, 3), np.float32)
+    cloud = PointCloud(POINTS, one, one.astype(np.uint8), np.uint8([2, 9]), np.uint8([130, 255]))
+    write_ply(tmp_path / "a.ply", cloud, quality=quality)
+    np.testing.assert_array_equal(read_ply_points(tmp_path / "a.ply"), POINTS)
+    back = read_ply(tmp_path / "a.ply")
+    back.check()
+    np.testing.assert_array_equal(back.points_in_world, POINTS)
+    if quality:
+        np.testing.assert_array_equal([back.view_counts, back.confidence], [[2, 9], [130, 255]])
+    else:
+        assert back.confidence is None
+
+
+@pytest.mark.parametrize(
+    ("data", "what"),
+    [
+        (b"", "no end_header"),
+        (header("ascii", ["float x", "float y"]) + b"1 2\n3 4\n", "lack x, y or z"),
+        (header("ascii", ["float x", "float y", "float z"]) + b"1 2 3\n", "promises 2 points"),
+        (header("ascii", ["float x", "float y", "float z"]) + b"1 2 3\n4 5\n", "promises 2 points"),
+        (header("ascii", ["float x", "float y", "float z"]) + b"1 2 3\n4 5 nan\n", "no finite place"),
+        (header("binary_little_endian", ["float x", "float y", "float z"]) + bytes(23), "promises 2 points"),
+        (header("binary_middle_endian", ["float x", "float y", "float z"]), "no known format"),
+        (header("ascii", ["list uchar int x", "float y", "float z"]), "lists or properties of unknown types"),
+        (b"ply\nformat ascii 1.0\nelement face 1\nend_header\n", "must be its vertices"),
+    ],
+)
+def test_damaged_and_strange_files_are_named(tmp_path, data, what):
+    (tmp_path / "a.ply").write_bytes(data)
+    with pytest.raises(InputError, match=rf"a\.ply: .*{what}"):
+        read_ply_points(tmp_path / "a.ply")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_ply_points(tmp_path / "no.ply")
