@@ -83,12 +83,16 @@ def agreement(number: int, backend: str, *, device: str = "auto") -> float:
     Pixels without a range in both agree too. The contract is a mean of 0.99 over all cases: sums in another order, and
     positions rounded otherwise, decide some pixels on bare walls differently.
     """
-    case, plain = sweep_case(number), _readable(number)
-    found = case.swept(backend, device=device)
+    found = sweep_case(number).swept(backend, device=device)
     found.check()
+    return share_alike(found, _readable(number), sweep_case(number).settings)
+
+
+def share_alike(one: RangeMap, other: RangeMap, settings: SweepSettings) -> float:
+    """Return the share of pixels within half a level of each other, or without a range in both."""
     with np.errstate(invalid="ignore"):
-        close = np.abs(_level(found, case.settings) - _level(plain, case.settings)) < 0.5
-    return float((close | (np.isnan(found.range) & np.isnan(plain.range))).mean())
+        close = np.abs(_level(one, settings) - _level(other, settings)) < 0.5
+    return float((close | (np.isnan(one.range) & np.isnan(other.range))).mean())
 
 
 def _level(range_map: RangeMap, settings: SweepSettings) -> NDArray[np.float64]:

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.sweep.costs import CostWindow
-from pano_mvs.algorithms.sweep.numpy_backend import winners_of
+from pano_mvs.algorithms.sweep.backends import SWEEP_BACKENDS, backend_for, helper_backend, register_sweep_backend
+from pano_mvs.algorithms.sweep.costs import SWEEP_COSTS, CostWindow, register_sweep_cost
+from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
+from pano_mvs.algorithms.sweep.numpy_backend import find_winners, winners_of
 from pano_mvs.algorithms.sweep.running_winner import RunningWinner
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.algorithms.sweep.windows import WindowBands, column_offsets
-from pano_mvs.core.errors import UsageError
+from pano_mvs.core.errors import ContractError, PluginError, UsageError
 from pano_mvs.geometry import Rigid3
-from pano_mvs.testing.sweep_backends import CASES, agreement
+from pano_mvs.testing.room import capture_poses, default_room, render
+from pano_mvs.testing.sweep_backends import CASES, agreement, share_alike, sweep_case
 
 
 @pytest.mark.parametrize("backend", ["numba", "opencv"])
@@ -52,3 +58,88 @@ def test_opencv_says_how_wide_a_picture_may_be():
     pose = Rigid3(np.eye(3), np.array([0.3, 0, 0]))
     with pytest.raises(UsageError, match="at most 32000 columns"):
         sweep_range(wide, [wide], [pose], near=1, far=2, settings=SweepSettings(planes=3), backend="opencv")
+
+
+@pytest.fixture
+def ours() -> Iterator[None]:
+    """Forget what a test registers."""
+    before = dict(SWEEP_BACKENDS._added), dict(SWEEP_COSTS._added)
+    yield
+    SWEEP_BACKENDS._added, SWEEP_COSTS._added = before
+
+
+def census_like(reference, warped, window):
+    """The census cost, as a stranger would write it."""
+    pairs = zip(window.neighbours(reference[..., 0]), window.neighbours(warped[..., 0]), strict=True)
+    differs = [(ours > reference[..., 0]) != (theirs > warped[..., 0]) for ours, theirs in pairs]
+    return np.sum(differs, axis=0) / (len(differs) - 1)
+
+
+@pytest.mark.parametrize("backend", ["numpy", "opencv"])
+@pytest.mark.parametrize("number", [2, 3])
+def test_census_from_a_plugin_is_census(ours, backend, number):
+    case = sweep_case(number)
+    assert case.settings.cost == "census"
+    register_sweep_cost("census-like")(census_like)
+    settings = case.settings.replace(cost="census-like")
+    found = replace(case, settings=settings).swept(backend)
+    assert share_alike(found, case.swept("numpy"), settings) >= 0.99
+
+
+def test_a_colour_cost_is_given_colours_and_grey_is_the_default(ours):
+    seen = []
+
+    def cost(reference, warped, window):
+        seen.append((reference.shape, warped.shape, warped.dtype, window.radius))
+        return np.full(reference.shape[:2], 0.5)
+
+    register_sweep_cost("grey")(cost)
+    register_sweep_cost("colour", colors=True)(cost)
+    picture = np.zeros((16, 32, 3), np.uint8)
+    pose = Rigid3(np.eye(3), np.array([0.3, 0, 0]))
+    for name in ("grey", "colour"):
+        settings = SweepSettings(planes=3, cost=name, exposure=False)
+        sweep_range(picture, [picture], [pose], near=1, far=2, settings=settings, backend="numpy")
+    assert {first[2] for first, *_ in seen} == {1, 3}
+    assert all(ours == theirs and kind == np.float64 and radius == 3 for ours, theirs, kind, radius in seen)
+
+
+@pytest.mark.parametrize("value", [1.5, -0.1, np.nan])
+def test_a_cost_out_of_bounds_is_blamed(ours, value):
+    register_sweep_cost("wrong")(lambda reference, warped, window: np.full(reference.shape[:2], value))
+    picture = np.zeros((16, 32, 3), np.uint8)
+    pose = Rigid3(np.eye(3), np.array([0.3, 0, 0]))
+    with pytest.raises(ContractError, match=r"'wrong' must return \(16, 32\) from 0 to 1"):
+        sweep_range(picture, [picture], [pose], near=1, far=2,
+                    settings=SweepSettings(planes=3, cost="wrong"), backend="opencv")  # fmt: skip
+
+
+def test_the_small_sweeps_behind_a_sweep_need_not_be_the_backends_own(ours):
+    """A backend that has differences only: limits and exposures are found by census, with numba."""
+
+    @register_sweep_backend("differences", costs=["sad"])
+    def find(work):
+        assert work.settings.cost == "sad"
+        assert work.device == "cuda:3"
+        return find_winners(work)
+
+    assert helper_backend("differences") == "numba"
+    assert helper_backend("opencv") == "opencv"
+    poses = capture_poses(2, seed=5)
+    pictures = [render(default_room(1), pose, (32, 64))[0] for pose in poses]
+    masks = [np.ones((32, 64), np.bool_)] * 2
+    near, far = limits_by_sweeping(pictures, poses, masks=masks, backend="differences")
+    assert 0 < near < far
+    found = sweep_range(
+        pictures[0], pictures[1:], [poses[1] @ poses[0].inverse()], near=near, far=far,
+        settings=SweepSettings(planes=8, cost="sad"), backend="differences", device="cuda:3",
+    )  # fmt: skip
+    found.check()
+    with pytest.raises(UsageError, match="'differences' does not have the cost 'census'; those that do: numba, numpy"):
+        backend_for("differences", "census")
+
+
+def test_built_in_names_are_not_to_be_taken(ours):
+    with pytest.raises(PluginError, match="'numba' is built in"):
+        register_sweep_backend("numba")(find_winners)
+    assert SWEEP_BACKENDS.code_file("numba") is None
