@@ -15,6 +15,7 @@ from pano_mvs.stages.filters import (
     gaussian,
     guided,
     median,
+    planes,
     speckle,
 )
 from pano_mvs.stages.frame import level, scale, unit_translations
@@ -47,6 +48,7 @@ __all__ = [
     "nearest",
     "orb_tangent",
     "patchmatch",
+    "planes",
     "ply",
     "position",
     "previews",

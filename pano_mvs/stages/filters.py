@@ -15,6 +15,7 @@ from pano_mvs.algorithms.filters.fill import fill_from_neighbours
 from pano_mvs.algorithms.filters.gaussian import gaussian_range
 from pano_mvs.algorithms.filters.guided import guided_range
 from pano_mvs.algorithms.filters.median import median_range
+from pano_mvs.algorithms.filters.planes import lay_planes
 from pano_mvs.algorithms.filters.replacement import with_ranges
 from pano_mvs.algorithms.filters.speckle import remove_speckles
 from pano_mvs.api import Context, Each, Near, Panorama, Params, Pose, RangeMap, stage
@@ -93,6 +94,12 @@ class ConsistencyParams(Params):
 
     max_relative_error: float = Field(default=0.02, gt=0, description="ranges that agree differ by at most this share")
     max_reprojection_px: float = Field(default=1.0, gt=0, description="forward and back may miss the pixel by this")
+    min_support: float = Field(
+        default=0.5, ge=0, description="sum over sources of (1 - (miss / max_reprojection_px)²)² that a pixel needs"
+    )
+    min_motion_px: float = Field(
+        default=0.05, ge=0, description="a change by max_relative_error must move a pixel by this in the sources"
+    )
     min_views: int = Field(default=1, ge=1, description="sources that must confirm a pixel")
     remove_inconsistent: bool = Field(
         default=False, description="remove what no source confirms and several contradict"
@@ -169,6 +176,29 @@ def fill(range_map: Each[RangeMap], image: Each[Panorama], params: FillParams, c
     """
     filled = fill_from_neighbours(range_map, **params.model_dump())
     return _measured(_unmasked(filled, image), ctx)
+
+
+class PlanesParams(Params):
+    """Settings of filters.planes."""
+
+    contrast: float = Field(default=8.0, gt=0, description="grey levels around a pixel of a plain surface, at most")
+    min_area_deg2: float = Field(default=75.0, gt=0, description="smaller surfaces are left, in square degrees")
+    max_relative_error: float = Field(default=0.02, gt=0, description="pixels on a plane differ by at most this share")
+    min_share: float = Field(default=0.25, gt=0, le=1, description="of the trusted pixels that must lie on the plane")
+    min_confidence: int = Field(default=128, ge=1, le=255, description="pixels below are not trusted")
+    max_hole_deg: float = Field(
+        default=20.0, ge=0, description="larger holes, such as a sky, stay holes (diameter of a disc); 0 fills all"
+    )
+
+
+@stage("filters.planes")
+def planes(range_map: Each[RangeMap], image: Each[Panorama], params: PlanesParams, ctx: Context) -> RangeMap:
+    """Lay planes through plain walls and ceilings, on which nothing can be matched; best after the bilateral solver.
+
+    Masked pixels get no range.
+    """
+    laid = lay_planes(range_map, image.load(), rng=ctx.rng, **params.model_dump())
+    return _measured(_unmasked(laid, image), ctx)
 
 
 def _unmasked(range_map: RangeMap, image: Panorama) -> RangeMap:

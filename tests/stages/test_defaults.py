@@ -16,6 +16,7 @@ from pano_mvs.algorithms.filters.fill import fill_from_neighbours
 from pano_mvs.algorithms.filters.gaussian import gaussian_range
 from pano_mvs.algorithms.filters.guided import guided_range
 from pano_mvs.algorithms.filters.median import median_range
+from pano_mvs.algorithms.filters.planes import lay_planes
 from pano_mvs.algorithms.filters.speckle import remove_speckles
 from pano_mvs.algorithms.fusion.settings import FusionSettings
 from pano_mvs.algorithms.matching.brute_force import match_features
@@ -56,6 +57,7 @@ FUNCTIONS = {
     "filters.median": median_range,
     "filters.gaussian": gaussian_range,
     "filters.guided": guided_range,
+    "filters.planes": lay_planes,
     "filters.confidence": require_confidence,
     "filters.speckle": remove_speckles,
     "filters.consistency": check_consistency,

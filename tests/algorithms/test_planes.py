@@ -1,0 +1,130 @@
+"""Planes on plain surfaces: recovered from their outline, never carried on beyond it, never laid across texture."""
+
+import numpy as np
+import pytest
+
+from pano_mvs.algorithms.filters.planes import fit_plane, lay_planes, plain_surfaces
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import Rigid3, ray_grid, rotation_from_rotvec
+from pano_mvs.testing.room import default_room, render
+from pano_mvs.testing.scenes import white_room
+from tests.algorithms.range_scenes import TRUSTED, as_map, rolled
+
+SIZE = (128, 256)
+HIDDEN = 90
+
+
+def rng():
+    return np.random.default_rng(0)
+
+
+@pytest.fixture(scope="module")
+def white():
+    """A view of the white room, its ranges, and the map that chance makes of plain paint; the outline is seen."""
+    image, ranges = white_room(turned=False).view(0, SIZE)
+    _, bare = plain_surfaces(image, 8.0)
+    noise = np.random.default_rng(1)
+    found = np.where(bare, noise.uniform(1, 6, SIZE), ranges * (1 + 0.004 * noise.standard_normal(SIZE)))
+    chance = bare & (noise.random(SIZE) < 0.3)  # confirmed by chance
+    return image, ranges, bare, as_map(found, np.where(bare & ~chance, HIDDEN, TRUSTED))
+
+
+def bad_share(ranges, truth, where):
+    return float((~(np.abs(ranges / truth - 1) < 0.05))[where].mean())
+
+
+def test_a_plane_is_found_among_outliers():
+    noise = rng()
+    rays = noise.normal(size=(400, 3))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    plane = np.array([0.3, -0.5, 0.2])
+    rays = rays[rays @ plane > 0.1]
+    inverse = rays @ plane * (1 + 0.003 * noise.standard_normal(len(rays)))
+    outlier = np.arange(len(rays)) % 5 < 3
+    inverse[outlier] = noise.uniform(0.1, 1, outlier.sum())
+    found, on_plane = fit_plane(rays, inverse, max_relative_error=0.02, rng=rng())
+    np.testing.assert_allclose(found, plane, atol=5e-3)
+    assert on_plane[~outlier].all()
+    degenerate = fit_plane(np.tile([0.0, 0, 1], (9, 1)), np.ones(9), max_relative_error=0.02, rng=rng())
+    assert not degenerate[1].any()
+
+
+def test_the_ceiling_of_a_white_room_is_found_from_its_outline(white):
+    image, truth, bare, found = white
+    laid = lay_planes(found, image, rng=rng())
+    laid.check()
+    ceiling = bare & (np.arange(SIZE[0])[:, None] < 25)
+    assert bad_share(found.range, truth, ceiling) > 0.8
+    assert bad_share(laid.range, truth, ceiling) < 0.02
+    assert bad_share(laid.range, truth, bare) < 0.8 * bad_share(found.range, truth, bare)
+    moved = laid.range != found.range
+    assert not moved[~bare].any(), "what shows texture stays as it is"
+    assert set(np.unique(laid.confidence[moved])) <= {63, HIDDEN, TRUSTED}
+    wrong = moved & (np.abs(laid.range / found.range - 1) > 0.1)
+    assert np.all(laid.confidence[wrong] == 63)
+
+
+@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (1.4, 0.3, -0.2), (0.2, 2.0, 1.0)])
+def test_it_does_not_matter_how_the_camera_is_turned(turn):
+    """The ceiling may lie about a pole or across the seam."""
+    scene = white_room(turned=False)
+    pose = Rigid3(rotation_from_rotvec(turn), np.zeros(3))
+    image, truth = render(scene.room, pose, SIZE)
+    _, bare = plain_surfaces(image, 8.0)
+    ceiling = bare & ((ray_grid(SIZE) @ pose.rotation)[..., 1] < -0.85)
+    found = as_map(np.where(bare, 1.9, truth), np.where(bare, HIDDEN, TRUSTED))
+    laid = lay_planes(found, image, rng=rng())
+    assert bad_share(laid.range, truth, ceiling) < 0.03
+
+
+def test_rolling_the_input_rolls_the_surfaces(white):
+    image, *_, found = white
+    laid = lay_planes(found, image, rng=rng())
+    again = rolled(lay_planes(rolled(found, 61), np.roll(image, 61, 1), rng=rng()), -61)
+    same = np.isclose(again.range, laid.range, rtol=5e-3)
+    assert same.mean() > 0.97
+
+
+def test_textured_surfaces_and_balls_are_left_alone():
+    image, truth = render(default_room(), Rigid3.identity(), SIZE)
+    found = as_map(truth * (1 + 0.05 * rng().standard_normal(SIZE)), TRUSTED)
+    np.testing.assert_array_equal(lay_planes(found, image, rng=rng()).range, found.range)
+    plain = np.full((*SIZE, 3), 128, np.uint8)
+    sphere = as_map(np.full(SIZE, 2.0), TRUSTED)
+    np.testing.assert_array_equal(lay_planes(sphere, plain, rng=rng()).range, sphere.range)
+
+
+def sky_over_a_wall():
+    """A plain sky above a far wall of which only the top is seen: it goes on upwards in nobody's picture."""
+    rows = np.arange(SIZE[0])[:, None] * np.ones(SIZE[1])
+    image = np.random.default_rng(2).integers(0, 256, (*SIZE, 3), np.uint8)
+    image[:40] = 200
+    wall = np.array([0.0, 0.0, 1 / 8.0])
+    ranges = 1 / np.maximum(ray_grid(SIZE) @ wall, 1 / 30)
+    return image, ranges, rows < 40
+
+
+@pytest.mark.parametrize("max_hole_deg", [0.0, 20.0])
+def test_a_wall_is_not_carried_on_into_the_sky(max_hole_deg):
+    image, ranges, sky = sky_over_a_wall()
+    found = as_map(np.where(sky, np.nan, ranges), TRUSTED)
+    assert not lay_planes(found, image, rng=rng(), max_hole_deg=max_hole_deg).valid[sky].any()
+
+
+def test_small_holes_of_a_plane_are_filled_and_large_ones_only_when_asked(white):
+    image, truth, bare, _ = white
+    hole = bare & (np.arange(SIZE[0])[:, None] < 25)
+    found = as_map(np.where(hole, np.nan, truth), TRUSTED)
+    assert not lay_planes(found, image, rng=rng()).valid[hole].all()
+    filled = lay_planes(found, image, rng=rng(), max_hole_deg=0)
+    assert bad_share(filled.range, truth, hole) < 0.02
+    assert np.all(filled.confidence[hole & filled.valid] == 63)
+
+
+def test_bad_settings_are_refused(white):
+    image, *_, found = white
+    for harm in ({"contrast": 0.0}, {"min_share": 1.5}, {"max_relative_error": 0.0}, {"min_area_deg2": -1.0}):
+        with pytest.raises(UsageError, match="must be positive"):
+            lay_planes(found, image, rng=rng(), **harm)
+    with pytest.raises(UsageError, match="guide must be"):
+        lay_planes(found, image[::2], rng=rng())
