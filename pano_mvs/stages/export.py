@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from pano_mvs.api import All, Context, Each, Files, One, Panorama, PointCloud, Poses, RangeMap, stage
+from pydantic import Field
+
+from pano_mvs.api import All, Context, Each, Files, One, Panorama, Params, PointCloud, Poses, RangeMap, stage
 from pano_mvs.io.colmap_model import write_colmap_model
 from pano_mvs.io.ply import write_ply
 from pano_mvs.io.preview import write_preview
@@ -18,11 +20,17 @@ def colmap(poses: One[Poses], images: All[Panorama], ctx: Context) -> Files:
     return Files({f"colmap/sparse/0/{path.name}": path for path in sorted(folder.iterdir())})
 
 
+class PlyParams(Params):
+    """Settings of export.ply."""
+
+    quality: bool = Field(default=False, description="add to each point how many views agree, and its confidence")
+
+
 @stage("export.ply")
-def ply(cloud: One[PointCloud], ctx: Context) -> Files:
+def ply(cloud: One[PointCloud], params: PlyParams, ctx: Context) -> Files:
     """The fused cloud as cloud.ply: binary little endian, x y z nx ny nz red green blue."""
     path = ctx.scratch / "cloud.ply"
-    write_ply(path, cloud)
+    write_ply(path, cloud, quality=params.quality)
     return Files({"cloud.ply": path})
 
 

@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
+from pano_mvs.api import Context
 from pano_mvs.core.errors import InputError
 from pano_mvs.io.ply import read_ply, write_ply
 from pano_mvs.io.ply_points import read_ply_points
 from pano_mvs.scene import PointCloud
+from pano_mvs.stages.export import PlyParams, ply
 
 POINTS = np.float32([[1, 2, 3], [-4.5, 0.25, 1e6]])
 
@@ -72,3 +74,12 @@ def test_damaged_and_strange_files_are_named(tmp_path, data, what):
         read_ply_points(tmp_path / "a.ply")
     with pytest.raises(InputError, match="cannot be read"):
         read_ply_points(tmp_path / "no.ply")
+
+
+def test_the_export_writes_quality_on_demand(tmp_path):
+    cloud = PointCloud(POINTS, POINTS, POINTS.astype(np.uint8), np.uint8([2, 9]), np.uint8([130, 255]))
+    context = Context(np.random.default_rng(0), tmp_path)
+    for quality, confidence in ((False, None), (True, [130, 255])):
+        files = ply(cloud, PlyParams(quality=quality), context)
+        back = read_ply(files.files["cloud.ply"])
+        assert (None if back.confidence is None else back.confidence.tolist()) == confidence
