@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.filters.consistency import check_consistency, seen_ranges
-from pano_mvs.algorithms.filters.kernels_reprojection import judge_view
+from pano_mvs.algorithms.filters.consistency import _step_around, check_consistency, seen_ranges
+from pano_mvs.algorithms.filters.kernels_reprojection import judge_rows
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, ray_grid, roll_panorama
 from pano_mvs.scene import RangeMap
@@ -14,7 +14,8 @@ from tests.oracles import range_filters as oracle
 
 SIZE = (128, 256)
 POSES = capture_poses(4, seed=1, spread=0.4)
-LIMITS = {"max_relative_error": 0.02, "max_reprojection_px": 1.0}
+# At this size true ranges, too, are seen at less parallax than is asked for by default.
+LIMITS = {"max_relative_error": 0.02, "max_reprojection_px": 1.0, "min_motion_px": 0.01}
 
 
 @pytest.fixture(scope="module")
@@ -35,14 +36,16 @@ def test_compiled_verdicts_equal_the_plain_ones(size):
     reference, source = random_map(rng, size), random_map(rng, (16, 32))
     smooth = as_map(2 + 0.02 * rng.random((16, 32)))
     for ranges in (source.range, smooth.range):
-        verdicts, errors = judge_view(
-            reference.range, ray_grid(size), pose.rotation, pose.translation, ranges,
-            np.array([0.2, 3 * 2 * np.pi / size[1], 0.3]),
-        )  # fmt: skip
-        expected, expected_errors = oracle.judge(reference.range, pose, ranges, 0.2, 3, 0.3)
+        verdicts, supports, motions = np.empty(size, np.uint8), np.empty(size), np.empty(size)
+        limits = np.array([0.2, 3 * 2 * np.pi / size[1], 0.3])
+        view = pose.rotation, pose.translation
+        judge_rows(0, 5, reference.range, ray_grid(size), view, ranges, limits, verdicts, supports, motions)
+        judge_rows(5, size[0] - 5, reference.range, ray_grid(size), view, ranges, limits, verdicts, supports, motions)
+        expected, expected_supports, expected_motions = oracle.judge(reference.range, pose, ranges, 0.2, 3, 0.3)
         assert len(np.unique(expected)) == 3
         np.testing.assert_array_equal(verdicts, expected)
-        np.testing.assert_allclose(errors, expected_errors, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(supports, expected_supports, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(motions, expected_motions, rtol=1e-3, atol=1e-6)
 
 
 def test_true_ranges_confirm_each_other(true_maps):
@@ -76,6 +79,44 @@ def test_confidence_grows_with_the_number_of_views_and_falls_with_the_error(true
     off = checked([as_map(true_maps[0].range * 1.01), *true_maps[1:]])
     both = (off.confidence >= 128) & (many.confidence >= 128)
     assert np.median(off.confidence[both]) < np.median(many.confidence[both])
+
+
+def test_along_the_baseline_nothing_is_consistent_however_well_it_agrees(true_maps):
+    """Forward and backward meet at the epipoles whatever the range is."""
+    result = check_consistency(true_maps[0], POSES[0], true_maps[1:2], POSES[1:2], min_motion_px=0.1)
+    rays = ray_grid(SIZE)
+    baseline = (POSES[1] @ POSES[0].inverse()).center
+    sine = np.linalg.norm(np.cross(rays, baseline / np.linalg.norm(baseline)), axis=-1)
+    assert (result.confidence[sine < 0.1] < 128).all()
+    assert (result.confidence[sine > 0.9] >= 128).mean() > 0.6
+    even = checked(true_maps[:2] + [as_map(np.full(SIZE, np.nan))] * 2)
+    both = even.confidence >= 128
+    assert np.median(even.confidence[both & (sine > 0.9)]) > np.median(even.confidence[both & (sine < 0.3)]) + 10
+
+
+def test_agreement_by_a_hair_is_not_enough(true_maps):
+    """A range that misses the sources by nearly what is allowed has little support, one that misses by little much."""
+    shares = {}
+    for factor in (1.0, 1.012):
+        for support in (0.0, 0.9):
+            maps = [as_map(true_maps[0].range * factor), *true_maps[1:]]
+            result = checked(maps, max_reprojection_px=0.15, min_support=support)
+            shares[factor, support] = (result.confidence >= 128).mean()
+    assert min(shares[1.0, 0.0], shares[1.0, 0.9], shares[1.012, 0.0]) > 0.98
+    assert shares[1.012, 0.9] < 0.8
+
+
+def test_beside_a_step_sides_are_doubtful_and_normals_are_kept(true_maps):
+    edge = np.where(np.arange(SIZE[1]) < 100, 2.0, 4.0) * np.ones(SIZE)
+    step = _step_around(as_map(edge).range)
+    np.testing.assert_allclose(step[:, 98:102], np.log(2), rtol=1e-6)
+    np.testing.assert_allclose(step[2:-2, [97, 102, 30]], 0, atol=1e-6)
+    np.testing.assert_allclose(step[2:-2, [254, 255, 0, 1]], np.log(2), rtol=1e-6)  # over the seam
+    hole = as_map(np.where(np.arange(SIZE[1]) < 100, np.nan, edge))
+    assert np.isfinite(_step_around(hole.range)).all()
+    normals = np.broadcast_to(np.array([0, 0, -1], np.float16), (*SIZE, 3)).copy()
+    with_normals = RangeMap(true_maps[0].range, true_maps[0].confidence, normals)
+    np.testing.assert_array_equal(checked([with_normals, *true_maps[1:]]).normals_in_cam, normals)
 
 
 def test_min_views_is_the_number_that_must_confirm(true_maps):

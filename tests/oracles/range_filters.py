@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pano_mvs.geometry import pad_panorama, pixel_from_ray, ray_grid
+from pano_mvs.geometry import angle_between, pad_panorama, pixel_from_ray, ray_grid
 
 UNKNOWN, AGREES, CONTRADICTS = 0, 1, 2
 
@@ -75,12 +75,12 @@ def sample_range(ranges, pixel, max_step):
 
 
 def judge(ranges, source_from_reference, source_ranges, max_error, max_px, max_step):
-    """Verdict and relative error of one source on every pixel, by points, pixels and back."""
+    """Verdict, support and squared motion of one source on every pixel, by points, pixels and back."""
     size, source_size = ranges.shape, source_ranges.shape
     rays = ray_grid(size)
-    verdicts, errors = np.zeros(size, np.uint8), np.zeros(size)
+    verdicts, supports, motions = np.zeros(size, np.uint8), np.zeros(size), np.zeros(size)
     for row, column in np.argwhere(np.isfinite(ranges)):
-        point_in_source = source_from_reference.apply(ranges[row, column] * rays[row, column])
+        point_in_source = source_from_reference.apply(float(ranges[row, column]) * rays[row, column])
         distance = np.linalg.norm(point_in_source)
         seen = sample_range(source_ranges, pixel_from_ray(point_in_source, source_size), max_step)
         if not np.isfinite(seen):
@@ -88,12 +88,14 @@ def judge(ranges, source_from_reference, source_ranges, max_error, max_px, max_s
         back = source_from_reference.inverse().apply(seen * point_in_source / distance)
         cosine = back @ rays[row, column] / np.linalg.norm(back)
         error_px = np.arccos(np.clip(cosine, -1, 1)) * size[1] / (2 * np.pi)
-        errors[row, column] = abs(seen - distance) / distance
-        if errors[row, column] <= max_error and error_px <= max_px:
+        if abs(seen - distance) / distance <= max_error and error_px <= max_px:
             verdicts[row, column] = AGREES
+            supports[row, column] = (1 - (error_px / max_px) ** 2) ** 2
+            a_little_further = source_from_reference.apply((1 + 1e-6) * float(ranges[row, column]) * rays[row, column])
+            motions[row, column] = (angle_between(point_in_source, a_little_further) / 1e-6) ** 2
         elif seen > distance * (1 + 2 * max_error):
             verdicts[row, column] = CONTRADICTS
-    return verdicts, errors
+    return verdicts, supports, motions
 
 
 def fill(ranges, trusted, columns_per_step, max_distance_px, max_ratio):

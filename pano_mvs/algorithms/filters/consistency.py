@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import Rigid3, ray_grid
+from pano_mvs.geometry import Rigid3, pad_panorama, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
 
 # Four neighbouring source pixels further apart than this are two surfaces: no value lies between them.
 _MAX_SURFACE_STEP = 0.05
+# Range maps are matched to about this part of a pixel.
+_PRECISION_PX = 0.2
+# Beside a step like this, in ln range, it is doubtful which side a pixel belongs to, so far away from it.
+_DOUBTFUL_STEP, _DOUBTFUL_RADIUS = 0.1, 2
 
 
 def check_consistency(
@@ -24,6 +32,8 @@ def check_consistency(
     *,
     max_relative_error: float = 0.02,
     max_reprojection_px: float = 1.0,
+    min_support: float = 0.5,
+    min_motion_px: float = 0.05,
     min_views: int = 1,
     remove_inconsistent: bool = False,
     min_contradictions: int = 2,
@@ -33,22 +43,31 @@ def check_consistency(
     Forward and backward: the point at range r along a pixel's ray is projected into a source, X' = R r F(u) + t. The
     source's own range s there must equal |X'| within `max_relative_error`, and the source's point at s, seen from the
     reference, must lie within `max_reprojection_px` of the pixel (Schönberger et al., "Pixelwise view selection for
-    unstructured multi-view stereo", 2016, section 4.3, on the sphere). Where s is smaller something hides the point
-    and the source has no say. Where s is larger by more than twice the limit the source sees through the point: it
-    contradicts. Ranges of the sources that were filled, not seen, have no say either.
+    unstructured multi-view stereo", 2016, section 4.3, on the sphere): the source agrees, and supports the pixel with
+    (1 − (e / max_reprojection_px)²)², e its reprojection error. Where s is smaller something hides the point and the
+    source has no say. Where s is larger by more than twice the limit the source sees through the point: it contradicts.
+    Ranges of the sources that were filled, not seen, have no say either.
 
-    Confidence of a pixel that was seen and that n ≥ `min_views` sources confirm, with mean relative error e:
-    128 + ⌊127 (1 − 2⁻ⁿ) (1 − e / (2 max_relative_error))⌋. Otherwise it is weak and keeps its confidence clipped to
-    64–127; filled pixels keep theirs.
+    Close to the epipoles sources agree on anything. So each also tells how far a relative change of the range would
+    move the point in it, m = sin γ r / |X'| radians, γ the angle between the two rays at the point. With the sum S of
+    the supports and M² = Σ support · m², a pixel is consistent if `min_views` sources agree, S ≥ `min_support`, and a
+    change by `max_relative_error` moves it by `min_motion_px`: μ = M max_relative_error.
+
+    Confidence of a pixel that was seen and is consistent: 128 + ⌊127 (1 − 2⁻ˢ) μ² / (μ² + μ₀²) (1 + D₀² / (D² + D₀²)) /
+    2⌋. μ₀ is a fifth of a pixel, which ranges are about as sure as; D is the step ln(largest / smallest range) within
+    two pixels around, beside which a surface easily gets its neighbour's range in all views alike, and D₀ a tenth.
+    Otherwise the pixel is weak and keeps its confidence clipped to 64–127; filled pixels keep theirs.
 
     Args:
-        reference: (H, W) range map, full sphere.
+        reference: (H, W) range map, full sphere; normals are passed on.
         reference_pose: its cam_from_world.
         sources: range maps, (H', W') each, in any order: the result does not depend on it.
         source_poses: cam_from_world of each.
         max_relative_error: largest |s − |X'|| / |X'|.
         max_reprojection_px: largest angle between pixel and reprojection, in pixels of the reference at the equator.
-        min_views: number of sources that must confirm a pixel.
+        min_support: smallest S; one source supports a pixel with 1 at most, and with ½ at 0.54 max_reprojection_px.
+        min_motion_px: smallest μ, in pixels of the reference at the equator.
+        min_views: number of sources that must agree.
         remove_inconsistent: whether to invalidate pixels that no source confirms and `min_contradictions` contradict.
         min_contradictions: how many sources must contradict; no more than there are sources.
 
@@ -59,53 +78,86 @@ def check_consistency(
         raise UsageError(f"{len(sources)} source range maps but {len(source_poses)} poses: give one pose for each")
     if not (max_relative_error > 0 and max_reprojection_px > 0 and min_views >= 1 and min_contradictions >= 1):
         raise UsageError("the limits of the consistency check must be positive")
-    limits = np.array(
-        [max_relative_error, max_reprojection_px * 2 * np.pi / reference.range.shape[1], _MAX_SURFACE_STEP]
-    )
-    confirming, contradicting, error = _count_verdicts(reference, reference_pose, sources, source_poses, limits)
-    grade = (1 - 0.5**confirming) * (1 - error / (2 * max_relative_error))
+    px_per_rad = reference.range.shape[1] / (2 * np.pi)
+    limits = np.array([max_relative_error, max_reprojection_px / px_per_rad, _MAX_SURFACE_STEP])
+    votes = _count_votes(reference, reference_pose, sources, source_poses, limits)
+    motion = max_relative_error * px_per_rad * np.sqrt(votes.motion)
+    consistent = (votes.agreeing >= min_views) & (votes.support >= min_support) & (motion >= min_motion_px)
+    step = _step_around(reference.range)
+    grade = (1 - 0.5**votes.support) * motion**2 / (motion**2 + _PRECISION_PX**2)
+    grade *= 0.5 + 0.5 * _DOUBTFUL_STEP**2 / (step**2 + _DOUBTFUL_STEP**2)
     low, high = CONSISTENT_CONFIDENCE
     graded = np.floor(low + (high - low) * grade).astype(np.uint8)
     weak = np.clip(reference.confidence, *WEAK_CONFIDENCE)
     seen = reference.confidence >= WEAK_CONFIDENCE[0]
-    confidence = np.where(seen, np.where(confirming >= min_views, graded, weak), reference.confidence)
+    confidence = np.where(seen, np.where(consistent, graded, weak), reference.confidence)
     ranges = reference.range
     if remove_inconsistent and sources:
-        removed = (confirming == 0) & (contradicting >= min(min_contradictions, len(sources)))
+        removed = (votes.agreeing == 0) & (votes.contradicting >= min(min_contradictions, len(sources)))
         ranges = np.where(removed, np.float32(np.nan), ranges)
     confidence[np.isnan(ranges)] = 0
-    return RangeMap(ranges, confidence)
+    return RangeMap(ranges, confidence, reference.normals_in_cam)
 
 
-def _count_verdicts(
+@dataclass(frozen=True, slots=True, eq=False)
+class _Votes:
+    """What all sources together say of each pixel, (H, W) each.
+
+    Attributes:
+        agreeing: how many agree.
+        contradicting: how many see through it.
+        support: sum of the supports of those that agree.
+        motion: sum of their supports times their squared motions, in rad².
+    """
+
+    agreeing: NDArray[np.int64]
+    contradicting: NDArray[np.int64]
+    support: NDArray[np.float64]
+    motion: NDArray[np.float64]
+
+
+def _count_votes(
     reference: RangeMap,
     reference_pose: Rigid3,
     sources: Sequence[RangeMap],
     source_poses: Sequence[Rigid3],
     limits: NDArray[np.float64],
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Return per pixel how many sources confirm, how many contradict, and the mean relative error of the former."""
-    from pano_mvs.algorithms.filters.kernels_reprojection import AGREES, CONTRADICTS, judge_view  # compiles on import
+) -> _Votes:
+    import numba  # slow to import
+
+    from pano_mvs.algorithms.filters import kernels_reprojection as kernels  # compiles on import
 
     shape = reference.range.shape
-    confirming, contradicting = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
-    total = np.zeros(shape)
-    rays = ray_grid((shape[0], shape[1]))
+    votes = _Votes(np.zeros(shape, np.int64), np.zeros(shape, np.int64), np.zeros(shape), np.zeros(shape))
+    ranges, rays = np.ascontiguousarray(reference.range), ray_grid((shape[0], shape[1]))
+    verdicts, supports, motions = np.empty(shape, np.uint8), np.empty(shape), np.empty(shape)
     for source, pose in zip(sources, source_poses, strict=True):
-        source_from_reference = pose @ reference_pose.inverse()
-        verdicts, errors = judge_view(
-            np.ascontiguousarray(reference.range),
-            rays,
-            np.ascontiguousarray(source_from_reference.rotation),
-            np.ascontiguousarray(source_from_reference.translation),
-            seen_ranges(source, min_confidence=WEAK_CONFIDENCE[0]),
-            limits,
-        )
-        confirming += verdicts == AGREES
-        contradicting += verdicts == CONTRADICTS
+        moved = pose @ reference_pose.inverse()
+        view = np.ascontiguousarray(moved.rotation), np.ascontiguousarray(moved.translation)
+        known = seen_ranges(source, min_confidence=WEAK_CONFIDENCE[0])
+        arguments = ranges, rays, view, known, limits, verdicts, supports, motions
+        for_bands(partial(_judge, kernels.judge_rows, arguments), shape[0], threads=numba.get_num_threads())
+        votes.agreeing[...] += verdicts == kernels.AGREES
+        votes.contradicting[...] += verdicts == kernels.CONTRADICTS
         # Rounded, so that the sum of a few does not depend on the order of the sources.
-        total += np.where(verdicts == AGREES, np.rint(errors.astype(np.float64) * 2**40) / 2**40, 0.0)
-    return confirming, contradicting, total / np.maximum(confirming, 1)
+        votes.support[...] += np.rint(supports * 2**40) / 2**40
+        votes.motion[...] += np.rint(supports * motions * 2**40) / 2**40
+    return votes
+
+
+def _judge(kernel: Callable[..., object], arguments: tuple[object, ...], first: int, rows: int) -> None:
+    kernel(first, rows, *arguments)
+
+
+def _step_around(ranges: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return ln(largest / smallest valid range) within two pixels, (H, W); 0 where there is none."""
+    radius = _DOUBTFUL_RADIUS
+    logs = pad_panorama(np.log(ranges), radius)
+    window = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
+    nearest = cv2.erode(np.where(np.isnan(logs), np.float32(np.inf), logs), window)
+    farthest = cv2.dilate(np.where(np.isnan(logs), np.float32(-np.inf), logs), window)
+    step = np.where(farthest >= nearest, farthest, 0) - np.where(farthest >= nearest, nearest, 0)
+    return np.asarray(step[radius:-radius, radius:-radius], np.float32)
 
 
 def seen_ranges(range_map: RangeMap, *, min_confidence: int) -> NDArray[np.float32]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numba import njit, prange
+from numba import njit
 
 # What a source says of a point: it cannot tell (no range there, or something nearer hides the point), it sees the
 # same surface, or it sees through the point to something farther away.
@@ -101,20 +100,48 @@ def judge_point(point, rotation, translation, baseline, ranges, limits):  # type
     return UNKNOWN, error, x, y, seen
 
 
-@njit(cache=True, error_model="numpy", nogil=True, parallel=True)
-def judge_view(ranges, rays, rotation, translation, source_ranges, limits):  # type: ignore[no-untyped-def]
-    """Return the verdict of one source on every pixel, (H, W) uint8, and its relative error, (H, W) float32."""
-    height, width = ranges.shape
-    verdicts = np.zeros((height, width), np.uint8)
-    errors = np.zeros((height, width), np.float32)
+@njit(cache=True, error_model="numpy", nogil=True)
+def squared_motion(point, distance, baseline):  # type: ignore[no-untyped-def]
+    """Return the square of how far, in radians at the source, a point moves for its relative change of range.
+
+    That is (sin γ r / d)², γ the angle at the point between the two rays, r and d its distances from the two cameras.
+    """
+    square = point[0] * point[0] + point[1] * point[1] + point[2] * point[2]
+    along = point[0] * baseline[0] + point[1] * baseline[1] + point[2] * baseline[2]
+    length = baseline[0] * baseline[0] + baseline[1] * baseline[1] + baseline[2] * baseline[2]
+    return max(square * length - along * along, 0.0) / distance**4
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def judge_rows(first, rows, ranges, rays, view, source_ranges, limits, verdicts, supports, motions):  # type: ignore[no-untyped-def]
+    """Write what one source says of the pixels of some rows.
+
+    Args:
+        first: the first row.
+        rows: how many.
+        ranges: (H, W) float32 of the reference.
+        rays: (H, W, 3) its rays.
+        view: rotation (3, 3) and translation (3,) source_from_reference.
+        source_ranges: (Hs, Ws) float32.
+        limits: see `judge_point`.
+        verdicts: (H, W) uint8, written.
+        supports: (H, W) float64, written: (1 − (angle / limit)²)² where the source agrees, else 0.
+        motions: (H, W) float64, written: `squared_motion` where the source agrees, else 0.
+    """
+    rotation, translation = view
     baseline = -(rotation.T @ translation)
-    for row in prange(height):
-        for column in range(width):
+    for row in range(first, first + rows):
+        for column in range(ranges.shape[1]):
             r = ranges[row, column]
-            if math.isfinite(r):
-                ray = rays[row, column]
-                point = (r * ray[0], r * ray[1], r * ray[2])
-                verdict, error, _, _, _ = judge_point(point, rotation, translation, baseline, source_ranges, limits)
-                verdicts[row, column] = verdict
-                errors[row, column] = error
-    return verdicts, errors
+            verdicts[row, column], supports[row, column], motions[row, column] = UNKNOWN, 0.0, 0.0
+            if not math.isfinite(r):
+                continue
+            ray = rays[row, column]
+            point = (r * ray[0], r * ray[1], r * ray[2])
+            verdict, _, _, _, seen = judge_point(point, rotation, translation, baseline, source_ranges, limits)
+            verdicts[row, column] = verdict
+            if verdict == AGREES:
+                _, _, distance = project(point, rotation, translation, ranges.shape[0], ranges.shape[1])
+                share = reprojection_angle(point, baseline, seen / distance) / limits[1]
+                supports[row, column] = (1.0 - share * share) ** 2
+                motions[row, column] = squared_motion(point, distance, baseline)

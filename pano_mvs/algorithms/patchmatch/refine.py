@@ -15,8 +15,7 @@ Nothing is drawn at random, so that a rolled panorama gives the rolled result.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from math import ceil
 
 import numpy as np
@@ -24,6 +23,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.preparation import voting_pixels
 from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
+from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pad_panorama, ray_grid
 from pano_mvs.scene import RangeMap
@@ -34,7 +34,6 @@ Mask = NDArray[np.bool_]
 FloatImage = NDArray[np.float32]
 
 _LUMA = np.array([0.2126, 0.7152, 0.0722])
-_BAND_ROWS = 32
 # Samples of a window are neighbours, and not independent: of 25 so many count.
 _SAMPLES = 10.0
 # No step is larger, in pixels of the reference at the widest baseline: beyond that pictures are not linear.
@@ -86,6 +85,8 @@ def refine_range(
     if rounds < 0 or window < 3 or window % 2 == 0 or min(prior_px, prior_slope, noise, sigma_color) <= 0:
         raise UsageError(f"rounds must not be negative, window odd and at least 3, the others positive, got {rounds}, "
                          f"{window}, {prior_px}, {prior_slope}, {noise}, {sigma_color}")  # fmt: skip
+    import numba  # slow to import
+
     from pano_mvs.algorithms.patchmatch import kernels_planes, kernels_refine  # compile on import
 
     height, width = range_map.range.shape
@@ -104,18 +105,18 @@ def refine_range(
     inverse = np.where(seen, 1 / range_map.range, np.float32(np.nan)).astype(np.float32)
     planes = np.empty((3, height, width), np.float32)
 
-    def lay(first: int) -> None:
-        rows = min(_BAND_ROWS, height - first)
+    def lay(first: int, rows: int) -> None:
         kernels_planes.fit_planes(inverse, first, rows, near_offsets, stretches, _MAX_STEP, planes)
 
-    def match(first: int) -> None:
-        kernels_refine.refine_rows(first, min(_BAND_ROWS, height - first), planes, *views, numbers, inverse)
+    def match(first: int, rows: int) -> None:
+        kernels_refine.refine_rows(first, rows, planes, *views, numbers, inverse)
 
+    threads = numba.get_num_threads()
     for _ in range(rounds):
-        _in_bands(lay, height)
-        _in_bands(match, height)
+        for_bands(lay, height, threads=threads)
+        for_bands(match, height, threads=threads)
         inverse[~seen] = np.nan
-    _in_bands(lay, height)
+    for_bands(lay, height, threads=threads)
     return _range_map_from_planes(planes, range_map, seen)
 
 
@@ -171,15 +172,6 @@ def _packed(plane: NDArray[np.uint64]) -> NDArray[np.uint64]:
     upper, lower = padded[:-1], padded[1:]
     patches = upper[:, :-1] | lower[:, :-1] << 16 | upper[:, 1:] << 32 | lower[:, 1:] << 48
     return np.asarray(patches, dtype=np.uint64)
-
-
-def _in_bands(work: Callable[[int], None], height: int) -> None:
-    """Do the work on all bands of rows, by their first row, in threads: they write disjoint rows."""
-    import numba
-
-    with ThreadPoolExecutor(numba.get_num_threads()) as pool:
-        for _ in pool.map(work, range(0, height, _BAND_ROWS)):
-            pass
 
 
 def _check(

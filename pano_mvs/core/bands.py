@@ -1,0 +1,25 @@
+"""Rows of a picture, handed to plain threads in bands."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+_BAND_ROWS = 32
+
+
+def for_bands(work: Callable[[int, int], object], height: int, *, threads: int) -> None:
+    """Call `work` with the first row and the number of rows of bands that make up all rows.
+
+    Bands write disjoint rows, so that the number of threads changes no bit. Compiled work that releases the GIL runs
+    side by side; what one band raises is raised here.
+
+    Args:
+        work: called once for each band, in any order.
+        height: number of rows.
+        threads: how many bands to work on at a time.
+    """
+    firsts = range(0, height, _BAND_ROWS)
+    with ThreadPoolExecutor(max(threads, 1)) as pool:
+        for _ in pool.map(lambda first: work(first, min(_BAND_ROWS, height - first)), firsts):
+            pass
