@@ -84,10 +84,11 @@ class Desk:
             f"settings, or say with `memory:` in stage {unit.entry.name!r} what it really needs"
         )
 
-    def hand_out(self, unit: Unit) -> None:
-        """Give a unit to the executor."""
+    def hand_out(self, unit: Unit, *, siblings: int) -> None:
+        """Give a unit to the executor; if its stage has few units, each of them may use the more threads."""
+        threads = max(self._executor.threads, self._executor.cores // siblings)
         log = self._store.blobs.temporary / f"log-{uuid.uuid4().hex}.txt"
-        job = Job(self._next, unit, unit.entry.policy.timeout_s, log, self._plugins)
+        job = Job(self._next, unit, threads, unit.entry.policy.timeout_s, log, self._plugins)
         self._next += 1
         self._out[job.number] = _Out(job, memory_of(unit))
         self._executor.submit(job)

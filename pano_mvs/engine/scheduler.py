@@ -112,7 +112,7 @@ class Scheduler:
             return True
         self._twins[unit.key] = []
         self._tally.unit_started(unit.entry, unit.item)
-        self._desk.hand_out(unit)
+        self._desk.hand_out(unit, siblings=len(self._board.states[unit.entry.name].members))
         return True
 
     def _end(self, ended: Ended) -> None:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import os
+
 from pano_mvs.core.errors import UsageError
 from pano_mvs.engine.executors.processes import ProcessExecutor
 from pano_mvs.engine.executors.protocol import Executor
 from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.executors.threads import available_threads, share_cores
+from pano_mvs.engine.memory import free_memory_bytes
 from pano_mvs.engine.store import Store
 
+VARIABLE = "PANO_MVS_EXECUTOR"
+_WORKER_BYTES = 3_000_000_000
 EXECUTORS = ("serial", "processes", "dask")
 
 
@@ -17,9 +22,9 @@ def make_executor(store: Store, name: str = "", *, workers: int = 0, threads: in
 
     Args:
         store: where values are.
-        name: of the executor; by default that which the other settings ask for, else processes where there is more
-            than one core.
-        workers: units at a time; 0 for as many as there are cores for.
+        name: of the executor; by default that which the other settings or $PANO_MVS_EXECUTOR ask for, else processes
+            where there is more than one core.
+        workers: units at a time; 0 for as many as there are cores for, and memory (3 GB each).
         threads: threads of each worker; 0 for an equal share of the cores.
         scheduler: address of a dask scheduler; without one, dask starts a cluster on this host.
 
@@ -27,7 +32,8 @@ def make_executor(store: Store, name: str = "", *, workers: int = 0, threads: in
         UsageError: if the settings contradict each other, or the executor is not installed or cannot be reached.
     """
     cores = available_threads()
-    name = name or ("dask" if scheduler else "processes" if workers > 1 or (cores > 1 and workers != 1) else "serial")
+    name = name or ("dask" if scheduler else "" if workers else os.environ.get(VARIABLE, ""))
+    name = name or ("processes" if workers > 1 or (cores > 1 and workers != 1) else "serial")
     if name not in EXECUTORS:
         raise UsageError(f"there is no executor {name!r}; there are {', '.join(EXECUTORS)}")
     if scheduler and name != "dask":
@@ -36,6 +42,8 @@ def make_executor(store: Store, name: str = "", *, workers: int = 0, threads: in
         if workers > 1:
             raise UsageError("--executor serial runs one unit at a time; for more use --executor processes")
         return SerialExecutor(store, threads=threads)
+    if not workers and not threads:
+        workers = max(1, min(cores, free_memory_bytes() // _WORKER_BYTES or cores))
     workers, threads = share_cores(cores, workers=workers, threads=threads)
     if name == "processes":
         return ProcessExecutor(store, workers=workers, threads=threads)

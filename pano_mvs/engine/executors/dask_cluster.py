@@ -65,17 +65,19 @@ class DaskExecutor:
         except (OSError, ValueError, TimeoutError) as error:
             raise UsageError(f"--scheduler {scheduler}: it does not answer ({error})") from error
         try:
-            places, share = self._check_workers()
+            places, share, cores = self._check_workers()
         except UsageError:
             self.close()
             raise
         self.capacity = places + (places + 1) // 2 if scheduler else places
         self.threads = threads or share
+        self.cores = max(self.threads, cores)
         self._is_remote = bool(scheduler)
 
     def submit(self, job: Job) -> None:
         """Take a job."""
-        request = request_to_json(job, self._store, self.threads)
+        request = request_to_json(job, self._store)
+        request["cores"] = self.cores
         request["plugin_texts"] = {str(path.absolute()): self._texts(path) for path in job.plugins}
         text = json.dumps(request)
         if len(text) > _LARGE_BYTES:
@@ -131,8 +133,8 @@ class DaskExecutor:
             self._sources[key] = code_texts(path)
         return self._sources[key]
 
-    def _check_workers(self) -> tuple[int, int]:
-        """Return how many units the workers take at a time, and how many threads each of these may use."""
+    def _check_workers(self) -> tuple[int, int, int]:
+        """Return how many units the workers take at a time, how many threads each may use, and how many if alone."""
         token = f"hello-{uuid.uuid4().hex}"
         folder = self._store.blobs.temporary
         folder.mkdir(parents=True, exist_ok=True)
@@ -151,7 +153,8 @@ class DaskExecutor:
         for worker, answer in found.items():
             on_host[answer["host"]] += places[worker]
         cores = {answer["host"]: answer["cores"] for answer in found.values()}
-        return sum(places.values()), max(1, min(cores[host] // count for host, count in on_host.items()))
+        share = max(1, min(cores[host] // count for host, count in on_host.items()))
+        return sum(places.values()), share, min(cores.values())
 
     def _check(self, worker: str, answer: Any, token: str) -> None:
         if isinstance(answer, BaseException):

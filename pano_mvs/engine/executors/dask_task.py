@@ -35,7 +35,7 @@ def run_unit(run: str, text: str) -> str:
         text: the request as JSON, or the path of a file in the store that holds it.
     """
     request = json.loads(text if text.startswith("{") else Path(text).read_bytes())
-    worker = _workers.setdefault((run, threading.get_ident()), _new_worker(request["threads"]))
+    worker = _workers.setdefault((run, threading.get_ident()), _new_worker(request["cores"]))
     return json.dumps(worker.run(request).to_json())
 
 

@@ -31,6 +31,7 @@ class ProcessExecutor:
     def __init__(self, store: Store, *, workers: int, threads: int, units_per_process: int = UNITS_PER_PROCESS) -> None:
         self.capacity = workers
         self.threads = threads
+        self.cores = workers * threads
         self._store = store
         self._units_per_process = units_per_process
         self._jobs: queue.SimpleQueue[tuple[Job, dict[str, Any]] | None] = queue.SimpleQueue()
@@ -42,7 +43,7 @@ class ProcessExecutor:
 
     def submit(self, job: Job) -> None:
         """Take a job; a further worker is started if all are busy."""
-        request = request_to_json(job, self._store, self.threads)
+        request = request_to_json(job, self._store)
         if len(self._out) == len(self._keepers):
             self._add_keeper()
         self._out.add(job.number)
@@ -92,7 +93,7 @@ class ProcessExecutor:
     def _add_keeper(self) -> None:
         errors = self._store.blobs.temporary / f"worker-{uuid.uuid4().hex}.txt"
         errors.parent.mkdir(parents=True, exist_ok=True)
-        worker = WorkerProcess(self.threads, errors)
+        worker = WorkerProcess(self.cores, errors)
         thread = threading.Thread(target=self._keep, args=(worker,), daemon=True)
         self._keepers.append((thread, worker))
         thread.start()

@@ -20,6 +20,7 @@ class Job:
     Attributes:
         number: names the job in this run.
         unit: what to compute.
+        threads: how many threads it may use.
         timeout_s: the time after which it is given up; 0 for none.
         log: file for whatever the unit prints; it exists afterwards if there was anything.
         plugins: the plugin files of the workflow, with the digests of their code.
@@ -27,6 +28,7 @@ class Job:
 
     number: int
     unit: Unit
+    threads: int
     timeout_s: float
     log: Path
     plugins: Mapping[Path, str] = field(default_factory=dict)
@@ -83,13 +85,15 @@ class Executor(Protocol):
     Attributes:
         name: as it is chosen on the command line.
         capacity: how many jobs it takes at a time.
-        threads: how many threads a unit may use.
+        threads: how many threads a unit may use while as many others run as there can.
+        cores: how many threads a unit may use that runs alone.
         enforces_timeouts: whether it can end a unit that takes too long.
     """
 
     name: str
     capacity: int
     threads: int
+    cores: int
     enforces_timeouts: bool
 
     def submit(self, job: Job) -> None:

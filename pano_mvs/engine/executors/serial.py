@@ -17,7 +17,7 @@ class SerialExecutor:
     enforces_timeouts = False
 
     def __init__(self, store: Store, *, threads: int = 0) -> None:
-        self.threads = threads or available_threads()
+        self.threads = self.cores = threads or available_threads()
         self._store = store
         self._jobs: list[Job] = []
 
@@ -30,7 +30,7 @@ class SerialExecutor:
         if not self._jobs or timeout_s == 0:
             return None
         job = self._jobs.pop(0)
-        return job.number, perform(job.unit, self._store, threads=self.threads, log=job.log)
+        return job.number, perform(job.unit, self._store, threads=job.threads, log=job.log)
 
     def free_memory_bytes(self) -> int:
         """Return what is free on this host."""

@@ -41,13 +41,22 @@ def bound_environment(environment: MutableMapping[str, str], threads: int) -> No
 
 
 def bound_threads(threads: int) -> None:
-    """Bound libraries that are loaded already, as far as they let themselves be bound."""
+    """Bound libraries for one unit: those loaded already, and numba if it is loaded meanwhile."""
     if "cv2" in sys.modules:
         sys.modules["cv2"].setNumThreads(threads)
     if "numba" in sys.modules:
         numba = sys.modules["numba"]
         numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+    else:
+        os.environ["NUMBA_NUM_THREADS"] = str(min(threads, _most_numba_threads()))
     _bound_blas()
+
+
+@cache
+def _most_numba_threads() -> int:
+    """Return what the environment allowed when the first unit came."""
+    bound = os.environ.get("NUMBA_NUM_THREADS", "")
+    return int(bound) if bound.isdigit() and int(bound) else available_threads()
 
 
 @cache

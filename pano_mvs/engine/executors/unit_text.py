@@ -18,14 +18,14 @@ from pano_mvs.engine.workflow import Policy, StageEntry
 TEXT_VERSION = 1
 
 
-def request_to_json(job: Job, store: Store, threads: int) -> dict[str, Any]:
+def request_to_json(job: Job, store: Store) -> dict[str, Any]:
     """Return what a worker is asked: the unit, and where its plugins, its store and its log are."""
     return {
         "unit": unit_to_json(job.unit, store),
         "plugins": {str(path.absolute()): digest for path, digest in job.plugins.items()},
         "store": str(store.root.absolute()),
         "log": str(job.log.absolute()),
-        "threads": threads,
+        "threads": job.threads,
         "timeout_s": job.timeout_s,
     }
 

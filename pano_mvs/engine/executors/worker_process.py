@@ -40,7 +40,7 @@ class WorkerProcess:
         """Prepare a worker.
 
         Args:
-            threads: how many threads its libraries may use.
+            threads: how many threads a unit of it may use at most.
             errors: file for what it prints outside units, such as why it cannot start.
         """
         self.threads = threads

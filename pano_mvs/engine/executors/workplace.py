@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,16 +24,21 @@ def run_request(request: Mapping[str, Any]) -> Outcome:
     """Compute the unit of a request, see `request_to_json`."""
     try:
         store = _store(request["store"])
-        plugins = _with_texts(request["plugins"], request.get("plugin_texts", {}))
+        files = _with_texts(request["plugins"], request.get("plugin_texts", {}))
+        plugins = {files[path]: digest for path, digest in request["plugins"].items()}
         unit = unit_from_json(request["unit"], _spec(request["unit"]["use"], plugins), store)
     except PanoMvsError as error:
         return Outcome("stopped", cause=str(error), error="UsageError")
-    return perform(unit, store, threads=request["threads"], log=Path(request["log"]))
+    outcome = perform(unit, store, threads=request["threads"], log=Path(request["log"]))
+    for path, here in files.items():  # whoever reads of a failure knows the file where it came from
+        if here != path:
+            outcome = replace(outcome, cause=outcome.cause.replace(here, path), trace=outcome.trace.replace(here, path))
+    return outcome
 
 
 def _with_texts(plugins: Mapping[str, str], texts: Mapping[str, Any]) -> dict[str, str]:
-    """Return the plugin files, with those whose text came along in a folder of our own: their host may be another."""
-    return {_written(digest, *texts[path]) if path in texts else path: digest for path, digest in plugins.items()}
+    """Return where each plugin file is: those whose text came along are in a folder of our own."""
+    return {path: _written(digest, *texts[path]) if path in texts else path for path, digest in plugins.items()}
 
 
 _folders: dict[str, TemporaryDirectory[str]] = {}
@@ -78,7 +85,11 @@ def _of_files(plugins: tuple[tuple[str, str], ...]) -> Registry:
 
 def _spec(name: str, plugins: Mapping[str, str]) -> StageSpec:
     """Return a stage, a plugin's or an installed one; whichever it is, it may use parts that plugins add."""
-    spec = _of_files(tuple(plugins.items())).stages.get(name) or _installed().stages.get(name)
+    spec = _of_files(tuple(plugins.items())).stages.get(name)
+    if spec is None:
+        # Before its first unit: numba takes its greatest number of threads from the environment when it is loaded.
+        importlib.import_module("numba")
+        spec = _installed().stages.get(name)
     if spec is None:
         raise PluginError(f"the worker knows no stage {name!r}; {_installed().suggest(name)}")
     return spec

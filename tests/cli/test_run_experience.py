@@ -1,0 +1,182 @@
+"""What a person, or a program, sees of a run: events, interrupts, logs, exit codes; all in real processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pano_mvs.cli.estimate import Estimate, duration
+from tests.engine.conftest import Toy, toy  # noqa: F401 (a fixture)
+from tests.engine.test_resume import deliverables, finished_records
+
+ON_POSIX = pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
+
+
+def start(toy: Toy, *options: str, sleep_s: float = 0.0) -> subprocess.Popen[str]:  # noqa: F811
+    command = [sys.executable, "-m", "pano_mvs", "run", str(toy.folder / "wf.yaml"),
+               "--cache", str(toy.folder / "cache"), "--out", str(toy.folder / "out"), *options]  # fmt: skip
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                            env=os.environ | {"TOY_SLEEP_S": str(sleep_s)}, cwd=toy.folder)  # fmt: skip
+
+
+def finish(process: subprocess.Popen[str]) -> tuple[int, str, str]:
+    out, err = process.communicate(timeout=120)
+    return process.returncode, out, err
+
+
+def wait_for(process: subprocess.Popen[str], toy: Toy, records: int) -> None:  # noqa: F811
+    deadline = time.monotonic() + 60
+    while finished_records(toy) < records:
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def events_of(text: str) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in text.splitlines()]
+
+
+def test_events_are_complete_and_nothing_else_is_printed(toy: Toy) -> None:  # noqa: F811
+    toy.number("3.txt", "13")
+    toy.edit("plug.py", lambda text: text.replace('"""Multiply."""', '"""Multiply."""\n    print("noise", x.value)'))
+    code, out, _ = finish(start(toy, "--json", "--executor", "processes", "--workers", "2"))
+    assert code == 3
+    events = events_of(out)
+    assert [events[0]["event"], events[-1]["event"]] == ["run_started", "run_finished"]
+    assert (events[0]["schema"], events[0]["executor"], events[0]["workers"]) == (1, "processes", 2)
+    assert events[-1]["exit_code"] == 3
+    opened = {event["stage"]: event["units"] for event in events if event["event"] == "stage_started"}
+    assert set(opened) == set(events[0]["stages"])
+    assert Counter(event["stage"] for event in events if event["event"] == "unit_finished") == opened
+    closed = {event["stage"]: event for event in events if event["event"] == "stage_finished"}
+    assert {name: event["units"] for name, event in closed.items()} == opened
+    for what in ("run", "failed", "blocked"):
+        assert sum(event[what] for event in closed.values()) == events[-1][what]
+    (failed,) = (event for event in events if event["event"] == "unit_failed")
+    assert (failed["stage"], failed["item"], failed["said"]) == ("scaled", "3.txt", ["noise 13.0"])
+    assert Path(failed["log"]).read_text() == "noise 13.0\n"
+    begun = Counter((event["stage"], event["item"]) for event in events if event["event"] == "unit_started")
+    assert set(begun.values()) == {1}
+
+
+def test_events_of_a_run_that_cannot_begin_end_as_well(toy: Toy) -> None:  # noqa: F811
+    for number in range(1, 6):
+        toy.number(f"{number}.txt", "not a number")
+    code, out, err = finish(start(toy, "--json", "--executor", "serial"))
+    assert code == 2
+    assert events_of(out)[-1]["exit_code"] == 2
+    assert "none of the 5 items" in err
+
+
+@ON_POSIX
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
+def test_interrupt_lets_units_finish_and_says_how_to_go_on(toy: Toy, number: signal.Signals) -> None:  # noqa: F811
+    process = start(toy, "--executor", "processes", "--workers", "2", sleep_s=1.0)
+    wait_for(process, toy, 18)  # the means have begun
+    process.send_signal(number)
+    code, out, err = finish(process)
+    assert code == 130
+    assert "may finish within" in out
+    assert f"pano-mvs run {toy.folder / 'wf.yaml'}" in err.replace("\n", "")
+    kept = finished_records(toy)
+    assert kept >= 19, "a unit in flight has finished"
+    code, out, _ = finish(start(toy, "--executor", "serial"))
+    assert code == 0
+    assert f"{28 - kept} units computed, {kept} cached" in out
+
+
+def _read_until(process: subprocess.Popen[str], *words: str) -> None:
+    assert process.stdout is not None
+    for line in process.stdout:
+        if all(word in line for word in words):
+            return
+    pytest.fail(f"it never said {words}")
+
+
+@ON_POSIX
+def test_second_interrupt_ends_at_once(toy: Toy) -> None:  # noqa: F811
+    process = start(toy, "--json", "--executor", "processes", "--workers", "2", sleep_s=300.0)
+    _read_until(process, '"unit_started"', '"mean"')
+    process.send_signal(signal.SIGINT)
+    _read_until(process, "may finish")
+    started = time.monotonic()
+    process.send_signal(signal.SIGINT)
+    code, out, _ = finish(process)
+    assert time.monotonic() - started < 8
+    assert code == 130
+    assert events_of(out)[-1]["exit_code"] == 130
+
+
+@ON_POSIX
+@pytest.mark.slow
+def test_workers_end_with_a_run_that_is_killed(toy: Toy) -> None:  # noqa: F811
+    toy.edit("plug.py", lambda text: text.replace('"""Multiply."""', '''"""Multiply."""
+    open(f"pid-{os.getpid()}", "w").close(); time.sleep(300)'''))  # fmt: skip
+    process = start(toy, "--executor", "processes", "--workers", "1")
+    deadline = time.monotonic() + 60
+    while not (found := list(toy.folder.glob("pid-*"))) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.kill()
+    process.communicate()
+    pid = int(found[0].name.removeprefix("pid-"))
+    deadline = time.monotonic() + 20
+    while time.monotonic() < deadline:
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return
+        if "(zombie)" in _state(pid):
+            return
+        time.sleep(0.05)
+    os.kill(pid, signal.SIGKILL)
+    pytest.fail("the worker goes on for nobody")
+
+
+def _state(pid: int) -> str:
+    path = Path(f"/proc/{pid}/status")
+    return path.read_text() if path.is_file() else ""
+
+
+def test_failure_shows_the_last_lines_and_where_the_rest_is(toy: Toy) -> None:  # noqa: F811
+    toy.number("3.txt", "13")
+    toy.edit("plug.py", lambda text: text.replace('"""Multiply."""', '"""Multiply."""\n    print("just before")'))
+    code, out, _ = finish(start(toy, "--executor", "serial"))
+    assert code == 3
+    assert "  | just before" in out
+    assert "3.txt.log" in out
+    assert "thirteen is unlucky" in out
+    assert "just before" not in [line.strip() for line in out.splitlines()], "units do not print among our lines"
+
+
+@pytest.mark.slow
+def test_serial_and_processes_leave_the_same_files(toy: Toy) -> None:  # noqa: F811
+    assert finish(start(toy, "--executor", "serial"))[0] == 0
+    first = deliverables(toy)
+    toy.edit("wf.yaml", lambda text: text + "# another\n")
+    toy.folder.joinpath("cache").rename(toy.folder / "old")
+    assert finish(start(toy, "--workers", "2"))[0] == 0
+    assert deliverables(toy) == first
+
+
+def test_time_left_is_a_bound_until_all_is_known() -> None:
+    estimate = Estimate(workers=2)
+    estimate.start("a", 10)
+    assert estimate.of_run(2) == ""
+    estimate.count("a", 0.0, computed=False)
+    estimate.count("a", 20.0, computed=True)
+    assert estimate.of_stage("a") == "80 s left"
+    assert estimate.of_run(2) == "more than 80 s left"
+    estimate.start("b", 1)
+    assert estimate.of_run(2) == "more than 80 s left"
+    estimate.count("b", 4.0, computed=True)
+    assert estimate.of_run(2) == "about 80 s left"
+    assert [duration(s) for s in (5, 600, 9000)] == ["5 s", "10 min", "2.5 h"]
