@@ -71,5 +71,7 @@ def deliverables(folder: Path) -> dict[str, bytes]:
     return {
         path.relative_to(folder).as_posix(): path.read_bytes()
         for path in sorted(folder.rglob("*"))
-        if path.is_file() and path.name not in ("run.json", "report.html")
+        if path.is_file()
+        and path.name not in ("run.json", "report.html")
+        and path.relative_to(folder).parts[0] != "logs"
     }

@@ -1,0 +1,43 @@
+"""The whole quickstart, whoever computes it: the same bytes in the output folder and in the store."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.cli.conftest import SMALL, deliverables
+
+WAYS = {
+    "serial": ("--executor", "serial", "--threads-per-worker", "2"),
+    "one": ("--executor", "processes", "--workers", "1", "--threads-per-worker", "1"),
+    "two": ("--executor", "processes", "--workers", "2"),
+    "four": ("--executor", "processes", "--workers", "4", "--threads-per-worker", "1"),
+    "dask": ("--executor", "dask", "--workers", "2"),
+}
+
+
+def stored(folder: Path) -> dict[str, object]:
+    """Return the records of a store without their times."""
+    found = {}
+    for path in (folder / "records").rglob("*.json"):
+        found[path.name] = json.loads(path.read_bytes().partition(b"\n")[2]) | {"seconds": 0}
+    return found
+
+
+@pytest.mark.slow
+def test_all_executors_give_the_same_bytes(rendered: Path, tmp_path: Path) -> None:
+    # Nothing is bound from outside: what bounds the libraries is ours.
+    unbound = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    for name, options in WAYS.items():
+        command = [sys.executable, "-m", "pano_mvs", "run", "quickstart", "--images", str(rendered), *SMALL, *options,
+                   "--out", str(tmp_path / f"out-{name}"), "--cache", str(tmp_path / f"cache-{name}")]  # fmt: skip
+        done = subprocess.run(command, env=unbound, capture_output=True, text=True, check=False, timeout=600)
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert deliverables(tmp_path / f"out-{name}") == deliverables(tmp_path / "out-serial"), name
+        assert stored(tmp_path / f"cache-{name}") == stored(tmp_path / "cache-serial"), name
+    assert len(deliverables(tmp_path / "out-serial")) > 10
