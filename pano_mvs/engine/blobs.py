@@ -72,6 +72,7 @@ class BlobStore:
     def __init__(self, root: Path, stat_cache: StatCache, *, durable: bool = False) -> None:
         self.root = root
         self.durable = durable
+        self._folder = str(root / "blobs")
         self.temporary = root / "tmp"
         self.stat_cache = stat_cache
         self._external: dict[str, Path] = {}
@@ -85,14 +86,17 @@ class BlobStore:
 
     def path(self, ref: BlobRef) -> Path:
         """Return where a blob is or would be."""
+        return Path(self._place(ref))
+
+    def _place(self, ref: BlobRef) -> str | Path:
         if ref.external:
-            return self._external.get(ref.digest, Path("unregistered") / ref.digest)
-        return self.root / "blobs" / ref.digest[:2] / f"{ref.digest}{ref.suffix}"
+            return self._external.get(ref.digest, f"unregistered/{ref.digest}")
+        return f"{self._folder}/{ref.digest[:2]}/{ref.digest}{ref.suffix}"  # a Path costs ten times as much
 
     def exists(self, ref: BlobRef) -> bool:
         """Return whether a blob is there with its right size (its bytes are checked when it is read)."""
         try:
-            return self.path(ref).stat().st_size == ref.size_bytes
+            return os.stat(self._place(ref)).st_size == ref.size_bytes  # noqa: PTH116  # see `_place`
         except OSError:
             return False
 

@@ -16,7 +16,7 @@ from pano_mvs.engine.wiring import Edge
 from pano_mvs.engine.workflow import StageEntry
 from pano_mvs.scene import Axis, Pairs, Record, Views
 
-KEY_SCHEMA = 1
+KEY_SCHEMA = 2
 WHOLE = ""
 """The name of the one unit of a stage that has no fan-out."""
 
@@ -105,6 +105,7 @@ def resolve_source(entry: StageEntry, store: Store) -> Resolution:
     assert entry.spec.list_items is not None
     resolution = Resolution()
     static = _static_identity(entry, store)
+    common = digest_from_value(static)
     for item in entry.spec.list_items(entry.params):
         if item.name in resolution.members:
             raise InputError(f"{entry.name}: the item {item.name!r} is listed twice")
@@ -117,8 +118,9 @@ def resolve_source(entry: StageEntry, store: Store) -> Resolution:
         except InputError as error:
             resolution.blocked[item.name] = str(error)
             continue
-        identity = static | {"inputs": {"files": digests, "name": item.name}}
-        unit = Unit(entry, item.name, (item.name,), {}, digest_from_value(identity), identity, item)
+        inputs = {"files": digests, "name": item.name}
+        key = _key(common, inputs)
+        unit = Unit(entry, item.name, (item.name,), {}, key, static | {"inputs": inputs}, item)
         resolution.units.append(unit)
     return resolution
 
@@ -149,7 +151,9 @@ class Resolver:
         self.store = store
         self.resolution = Resolution()
         self.near: Mapping[str, tuple[str, ...]] = {}
-        self._static: Mapping[str, Any] | None = None
+        self._static: dict[str, Any] = {}
+        self._common = ""
+        self._near_edges = [edge for edge in edges.values() if edge.port.cardinality is Cardinality.NEAR]
 
     def resolve(self) -> Resolution:
         """Return all units, as far as they are known."""
@@ -222,11 +226,12 @@ class Resolver:
         if waiting:
             self.resolution.waiting.append(name)
             return
-        if self._static is None:
+        if not self._static:
             self._static = _static_identity(self.entry, self.store)
-        identity = dict(self._static) | {"inputs": {port: self._encode(port, value) for port, value in inputs.items()}}
-        key = digest_from_value(identity)
-        self.resolution.units.append(Unit(self.entry, name, members, inputs, key, identity))
+            self._common = digest_from_value(self._static)
+        encoded = {port: self._encode(port, value) for port, value in inputs.items()}
+        identity = self._static | {"inputs": encoded}
+        self.resolution.units.append(Unit(self.entry, name, members, inputs, _key(self._common, encoded), identity))
 
     def _input(self, edge: Edge, name: str) -> tuple[UnitInput, str, bool]:
         """Return what a unit reads at a port, why it cannot, and whether that is not known yet."""
@@ -264,11 +269,9 @@ class Resolver:
 
     def _near(self, name: str) -> list[str]:
         """Return a unit's neighbours that every Near port has or may come to have, so that all ports stay in step."""
-        return [item for item in self.near[name] if all(self._may_have(edge, item) for edge in self.edges.values())]
+        return [item for item in self.near[name] if all(self._may_have(edge, item) for edge in self._near_edges)]
 
     def _may_have(self, edge: Edge, item: str) -> bool:
-        if edge.port.cardinality is not Cardinality.NEAR:
-            return True
         state = self.states[edge.producer]
         if state.open or item in state.pending or (edge.exploded and state.pending):
             return True
@@ -294,6 +297,11 @@ class Resolver:
             return list(value)
         state = self.states[self.edges[port].producer]
         return [[list(state.members.get(name, (name,))), ref.digest] for name, ref in value.items()]
+
+
+def _key(common: str, inputs: Mapping[str, Any]) -> str:
+    """Return a unit's key: what its stage has in common with all its units is encoded once, not for each."""
+    return digest_from_value([common, inputs])
 
 
 def _static_identity(entry: StageEntry, store: Store) -> dict[str, Any]:
