@@ -40,8 +40,7 @@ def batch_for(name: str) -> Batch:
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     if name == "cpu":
-        # What is worked on stays in the processor's cache.
-        return Batch(torch.device("cpu"), costs=1 << 24, samples=1 << 18)
+        return Batch(torch.device("cpu"), costs=1 << 24, samples=1 << 21)
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     device = torch.device(name)
     if (device.index or 0) >= count:
