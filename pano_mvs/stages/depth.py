@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from pano_mvs.algorithms.sweep.backends import SWEEP_BACKENDS, backend_for
+from pano_mvs.algorithms.sweep.backends import SWEEP_BACKENDS, backend_for, check_levels
 from pano_mvs.algorithms.sweep.costs import SWEEP_COSTS
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
 from pano_mvs.algorithms.sweep.settings import SweepSettings
@@ -81,10 +81,18 @@ class SweepParams(Params):
     exposure: bool = Field(
         default=True, description="match the exposure of sources to the reference's where colours are compared"
     )
+    levels: int = Field(
+        default=1,
+        ge=1,
+        le=4,
+        description="1: every plane everywhere; 2 or 3: a sweep at half or a quarter of the resolution says where to "
+        "look, which is faster",
+    )
 
     @model_validator(mode="after")
     def _backend_has_cost(self) -> SweepParams:
         backend_for(self.backend, self.cost)
+        check_levels(self.backend, self.levels)
         return self
 
 

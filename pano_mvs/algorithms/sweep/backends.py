@@ -52,6 +52,10 @@ class SweepBackend:
 def _numba(work: SweepInput) -> Winners:
     from pano_mvs.algorithms.sweep import numba_backend  # on use: numba is slow to import
 
+    if work.settings.levels > 1:
+        from pano_mvs.algorithms.sweep import coarse_to_fine
+
+        return coarse_to_fine.find_winners(work)
     return numba_backend.find_winners(work)
 
 
@@ -97,6 +101,12 @@ def backend_for(name: str, cost: str) -> SweepBackend:
     able = [other for other in SWEEP_BACKENDS.names() if _has(SWEEP_BACKENDS.get(other), cost)]
     raise UsageError(f"the sweep backend {name!r} does not have the cost {cost!r}; those that do: "
                      f"{', '.join(able) or 'none'}")  # fmt: skip
+
+
+def check_levels(name: str, levels: int) -> None:
+    """Raise UsageError if the backend of that name cannot go from coarse to fine over so many levels."""
+    if levels > 1 and name != "numba":
+        raise UsageError(f"levels: {levels} needs the sweep backend 'numba', got {name!r}: use it, or levels: 1")
 
 
 def helper_backend(name: str) -> str:

@@ -63,6 +63,8 @@ class SweepSettings:
             it up as it is.
         exposure: match each source to the reference by a gain and an offset for each colour before comparing by
             differences; census and zncc need none.
+        levels: 1: every plane everywhere; 2: a sweep at half the resolution guides that at the full one, 3: one at a
+            quarter guides that; see `coarse_to_fine`. More is faster. Needs the backend numba.
     """
 
     planes: int = 128

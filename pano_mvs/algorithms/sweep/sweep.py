@@ -13,7 +13,7 @@ from math import ceil
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.backends import backend_for, helper_backend
+from pano_mvs.algorithms.sweep.backends import backend_for, check_levels, helper_backend
 from pano_mvs.algorithms.sweep.exposure import match_all, shrink
 from pano_mvs.algorithms.sweep.hypotheses import virtual_ranges
 from pano_mvs.algorithms.sweep.no_match import has_match
@@ -71,6 +71,7 @@ def sweep_range(
     """
     settings = settings or SweepSettings()
     compute = backend_for(backend, settings.cost).find_winners
+    check_levels(backend, settings.levels)
     _check_picture("reference", reference, reference_mask)
     masks = _checked_sources(sources, source_from_reference, source_masks)
     ranges = virtual_ranges(near, far, planes=settings.planes, spacing=settings.spacing)

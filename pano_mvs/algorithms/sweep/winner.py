@@ -28,6 +28,7 @@ class Winners:
         before: (H, W) float32 the cost of the plane before it; of the plane itself where it is the first.
         after: (H, W) float32 the cost of the plane after it; of the plane itself where it is the last.
         rival: (H, W) float32 the least cost of all planes that are not next to it; infinite if there is none.
+        lean: (H, W) float32 how many planes beyond `plane` the winner really lies; None: everywhere 0.
     """
 
     plane: NDArray[np.int32]
@@ -35,6 +36,13 @@ class Winners:
     before: NDArray[np.float32]
     after: NDArray[np.float32]
     rival: NDArray[np.float32]
+    lean: NDArray[np.float32] | None = None
+
+    @property
+    def position(self) -> NDArray[np.float64]:
+        """Where the winner lies among the planes, (H, W)."""
+        plane = self.plane.astype(np.float64)
+        return plane if self.lean is None else plane + self.lean
 
 
 def range_map_from_winners(
@@ -49,7 +57,7 @@ def range_map_from_winners(
         settings: planes, spacing, selection and confidence.
         seen: (H, W) where the reference is valid and at least one source saw the winner.
     """
-    position = winners.plane.astype(np.float64)
+    position = winners.position
     if settings.selection != "winner":
         position += subplane_offset(winners, planes=settings.planes, shape=settings.selection)
     ranges = range_at(position, near, far, planes=settings.planes, spacing=settings.spacing)
