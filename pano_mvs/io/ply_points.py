@@ -23,7 +23,7 @@ _MARK = b"end_header"
 class _Layout(NamedTuple):
     """How the vertices of a file lie: their number, their properties, and whether they are text."""
 
-    count: int
+    points: int
     vertex: np.dtype[np.void]
     text: bool
 
@@ -48,7 +48,7 @@ def read_ply_points(path: Path) -> NDArray[np.float32]:
     body = rest[rest.find(b"\n") + 1 :]
     vertices = _text_vertices(body, layout) if layout.text else _binary_vertices(body, layout)
     if vertices is None:
-        raise InputError(f"{path}: its header promises {layout.count} points, but it holds fewer. Write it again")
+        raise InputError(f"{path}: its header promises {layout.points} points, but it holds fewer. Write it again")
     points = np.stack([vertices[name] for name in "xyz"], axis=-1).astype(np.float32)
     if not np.isfinite(points).all():
         raise InputError(f"{path}: a point has no finite place. Leave such points out")
@@ -56,17 +56,17 @@ def read_ply_points(path: Path) -> NDArray[np.float32]:
 
 
 def _binary_vertices(body: bytes, layout: _Layout) -> NDArray[np.void] | None:
-    if len(body) < layout.count * layout.vertex.itemsize:
+    if len(body) < layout.points * layout.vertex.itemsize:
         return None
-    return np.frombuffer(body, layout.vertex, layout.count)
+    return np.frombuffer(body, layout.vertex, layout.points)
 
 
 def _text_vertices(body: bytes, layout: _Layout) -> NDArray[np.void] | None:
-    lines = body.splitlines()[: layout.count]
+    lines = body.splitlines()[: layout.points]
     try:
         rows = [tuple(float(number) for number in line.split()) for line in lines]
         return (
-            np.array(rows, [(name, "f8") for name in layout.vertex.names or ()]) if len(rows) == layout.count else None
+            np.array(rows, [(name, "f8") for name in layout.vertex.names or ()]) if len(rows) == layout.points else None
         )
     except ValueError:  # a line that is cut off, or holds no numbers
         return None

@@ -114,7 +114,7 @@ def nearest_views(poses: Sequence[Rigid3], count: int) -> list[list[int]]:
     if len(poses) <= count + 1:
         return [[other for other in range(len(poses)) if other != idx] for idx in range(len(poses))]
     centers = np.array([pose.center for pose in poses])
-    distances, found = cKDTree(centers).query(centers, k=count + 1)
+    distances, found = (np.asarray(values) for values in cKDTree(centers).query(centers, k=count + 1))
     nearest = []
     for idx in range(len(poses)):
         others = [(distance, other) for distance, other in zip(distances[idx], found[idx], strict=True) if other != idx]
