@@ -60,11 +60,11 @@ class Execution:
 
 def run_workflow(session: Session, execution: Execution = Execution()) -> int:
     """Run a workflow, write run.json and report.html, print what came out, and return the exit code."""
-    stream = apart(sys.stdout)
     _check_output(session)
     store = Store(session.store_root)
     executor = make_executor(store, execution.executor, workers=execution.workers, threads=execution.threads,
                              scheduler=execution.scheduler)  # fmt: skip
+    stream = apart(sys.stdout)
     try:
         with interrupted_by_termination():
             if execution.as_json:
@@ -72,6 +72,8 @@ def run_workflow(session: Session, execution: Execution = Execution()) -> int:
             return _run_for_people(session, store, executor, Console(file=stream))
     finally:
         executor.close()
+        if stream is not sys.stdout:
+            stream.close()
 
 
 def _run_for_people(session: Session, store: Store, executor: Executor, console: Console) -> int:

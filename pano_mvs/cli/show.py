@@ -10,8 +10,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from pano_mvs.core.errors import UsageError
+from pano_mvs.engine.policy import RESERVED_KEYS
 from pano_mvs.engine.registry import Registry
-from pano_mvs.engine.workflow import RESERVED_KEYS
 
 
 def show_plugins(console: Console) -> None:

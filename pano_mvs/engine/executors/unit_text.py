@@ -9,11 +9,12 @@ from typing import Any
 from pano_mvs.core.errors import UsageError
 from pano_mvs.engine.executors.protocol import Job
 from pano_mvs.engine.params import Params
+from pano_mvs.engine.policy import Policy
 from pano_mvs.engine.ports import Cardinality
 from pano_mvs.engine.stage import SourceItem, StageSpec
 from pano_mvs.engine.store import ItemRef, Store
 from pano_mvs.engine.units import PENDING, Unit, UnitInput
-from pano_mvs.engine.workflow import Policy, StageEntry
+from pano_mvs.engine.workflow import StageEntry
 
 TEXT_VERSION = 1
 
@@ -23,7 +24,7 @@ def request_to_json(job: Job, store: Store) -> dict[str, Any]:
     return {
         "unit": unit_to_json(job.unit, store),
         "plugins": {str(path.absolute()): digest for path, digest in job.plugins.items()},
-        "store": str(store.root.absolute()),
+        "store": [str(store.root.absolute()), store.durable, store.least_free_bytes],
         "log": str(job.log.absolute()),
         "threads": job.threads,
         "timeout_s": job.timeout_s,

@@ -23,7 +23,7 @@ from pano_mvs.engine.store import Store
 def run_request(request: Mapping[str, Any]) -> Outcome:
     """Compute the unit of a request, see `request_to_json`."""
     try:
-        store = _store(request["store"])
+        store = _store(*request["store"])
         files = _with_texts(request["plugins"], request.get("plugin_texts", {}))
         plugins = {files[path]: digest for path, digest in request["plugins"].items()}
         unit = unit_from_json(request["unit"], _spec(request["unit"]["use"], plugins), store)
@@ -57,8 +57,8 @@ def _written(digest: str, name: str, texts: Mapping[str, str]) -> str:
 
 
 @cache
-def _store(root: str) -> Store:
-    return Store(Path(root))
+def _store(root: str, durable: bool, least_free_bytes: int) -> Store:
+    return Store(Path(root), durable=durable, least_free_bytes=least_free_bytes)
 
 
 @cache
