@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pano_mvs.algorithms.sweep.kernels_census import count_census_row
+from pano_mvs.algorithms.sweep.kernels_cost import census_row
 from pano_mvs.algorithms.sweep.kernels_lookup import warp_band
 from pano_mvs.algorithms.sweep.kernels_project import knot_rows
 from pano_mvs.algorithms.sweep.kernels_vector import HAS_VECTOR
@@ -82,3 +84,16 @@ def test_packed_patches_hold_the_four_neighbours_over_seam_and_poles():
         assert list(packed[row, column : column + 1].view(np.uint8) ^ 128) == corners
         both = colors[row, column : column + 2].view(np.uint8).reshape(2, 4, 2) ^ 128
         assert both[:, 1].ravel().tolist() == corners
+
+
+@pytest.mark.parametrize("side", [3, 7, 15])
+@pytest.mark.parametrize("width", [20, 64, 100])
+def test_census_by_vector_instructions_counts_what_loops_count(side, width):
+    pad = 40
+    reference, warped = _picture(3, (side + 2, width + 2 * pad)) // 16, _picture(4, (side, width + 2 * pad)) // 16
+    offsets = np.rint(np.linspace(-30, 30, side)).astype(np.int64)
+    expected, counted = np.zeros(width, np.uint8), np.zeros(width, np.uint8)
+    census_row(reference, side // 2 + 2, warped, side // 2, offsets, pad, expected)
+    count_census_row(reference, side // 2 + 2, warped, side // 2, offsets, pad, counted)
+    assert counted.tolist() == expected.tolist()
+    assert len(set(expected)) > 3

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from pano_mvs.algorithms.sweep.kernels_census import count_census_row
 from pano_mvs.algorithms.sweep.kernels_combine import combine_row
 from pano_mvs.algorithms.sweep.kernels_cost import (
     CENSUS,
@@ -12,7 +13,6 @@ from pano_mvs.algorithms.sweep.kernels_cost import (
     SAD_GRADIENT,
     ZNCC,
     box_rows,
-    census_row,
     difference_row,
 )
 from pano_mvs.algorithms.sweep.kernels_gradient import census_gradient_row, sad_gradient_row
@@ -61,7 +61,7 @@ def source_cost(  # type: ignore[no-untyped-def]
         y = first - box_radius + j
         mirrored = -1 - y if y < 0 else (2 * height - 1 - y if y >= height else y)
         if cost == CENSUS:
-            census_row(reference[0], y + pad, warped[0], j + compare_radius, offsets[mirrored], pad, disagree)
+            count_census_row(reference[0], y + pad, warped[0], j + compare_radius, offsets[mirrored], pad, disagree)
             for i in range(_U(width)):
                 total[i] = np.uint16(disagree[i])
         elif cost == CENSUS_GRADIENT:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from pano_mvs.algorithms.sweep.kernels_cost import census_row, difference_row
+from pano_mvs.algorithms.sweep.kernels_census import count_census_row
+from pano_mvs.algorithms.sweep.kernels_cost import difference_row
 from pano_mvs.algorithms.sweep.settings import GREY_WEIGHT, LARGEST_COLOR_COST, LARGEST_GRADIENT_COST
 
 _U = np.uint64
@@ -69,7 +70,7 @@ def census_gradient_row(  # type: ignore[no-untyped-def]
         disagree: (W,) uint8, scratch.
         total: (W,) uint16, written.
     """
-    census_row(reference, reference_row, warped, warped_row, offsets, pad, disagree)
+    count_census_row(reference, reference_row, warped, warped_row, offsets, pad, disagree)
     gradient = np.zeros(total.shape[0], np.uint16)
     total[:] = 0
     difference_row(reference, reference_row, warped, warped_row, pad, total)

@@ -20,7 +20,7 @@ EVERY = 8
 """Rows from one exact row to the next."""
 
 _BLOCK = 16
-_LARGEST_THIRD_PX = _F(0.5)
+_LARGEST_THIRD_PX = _F(1)
 # Eight rows of a lower picture are no small step on the sphere: all its positions are exact.
 _LOWEST_PICTURE = 128
 

@@ -194,3 +194,50 @@ def sample_rgb_block(  # type: ignore[no-untyped-def]
             target = builder.add(target, args[8])
 
     return signature, emit
+
+
+CENSUS_PIXELS: Final = 4 * PIXELS
+"""How many pixels one call of `census_block` compares."""
+
+
+@intrinsic
+def census_block(  # type: ignore[no-untyped-def]
+    typingctx, reference, reference_at, warped, warped_at, stride, offsets, side, out, out_at
+):
+    """Do what `kernels_cost.census_row` does for some pixels, the counts staying in a register.
+
+    Args:
+        typingctx: numba's.
+        reference: (·,) uint8.
+        reference_at: where the first pixel is.
+        warped: (·,) uint8.
+        warped_at: likewise.
+        stride: from a row to the next, of both.
+        offsets: (side,) int64 columns of the window.
+        side: of the window.
+        out: (·,) uint8, written.
+        out_at: where.
+    """
+    place = types.uint64
+    signature = types.void(reference, place, warped, place, place, offsets, place, out, place)
+
+    def emit(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        whole = _vector(_I8)
+        pictures = ((sig.args[0], args[0], args[1]), (sig.args[2], args[2], args[3]))
+        centers = [_load(builder, _place(context, builder, kind, data, at, whole)) for kind, data, at in pictures]
+        count = cgutils.alloca_once_value(builder, _constant(_I8, 0))
+        half = builder.lshr(args[6], ir.Constant(_I64, 1))
+        with cgutils.for_range(builder, args[6]) as rows, cgutils.for_range(builder, args[6]) as columns:
+            below = builder.mul(builder.sub(rows.index, half), args[4])
+            column = builder.load(_place(context, builder, sig.args[5], args[5], columns.index, _I64))
+            shift = builder.add(below, column)
+            larger = []
+            for (kind, data, at), center in zip(pictures, centers, strict=True):
+                pointer = _place(context, builder, kind, data, builder.add(at, shift), whole)
+                larger.append(builder.icmp_unsigned(">", _load(builder, pointer), center))
+            differs = builder.sext(builder.xor(*larger), whole)
+            builder.store(builder.sub(builder.load(count), differs), count)
+        target = _place(context, builder, sig.args[7], args[7], args[8], whole)
+        builder.store(builder.load(count), target, align=1)
+
+    return signature, emit
