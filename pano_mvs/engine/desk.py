@@ -18,6 +18,7 @@ from pano_mvs.engine.units import Unit
 
 LOG_FOLDER = "logs"
 _SHOWN_LINES = 20
+_TRIES_AFTER_DEATH = 2
 _NOT_IN_NAMES = re.compile(r'[<>:"\\|?*\x00-\x1f]')
 
 
@@ -98,8 +99,8 @@ class Desk:
         while self._out and (found := self._executor.wait(timeout_s)) is not None:
             number, outcome = found
             out = self._out[number]
-            # A process may be killed for another's fault: that alone costs no unit.
-            further = max(out.job.unit.entry.policy.retries, 1 if outcome.died else 0)
+            # A process may be killed for no fault of the unit: that alone costs none.
+            further = max(out.job.unit.entry.policy.retries, _TRIES_AFTER_DEATH if outcome.died else 0)
             if outcome.status == "failed" and out.tries <= further:
                 out.tries += 1
                 self._executor.submit(out.job)

@@ -103,14 +103,14 @@ class ProcessExecutor:
         while (taken := self._jobs.get()) is not None and not self._closing:
             job, request = taken
             outcome = worker.run(request)
-            self._ended.put((job.number, self._judged(outcome, was_ready=worker.ready)))
+            self._ended.put((job.number, self._judged(outcome, refused=worker.refused)))
             if worker.served >= self._units_per_process:
                 worker.stop()
         worker.stop()
 
-    def _judged(self, outcome: Outcome, *, was_ready: bool) -> Outcome:
-        """Return the outcome; if workers do not even start, again and again, nothing can go on."""
-        self._false_starts = 0 if was_ready else self._false_starts + 1
+    def _judged(self, outcome: Outcome, *, refused: bool) -> Outcome:
+        """Return the outcome; if workers give up while they start, again and again, nothing can go on."""
+        self._false_starts = self._false_starts + 1 if refused else 0
         if self._false_starts < _FALSE_STARTS:
             return outcome
         return replace(outcome, status="stopped", cause=f"workers do not start: {outcome.cause}", error="PanoMvsError")

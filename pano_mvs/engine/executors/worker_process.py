@@ -33,7 +33,7 @@ class WorkerProcess:
 
     Attributes:
         served: units that the present process has been given.
-        ready: whether the present process has ever come so far as to wait for a unit.
+        refused: whether the latest process gave up by itself before it had come so far as to wait for a unit.
     """
 
     def __init__(self, threads: int, errors: Path) -> None:
@@ -46,7 +46,8 @@ class WorkerProcess:
         self.threads = threads
         self.errors = errors
         self.served = 0
-        self.ready = False
+        self.refused = False
+        self._ready = False
         self._process: subprocess.Popen[bytes] | None = None
         self._too_late = False
 
@@ -88,7 +89,7 @@ class WorkerProcess:
         environment = dict(os.environ)
         bound_environment(environment, self.threads)
         path = json.dumps([place for place in sys.path if place])  # "" would be the folder where it happens to run
-        self.served, self.ready, self._too_late = 0, False, False
+        self.served, self.refused, self._ready, self._too_late = 0, False, False, False
         with self.errors.open("wb") as errors:
             self._process = subprocess.Popen(  # noqa: S603 (it is ourselves)
                 [sys.executable, "-P", "-X", "faulthandler", "-c", _BOOT, path],
@@ -111,7 +112,7 @@ class WorkerProcess:
             answer = json.loads(line)
             if "status" in answer:
                 return Outcome.from_json(answer)
-            self.ready = True
+            self._ready = True
             if "started" in answer and timer is not None:
                 timer.start()
         return None
@@ -127,7 +128,8 @@ class WorkerProcess:
             return Outcome(
                 "failed", cause=f"it took longer than timeout_s: {timeout_s:g}, and was ended", error="Timeout"
             )
-        said = () if self.ready else tail(self.errors, 3)
+        self.refused = not self._ready and process.returncode >= 0
+        said = () if self._ready else tail(self.errors, 3)
         cause = f"its worker process died ({_how(process.returncode)})" + "".join(f"\n  {line}" for line in said)
         return Outcome("failed", cause=cause, died=True)
 
