@@ -1,25 +1,32 @@
-"""How long the sweep takes: `python -m tests.benchmarks.sweep [--rows 512] [--planes 128] [--sources 3]`.
+"""How long the sweep takes: `python -m tests.benchmarks.sweep [--small] [--rows 512] [--planes 128] [--sources 3]`.
 
-CPU time of this process, so that other work on the machine counts less; each configuration in turn, several rounds,
-the median of them. Pictures are noise: the sweep's work does not depend on what is in them.
+CPU time of one process, so that other work on the machine counts less; each work in turn, several rounds, the median.
+Pictures are noise: the sweep's work does not depend on what is in them. The floor is RGB bilinear sampling from L2 with
+the coordinates known; "cv2.remap" does the work of SAD + box with maps that are there already. All run in one thread.
 """
 
 from __future__ import annotations
 
 import argparse
 import statistics
-import time
 from collections.abc import Sequence
+from functools import partial
+from unittest.mock import patch
 
 import cv2
+import numba
 import numpy as np
 
+from pano_mvs.algorithms.sweep import numba_backend
+from pano_mvs.algorithms.sweep.hypotheses import virtual_ranges
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
+from tests.benchmarks.sampling import FLOOR_WORK, cpu_seconds, floors, remap_pipeline
 
-CENSUS_SGM = "numba census + SGM"
-SAD_BOX = "numba SAD + box (the paper)"
-NUMPY = "numpy census + SGM"
+NEAR, FAR = 0.3, 10.0
+SAD_BOX = "numba, SAD + box 7×7, sum (the paper)"
+LOOPS = "numba, the same by portable loops"
+REMAP = "cv2.remap, the same, maps there"
 
 
 def pictures(rows: int, sources: int) -> tuple[list[np.ndarray], list[Rigid3]]:
@@ -33,49 +40,62 @@ def pictures(rows: int, sources: int) -> tuple[list[np.ndarray], list[Rigid3]]:
     return noise, [Rigid3(rotation_from_rotvec(rng.normal(size=3)), direction) for direction in directions]
 
 
-def measure(*, rows: int, planes: int, sources: int, rounds: int, with_numpy: bool) -> dict[str, tuple[float, float]]:
-    """Return the first call's and the median later call's CPU seconds of each configuration."""
-    census = SweepSettings(planes=planes)
-    sad = SweepSettings(planes=planes, cost="sad", aggregation="box", exposure=False)
-    work = {CENSUS_SGM: (census, "numba"), SAD_BOX: (sad, "numba")}
-    if with_numpy:
-        work[NUMPY] = (census, "numpy")
+def measure(*, rows: int, planes: int, sources: int, rounds: int) -> dict[str, float]:
+    """Return the median nanoseconds a sample of each work, the floors' among them."""
     images, poses = pictures(rows, sources)
-    seconds: dict[str, list[float]] = {name: [] for name in work}
+    sad = SweepSettings(planes=planes, cost="sad", aggregation="box", combination="sum", exposure=False)
+    configurations = {
+        SAD_BOX: sad,
+        "numba, SAD + box, best half": sad.replace(combination="best_half"),
+        "numba, census + box": SweepSettings(planes=planes, aggregation="box"),
+        "numba, census + SGM": SweepSettings(planes=planes),
+    }
+
+    def sweep(settings: SweepSettings) -> float:
+        work = partial(sweep_range, images[0], images[1:], poses, near=NEAR, far=FAR, settings=settings)
+        return cpu_seconds(work)
+
+    samples = 2 * rows * rows * planes * sources
+    ranges = virtual_ranges(NEAR, FAR, planes=planes, spacing="inverse")
+    found: dict[str, list[float]] = {}
     for turn in range(rounds + 1):
-        for name, (settings, backend) in work.items():
-            if backend == "numpy" and turn > 1:
-                continue
-            start = time.process_time()
-            sweep_range(images[0], images[1:], poses, near=0.3, far=10.0, settings=settings, backend=backend)
-            seconds[name].append(time.process_time() - start)
-    return {name: (times[0], statistics.median(times[1:])) for name, times in seconds.items()}
+        times = {name: cpu_seconds(work) / FLOOR_WORK for name, work in floors().items()}
+        times |= {name: sweep(settings) / samples for name, settings in configurations.items()}
+        with patch.object(numba_backend, "HAS_VECTOR", False):
+            times[LOOPS] = sweep(sad) / samples
+        times[REMAP] = remap_pipeline(images, poses, ranges) / samples if turn else np.nan
+        for name, seconds in times.items() if turn else ():  # the first turn compiles
+            found.setdefault(name, []).append(1e9 * seconds)
+    return {name: statistics.median(values) for name, values in found.items()}
+
+
+def table(found: dict[str, float], samples: int) -> str:
+    """Return the ratios and times as markdown."""
+    floor = found.get("floor, float coordinates", np.nan)
+    lines = ["| work | × floor | cv2.remap takes × as long | ns/sample | CPU-s |", "|---|---|---|---|---|"]
+    for name, ns in found.items():
+        seconds = "" if name.startswith("floor") else f"{ns * samples / 1e9:.2f}"
+        lines.append(f"| {name} | {ns / floor:.1f} | {found[REMAP] / ns:.2f} | {ns:.2f} | {seconds} |")
+    return "\n".join(lines)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--small", action="store_true", help="128 rows, 16 planes, one round")
     parser.add_argument("--rows", type=int, default=512)
     parser.add_argument("--planes", type=int, default=128)
     parser.add_argument("--sources", type=int, default=3)
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument(
-        "--numpy-rows", type=int, default=128, help="picture size for the numpy backend; 0 leaves it out"
-    )
     options = parser.parse_args(arguments)
-    shared = {"planes": options.planes, "sources": options.sources, "rounds": options.rounds}
-    _print(options.rows, shared, measure(rows=options.rows, with_numpy=False, **shared))
-    if options.numpy_rows:
-        _print(options.numpy_rows, shared, measure(rows=options.numpy_rows, with_numpy=True, **shared))
-
-
-def _print(rows: int, shared: dict[str, int], results: dict[str, tuple[float, float]]) -> None:
-    samples = rows * 2 * rows * shared["planes"] * shared["sources"]
-    base = results[CENSUS_SGM][1]
-    print(f"{rows}×{2 * rows}, {shared['sources']} sources, {shared['planes']} planes, {cv2.getNumThreads()} cores")
-    print(f"{'':28}  first CPU-s  later CPU-s  ns/sample  ratio")
-    for name, (first, later) in results.items():
-        print(f"{name:28}  {first:11.2f}  {later:11.2f}  {later / samples * 1e9:9.2f}  {later / base:5.1f}")
+    if options.small:
+        options.rows, options.planes, options.rounds = 128, 16, 1
+    numba.set_num_threads(1)
+    cv2.setNumThreads(1)
+    shared = {"rows": options.rows, "planes": options.planes, "sources": options.sources}
+    found = measure(**shared, rounds=options.rounds)
+    print(f"{options.rows}×{2 * options.rows}, {options.sources} sources, {options.planes} planes, one thread\n")
+    print(table(found, 2 * options.rows**2 * options.planes * options.sources))
 
 
 if __name__ == "__main__":
