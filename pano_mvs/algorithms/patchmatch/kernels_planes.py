@@ -36,28 +36,24 @@ def plane_from_slopes(alpha, beta, gamma, basis, plane):  # type: ignore[no-unty
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def fit_slopes(inverse, row, column, offsets, stretch, max_step):  # type: ignore[no-untyped-def]
-    """Return (α, β, γ) of the plane through the inverse ranges around a pixel, robustly, in units of its own q.
+def weighted_slopes(values, offsets, stretch, guess, tolerance, growth):  # type: ignore[no-untyped-def]
+    """Return (α, β, γ, whether they are well posed) of the plane through the values (side, side) of a window.
 
-    The weight of a neighbour falls to nothing where its q differs by the share `max_step` for each step and one more
-    (Tukey's biweight). Too few neighbours leave q as it is, and the surface facing the camera.
+    Weights are Tukey's biweight of the distance from the plane `guess` (α, β, γ), which falls to nothing where it
+    reaches `tolerance` and `growth` for each step from the centre.
     """
-    height, width = inverse.shape
-    radius = offsets.shape[0] // 2
-    center = np.float64(inverse[row, column])
+    side = len(offsets)
+    radius = side // 2
     n, su, sv, suu, suv, svv, sq, squ, sqv = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for v in range(-radius, radius + 1):
-        y, turn = row + v, 0
-        if y < 0 or y >= height:  # beyond a pole: half a turn further on
-            y = -1 - y if y < 0 else 2 * height - 1 - y
-            turn = width // 2
-        for step in range(offsets.shape[0]):
-            value = inverse[y, (column + offsets[step] + turn) % width] / center - 1.0
-            deviation = abs(value) / (max_step * (1 + max(abs(step - radius), abs(v))))
-            if not deviation < 1:  # NaN included
+    for row in range(side):
+        v = row - radius
+        for step in range(side):
+            u, value = offsets[step] / stretch, values[row, step]
+            reach = tolerance + growth * max(abs(step - radius), abs(v))
+            deviation = (value - guess[0] - guess[1] * u - guess[2] * v) / reach
+            if not deviation * deviation < 1:  # NaN included
                 continue
             w = (1 - deviation * deviation) ** 2
-            u = offsets[step] / stretch
             n += w
             su += w * u
             sv += w * v
@@ -67,14 +63,38 @@ def fit_slopes(inverse, row, column, offsets, stretch, max_step):  # type: ignor
             sq += w * value
             squ += w * value * u
             sqv += w * value * v
+    n = max(n, 1e-30)
     mu, mv, mq = su / n, sv / n, sq / n
     suu, suv, svv = suu / n - mu * mu, suv / n - mu * mv, svv / n - mv * mv
     squ, sqv = squ / n - mq * mu, sqv / n - mq * mv
     determinant = suu * svv - suv * suv
     if n < _FEWEST or determinant < _LEAST_SPREAD:
-        return 1.0, 0.0, 0.0
+        return guess[0], guess[1], guess[2], False
     beta, gamma = (svv * squ - suv * sqv) / determinant, (suu * sqv - suv * squ) / determinant
-    return 1.0 + mq - beta * mu - gamma * mv, beta, gamma
+    return mq - beta * mu - gamma * mv, beta, gamma, True
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def fit_slopes(inverse, row, column, offsets, stretch, max_step, values):  # type: ignore[no-untyped-def]
+    """Return (α, β, γ) of the plane through the inverse ranges around a pixel, robustly, in units of its own q.
+
+    First from what differs from the pixel by less than the share `max_step` for each step and one more, then from what
+    lies within `max_step` of that plane. Too few neighbours leave q as it is, and the surface facing the camera.
+    `values`, (side, side) float64, is scratch space.
+    """
+    height, width = inverse.shape
+    side = len(offsets)
+    center = np.float64(inverse[row, column])
+    for j in range(side):
+        y, turn = row + j - side // 2, 0
+        if y < 0 or y >= height:  # beyond a pole: half a turn further on
+            y = -1 - y if y < 0 else 2 * height - 1 - y
+            turn = width // 2
+        for step in range(side):
+            values[j, step] = inverse[y, (column + offsets[step] + turn) % width] / center
+    alpha, beta, gamma, _ = weighted_slopes(values, offsets, stretch, (1.0, 0.0, 0.0), max_step, max_step)
+    alpha, beta, gamma, _ = weighted_slopes(values, offsets, stretch, (alpha, beta, gamma), max_step, 0.0)
+    return alpha, beta, gamma
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -92,12 +112,13 @@ def fit_planes(inverse, first, rows, offsets, stretches, max_step, planes):  # t
     """
     height, width = inverse.shape
     basis, plane = np.empty((3, 3)), np.empty(3)
+    values = np.empty((offsets.shape[1], offsets.shape[1]))
     for row in range(first, first + rows):
         for column in range(width):
             q = np.float64(inverse[row, column])
             plane[:] = 0.0
             if np.isfinite(q):
-                alpha, beta, gamma = fit_slopes(inverse, row, column, offsets[row], stretches[row], max_step)
+                alpha, beta, gamma = fit_slopes(inverse, row, column, offsets[row], stretches[row], max_step, values)
                 tangent_basis(row, column, height, width, stretches[row], basis)
                 plane_from_slopes(q * alpha, q * beta, q * gamma, basis, plane)
             for a in range(3):

@@ -38,10 +38,12 @@ _LUMA = np.array([0.2126, 0.7152, 0.0722])
 _SAMPLES = 10.0
 # No step is larger, in pixels of the reference at the widest baseline: beyond that pictures are not linear.
 _LARGEST_STEP_PX = 0.5
-# Neighbours on a plane differ in range by less than this share a pixel.
-_MAX_STEP = 0.01
+# Neighbours on a plane differ in range by less than this share a radian: the tangent of a slant of 58°.
+_MAX_SLOPE = 1.6
 _FIT_RADIUS = 3
 _SMALLEST_SIDE = 16
+# A window reaches two pixels a sample from its centre, and half as far again in a source that is nearer.
+_SOURCE_REACH = 3.0
 
 
 def refine_range(
@@ -99,14 +101,15 @@ def refine_range(
     near_offsets = column_offsets((height, width), _FIT_RADIUS, spherical=True)
     views = (
         _reference_arrays(reference, offsets, stretches),
-        _source_arrays(sources, source_from_reference, source_masks, reach=(window - 1) / height),
+        _source_arrays(sources, source_from_reference, source_masks, reach=_SOURCE_REACH * (window // 2) / height),
     )
     seen = range_map.confidence >= WEAK_CONFIDENCE[0]
     inverse = np.where(seen, 1 / range_map.range, np.float32(np.nan)).astype(np.float32)
     planes = np.empty((3, height, width), np.float32)
+    max_step = _MAX_SLOPE * 2 * np.pi / width
 
     def lay(first: int, rows: int) -> None:
-        kernels_planes.fit_planes(inverse, first, rows, near_offsets, stretches, _MAX_STEP, planes)
+        kernels_planes.fit_planes(inverse, first, rows, near_offsets, stretches, max_step, planes)
 
     def match(first: int, rows: int) -> None:
         kernels_refine.refine_rows(first, rows, planes, *views, numbers, inverse)

@@ -1,0 +1,249 @@
+"""Slanted planes: the compiled passes equal the plain ones, and what a sweep bends and quantises comes out straight."""
+
+import numpy as np
+import pytest
+
+from pano_mvs.algorithms.patchmatch import kernels_planes, kernels_refine
+from pano_mvs.algorithms.patchmatch.refine import _reference_arrays, _source_arrays, refine_range
+from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
+from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, ray_from_pixel, ray_grid, roll_panorama
+from pano_mvs.scene import RangeMap
+from pano_mvs.testing.room import capture_poses, default_room, render
+from pano_mvs.testing.texture import noise as solid_noise
+from tests.oracles import patchmatch as oracle
+
+SIZE = (160, 320)
+FLOOR_Y = 1.3
+LUMA = np.array([0.2126, 0.7152, 0.0722])
+SETTINGS = (0.2, 40.0, 900.0, 10.0, 0.05)
+
+
+@pytest.fixture(scope="module")
+def views():
+    """Pictures, true ranges and poses of three cameras in the room."""
+    poses = capture_poses(3, seed=1, spread=0.4)
+    pictures, truth = zip(*(render(default_room(), pose, SIZE) for pose in poses), strict=True)
+    return list(pictures), list(truth), poses
+
+
+@pytest.fixture(scope="module")
+def swept(views):
+    pictures, _, poses = views
+    relative = [pose @ poses[0].inverse() for pose in poses[1:]]
+    return sweep_range(pictures[0], pictures[1:], relative, near=0.6, far=6, settings=SweepSettings(planes=48))
+
+
+def refined(views, range_map, **settings):
+    pictures, _, poses = views
+    relative = [pose @ poses[0].inverse() for pose in poses[1:]]
+    return refine_range(range_map, pictures[0], pictures[1:], relative, **settings)
+
+
+@pytest.fixture(scope="module")
+def result(views, swept):
+    return refined(views, swept)
+
+
+def floor_of(truth, pose):
+    """The pixels of view that lie well on the floor, and below the camera not right on the nadir."""
+
+    points = pose.inverse().apply(ray_grid(SIZE) * truth[..., None])
+    on = np.abs(points[..., 1] - FLOOR_Y) < 1e-3
+    inner = on.copy()
+    for shift in range(-4, 5):
+        inner &= np.roll(on, shift, 1) & np.roll(on, shift, 0)
+    return inner
+
+
+def little_picture(rng, size):
+    """A picture of smooth colours that goes on over seam and poles."""
+
+    rays = ray_grid(size).reshape(-1, 3)
+    channels = [solid_noise(rays, cells=((0.35, 60.0),), seed=int(rng.integers(1000))) for _ in range(3)]
+    return np.clip(128 + np.stack(channels, -1), 0, 255).astype(np.uint8).reshape(*size, 3)
+
+
+def test_compiled_planes_equal_least_squares():
+    rng = np.random.default_rng(0)
+    size, radius, max_step = (12, 24), 2, 0.05
+    inverse = (0.5 * (1 + 0.03 * rng.normal(size=size))).astype(np.float32)
+    inverse[rng.random(size) < 0.1] *= 2
+    inverse[rng.random(size) < 0.1] = np.nan
+    offsets, stretches = column_offsets(size, radius, spherical=True), column_stretch(size[0], spherical=True)
+    planes = np.full((3, *size), 9, np.float32)
+    kernels_planes.fit_planes(inverse, 0, 5, offsets, stretches, max_step, planes)
+    kernels_planes.fit_planes(inverse, 5, 7, offsets, stretches, max_step, planes)
+    for row, column in np.ndindex(size):
+        expected = np.zeros(3)
+        if np.isfinite(inverse[row, column]):
+            expected = oracle.plane_at(inverse.astype(float), row, column, offsets[row], stretches[row], max_step)
+        np.testing.assert_allclose(planes[:, row, column], expected, rtol=2e-4, atol=2e-5)
+
+
+def test_compiled_steps_equal_normal_equations():
+    """With sources of other sizes, a mask, planes of all slants, over the seam and over the poles."""
+    rng = np.random.default_rng(1)
+    size = (16, 32)
+    reference = little_picture(rng, size)
+    poses = [capture_poses(2, seed=seed, tilt_deg=50)[1] for seed in (3, 4)]
+    sources = [little_picture(rng, (18, 36)), little_picture(rng, size)]
+    mask = np.ones(size, np.bool_)
+    mask[:, :16] = False
+    offsets, stretches = column_offsets(size, 4, spherical=True)[:, ::2].copy(), column_stretch(size[0], spherical=True)
+    inverse = rng.uniform(0.3, 0.6, size).astype(np.float32)
+    planes = np.empty((3, *size), np.float32)
+    kernels_planes.fit_planes(inverse, 0, 16, column_offsets(size, 3, spherical=True), stretches, 0.2, planes)
+    found = np.empty(size, np.float32)
+    numbers = (np.float32(1 / 25), np.float32(SETTINGS[0]), *SETTINGS[1:4], np.float32(SETTINGS[4]))
+    arrays = (_reference_arrays(reference, offsets, stretches),
+              _source_arrays(sources, poses, [None, mask], reach=0.0))  # fmt: skip
+    kernels_refine.refine_rows(0, 16, planes, *arrays, numbers, found)
+    grey = [np.rint(256 * (picture @ LUMA)) / 256 for picture in sources]
+    rows, off = (-4, -2, 0, 2, 4), []
+    for row, column in np.ndindex(size):
+        places, values, weights = oracle.window(
+            (reference @ LUMA).astype(np.float32), row, column, rows, offsets[row], sigma_color=25
+        )
+        plane = planes[:, row, column].astype(float)
+        votes = oracle_votes(plane, row, column, size, poses[1], mask)
+        steps = np.array([(u / stretches[row], v) for v in rows for u in offsets[row]])
+        expected = oracle.likely_inverse(
+            plane, (size, places, values, weights), [(grey[0], poses[0], True), (grey[1], poses[1], votes)], steps,
+            SETTINGS,
+        )  # fmt: skip
+        off.append(abs(found[row, column] - expected) / SETTINGS[4])
+    # Slopes between pixels jump: where a sample lies on a pixel's centre both sides are right.
+    assert np.quantile(off, 0.98) < 2e-3
+    assert np.ptp(found / inverse) > 0.05
+
+
+def oracle_votes(plane, row, column, size, pose, mask):
+    """Whether all four pixels around the place where a source sees the pixel may vote."""
+
+    ray = ray_from_pixel([column + 0.5, row + 0.5], size)
+    x, y = pixel_from_ray(pose.rotation @ ray + pose.translation * (plane @ ray), size)
+    left, top = int(np.floor(x + 0.5)), int(np.floor(y + 0.5))
+    return bool(pad_panorama(mask, 1)[top : top + 2, left : left + 2].all())
+
+
+def test_a_slanted_floor_comes_out_straight_with_its_normal(views, swept, result):
+    _, truth, poses = views
+    floor = floor_of(truth[0], poses[0]) & swept.valid
+    assert floor.mean() > 0.1
+    before, after = (np.abs(m.range - truth[0])[floor] / truth[0][floor] for m in (swept, result))
+    assert np.median(after) < 0.4 * np.median(before)
+    assert np.mean(after > 0.02) <= np.mean(before > 0.02) + 0.01
+    up = poses[0].rotation @ [0, -1, 0]
+    angle = np.degrees(np.arccos(np.clip(result.normals_in_cam[floor].astype(float) @ up, -1, 1)))
+    assert np.median(angle) < 3
+    result.check()
+
+
+def test_everything_else_gets_better_too(views, swept, result):
+    _, truth, _ = views
+    before, after = (np.abs(m.range - truth[0]) / truth[0] for m in (swept, result))
+    assert np.median(after) < 0.5 * np.median(before)
+    # Pixels are wide here: beside edges, windows reach over them, and some pixels are lost.
+    assert np.mean(after < 0.05) > np.mean(before < 0.05) - 0.02
+    np.testing.assert_array_equal(result.confidence, swept.confidence)
+
+
+def test_true_ranges_stay(views):
+    _, truth, _ = views
+    true_map = RangeMap(truth[0], np.full(SIZE, 100, np.uint8))
+    after = refined(views, true_map)
+    assert np.median(np.abs(after.range - truth[0]) / truth[0]) < 4e-3
+
+
+def test_exposure_changes_little(views, swept, result):
+    pictures, truth, poses = views
+    darker = [pictures[0], *(np.rint(0.8 * p + 10).astype(np.uint8) for p in pictures[1:])]
+    other = refined((darker, truth, poses), swept)
+    assert np.median(np.abs(other.range / result.range - 1)) < 5e-4
+
+
+@pytest.mark.parametrize("columns", [1, 77, 160])
+def test_rolling_all_pictures_rolls_the_result(views, swept, result, columns):
+    pictures, truth, poses = views
+    rolled = [roll_panorama(picture, columns) for picture in pictures]
+    turned = [Rigid3(new_from_old, np.zeros(3)) @ pose for (_, new_from_old), pose in zip(rolled, poses, strict=True)]
+    before = RangeMap(np.roll(swept.range, columns, 1), np.roll(swept.confidence, columns, 1))
+    after = refined(([picture for picture, _ in rolled], truth, turned), before)
+    difference = np.abs(after.range / np.roll(result.range, columns, 1) - 1)
+    assert np.nanquantile(difference, 0.999) < 1e-3
+
+
+def test_any_number_of_threads_gives_the_same_bytes(views, swept, result):
+    numba = pytest.importorskip("numba")
+    before = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        other = refined(views, swept)
+    finally:
+        numba.set_num_threads(before)
+    assert other.range.tobytes() == result.range.tobytes()
+    assert other.normals_in_cam.tobytes() == result.normals_in_cam.tobytes()
+
+
+def test_filled_and_invalid_pixels_stay_as_they_are(views, swept, result):
+    ranges, confidence = swept.range.copy(), swept.confidence.copy()
+    ranges[40:60, 300:] = np.nan
+    confidence[40:60, 300:] = 0
+    ranges[100:120, :30], confidence[100:120, :30] = 1.0, 30
+    after = refined(views, RangeMap(ranges, confidence))
+    after.check()
+    assert np.isnan(after.range[40:60, 300:]).all()
+    np.testing.assert_array_equal(after.range[100:120, :30], 1.0)
+    assert np.isnan(after.normals_in_cam[100:120, :30]).all()
+    # Nothing that lies out of the reach of windows has changed.
+    np.testing.assert_array_equal(after.range[70:90, 100:200], result.range[70:90, 100:200])
+
+
+def test_masked_sources_have_no_vote(views, swept):
+    """A source that shows something else does no harm behind its mask, and does without."""
+    pictures, truth, poses = views
+    spoilt = pictures[1].copy()
+    spoilt[:, :160] = np.random.default_rng(0).integers(0, 256, (SIZE[0], 160, 3))
+    mask = np.ones(SIZE, np.bool_)
+    mask[:, :160] = False
+    other = pictures[0], spoilt, pictures[2]
+    hidden = refined((other, truth, poses), swept, source_masks=[mask, None])
+    plain = refined((pictures, truth, poses), swept, source_masks=[mask, None])
+    assert np.mean(np.abs(hidden.range / plain.range - 1) > 1e-4) < 0.02
+    one = refined((pictures, truth, poses), swept)
+    assert np.mean(np.abs(one.range / plain.range - 1) > 1e-4) > 0.1
+
+
+def test_no_rounds_only_lay_planes_and_no_source_in_sight_changes_little(views, swept):
+    planes = refined(views, swept, rounds=0)
+    blind = refined(views, swept, rounds=1, source_masks=[np.zeros(SIZE, np.bool_)] * 2)
+    assert np.nanmedian(np.abs(planes.range / blind.range - 1)) < 2e-3
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"window": 4}, "window odd"),
+        ({"rounds": -1}, "rounds must not be negative"),
+        ({"noise": 0}, "the others positive"),
+        ({"source_masks": [None]}, "one pose"),
+        ({"source_masks": [None, np.ones((3, 4), np.bool_)]}, "source 1: its mask"),
+    ],
+)
+def test_impossible_settings_are_named(views, swept, change, said):
+    with pytest.raises(UsageError, match=said):
+        refined(views, swept, **change)
+
+
+def test_impossible_pictures_are_named(views, swept):
+    pictures, _, poses = views
+    with pytest.raises(UsageError, match="one pose"):
+        refine_range(swept, pictures[0], pictures[1:], poses[1:2])
+    with pytest.raises(UsageError, match="size of its range map"):
+        refine_range(swept, pictures[0][:80], pictures[1:], poses[1:])
+    with pytest.raises(UsageError, match=r"source 0: refinement needs \(H, W, 3\) uint8"):
+        refine_range(swept, pictures[0], [pictures[1][..., 0]], poses[1:2])
+    with pytest.raises(UsageError, match="another place"):
+        refine_range(swept, pictures[0], pictures[1:2], [Rigid3.identity()])
