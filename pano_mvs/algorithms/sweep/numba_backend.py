@@ -1,8 +1,9 @@
 """The sweep, compiled: bands of rows in threads, no volume unless semi-global matching needs one.
 
-Memory beyond the pictures (a source's packed copy has 4 bytes a pixel if grey, 8 in colour, or 12 without vector instructions) and the result: for "box" about 2 MB
-a thread at 1,000 columns and 3 sources, whatever the planes and the rows; for "sgm" on top of it 3 bytes for each pixel
-and plane (a uint8 volume of costs and a uint16 volume of path sums; 201 MB at 512×1024×128).
+Memory beyond the pictures and the result: a source's packed copy has 4 bytes a pixel if it is grey, 8 in colour, or 12
+without vector instructions; for "box" about 2 MB a thread at 1,000 columns and 3 sources, whatever the planes and the
+rows; for "sgm" on top of it 3 bytes for each pixel and plane (a uint8 volume of costs and a uint16 volume of path sums;
+201 MB at 512×1024×128).
 
 Bands and strips are handed to plain threads (the kernels release the GIL), as many as numba is told to use: they write
 disjoint parts in a fixed arithmetic order, so the number of threads changes no bit. numba's own parallel regions would
