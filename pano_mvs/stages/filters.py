@@ -95,7 +95,7 @@ class ConsistencyParams(Params):
     max_relative_error: float = Field(default=0.02, gt=0, description="ranges that agree differ by at most this share")
     max_reprojection_px: float = Field(default=1.0, gt=0, description="forward and back may miss the pixel by this")
     min_support: float = Field(
-        default=0.5, ge=0, description="sum over sources of (1 - (miss / max_reprojection_px)²)² that a pixel needs"
+        default=0.85, ge=0, description="sum over sources of (1 - (miss / max_reprojection_px)²)² that a pixel needs"
     )
     min_motion_px: float = Field(
         default=0.05, ge=0, description="a change by max_relative_error must move a pixel by this in the sources"

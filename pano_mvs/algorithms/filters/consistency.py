@@ -32,7 +32,7 @@ def check_consistency(
     *,
     max_relative_error: float = 0.02,
     max_reprojection_px: float = 1.0,
-    min_support: float = 0.5,
+    min_support: float = 0.85,
     min_motion_px: float = 0.05,
     min_views: int = 1,
     remove_inconsistent: bool = False,
@@ -65,7 +65,7 @@ def check_consistency(
         source_poses: cam_from_world of each.
         max_relative_error: largest |s − |X'|| / |X'|.
         max_reprojection_px: largest angle between pixel and reprojection, in pixels of the reference at the equator.
-        min_support: smallest S; one source supports a pixel with 1 at most, and with ½ at 0.54 max_reprojection_px.
+        min_support: smallest S; one source supports a pixel with 1 at most, and with 0.85 at 0.28 max_reprojection_px.
         min_motion_px: smallest μ, in pixels of the reference at the equator.
         min_views: number of sources that must agree.
         remove_inconsistent: whether to invalidate pixels that no source confirms and `min_contradictions` contradict.

@@ -73,7 +73,10 @@ def limits_by_sweeping(
         _coarse(idx, small, small_masks, poses, width=width, backend=helper_backend(backend), device=device)
         for idx in range(len(poses))
     ]
-    checked = check_consistency(maps[0], poses[0], maps[1:], poses[1:], max_relative_error=0.1, max_reprojection_px=1.5)
+    checked = check_consistency(
+        maps[0], poses[0], maps[1:], poses[1:],
+        max_relative_error=0.1, max_reprojection_px=1.5, min_support=0, min_motion_px=0,
+    )  # fmt: skip
     agreed = (checked.confidence >= CONSISTENT_CONFIDENCE[0]) & _textured(small[0])
     solid_angle = np.broadcast_to(pixel_solid_angle(agreed.shape)[:, None], agreed.shape)
     if solid_angle[agreed].sum() < _LEAST_SHARE * solid_angle.sum():
