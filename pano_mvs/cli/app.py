@@ -20,7 +20,17 @@ from pano_mvs import __version__
 from pano_mvs.cli.cache_app import cache_app
 from pano_mvs.cli.default_command import RunByDefault
 from pano_mvs.cli.guard import guarded
-from pano_mvs.cli.options import CacheOption, ImagesOption, OutOption, SetOption, WorkflowArgument
+from pano_mvs.cli.options import (
+    AcceptOption,
+    CacheOption,
+    ImagesOption,
+    OnlyOption,
+    OutOption,
+    RefreshOption,
+    SetOption,
+    UntilOption,
+    WorkflowArgument,
+)
 from pano_mvs.engine.executors.threads import available_threads, bound_environment
 
 app = typer.Typer(
@@ -73,25 +83,48 @@ def run(
     scheduler: Annotated[str, typer.Option("--scheduler", metavar="ADDRESS", help="An existing dask scheduler, such as "
                                            "tcp://host:8786, whose workers see the cache.", show_default=False)] = "",
     as_json: Annotated[bool, typer.Option("--json", help="Print events, one JSON object in a line.")] = False,
+    until: UntilOption = None,
+    only: OnlyOption = None,
+    refresh: RefreshOption = None,
+    accept_code: AcceptOption = False,
+    keep_going: Annotated[bool, typer.Option("-k", "--keep-going", help="Go on after failures even where a stage "
+                                             "says on_error: stop.")] = False,
 ) -> None:  # fmt: skip
     """Run a workflow; the same command resumes it."""
     from pano_mvs.cli.run_command import Execution, run_workflow
     from pano_mvs.cli.session import open_session
+    from pano_mvs.engine.demands import Demands
 
-    session = open_session(workflow, overrides=overrides or [], images=images, cache=cache, out=out)
+    demands = Demands(tuple(until or ()), tuple(only or ()), tuple(refresh or ()), accept_code, keep_going)
+    session = open_session(workflow, overrides=overrides or [], images=images, cache=cache, out=out, demands=demands)
     raise typer.Exit(run_workflow(session, Execution(executor, workers, threads, scheduler, as_json)))
 
 
 @app.command()
 @guarded
 def plan(
-    workflow: WorkflowArgument, images: ImagesOption = None, overrides: SetOption = None, cache: CacheOption = None
-) -> None:
+    workflow: WorkflowArgument,
+    images: ImagesOption = None,
+    overrides: SetOption = None,
+    cache: CacheOption = None,
+    until: UntilOption = None,
+    only: OnlyOption = None,
+    refresh: RefreshOption = None,
+    explain: Annotated[str, typer.Option("--explain", metavar="STAGE:ITEM", help="All about one unit: what it reads, "
+                                         "what it is made of, where its result is.", show_default=False)] = "",
+) -> None:  # fmt: skip
     """Show what a run would do, what is cached, and why the rest is not."""
+    from pano_mvs.cli.explain import explain_unit
     from pano_mvs.cli.plan_command import show_plan
     from pano_mvs.cli.session import open_session
+    from pano_mvs.engine.demands import Demands
 
-    show_plan(open_session(workflow, overrides=overrides or [], images=images, cache=cache), Console())
+    demands = Demands(tuple(until or ()), tuple(only or ()), tuple(refresh or ()))
+    session = open_session(workflow, overrides=overrides or [], images=images, cache=cache, demands=demands)
+    if explain:
+        explain_unit(session, explain, Console())
+    else:
+        show_plan(session, Console())
 
 
 @app.command()

@@ -12,3 +12,17 @@ ImagesOption = Annotated[Optional[Path], typer.Option("--images", help="Folder o
 SetOption = Annotated[Optional[list[str]], typer.Option("--set", metavar="STAGE.PARAM=VALUE", help="Change a setting.")]  # noqa: UP045
 CacheOption = Annotated[Optional[Path], typer.Option("--cache", help="Folder of the cache.")]  # noqa: UP045
 OutOption = Annotated[Optional[Path], typer.Option("--out", help="Folder of the results; default out/<workflow>.")]  # noqa: UP045
+UntilOption = Annotated[
+    Optional[list[str]], typer.Option("--until", metavar="STAGE", help="Only what this stage needs.")
+]  # noqa: UP045
+OnlyOption = Annotated[
+    Optional[list[str]],  # noqa: UP045
+    typer.Option("--only", metavar="STAGE:ITEM", help="Only this unit and what it needs."),
+]
+RefreshOption = Annotated[
+    Optional[list[str]],  # noqa: UP045
+    typer.Option("--refresh", metavar="STAGE[:ITEM]", help="Compute it again though it is cached."),
+]
+AcceptOption = Annotated[
+    bool, typer.Option("--accept-code", help="Keep what was computed before a plugin's code changed.")
+]

@@ -62,7 +62,8 @@ def _print_last(last: Any, console: Console) -> None:
 
 def _plans(session: Session) -> list[StagePlan]:
     store = Store(session.store_root)
-    plans = make_plan(session.workflow, session.graph, store, workflow_id(session.workflow))
+    workflow, graph = session.demands.applied_to(session.workflow, session.graph)
+    plans = make_plan(workflow, graph, store, workflow_id(session.workflow), session.demands)
     store.stat_cache.save()
     return plans
 

@@ -111,7 +111,8 @@ def _run(session: Session, store: Store, executor: Executor, observer: Observer)
     """Run, and write what there is to say of it into the output folder."""
     started, clock = datetime.now(UTC), time.perf_counter()
     earlier = earlier_files(session.out)
-    run = Run(session.workflow, session.graph, store, session.out, observer=observer, executor=executor)
+    run = Run(session.workflow, session.graph, store, session.out, observer=observer, executor=executor,
+              demands=session.demands)  # fmt: skip
     while True:
         result = run.execute(earlier_files=earlier)
         try:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pano_mvs
 from pano_mvs.core.errors import InputError, WorkflowError
+from pano_mvs.engine.demands import NO_DEMANDS, Demands
 from pano_mvs.engine.registry import Registry
 from pano_mvs.engine.wiring import Graph, wire, wiring_problems
 from pano_mvs.engine.workflow import PartialWorkflowError, Workflow, find_workflow, load_workflow
@@ -25,6 +26,7 @@ class Session:
     registry: Registry
     store_root: Path
     out: Path
+    demands: Demands = NO_DEMANDS
 
 
 def presets_folder() -> Path:
@@ -41,6 +43,7 @@ def open_session(
     images: Path | None = None,
     cache: Path | None = None,
     out: Path | None = None,
+    demands: Demands = NO_DEMANDS,
 ) -> Session:
     """Find, validate and wire a workflow.
 
@@ -50,6 +53,7 @@ def open_session(
     Raises:
         UsageError: if there is no such workflow.
         WorkflowError: with every mistake in it.
+        InputError: if the folder of images is not there.
     """
     path, is_preset = find_workflow(name, presets_folder())
     if images is not None and not images.is_dir():
@@ -63,4 +67,4 @@ def open_session(
     variable = os.environ.get(CACHE_VARIABLE)
     beside = Path.cwd() if is_preset else path.parent
     root = cache or (Path(variable) if variable else beside / ".pano-mvs")
-    return Session(workflow, graph, registry, root, out or Path("out") / workflow.name)
+    return Session(workflow, graph, registry, root, out or Path("out") / workflow.name, demands)

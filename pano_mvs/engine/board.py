@@ -14,9 +14,10 @@ from dataclasses import dataclass, field
 from typing import Protocol, TypeAlias
 
 from pano_mvs.engine.ports import Cardinality
+from pano_mvs.engine.resolve import Resolver, resolve_source
 from pano_mvs.engine.stage import INDEX_PORT
 from pano_mvs.engine.store import ItemRef, Store, UnitRecord
-from pano_mvs.engine.units import WHOLE, Resolver, StageState, Unit, resolve_source
+from pano_mvs.engine.units import WHOLE, StageState, Unit
 from pano_mvs.engine.wiring import Edge, Graph
 from pano_mvs.engine.workflow import StageEntry, Workflow
 
@@ -64,13 +65,14 @@ class Board:
     def __init__(self, workflow: Workflow, graph: Graph, store: Store, listener: Listener) -> None:
         self.states = {name: StageState(graph.axes[name], open=True) for name in graph.order}
         self._store = store
+        self._only = graph.only
         self._listener = listener
         self._stages = {
             name: _Stage(
                 (entry := workflow.stages[name]),
                 position,
                 graph.edges[name],
-                Resolver(entry, graph.axes[name], graph.edges[name], self.states, store),
+                Resolver(entry, graph, self.states, store),
             )
             for position, name in enumerate(graph.order)
         }
@@ -163,7 +165,7 @@ class Board:
         self._open_behind(name)
 
     def _list_source(self, stage: _Stage, state: StageState) -> Mapping[str, str]:
-        resolution = resolve_source(stage.entry, self._store)
+        resolution = resolve_source(stage.entry, self._store, self._only.get(stage.entry.name))
         stage.found = {unit.item: unit for unit in resolution.units}
         state.members.update(resolution.members)
         self._listener.source_listed(resolution.members)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
+from pano_mvs.engine.demands import NO_DEMANDS, Demands
 from pano_mvs.engine.reasons import reason_to_run
+from pano_mvs.engine.resolve import resolve
 from pano_mvs.engine.store import Store, UnitRecord
-from pano_mvs.engine.units import Resolution, StageState, Unit, resolve
+from pano_mvs.engine.units import Resolution, StageState, Unit
 from pano_mvs.engine.wiring import Graph
 from pano_mvs.engine.workflow import Workflow
 
@@ -35,8 +37,24 @@ class StagePlan:
     open: bool = False
 
 
-def make_plan(workflow: Workflow, graph: Graph, store: Store, workflow_id: str) -> list[StagePlan]:
+def make_plan(
+    workflow: Workflow,
+    graph: Graph,
+    store: Store,
+    workflow_id: str,
+    demands: Demands = NO_DEMANDS,
+    *,
+    visit: Callable[[Unit, UnitRecord | None, str], None] | None = None,
+) -> list[StagePlan]:
     """Return what a run would do, stage by stage, without running anything.
+
+    Args:
+        workflow: as the run would see it, likewise its graph.
+        graph: wired.
+        store: where finished units are.
+        workflow_id: under which the latest run is remembered.
+        demands: what is asked of the run.
+        visit: called for each unit whose inputs are known, with its record if it has one, else the reason to run.
 
     Raises:
         InputError: if the source cannot be listed.
@@ -46,19 +64,21 @@ def make_plan(workflow: Workflow, graph: Graph, store: Store, workflow_id: str) 
     plans: list[StagePlan] = []
     for name in graph.order:
         entry = workflow.stages[name]
-        resolution = resolve(entry, graph.axes[name], graph.edges[name], states, store)
+        resolution = resolve(entry, graph, states, store)
         state = start_state(graph, name, resolution)
         plan = StagePlan(name, entry.spec.name, may_run=list(resolution.waiting), blocked=dict(resolution.blocked))
         plan.open = state.open = resolution.open
         state.pending.update(resolution.waiting)
         for unit in resolution.units:
-            record = store.find(unit.key)
+            record = None if demands.refreshes(unit) else store.find(unit.key)
             if record is not None:
                 settle(state, unit, record)
                 plan.cached.append(unit.item)
             else:
                 state.pending.add(unit.item)
-                plan.run[unit.item] = _reason(unit, last.get(name, {}), store)
+                plan.run[unit.item] = _reason(unit, last.get(name, {}), store, demands)
+            if visit is not None:
+                visit(unit, record, plan.run.get(unit.item, ""))
         states[name] = state
         plans.append(plan)
     return plans
@@ -75,5 +95,7 @@ def settle(state: StageState, unit: Unit, record: UnitRecord) -> None:
     state.exploded.update(record.items)
 
 
-def _reason(unit: Unit, last: Mapping[str, str], store: Store) -> str:
+def _reason(unit: Unit, last: Mapping[str, str], store: Store, demands: Demands) -> str:
+    if demands.refreshes(unit):
+        return "asked for"
     return reason_to_run(unit, last.get(unit.item), store)

@@ -41,6 +41,11 @@ def reason_to_run(unit: Unit, last_key: str | None, store: Store) -> str:
     return "; ".join(differences) or "its key is made differently in this version"
 
 
+def only_the_code_differs(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
+    """Return whether two identities are of the same stage, settings and inputs, and of different code."""
+    return before.get("code") != now.get("code") and {**before, "code": ""} == {**now, "code": ""}
+
+
 def _differences(what: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     return [
         f"{what} {name} {before.get(name)!r} → {now.get(name)!r}"

@@ -11,6 +11,7 @@ from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import GateError, StoreError
 from pano_mvs.engine.blobs import DamagedBlobError
 from pano_mvs.engine.board import Board
+from pano_mvs.engine.demands import NO_DEMANDS, Demands
 from pano_mvs.engine.desk import Desk
 from pano_mvs.engine.events import Observer, RunResult, Silent
 from pano_mvs.engine.executors.protocol import Executor
@@ -19,7 +20,7 @@ from pano_mvs.engine.publish import Publisher
 from pano_mvs.engine.scheduler import Scheduler
 from pano_mvs.engine.store import Store, UnitRecord
 from pano_mvs.engine.tally import Tally
-from pano_mvs.engine.units import StageState
+from pano_mvs.engine.units import StageState, Unit
 from pano_mvs.engine.wiring import Graph
 from pano_mvs.engine.workflow import Workflow
 from pano_mvs.scene import Record
@@ -52,14 +53,15 @@ class Run:
         *,
         observer: Observer | None = None,
         executor: Executor | None = None,
+        demands: Demands = NO_DEMANDS,
     ) -> None:
         """Prepare a run; the executor, by default a serial one with all threads, stays the caller's to close.
 
         Raises:
-            UsageError: if the output folder cannot be written.
+            UsageError: if the output folder cannot be written, or demands name a stage that there is not.
         """
-        self.workflow = workflow
-        self.graph = graph
+        self.workflow, self.graph = demands.applied_to(workflow, graph)
+        self.demands = demands
         self.store = store
         self.out = out
         self.observer = observer or Silent()
@@ -70,6 +72,7 @@ class Run:
         self._desk = Desk(self.executor, store, out, workflow.plugins)
         self._keys: dict[str, dict[str, str]] = {}
         self._computed: dict[str, UnitRecord] = {}
+        self._last_keys = store.runs.last_keys(workflow_id(workflow)) if demands.accept_code else {}
 
     def execute(self, *, earlier_files: Mapping[str, str] | None = None) -> RunResult:
         """Run every stage; finished units are kept whatever happens.
@@ -87,7 +90,7 @@ class Run:
         self._warn_of_timeouts()
         try:
             self._execute_healing()
-            if self.result.exit_code == 0:
+            if self.result.exit_code == 0 and not self.graph.is_part:
                 self.result.removed = self._publisher.remove_stale(earlier)
         except KeyboardInterrupt:
             self.result.stopped = "interrupted"
@@ -114,7 +117,7 @@ class Run:
         """Keep what makes the next plan better; a run does not fail for want of it."""
         name = workflow_id(self.workflow)
         try:
-            finished = self.result.exit_code in {0, 3} and not self.result.stopped
+            finished = self.result.exit_code in {0, 3} and not self.result.stopped and not self.graph.is_part
             self.store.runs.remember(name, self._keys, workflow=self.workflow.name, out=self.out, finished=finished)
             self.store.stat_cache.save()
         except StoreError as error:
@@ -142,7 +145,7 @@ class Run:
         board = Board(self.workflow, self.graph, self.store, tally)
         self.states = board.states
         self._scheduler = Scheduler(board, tally, self._desk, self._publisher, keys=self._keys,
-                                    computed=self._computed, warn=self._warn)  # fmt: skip
+                                    computed=self._computed, finder=self._find, warn=self._warn)  # fmt: skip
         stop: GateError | None = None
         try:
             board.start()
@@ -155,6 +158,13 @@ class Run:
             result.stopped, result.exit_code = str(stop), stop.exit_code
         else:
             result.exit_code = 3 if result.failures or result.rejected else 0
+
+    def _find(self, unit: Unit) -> UnitRecord | None:
+        """Return a unit's record if the store has it and nobody asked for it anew."""
+        if self.demands.refreshes(unit) and unit.key not in self._computed:
+            return None
+        last = self._last_keys.get(unit.entry.name, {}).get(unit.item)
+        return self.store.find(unit.key) or self.demands.accepted(unit, last, self.store)
 
     def _let_finish(self) -> None:
         """Give units in flight some time after an interrupt; a second interrupt ends it at once."""

@@ -45,6 +45,7 @@ class Scheduler:
         *,
         keys: dict[str, dict[str, str]],
         computed: dict[str, UnitRecord],
+        finder: Callable[[Unit], UnitRecord | None],
         warn: Callable[[str], None],
     ) -> None:
         self.keys = keys
@@ -54,6 +55,7 @@ class Scheduler:
         self._desk = desk
         self._publisher = publisher
         self._store: Store = publisher.store
+        self._finder = finder
         self._warn = warn
         self._twins: dict[str, list[Unit]] = {}  # key that is being computed to other units that have the same
 
@@ -95,7 +97,7 @@ class Scheduler:
             return True
         self.keys.setdefault(unit.entry.name, {})[unit.item] = unit.key
         seen = len(self._store.damaged)
-        record = self._store.find(unit.key)
+        record = self._finder(unit)
         for path in self._store.damaged[seen:]:
             self._warn(f"{path} is damaged; computing it again")
         if record is not None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from graphlib import CycleError, TopologicalSorter
 
@@ -37,11 +37,24 @@ class Graph:
         order: stage names, producers first, otherwise as in the file.
         edges: stage name to port name to what feeds it.
         axes: stage name to the axis of its units.
+        only: stage name to the units to which it is confined, where it is.
+        is_part: whether some stages or units of the workflow are left out.
     """
 
     order: tuple[str, ...]
     edges: Mapping[str, Mapping[str, Edge]]
     axes: Mapping[str, Axis]
+    only: Mapping[str, frozenset[str]] = field(default_factory=dict)
+    is_part: bool = False
+
+    def confined(self, ends: Collection[str], only: Mapping[str, frozenset[str]]) -> Graph:
+        """Return the part of the graph that the stages `ends` need, themselves included."""
+        needed = set(ends)
+        for name in reversed(self.order):
+            if name in needed:
+                needed.update(edge.producer for edge in self.edges[name].values())
+        order = tuple(name for name in self.order if name in needed)
+        return Graph(order, self.edges, self.axes, only, is_part=True)
 
 
 def wire(workflow: Workflow) -> Graph:

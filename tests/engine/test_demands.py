@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+import pytest
+
+from pano_mvs.core.errors import UsageError
+from pano_mvs.engine.demands import Demands
+from pano_mvs.engine.events import RunResult
+from pano_mvs.engine.plan import make_plan
+from pano_mvs.engine.run import Run, workflow_id
+from pano_mvs.engine.store import Store
+from tests.engine.conftest import Toy, ran
+
+
+def run(toy: Toy, demands: Demands) -> RunResult:
+    session = toy.session()
+    return Run(session.workflow, session.graph, Store(session.store_root), session.out, demands=demands).execute()
+
+
+def test_until_runs_only_what_the_stage_needs(toy: Toy) -> None:
+    assert ran(run(toy, Demands(until=("difference",)))) == {"images": 5, "scaled": 5, "pairs": 1, "difference": 4}
+    assert ran(toy.run()).keys() == {"shifted", "views", "mean", "each", "all"}
+
+
+def test_only_runs_one_unit_and_what_it_needs(toy: Toy) -> None:
+    assert ran(run(toy, Demands(only=("mean:2.txt",)))) == {"images": 5, "scaled": 5, "views": 1, "mean": 1}
+    assert ran(run(toy, Demands(only=("mean:2.txt", "mean:3.txt")))) == {"mean": 1}
+
+
+def test_part_of_a_run_deletes_no_file_of_the_whole(toy: Toy) -> None:
+    earlier = toy.run().published
+    files = toy.deliverables()
+    session = toy.session()
+    demands = Demands(until=("scaled",))
+    result = Run(session.workflow, session.graph, Store(session.store_root), session.out, demands=demands).execute(
+        earlier_files=earlier
+    )
+    assert not result.removed
+    assert toy.deliverables() == files
+
+
+def test_refresh_computes_again_and_what_turns_out_the_same_ends_there(toy: Toy) -> None:
+    toy.run()
+    assert ran(run(toy, Demands(refresh=("scaled",)))) == {"scaled": 5}
+    assert ran(run(toy, Demands(refresh=("mean:1.txt",)))) == {"mean": 1}
+    assert ran(toy.run()) == {}
+
+
+def test_accepted_code_keeps_what_was_computed(toy: Toy) -> None:
+    toy.run()
+    toy.edit("plug.py", lambda text: text.replace("double(x.value) * params.by / 2", "double(x.value) / 2 * params.by"))
+    assert ran(toy.run("scaled.by=4"))["scaled"] == 5
+    toy.edit("plug.py", lambda text: text.replace("x.value == 13", "13 == x.value"))
+    toy.run()
+    toy.edit("plug.py", lambda text: text.replace("13 == x.value", "x.value in (13,)"))
+    assert ran(run(toy, Demands(accept_code=True))) == {}
+    assert ran(toy.run()) == {}, "what was accepted once is cached"
+
+
+def test_code_that_changed_with_a_setting_is_not_accepted(toy: Toy) -> None:
+    toy.run()
+    toy.edit("plug.py", lambda text: text.replace("x.value == 13", "13 == x.value"))
+    toy.edit("wf.yaml", lambda text: text.replace("by: 3", "by: 5"))
+    assert ran(run(toy, Demands(accept_code=True)))["scaled"] == 5
+
+
+def test_keep_going_goes_on_where_the_workflow_would_stop(toy: Toy) -> None:
+    toy.number("3.txt", "13")
+    toy.edit("wf.yaml", lambda text: text.replace("by: 3}", "by: 3, on_error: stop}"))
+    assert run(toy, Demands()).exit_code == 4
+    assert run(toy, Demands(keep_going=True)).exit_code == 3
+
+
+@pytest.mark.parametrize("demands", [Demands(until=("nowhere",)), Demands(refresh=("nowhere:a",))])
+def test_stage_that_is_not_there_is_named(toy: Toy, demands: Demands) -> None:
+    with pytest.raises(UsageError, match="no stage 'nowhere'"):
+        run(toy, demands)
+
+
+def test_unit_that_is_not_there_is_named(toy: Toy) -> None:
+    with pytest.raises(UsageError, match=r"mean has no unit '9\.txt'"):
+        run(toy, Demands(only=("mean:9.txt",)))
+
+
+def test_plan_says_what_was_asked_for(toy: Toy) -> None:
+    toy.run()
+    session = toy.session()
+    demands = Demands(until=("mean",), refresh=("scaled:1.txt",))
+    workflow, graph = demands.applied_to(session.workflow, session.graph)
+    plans = make_plan(workflow, graph, Store(session.store_root), workflow_id(session.workflow), demands)
+    assert {plan.name: plan.run for plan in plans if plan.run} == {"scaled": {"1.txt": "asked for"}}
+    assert plans[-1].name == "mean"
