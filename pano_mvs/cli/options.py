@@ -13,8 +13,9 @@ SetOption = Annotated[Optional[list[str]], typer.Option("--set", metavar="STAGE.
 CacheOption = Annotated[Optional[Path], typer.Option("--cache", help="Folder of the cache.")]  # noqa: UP045
 OutOption = Annotated[Optional[Path], typer.Option("--out", help="Folder of the results; default out/<workflow>.")]  # noqa: UP045
 UntilOption = Annotated[
-    Optional[list[str]], typer.Option("--until", metavar="STAGE", help="Only what this stage needs.")
-]  # noqa: UP045
+    Optional[list[str]],  # noqa: UP045
+    typer.Option("--until", metavar="STAGE", help="Only this stage and what it needs."),
+]
 OnlyOption = Annotated[
     Optional[list[str]],  # noqa: UP045
     typer.Option("--only", metavar="STAGE:ITEM", help="Only this unit and what it needs."),
