@@ -10,7 +10,9 @@ slanted surfaces. Here two steps alternate, the data and the smoothness of one e
   it is most likely: a Gauss–Newton step on the zero-mean normalised correlation (Lucas and Kanade, 1981) in q and its
   two slopes, with the plane as a prior whose weight against the pictures is that of the texture they show.
 
-Nothing is drawn at random, so that a rolled panorama gives the rolled result.
+Of PatchMatch it takes the planes and leaves the random search: started from a sweep there is little to search for, and
+handing on the planes of neighbours by correlation alone spreads the nearer surface over edges that semi-global matching
+had found (measured on four scenes). Nothing is drawn at random, so that a rolled panorama gives the rolled result.
 """
 
 from __future__ import annotations
