@@ -60,7 +60,7 @@ def open_session(
         raise InputError(f"--images {images}: there is no such folder")
     registry = Registry.installed()
     try:
-        workflow = load_workflow(path, registry, overrides=overrides, images=images)
+        workflow = load_workflow(path, registry, overrides=overrides, images=images, presets=presets_folder())
     except PartialWorkflowError as error:
         raise WorkflowError([*error.problems, *wiring_problems(error.stages)]) from None
     graph = wire(workflow)

@@ -134,10 +134,10 @@ def _check_gates(entry: StageEntry, summary: StageSummary) -> None:
     if summary.units and done / summary.units < entry.policy.min_success:
         raise GateError(f"stage {entry.name!r}: {done} of {summary.units} units succeeded, min_success is "
                         f"{entry.policy.min_success}")  # fmt: skip
-    for metric, least in entry.policy.gate.items():
+    for metric, limits in entry.policy.gate.items():
         if metric not in summary.metrics:
             known = ", ".join(summary.metrics) or "none"
             raise GateError(f"stage {entry.name!r}: gate on {metric!r}, but it reports: {known}")
-        if summary.metrics[metric] < least:
+        if objection := limits.objection(summary.metrics[metric]):
             raise GateError(f"stage {entry.name!r}: {metric} is {summary.metrics[metric]:.4g}, the gate asks for "
-                            f"{least:.4g}")  # fmt: skip
+                            f"{objection}")  # fmt: skip

@@ -5,22 +5,21 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
-from pano_mvs.core.errors import InputError, PluginError, UsageError, WorkflowError
+from pano_mvs.core.errors import PluginError, UsageError, WorkflowError
 from pano_mvs.engine.code_digest import code_digest
+from pano_mvs.engine.layers import Layer, LayerReader, did_you_mean, merge_stages, read_text
+from pano_mvs.engine.names import is_plain_name
+from pano_mvs.engine.overrides import apply_overrides
 from pano_mvs.engine.params import Params, files_of
 from pano_mvs.engine.policy import RESERVED_KEYS, Policy
 from pano_mvs.engine.registry import Registry
 from pano_mvs.engine.stage import StageSpec
-from pano_mvs.engine.yaml_text import Located, parse_yaml
-
-FORMAT_VERSION = 1
-_TOP_KEYS = ("pano_mvs", "name", "description", "plugins", "stages")
+from pano_mvs.engine.yaml_text import Located, Problems
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +50,7 @@ class Workflow:
     Attributes:
         name: for the output folder and the report.
         path: the file, or None.
-        text: the YAML as written.
+        text: the YAML as written, with that of the files that it extends.
         stages: in the order of the file.
         overrides: the `--set` and `--images` that were applied.
         plugins: the plugin files that it names, with the digests of their code.
@@ -66,7 +65,12 @@ class Workflow:
 
 
 def load_workflow(
-    path: Path, registry: Registry, *, overrides: Sequence[str] = (), images: Path | None = None
+    path: Path,
+    registry: Registry,
+    *,
+    overrides: Sequence[str] = (),
+    images: Path | None = None,
+    presets: Path | None = None,
 ) -> Workflow:
     """Read and validate a workflow file.
 
@@ -75,16 +79,14 @@ def load_workflow(
         registry: the stages there are; the plugin files that the workflow names are added to it.
         overrides: `STAGE.PARAM=VALUE`, the value in YAML.
         images: a folder for the stage called `images` to read instead of its own.
+        presets: folder of the workflows that it may extend by name.
 
     Raises:
         InputError: if the file cannot be read.
         WorkflowError: with every mistake found, each with its place.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"workflow {path} cannot be read: {error}") from error
-    return WorkflowReader(str(path), path.parent, registry).read(text, overrides=overrides, images=images, path=path)
+    reader = WorkflowReader(str(path), path.parent, registry, presets=presets)
+    return reader.read(read_text(path), overrides=overrides, images=images, path=path)
 
 
 class PartialWorkflowError(WorkflowError):
@@ -98,110 +100,75 @@ class PartialWorkflowError(WorkflowError):
 class WorkflowReader:
     """Turns YAML into a workflow, collecting problems."""
 
-    def __init__(self, shown_as: str, base: Path, registry: Registry) -> None:
+    def __init__(self, shown_as: str, base: Path, registry: Registry, *, presets: Path | None = None) -> None:
         self.shown_as = shown_as
         self.base = base
         self.registry = registry
-        self.problems: list[str] = []
+        self.presets = presets
+        self.problems = Problems()
         self.plugins: dict[Path, str] = {}
+        self.folders: dict[str, Path] = {}
 
     def read(
         self, text: str, *, overrides: Sequence[str] = (), images: Path | None = None, path: Path | None = None
     ) -> Workflow:
         """Return the workflow, or raise WorkflowError with every mistake."""
-        root = parse_yaml(text, self.shown_as)
-        if not isinstance(root.value, dict):
-            raise WorkflowError([f"{self._place(root)}: a workflow is a mapping with the keys {', '.join(_TOP_KEYS)}"])
-        self._check_top(root)
-        self._load_plugins(root.value.get("plugins"))
-        entries = self._stage_nodes(root)
-        self._apply(entries, overrides, images)
+        layers = self._layers(text, path)
+        entries = merge_stages(layers, self.problems)
+        added = apply_overrides(entries, overrides, self.problems, images=images)
+        for layer in layers:
+            self._load_plugins(layer.root.value.get("plugins"))
+        for item in added:
+            self._load_plugin(item)
+        if not entries and not self.problems.lines:
+            self.problems.add(layers[-1].root.place, "no stage is left")
         stages = {name: entry for name, node in entries.items() if (entry := self._stage(name, node)) is not None}
-        if self.problems:
-            raise PartialWorkflowError(self.problems, stages if len(stages) == len(entries) else {})
-        name = root.value["name"].plain() if "name" in root.value else Path(self.shown_as).stem
+        if self.problems.lines:
+            raise PartialWorkflowError(self.problems.lines, stages if len(stages) == len(entries) else {})
+        root = layers[-1].root
+        name = root.value["name"].plain() if "name" in root.value else _name_of(self.shown_as)
         shown = ([f"images.path={images}"] if images else []) + list(overrides)
-        return Workflow(str(name), path, text, stages, tuple(shown), self.plugins)
+        return Workflow(name, path, _all_texts(layers), stages, tuple(shown), self.plugins)
 
-    def _check_top(self, root: Located) -> None:
-        for key, node in root.value.items():
-            if key not in _TOP_KEYS:
-                self._problem(node, f"unknown key {key!r}.{_did_you_mean(key, _TOP_KEYS)}", at_key=True)
-        version = root.value.get("pano_mvs")
-        if version is None:
-            self._problem(root, f"the key `pano_mvs: {FORMAT_VERSION}` is missing (the version of the workflow format)")
-        elif version.value != FORMAT_VERSION:
-            self._problem(
-                version, f"workflow format {version.plain()!r} is not known; this version reads {FORMAT_VERSION}"
-            )
-        if "name" in root.value and not _is_plain_name(root.value["name"].plain()):
-            self._problem(root.value["name"], "name must be a word of letters, digits, '-', '_' and '.'")
+    def _layers(self, text: str, path: Path | None) -> list[Layer]:
+        reader = LayerReader(self.problems, self.presets)
+        reader.read(text, self.shown_as, self.base, chain=(path.resolve(),) if path is not None else ())
+        self.folders = {layer.shown_as: layer.base for layer in reader.layers}
+        return reader.layers
 
     def _load_plugins(self, node: Located | None) -> None:
         if node is None or node.value is None:
             return
         if not isinstance(node.value, list):
-            self._problem(node, "plugins must be a list of Python files")
+            self.problems.add(node.place, "plugins must be a list of Python files")
             return
         for item in node.value:
-            if not isinstance(item.value, str):
-                self._problem(item, "a plugin is the path of a Python file")
-                continue
-            try:
-                self.registry.add_file(self.base / item.value)
-                self.plugins[self.base / item.value] = code_digest(self.base / item.value)
-            except PluginError as error:
-                self._problem(item, str(error))
+            self._load_plugin(item)
 
-    def _stage_nodes(self, root: Located) -> dict[str, Located]:
-        node = root.value.get("stages")
-        if node is None or not isinstance(node.value, dict) or not node.value:
-            self._problem(node or root, "`stages:` must be a mapping of stage names to {use: …}")
-            return {}
-        entries: dict[str, Located] = {}
-        for name, entry in node.value.items():
-            if not _is_plain_name(name):
-                self._problem(entry, f"stage name {name!r} must be a word of letters, digits, '-' and '_'", at_key=True)
-            elif not isinstance(entry.value, dict) or "use" not in entry.value:
-                self._problem(entry, f"stage {name!r} needs `use: NAME`", at_key=True)
-            else:
-                entries[name] = entry
-        return entries
+    def _load_plugin(self, item: Located) -> None:
+        if not isinstance(item.value, str):
+            self.problems.add(item.place, "a plugin is the path of a Python file")
+            return
+        path = self._folder(item) / item.value
+        if path in self.plugins:
+            return
+        try:
+            self.registry.add_file(path)
+            self.plugins[path] = code_digest(path)
+        except PluginError as error:
+            self.problems.add(item.place, str(error))
 
-    def _apply(self, entries: dict[str, Located], overrides: Sequence[str], images: Path | None) -> None:
-        if images is not None:
-            if "images" not in entries:
-                self.problems.append("--images: this workflow has no stage called 'images'; use --set STAGE.path=DIR")
-            else:
-                node = entries["images"]
-                node.value["path"] = Located(
-                    str(images.resolve()), node.line, node.column, node.key_line, node.key_column
-                )
-        for override in overrides:
-            self._apply_override(entries, override)
-
-    def _apply_override(self, entries: dict[str, Located], override: str) -> None:
-        target, equals, text = override.partition("=")
-        stage_name, dot, param = target.strip().partition(".")
-        if not (equals and dot and param):
-            self.problems.append(f"--set {override}: write STAGE.PARAM=VALUE")
-        elif stage_name not in entries:
-            self.problems.append(f"--set {override}: no stage {stage_name!r}.{_did_you_mean(stage_name, entries)}")
-        else:
-            try:
-                value = parse_yaml(text, f"--set {target}") if text.strip() else Located(None, 1, 1)
-            except WorkflowError as error:
-                self.problems.extend(error.problems)
-                return
-            entries[stage_name].value[param] = Located(value.value, 0, 0, origin=f"--set {target.strip()}")
+    def _folder(self, item: Located) -> Path:
+        """Return what a relative path is relative to: its file's folder, or where the command was typed."""
+        return Path.cwd() if item.origin else self.folders.get(item.file, self.base)
 
     def _stage(self, name: str, node: Located) -> StageEntry | None:
         use = node.value["use"]
         spec = self.registry.stages.get(use.value) if isinstance(use.value, str) else None
         if spec is None:
-            self._problem(
-                use, f"stage {name!r}: there is no stage {use.plain()!r}; {self.registry.suggest(str(use.value))}"
-            )
+            shown = repr(use.plain())[:80]
+            hint = self.registry.suggest(str(use.value)[:80])
+            self.problems.add(use.place, f"stage {name!r}: there is no stage {shown}; {hint}")
             return None
         values = node.plain()
         policy = self._validate(Policy, {key: values[key] for key in values if key in RESERVED_KEYS}, node, name)
@@ -209,20 +176,18 @@ class WorkflowReader:
         params = self._validate(spec.params_type, own, node, name)
         if params is not None:
             self._check_files(params, node, name)
-        places = {key: self._place(item) for key, item in node.value.items()}
+        places = {key: item.place for key, item in node.value.items()}
         wiring = node.value.get("in")
         if wiring is not None and isinstance(wiring.value, dict):
-            places.update({f"in.{port}": self._place(item) for port, item in wiring.value.items()})
+            places.update({f"in.{port}": item.place for port, item in wiring.value.items()})
         # Mistakes in settings do not keep the wiring from being checked, so that all are found in one go.
-        return StageEntry(
-            name, spec, params or Params(), policy or Policy(use=spec.name), self._key_place(node), places
-        )
+        return StageEntry(name, spec, params or Params(), policy or Policy(use=spec.name), node.key_place, places)
 
     def _check_files(self, params: Params, node: Located, name: str) -> None:
         for key, paths in files_of(params).items():
             for path in paths:
                 if not path.exists():
-                    self._problem(node.at((key,)), f"stage {name!r}: {key}: {path} does not exist")
+                    self.problems.add(node.at((key,)).place, f"stage {name!r}: {key}: {path} does not exist")
 
     def _validate(self, model: type[Any], values: dict[str, Any], node: Located, name: str) -> Any:
         try:
@@ -233,47 +198,37 @@ class WorkflowReader:
                 self._report(problem, node, name, known)
             return None
 
-    @staticmethod
-    def _bases(node: Located) -> dict[str, Path]:
-        """Return the settings from the command line: their paths are relative to where it was typed."""
-        return {key: Path.cwd() for key, item in node.value.items() if item.origin}
+    def _bases(self, node: Located) -> dict[str, Path]:
+        """Return what each setting's paths are relative to."""
+        return {key: self._folder(item) for key, item in node.value.items()}
 
     def _report(self, problem: Any, node: Located, name: str, known: list[str]) -> None:
         path = tuple(problem["loc"])
         found = node.at(path)
         key = ".".join(map(str, path))
         if problem["type"] == "extra_forbidden":
-            options = [*known, *(key for key in RESERVED_KEYS if key not in known)]
-            self._problem(found, f"stage {name!r}: unknown setting {key!r}.{_did_you_mean(key, options)}", at_key=True)
+            options = [*known, *(key for key in RESERVED_KEYS if key not in known)] if len(path) == 1 else []
+            unknown = f"unknown setting {key[:80]!r}.{did_you_mean(key, options)}"
+            self.problems.add(found.key_place, f"stage {name!r}: {unknown}")
         elif problem["type"] == "missing":
-            self._problem(node, f"stage {name!r}: setting {key!r} is missing", at_key=True)
+            self.problems.add(found.key_place, f"stage {name!r}: setting {key!r} is missing")
         else:
             message = problem["msg"].removeprefix("Value error, ")
             shown = json.dumps(problem["input"], default=str, ensure_ascii=False)[:80]
             setting = f"{key}: " if key else ""
-            self._problem(found, f"stage {name!r}: {setting}{message} (got {shown})")
-
-    def _place(self, node: Located) -> str:
-        if node.origin:
-            return node.origin
-        return f"{self.shown_as}:{node.line}:{node.column}"
-
-    def _key_place(self, node: Located) -> str:
-        return f"{self.shown_as}:{node.key_line}:{node.key_column}" if node.key_line else self._place(node)
-
-    def _problem(self, node: Located, message: str, *, at_key: bool = False) -> None:
-        self.problems.append(f"{self._key_place(node) if at_key else self._place(node)}: {message}")
+            self.problems.add(found.place, f"stage {name!r}: {setting}{message} (got {shown})")
 
 
-def _is_plain_name(name: object) -> bool:
-    return isinstance(name, str) and bool(name) and name[0] not in ".-" and all(c.isalnum() or c in "-_." for c in name)
+def _name_of(shown_as: str) -> str:
+    """Return a name for a workflow that has none, from its file's."""
+    word = "".join(sign if sign.isalnum() or sign in "-_." else "_" for sign in Path(shown_as).stem)
+    return word if is_plain_name(word) else "workflow"
 
 
-def _did_you_mean(word: str, options: Sequence[str] | dict[str, Any]) -> str:
-    close = get_close_matches(word, list(options), n=2, cutoff=0.5)
-    if close:
-        return f" Did you mean {' or '.join(map(repr, close))}?"
-    return f" Known: {', '.join(options)}" if options else ""
+def _all_texts(layers: Sequence[Layer]) -> str:
+    """Return a workflow's text, with those of the files that it extends behind it."""
+    *below, own = layers
+    return own.text + "".join(f"\n---\n# extended: {layer.shown_as}\n{layer.text}" for layer in below)
 
 
 def find_workflow(name: str, presets: Path) -> tuple[Path, bool]:
@@ -283,10 +238,15 @@ def find_workflow(name: str, presets: Path) -> tuple[Path, bool]:
         UsageError: if there is neither.
     """
     path = Path(name)
-    if path.is_file():
-        return path, False
-    preset = presets / f"{name}.yaml"
-    if _is_plain_name(name) and preset.is_file():
-        return preset, True
+    try:
+        if path.is_file():
+            return path, False
+        preset = presets / f"{name}.yaml"
+        if is_plain_name(name) and preset.is_file():
+            return preset, True
+        if path.exists():
+            return path, False  # reading it says what is wrong with it
+    except (OSError, ValueError) as error:
+        raise UsageError(f"there is no workflow file {name[:80]!r}: {error}. Name a file or a preset") from error
     names = sorted(file.stem for file in presets.glob("*.yaml"))
-    raise UsageError(f"there is no workflow file {name!r} and no preset of that name.{_did_you_mean(name, names)}")
+    raise UsageError(f"there is no workflow file {name!r} and no preset of that name.{did_you_mean(name, names)}")
