@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO
@@ -15,6 +16,8 @@ from typing import IO
 from pano_mvs.core.errors import UsageError
 
 DIGEST_BYTES = 16
+IS_DIGEST = re.compile(rf"[0-9a-f]{{{2 * DIGEST_BYTES}}}")
+"""Matches what the functions below return."""
 
 
 def digest_from_value(value: object) -> str:

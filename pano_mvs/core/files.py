@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
+import re
 import shutil
+import socket
 import tempfile
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 
 from pano_mvs.core.errors import StoreError
@@ -22,6 +27,69 @@ def _umask() -> int:
 
 
 _UMASK = _umask()  # once: to ask is to set it for a moment, for all threads
+_TEMPORARY = re.compile(r"\.tmp-([0-9a-f]{8})-(\d{1,10})-.*")
+_ABANDONED_AFTER_S = 7 * 24 * 3600.0
+
+
+def temporary_prefix() -> str:
+    """Return how the names of this process's temporary files begin: they tell whether who made them is still there."""
+    return f".tmp-{_place()}-{os.getpid()}-"
+
+
+def clear_abandoned(folder: Path) -> None:
+    """Remove the temporary files and folders of processes that were killed.
+
+    Those of processes that are known to be gone are removed at once. Where that cannot be known (another host or
+    container, Windows), and what bears another name, it is for age to tell: no unit takes seven days.
+    """
+    with suppress(OSError):
+        for path in folder.glob(".tmp-*"):
+            if _is_abandoned(path):
+                remove_whole(path)
+
+
+def remove_whole(path: Path) -> None:
+    """Remove a file, a link or a whole folder; another process may be doing so too."""
+    with suppress(OSError):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def _is_abandoned(path: Path) -> bool:
+    match = _TEMPORARY.fullmatch(path.name)
+    if match and match[1] == _place() and os.name == "posix":
+        return not _lives(int(match[2]))
+    return is_older(path, _ABANDONED_AFTER_S)
+
+
+def is_older(path: Path, seconds: float) -> bool:
+    """Return whether a file was last changed longer ago; not if it is gone."""
+    try:
+        return time.time() - path.lstat().st_mtime > seconds
+    except OSError:
+        return False
+
+
+def _lives(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:
+        return True
+    return True
+
+
+@cache
+def _place() -> str:
+    """Return a name for that within which a process's number means one process: this start of this container."""
+    marks = [socket.gethostname()]
+    with suppress(OSError):
+        marks.append(Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii"))
+        marks.append(str(Path("/proc/self/ns/pid").readlink()))
+    return hashlib.blake2b("\n".join(marks).encode(), digest_size=4).hexdigest()
 
 
 @contextmanager
@@ -41,7 +109,7 @@ def replacing(path: Path, *, temporary_in: Path | None = None, durable: bool = F
     try:
         folder.mkdir(parents=True, exist_ok=True)
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=folder, prefix=".tmp-", suffix=path.suffix)
+        handle, name = tempfile.mkstemp(dir=folder, prefix=temporary_prefix(), suffix=path.suffix)
         os.close(handle)
         temporary = Path(name)
         yield temporary
@@ -62,9 +130,9 @@ def replacing(path: Path, *, temporary_in: Path | None = None, durable: bool = F
             temporary.unlink(missing_ok=True)
 
 
-def write_text(path: Path, text: str, *, durable: bool = False) -> None:
+def write_text(path: Path, text: str, *, temporary_in: Path | None = None, durable: bool = False) -> None:
     """Write a text file in one step (UTF-8, as given); see `replacing`."""
-    with replacing(path, durable=durable) as temporary:
+    with replacing(path, temporary_in=temporary_in, durable=durable) as temporary:
         temporary.write_bytes(text.encode())
 
 

@@ -15,14 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from pano_mvs.core.digest import DIGEST_BYTES, digest_from_bytes, digest_from_file
+from pano_mvs.core.digest import DIGEST_BYTES, IS_DIGEST, digest_from_bytes, digest_from_file
 from pano_mvs.core.errors import StoreError
 from pano_mvs.core.files import replacing
 from pano_mvs.engine.stat_cache import StatCache
 from pano_mvs.scene import FilePart, Part
 
-_DIGEST = re.compile(rf"[0-9a-f]{{{2 * DIGEST_BYTES}}}")
-_SUFFIX = re.compile(r"(\.[a-z0-9_+-]{1,16})?")
+SUFFIX = re.compile(r"(\.[a-z0-9_+-]{1,16})?")
 _LARGEST_BYTES = 1 << 50
 
 
@@ -58,8 +57,8 @@ class BlobRef:
             ValueError: if it is none: what it names could lie outside the store.
         """
         digest, size_bytes, suffix, external = value
-        sound = isinstance(digest, str) and _DIGEST.fullmatch(digest) and isinstance(suffix, str)
-        if not sound or not _SUFFIX.fullmatch(suffix) or type(size_bytes) is not int or type(external) is not bool:
+        sound = isinstance(digest, str) and IS_DIGEST.fullmatch(digest) and isinstance(suffix, str)
+        if not sound or not SUFFIX.fullmatch(suffix) or type(size_bytes) is not int or type(external) is not bool:
             raise ValueError(f"no reference to a blob: {value!r}")
         if not 0 <= size_bytes < _LARGEST_BYTES:
             raise ValueError(f"a blob of {size_bytes} bytes")
@@ -119,13 +118,14 @@ class BlobStore:
         path = self.verified_path(ref)
         try:
             if ref.suffix == ".npy" and not ref.external:
-                array: np.ndarray[Any, Any] = np.load(path, mmap_mode="r", allow_pickle=False)
-                return array
+                return _mapped(path)
             if ref.suffix == ".json" and not ref.external:
                 value = json.loads(path.read_bytes())
                 if not isinstance(value, dict):
                     raise ValueError("not an object")
                 return value
+        except FileNotFoundError as error:  # somebody has collected it since it was verified
+            raise self.discard(ref, "is gone") from error
         except (ValueError, RecursionError) as error:
             raise self.discard(ref, f"holds nothing that pano_mvs writes ({error})") from error
         return FilePart(path, external=ref.external, digest=ref.digest)
@@ -133,23 +133,27 @@ class BlobStore:
     def discard(self, ref: BlobRef, why: str) -> DamagedBlobError:
         """Remove a blob that is of no use, unless it is the user's own file, and return the error that says so."""
         path = self.path(ref)
-        if not ref.external:
+        if ref.external:
+            self.stat_cache.forget(path)
+        elif not path.parent.is_symlink():
             path.unlink(missing_ok=True)
-        self._verified.discard(ref.digest)
+        self._verified.discard(str(path))
         return DamagedBlobError(f"{path} {why}; the same command computes it again")
 
     def verified_path(self, ref: BlobRef) -> Path:
         """Return a blob's path after checking its bytes, once in the life of this object."""
         path = self.path(ref)
-        if ref.digest in self._verified:
+        if str(path) in self._verified:
             return path
+        if not ref.external:
+            self._refuse_link(path)
         try:
             sound = path.stat().st_size == ref.size_bytes and digest_from_file(path) == ref.digest
         except OSError:
             sound = False
         if not sound:
             raise self.discard(ref, "is damaged or gone")
-        self._verified.add(ref.digest)
+        self._verified.add(str(path))
         return path
 
     def _put_bytes(self, data: bytes, suffix: str) -> BlobRef:
@@ -179,7 +183,7 @@ class BlobStore:
 
     def _put_file(self, part: FilePart) -> BlobRef:
         suffix = part.path.suffix.lower()
-        if not _SUFFIX.fullmatch(suffix):
+        if not SUFFIX.fullmatch(suffix):
             suffix = ""
         if part.external:
             digest = self.register_external(part.path)
@@ -203,7 +207,26 @@ class BlobStore:
 
     def _writing(self, ref: BlobRef) -> AbstractContextManager[Path]:
         path = self.path(ref)
+        self._refuse_link(path)
+        self._verified.discard(str(path))  # it is not there, or not sound
+        return replacing(path, temporary_in=self.temporary, durable=self.durable)
+
+    @staticmethod
+    def _refuse_link(path: Path) -> None:
         if path.parent.is_symlink():
             raise StoreError(f"{path.parent} is a link, which no cache has: remove it, or choose another cache "
                              "with --cache DIR")  # fmt: skip
-        return replacing(path, temporary_in=self.temporary, durable=self.durable)
+
+
+def _mapped(path: Path) -> np.ndarray[Any, Any]:
+    """Return the array of a .npy file; nothing in it is executed.
+
+    Raises:
+        ValueError: if it is none, or one of Python objects.
+    """
+    try:
+        return np.lib.format.open_memmap(path, mode="r")
+    except OSError:
+        raise
+    except Exception as error:  # numpy reads the header with Python's own parser, which fails in a dozen ways
+        raise ValueError(str(error)) from error

@@ -115,6 +115,10 @@ class Board:
         self._settle(unit.entry.name, unit.item)
         self._spread()
 
+    def producers(self, stage: str) -> set[str]:
+        """Return the stages that feed a stage."""
+        return {edge.producer for edge in self._stages[stage].edges.values()}
+
     def place(self, stage: str, item: str) -> tuple[int, int]:
         """Return where a unit stands in the order of the workflow and of the capture."""
         return self._stages[stage].position, self._stages[stage].rank.get(item, 0)

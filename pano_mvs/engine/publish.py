@@ -8,9 +8,10 @@ from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
 from pano_mvs.core.errors import StoreError, UsageError
-from pano_mvs.core.files import OUTPUT_MARK, copy_file
-from pano_mvs.engine.blobs import BlobRef
+from pano_mvs.core.files import OUTPUT_MARK, clear_abandoned, copy_file
+from pano_mvs.engine.blobs import BlobRef, DamagedBlobError
 from pano_mvs.engine.store import ItemRef, Store
+from pano_mvs.scene import Files
 
 
 class Publisher:
@@ -34,7 +35,12 @@ class Publisher:
             raise UsageError(_cannot_write(out, error.strerror or str(error))) from error
         if not os.access(out, os.W_OK | os.X_OK):
             raise UsageError(_cannot_write(out, "permission denied"))
-        (out / OUTPUT_MARK).touch()
+        try:
+            (out / OUTPUT_MARK).touch()
+        except OSError as error:
+            raise StoreError(_cannot_write(out, error.strerror or str(error))) from error
+        self._cleared: set[Path] = set()
+        self._clear(out)
 
     def name_items(self, names: Iterable[str]) -> None:
         """Fix the `{item}` of each image: its path without the extension, kept where two would collide."""
@@ -55,16 +61,13 @@ class Publisher:
             StoreError: if a file cannot be written.
             DamagedBlobError: if the store's copy is damaged.
         """
-        meta = self.store.blobs.get(ref.parts["meta"])
-        assert isinstance(meta, dict)
-        for number, target in enumerate(meta["targets"]):
+        for target, blob in self._files(ref):
             name = str(PurePosixPath(to) / target.replace("{item}", self._stems.get(item, item)))
             owner = self._owners.setdefault(name, f"{stage}:{item}")
             if owner != f"{stage}:{item}":
                 other = owner.partition(":")[0]
                 raise UsageError(f"stages {other!r} and {stage!r} both write {name}; give one a folder of its own "
                                  "with `to: NAME`")  # fmt: skip
-            blob = ref.parts[str(number)]
             self._write(name, blob)
             self.published[name] = blob.digest
 
@@ -80,13 +83,38 @@ class Publisher:
                 removed.append(name)
         return removed
 
+    def _files(self, ref: ItemRef) -> list[tuple[str, BlobRef]]:
+        """Return the targets of a unit's files and the blobs with their bytes, which are not read."""
+        try:
+            meta = self.store.blobs.get(ref.parts["meta"])
+            assert isinstance(meta, dict)
+            files = [(target, ref.parts[str(number)]) for number, target in enumerate(meta["targets"])]
+            Files({target: self.out for target, _ in files}).check()
+        except (KeyError, TypeError, ValueError, AssertionError) as error:
+            raise DamagedBlobError(f"a cached list of files ({ref.digest}) is not what stages write ({error}); it is "
+                                   "computed again")  from error  # fmt: skip
+        return files
+
+    def _clear(self, folder: Path) -> None:
+        """Remove, once, what runs that were killed left half written in a folder."""
+        if folder not in self._cleared:
+            self._cleared.add(folder)
+            clear_abandoned(folder)
+
     def _write(self, name: str, blob: BlobRef) -> None:
         target = self.out / name
+        self._clear(target.parent)
         if target.is_file() and not target.is_symlink() and self.store.stat_cache.digest(target) == blob.digest:
             return
         if not _is_inside(target, self.out):
             raise StoreError(_cannot_write(target, "it would leave the output folder (a link leads outside)"))
-        copy_file(self.store.blobs.verified_path(blob), target)
+        source = self.store.blobs.verified_path(blob)
+        try:
+            copy_file(source, target)
+        except StoreError:
+            if not self.store.blobs.exists(blob):  # somebody has collected it meanwhile
+                raise self.store.blobs.discard(blob, "is gone") from None
+            raise
         self.written.append(name)
 
 

@@ -61,10 +61,11 @@ class RunBook:
 
         What a run that did not get to its end had not reached yet stays as it was known.
         """
-        if not finished:
-            before = self.last_keys(workflow_id)
-            keys = before | {stage: before.get(stage, {}) | units for stage, units in keys.items()}
         name = f"{workflow_id[:16]}-{digest_from_value(str(out.resolve()))[:16]}"
+        if not finished:
+            own = _read(self.root / "runs" / f"{name}.json")
+            before = own.keys if own is not None else self.last_keys(workflow_id)
+            keys = before | {stage: before.get(stage, {}) | units for stage, units in keys.items()}
         when = datetime.now(UTC).isoformat(timespec="seconds")
         self._write("runs", RunEntry(name, workflow, str(out.resolve()), when, keys))
 
@@ -108,24 +109,37 @@ class RunBook:
             known = ", ".join(entry.name for entry in found or runs) or "none"
             raise UsageError(f"{len(found)} runs are called {run!r}; there are: {known}")
         old = found[0]
+        if any(entry.pinned and entry.name == name and entry.keys != old.keys for entry in self.entries()):
+            raise UsageError(f"there is a pin {name!r} already, of other results: choose another name, or give it up "
+                             f"with `cache unpin {name}`")  # fmt: skip
         pin = RunEntry(name, old.workflow, old.out, old.when, old.keys, pinned=True)
         self._write("pins", pin)
         return pin
 
     def forget(self, entry: RunEntry) -> None:
-        """Remove a run or a pin from the book; what it used stays until it is collected."""
-        self._path(entry).unlink(missing_ok=True)
+        """Remove a run or a pin from the book; what it used stays until it is collected.
+
+        Raises:
+            StoreError: if it cannot be removed.
+        """
+        path = self._path(entry)
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise StoreError(f"{path} cannot be deleted: {error.strerror}. Mend the permissions of the "
+                             "cache")  from error  # fmt: skip
 
     def _write(self, folder: str, entry: RunEntry) -> None:
         value = {"workflow": entry.workflow, "out": entry.out, "when": entry.when, "keys": entry.keys}
         body = json.dumps(value, sort_keys=True)
-        write_text(self.root / folder / f"{entry.name}.json", f"{digest_from_bytes(body.encode())}\n{body}")
+        path = self.root / folder / f"{entry.name}.json"
+        write_text(path, f"{digest_from_bytes(body.encode())}\n{body}", temporary_in=self.root / "tmp")
 
     def _path(self, entry: RunEntry) -> Path:
         return self.root / ("pins" if entry.pinned else "runs") / f"{entry.name}.json"
 
     def _paths(self, folder: str, pattern: str) -> list[Path]:
-        return sorted((self.root / folder).glob(pattern))
+        return sorted(path for path in (self.root / folder).glob(pattern) if path.is_file() and path.name[0] != ".")
 
 
 def _read(path: Path) -> RunEntry | None:
@@ -135,7 +149,8 @@ def _read(path: Path) -> RunEntry | None:
             return None
         value = json.loads(body)
         workflow, out, when = (str(value[name]) for name in ("workflow", "out", "when"))
-        datetime.fromisoformat(when)
+        if datetime.fromisoformat(when).utcoffset() is None or not "1970" < when[:4] < "9999":
+            raise ValueError("no time of a run")
         return RunEntry(path.stem, workflow, out, when, _keys(value["keys"]), pinned=path.parent.name == "pins")
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None

@@ -10,6 +10,7 @@ from pano_mvs.engine.board import Board
 from pano_mvs.engine.desk import Desk, Ended
 from pano_mvs.engine.events import Failure
 from pano_mvs.engine.executors.protocol import Outcome
+from pano_mvs.engine.executors.unit_text import input_blobs
 from pano_mvs.engine.failures import lost
 from pano_mvs.engine.publish import Publisher
 from pano_mvs.engine.store import Store, UnitRecord
@@ -121,6 +122,7 @@ class Scheduler:
         outcome, unit = ended.outcome, ended.unit
         twins = self._twins.pop(unit.key)
         if outcome.status == "damaged":
+            self._doubt(unit)
             raise DamagedBlobError(outcome.cause)
         if outcome.status == "stopped":
             raise _STOPPING.get(outcome.error, PanoMvsError)(outcome.cause)
@@ -135,9 +137,24 @@ class Scheduler:
 
     def _accept(self, unit: Unit, record: UnitRecord, *, was_computed: bool) -> None:
         if issubclass(unit.entry.spec.output, Files):
-            self._publisher.publish(unit.entry.name, unit.item, record.output, to=unit.entry.policy.to)
+            try:
+                self._publisher.publish(unit.entry.name, unit.item, record.output, to=unit.entry.policy.to)
+            except DamagedBlobError:
+                self._store.drop(record.key)
+                raise
         self._tally.unit_done(unit.entry, unit.item, record, "run" if was_computed else "cached")
         self._board.finish(unit, record)
+
+    def _doubt(self, unit: Unit) -> None:
+        """Have all computed again that could have led a unit to something damaged, lest it leads there again."""
+        for ref in input_blobs(unit):
+            if ref.external:
+                self._store.stat_cache.forget(self._store.blobs.path(ref))
+        for producer in self._board.producers(unit.entry.name):
+            for key in self.keys.get(producer, {}).values():
+                record = self._store.read_record(key)
+                if record is not None and not all(self._store.blobs.exists(ref) for ref in record.blobs()):
+                    self._store.drop(key)
 
     def _fail(self, ended: Ended) -> None:
         """List a unit that failed; stop if the workflow wants it so, or if all others wait for it."""

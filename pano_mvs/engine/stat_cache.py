@@ -5,28 +5,27 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
+from typing import TypeAlias
 
-from pano_mvs.core.digest import digest_from_file, digest_from_value
+from pano_mvs.core.digest import IS_DIGEST, digest_from_bytes, digest_from_file, digest_from_value
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.files import write_text
 
 # A file changed within this time of being hashed may change again without its time stamp showing it.
 _SETTLE_S = 2.0
+_MOST_ENTRIES = 200_000
+
+Entry: TypeAlias = "list[int | str]"
+"""Size, time of the last change of the bytes and of the file in ns, inode; digest."""
 
 
 class StatCache:
-    """Remembers file digests in one JSON file; losing it costs time and nothing else."""
+    """Remembers file digests in one file, JSON under a digest of it; losing it costs time and nothing else."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._changed = False
-        self._entries: dict[str, list[object]] = {}
-        try:
-            entries = json.loads(path.read_bytes())
-        except (OSError, ValueError):
-            entries = None
-        if isinstance(entries, dict):
-            self._entries = entries
+        self._entries = _read(path)
+        self._learnt: dict[str, Entry] = {}
 
     def digest(self, path: Path) -> str:
         """Return the digest of a file, or of a folder's relative names and files.
@@ -43,21 +42,50 @@ class StatCache:
             reason = error.strerror or str(error)
             raise InputError(f"{path}: cannot be read ({reason}). Check that it exists and may be read") from error
 
+    def forget(self, path: Path) -> None:
+        """Forget a file whose bytes turned out to be others."""
+        self._learnt.pop(str(path.resolve()), None)
+        self._entries.pop(str(path.resolve()), None)
+
     def save(self) -> None:
-        """Write what was learnt."""
-        if self._changed:
-            write_text(self._path, json.dumps(self._entries))
-            self._changed = False
+        """Add what was learnt to the file, to which other runs may have added meanwhile.
+
+        What was learnt long ago goes when there is too much: it may be of files that are long gone.
+        """
+        if self._learnt:
+            kept = {name: entry for name, entry in _read(self._path).items() if name not in self._learnt}
+            entries = [*kept.items(), *self._learnt.items()][-_MOST_ENTRIES:]
+            body = json.dumps(dict(entries))
+            text = f"{digest_from_bytes(body.encode())}\n{body}"
+            write_text(self._path, text, temporary_in=self._path.parent / "tmp")
+            self._entries, self._learnt = dict(entries), {}
 
     def _file(self, path: Path) -> str:
         stat = path.stat()
         state = [stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino]
         key = str(path.resolve())
         known = self._entries.get(key)
-        if isinstance(known, list) and len(known) == 5 and known[:4] == state:
+        if known is not None and known[:4] == state:
             return str(known[4])
         digest = digest_from_file(path)
         if time.time() - max(stat.st_mtime, stat.st_ctime) > _SETTLE_S:
-            self._entries[key] = [*state, digest]
-            self._changed = True
+            self._entries[key] = self._learnt[key] = [*state, digest]
         return digest
+
+
+def _read(path: Path) -> dict[str, Entry]:
+    """Return the entries of a file, none if it is damaged."""
+    try:
+        checksum, _, body = path.read_bytes().partition(b"\n")
+        entries = json.loads(body) if checksum.decode() == digest_from_bytes(body) else None
+    except (OSError, ValueError, RecursionError):
+        return {}
+    if not isinstance(entries, dict):
+        return {}
+    return {name: entry for name, entry in entries.items() if _is_entry(entry)}
+
+
+def _is_entry(value: object) -> bool:
+    if not isinstance(value, list) or len(value) != 5 or not isinstance(value[4], str):
+        return False
+    return all(type(number) is int for number in value[:4]) and IS_DIGEST.fullmatch(value[4]) is not None

@@ -10,21 +10,19 @@ several hosts, may share a store.
 
 from __future__ import annotations
 
-import errno
 import json
-import shutil
-import tempfile
-import time
+import math
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from pano_mvs.core.digest import digest_from_bytes, digest_from_value
 from pano_mvs.core.errors import ContractError, StoreError, UsageError
-from pano_mvs.core.files import write_text
+from pano_mvs.core.files import clear_abandoned, is_older, remove_whole, write_text
 from pano_mvs.engine.blobs import BlobRef, BlobStore, DamagedBlobError
+from pano_mvs.engine.room import Room, is_full_disk
 from pano_mvs.engine.runs import RunBook
 from pano_mvs.engine.stat_cache import StatCache
 from pano_mvs.scene import Record
@@ -33,7 +31,6 @@ LAYOUT_VERSION = 1
 LEAST_FREE_BYTES = 200_000_000
 _ABANDONED_AFTER_S = 7 * 24 * 3600.0
 _FOLDERS = ("blobs", "records", "runs", "pins", "tmp")
-_FULL = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,20 +94,23 @@ class UnitRecord:
         """Return the record that `to_json` gave.
 
         Raises:
-            ValueError, KeyError, TypeError, AttributeError: if it is none.
+            ValueError, KeyError, TypeError, AttributeError, OverflowError: if it is none.
         """
         identity, rejected = value["identity"], value["rejected"]
         if not isinstance(identity, dict) or not isinstance(rejected, dict):
             raise TypeError("a record's identity and its rejected images are objects")
+        metrics, seconds = {str(name): float(metric) for name, metric in value["metrics"].items()}, value["seconds"]
+        if not all(map(math.isfinite, (*metrics.values(), seconds))):
+            raise ValueError("a figure that is none")
         return UnitRecord(
             key=str(value["key"]),
             identity=identity,
             output=ItemRef.from_json(value["output"]),
             items={name: ItemRef.from_json(item) for name, item in value["items"].items()},
-            metrics={str(name): float(metric) for name, metric in value["metrics"].items()},
+            metrics=metrics,
             notes=tuple(str(note) for note in value["notes"]),
             rejected={str(name): str(reason) for name, reason in rejected.items()},
-            seconds=float(value["seconds"]),
+            seconds=float(seconds),
         )
 
     def blobs(self) -> Iterator[BlobRef]:
@@ -138,6 +138,7 @@ class Store:
         self.least_free_bytes = least_free_bytes
         self.damaged: list[str] = []
         self._records = str(root / "records")
+        self._room = Room(root, least_free_bytes=least_free_bytes)
         self._open_layout()
         self._clear_abandoned()
         self.runs = RunBook(root)
@@ -172,7 +173,14 @@ class Store:
         if path.parent.is_symlink():
             raise StoreError(f"{path.parent} is a link, which no cache has: remove it, or choose another cache "
                              "with --cache DIR")  # fmt: skip
-        write_text(path, f"{digest_from_bytes(body.encode())}\n{body}", durable=self.durable)
+        write_text(path, f"{digest_from_bytes(body.encode())}\n{body}", temporary_in=self.blobs.temporary,
+                   durable=self.durable)  # fmt: skip
+
+    def drop(self, key: str) -> None:
+        """Remove a record that turned out to be of no use."""
+        path = self.record_path(key)
+        if not path.parent.is_symlink():
+            path.unlink(missing_ok=True)
 
     def put_value(self, value: Record) -> ItemRef:
         """Store a value's parts and return its reference.
@@ -210,37 +218,19 @@ class Store:
 
     def require_room(self) -> None:
         """Raise StoreError if there is too little room on the disk to begin anything."""
-        free = shutil.disk_usage(self.root).free
-        if free < self.least_free_bytes:
-            raise StoreError(
-                f"{free / 1e6:.0f} MB are free where the cache {self.root} is, {self.least_free_bytes / 1e6:.0f} MB "
-                "are kept (--min-free). Make room (`pano-mvs cache gc` shows what can go) and run the same command "
-                "again: what was finished is kept"
-            )
+        self._room.require()
 
-    @contextmanager
-    def scratch(self) -> Iterator[Path]:
-        """Yield an empty folder inside the store, removed afterwards.
+    def scratch(self) -> AbstractContextManager[Path]:
+        """Return a context with an empty folder inside the store, removed afterwards.
 
         Raises:
             StoreError: if the disk is too full to begin, or was filled by what was done inside.
         """
-        self.require_room()
-        try:
-            self.blobs.temporary.mkdir(parents=True, exist_ok=True)
-            folder = Path(tempfile.mkdtemp(dir=self.blobs.temporary))
-        except OSError as error:
-            raise StoreError(f"cache {self.root} cannot be written: {error.strerror}. Mend it, or choose another with "
-                             "--cache DIR")  from error  # fmt: skip
-        try:
-            yield folder
-        except OSError as error:
-            if error.errno in _FULL:
-                raise StoreError(f"the disk of the cache {self.root} is full. Make room and run the same command "
-                                 "again: what was finished is kept")  from error  # fmt: skip
-            raise
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
+        return self._room.scratch(self.blobs.temporary)
+
+    def cannot_write(self, error: OSError) -> StoreError:
+        """Return the error that says that the store cannot be written, and whether for want of room."""
+        return self._room.cannot_write(error)
 
     def record_path(self, key: str) -> Path:
         """Return where the record of a key is or would be."""
@@ -266,24 +256,21 @@ class Store:
             )
 
     def _clear_abandoned(self) -> None:
-        """Remove what runs that were killed long ago left half written; no unit takes that long."""
+        """Remove what runs that were killed left half written."""
         folder = self.root / "tmp"
+        clear_abandoned(folder)
         for path in folder.iterdir() if folder.is_dir() else ():
-            try:
-                if time.time() - path.stat().st_mtime < _ABANDONED_AFTER_S:
-                    continue
-                if path.is_dir() and not path.is_symlink():
-                    shutil.rmtree(path, ignore_errors=True)
-                else:
-                    path.unlink(missing_ok=True)
-            except OSError:
-                continue  # another run is cleaning up too
+            if is_older(path, _ABANDONED_AFTER_S):
+                remove_whole(path)
 
     def _create(self, path: Path) -> None:
         try:
             write_text(path, json.dumps({"layout": LAYOUT_VERSION}))
         except StoreError as error:
-            raise UsageError(f"cache {self.root} cannot be written. Choose another with --cache DIR") from error
+            if is_full_disk(error.__cause__):
+                raise
+            raise UsageError(f"cache {self.root} cannot be written ({error.__cause__ or error}). Choose another with "
+                             "--cache DIR") from error  # fmt: skip
 
 
 def record_from_bytes(data: bytes) -> UnitRecord | None:
@@ -293,5 +280,5 @@ def record_from_bytes(data: bytes) -> UnitRecord | None:
         if checksum.decode() != digest_from_bytes(body):
             return None
         return UnitRecord.from_json(json.loads(body))
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
         return None

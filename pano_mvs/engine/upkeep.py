@@ -8,17 +8,20 @@ is too young to be swept.
 from __future__ import annotations
 
 import os
+import re
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pano_mvs.core.digest import digest_from_file
+from pano_mvs.core.digest import IS_DIGEST, digest_from_file
 from pano_mvs.core.errors import StoreError
+from pano_mvs.engine.blobs import SUFFIX
 from pano_mvs.engine.runs import RunEntry
 from pano_mvs.engine.store import Store, UnitRecord, record_from_bytes
 
-_BLOB_NAME_LENGTH = 32
+_BLOB_NAME = re.compile(rf"({IS_DIGEST.pattern}){SUFFIX.pattern}")
+_RECORD_NAME = re.compile(rf"({IS_DIGEST.pattern})\.json")
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +83,7 @@ def usage_of(store: Store) -> list[StageUsage]:
     """Return what each stage has in a store, the largest first."""
     seen: set[str] = set()
     totals: dict[str, list[float]] = {}
-    for record in _records(store):
+    for _, record in _records(store):
         total = totals.setdefault(_stage_of(record), [0, 0, 0.0])
         total[0] += 1
         total[2] += record.seconds
@@ -94,34 +97,54 @@ def usage_of(store: Store) -> list[StageUsage]:
 
 def size_on_disk(store: Store) -> int:
     """Return the bytes of all files of a store."""
-    return sum(entry.stat(follow_symlinks=False).st_size for entry in _files(store.root))
+    stats = (_stat(file.path) for file in _files(store.root))
+    return sum(stat.st_size for stat in stats if stat is not None)
 
 
 def verify(store: Store) -> Damage:
-    """Check every record and every blob against its digest; damaged ones are removed."""
+    """Check every record and every blob against its digest; damaged ones are removed, what is foreign stays.
+
+    Runs may go on meanwhile.
+
+    Raises:
+        StoreError: if a file cannot be read or removed.
+    """
     damage = Damage()
     sound: set[str] = set()
-    for entry in _files(store.root / "blobs"):
-        name = entry.name[:_BLOB_NAME_LENGTH]
-        if entry.is_symlink() or len(name) < _BLOB_NAME_LENGTH:
-            damage.foreign.append(entry.path)
-        elif digest_from_file(Path(entry.path)) == name:
-            sound.add(entry.name)
+    for file in _files(store.root / "blobs"):
+        name = _own_name(file, _BLOB_NAME)
+        if not name:
+            damage.foreign.append(file.path)
+            continue
+        found = _digest(file.path)
+        if found == name:
+            sound.add(file.name)
             damage.blobs += 1
-        else:
-            _remove(Path(entry.path))
-            damage.removed.append(entry.path)
-    for entry in _files(store.root / "records"):
-        path = Path(entry.path)
-        record = None if entry.is_symlink() else record_from_bytes(path.read_bytes())
-        if record is None or record.key != path.stem:
-            _remove(path)
-            damage.removed.append(entry.path)
-        elif all(ref.external or f"{ref.digest}{ref.suffix}" in sound for ref in record.blobs()):
-            damage.records += 1
-        else:
-            damage.incomplete.append(entry.path)
+        elif found:
+            _remove(Path(file.path))
+            damage.removed.append(file.path)
+    for file in _files(store.root / "records"):
+        key = _own_name(file, _RECORD_NAME)
+        data = _read(file.path) if key else None
+        if not key:
+            damage.foreign.append(file.path)
+        elif data is not None:
+            _verify_record(store, damage, sound, file.path, key=key, data=data)
     return damage
+
+
+def _verify_record(store: Store, damage: Damage, sound: set[str], path: str, *, key: str, data: bytes) -> None:
+    record = record_from_bytes(data)
+    if record is None or record.key != key:
+        _remove(Path(path))
+        damage.removed.append(path)
+        return
+    # What is not known to be sound may have come, from a run that goes on, after the blobs were checked.
+    blobs = (ref for ref in record.blobs() if not ref.external and f"{ref.digest}{ref.suffix}" not in sound)
+    if all(_digest(store.blobs.path(ref)) == ref.digest for ref in blobs):
+        damage.records += 1
+    else:
+        damage.incomplete.append(path)
 
 
 def collect(store: Store, *, unused_s: float, forget_after_s: float | None = None, delete: bool = False) -> Collection:
@@ -134,7 +157,8 @@ def collect(store: Store, *, unused_s: float, forget_after_s: float | None = Non
         delete: remove; else only tell.
 
     Raises:
-        StoreError: if an entry of the book is damaged, since what it protects is not known.
+        StoreError: if an entry of the book is damaged, since what it protects is not known; or a file cannot be read
+            or removed.
     """
     found = Collection()
     newest = time.time() - unused_s
@@ -145,31 +169,35 @@ def collect(store: Store, *, unused_s: float, forget_after_s: float | None = Non
         else:
             kept_keys.update(key for units in entry.keys.values() for key in units.values())
     kept_blobs: set[str] = set()
-    for file in _files(store.root / "records"):
-        record = record_from_bytes(Path(file.path).read_bytes())
-        if record is None or record.key in kept_keys or file.stat(follow_symlinks=False).st_mtime > newest:
-            kept_blobs.update(f"{ref.digest}{ref.suffix}" for ref in (record.blobs() if record else ()))
-        else:
+    for file, record in _records(store):
+        stat = _stat(file.path)
+        if stat is not None and record.key not in kept_keys and stat.st_mtime <= newest:
             found.records.append(Path(file.path))
-            found.size_bytes += file.stat(follow_symlinks=False).st_size
+            found.size_bytes += stat.st_size
+        else:
+            kept_blobs.update(f"{ref.digest}{ref.suffix}" for ref in record.blobs())
     for file in _files(store.root / "blobs"):
-        stat = file.stat(follow_symlinks=False)
+        stat = _stat(file.path)
+        if stat is None or not _own_name(file, _BLOB_NAME):
+            continue
         if file.name in kept_blobs or stat.st_mtime > newest:
             found.kept_bytes += stat.st_size
         else:
             found.blobs.append(Path(file.path))
             found.size_bytes += stat.st_size
     if delete:
-        _delete(store, found)
+        _delete(store, found, newest)
     return found
 
 
-def _delete(store: Store, found: Collection) -> None:
+def _delete(store: Store, found: Collection, newest: float) -> None:
     """Remove records before the blobs that they name, so that no sound record is left without them."""
     for entry in found.runs:
         store.runs.forget(entry)
     for path in (*found.records, *found.blobs):
-        _remove(path)
+        stat = _stat(path)
+        if stat is not None and stat.st_mtime <= newest:  # else a run has come to use it meanwhile
+            _remove(path)
 
 
 def _remove(path: Path) -> None:
@@ -179,15 +207,56 @@ def _remove(path: Path) -> None:
         raise StoreError(f"{path} cannot be deleted: {error.strerror}. Mend the permissions of the cache") from error
 
 
-def _records(store: Store) -> Iterator[UnitRecord]:
-    for entry in _files(store.root / "records"):
-        record = record_from_bytes(Path(entry.path).read_bytes())
-        if record is not None:
-            yield record
+def _records(store: Store) -> Iterator[tuple[os.DirEntry[str], UnitRecord]]:
+    """Yield every record that is sound."""
+    for file in _files(store.root / "records"):
+        key = _own_name(file, _RECORD_NAME)
+        record = record_from_bytes(_read(file.path) or b"") if key else None
+        if record is not None and record.key == key:
+            yield file, record
 
 
 def _stage_of(record: UnitRecord) -> str:
     return str(record.identity.get("stage", "unknown"))
+
+
+def _own_name(file: os.DirEntry[str], pattern: re.Pattern[str]) -> str:
+    """Return the digest in the name of a file that a store has written there, or nothing if it is no such file."""
+    match = pattern.fullmatch(file.name)
+    in_place = match is not None and Path(file.path).parent.name == match[1][:2] and file.is_file(follow_symlinks=False)
+    return match[1] if match is not None and in_place else ""
+
+
+def _read(path: str) -> bytes | None:
+    """Return the bytes of a file, None if it is gone: others look after the store too."""
+    try:
+        return Path(path).read_bytes()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise _cannot_read(path, error) from error
+
+
+def _digest(path: str | Path) -> str:
+    try:
+        return digest_from_file(Path(path))
+    except FileNotFoundError:
+        return ""
+    except OSError as error:
+        raise _cannot_read(path, error) from error
+
+
+def _stat(path: str | Path) -> os.stat_result | None:
+    try:
+        return Path(path).lstat()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise _cannot_read(path, error) from error
+
+
+def _cannot_read(path: str | Path, error: OSError) -> StoreError:
+    return StoreError(f"{path} cannot be read: {error.strerror}. Mend the permissions of the cache, or check its disk")
 
 
 def _files(folder: Path) -> Iterator[os.DirEntry[str]]:
@@ -205,3 +274,5 @@ def _sorted(folder: Path) -> Iterable[os.DirEntry[str]]:
             return sorted(entries, key=lambda entry: entry.name)
     except FileNotFoundError:
         return ()
+    except OSError as error:
+        raise _cannot_read(folder, error) from error

@@ -28,7 +28,7 @@ class Files(Record):
         """Raise ContractError if a target would leave the output folder."""
         for target in self.files:
             path = PurePosixPath(target)
-            inside = not path.is_absolute() and ".." not in path.parts and "\\" not in target and ":" not in target
+            inside = not path.is_absolute() and ".." not in path.parts and not {"\\", ":", "\0"} & set(target)
             require(inside and bool(path.parts), self, f"target {target!r} is not inside the output folder")
 
     def to_parts(self) -> Parts:

@@ -137,8 +137,12 @@ class DaskExecutor:
         """Return how many units the workers take at a time, how many threads each may use, and how many if alone."""
         token = f"hello-{uuid.uuid4().hex}"
         folder = self._store.blobs.temporary
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / token).write_text(token, encoding="ascii")
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / token).write_text(token, encoding="ascii")
+        except OSError as error:
+            self.close()
+            raise self._store.cannot_write(error) from error
         try:
             found = self._client.run(introduce, str(self._store.root.absolute()), token, on_error="return")
             for worker, answer in found.items():

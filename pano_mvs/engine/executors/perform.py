@@ -11,6 +11,7 @@ from pano_mvs.engine.execute import execute_unit
 from pano_mvs.engine.executors.capture import captured
 from pano_mvs.engine.executors.protocol import Outcome
 from pano_mvs.engine.executors.threads import bound_threads
+from pano_mvs.engine.executors.unit_text import input_blobs
 from pano_mvs.engine.failures import cause_of
 from pano_mvs.engine.store import Store
 from pano_mvs.engine.units import Unit
@@ -19,6 +20,11 @@ from pano_mvs.engine.units import Unit
 def perform(unit: Unit, store: Store, *, threads: int, log: Path) -> Outcome:
     """Run a unit, with its output in `log`, and put its result into the store."""
     started = time.perf_counter()
+    try:
+        log.parent.mkdir(parents=True, exist_ok=True)
+        log.touch()
+    except OSError as error:
+        return Outcome("stopped", cause=str(store.cannot_write(error)), error="StoreError", exit_code=4)
     try:
         with captured(log):
             bound_threads(threads)
@@ -29,6 +35,9 @@ def perform(unit: Unit, store: Store, *, threads: int, log: Path) -> Outcome:
         kind = StoreError if isinstance(error, StoreError) else GateError
         return Outcome("stopped", cause=str(error), error=kind.__name__, exit_code=error.exit_code)
     except (Exception, SystemExit) as error:
+        gone = next((ref for ref in input_blobs(unit) if not store.blobs.exists(ref)), None)
+        if gone is not None:  # somebody has collected it while the stage was about to read it: no fault of the stage
+            return Outcome("damaged", cause=str(store.blobs.discard(gone, "is gone")))
         cause, trace = cause_of(unit, error)
         exit_code = error.exit_code if isinstance(error, InputError | UsageError) else 0
         seconds = time.perf_counter() - started

@@ -92,7 +92,10 @@ class ProcessExecutor:
 
     def _add_keeper(self) -> None:
         errors = self._store.blobs.temporary / f"worker-{uuid.uuid4().hex}.txt"
-        errors.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            errors.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise self._store.cannot_write(error) from error
         worker = WorkerProcess(self.cores, errors)
         thread = threading.Thread(target=self._keep, args=(worker,), daemon=True)
         self._keepers.append((thread, worker))
@@ -102,7 +105,11 @@ class ProcessExecutor:
         """Give one worker its units until there are no more, and replace it in time."""
         while (taken := self._jobs.get()) is not None and not self._closing:
             job, request = taken
-            outcome = worker.run(request)
+            try:
+                outcome = worker.run(request)
+            except OSError as error:  # the unit is not to blame
+                outcome = Outcome("stopped", cause=f"a worker cannot be started: {error}. Mend it and run the same "
+                                  "command again", error="StoreError", exit_code=4)  # fmt: skip
             self._ended.put((job.number, self._judged(outcome, refused=worker.refused)))
             if worker.served >= self._units_per_process:
                 worker.stop()

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from pano_mvs.core.errors import UsageError
+from pano_mvs.engine.blobs import BlobRef
 from pano_mvs.engine.executors.protocol import Job
 from pano_mvs.engine.params import Params
 from pano_mvs.engine.policy import Policy
@@ -48,7 +49,7 @@ def unit_to_json(unit: Unit, store: Store) -> dict[str, Any]:
         "item": unit.item,
         "members": list(unit.members),
         "inputs": {port: _input_to_json(unit, port, value) for port, value in unit.inputs.items()},
-        "external": {ref.digest: str(store.blobs.path(ref).absolute()) for ref in _external(unit)},
+        "external": {ref.digest: str(store.blobs.path(ref).absolute()) for ref in input_blobs(unit) if ref.external},
         "source": None if unit.source is None else _source_to_json(unit.source),
         "key": unit.key,
         "identity": dict(unit.identity),
@@ -131,11 +132,12 @@ def _input_from_json(value: Any) -> UnitInput:
     return {name: ItemRef.from_json(ref) for name, ref in value["many"].items()}
 
 
-def _external(unit: Unit) -> Iterator[Any]:
+def input_blobs(unit: Unit) -> Iterator[BlobRef]:
+    """Yield every blob that a unit's inputs are made of."""
     for value in unit.inputs.values():
         items = [value] if isinstance(value, ItemRef) else (value or {}).values()
         for item in items:
-            yield from (ref for ref in item.parts.values() if ref.external)
+            yield from item.parts.values()
 
 
 def _source_to_json(item: SourceItem) -> dict[str, Any]:
