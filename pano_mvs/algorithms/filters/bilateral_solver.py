@@ -177,11 +177,15 @@ def solve_bilateral(
     # S C Sᵀ 1, the weight that a vertex draws from its pixels.
     pulled = kernels.sum_at_vertices(system.gram.sum(axis=2), system.vertices, count)
     arguments = (smoothness, system.n, system.m, *system.graph, _BLUR_CENTER, system.vertices, system.gram)
-    solution, _ = kernels.solve(system.right, system.right / pulled, diagonal, _TOLERANCE, iterations, arguments)
+    # A corner of a cell in which no pixel has a share is not part of the system: it starts at 0 and stays there.
+    held = system.mass > 0
+    start = np.divide(system.right, pulled, out=np.zeros(count), where=held)
+    diagonal[~held] = 1
+    solution, _ = kernels.solve(system.right, start, diagonal, _TOLERANCE, iterations, arguments)
     place = cells.gap_of_row, cells.weight_row, cells.weight_upper, cells.weight_lower
     smooth = kernels.slice_pixels(system.elements, system.vertices, solution, *place)
-    support = kernels.slice_pixels(system.elements, system.vertices, pulled / system.mass, *place)
-    return smooth, support
+    share = np.divide(pulled, system.mass, out=np.zeros(count), where=held)
+    return smooth, kernels.slice_pixels(system.elements, system.vertices, share, *place)
 
 
 def build_system(

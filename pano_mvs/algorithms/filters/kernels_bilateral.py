@@ -236,7 +236,8 @@ def bistochastise(mass, starts, indices, strengths, center, iterations):  # type
     for _ in range(iterations):
         blurred = blur(n, starts, indices, strengths, center)
         for vertex in range(len(n)):
-            n[vertex] = np.sqrt(n[vertex] * mass[vertex] / blurred[vertex])
+            # No pixel has a share in some corners of cells: 0 / 0 there would stop the whole solution.
+            n[vertex] = np.sqrt(n[vertex] * mass[vertex] / blurred[vertex]) if mass[vertex] > 0 else 0.0
     # m from n, not the mass itself: then the rows of D_m − D_n B̄ D_n sum to exactly zero.
     return n, n * blur(n, starts, indices, strengths, center)
 
