@@ -38,6 +38,7 @@ from pano_mvs.scene import (
     TwoView,
     Views,
 )
+from pano_mvs.scene.image_file import decode_image, write_png
 
 __all__ = [
     "NOT_IN_KEY",
@@ -77,8 +78,10 @@ __all__ = [
     "UsageError",
     "Views",
     "Winners",
+    "decode_image",
     "register_sweep_backend",
     "register_sweep_cost",
     "source",
     "stage",
+    "write_png",
 ]

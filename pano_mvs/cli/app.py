@@ -31,6 +31,7 @@ from pano_mvs.cli.options import (
     UntilOption,
     WorkflowArgument,
 )
+from pano_mvs.cli.plugin_app import plugin_app, plugins, stage_app
 from pano_mvs.engine.executors.threads import available_threads, bound_environment
 
 app = typer.Typer(
@@ -40,8 +41,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-stage_app = typer.Typer(help="Look at one stage.", no_args_is_help=True)
 app.add_typer(stage_app, name="stage")
+app.add_typer(plugin_app, name="plugin")
 evaluate_app = typer.Typer(
     cls=RunByDefault,
     help="Compare with the truth; `evaluate OUT --truth DIR` is `evaluate run OUT --truth DIR`.",
@@ -139,6 +140,21 @@ def check(workflow: WorkflowArgument, images: ImagesOption = None, overrides: Se
 
 @app.command()
 @guarded
+def schema(
+    workflow: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Argument(metavar="[WORKFLOW]", help="With its plugins, and the stages of what it extends."),
+    ] = None,
+    out: Annotated[Optional[Path], typer.Option("--out", help="A file; else the standard output.")] = None,  # noqa: UP045
+) -> None:
+    """Write the JSON Schema of workflows, with which an editor completes and checks them."""
+    from pano_mvs.cli.schema_command import show_schema
+
+    show_schema(workflow, out)
+
+
+@app.command()
+@guarded
 def status(
     workflow: WorkflowArgument, images: ImagesOption = None, out: OutOption = None, cache: CacheOption = None
 ) -> None:
@@ -149,22 +165,7 @@ def status(
     show_status(open_session(workflow, images=images, out=out, cache=cache), Console())
 
 
-@app.command()
-@guarded
-def plugins() -> None:
-    """List all stages, where they come from, and the plugins that failed to load."""
-    from pano_mvs.cli.show import show_plugins
-
-    show_plugins(Console())
-
-
-@stage_app.command("show")
-@guarded
-def stage_show(name: Annotated[str, typer.Argument(help="A stage's name, such as depth.sweep.")]) -> None:
-    """Show a stage's ports, settings and documentation."""
-    from pano_mvs.cli.show import show_stage
-
-    show_stage(name, Console())
+app.command()(plugins)
 
 
 @evaluate_app.command("run")

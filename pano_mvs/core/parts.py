@@ -12,6 +12,7 @@ from pano_mvs.core.errors import PluginError, UsageError
 
 Value = TypeVar("Value")
 _ATTRIBUTE = "__pano_mvs_parts__"
+_unusable: dict[tuple[str, str], str] = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,8 +73,11 @@ class Parts(Generic[Value]):
 
     def check(self, name: str) -> str:
         """Return the name if there is such a part, else raise UsageError."""
-        if name in self._builtin or name in self._added:
+        why = _unusable.get((self.kind, name))
+        if name in self._builtin or (name in self._added and why is None):
             return name
+        if why is not None:
+            raise UsageError(f"the {self.kind} {name!r} cannot be used: {why}")
         close = get_close_matches(name, self.names(), n=2, cutoff=0.5)
         hint = f"did you mean {' or '.join(map(repr, close))}? " if close else ""
         raise UsageError(
@@ -88,6 +92,12 @@ class Parts(Generic[Value]):
     def code_file(self, name: str) -> Path | None:
         """Return the file that defines a plugin's part; None for what is built in."""
         return Path(self._added[name][1].__code__.co_filename) if name in self._added else None
+
+
+def set_unusable_parts(reasons: Mapping[tuple[str, str], str]) -> None:
+    """Say, by kind and name, why parts cannot be had that plugins would give; whatever was said before is forgotten."""
+    _unusable.clear()
+    _unusable.update(reasons)
 
 
 def marks_of(value: object) -> tuple[PartMark, ...]:

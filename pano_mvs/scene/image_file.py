@@ -42,3 +42,9 @@ def decode_image(path: Path) -> NDArray[np.uint8]:
         raise InputError(f"{path}: {image.dtype} pictures are not supported. Convert it to 8 or 16 bits")
     rgb: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
     return rgb
+
+
+def write_png(path: Path, picture: NDArray[np.uint8]) -> None:
+    """Write a picture, (H, W) grey or (H, W, 3) RGB uint8, as PNG."""
+    ordered = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+    path.write_bytes(cv2.imencode(".png", ordered)[1].tobytes())

@@ -1,0 +1,82 @@
+"""What can be known of a plugin without importing it: where user plugins lie, and which names a source declares."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import sys
+from collections.abc import Iterable, Mapping
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+PLUGINS_VARIABLE = "PANO_MVS_PLUGINS"
+
+# A declaration is told by its text rather than by the syntax tree, since a broken file may have none.
+_DECLARATION = re.compile(r"""^[ \t]*@(?:\w+\.)*(stage|source|register_\w+)\(\s*["']([^"'\n]+)["']""", re.MULTILINE)
+
+
+def user_plugin_folders(environment: Mapping[str, str] = os.environ) -> list[Path]:
+    """Return the folders whose files are the user's plugins: of $PANO_MVS_PLUGINS, else the one in the user's settings.
+
+    The variable holds one or more folders, separated as in PATH; set to nothing, there are none. Without it the folder
+    is `pano-mvs/plugins` in $XDG_CONFIG_HOME or ~/.config (Linux), ~/Library/Application Support (macOS), or %APPDATA%
+    (Windows). A relative folder would be another one wherever the command is typed, and is the caller's to refuse.
+    """
+    variable = environment.get(PLUGINS_VARIABLE)
+    if variable is not None:
+        return [Path(folder) for folder in variable.split(os.pathsep) if folder]
+    settings = _settings_folder(environment)
+    return [] if settings is None else [settings / "pano-mvs" / "plugins"]
+
+
+def plugin_files_in(folder: Path) -> list[Path]:
+    """Return the plugin files of a folder, by name: all of Python but tests, and helpers, whose names begin with _."""
+    files = sorted(folder.glob("*.py")) if folder.is_dir() else []
+    return [file for file in files if not file.name.startswith(("_", ".", "test_")) and file.name != "conftest.py"]
+
+
+def declared_names(text: str) -> list[tuple[str, str]]:
+    """Return what a source says that it declares: ("stage", name), or a part's kind and name."""
+    return [
+        ("stage" if what in ("stage", "source") else what.removeprefix("register_").replace("_", " "), name)
+        for what, name in _DECLARATION.findall(text)
+    ]
+
+
+def names_in_files(files: Iterable[Path]) -> tuple[tuple[str, str], ...]:
+    """Return what files declare, as far as they can be read."""
+    found: list[tuple[str, str]] = []
+    for file in files:
+        try:
+            found.extend(declared_names(file.read_text(encoding="utf-8", errors="replace")))
+        except OSError:
+            continue  # it is listed as broken in any case; only its names stay unknown
+    return tuple(found)
+
+
+def names_in_package(entry: EntryPoint) -> tuple[tuple[str, str], ...]:
+    """Return what the package behind an entry point declares, without importing it."""
+    try:
+        spec = importlib.util.find_spec(entry.module.partition(".")[0])
+    except (ImportError, ValueError):
+        return ()
+    if spec is None:
+        return ()
+    folders = [Path(folder) for folder in spec.submodule_search_locations or ()]
+    files = [file for folder in folders for file in sorted(folder.rglob("*.py"))]
+    return names_in_files(files if folders else [Path(spec.origin)] if spec.origin else [])
+
+
+def _settings_folder(environment: Mapping[str, str]) -> Path | None:
+    """Return where programs keep a user's settings, if there is such a place."""
+    try:
+        home = Path.home()
+    except RuntimeError:
+        return None
+    if sys.platform == "win32":
+        return Path(environment.get("APPDATA") or home / "AppData" / "Roaming")
+    if sys.platform == "darwin":
+        return home / "Library" / "Application Support"
+    given = Path(environment.get("XDG_CONFIG_HOME") or "")
+    return given if given.is_absolute() else home / ".config"

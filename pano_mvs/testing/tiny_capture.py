@@ -1,0 +1,283 @@
+"""A tiny synthetic capture, with everything that the stages before might have made of it: what stages are tested on."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.geometry import Rigid3, pixel_from_ray, roll_panorama
+from pano_mvs.scene import (
+    Features,
+    FilePart,
+    GlobalDescriptor,
+    Pairs,
+    Panorama,
+    PointCloud,
+    Pose,
+    Poses,
+    RangeMap,
+    Record,
+    Scores,
+    TwoView,
+    Views,
+)
+from pano_mvs.scene.image_file import write_png
+from pano_mvs.testing.room import capture_poses, default_room, range_along, render
+
+Frozen = TypeVar("Frozen", bound=Record)
+
+_POINTS = 240
+_NOISE_RAD = 2e-4
+_METRES_PER_DEGREE = 111_320.0
+_folders: list[TemporaryDirectory[str]] = []
+
+
+@dataclass(frozen=True)
+class Variant:
+    """How a tiny capture is.
+
+    Attributes:
+        size_hw: (height, width) of the pictures.
+        rolled: columns by which all pictures are rolled to the right, and the cameras turned with them.
+        masked: whether the tripod and a patch over the seam are masked in every picture.
+        cropped: whether the files lack the uppermost and lowest eighth of the sphere.
+        mixed: whether every second picture has half as many rows.
+        blank: whether there is nothing to see: all is masked, and no stage before found anything.
+    """
+
+    size_hw: tuple[int, int] = (32, 64)
+    rolled: int = 0
+    masked: bool = False
+    cropped: bool = False
+    mixed: bool = False
+    blank: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class TinyCapture:
+    """Some views of a synthetic room.
+
+    Attributes:
+        folder: with images/ and truth/poses.json.
+        variant: how it is.
+        names: of the pictures.
+        poses: cam_from_world of each.
+        pictures: as the files hold them where they are not cropped.
+        ranges: the true ones, (H, W) float32.
+    """
+
+    folder: Path
+    variant: Variant
+    names: tuple[str, ...]
+    poses: tuple[Rigid3, ...]
+    pictures: tuple[NDArray[np.uint8], ...]
+    ranges: tuple[NDArray[np.float32], ...]
+
+    @functools.cached_property
+    def images(self) -> dict[str, Panorama]:
+        """The panoramas, with GPS positions and sensors' directions."""
+        return {name: self._panorama(idx) for idx, name in enumerate(self.names)}
+
+    @functools.cached_property
+    def items(self) -> Mapping[type[Record], Mapping[Any, Record]]:
+        """Kind to the item of each picture, or of each pair."""
+        pairs = self.wholes[Pairs]
+        assert isinstance(pairs, Pairs)
+        return {
+            Panorama: self.images,
+            Pose: {name: Pose(pose) for name, pose in zip(self.names, self.poses, strict=True)},
+            Features: {name: self._features(idx) for idx, name in enumerate(self.names)},
+            GlobalDescriptor: {name: self._descriptor(idx) for idx, name in enumerate(self.names)},
+            RangeMap: {name: self._range_map(idx) for idx, name in enumerate(self.names)},
+            TwoView: {pair: self._two_view(*pair) for pair in pairs.pairs},
+        }
+
+    @functools.cached_property
+    def wholes(self) -> Mapping[type[Record], Record]:
+        """Kind to the one value of it."""
+        count = len(self.names)
+        pairs = tuple((self.names[i], self.names[j]) for i in range(count) for j in range(i + 1, count))
+        others = {name: tuple(other for other in self.names if other != name) for name in self.names}
+        return {
+            Pairs: Pairs(pairs),
+            Views: Views(others),
+            Poses: self._poses_with_points(),
+            PointCloud: self._cloud(),
+            Scores: Scores({"registered": 1.0}, {}),
+        }
+
+    @functools.cached_property
+    def points_in_world(self) -> NDArray[np.float64]:
+        """Points on the room's surfaces, (P, 3); each is taken to be seen from everywhere."""
+        rng = np.random.default_rng(5)
+        rays = rng.normal(size=(_POINTS, 3))
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        origin = self.poses[0].center
+        return np.asarray(origin + rays * range_along(default_room(), origin, rays)[:, None])
+
+    def bearings(self, idx: int) -> NDArray[np.float64]:
+        """Return the noisy unit rays, (P, 3), along which a camera sees the points."""
+        rays = self.poses[idx].apply(self.points_in_world)
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        noisy = rays + np.random.default_rng([6, idx]).normal(0, _NOISE_RAD, rays.shape)
+        return np.asarray(noisy / np.linalg.norm(noisy, axis=1, keepdims=True))
+
+    def _panorama(self, idx: int) -> Panorama:
+        height, width = self.pictures[idx].shape[:2]
+        images, mask = self.folder / "images", self.folder / f"mask{idx}.png"
+        center = self.poses[idx].center
+        up = self.poses[idx].rotation @ (0.0, -1.0, 0.0)
+        return Panorama(
+            image=FilePart(images / self.names[idx], external=True),
+            size_hw=(height, width),
+            source_size_hw=(height, width),
+            crop_ltwh=(0, height // 8, width, height - 2 * (height // 8)) if self.variant.cropped else None,
+            mask_file=FilePart(mask, external=True) if mask.exists() else None,
+            up_in_cam=(float(up[0]), float(up[1]), float(up[2])),
+            position_lla=(center[2] / _METRES_PER_DEGREE, center[0] / _METRES_PER_DEGREE, 50.0 - center[1]),
+        )
+
+    def _features(self, idx: int) -> Features:
+        height, width = self.pictures[idx].shape[:2]
+        count = 0 if self.variant.blank else _POINTS
+        bearings = self.bearings(idx)[:count]
+        pixels = np.floor(pixel_from_ray(bearings, (height, width))).astype(int)
+        descriptors = np.random.default_rng(7).normal(size=(_POINTS, 32))[:count]
+        return frozen(
+            Features(
+                bearings=bearings,
+                descriptors=descriptors.astype(np.float32),
+                sizes_rad=np.full(count, 0.05, np.float32),
+                scores=np.linspace(1, 0.1, _POINTS, dtype=np.float32)[:count],
+                colors_rgb=self.pictures[idx][pixels[:, 1] % height, pixels[:, 0] % width],
+                metric="l2",
+                size_hw=(height, width),
+            )
+        )
+
+    def _descriptor(self, idx: int) -> GlobalDescriptor:
+        vector = np.random.default_rng([8, idx]).normal(size=16).astype(np.float32)
+        return frozen(GlobalDescriptor(np.zeros_like(vector) if self.variant.blank else vector))
+
+    def _range_map(self, idx: int) -> RangeMap:
+        """Return the true ranges with noise, a hole and some outliers; nothing where the picture is masked."""
+        height, width = self.ranges[idx].shape
+        draws = np.roll(np.random.default_rng([9, idx]).random((2, height, width)), self.variant.rolled, axis=2)
+        ranges = self.ranges[idx] * (1 + 0.004 * (draws[0] - 0.5)).astype(np.float32)
+        ranges = np.where(draws[1] < 0.02, 0.6 * ranges, ranges)
+        hole = np.zeros((height, width), np.bool_)
+        hole[height // 3 : height // 2, width // 8 : width // 4] = True
+        keep = ~np.roll(hole, self.variant.rolled, axis=1) & self.images[self.names[idx]].load_mask()
+        confidence = np.where(draws[1] < 0.3, np.uint8(90), np.uint8(200))
+        return frozen(
+            RangeMap(np.where(keep, ranges, np.nan).astype(np.float32), np.where(keep, confidence, 0).astype(np.uint8))
+        )
+
+    def _two_view(self, first: str, second: str) -> TwoView:
+        if self.variant.blank:
+            return frozen(TwoView.failed("nothing to see"))
+        one, other = self.names.index(first), self.names.index(second)
+        relative = self.poses[other] @ self.poses[one].inverse()
+        same = np.arange(_POINTS, dtype=np.int32)
+        return frozen(
+            TwoView(
+                matches_idx=np.stack([same, same], axis=-1),
+                rotation=relative.rotation,
+                direction=relative.translation / np.linalg.norm(relative.translation),
+                residuals_rad=np.full(_POINTS, _NOISE_RAD, np.float32),
+                geometry="general",
+                candidates=_POINTS,
+                parallax_deg=10.0,
+                rotation_std_deg=0.02,
+                direction_std_deg=0.05,
+            )
+        )
+
+    def _poses_with_points(self) -> Poses:
+        poses = dict(zip(self.names, self.poses, strict=True))
+        bare = Poses.without_points(poses, frame="the room's", scale="the room's", metric=False)
+        if self.variant.blank:
+            return frozen(bare)
+        count = len(self.names)
+        return frozen(
+            Poses(
+                names=bare.names,
+                rotations=bare.rotations,
+                translations=bare.translations,
+                points_in_world=self.points_in_world,
+                point_colors_rgb=np.full((_POINTS, 3), 128, np.uint8),
+                point_errors_rad=np.full(_POINTS, _NOISE_RAD, np.float32),
+                track_point_idx=np.tile(np.arange(_POINTS, dtype=np.int32), count),
+                track_image_idx=np.repeat(np.arange(count, dtype=np.int32), _POINTS),
+                track_bearings=np.concatenate([self.bearings(idx) for idx in range(count)]),
+                rejected={},
+            )
+        )
+
+    def _cloud(self) -> PointCloud:
+        points = self.points_in_world[: 0 if self.variant.blank else None]
+        normals = -points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-9)
+        counts = np.full(len(points), 2, np.uint8)
+        colors = np.full((len(points), 3), 128, np.uint8)
+        return frozen(PointCloud(points.astype(np.float32), normals.astype(np.float32), colors, counts))
+
+
+def frozen(record: Frozen) -> Frozen:
+    """Return a record whose arrays cannot be written to, as the store hands them out."""
+    for value in vars(record).values():
+        if isinstance(value, np.ndarray):
+            value.flags.writeable = False
+    return record
+
+
+@functools.cache
+def tiny_capture(variant: Variant = Variant()) -> TinyCapture:
+    """Return the capture of that variant; it is rendered once, into a folder that goes with the process."""
+    _folders.append(TemporaryDirectory(prefix="pano-mvs-tiny-"))
+    folder = Path(_folders[-1].name)
+    (folder / "images").mkdir()
+    (folder / "truth").mkdir()
+    names, poses, pictures, ranges = [], [], [], []
+    for idx, straight in enumerate(capture_poses(4, spread=0.4)):
+        size_hw = _half(variant.size_hw) if variant.mixed and idx % 2 else variant.size_hw
+        picture, true_range = render(default_room(), straight, size_hw, supersample=1)
+        columns = variant.rolled * size_hw[1] // variant.size_hw[1]
+        picture, turn = roll_panorama(picture, columns)
+        names.append(f"{idx:03d}.png")
+        poses.append(Rigid3(turn, np.zeros(3)) @ straight)
+        pictures.append(picture)
+        ranges.append(np.roll(true_range, columns, axis=1))
+        _write_picture(folder, variant, idx, picture)
+    views = [
+        {"image": f"images/{name}", "R": pose.rotation.tolist(), "t": pose.translation.tolist()}
+        for name, pose in zip(names, poses, strict=True)
+    ]
+    size = {"width": variant.size_hw[1], "height": variant.size_hw[0], "metric": True}
+    (folder / "truth" / "poses.json").write_text(json.dumps(size | {"views": views}), encoding="utf-8")
+    depth = {name.removesuffix(".png"): values for name, values in zip(names, ranges, strict=True)}
+    np.savez(folder / "truth" / "depth.npz", **depth)  # type: ignore[arg-type]  # names are ours
+    return TinyCapture(folder, variant, tuple(names), tuple(poses), tuple(pictures), tuple(ranges))
+
+
+def _write_picture(folder: Path, variant: Variant, idx: int, picture: NDArray[np.uint8]) -> None:
+    height, width = picture.shape[:2]
+    edge = height // 8 if variant.cropped else 0
+    write_png(folder / "images" / f"{idx:03d}.png", picture[edge : height - edge])
+    if variant.masked or variant.blank:
+        keep = np.full((height, width), 0 if variant.blank else 255, np.uint8)
+        keep[-height // 5 :] = 0
+        keep[height // 4 : height // 2, : width // 10] = 0
+        keep[height // 4 : height // 2, -width // 10 :] = 0
+        write_png(folder / f"mask{idx}.png", np.roll(keep, variant.rolled, axis=1))
+
+
+def _half(size_hw: tuple[int, int]) -> tuple[int, int]:
+    return max(4, size_hw[0] // 2), max(8, size_hw[0] // 2 * 2)

@@ -1,0 +1,31 @@
+"""Every built-in stage keeps the contract that strangers' stages are held to."""
+
+from __future__ import annotations
+
+import pytest
+
+from pano_mvs.engine.registry import Registry
+from pano_mvs.testing.conformance import Law, stage_laws
+
+SETTINGS = {
+    "poses.from_model": {"path": "{capture}/truth/poses.json"},
+    "poses.extend": {"path": "{capture}/truth/poses.json"},
+    "poses.scale": {"factor": 2.0},
+}
+SIZES_HW = {"poses.colmap_sift": (96, 192)}
+
+
+def laws() -> list[Law]:
+    stages = Registry.installed().stages
+    builtin = [name for name in sorted(stages) if stages[name].function.__module__.startswith("pano_mvs.stages.")]
+    assert len(builtin) > 30
+    return [
+        law
+        for name in builtin
+        for law in stage_laws(stages[name], settings=SETTINGS.get(name), size_hw=SIZES_HW.get(name, (32, 64)))
+    ]
+
+
+@pytest.mark.parametrize("law", laws(), ids=str)
+def test_keeps_the_contract(law: Law) -> None:
+    law.check()
