@@ -24,6 +24,18 @@ RefreshOption = Annotated[
     Optional[list[str]],  # noqa: UP045
     typer.Option("--refresh", metavar="STAGE[:ITEM]", help="Compute it again though it is cached."),
 ]
+MinFreeOption = Annotated[
+    str,
+    typer.Option(
+        "--min-free",
+        metavar="SIZE",
+        help="Room on the cache's disk below which nothing is begun, such as 5GB; 200MB.",
+        show_default=False,
+    ),
+]
+DurableOption = Annotated[
+    bool, typer.Option("--durable", help="Flush all results to the disk at once, for machines that lose power.")
+]
 AcceptOption = Annotated[
     bool, typer.Option("--accept-code", help="Keep what was computed before a plugin's code changed.")
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import sys
 import threading
@@ -30,12 +31,14 @@ from pano_mvs.engine.blobs import DamagedBlobError
 from pano_mvs.engine.events import Observer, RunResult
 from pano_mvs.engine.executors.choose import make_executor
 from pano_mvs.engine.executors.protocol import Executor
+from pano_mvs.engine.memory import bytes_from_size
 from pano_mvs.engine.params import files_of
 from pano_mvs.engine.run import Run
-from pano_mvs.engine.store import Store
+from pano_mvs.engine.store import LEAST_FREE_BYTES, Store
 from pano_mvs.report.page import write_report
 
 INTERRUPTED = 130
+MIN_FREE_VARIABLE = "PANO_MVS_MIN_FREE"
 _SHOWN_FAILURES = 20
 
 
@@ -49,6 +52,9 @@ class Execution:
         threads: of each worker; 0 for an equal share of the cores.
         scheduler: address of a dask scheduler.
         as_json: whether to write events for programs to the standard output, instead of lines for people.
+        min_free: room on the store's disk below which no unit is begun, such as `5GB`; empty for what
+            $PANO_MVS_MIN_FREE says, else 200 MB.
+        durable: whether to flush every result to the disk before going on.
     """
 
     executor: str = ""
@@ -56,12 +62,14 @@ class Execution:
     threads: int = 0
     scheduler: str = ""
     as_json: bool = False
+    min_free: str = ""
+    durable: bool = False
 
 
 def run_workflow(session: Session, execution: Execution = Execution()) -> int:
     """Run a workflow, write run.json and report.html, print what came out, and return the exit code."""
     _check_output(session)
-    store = Store(session.store_root)
+    store = Store(session.store_root, durable=execution.durable, least_free_bytes=least_free_bytes(execution.min_free))
     executor = make_executor(store, execution.executor, workers=execution.workers, threads=execution.threads,
                              scheduler=execution.scheduler)  # fmt: skip
     stream = apart(sys.stdout)
@@ -74,6 +82,19 @@ def run_workflow(session: Session, execution: Execution = Execution()) -> int:
         executor.close()
         if stream is not sys.stdout:
             stream.close()
+
+
+def least_free_bytes(size: str = "") -> int:
+    """Return the bytes of `--min-free`, else of $PANO_MVS_MIN_FREE, else the default.
+
+    Raises:
+        UsageError: if it is no size.
+    """
+    size = size or os.environ.get(MIN_FREE_VARIABLE, "")
+    try:
+        return bytes_from_size(size) if size else LEAST_FREE_BYTES
+    except ValueError as error:
+        raise UsageError(f"--min-free (or ${MIN_FREE_VARIABLE}) {size!r}: {error}") from error
 
 
 def _run_for_people(session: Session, store: Store, executor: Executor, console: Console) -> int:

@@ -1,0 +1,254 @@
+"""Kill runs at random and see that nothing is lost: `python -m tests.stress.kills [N] [options]`.
+
+Two runs go on at the same time on one store, each into a folder of its own. N times, at a random moment, one of them
+gets a SIGKILL, or one of its worker processes does; a main process that was killed is started again with the same
+command, and so is one that ended because a unit's worker was killed three times. Most moments are some units after the kill
+before, so that every stage is met; the others are random times, so that starting and ending are met too. Whenever both
+have come to their end, the files that they delivered must be, byte for byte, those of a clean run in a store of its
+own, `cache verify` must find nothing damaged, and nothing half written may lie about. Then both start anew in an empty
+store, until N have been killed.
+
+Without `--workflow`, a toy workflow whose stages take some hundredths of a second each. With it, any workflow; its
+deliverables must be the same from run to run, as they are to be anyway.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from tests.stress.captures import SLEEP_VARIABLE, deliverables, write_toy
+
+_LOOK_S = 0.02
+_LONGEST_S = 600.0
+_FAILED_ITEMS = 3
+_MOST_UNITS = 12
+_SHARE_OF_TIMES = 0.25
+
+
+class Moments:
+    """When to kill: so many units after the kill before, or after a time; ever more seldom, so that runs end."""
+
+    def __init__(self, rng: random.Random, typical_s: float) -> None:
+        self._rng = rng
+        self._longest_s = typical_s
+        self._most_units = float(_MOST_UNITS)
+        self.draw(0)
+
+    def draw(self, records: int) -> None:
+        """Choose the next moment."""
+        by_time = self._rng.random() < _SHARE_OF_TIMES
+        self._units = records + self._rng.uniform(1, self._most_units)
+        self._time = time.monotonic() + (self._rng.uniform(0, 1) if by_time else 3) * self._longest_s
+        self._longest_s *= 1.02
+        self._most_units *= 1.05
+
+    def has_come(self, records: int) -> bool:
+        """Return whether it is time."""
+        return records >= self._units or time.monotonic() > self._time
+
+
+@dataclass
+class Setting:
+    """What is run, and how."""
+
+    command: list[str]
+    environment: dict[str, str]
+    folder: Path
+
+
+@dataclass
+class Killed:
+    """What was killed, and what came of it."""
+
+    mains: int = 0
+    workers: int = 0
+    rounds: int = 0
+    wrong: list[str] = field(default_factory=list)
+    at: Counter[int] = field(default_factory=Counter)
+    units: int = 0
+
+    @property
+    def total(self) -> int:
+        return self.mains + self.workers
+
+
+class Runner:
+    """One of the runs: the same command again and again, until it ends of itself."""
+
+    def __init__(self, setting: Setting, name: str, store: str) -> None:
+        self._setting = setting
+        self._store = setting.folder / store
+        self.out = setting.folder / name
+        self.done = False
+        self.process = self._start()
+
+    def _start(self) -> subprocess.Popen[str]:
+        command = [*self._setting.command, "--cache", str(self._store), "--out", str(self.out)]
+        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+                                env=self._setting.environment, cwd=self._setting.folder)  # fmt: skip
+
+    def look(self) -> str:
+        """Start again if it was killed; return what is wrong, if anything."""
+        code = self.process.poll()
+        if code is None or self.done:
+            return ""
+        said, _ = self.process.communicate()
+        if code == -signal.SIGKILL:
+            self.process = self._start()
+            return ""
+        if code == _FAILED_ITEMS and "killed by SIGKILL" in said:
+            self.process = self._start()
+            return ""
+        self.done = True
+        return "" if code == 0 else f"{self.out.name} ended with exit code {code}:\n{said}"
+
+    def kill(self, rng: random.Random, killed: Killed, records: int) -> None:
+        """Kill the main process or one of its workers, whichever comes."""
+        victim = rng.choice([self.process.pid, *children(self.process.pid)])
+        try:
+            os.kill(victim, signal.SIGKILL)
+        except ProcessLookupError:
+            return  # it has just ended
+        if victim == self.process.pid:
+            self.process.wait()
+            killed.mains += 1
+        else:
+            killed.workers += 1
+        killed.at[records] += 1
+
+    def end(self) -> None:
+        """Kill it for good."""
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.communicate()
+
+
+def children(process: int) -> list[int]:
+    """Return the child processes of a process (Linux; elsewhere none are found, and main processes alone killed)."""
+    found: list[int] = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[1]) == process and fields[0] != "Z":
+            found.append(int(stat.parent.name))
+    return found
+
+
+def kill_runs(setting: Setting, count: int, rng: random.Random) -> Killed:
+    """Kill until so many have been killed, and both runs have come to their end after that."""
+    killed = Killed()
+    started = time.monotonic()
+    clean = Runner(setting, "clean", "clean-store")
+    while not clean.done:
+        time.sleep(_LOOK_S)
+        wrong = clean.look()
+        if wrong:
+            killed.wrong.append(wrong)
+            return killed
+    typical_s = time.monotonic() - started
+    expected = deliverables(clean.out)
+    killed.units = records_in(setting.folder / "clean-store")
+    while killed.total < count and not killed.wrong:
+        killed.rounds += 1
+        _one_round(setting, killed, count, rng, typical_s=typical_s, expected=expected)
+        print(f"round {killed.rounds}: {killed.total} of {count} killed, "
+              f"{killed.wrong[-1] if killed.wrong else 'all as it should be'}", flush=True)  # fmt: skip
+    return killed
+
+
+def _one_round(
+    setting: Setting,
+    killed: Killed,
+    count: int,
+    rng: random.Random,
+    *,
+    typical_s: float,
+    expected: dict[str, bytes],
+) -> None:
+    """Start two runs in an empty store and kill them, ever more seldom, until both have come to their end."""
+    for name in ("a", "b", "store"):
+        shutil.rmtree(setting.folder / name, ignore_errors=True)
+    runners = [Runner(setting, name, "store") for name in ("a", "b")]
+    moments, deadline = Moments(rng, typical_s), time.monotonic() + _LONGEST_S
+    try:
+        while not all(runner.done for runner in runners):
+            time.sleep(_LOOK_S)
+            killed.wrong.extend(filter(None, [runner.look() for runner in runners]))
+            if killed.wrong or time.monotonic() > deadline:
+                killed.wrong.append("it does not come to an end") if not killed.wrong else None
+                return
+            living, records = [runner for runner in runners if not runner.done], records_in(setting.folder / "store")
+            if living and killed.total < count and moments.has_come(records):
+                rng.choice(living).kill(rng, killed, records)
+                moments.draw(records)
+    finally:
+        for runner in runners:
+            runner.end()
+    killed.wrong.extend(_faults(setting, runners, expected))
+
+
+def records_in(store: Path) -> int:
+    """Return how many units are done."""
+    return sum(1 for _ in (store / "records").glob("*/*.json"))
+
+
+def _faults(setting: Setting, runners: list[Runner], expected: dict[str, bytes]) -> list[str]:
+    faults: list[str] = []
+    for runner in runners:
+        found = deliverables(runner.out)
+        names = [name for name in {*found, *expected} if found.get(name) != expected.get(name)]
+        if names:
+            faults.append(f"{runner.out.name} differs from a clean run in {', '.join(sorted(names))}")
+    store = setting.folder / "store"
+    verified = subprocess.run([sys.executable, "-m", "pano_mvs", "cache", "verify", "--cache", str(store)],
+                              capture_output=True, text=True, env=setting.environment, check=False)  # fmt: skip
+    if verified.returncode or ", 0 damaged" not in " ".join(verified.stdout.split()):
+        faults.append(f"cache verify: {verified.stdout}{verified.stderr}")
+    if "not of the cache" in verified.stdout:
+        faults.append(f"left in the store: {verified.stdout}")
+    return faults
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Kill, print what came of it, and return the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m tests.stress.kills", description=__doc__.splitlines()[0])
+    parser.add_argument("count", nargs="?", type=int, default=200, help="how many are killed")
+    parser.add_argument("--workflow", help="a workflow file or a preset; by default a toy")
+    parser.add_argument("--executor", default="processes", help="serial, processes or dask")
+    parser.add_argument("--workers", type=int, default=2, help="of processes and dask")
+    parser.add_argument("--seed", type=int, default=0, help="of the moments")
+    options, more = parser.parse_known_args(arguments)  # what is not known here is for `pano-mvs run`
+    with tempfile.TemporaryDirectory(prefix="pano-mvs-kills-") as name:
+        folder = Path(name)
+        workflow = str(Path(options.workflow).absolute()) if options.workflow else str(write_toy(folder))
+        if options.workflow and not Path(options.workflow).is_file():
+            workflow = options.workflow  # a preset
+        workers = [] if options.executor == "serial" else ["--workers", str(options.workers)]
+        command = [sys.executable, "-m", "pano_mvs", "run", workflow, "--executor", options.executor, *workers, *more]
+        environment = os.environ | {SLEEP_VARIABLE: os.environ.get(SLEEP_VARIABLE, "0.05"), "COLUMNS": "400"}
+        started = time.monotonic()
+        killed = kill_runs(Setting(command, environment, folder), options.count, random.Random(options.seed))
+    quarters = [sum(n for done, n in killed.at.items() if quarter == min(3, 4 * done // max(1, killed.units)))
+                for quarter in range(4)]  # fmt: skip
+    print(f"{killed.total} killed ({killed.mains} main processes, {killed.workers} workers; {quarters} in the quarters "
+          f"of {killed.units} units) in {killed.rounds} rounds of two runs on one store, "
+          f"{time.monotonic() - started:.0f} s")  # fmt: skip
+    print("FAILED: " + "\n".join(killed.wrong) if killed.wrong else "deliverables as of a clean run, 0 bad records")
+    return 1 if killed.wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
