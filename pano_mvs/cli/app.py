@@ -23,7 +23,9 @@ from pano_mvs.cli.guard import guarded
 from pano_mvs.cli.options import (
     AcceptOption,
     CacheOption,
+    DurableOption,
     ImagesOption,
+    MinFreeOption,
     OnlyOption,
     OutOption,
     RefreshOption,
@@ -90,6 +92,8 @@ def run(
     accept_code: AcceptOption = False,
     keep_going: Annotated[bool, typer.Option("-k", "--keep-going", help="Go on after failures even where a stage "
                                              "says on_error: stop.")] = False,
+    min_free: MinFreeOption = "",
+    durable: DurableOption = False,
 ) -> None:  # fmt: skip
     """Run a workflow; the same command resumes it."""
     from pano_mvs.cli.run_command import Execution, run_workflow
@@ -98,7 +102,8 @@ def run(
 
     demands = Demands(tuple(until or ()), tuple(only or ()), tuple(refresh or ()), accept_code, keep_going)
     session = open_session(workflow, overrides=overrides or [], images=images, cache=cache, out=out, demands=demands)
-    raise typer.Exit(run_workflow(session, Execution(executor, workers, threads, scheduler, as_json)))
+    execution = Execution(executor, workers, threads, scheduler, as_json, min_free, durable)
+    raise typer.Exit(run_workflow(session, execution))
 
 
 @app.command()

@@ -2,11 +2,11 @@
 
 Two runs go on at the same time on one store, each into a folder of its own. N times, at a random moment, one of them
 gets a SIGKILL, or one of its worker processes does; a main process that was killed is started again with the same
-command, and so is one that ended because a unit's worker was killed three times. Most moments are some units after the kill
-before, so that every stage is met; the others are random times, so that starting and ending are met too. Whenever both
-have come to their end, the files that they delivered must be, byte for byte, those of a clean run in a store of its
-own, `cache verify` must find nothing damaged, and nothing half written may lie about. Then both start anew in an empty
-store, until N have been killed.
+command, and so is one that ended because a unit's worker was killed three times. Most moments are some units after
+the kill before, so that every stage is met; the others are random times, so that starting and ending are met too.
+Whenever both have come to their end, the files that they delivered must be, byte for byte, those of a clean run in a
+store of its own, `cache verify` must find nothing damaged, and nothing half written may lie about. Then both start anew
+in an empty store, until N have been killed.
 
 Without `--workflow`, a toy workflow whose stages take some hundredths of a second each. With it, any workflow; its
 deliverables must be the same from run to run, as they are to be anyway.
