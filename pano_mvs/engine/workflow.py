@@ -130,6 +130,19 @@ class WorkflowReader:
         shown = ([f"images.path={images}"] if images else []) + list(overrides)
         return Workflow(name, path, _all_texts(layers), stages, tuple(shown), self.plugins)
 
+    def inherited(self, text: str, path: Path) -> dict[str, Located]:
+        """Return the stages that a file has from those that it extends, and load the plugins of all of them.
+
+        Mistakes are passed over: this serves an editor in which the file is being written.
+
+        Raises:
+            WorkflowError: if it is no YAML.
+        """
+        layers = self._layers(text, path)
+        for layer in layers:
+            self._load_plugins(layer.root.value.get("plugins"))
+        return merge_stages(layers[:-1], self.problems)
+
     def _layers(self, text: str, path: Path | None) -> list[Layer]:
         reader = LayerReader(self.problems, self.presets)
         reader.read(text, self.shown_as, self.base, chain=(path.resolve(),) if path is not None else ())

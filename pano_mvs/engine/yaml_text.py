@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from ruamel.yaml import YAML
+from ruamel.yaml.composer import Composer
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
-from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from pano_mvs.core.errors import WorkflowError
@@ -110,17 +110,15 @@ def parse_yaml(text: str, name: str) -> Located:
         WorkflowError: for every mistake that can be seen, as `name:line:column: message`.
     """
     try:
-        root = YAML(typ="safe", pure=True).compose(text)
+        yaml = YAML(typ="safe", pure=True)
+        yaml.Composer = _Composer
+        root = yaml.compose(text)
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place = f"{name}:{mark.line + 1}:{mark.column + 1}" if mark else name
         raise WorkflowError([f"{place}: {_shortened(error.problem or error.context or 'not valid YAML')}"]) from None
     except YAMLError as error:
         raise WorkflowError([f"{name}: {_unreadable(text) or 'not valid YAML: ' + _shortened(str(error))}"]) from None
-    except RecursionError:
-        raise WorkflowError(
-            [f"{_depth_place(text, name)}: nested too deeply; {MAX_DEPTH} levels are allowed"]
-        ) from None
     except (ValueError, IndexError, AssertionError, KeyError, TypeError, AttributeError) as error:
         # ruamel.yaml's own slips over malformed directives, tags and escapes.
         raise WorkflowError([f"{name}: not valid YAML ({type(error).__name__}: {_shortened(str(error))})"]) from None
@@ -132,14 +130,27 @@ def parse_yaml(text: str, name: str) -> Located:
     return located
 
 
-def _depth_place(text: str, name: str) -> str:
-    """Return where a text, of which it is known that it goes too deep, does so."""
-    depth = 0
-    for event in YAML(typ="safe", pure=True).parse(text):
-        depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
-        if depth > MAX_DEPTH:
-            return f"{name}:{event.start_mark.line + 1}:{event.start_mark.column + 1}"
-    return name
+class _Composer(Composer):
+    """ruamel's composer, which calls itself for every level, with an end to it."""
+
+    def __init__(self, loader: Any = None) -> None:
+        super().__init__(loader)
+        self.warn_double_anchors = False
+        self._level = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """Return the next node.
+
+        Raises:
+            MarkedYAMLError: if it lies too deep.
+        """
+        self._level += 1
+        if self._level > MAX_DEPTH + 1:
+            mark = self.parser.peek_event().start_mark
+            raise MarkedYAMLError(problem=f"nested too deeply; {MAX_DEPTH} levels are allowed", problem_mark=mark)
+        node = super().compose_node(parent, index)
+        self._level -= 1
+        return node
 
 
 def _shortened(text: str) -> str:
