@@ -9,7 +9,16 @@ from pano_mvs.algorithms.sweep.kernels_band import store_row
 from pano_mvs.algorithms.sweep.kernels_combine import combine_row
 from pano_mvs.algorithms.sweep.kernels_cost import box_rows, census_row, difference_row
 from pano_mvs.algorithms.sweep.kernels_sgm import sweep_row, sweep_strip
-from pano_mvs.algorithms.sweep.kernels_winner import AFTER, BEFORE, BEST, RIVAL, STATES, update_winner, winners_of_rows
+from pano_mvs.algorithms.sweep.kernels_winner import (
+    AFTER,
+    BEFORE,
+    BEST,
+    RIVAL,
+    STATES,
+    update_plain,
+    update_winners,
+    winners_of_rows,
+)
 from pano_mvs.algorithms.sweep.numpy_backend import path_step, winners_of
 from pano_mvs.algorithms.sweep.penalties import DIRECTIONS
 from pano_mvs.algorithms.sweep.windows import column_offsets
@@ -80,22 +89,34 @@ def test_sources_combine_to_the_mean_of_those_that_count(sources, share, most, a
     np.testing.assert_allclose(result, expected, rtol=1e-5)
 
 
-def test_winners_of_a_stream_equal_those_of_the_volume():
-    rng = np.random.default_rng(8)
-    volume = rng.integers(0, 12, (3, 9, 500)).astype(np.uint16)  # few levels: ties, neighbours, both ends
+@pytest.mark.parametrize("kinds", [(np.float32, np.int32), (np.uint16, np.uint16)])
+@pytest.mark.parametrize("at_once", [1, 4, 9])
+def test_winners_of_a_stream_equal_those_of_the_volume(kinds, at_once):
+    volume = np.random.default_rng(8).integers(0, 12, (3, 9, 500)).astype(kinds[0])  # few levels: ties, both ends
     expected = winners_of(volume.astype(np.float64))
-    streamed = np.full((STATES, 3, 500), np.inf, np.float32), np.zeros((3, 500), np.int32)
-    for d in range(9):
-        for row in range(3):
-            update_winner(volume[row, d].astype(np.float32), d, streamed[0], row, streamed[1])
-    stored = np.full((STATES, 3, 500), np.inf, np.float32), np.zeros((3, 500), np.int32)
-    winners_of_rows(volume, 0, *stored)
-    for state, plane in (streamed, stored):
-        np.testing.assert_array_equal(plane, expected.plane)
-        np.testing.assert_array_equal(state[BEST], expected.cost)
-        np.testing.assert_array_equal(np.where(plane == 0, state[BEST], state[BEFORE]), expected.before)
-        np.testing.assert_array_equal(state[AFTER], expected.after)
-        np.testing.assert_array_equal(state[RIVAL], expected.rival)
+    largest = np.inf if kinds[0] is np.float32 else 65535
+    state, plane = np.full((STATES, 3, 500), largest, kinds[0]), np.zeros((3, 500), kinds[1])
+    plain = state.copy(), plane.copy()
+    for row in range(3):
+        for d in range(0, 9, at_once):
+            update_winners(volume[row], d, min(at_once, 9 - d), d, state, row, plane)
+        update_plain(volume[row], 0, 9, 0, plain[0], row, plain[1], 0)
+    np.testing.assert_array_equal(state, plain[0])
+    np.testing.assert_array_equal(plane, plain[1])
+    np.testing.assert_array_equal(plane, expected.plane)
+    np.testing.assert_array_equal(state[BEST], expected.cost)
+    np.testing.assert_array_equal(np.where(plane == 0, state[BEST], state[BEFORE]), expected.before)
+    np.testing.assert_array_equal(state[AFTER], expected.after)
+    np.testing.assert_array_equal(np.where(state[RIVAL] == largest, np.inf, state[RIVAL]), expected.rival)
+
+
+def test_winners_of_rows_are_those_of_the_volume():
+    volume = np.random.default_rng(9).integers(0, 60000, (5, 21, 45)).astype(np.uint16)
+    expected = winners_of(volume.astype(np.float64))
+    state, plane = np.full((STATES, 2, 45), 65535, np.uint16), np.zeros((2, 45), np.uint16)
+    winners_of_rows(volume, 3, state, plane)
+    np.testing.assert_array_equal(plane, expected.plane[3:])
+    np.testing.assert_array_equal(state[RIVAL], expected.rival[3:])
 
 
 def test_costs_are_stored_rounded_and_saturated():

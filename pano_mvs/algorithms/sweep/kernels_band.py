@@ -19,7 +19,7 @@ from pano_mvs.algorithms.sweep.kernels_gradient import census_gradient_row, sad_
 from pano_mvs.algorithms.sweep.kernels_lookup import warp_band
 from pano_mvs.algorithms.sweep.kernels_project import knot_rows
 from pano_mvs.algorithms.sweep.kernels_warp import wrap_row
-from pano_mvs.algorithms.sweep.kernels_winner import update_winner
+from pano_mvs.algorithms.sweep.kernels_winner import PLANES_AT_ONCE, update_winners
 from pano_mvs.algorithms.sweep.kernels_zncc import zncc_rows
 
 _F = np.float32
@@ -127,7 +127,7 @@ def sweep_band(  # type: ignore[no-untyped-def]
         scale: float32 from mean costs to the volume's.
         neutral: float32 mean cost where no source votes.
         volume: (H, D, W) uint8, written; empty if the winner is wanted at once.
-        state: (STATES, rows, W) float32, infinite; see `update_winner`.
+        state: (STATES, rows, W) float32, infinite; see `update_plain`.
         planes: (rows, W) int32, written if the volume is empty.
     """
     rows, width = planes.shape
@@ -139,7 +139,7 @@ def sweep_band(  # type: ignore[no-untyped-def]
     pixel_costs = np.empty((rows + 2 * box_radius, width + 2 * pad), np.uint16)
     scratch = np.empty((2, width + 2 * pad), np.int32)
     costs = np.empty((sources, rows, width), np.float32)
-    combined = np.empty(width, np.float32)
+    combined = np.empty((rows, PLANES_AT_ONCE, width), np.float32)
     for d in range(len(ranges)):
         for s in range(sources):
             warp_band(
@@ -155,9 +155,10 @@ def sweep_band(  # type: ignore[no-untyped-def]
                     for i in range(width):
                         if votes[j + halo, i] == 0:
                             costs[s, j, i] = np.inf
+        held = d % PLANES_AT_ONCE
         for j in range(rows):
-            combine_row(costs, j, weights, first + j, share, most, len(valid) == 0, neutral, combined)
+            combine_row(costs, j, weights, first + j, share, most, len(valid) == 0, neutral, combined[j, held])
             if len(volume):
-                store_row(combined, scale, volume[first + j, d])
-            else:
-                update_winner(combined, d, state, j, planes)
+                store_row(combined[j, held], scale, volume[first + j, d])
+            elif held == PLANES_AT_ONCE - 1 or d == len(ranges) - 1:
+                update_winners(combined[j], 0, held + 1, d - held, state, j, planes)

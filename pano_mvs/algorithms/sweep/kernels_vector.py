@@ -35,6 +35,8 @@ HAS_VECTOR: Final = _LANES > 0 and not numba.config.DISABLE_JIT
 PIXELS: Final = 4 * max(_LANES, 1)
 """How many pixels one call samples."""
 
+REGISTER_BYTES: Final = 16 * max(_LANES, 1)
+
 _BITS = {1: "128", 2: "", 4: "512"}
 # Where a patch of `packing.pack_colors` has {upper, lower} left, {upper, lower} right of R, of G, of B and of nothing.
 _COLOR_PAIRS = [0, 1, 8, 9, 2, 3, 10, 11, 4, 5, 12, 13, 6, 7, 14, 15]
@@ -71,13 +73,14 @@ def _constant(element: ir.IntType, value: int) -> Any:
     return ir.Constant(kind, [value] * kind.count)
 
 
-def _place(context: Any, builder: Any, array_type: Any, array: Any, position: Any, to: Any) -> Any:
+def element_pointer(context: Any, builder: Any, array_type: Any, array: Any, position: Any, to: Any) -> Any:
     """Return a pointer to `position` of an array of any rank, counted in elements, as a pointer to `to`."""
     data = context.make_array(array_type)(context, builder, array).data
     return builder.bitcast(builder.gep(data, [position]), to.as_pointer())
 
 
-def _load(builder: Any, pointer: Any) -> Any:
+def load_unaligned(builder: Any, pointer: Any) -> Any:
+    """Return what a pointer points to, wherever that is."""
     loaded = builder.load(pointer)
     loaded.align = 1
     return loaded
@@ -132,10 +135,13 @@ def blend_grey_block(typingctx, patches, weight_y, weight_x, at, out, out_at):  
 
     def emit(context, builder, sig, args):  # type: ignore[no-untyped-def]
         whole = _vector(_I32)
-        loaded = [_load(builder, _place(context, builder, sig.args[k], args[k], args[3], whole)) for k in range(3)]
+        loaded = [
+            load_unaligned(builder, element_pointer(context, builder, sig.args[k], args[k], args[3], whole))
+            for k in range(3)
+        ]
         weights_y = _spread(builder, loaded[1], [0, 0, 1, 1]), _spread(builder, loaded[1], [2, 2, 3, 3])
         values = _blend(builder, builder.bitcast(loaded[0], _vector(_I8)), list(range(16)), weights_y, loaded[2])
-        target = _place(context, builder, sig.args[4], args[4], args[5], ir.VectorType(_I8, whole.count))
+        target = element_pointer(context, builder, sig.args[4], args[4], args[5], ir.VectorType(_I8, whole.count))
         builder.store(_unsigned_byte(builder, values), target, align=1)
 
     return signature, emit
@@ -146,8 +152,8 @@ def _patches(context: Any, builder: Any, packed: tuple[Any, Any], base: Any, pla
     loaded = []
     for place in places:
         position = builder.add(base, builder.zext(place, _I64))
-        pointer = _place(context, builder, *packed, position, ir.VectorType(_I8, 16))
-        loaded.append(_load(builder, pointer))
+        pointer = element_pointer(context, builder, *packed, position, ir.VectorType(_I8, 16))
+        loaded.append(load_unaligned(builder, pointer))
     while len(loaded) > 1:
         both = list(range(2 * loaded[0].type.count))
         loaded = [_shuffle(builder, loaded[i], loaded[i + 1], both) for i in range(0, len(loaded), 2)]
@@ -183,13 +189,16 @@ def sample_rgb_block(  # type: ignore[no-untyped-def]
 
     def emit(context, builder, sig, args):  # type: ignore[no-untyped-def]
         whole = _vector(_I32)
-        rows = [_place(context, builder, sig.args[2], args[2], args[5], _I32)]
-        rows += [_load(builder, _place(context, builder, sig.args[k], args[k], args[5], whole)) for k in (3, 4)]
+        rows = [element_pointer(context, builder, sig.args[2], args[2], args[5], _I32)]
+        rows += [
+            load_unaligned(builder, element_pointer(context, builder, sig.args[k], args[k], args[5], whole))
+            for k in (3, 4)
+        ]
         pixels = _rgb_bytes(context, builder, (sig.args[0], args[0]), args[1], rows)
         target = args[7]
         for color in range(3):
             values = builder.lshr(pixels, _constant(_I32, 8 * color))
-            place = _place(context, builder, sig.args[6], args[6], target, ir.VectorType(_I8, whole.count))
+            place = element_pointer(context, builder, sig.args[6], args[6], target, ir.VectorType(_I8, whole.count))
             builder.store(_unsigned_byte(builder, values), place, align=1)
             target = builder.add(target, args[8])
 
@@ -224,20 +233,23 @@ def census_block(  # type: ignore[no-untyped-def]
     def emit(context, builder, sig, args):  # type: ignore[no-untyped-def]
         whole = _vector(_I8)
         pictures = ((sig.args[0], args[0], args[1]), (sig.args[2], args[2], args[3]))
-        centers = [_load(builder, _place(context, builder, kind, data, at, whole)) for kind, data, at in pictures]
+        centers = [
+            load_unaligned(builder, element_pointer(context, builder, kind, data, at, whole))
+            for kind, data, at in pictures
+        ]
         count = cgutils.alloca_once_value(builder, _constant(_I8, 0))
         half = builder.lshr(args[6], ir.Constant(_I64, 1))
         with cgutils.for_range(builder, args[6]) as rows, cgutils.for_range(builder, args[6]) as columns:
             below = builder.mul(builder.sub(rows.index, half), args[4])
-            column = builder.load(_place(context, builder, sig.args[5], args[5], columns.index, _I64))
+            column = builder.load(element_pointer(context, builder, sig.args[5], args[5], columns.index, _I64))
             shift = builder.add(below, column)
             larger = []
             for (kind, data, at), center in zip(pictures, centers, strict=True):
-                pointer = _place(context, builder, kind, data, builder.add(at, shift), whole)
-                larger.append(builder.icmp_unsigned(">", _load(builder, pointer), center))
+                pointer = element_pointer(context, builder, kind, data, builder.add(at, shift), whole)
+                larger.append(builder.icmp_unsigned(">", load_unaligned(builder, pointer), center))
             differs = builder.sext(builder.xor(*larger), whole)
             builder.store(builder.sub(builder.load(count), differs), count)
-        target = _place(context, builder, sig.args[7], args[7], args[8], whole)
+        target = element_pointer(context, builder, sig.args[7], args[7], args[8], whole)
         builder.store(builder.load(count), target, align=1)
 
     return signature, emit

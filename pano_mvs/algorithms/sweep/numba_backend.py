@@ -36,6 +36,8 @@ from pano_mvs.geometry import pad_panorama
 
 _BAND_ROWS = 32
 _STRIP_LINES = 128
+# More than the eight paths of a plane can cost, see `SweepSettings.penalties`.
+_NO_SUM = 65535
 
 Job = TypeVar("Job")
 
@@ -65,9 +67,12 @@ def winners_by_paths(work: SweepInput, volume: NDArray[np.uint8]) -> Winners:
     found = _unset_winners((height, width))
 
     def decide(first: int) -> None:
-        state, planes = _fresh_state(min(_BAND_ROWS, height - first), width)
+        rows = min(_BAND_ROWS, height - first)
+        state, planes = np.full((STATES, rows, width), _NO_SUM, np.uint16), np.zeros((rows, width), np.uint16)
         winners_of_rows(total, first, state, planes)
         _keep(found, first, state, planes)
+        rival = found.rival[first : first + rows]
+        rival[rival == _NO_SUM] = np.inf
 
     with ThreadPoolExecutor(numba.get_num_threads()) as pool:
         total = _aggregate(pool, work, volume)
@@ -139,7 +144,9 @@ def _unset_winners(size_hw: tuple[int, int]) -> Winners:
     return Winners(np.empty(size_hw, np.int32), *costs)
 
 
-def _keep(found: Winners, first: int, state: NDArray[np.float32], planes: NDArray[np.int32]) -> None:
+def _keep(
+    found: Winners, first: int, state: NDArray[np.float32 | np.uint16], planes: NDArray[np.int32 | np.uint16]
+) -> None:
     """Copy what a band found to where it belongs."""
     rows = slice(first, first + len(planes))
     found.plane[rows] = planes
