@@ -15,6 +15,7 @@ _LARGEST_SAD, LARGEST_COLOR_COST = 96, 30
 LARGEST_GRADIENT_COST = 60
 # A level of grey differences counts this much beside census, and both are the same at their worst.
 GREY_WEIGHT = 8
+_CENSUS_SHARE = 4
 _LARGEST_GREY = GREY_WEIGHT * (LARGEST_COLOR_COST + LARGEST_GRADIENT_COST) // 3
 # The variance of noise, in grey levels squared, against which correlation has to stand out.
 ZNCC_NOISE_VARIANCE = 4.0
@@ -34,7 +35,7 @@ class SweepSettings:
         cost: "census" (Hamming distance of the signs of differences to the window's centre; blind to exposure), "zncc"
             (1 − zero-mean normalised cross-correlation; blind to it too), "sad" (sum of absolute differences of R, G
             and B; the paper's), "sad_gradient" (differences of colours and of their gradients, both cut off),
-            "census_gradient" (census and, with the same weight, differences of grey levels and of their gradients, cut
+            "census_gradient" (census and, with a quarter of its weight, differences of grey levels and of their gradients, cut
             off) or a plugin's.
         window: side in pixels, odd, of the window of either cost (the paper: 7).
         spherical_window: widen the windows' columns by 1/cos of the elevation, so that they keep their solid angle.
@@ -137,8 +138,11 @@ class SweepSettings:
 
     @property
     def census_weight(self) -> int:
-        """What a disagreement counts beside grey levels in "census_gradient", so that both can be as bad."""
-        return max(1, round(_LARGEST_GREY / max(1, self.window**2 - 1)))
+        """What a disagreement counts beside grey levels in "census_gradient": at worst, all of them four times as much.
+
+        With equal weights a mirror's picture is matched behind it; without grey levels plain walls are not matched.
+        """
+        return _CENSUS_SHARE * max(1, round(_LARGEST_GREY / max(1, self.window**2 - 1)))
 
     @property
     def cost_scale(self) -> float:
