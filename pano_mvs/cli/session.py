@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pano_mvs
@@ -63,8 +63,19 @@ def open_session(
         workflow = load_workflow(path, registry, overrides=overrides, images=images, presets=presets_folder())
     except PartialWorkflowError as error:
         raise WorkflowError([*error.problems, *wiring_problems(error.stages)]) from None
+    workflow = replace(workflow, plugins=_all_plugins(workflow, registry))
     graph = wire(workflow)
     variable = os.environ.get(CACHE_VARIABLE)
     beside = Path.cwd() if is_preset else path.parent
     root = cache or (Path(variable) if variable else beside / ".pano-mvs")
     return Session(workflow, graph, registry, root, out or Path("out") / workflow.name, demands)
+
+
+def _all_plugins(workflow: Workflow, registry: Registry) -> dict[Path, str]:
+    """Return the plugin files that a workflow names, and those of the user's folder that it uses without naming them.
+
+    Both go along to the workers, which need not have the folder.
+    """
+    named = {path.resolve() for path in workflow.plugins}
+    behind = registry.files_behind({entry.spec.name for entry in workflow.stages.values()})
+    return dict(workflow.plugins) | {path: digest for path, digest in behind.items() if path not in named}

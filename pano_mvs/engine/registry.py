@@ -188,19 +188,15 @@ class Registry:
 
     def _clashes(self, module: ModuleType, *, own_only: bool) -> dict[tuple[str, str], str]:
         """Return which names of a module others have, with both places."""
+        places = {key: mark.origin for key, mark in self.parts.items()}
+        places |= {("stage", name): spec.origin for name, spec in self.stages.items()}
+        given = [((mark.kind, mark.name), mark.origin) for mark in _marks(module, own_only=own_only)]
+        given += [(("stage", spec.name), spec.origin) for spec in _specs(module, own_only=own_only)]
         clashes: dict[tuple[str, str], str] = {}
-        for mark in _marks(module, own_only=own_only):
-            taken = self.parts.get((mark.kind, mark.name), mark)
-            if taken.origin != mark.origin:
-                clashes[mark.kind, mark.name] = (
-                    f"{mark.kind} {mark.name!r} is defined twice: {taken.origin} and {mark.origin}. Rename one of them"
-                )
-        for spec in _specs(module, own_only=own_only):
-            known = self.stages.get(spec.name, spec)
-            if known.origin != spec.origin:
-                clashes["stage", spec.name] = (
-                    f"stage {spec.name!r} is defined twice: {known.origin} and {spec.origin}. Rename one of them"
-                )
+        for (kind, name), origin in given:
+            taken = places.setdefault((kind, name), origin)
+            if taken != origin:
+                clashes[kind, name] = f"{kind} {name!r} is defined twice: {taken} and {origin}. Rename one of them"
         return clashes
 
     def _add(self, module: ModuleType, origin: str, code: str) -> None:
