@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from statistics import median
 from types import FrameType
 from typing import Any
 
@@ -191,6 +192,7 @@ def print_summary(summary: Mapping[str, Any], out: Path, console: Console, *, wr
     _print_failures(summary, console)
     _print_poses(summary, console)
     print_scores(summary["scores"], console)
+    _print_comparison(summary["all_scores"], console)
     for note in summary["notes"]:
         console.print(f"note: {escape(note)}", highlight=False, soft_wrap=True)
     if summary["stopped"]:
@@ -243,6 +245,18 @@ def print_scores(scores: Mapping[str, Any], console: Console) -> None:
     table = Table("view", *_SHOWN_SCORES.values())
     for view, values in scores["views"].items():
         table.add_row(escape(view), *(_shown(values.get(name)) for name in _SHOWN_SCORES))
+    console.print(table)
+
+
+def _print_comparison(all_scores: Mapping[str, Any], console: Console) -> None:
+    """Print, where several branches are scored, the medians over their views side by side."""
+    if len(all_scores) < 2:
+        return
+    table = Table("median over views", *_SHOWN_SCORES.values())
+    for stage, scores in all_scores.items():
+        views = scores["views"].values()
+        values = ([view[name] for view in views if view.get(name) is not None] for name in _SHOWN_SCORES)
+        table.add_row(escape(stage), *(_shown(median(found) if found else None) for found in values))
     console.print(table)
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import pano_mvs
 from pano_mvs.engine.events import RunResult, StageSummary
 from pano_mvs.engine.run import Run
+from pano_mvs.engine.wiring import Graph
 from pano_mvs.engine.workflow import Workflow
 from pano_mvs.scene import Axis, PointCloud, Poses, RangeMap, Record, Scores, TwoView
 from pano_mvs.scene.index import pair_from_name
@@ -22,6 +23,7 @@ _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "pycolmap", "scipy")
 def summarise(run: Run, result: RunResult, *, started: datetime, seconds: float) -> dict[str, Any]:
     """Return everything that run.json and the report say, as plain JSON values."""
     workflow = run.workflow
+    scores = _scores(run)
     return {
         "workflow": {"name": workflow.name, "path": str(workflow.path or ""), "overrides": list(workflow.overrides)},
         "version": pano_mvs.__version__,
@@ -54,7 +56,8 @@ def summarise(run: Run, result: RunResult, *, started: datetime, seconds: float)
         "warnings": list(result.warnings),
         "notes": [note for summary in result.stages for note in summary.notes],
         "poses": _poses(run, result),
-        "scores": _scores(run),
+        "scores": next(iter(scores.values()), {}),
+        "all_scores": scores if len(scores) > 1 else {},
         "views": _views(run, result),
         "cloud": _cloud(run, result),
         "workflow_text": workflow.text,
@@ -64,13 +67,29 @@ def summarise(run: Run, result: RunResult, *, started: datetime, seconds: float)
     }
 
 
+def chain_of(workflow: Workflow, graph: Graph, kind: type[Record]) -> list[str]:
+    """Return the stages that make a kind one from the other, beginning with the first of the workflow.
+
+    What does not come from the first, such as a second sweep beside it, is another branch and not in the chain.
+    """
+    makers = [name for name in graph.order if issubclass(workflow.stages[name].spec.output, kind)]
+    above: dict[str, set[str]] = {}
+    for name in graph.order:
+        feeding = {edge.producer for edge in graph.edges[name].values()}
+        above[name] = feeding.union(*(above[producer] for producer in feeding))
+    chain = makers[:1]
+    for name in makers[1:]:
+        if chain[-1] in above[name]:
+            chain.append(name)
+    return chain
+
+
 def latest(run: Run, kind: type[Record]) -> Record | None:
-    """Return the value of the last stage that made a whole value of a kind in this run."""
-    for name in reversed(list(run.states)):
-        if issubclass(run.workflow.stages[name].spec.output, kind):
-            value = run.load(name, kind)
-            if value is not None:
-                return value
+    """Return the value of the last stage, of the first chain, that made a whole value of a kind in this run."""
+    for name in reversed(chain_of(run.workflow, run.graph, kind)):
+        value = run.load(name, kind)
+        if value is not None:
+            return value
     return None
 
 
@@ -92,8 +111,8 @@ def _stage(summary: StageSummary, workflow: Workflow) -> dict[str, Any]:
 
 
 def _last_stage_of(run: Run, result: RunResult, kind: type[Record]) -> StageSummary | None:
-    of_kind = [s for s in result.stages if issubclass(run.workflow.stages[s.name].spec.output, kind)]
-    return of_kind[-1] if of_kind else None
+    chain = chain_of(run.workflow, run.graph, kind)
+    return next((summary for summary in reversed(result.stages) if summary.name in chain), None)
 
 
 def _poses(run: Run, result: RunResult) -> dict[str, Any]:
@@ -119,10 +138,14 @@ def _poses(run: Run, result: RunResult) -> dict[str, Any]:
 
 
 def _scores(run: Run) -> dict[str, Any]:
-    scores = latest(run, Scores)
-    if not isinstance(scores, Scores):
-        return {}
-    return {"poses": scores.poses, "views": scores.views, "notes": list(scores.notes)}
+    """Return the scores by stage: one, or one for each branch that has some."""
+    found: dict[str, Any] = {}
+    for name in run.graph.order:
+        if issubclass(run.workflow.stages[name].spec.output, Scores):
+            scores = run.load(name, Scores)
+            if isinstance(scores, Scores):
+                found[name] = {"poses": scores.poses, "views": scores.views, "notes": list(scores.notes)}
+    return found
 
 
 def _views(run: Run, result: RunResult) -> list[dict[str, Any]]:
