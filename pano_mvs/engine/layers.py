@@ -226,7 +226,7 @@ def _exists(path: Path) -> bool:
 
 def did_you_mean(word: str, options: Sequence[str] | Mapping[str, object]) -> str:
     """Return a hint at what a word that is not known may have meant, or at what there is."""
-    close = get_close_matches(word[:80], list(options), n=2, cutoff=0.5)
+    close = get_close_matches(word[:80], list(options), n=2, cutoff=0.6)
     if close:
         return f" Did you mean {' or '.join(map(repr, close))}?"
     shown = list(options)[:40]
