@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 from pano_mvs.core.errors import StoreError, UsageError
 from pano_mvs.core.files import OUTPUT_MARK, clear_abandoned, copy_file
 from pano_mvs.engine.blobs import BlobRef, DamagedBlobError
+from pano_mvs.engine.room import is_full_disk
 from pano_mvs.engine.store import ItemRef, Store
 from pano_mvs.scene import Files
 
@@ -22,6 +23,7 @@ class Publisher:
 
         Raises:
             UsageError: if it cannot.
+            StoreError: if its disk is full.
         """
         self.out = out
         self.store = store
@@ -32,7 +34,8 @@ class Publisher:
         try:
             out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise UsageError(_cannot_write(out, error.strerror or str(error))) from error
+            kind = StoreError if is_full_disk(error) else UsageError
+            raise kind(_cannot_write(out, error.strerror or str(error))) from error
         if not os.access(out, os.W_OK | os.X_OK):
             raise UsageError(_cannot_write(out, "permission denied"))
         try:
@@ -123,4 +126,4 @@ def _is_inside(path: Path, folder: Path) -> bool:
 
 
 def _cannot_write(path: Path, reason: str) -> str:
-    return f"output {path} cannot be written: {reason}. Choose another folder with --out DIR"
+    return f"output {path} cannot be written: {reason}. Choose another folder with --out DIR, or free some space"

@@ -80,8 +80,9 @@ class Room:
                              "--cache DIR")  from error  # fmt: skip
 
     def _full(self) -> StoreError:
-        return StoreError(f"the disk of the cache {self._root} is full. Make room (`pano-mvs cache gc` shows what can "
-                          "go) and run the same command again: what was finished is kept")  # fmt: skip
+        return StoreError(f"the disk of the cache {self._root} is full, or what you may use of it. Make room "
+                          "(`pano-mvs cache gc` shows what can go) and run the same command again: what was finished "
+                          "is kept")  # fmt: skip
 
 
 def is_full_disk(error: BaseException | None) -> bool:

@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeAlias
 
 from pano_mvs.cli.session import open_session
 from pano_mvs.core.files import remove_whole
@@ -28,6 +29,7 @@ from pano_mvs.engine.upkeep import verify
 from tests.stress.captures import deliverables, write_toy
 
 _BATCH = 25
+Check: TypeAlias = "Callable[[Patient, int, random.Random], list[str]]"
 
 
 @dataclass

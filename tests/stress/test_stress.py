@@ -1,0 +1,29 @@
+"""The scripts that kill runs and damage stores, with small numbers; larger ones in CI's second step."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import pytest
+
+from tests.stress import damage, kills
+
+
+@pytest.mark.parametrize(
+    "check", [damage.unnoticed_when_read, damage.not_healed_after_verification, damage.not_healed_by_running]
+)
+def test_what_is_flipped_or_cut_short_is_noticed_and_healed(tmp_path: Path, check: damage.Check) -> None:
+    patient = damage.make_patient(tmp_path / "toy", numbers=5)
+    assert check(patient, 50, random.Random(0)) == []
+
+
+@pytest.mark.slow
+def test_five_hundred_damages_are_healed_by_processes() -> None:
+    assert damage.main(["500", "--executor", "processes"]) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("executor", ["processes", "serial"])
+def test_killed_runs_lose_nothing(executor: str) -> None:
+    assert kills.main(["6", "--executor", executor]) == 0
