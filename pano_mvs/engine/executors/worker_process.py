@@ -15,6 +15,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +78,8 @@ class WorkerProcess:
         process, self._process = self._process, None
         if process is not None:
             _close(process)
-        self.errors.unlink(missing_ok=True)
+        with suppress(OSError):  # in a store that cannot be written any more it stays
+            self.errors.unlink(missing_ok=True)
 
     def kill(self) -> None:
         """End the process at once, from any thread."""

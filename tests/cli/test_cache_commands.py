@@ -1,0 +1,420 @@
+"""The commands that look after a cache: what they show, what they keep, what they leave alone."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import stat
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from pano_mvs.cli.app import app
+from pano_mvs.core.digest import digest_from_bytes
+from pano_mvs.engine.blobs import BlobStore
+from pano_mvs.engine.store import Store
+from pano_mvs.engine.upkeep import collect
+from tests.engine.conftest import Toy, toy  # noqa: F401 (a fixture)
+from tests.engine.test_run import ALL_UNITS
+from tests.stress.captures import deliverables
+
+Cache = Callable[..., tuple[int, str]]
+UNITS = sum(ALL_UNITS.values())
+
+
+@pytest.fixture
+def cache(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> Cache:  # noqa: F811
+    """Run a `cache` command on the toy's store."""
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def call(*arguments: str) -> tuple[int, str]:
+        result = CliRunner().invoke(app, ["cache", *arguments, "--cache", str(toy.folder / "cache")])
+        return result.exit_code, " ".join(result.output.split())
+
+    return call
+
+
+def run(toy: Toy, out: str, *options: str) -> tuple[int, str]:  # noqa: F811
+    result = CliRunner().invoke(app, ["run", str(toy.folder / "wf.yaml"), "--cache", str(toy.folder / "cache"), "--out",
+                                      str(toy.folder / out), *options])  # fmt: skip
+    return result.exit_code, " ".join(result.output.split())
+
+
+def files_of(folder: Path) -> dict[str, int]:
+    return {path.relative_to(folder).as_posix(): path.stat().st_size for path in folder.rglob("*") if path.is_file()}
+
+
+def make_old(folder: Path) -> None:
+    for path in folder.rglob("*"):
+        os.utime(path, (1e9, 1e9), follow_symlinks=False)
+
+
+def test_usage_names_every_stage_and_the_whole(toy: Toy, cache: Cache) -> None:  # noqa: F811
+    toy.run()
+    code, said = cache("du")
+    assert code == 0
+    assert all(name in said for name in ("toy.source", "toy.scale", "toy.pairs", "toy.mean", "toy.write"))
+    on_disk = sum(files_of(toy.folder / "cache").values())
+    assert f"{on_disk / 1000:.1f} kB on the disk" in said
+
+
+def test_runs_are_listed_by_workflow_and_folder(toy: Toy, cache: Cache) -> None:  # noqa: F811
+    for out in ("here", "there", "here"):
+        run(toy, out)
+    code, said = cache("ls")
+    assert code == 0
+    assert said.count(str(toy.folder / "here")) == 1
+    assert said.count(str(toy.folder / "there")) == 1
+    assert said.count(f"│ {UNITS} │") == 2
+
+
+def test_verification_of_a_sound_cache_ends_well(toy: Toy, cache: Cache) -> None:  # noqa: F811
+    toy.run()
+    blobs = len(list((toy.folder / "cache" / "blobs").rglob("*.*")))
+    assert cache("verify") == (0, f"{UNITS} records and {blobs} blobs are sound, 0 damaged")
+
+
+def test_verification_removes_what_is_damaged_and_says_what_is_missing(toy: Toy, cache: Cache) -> None:  # noqa: F811
+    toy.run()
+    root = toy.folder / "cache"
+    record = sorted((root / "records").rglob("*.json"))[0]
+    record.write_bytes(record.read_bytes()[:-1])
+    blob = sorted((root / "blobs").rglob("*.txt"))[0]
+    blob.write_bytes(b"x" + blob.read_bytes()[1:])
+    code, said = cache("verify")
+    assert code == 3
+    assert f"removed, damaged: {blob}" in said
+    assert f"removed, damaged: {record}" in said
+    assert "incomplete: " in said
+    assert "2 damaged" in said
+    assert "the same run computes what is missing again" in said
+    assert not record.exists()
+    assert not blob.exists()
+    toy.run()
+    assert cache("verify")[0] == 0
+
+
+def test_collection_tells_first_and_deletes_when_asked(toy: Toy, cache: Cache) -> None:  # noqa: F811
+    run(toy, "out", "--set", "scaled.by=5")
+    run(toy, "out")
+    before = files_of(toy.folder / "cache")
+    code, said = cache("gc", "--unused", "0s")
+    assert code == 0
+    assert "would delete: 2" in said
+    assert "nothing was deleted; --delete does it" in said
+    assert files_of(toy.folder / "cache") == before
+    code, again = cache("gc", "--unused", "0s", "--delete")
+    assert again == said.replace("would delete", "deleted").replace(" nothing was deleted; --delete does it", "")
+    assert len(files_of(toy.folder / "cache")) < len(before)
+    assert "0 units, 0 blobs" in cache("gc", "--unused", "0s")[1]
+    assert "(nothing to compute)" in run(toy, "out")[1]
+    assert cache("verify")[0] == 0
+
+
+def test_what_is_young_stays(toy: Toy, cache: Cache) -> None:  # noqa: F811
+    run(toy, "out", "--set", "scaled.by=5")
+    run(toy, "out")
+    assert "0 units, 0 blobs" in cache("gc", "--delete")[1]
+    assert "0 units, 0 blobs" in cache("gc", "--delete", "--unused", "1h")[1]
+    make_old(toy.folder / "cache")
+    assert "deleted: 2" in cache("gc", "--delete", "--unused", "1h")[1]
+
+
+def test_two_captures_with_one_workflow_are_both_kept(toy: Toy, cache: Cache) -> None:  # noqa: F811
+    other = toy.folder / "other"
+    shutil.copytree(toy.folder / "capture", other)
+    (other / "1.txt").write_text("77")
+    run(toy, "one")
+    run(toy, "two", "--images", str(other))
+    assert "0 units, 0 blobs" in cache("gc", "--delete", "--unused", "0s")[1]
+    assert "(nothing to compute)" in run(toy, "one")[1]
+    assert "(nothing to compute)" in run(toy, "two", "--images", str(other))[1]
+
+
+def test_failed_units_do_not_expose_the_others(toy: Toy, cache: Cache) -> None:  # noqa: F811
+    toy.number("2.txt", "13")
+    assert run(toy, "out")[0] == 3
+    assert "0 units, 0 blobs" in cache("gc", "--delete", "--unused", "0s")[1]
+    assert toy.run().computed == 0
+
+
+def test_run_that_did_not_end_keeps_what_its_folder_had(toy: Toy, cache: Cache) -> None:  # noqa: F811
+    """What an unfinished run had not reached was taken from the latest run into any folder, not from its own."""
+    run(toy, "mine", "--set", "scaled.by=5")
+    run(toy, "other")
+    session = toy.session("scaled.by=5")
+    store = Store(session.store_root)
+    from pano_mvs.engine.run import workflow_id
+
+    store.runs.remember(workflow_id(session.workflow), {}, workflow="toy", out=toy.folder / "mine", finished=False)
+    cache("gc", "--delete", "--unused", "0s")
+    assert "(nothing to compute)" in run(toy, "mine", "--set", "scaled.by=5")[1]
+
+
+def test_runs_that_are_too_old_are_forgotten_and_pins_are_not(toy: Toy, cache: Cache) -> None:  # noqa: F811
+    run(toy, "pinned", "--set", "scaled.by=5")
+    run(toy, "out")
+    code, said = cache("pin", str(toy.folder / "pinned"), "good")
+    assert code == 0
+    assert f"good: {UNITS} units" in said
+    assert "good (pin)" in cache("ls")[1]
+    code, said = cache("gc", "--delete", "--unused", "0s", "--older-than", "0s")
+    assert said.count("run of toy into") == 2
+    assert "(nothing to compute)" in run(toy, "pinned", "--set", "scaled.by=5")[1]
+    assert f"{UNITS - 5} units computed" not in run(toy, "out")[1]
+    cache("gc", "--delete", "--unused", "0s", "--older-than", "0s")
+    assert cache("unpin", "good")[0] == 0
+    cache("gc", "--delete", "--unused", "0s", "--older-than", "0s")
+    assert not list((toy.folder / "cache" / "records").rglob("*.json"))
+    assert not [path for path in (toy.folder / "cache" / "blobs").rglob("*") if path.is_file()]
+
+
+def test_pins_are_asked_for_properly(toy: Toy, cache: Cache) -> None:  # noqa: F811
+    run(toy, "one")
+    run(toy, "two", "--set", "scaled.by=5")
+    for run_name, name, why in (("nothing", "good", "0 runs are called"), ("", "good", "2 runs are called"),
+                                (str(toy.folder / "one"), "../x", "no name for a pin"),
+                                (str(toy.folder / "one"), "", "no name for a pin")):  # fmt: skip
+        code, said = cache("pin", run_name, name)
+        assert code == 2
+        assert why in said
+    assert cache("pin", str(toy.folder / "one"), "good")[0] == 0
+    assert cache("pin", str(toy.folder / "one"), "good")[0] == 0
+    code, said = cache("pin", str(toy.folder / "two"), "good")
+    assert code == 2
+    assert "unpin good" in said
+    code, said = cache("unpin", "bad")
+    assert code == 2
+    assert "there are: good" in said
+
+
+@pytest.mark.parametrize("folder", ["runs", "pins"])
+def test_nothing_is_collected_while_what_is_protected_is_not_known(toy: Toy, cache: Cache, folder: str) -> None:  # noqa: F811
+    run(toy, "out")
+    cache("pin", str(toy.folder / "out"), "good")
+    (entry,) = (toy.folder / "cache" / folder).iterdir()
+    entry.write_bytes(entry.read_bytes()[:-2])
+    before = files_of(toy.folder / "cache")
+    code, said = cache("gc", "--delete", "--unused", "0s")
+    assert code == 4
+    assert f"{entry} is damaged" in said
+    assert files_of(toy.folder / "cache") == before
+
+
+@pytest.mark.parametrize(("option", "text"), [("--unused", "soon"), ("--older-than", "-3d"), ("--unused", "1")])
+def test_time_that_is_none_is_refused(toy: Toy, cache: Cache, option: str, text: str) -> None:  # noqa: F811
+    toy.run()
+    code, said = cache("gc", option, text)
+    assert code == 2
+    assert "such as 30d" in said
+
+
+def test_foreign_files_and_links_are_left_alone(toy: Toy, cache: Cache) -> None:  # noqa: F811
+    """A note in the folder of blobs was deleted by `verify` if its name was long, and by `gc` if it was old."""
+    toy.run()
+    root, outside = toy.folder / "cache", toy.folder / "outside"
+    outside.mkdir()
+    sound = sorted((root / "blobs").rglob("*.json"))[0]
+    shutil.copy(sound, outside / "mine.json")
+    notes = [root / "blobs" / "notes-on-this-capture-of-november-2026.txt", root / "records" / "README.txt",
+             root / "blobs" / "ab" / "short", root / "records" / "zz" / f"{'0' * 32}.json",
+             root / "blobs" / "zz" / f"{'0' * 32}.npy"]  # fmt: skip
+    for path in notes:
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("mine")
+    links = [root / "blobs" / "ab" / f"ab{'0' * 30}.json", root / "records" / "ab" / f"ab{'0' * 30}.json",
+             root / "blobs" / "xx"]  # fmt: skip
+    for path in links:
+        path.parent.mkdir(exist_ok=True)
+        path.symlink_to(outside if path.name == "xx" else outside / "mine.json")
+    make_old(root)
+    make_old(outside)
+    code, said = cache("verify")
+    assert (code, said.count("not of the cache: ")) == (0, len(notes) + len(links))
+    shutil.rmtree(root / "runs")
+    assert "deleted: 28 units" in cache("gc", "--delete", "--unused", "0s")[1]
+    assert cache("du")[0] == 0
+    assert all(path.read_text() == "mine" for path in notes)
+    assert all(path.is_symlink() for path in links)
+    assert (outside / "mine.json").is_file()
+
+
+def test_store_with_a_half_written_entry_of_a_killed_run_can_be_collected(toy: Toy, cache: Cache) -> None:  # noqa: F811
+    toy.run()
+    (toy.folder / "cache" / "runs" / ".tmp-abc.json").write_text("half")
+    assert cache("gc")[0] == 0
+    assert cache("ls")[0] == 0
+
+
+def test_collection_while_a_run_goes_on_costs_time_at_most(toy: Toy, cache: Cache) -> None:  # noqa: F811
+    """Everything is collected, again and again, while two processes compute; the run heals what it finds gone."""
+    toy.edit("plug.py", lambda text: text.replace('"""Multiply."""', '"""Multiply."""\n    time.sleep(0.02)'))
+    toy.run(cache=toy.folder / "clean")
+    clean = deliverables(toy.folder / "out")
+    results: list[tuple[int, str]] = []
+    thread = threading.Thread(target=lambda: results.append(run(toy, "new", "--executor", "processes", "--workers",
+                                                                "2")))  # fmt: skip
+    thread.start()
+    rounds = 0
+    while thread.is_alive():
+        rounds += 1
+        store = Store(toy.folder / "cache")
+        if rounds < 8:
+            collect(store, unused_s=0.0, forget_after_s=0.0, delete=True)
+        time.sleep(0.2)
+    thread.join()
+    assert results[0][0] == 0, results
+    assert deliverables(toy.folder / "new") == clean
+
+
+def test_verification_while_a_run_writes_reports_nothing_wrong(
+    toy: Toy,  # noqa: F811
+    cache: Cache,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Units that end after the blobs were checked were told to be incomplete."""
+    from pano_mvs.engine import upkeep
+
+    files, waiting = upkeep._files, [True]
+
+    def and_run_between(folder: Path) -> object:
+        if folder.name == "records" and waiting:
+            waiting.clear()
+            toy.run()
+        return files(folder)
+
+    Store(toy.folder / "cache")
+    monkeypatch.setattr(upkeep, "_files", and_run_between)
+    code, said = cache("verify")
+    assert (code, said) == (0, f"{UNITS} records and 0 blobs are sound, 0 damaged")
+
+
+def test_file_that_goes_while_it_is_looked_at_is_no_error(toy: Toy, cache: Cache) -> None:  # noqa: F811
+    toy.run()
+    from pano_mvs.engine import upkeep
+
+    gone = str(toy.folder / "cache" / "records" / "gone")
+    assert upkeep._stat(gone) is None
+    assert upkeep._read(gone) is None
+    assert upkeep._digest(gone) == ""
+
+
+def test_blob_that_a_run_came_to_use_is_not_swept(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+    toy.run()
+    root = toy.folder / "cache"
+    shutil.rmtree(root / "runs")
+    make_old(root)
+    store = Store(root)
+    from pano_mvs.engine import upkeep
+
+    delete = upkeep._delete
+
+    def after_a_use(*arguments: object) -> None:
+        for path in (*root.rglob("*.json"), *root.rglob("*.txt")):
+            os.utime(path)
+        delete(*arguments)  # type: ignore[arg-type]
+
+    before = files_of(root)
+    monkeypatch.setattr(upkeep, "_delete", after_a_use)
+    collect(store, unused_s=3600.0, delete=True)
+    assert files_of(root) == before
+
+
+def test_store_may_be_reached_through_another_path(toy: Toy, cache: Cache) -> None:  # noqa: F811
+    toy.run()
+    (toy.folder / "link").symlink_to(toy.folder / "cache")
+    assert toy.run(cache=toy.folder / "link").computed == 0
+    moved = toy.folder / "moved"
+    (toy.folder / "cache").rename(moved)
+    assert toy.run(cache=moved).computed == 0
+    assert CliRunner().invoke(app, ["cache", "verify", "--cache", str(moved)]).exit_code == 0
+
+
+def test_folder_that_is_no_cache_is_refused_and_left_as_it_is(tmp_path: Path) -> None:
+    for command in (["du"], ["ls"], ["verify"], ["gc"], ["pin", "a", "b"], ["unpin", "a"]):
+        result = CliRunner().invoke(app, ["cache", *command, "--cache", str(tmp_path)])
+        assert result.exit_code == 2
+        assert "is no cache of pano-mvs" in " ".join(result.output.split())
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("layout", ['{"layout": 2}', "[]", "{}", "1", "[" * 100_000, "\xff"])
+def test_layout_of_another_version_is_refused_by_all_commands(toy: Toy, cache: Cache, layout: str) -> None:  # noqa: F811
+    toy.run()
+    (toy.folder / "cache" / "layout.json").write_text(layout, encoding="latin-1")
+    before = files_of(toy.folder / "cache")
+    for command in (["du"], ["verify"], ["gc", "--delete", "--unused", "0s"]):
+        code, said = cache(*command)
+        assert code == 2
+        assert "Choose another with --cache DIR" in said
+    assert files_of(toy.folder / "cache") == before
+
+
+def test_cache_that_cannot_be_written_says_so(toy: Toy, cache: Cache, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+    """By permissions, or, where these do not bind us, by a stand-in of the calls that would fail."""
+    toy.run()
+    root = toy.folder / "cache"
+    assert run(toy, "new")[0] == 0
+    folders = [path for path in (root, *root.rglob("*")) if path.is_dir()]
+    for path in folders:
+        path.chmod(stat.S_IRUSR | stat.S_IXUSR)
+    try:
+        if os.access(root, os.W_OK):  # root may write everywhere
+            _refuse_writes_below(root, monkeypatch)
+        code, said = run(toy, "again")
+        assert (code, "(nothing to compute)" in said) == (0, True), said
+        code, said = run(toy, "other", "--set", "scaled.by=5", "--executor", "serial")
+        assert code == 4
+        assert f"cache {root} cannot be written: " in said
+        code, said = run(toy, "other", "--set", "scaled.by=5", "--executor", "processes")
+        assert code == 4, said
+        assert f"{root}" in said
+        assert cache("verify")[0] == 0
+        code, said = cache("gc", "--delete", "--unused", "0s", "--older-than", "0s")
+        assert code == 4
+        assert "cannot be deleted: " in said
+    finally:
+        for path in folders:
+            path.chmod(0o755)
+
+
+def _refuse_writes_below(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import tempfile
+
+    def refusing(function: Callable[..., object]) -> Callable[..., object]:
+        def call(*arguments: object, **settings: object) -> object:
+            place = Path(str(settings.get("dir") or arguments[0]))
+            writes = function is not open_ or (arguments[1:2] and "w" in str(arguments[1]))
+            if writes and place.is_relative_to(root) and not (function is mkdir and place.exists()):
+                raise PermissionError(13, "Permission denied", str(place))
+            return function(*arguments, **settings)
+
+        return call
+
+    open_, mkdir = Path.open, Path.mkdir
+    for owner, name in ((Path, "open"), (Path, "mkdir"), (Path, "touch"), (Path, "unlink"), (tempfile, "mkstemp"),
+                        (tempfile, "mkdtemp")):  # fmt: skip
+        monkeypatch.setattr(owner, name, refusing(getattr(owner, name)))
+
+
+def test_same_bytes_under_two_names_are_each_checked(tmp_path: Path) -> None:
+    """A user's picture that had been checked stood for the store's own copy of it."""
+    from pano_mvs.engine.blobs import DamagedBlobError
+    from pano_mvs.scene import FilePart
+
+    (tmp_path / "a.txt").write_bytes(b"same")
+    store = Store(tmp_path / "store")
+    inside = store.blobs.put(FilePart(tmp_path / "a.txt"))
+    outside = store.blobs.put(FilePart(tmp_path / "a.txt", external=True))
+    assert inside.digest == outside.digest == digest_from_bytes(b"same")
+    fresh = Store(tmp_path / "store").blobs
+    assert isinstance(fresh, BlobStore)
+    fresh.register_external(tmp_path / "a.txt")
+    fresh.verified_path(outside)
+    fresh.path(inside).write_bytes(b"sane")
+    with pytest.raises(DamagedBlobError, match="damaged"):
+        fresh.verified_path(inside)
