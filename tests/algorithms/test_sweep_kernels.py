@@ -8,6 +8,7 @@ import pytest
 from pano_mvs.algorithms.sweep.kernels_band import store_row
 from pano_mvs.algorithms.sweep.kernels_combine import combine_row
 from pano_mvs.algorithms.sweep.kernels_cost import box_rows, census_row, difference_row
+from pano_mvs.algorithms.sweep.kernels_sad import average_differences, one_box_serves
 from pano_mvs.algorithms.sweep.kernels_sgm import sweep_row, sweep_strip
 from pano_mvs.algorithms.sweep.kernels_winner import (
     AFTER,
@@ -67,6 +68,29 @@ def test_running_sums_equal_the_mean_over_each_window(radius):
         for row in range(SIZE[0])
     ]
     np.testing.assert_allclose(means, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("sources", "share", "most", "pad", "serves"),
+    [(3, 1.0, 3, 4, True), (3, 0.5, 3, 4, False), (3, 1.0, 2, 4, False), (3, 0.5, 1, 4, False), (1, 0.5, 1, 4, True),
+     (85, 1.0, 85, 4, True), (86, 1.0, 86, 4, False), (80, 1.0, 80, 4096, False)],
+)  # fmt: skip
+def test_one_box_serves_where_all_sources_count_and_nothing_overflows(sources, share, most, pad, serves):
+    assert one_box_serves(sources, share, most, 3, pad) == serves
+
+
+@pytest.mark.parametrize("radius", [0, 2])
+def test_differences_are_averaged_over_seams(radius):
+    costs = np.random.default_rng(7).integers(0, 65536, (4 + 2 * radius, 20)).astype(np.uint16)
+    pad, reach = 5, np.array([0, 1, 2, 4]) if radius else np.zeros(4, np.int64)
+    padded = np.zeros((len(costs), 20 + 2 * pad), np.uint16)
+    padded[:, pad:-pad] = costs
+    means, scratch = np.zeros((4, 20), np.float32), np.zeros((2, 20 + 2 * pad), np.int32)
+    average_differences(padded, reach, radius, pad, scratch, means)
+    for row, wide in enumerate(reach):
+        rows = costs[row : row + 2 * radius + 1].astype(float)
+        expected = np.mean([np.roll(rows, shift, axis=1) for shift in range(-wide, wide + 1)], axis=(0, 1))
+        np.testing.assert_allclose(means[row], expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("sources", [1, 2, 3, 5])

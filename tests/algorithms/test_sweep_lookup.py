@@ -9,6 +9,7 @@ from pano_mvs.algorithms.sweep.kernels_census import count_census_row
 from pano_mvs.algorithms.sweep.kernels_cost import census_row
 from pano_mvs.algorithms.sweep.kernels_lookup import warp_band
 from pano_mvs.algorithms.sweep.kernels_project import knot_rows
+from pano_mvs.algorithms.sweep.kernels_sad import add_differences, interleave_rows
 from pano_mvs.algorithms.sweep.kernels_vector import HAS_VECTOR
 from pano_mvs.algorithms.sweep.packing import pack_colors, pack_plane, pack_sources
 from pano_mvs.geometry import pad_panorama, pixel_from_ray, ray_grid, rotation_from_rotvec, sample_panorama
@@ -23,7 +24,7 @@ def _picture(seed: int, shape: tuple[int, ...]) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
 
 
-def _warped(source, translation, size_hw, *, vector, halo=3, pad=4, first=0, rows=None):
+def _warped(source, translation, size_hw, *, vector, halo=3, pad=4, first=0, rows=None, against=None):
     height, width = size_hw
     rows = rows or height
     azimuth = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
@@ -33,12 +34,15 @@ def _warped(source, translation, size_hw, *, vector, halo=3, pad=4, first=0, row
     votes = np.zeros((rows + 2 * halo, width), np.uint8)
     knots = np.zeros((2, knot_rows(rows + 2 * halo), width), np.float32)
     valid = np.ones((source.shape[0] + 1) * (source.shape[1] + 2), np.uint8)
+    against = np.zeros((0, width), np.uint32) if against is None else against
+    pixel_costs = np.zeros((rows + 2 * halo, width + 2 * pad), np.uint16)
     warp_band(
         first - halo, height, sin_cos, np.column_stack([ROTATION, translation]), 1.3, packed, colors, starts[0],
-        np.array(source.shape[:2]), valid, 0, vector, pad, knots, warped, votes,
+        np.array(source.shape[:2]), valid, 0, vector, pad, knots, warped, votes, against,
+        pixel_costs,
     )  # fmt: skip
     assert votes.all()
-    return warped
+    return pixel_costs if len(against) else warped
 
 
 @pytest.mark.parametrize("source_hw", [(16, 32), (24, 48), (16, 64)])
@@ -73,6 +77,19 @@ def test_vector_instructions_give_what_loops_give(channels):
     instructions = _warped(source, TRANSLATIONS[1], (48, 100), vector=HAS_VECTOR, first=5, rows=8)
     assert loops.tobytes() == instructions.tobytes()
     assert loops.std() > 30
+
+
+@pytest.mark.skipif(not HAS_VECTOR, reason="sampled and compared at once by vector instructions alone")
+def test_differences_added_while_sampling_are_those_of_what_is_sampled():
+    reference, source = _picture(4, (3, 56, 72)), _picture(5, (64, 128, 3))
+    warped = _warped(source, TRANSLATIONS[1], (48, 64), vector=True, first=5, rows=8)
+    expected = np.zeros(warped.shape[1:], np.uint16)
+    add_differences(reference, 20, warped, 4, expected)
+    added = _warped(source, TRANSLATIONS[1], (48, 64), vector=True, first=5, rows=8,
+                    against=interleave_rows(reference, 20, 14, 4))  # fmt: skip
+    assert added[:, 4:-4].tolist() == expected[:, 4:-4].tolist()
+    whole = np.abs(reference[:, 20:34, 4:-4].astype(int) - warped[..., 4:-4]).sum(axis=0)
+    assert added[:, 4:-4].tolist() == whole.tolist()
 
 
 def test_packed_patches_hold_the_four_neighbours_over_seam_and_poles():

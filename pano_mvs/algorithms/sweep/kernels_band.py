@@ -10,6 +10,7 @@ from pano_mvs.algorithms.sweep.kernels_combine import combine_row
 from pano_mvs.algorithms.sweep.kernels_cost import (
     CENSUS,
     CENSUS_GRADIENT,
+    SAD,
     SAD_GRADIENT,
     ZNCC,
     box_rows,
@@ -18,6 +19,14 @@ from pano_mvs.algorithms.sweep.kernels_cost import (
 from pano_mvs.algorithms.sweep.kernels_gradient import census_gradient_row, sad_gradient_row
 from pano_mvs.algorithms.sweep.kernels_lookup import warp_band
 from pano_mvs.algorithms.sweep.kernels_project import knot_rows
+from pano_mvs.algorithms.sweep.kernels_sad import (
+    add_differences,
+    average_differences,
+    divide_row,
+    interleave_rows,
+    one_box_serves,
+)
+from pano_mvs.algorithms.sweep.kernels_vector import PIXELS
 from pano_mvs.algorithms.sweep.kernels_warp import wrap_row
 from pano_mvs.algorithms.sweep.kernels_winner import PLANES_AT_ONCE, update_winners
 from pano_mvs.algorithms.sweep.kernels_zncc import zncc_rows
@@ -94,6 +103,15 @@ def store_row(costs, scale, voxels):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
+def _silence(votes, halo, costs):  # type: ignore[no-untyped-def]
+    """Make costs, (rows, W), infinite where a source has no vote; `votes` has `halo` rows more on either side."""
+    for j in range(costs.shape[0]):
+        for i in range(costs.shape[1]):
+            if votes[j + halo, i] == 0:
+                costs[j, i] = np.inf
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def sweep_band(  # type: ignore[no-untyped-def]
     first, reference, sin_cos_azimuth, poses, ranges, packed, colors, starts, shapes, valid, valid_starts, vector,
     offsets, reach, cost, census_weight, compare_radius, box_radius, pad, weights, share, most, scale, neutral, volume,
@@ -140,25 +158,38 @@ def sweep_band(  # type: ignore[no-untyped-def]
     scratch = np.empty((2, width + 2 * pad), np.int32)
     costs = np.empty((sources, rows, width), np.float32)
     combined = np.empty((rows, PLANES_AT_ONCE, width), np.float32)
+    summed = cost == SAD and len(valid) + len(weights) == 0 and one_box_serves(sources, share, most, box_radius, pad)
+    above = first - halo + pad
+    fused = cost == SAD and len(colors) > 0 and width % PIXELS == 0
+    against = interleave_rows(reference, above, pixel_costs.shape[0] if fused else 0, pad)
     for d in range(len(ranges)):
         for s in range(sources):
+            if s == 0 or not summed:
+                pixel_costs[:] = 0
             warp_band(
                 first - halo, offsets.shape[0], sin_cos_azimuth, poses[s], ranges[d], packed, colors, starts[s],
-                shapes[s], valid, valid_starts[s], vector, pad, knots, warped, votes,
+                shapes[s], valid, valid_starts[s], vector, pad, knots, warped, votes, against, pixel_costs,
             )  # fmt: skip
-            source_cost(
-                first, reference, warped, offsets, reach, cost, census_weight, compare_radius, box_radius, pad,
-                pixel_costs, scratch, costs[s],
-            )  # fmt: skip
+            if cost == SAD:
+                if not fused:
+                    add_differences(reference, above, warped, pad, pixel_costs)
+                if s == sources - 1 or not summed:
+                    average_differences(pixel_costs, reach[first : first + rows], box_radius, pad, scratch, costs[s])
+            else:
+                source_cost(
+                    first, reference, warped, offsets, reach, cost, census_weight, compare_radius, box_radius, pad,
+                    pixel_costs, scratch, costs[s],
+                )  # fmt: skip
             if len(valid):
-                for j in range(rows):
-                    for i in range(width):
-                        if votes[j + halo, i] == 0:
-                            costs[s, j, i] = np.inf
+                _silence(votes, halo, costs[s])
         held = d % PLANES_AT_ONCE
         for j in range(rows):
-            combine_row(costs, j, weights, first + j, share, most, len(valid) == 0, neutral, combined[j, held])
+            row = combined[j, held]
+            if summed:
+                divide_row(costs[sources - 1, j], sources, row)
+            else:
+                combine_row(costs, j, weights, first + j, share, most, len(valid) == 0, neutral, row)
             if len(volume):
-                store_row(combined[j, held], scale, volume[first + j, d])
+                store_row(row, scale, volume[first + j, d])
             elif held == PLANES_AT_ONCE - 1 or d == len(ranges) - 1:
                 update_winners(combined[j], 0, held + 1, d - held, state, j, planes)

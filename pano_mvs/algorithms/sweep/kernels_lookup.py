@@ -14,6 +14,7 @@ from pano_mvs.algorithms.sweep.kernels_project import (
     replace_rough,
     rough_runs,
 )  # fmt: skip
+from pano_mvs.algorithms.sweep.kernels_sad import add_sampled_differences
 from pano_mvs.algorithms.sweep.kernels_vector import PIXELS, blend_grey_block, sample_rgb_block
 from pano_mvs.algorithms.sweep.kernels_warp import blend_row, gather_row, place_row, project_row, wrap_row
 
@@ -62,7 +63,7 @@ def _sample_rgb(colors, start, index, weight_y, weight_x, warped, row, pad):  # 
 @njit(cache=True, error_model="numpy", nogil=True)
 def warp_band(  # type: ignore[no-untyped-def]
     first, height, sin_cos_azimuth, pose, virtual_range, packed, colors, starts, shape, valid, valid_start, vector, pad,
-    knots, warped, votes,
+    knots, warped, votes, against, pixel_costs,
 ):  # fmt: skip
     """Look up the rows `first` … of the reference, at one virtual range, in one source.
 
@@ -84,8 +85,10 @@ def warp_band(  # type: ignore[no-untyped-def]
         vector: whether to use vector instructions; the result is the same.
         pad: width of the wrapped margin of the result.
         knots: (2, `knot_rows`(rows), W) float32, scratch.
-        warped: (C, rows, W + 2 pad) uint8, written.
+        warped: (C, rows, W + 2 pad) uint8, written unless `against` is there.
         votes: (rows, W) uint8, written unless `valid` is empty.
+        against: (rows, W) uint32 what to compare with at once, see `add_sampled_differences`, or empty.
+        pixel_costs: (rows, W + 2 pad) uint16, to which differences are then added.
     """
     rows = warped.shape[1]
     width = sin_cos_azimuth.shape[1]
@@ -111,11 +114,13 @@ def warp_band(  # type: ignore[no-untyped-def]
                 project_row(sin_cos_azimuth, matrix, offset, shape, runs[k, 0], runs[k, 1], exact[0], exact[1])
                 replace_rough(rough, exact, runs[k, 0], runs[k, 1], x_px, y_px)
         place_row(x_px, y_px, shape, index, weight_x, weight_y)
-        if len(colors):
+        if len(against):
+            add_sampled_differences(colors, starts[0], index, weight_y, weight_x, against, j, pad, pixel_costs)
+        elif len(colors):
             _sample_rgb(colors, starts[0], index, weight_y, weight_x, warped, j, pad)
         else:
             _sample_planes(packed, starts, vector, index, weight_y, weight_x, patches, warped, j, pad)
-        for c in range(warped.shape[0]):
+        for c in range(0 if len(against) else warped.shape[0]):
             wrap_row(warped[c, j], width, pad)
         if len(valid):
             for i in range(_U(width)):

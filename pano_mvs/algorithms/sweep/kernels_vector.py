@@ -205,6 +205,40 @@ def sample_rgb_block(  # type: ignore[no-untyped-def]
     return signature, emit
 
 
+@intrinsic
+def difference_rgb_block(  # type: ignore[no-untyped-def]
+    typingctx, packed, base, index, weight_y, weight_x, at, reference, reference_at, total, total_at
+):
+    """Sample as `sample_rgb_block` does and add |R − r| + |G − g| + |B − b| to `total`, uint16.
+
+    `reference` holds its pixels as R | G << 8 | B << 16, uint32; the positions are counted in elements.
+    """
+    place = types.uint64
+    signature = types.void(packed, place, index, weight_y, weight_x, place, reference, place, total, place)
+
+    def emit(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        whole, byte = _vector(_I32), _constant(_I32, 255)
+        rows = [element_pointer(context, builder, sig.args[2], args[2], args[5], _I32)]
+        for k in (3, 4):
+            rows.append(
+                load_unaligned(builder, element_pointer(context, builder, sig.args[k], args[k], args[5], whole))
+            )
+        pixels = _rgb_bytes(context, builder, (sig.args[0], args[0]), args[1], rows)
+        theirs = builder.bitcast(builder.xor(pixels, _constant(_I32, 0x808080)), _vector(_I8))
+        ours = load_unaligned(builder, element_pointer(context, builder, sig.args[6], args[6], args[7], _vector(_I8)))
+        larger = builder.icmp_unsigned(">", ours, theirs)
+        both = builder.select(larger, ours, theirs), builder.select(larger, theirs, ours)
+        difference = builder.bitcast(builder.sub(*both), whole)
+        added = builder.and_(difference, byte)
+        for color in (1, 2):
+            added = builder.add(added, builder.and_(builder.lshr(difference, _constant(_I32, 8 * color)), byte))
+        narrow = ir.VectorType(_I16, whole.count)
+        target = element_pointer(context, builder, sig.args[8], args[8], args[9], narrow)
+        builder.store(builder.add(load_unaligned(builder, target), builder.trunc(added, narrow)), target, align=1)
+
+    return signature, emit
+
+
 CENSUS_PIXELS: Final = 4 * PIXELS
 """How many pixels one call of `census_block` compares."""
 
