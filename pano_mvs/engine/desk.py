@@ -123,11 +123,14 @@ class Desk:
         unit = job.unit
         path = self._logs / f"{log_name(unit.entry.name, unit.item)}.log"
         said = tail(job.log, _SHOWN_LINES)
+        if not path.parent.resolve().is_relative_to(self._logs.parent.resolve()):
+            return None, said  # a link, or a plugin's name of an item, leads outside
         with suppress(OSError):  # a log is not worth failing for
             if not job.log.exists():
                 path.unlink(missing_ok=True)
                 return None, said
             path.parent.mkdir(parents=True, exist_ok=True)
+            path.unlink(missing_ok=True)  # a link there is not followed
             shutil.move(job.log, path)
             return path, said
         return None, said
@@ -140,4 +143,5 @@ def memory_of(unit: Unit) -> int:
 
 def log_name(stage: str, item: str) -> str:
     """Return a unit's log relative to the folder of logs, without its suffix; every system takes such names."""
-    return _NOT_IN_NAMES.sub("_", f"{stage}/{item}") if item else stage
+    name = _NOT_IN_NAMES.sub("_", f"{stage}/{item}") if item else stage
+    return "/".join("__" if part == ".." else part for part in name.split("/"))

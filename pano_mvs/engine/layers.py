@@ -13,7 +13,7 @@ from pano_mvs.engine.names import is_plain_name
 from pano_mvs.engine.yaml_text import Located, Problems, parse_yaml
 
 FORMAT_VERSION = 1
-MAX_BYTES = 256_000
+MAX_BYTES = 100_000
 MAX_FILES = 50
 MAX_STAGES = 1000
 TOP_KEYS = ("pano_mvs", "name", "description", "extends", "plugins", "stages")

@@ -30,7 +30,17 @@ def is_printable(text: str) -> bool:
 def leads_outside(path: str) -> bool:
     """Return whether a relative path with forward slashes is absolute, climbs, or means something else on Windows."""
     parts = path.split("/")
-    return path.startswith("/") or ".." in parts or "\\" in path or (len(path) > 1 and path[1] == ":") or "\0" in path
+    drive = path[1:2] == ":" and path[0].isalpha()
+    return path.startswith("/") or ".." in parts or "\\" in path or "\0" in path or drive
+
+
+def item_problem(name: str) -> str:
+    """Return why an item cannot have a name, empty if it can: files are called by it."""
+    if not name or not is_printable(name):
+        return f"its name {name!r} is empty or holds control characters; rename it"
+    if leads_outside(name):
+        return f"its name {name!r} would lead outside the output folder; rename it"
+    return ""
 
 
 def folder_problem(folder: str) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.engine.names import item_problem
 from pano_mvs.engine.params import key_fields
 from pano_mvs.engine.ports import Cardinality
 from pano_mvs.engine.stage import INDEX_PORT
@@ -36,8 +37,8 @@ def resolve_source(entry: StageEntry, store: Store, only: frozenset[str] | None 
         if item.name in resolution.members:
             raise InputError(f"{entry.name}: the item {item.name!r} is listed twice")
         resolution.members[item.name] = (item.name,)
-        if item.problem:
-            resolution.blocked[item.name] = item.problem
+        if problem := item.problem or item_problem(item.name):
+            resolution.blocked[item.name] = problem
             continue
         try:
             digests = {role: store.blobs.register_external(path) for role, path in sorted(item.files.items())}
