@@ -17,7 +17,7 @@ from pano_mvs.testing.room import capture_poses, default_room, render
 
 NEAR, FAR = 0.5, 6.0
 _SIZES_HW = [(16, 32), (18, 36), (25, 50), (32, 64), (20, 30), (40, 24)]
-_COSTS = ("census", "zncc", "sad", "sad_gradient")
+_COSTS = ("census", "zncc", "sad", "sad_gradient", "census_gradient")
 _COMBINATIONS = ("sum", "best_half", "best_k", "parallax_weighted")
 _COMBINED = list(itertools.product(_COSTS, _COMBINATIONS, ("box", "sgm")))
 CASES = len(_COMBINED)
@@ -40,6 +40,11 @@ class SweepCase:
             settings=self.settings, backend=backend, device=device,
             reference_mask=self.masks[0], source_masks=self.masks[1:],
         )  # fmt: skip
+
+
+def cost_of_case(number: int) -> str:
+    """Return the cost of a case, without making its pictures."""
+    return _COMBINED[number][0]
 
 
 @functools.cache

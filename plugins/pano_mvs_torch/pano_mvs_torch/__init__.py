@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pano_mvs.api import SweepInput, Winners, register_sweep_backend
 
-COSTS = ("census", "zncc", "sad", "sad_gradient")
+COSTS = ("census", "census_gradient", "zncc", "sad", "sad_gradient")
 
 
 @register_sweep_backend("torch", costs=COSTS)

@@ -8,7 +8,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from pano_mvs.algorithms.sweep.preparation import SweepInput
-from pano_mvs.algorithms.sweep.settings import LARGEST_COLOR_COST, LARGEST_GRADIENT_COST, ZNCC_NOISE_VARIANCE
+from pano_mvs.algorithms.sweep.settings import (
+    GREY_WEIGHT,
+    LARGEST_COLOR_COST,
+    LARGEST_GRADIENT_COST,
+    ZNCC_NOISE_VARIANCE,
+)
 from pano_mvs.algorithms.sweep.windows import WindowBands, column_offsets
 from pano_mvs.geometry import pad_panorama
 from torch import Tensor
@@ -25,6 +30,7 @@ class BandCost:
         settings = work.settings
         height, width = work.reference.shape[:2]
         self.compare_radius, self.box_radius = settings.compare_radius, settings.box_radius
+        self.census_weight = settings.census_weight
         self.halo = self.compare_radius + self.box_radius
         spherical = settings.spherical_window
         columns = column_offsets((height, width), self.compare_radius, spherical=spherical)
@@ -35,11 +41,12 @@ class BandCost:
         around = pad_panorama(work.reference, self.halo)[first : last + 2 * self.halo, self.halo : self.halo + width]
         self.reference = torch.from_numpy(np.ascontiguousarray(np.moveaxis(around, -1, 0))).to(device, torch.int32)
         kinds: dict[str, Callable[[Tensor], Tensor]] = {
-            "census": self._census, "zncc": self._zncc, "sad": self._sad, "sad_gradient": self._sad_gradient,
+            "census": self._census, "census_gradient": self._census_gradient, "zncc": self._zncc, "sad": self._sad,
+            "sad_gradient": self._sad_gradient,
         }  # fmt: skip
         self._cost = kinds[settings.cost]
         self._places = list(self.windows.places())
-        self._signs = list(self._signs_of(self.reference[0])) if settings.cost == "census" else []
+        self._signs = list(self._signs_of(self.reference[0])) if settings.cost in ("census", "census_gradient") else []
 
     def of(self, warped: Tensor) -> Tensor:
         """Return the mean costs of the band against a warped source.
@@ -53,13 +60,22 @@ class BandCost:
         return self._cost(warped)
 
     def _census(self, warped: Tensor) -> Tensor:
+        return self._box_mean(self._disagreements(warped))
+
+    def _census_gradient(self, warped: Tensor) -> Tensor:
+        """Return the census cost, its weight times, plus differences of grey levels and of their gradients, cut off."""
+        levels = self._absolute(warped).clamp_(max=LARGEST_COLOR_COST // 3)
+        grey = levels + self._gradients(warped).clamp_(max=LARGEST_GRADIENT_COST // 3)
+        return self._box_mean(self.census_weight * self._disagreements(warped) + GREY_WEIGHT * grey)
+
+    def _disagreements(self, warped: Tensor) -> Tensor:
         """Return how many places of the window differ in their sign; bytes all along, which are quickest."""
         differs: Tensor | None = None
         for sign, other in zip(self._signs, self._signs_of(warped[..., 0]), strict=True):
             other ^= sign
             differs = other if differs is None else differs.add_(other)
         assert differs is not None
-        return self._box_mean(differs.to(torch.int32))
+        return differs.to(torch.int32)
 
     def _signs_of(self, pictures: Tensor) -> Iterator[Tensor]:
         """Yield for each place of the window where the pixel there is brighter than the centre, (…, rows, W) 0 or 1."""
@@ -86,15 +102,24 @@ class BandCost:
     def _sad_gradient(self, warped: Tensor) -> Tensor:
         """Return differences of colours and of their gradients, each cut off."""
         colors = self._absolute(warped).clamp_(max=LARGEST_COLOR_COST)
-        gradient = torch.zeros_like(colors)
+        return self._box_mean(colors + self._gradients(warped).clamp_(max=LARGEST_GRADIENT_COST))
+
+    def _gradients(self, warped: Tensor) -> Tensor:
+        """Return the sum of absolute differences of the gradients of all colours, (P, rows, W)."""
+        radius, rows_there = self.compare_radius, self.reference.shape[-2]
+        middle = (2 * radius + 1) ** 2 // 2
+        gradient: Tensor | None = None
         for color in range(warped.shape[-1]):
             difference = self.reference[color] - warped[..., color]
-            gradient += (difference[..., 2:, :] - difference[..., :-2, :]).abs_()
+            above, below = (slice(radius + step, rows_there - radius + step) for step in (-1, 1))
+            one = (difference[..., below, :] - difference[..., above, :]).abs_()
             padded = _wrapped(difference, self.windows.margin)
             for rows, places in self._places:
-                (lines, left), (_, right) = places[3], places[5]  # the window's middle row: its first and last
-                gradient[..., rows, :] += (padded[..., lines, right] - padded[..., lines, left]).abs_()
-        return self._box_mean(colors + gradient.clamp_(max=LARGEST_GRADIENT_COST))
+                (lines, left), (_, right) = places[middle - 1], places[middle + 1]
+                one[..., rows, :] += (padded[..., lines, right] - padded[..., lines, left]).abs_()
+            gradient = one if gradient is None else gradient.add_(one)
+        assert gradient is not None
+        return gradient
 
     def _zncc(self, warped: Tensor) -> Tensor:
         """Return 1 − ρ; with n pixels in a window n² times each (co)variance is a whole number."""
