@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import keyword
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,7 +64,7 @@ def rendered(kind: str, name: str) -> tuple[str, str]:
     """
     if kind not in KINDS:
         raise UsageError(f"there is no kind of plugin {kind!r}; there are {', '.join(KINDS)}")
-    if not _NAME.fullmatch(name):
+    if not _NAME.fullmatch(name) or keyword.iskeyword(name):
         raise UsageError(f"a plugin cannot be called {name!r}: use small letters, digits and '_', a letter first")
     environment = Environment(
         loader=PackageLoader("pano_mvs.cli", "plugin_templates"),

@@ -49,7 +49,7 @@ _SIZES = {
 }
 _ROLL = 16
 _LARGEST_ROLL_ERROR = 0.01
-_LEAST_ROLL_AGREEMENT = {RangeMap: 0.95, Features: 0.5}
+_LEAST_ROLL_AGREEMENT = {RangeMap: 0.95, Features: 0.5, Panorama: 0.99}
 
 
 def stage_laws(
@@ -159,13 +159,17 @@ def _optional_inputs(case: StageCase) -> None:
 
 
 def _masks(case: StageCase) -> None:
-    """What is masked has no range and no key point."""
+    """What is masked has no range and no key point, and stays masked."""
     capture = tiny_capture(Variant(masked=True))
-    value = case.call(capture).value
+    call = case.call(capture)
+    value = call.value
     valid = capture.images[capture.names[0]].load_mask()
     if isinstance(value, RangeMap):
         wrong = int((value.valid & ~valid).sum())
         assert not wrong, f"{case.spec.name} gives {wrong} masked pixels a range"
+    elif call.mask is not None:
+        wrong = int((call.mask & ~valid).sum())
+        assert not wrong, f"{case.spec.name} unmasks {wrong} pixels"
     elif isinstance(value, Features):
         found = pixel_from_ray(value.bearings, (valid.shape[0], valid.shape[1]))
         columns, rows = np.floor(found).astype(int).T
@@ -178,9 +182,11 @@ def _masks(case: StageCase) -> None:
 def _rolls(case: StageCase) -> None:
     """Rolled pictures, with the cameras turned, give the rolled result: no border exists at the seam."""
     size_hw = (64, 128) if case.spec.output is Features else case.size_hw
-    straight = case.call(tiny_capture(Variant(size_hw))).value
-    rolled = case.call(tiny_capture(Variant(size_hw, rolled=_ROLL))).value
-    if isinstance(straight, RangeMap) and isinstance(rolled, RangeMap):
+    first, second = (case.call(tiny_capture(Variant(size_hw, rolled=columns))) for columns in (0, _ROLL))
+    straight, rolled = first.value, second.value
+    if first.mask is not None and second.mask is not None:
+        share = float((first.mask == np.roll(second.mask, -_ROLL, axis=1)).mean())
+    elif isinstance(straight, RangeMap) and isinstance(rolled, RangeMap):
         share = _same_ranges(straight.range, np.roll(rolled.range, -_ROLL, axis=1))
     else:
         assert isinstance(straight, Features)
@@ -224,10 +230,8 @@ def _applies(what: str, spec: StageSpec) -> bool:
             return bool(sees)
         case "takes" if "left out" in what:
             return any(port.optional for port in spec.ports)
-        case "respects":
-            return spec.output in (RangeMap, Features) and bool(own & {Panorama, RangeMap})
-        case "rolls":
-            return spec.output in (RangeMap, Features) and bool(own & {Panorama, RangeMap})
+        case "respects" | "rolls":
+            return spec.output in _LEAST_ROLL_AGREEMENT and bool(own & {Panorama, RangeMap})
     return True
 
 

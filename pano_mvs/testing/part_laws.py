@@ -14,7 +14,7 @@ from pano_mvs.algorithms.sweep.costs import CostWindow, PluginCost, checked_cost
 from pano_mvs.core.errors import UsageError
 from pano_mvs.engine.registry import Registry
 from pano_mvs.testing.law import Law
-from pano_mvs.testing.sweep_backends import CASES, agreement, sweep_case
+from pano_mvs.testing.sweep_backends import CASES, agreement, cost_of_case, sweep_case
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
 
 _LEAST_AGREEMENT = 0.99
@@ -87,7 +87,7 @@ def _backend_is_a_function(name: str, device: str) -> None:
 def _cases(name: str) -> Iterator[int]:
     """Yield some cases whose cost the backend has, spread over all."""
     costs = SWEEP_BACKENDS.get(name).costs
-    able = [number for number in range(CASES) if costs is None or sweep_case(number).settings.cost in costs]
+    able = [number for number in range(CASES) if costs is None or cost_of_case(number) in costs]
     if not able:
         raise UsageError(f"{name} has none of the built-in costs, by which backends are compared")
     yield from able[:: max(1, len(able) // _CASES_TRIED)]

@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pano_mvs.core.digest import digest_from_bytes, digest_from_file, digest_from_value
 from pano_mvs.core.errors import ContractError, PanoMvsError, UsageError
@@ -29,11 +30,13 @@ class Call:
         value: what the stage returned; None where it refused.
         digest: of the value and of the figures reported beside it.
         refusal: the error by which the stage refused its inputs.
+        mask: (H, W) the valid pixels of a panorama that it returned, whose files are gone with the call.
     """
 
     value: Record | None
     digest: str
     refusal: PanoMvsError | None = None
+    mask: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +98,8 @@ class StageCase:
             require_sound(value, self.spec, Path(scratch))
             figures = {name: float(metric).hex() for name, metric in context.metrics.items()}
             told = [figures, context.notes, context.rejected]
-            return Call(value, digest_from_value([digest_of(value), json.dumps(told)]))
+            mask = value.load_mask() if isinstance(value, Panorama) else None
+            return Call(value, digest_from_value([digest_of(value), json.dumps(told)]), mask=mask)
 
     def _argument(self, port: Port, capture: TinyCapture) -> Any:
         items = capture.items.get(port.kind)
@@ -127,8 +131,6 @@ def require_sound(value: object, spec: StageSpec, scratch: Path) -> None:
         inside = path.resolve().is_relative_to(scratch.resolve())
         assert path.is_file(), f"{spec.name} says that it wrote {path}, which is not there"
         assert inside, f"{spec.name} wrote {path}, outside ctx.scratch"
-    if isinstance(value, Panorama):
-        value.load_mask()  # its files are there, and are pictures
 
 
 def digest_of(value: object) -> str:
