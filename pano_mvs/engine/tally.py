@@ -55,7 +55,11 @@ class Tally:
         self._observer.stage_started(entry.name, units)
 
     def unit_blocked(self, entry: StageEntry, item: str, reason: str) -> None:
-        """Note a unit that cannot run; of a source, it is the image itself that cannot be used."""
+        """Note a unit that cannot run; of a source, it is the image itself that cannot be used.
+
+        Raises:
+            GateError: if such an image is to end the run.
+        """
         summary = self._counts[entry.name].summary
         if entry.spec.list_items is not None:
             summary.failed += 1
@@ -65,6 +69,8 @@ class Tally:
             failure = Failure(entry.name, item, f"it {reason}", consequence=lost(entry, item), blocked=True)
         self._result.failures.append(failure)
         self._observer.unit_finished(entry.name, item, "blocked", 0.0)
+        if entry.spec.list_items is not None and entry.policy.on_error == "stop":
+            raise GateError(f"stage {entry.name!r} has on_error: stop, and {item} cannot be used: {reason}")
 
     def unit_started(self, entry: StageEntry, item: str) -> None:
         """Note that a unit is being computed."""
