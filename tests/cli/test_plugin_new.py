@@ -28,7 +28,7 @@ stages:
   views:    {{use: views.new_views}}
   depth:    {{use: depth.new_depth}}
   swept:    {{use: depth.sweep, planes: 8, near: 0.5, far: 6, backend: numpy, cost: new_sweep_cost, aggregation: box}}
-  again:    {{use: depth.sweep, planes: 8, near: 0.5, far: 6, backend: new_sweep_backend, cost: sad}}
+  again:    {{use: depth.sweep, planes: 8, near: 0.5, far: 6, backend: new_sweep_backend, cost: sad, aggregation: box}}
   filtered: {{use: filters.new_filter, far: 5, in: {{range_map: depth}}}}
   cloud:    {{use: fusion.new_fusion, min_confidence: 1, in: {{ranges: filtered}}}}
   written:  {{use: export.new_export, in: {{range_map: filtered}}}}
