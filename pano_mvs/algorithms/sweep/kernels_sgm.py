@@ -12,6 +12,7 @@ from numba import njit
 _U = np.uint64
 _H = np.uint16
 _OUTSIDE = np.uint16(60000)  # the cost of the planes before the first and after the last; P1 on top must not overflow
+_BLOCK = 32  # columns of which all planes fit the nearest cache
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -82,23 +83,56 @@ def sweep_strip(volume, total, penalties, p1, first, lines, drift, upward, warm)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _advance(costs, x, penalty, p1, before, floor, after):  # type: ignore[no-untyped-def]
-    """Advance a horizontal path by one pixel; return the least of its new costs."""
-    depth = _U(costs.shape[1])
-    pixel = _U(x)
-    jump = _H(floor + penalty)
-    for d in range(depth):
-        stay = before[d + _U(1)]
-        down, up = _H(before[d] + p1), _H(before[d + _U(2)] + p1)
-        near = down if down < up else up
-        near = near if near < jump else jump
-        near = stay if stay < near else near
-        after[d + _U(1)] = _H(_H(near - floor) + _H(costs[pixel, d]))
-    least = _OUTSIDE
-    for d in range(depth):
-        value = after[d + _U(1)]
-        least = value if value < least else least
-    return least
+def _turn_row(volume, y, costs):  # type: ignore[no-untyped-def]
+    """Write row y of a volume, (H, D, W), pixel by pixel, into (W, D)."""
+    row, width = _U(y), volume.shape[2]
+    for start in range(0, width, _BLOCK):
+        stop = min(start + _BLOCK, width)
+        for d in range(_U(volume.shape[1])):
+            for x in range(_U(start), _U(stop)):
+                costs[x, d] = volume[row, d, x]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _add_turned_row(sums, y, total):  # type: ignore[no-untyped-def]
+    """Add (W, D) to row y of (H, D, W)."""
+    row, width = _U(y), total.shape[2]
+    for start in range(0, width, _BLOCK):
+        stop = min(start + _BLOCK, width)
+        for d in range(_U(total.shape[1])):
+            for x in range(_U(start), _U(stop)):
+                total[row, d, x] = _H(total[row, d, x] + sums[x, d])
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _circle(costs, penalties, p1, direction, warm, sums):  # type: ignore[no-untyped-def]
+    """Follow one horizontal path and add its costs to `sums`, (W, D) uint16; `penalties` is (W,).
+
+    The loops are in this function, and not in one for each pixel: views of arrays take longer than a pixel's planes.
+    """
+    width, depth = costs.shape
+    before, after = np.full(depth + 2, _OUTSIDE, np.uint16), np.full(depth + 2, _OUTSIDE, np.uint16)
+    before[1 : depth + 1] = 0
+    floor = _H(0)
+    for i in range(-warm, width):
+        x = (i + warm * width) % width
+        pixel = _U(width - 1 - x if direction == 1 else x)
+        jump = _H(floor + penalties[pixel])
+        for d in range(_U(depth)):
+            stay = before[d + _U(1)]
+            down, up = _H(before[d] + p1), _H(before[d + _U(2)] + p1)
+            near = down if down < up else up
+            near = near if near < jump else jump
+            near = stay if stay < near else near
+            after[d + _U(1)] = _H(_H(near - floor) + _H(costs[pixel, d]))
+        floor = _OUTSIDE
+        for d in range(_U(depth)):
+            value = after[d + _U(1)]
+            floor = value if value < floor else floor
+            before[d + _U(1)] = value
+        if i >= 0:
+            for d in range(_U(depth)):
+                sums[pixel, d] = _H(sums[pixel, d] + before[d + _U(1)])
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -115,25 +149,8 @@ def sweep_row(volume, total, penalties, p1, y, warm):  # type: ignore[no-untyped
     """
     depth, width = volume.shape[1:]
     costs = np.empty((width, depth), np.uint8)
-    row = _U(y)
-    for d in range(_U(depth)):
-        for x in range(_U(width)):
-            costs[x, d] = volume[row, d, x]
     sums = np.zeros((width, depth), np.uint16)
+    _turn_row(volume, y, costs)
     for direction in range(2):
-        buffers = np.zeros((2, depth + 2), np.uint16)
-        buffers[:, 0] = _OUTSIDE
-        buffers[:, depth + 1] = _OUTSIDE
-        least = _H(0)
-        for i in range(-warm, width):
-            now = (i + warm) % 2
-            x = (i + warm * width) % width
-            x = width - 1 - x if direction == 1 else x
-            least = _advance(costs, x, penalties[direction, y, x], p1, buffers[1 - now], least, buffers[now])
-            if i >= 0:
-                pixel = _U(x)
-                for d in range(_U(depth)):
-                    sums[pixel, d] = _H(sums[pixel, d] + buffers[now, d + _U(1)])
-    for d in range(_U(depth)):
-        for x in range(_U(width)):
-            total[row, d, x] = _H(total[row, d, x] + sums[x, d])
+        _circle(costs, penalties[direction, y], p1, direction, warm, sums)
+    _add_turned_row(sums, y, total)
