@@ -39,6 +39,8 @@ class Publisher:
         if not os.access(out, os.W_OK | os.X_OK):
             raise UsageError(_cannot_write(out, "permission denied"))
         try:
+            if (out / OUTPUT_MARK).is_symlink():
+                (out / OUTPUT_MARK).unlink()  # what it leads to may not even exist yet
             (out / OUTPUT_MARK).touch()
         except OSError as error:
             raise StoreError(_cannot_write(out, error.strerror or str(error))) from error
