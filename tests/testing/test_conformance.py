@@ -1,0 +1,332 @@
+"""The laws catch stages that break them, each by its own law."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from pydantic import ConfigDict, Field
+
+from pano_mvs.api import (
+    Axis,
+    Context,
+    CostWindow,
+    Each,
+    Features,
+    FilePart,
+    Files,
+    InputError,
+    Panorama,
+    Params,
+    RangeMap,
+    Record,
+    UsageError,
+    stage,
+    write_png,
+)
+from pano_mvs.core.errors import ContractError
+from pano_mvs.testing.conformance import backend_laws, check_stage, cost_laws, stage_laws
+from pano_mvs.testing.tiny_capture import Variant, tiny_capture
+
+DRAWS = np.random.default_rng()
+
+
+class Loose(Params):
+    """Settings that can be changed, and have no description."""
+
+    model_config = ConfigDict(frozen=False, extra="ignore")
+
+    bare: int = 1
+
+
+class Doubled(Params):
+    """A setting that is another one after JSON."""
+
+    places: set[int] = Field(default={1}, description="some")
+    doubled: float = Field(default=1.0, description="twice", validate_default=True)
+
+    def model_dump_json(self, **options: Any) -> str:
+        return super().model_dump_json(**options).replace("1.0", "2.0")
+
+
+def bad(function: Callable[..., Any]) -> Callable[..., Any]:
+    return stage(f"bad.{function.__name__}")(function)
+
+
+@bad
+def undocumented(x: Each[RangeMap]) -> RangeMap:
+    return x
+
+
+@bad
+def undescribed(x: Each[RangeMap], params: Loose) -> RangeMap:
+    """Settings without a description, which can be changed."""
+    return x
+
+
+@bad
+def changed_by_json(x: Each[RangeMap], params: Doubled) -> RangeMap:
+    """Settings that JSON changes."""
+    return x
+
+
+@stage("misnamed")
+def misnamed(x: Each[RangeMap]) -> RangeMap:
+    """A name without a kind."""
+    return x
+
+
+@bad
+def another_kind(x: Each[RangeMap]) -> Features:
+    """Not what it declares."""
+    return x  # type: ignore[return-value]
+
+
+@bad
+def unsound(x: Each[RangeMap]) -> RangeMap:
+    """A record that is none."""
+    return replace(x, confidence=np.full_like(x.confidence, 7))
+
+
+@bad
+def scribbles(x: Each[RangeMap]) -> RangeMap:
+    """Its input is written to."""
+    x.range[0] = 1.0
+    return x
+
+
+@bad
+def forces(x: Each[RangeMap]) -> RangeMap:
+    """Its input is written to by force."""
+    copy = replace(x, range=x.range.copy(), confidence=x.confidence.copy())
+    object.__setattr__(x, "range", x.range + 1)
+    return copy
+
+
+@bad
+def elsewhere(x: Each[RangeMap]) -> Files:
+    """A file that is not in the scratch folder."""
+    return Files({"{item}.txt": Path(__file__)})
+
+
+@bad
+def never_written(x: Each[RangeMap], ctx: Context) -> Files:
+    """A file that is not there."""
+    return Files({"{item}.txt": ctx.scratch / "a.txt"})
+
+
+@bad
+def draws(x: Each[RangeMap]) -> RangeMap:
+    """Random numbers of its own."""
+    return replace(x, range=(x.range * DRAWS.uniform(1, 1.001)).astype(np.float32))
+
+
+@bad
+def counts_threads(x: Each[RangeMap], ctx: Context) -> RangeMap:
+    """A result that depends on the number of threads."""
+    return replace(x, range=(x.range * ctx.threads).astype(np.float32))
+
+
+@bad
+def reports_at_random(x: Each[RangeMap], ctx: Context) -> RangeMap:
+    """A figure that is another one every time."""
+    ctx.metric("luck", DRAWS.random())
+    return x
+
+
+@bad
+def needs_room(x: Each[RangeMap]) -> RangeMap:
+    """An index that small pictures do not have."""
+    assert x.range[20, 40] != 0
+    return x
+
+
+@bad
+def needs_something(x: Each[RangeMap]) -> RangeMap:
+    """A median of nothing."""
+    level = np.array(sorted(x.range[x.valid]))[0]
+    return replace(x, range=np.maximum(x.range, level))
+
+
+@bad
+def needs_the_optional(x: Each[RangeMap], image: Each[Panorama] | None) -> RangeMap:
+    """An optional input that it cannot do without."""
+    assert image is not None
+    return x
+
+
+@bad
+def fills_masked(x: Each[RangeMap], image: Each[Panorama]) -> RangeMap:
+    """A range for every pixel."""
+    ranges = np.where(x.valid, x.range, np.float32(1))
+    return RangeMap(ranges, np.maximum(x.confidence, np.uint8(1)))
+
+
+@bad
+def unmasks(image: Each[Panorama], ctx: Context) -> Panorama:
+    """A mask that forgets the one that is there."""
+    path = ctx.scratch / "mask.png"
+    write_png(path, np.full(image.size_hw, 255, np.uint8))
+    return replace(image, mask_file=FilePart(path))
+
+
+@bad
+def sees_masked(image: Each[Panorama]) -> Features:
+    """A key point in every column, just above the nadir."""
+    height, width = image.size_hw
+    angles = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
+    low = np.radians(-80)
+    bearings = np.stack([np.cos(low) * np.sin(angles), np.full(width, -np.sin(low)), np.cos(low) * np.cos(angles)], -1)
+    ones, colors = np.ones(width, np.float32), np.zeros((width, 3), np.uint8)
+    return Features(bearings, np.ones((width, 2), np.float32), ones, ones, colors, "l2", (height, width))
+
+
+@bad
+def stops_at_the_seam(x: Each[RangeMap]) -> RangeMap:
+    """A border where there is none."""
+    keep = np.ones(x.range.shape, np.bool_)
+    keep[:, : keep.shape[1] // 8] = False
+    return RangeMap(np.where(keep & x.valid, x.range, np.nan).astype(np.float32), np.where(keep, x.confidence, 0))
+
+
+LAWS = {
+    undocumented: "declares itself",
+    misnamed: "declares itself",
+    undescribed: "declares itself|settings that are values",
+    changed_by_json: "settings that are values",
+    another_kind: "returns what it declares|returns the same|takes or refuses|respects|rolls",
+    unsound: "returns what it declares|returns the same|takes or refuses|respects|rolls",
+    scribbles: "returns what it declares|returns the same|takes or refuses|respects|rolls",
+    forces: "returns what it declares|returns the same|rolls",
+    elsewhere: "returns what it declares|returns the same|takes or refuses",
+    never_written: "returns what it declares|returns the same|takes or refuses",
+    draws: "returns the same bytes",
+    counts_threads: "returns the same bytes",
+    reports_at_random: "returns the same bytes",
+    needs_room: "takes or refuses pictures (8|9)",
+    needs_something: "takes or refuses nothing to see",
+    needs_the_optional: "takes or refuses inputs left out",
+    fills_masked: "respects masks",
+    unmasks: "respects masks",
+    sees_masked: "respects masks",
+    stops_at_the_seam: "rolls with",
+}
+
+
+@pytest.mark.parametrize("broken", LAWS, ids=lambda function: function.__name__)
+def test_a_stage_that_breaks_a_law_is_caught_by_it(broken: Callable[..., Any]) -> None:
+    caught = []
+    for law in stage_laws(broken):
+        if broken is forces:  # it changes what it is given
+            tiny_capture.cache_clear()
+        try:
+            law.check()
+        except (AssertionError, ContractError, ValueError, IndexError):
+            caught.append(law.name)
+    if broken is forces:
+        tiny_capture.cache_clear()
+    assert caught
+    expected = LAWS[broken].split("|") if "(" not in LAWS[broken] else ["takes or refuses pictures"]
+    assert all(any(what in name for what in expected) for name in caught), caught
+
+
+def test_a_refusal_is_no_breach_but_for_ordinary_inputs() -> None:
+    @stage("toy.refuses")
+    def refuses(x: Each[RangeMap]) -> RangeMap:
+        """Small pictures are refused."""
+        if x.range.shape[0] < 32:
+            raise InputError("too small: take larger pictures")
+        return x
+
+    check_stage(refuses)
+    with pytest.raises(AssertionError, match="refuses ordinary inputs: too small"):
+        check_stage(refuses, size_hw=(16, 32))
+
+
+@dataclass(frozen=True, eq=False)
+class Note(Record):
+    """A kind of somebody's own."""
+
+    axis: ClassVar[Axis | None] = Axis.IMAGE
+    text: str
+
+
+def test_a_kind_of_ones_own_is_given() -> None:
+    @stage("toy.shout")
+    def shout(note: Each[Note], image: Each[Panorama]) -> Note:
+        """Louder."""
+        return Note(note.text.upper())
+
+    check_stage(shout, inputs={"note": Note("here")})
+    with pytest.raises(UsageError, match=r"no Note: give one as inputs=\{'note'"):
+        check_stage(shout)
+
+
+def test_what_is_no_stage_is_refused() -> None:
+    with pytest.raises(UsageError, match="is not a stage"):
+        stage_laws(len)
+    with pytest.raises(UsageError, match=r"did you mean 'filters\.median'"):
+        stage_laws("filters.medain")
+
+
+PARTS = """\
+import numpy as np
+from pano_mvs.api import *
+
+
+@register_sweep_cost("law_{0}")
+def cost(reference, warped, window):
+    {1}
+
+
+@register_sweep_backend("law_{0}", costs=["sad"])
+def backend(work):
+    from pano_mvs.algorithms.sweep.numpy_backend import find_winners
+    from dataclasses import replace
+    winners = find_winners(work)
+    return replace(winners, plane=np.zeros_like(winners.plane))
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "body", "law"),
+    [
+        ("large", "return np.abs(reference - warped)[..., 0]", "from 0 to 1"),
+        ("constant", "return np.full(reference.shape[:2], 0.5)", "less where pictures are the same"),
+        ("random", "return np.random.default_rng().random(reference.shape[:2]) * (reference[..., 0] != warped[..., 0])",
+         "the same again"),
+    ],
+)  # fmt: skip
+def test_a_part_that_breaks_a_law_is_caught_by_it(tmp_path: Path, name: str, body: str, law: str) -> None:
+    path = tmp_path / f"{name}.py"
+    path.write_text(PARTS.format(name, body))
+    (broken,) = [each for each in cost_laws(path) if law in each.name]
+    with pytest.raises((AssertionError, ContractError)):
+        broken.check()
+
+
+def test_a_backend_that_finds_something_else_is_caught(tmp_path: Path) -> None:
+    path = tmp_path / "backend.py"
+    path.write_text(PARTS.format("backend", "return np.zeros(reference.shape[:2])"))
+    agreement, again = backend_laws(path)
+    with pytest.raises(AssertionError, match="agrees with the readable backend in"):
+        agreement.check()
+    again.check()
+
+
+def test_built_in_costs_have_no_laws_of_plugins() -> None:
+    with pytest.raises(UsageError, match="'census' is built in"):
+        cost_laws("census")[0].check()
+    assert CostWindow.of((8, 16), 1, spherical=True).columns.shape == (8, 3)
+
+
+def test_a_rolled_capture_is_the_same_place() -> None:
+    straight, rolled = tiny_capture(), tiny_capture(Variant(rolled=16))
+    for one, other in zip(straight.poses, rolled.poses, strict=True):
+        np.testing.assert_allclose(one.center, other.center, atol=1e-12)
+    np.testing.assert_array_equal(np.roll(straight.pictures[1], 16, axis=1), rolled.pictures[1])
+    np.testing.assert_array_equal(straight.points_in_world, rolled.points_in_world)
