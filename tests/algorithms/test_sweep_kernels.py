@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numba import njit
 
+from pano_mvs.algorithms.sweep import kernels_sgm
 from pano_mvs.algorithms.sweep.kernels_band import store_row
 from pano_mvs.algorithms.sweep.kernels_combine import combine_row
 from pano_mvs.algorithms.sweep.kernels_cost import box_rows, census_row, difference_row
 from pano_mvs.algorithms.sweep.kernels_sad import average_differences, one_box_serves
 from pano_mvs.algorithms.sweep.kernels_sgm import sweep_row, sweep_strip
+from pano_mvs.algorithms.sweep.kernels_vector import HAS_VECTOR
 from pano_mvs.algorithms.sweep.kernels_winner import (
     AFTER,
     BEFORE,
@@ -191,3 +194,21 @@ def test_one_step_of_many_paths_equals_each_alone():
         for d in range(5):
             around = [before[e, k] + 9 for e in (d - 1, d + 1) if 0 <= e < 5]
             assert together[d, k] == costs[d, k] + min([before[d, k], floor + p2, *around]) - floor
+
+
+@pytest.mark.skipif(not HAS_VECTOR, reason="there is nothing but loops")
+@pytest.mark.parametrize(("drift", "upward"), [(0, False), (1, False), (-1, True)])
+@pytest.mark.parametrize(("lines", "first"), [(100, 0), (40, 70), (5, 99), (33, 1)])
+def test_paths_by_vector_instructions_equal_those_by_loops(drift, upward, lines, first, monkeypatch):
+    rng = np.random.default_rng(lines)
+    (height, width), depth = (9, 100), 7
+    volume = rng.integers(1, 256, (height, depth, width), dtype=np.uint8)
+    penalties = rng.integers(20, 90, (height, width)).astype(np.uint16)
+    totals = []
+    for vector in (True, False):
+        monkeypatch.setattr(kernels_sgm, "HAS_VECTOR", vector)
+        strip = kernels_sgm.sweep_strip if vector else njit(sweep_strip.py_func, error_model="numpy")
+        totals.append(np.full(volume.shape, 3, np.uint16))
+        strip(volume, totals[-1], penalties, np.uint16(11), first, lines, drift, upward, 3)
+    assert totals[0].tobytes() == totals[1].tobytes()
+    assert (totals[0] == 3).sum() == (width - lines) * depth * height

@@ -9,6 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from pano_mvs.algorithms.sweep.kernels_vector import HAS_VECTOR
+from pano_mvs.algorithms.sweep.kernels_vector_path import LINES, step_lines
+
 _U = np.uint64
 _H = np.uint16
 _OUTSIDE = np.uint16(60000)  # the cost of the planes before the first and after the last; P1 on top must not overflow
@@ -16,7 +19,7 @@ _BLOCK = 32  # columns of which all planes fit the nearest cache
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _step(  # type: ignore[no-untyped-def]
+def step_plain(  # type: ignore[no-untyped-def]
     volume, total, place, segment, penalties, p1, before, least_before, after, least, keep
 ):
     """Advance the lines of one segment by one row: `place` (row, column), `segment` (first line, lines)."""
@@ -41,6 +44,25 @@ def _step(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
+def step_segment(volume, total, place, segment, penalties, p1, state, least, keep):  # type: ignore[no-untyped-def]
+    """Do what `step_plain` does by vector instructions, in place; volume and total must be contiguous.
+
+    Lines have a margin of `LINES` on either side: where the row ends before a register does, it starts earlier, with
+    lines of no meaning that are left as they are.
+    """
+    _, depth, width = volume.shape
+    first, lines = segment
+    for done in range(0, lines, LINES):
+        back = max(0, place[1] + done + LINES - width)
+        column = place[1] + done - back
+        step_lines(
+            volume, total, _U(place[0] * depth * width + column), _U(width), _U(depth), p1, penalties,
+            _U(place[0] * width + column), state, least, _U(LINES + first + done - back), _U(state.shape[1]),
+            _U(back), _U(back + min(LINES, lines - done)), _U(keep),
+        )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def sweep_strip(volume, total, penalties, p1, first, lines, drift, upward, warm):  # type: ignore[no-untyped-def]
     """Follow one strip of parallel paths from pole to pole and add their costs to the total.
 
@@ -59,25 +81,29 @@ def sweep_strip(volume, total, penalties, p1, first, lines, drift, upward, warm)
         warm: steps before the pole.
     """
     height, depth, width = volume.shape
-    buffers = np.zeros((2, depth + 2, lines), np.uint16)
+    vector = HAS_VECTOR and width >= LINES
+    margin = LINES if vector else 0
+    buffers = np.zeros((1 if vector else 2, depth + 2, lines + 2 * margin), np.uint16)
     buffers[:, 0, :] = _OUTSIDE
     buffers[:, depth + 1, :] = _OUTSIDE
-    least = np.zeros((2, lines), np.uint16)
+    least = np.zeros((2, lines + 2 * margin), np.uint16)
     for i in range(-warm, height):
         now = (i + warm) % 2
         row = i if i >= 0 else -1 - i
         row = height - 1 - row if upward else row
         column = first + drift * i + (0 if i >= 0 else width // 2)
         column = (column % width + width) % width
-        least[now, :] = _OUTSIDE
         direct = min(lines, width - column)
-        _step(
-            volume, total, (row, column), (0, direct), penalties, p1,
-            buffers[1 - now], least[1 - now], buffers[now], least[now], i >= 0,
-        )  # fmt: skip
-        if direct < lines:
-            _step(
-                volume, total, (row, 0), (direct, lines - direct), penalties, p1,
+        if vector:
+            step_segment(volume, total, (row, column), (0, direct), penalties, p1, buffers[0, 1:], least[0], i >= 0)
+            step_segment(
+                volume, total, (row, 0), (direct, lines - direct), penalties, p1, buffers[0, 1:], least[0], i >= 0
+            )
+            continue
+        least[now, :] = _OUTSIDE
+        for place, segment in (((row, column), (0, direct)), ((row, 0), (direct, lines - direct))):
+            step_plain(
+                volume, total, place, segment, penalties, p1,
                 buffers[1 - now], least[1 - now], buffers[now], least[now], i >= 0,
             )  # fmt: skip
 

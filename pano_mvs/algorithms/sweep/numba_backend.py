@@ -28,7 +28,7 @@ from pano_mvs.algorithms.sweep.kernels_sgm import sweep_row, sweep_strip
 from pano_mvs.algorithms.sweep.kernels_vector import HAS_VECTOR
 from pano_mvs.algorithms.sweep.kernels_winner import AFTER, BEFORE, BEST, RIVAL, STATES, winners_of_rows
 from pano_mvs.algorithms.sweep.packing import pack_sources, pack_votes
-from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, step_penalties, warm_up
+from pano_mvs.algorithms.sweep.penalties import step_penalties, warm_up
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.windows import column_offsets
 from pano_mvs.algorithms.sweep.winner import Winners
@@ -116,21 +116,28 @@ def _aggregate(pool: ThreadPoolExecutor, work: SweepInput, volume: NDArray[np.ui
     total = np.zeros(volume.shape, np.uint16)
     p1 = np.uint16(settings.penalties(height)[0])
     beyond_pole, before_seam = warm_up((height, width))
-    for rows, columns in DIRECTIONS:
-        penalties = step_penalties(work.reference, (rows, columns), settings)
-        follow = partial(_follow_strip, volume, total, penalties, p1, columns, rows < 0, beyond_pole)
+    for drift in (-1, 0, 1):
+        penalties = (
+            step_penalties(work.reference, (1, drift), settings),
+            step_penalties(work.reference, (-1, -drift), settings),
+        )
+        follow = partial(_follow_lines, volume, total, penalties, p1, drift, beyond_pole)
         _run(pool, follow, range(0, width, _STRIP_LINES))
     sideways = np.stack([step_penalties(work.reference, (0, step), settings) for step in (1, -1)])
     _run(pool, lambda y: sweep_row(volume, total, sideways, p1, y, before_seam), range(height))
     return total
 
 
-def _follow_strip(
-    volume: NDArray[np.uint8], total: NDArray[np.uint16], penalties: NDArray[np.uint16], p1: np.uint16,
-    drift: int, upward: bool, warm: int, first: int,
+def _follow_lines(
+    volume: NDArray[np.uint8], total: NDArray[np.uint16], penalties: tuple[NDArray[np.uint16], NDArray[np.uint16]],
+    p1: np.uint16, drift: int, warm: int, first: int,
 ) -> None:  # fmt: skip
-    lines = min(_STRIP_LINES, volume.shape[2] - first)
-    sweep_strip(volume, total, penalties, p1, first, lines, drift, upward, warm)
+    """Follow a strip of lines down and then, while caches still hold it, up again."""
+    height, _, width = volume.shape
+    lines = min(_STRIP_LINES, width - first)
+    sweep_strip(volume, total, penalties[0], p1, first, lines, drift, False, warm)
+    last = (first + drift * (height - 1)) % width
+    sweep_strip(volume, total, penalties[1], p1, last, lines, -drift, True, warm)
 
 
 def _run(pool: ThreadPoolExecutor, work: Callable[[Job], object], jobs: Iterable[Job]) -> None:
