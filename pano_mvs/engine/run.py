@@ -131,11 +131,12 @@ class Run:
                 self._execute_once()
                 return
             except DamagedBlobError as error:
-                found[str(error)] += 1
-                if found[str(error)] > _HEALING_ROUNDS:
-                    raise StoreError(f"{error} again and again: check the disk, or choose another cache with "
-                                     "--cache DIR")  from error  # fmt: skip
-                self._warn(str(error))
+                for text in dict.fromkeys(self._scheduler.damaged or [str(error)]):
+                    self._warn(text)
+                    found[text] += 1
+                    if found[text] > _HEALING_ROUNDS:
+                        raise StoreError(f"{text} again and again: check the disk, or choose another cache with "
+                                         "--cache DIR")  from error  # fmt: skip
                 self._scheduler.drain()
 
     def _execute_once(self) -> None:

@@ -35,6 +35,8 @@ class Scheduler:
     Attributes:
         keys: stage to unit to cache key, of all units seen.
         computed: key to what was computed rather than found, in this pass or in those before it.
+        damaged: what turned out damaged in this pass, and has been removed. Units that need it are left for the next
+            pass, and the rest goes on: much damage takes no more passes than little.
     """
 
     def __init__(
@@ -51,6 +53,7 @@ class Scheduler:
     ) -> None:
         self.keys = keys
         self.computed = computed
+        self.damaged: list[str] = []
         self._board = board
         self._tally = tally
         self._desk = desk
@@ -64,7 +67,7 @@ class Scheduler:
         """Go on until every unit is settled.
 
         Raises:
-            DamagedBlobError: if something stored turned out damaged; it has been removed.
+            DamagedBlobError: if something stored turned out damaged, once nothing else can be done.
             GateError: if the workflow says that the run stops here.
             StoreError: if the store or the output folder cannot be written.
             UsageError: if workers know another version of a stage.
@@ -79,6 +82,8 @@ class Scheduler:
             if held is not None and self._hand_out(held):
                 held = None
             if nothing_runs and not self._desk:
+                if self.damaged:
+                    raise DamagedBlobError(self.damaged[0])
                 return
             must_wait = nothing_runs or held is not None or not self._desk.has_room
             ended = self._desk.take(None if must_wait else 0)
@@ -123,7 +128,8 @@ class Scheduler:
         twins = self._twins.pop(unit.key)
         if outcome.status == "damaged":
             self._doubt(unit)
-            raise DamagedBlobError(outcome.cause)
+            self.damaged.append(outcome.cause)
+            return
         if outcome.status == "stopped":
             raise _STOPPING.get(outcome.error, PanoMvsError)(outcome.cause)
         if outcome.record is not None:
@@ -139,9 +145,10 @@ class Scheduler:
         if issubclass(unit.entry.spec.output, Files):
             try:
                 self._publisher.publish(unit.entry.name, unit.item, record.output, to=unit.entry.policy.to)
-            except DamagedBlobError:
+            except DamagedBlobError as error:
                 self._store.drop(record.key)
-                raise
+                self.damaged.append(str(error))
+                return
         self._tally.unit_done(unit.entry, unit.item, record, "run" if was_computed else "cached")
         self._board.finish(unit, record)
 

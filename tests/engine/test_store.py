@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import ContractError, UsageError
 from pano_mvs.engine.blobs import DamagedBlobError
+from pano_mvs.engine.events import Silent
 from pano_mvs.engine.store import Store
 from pano_mvs.scene import RangeMap, Record
 from tests.engine.conftest import Toy, ran, settle
@@ -167,3 +168,28 @@ def test_digest_does_not_depend_on_the_order_of_keys() -> None:
 def test_what_has_no_canonical_form_is_refused(value: object) -> None:
     with pytest.raises(UsageError, match="cache key"):
         digest_from_value([value])
+
+
+def test_much_damage_takes_few_passes(toy: Toy) -> None:
+    """Each damaged blob made the run start over: hundreds of them in a large capture took hours."""
+    for number in range(6, 20):
+        toy.number(f"{number}.txt", str(10 * number))
+    toy.run()
+    clean = toy.deliverables()
+    root = toy.folder / "cache"
+    for blob in (root / "blobs").rglob("*.*"):
+        blob.write_bytes(b"x" * blob.stat().st_size)
+    for record in (root / "records").rglob("*.json"):
+        if b'"stage": "toy.mean"' in record.read_bytes() or b'"stage": "toy.write' in record.read_bytes():
+            record.unlink()
+    passes = []
+    listed = Silent.stage_started
+    try:
+        Silent.stage_started = lambda self, name, units: passes.append(name)  # type: ignore[method-assign]
+        result = toy.run()
+    finally:
+        Silent.stage_started = listed  # type: ignore[method-assign]
+    assert result.exit_code == 0
+    assert toy.deliverables() == clean
+    assert len(result.warnings) > 19
+    assert passes.count("images") < 8

@@ -1,0 +1,91 @@
+"""Files that are written in one step, and what is left of those who were killed while they wrote."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from pano_mvs.core import files
+from pano_mvs.core.errors import StoreError
+from pano_mvs.core.files import clear_abandoned, replacing, temporary_prefix, write_text
+from pano_mvs.engine.store import Store
+from tests.engine.conftest import Toy, toy  # noqa: F401 (a fixture)
+
+ON_POSIX = pytest.mark.skipif(os.name != "posix", reason="elsewhere only age tells whether a process is gone")
+
+
+def of_a_dead_process() -> str:
+    code = "from pano_mvs.core.files import temporary_prefix; print(temporary_prefix(), end='')"
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+
+
+@ON_POSIX
+def test_leavings_of_dead_processes_go_at_once_and_those_of_others_with_age(tmp_path: Path) -> None:
+    dead, here, elsewhere = of_a_dead_process(), temporary_prefix(), ".tmp-00000000-1-"
+    assert dead != here
+    for prefix in (dead, here, elsewhere, ".tmp-", "tmp-", ".tmp-00000000-99999999999-"):
+        (tmp_path / f"{prefix}young").touch()
+        (tmp_path / f"{prefix}old").mkdir()
+        (tmp_path / f"{prefix}old" / "inside").touch()
+        os.utime(tmp_path / f"{prefix}old", (time.time() - 8 * 86400,) * 2)
+    (tmp_path / f"{dead}link").symlink_to(tmp_path / f"{here}old")
+    clear_abandoned(tmp_path)
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {f"{here}young", f"{here}old", f"{elsewhere}young", ".tmp-young", "tmp-young", "tmp-old",
+                    ".tmp-00000000-99999999999-young"}  # fmt: skip
+    assert (tmp_path / f"{here}old" / "inside").exists()
+    clear_abandoned(tmp_path / "nowhere")
+
+
+@ON_POSIX
+def test_nothing_half_written_is_left_in_results_or_store(toy: Toy) -> None:  # noqa: F811
+    """What a killed run was writing stayed beside the results for ever, and blocked `cache gc` in the book of runs."""
+    toy.run()
+    clean, dead = toy.deliverables(), of_a_dead_process()
+    root = toy.folder / "cache"
+    for folder in (toy.folder / "out", toy.folder / "out" / "mean", root / "tmp"):
+        (folder / f"{dead}x.txt").write_text("half")
+    toy.run()
+    assert toy.deliverables() == clean
+    assert not list((root / "tmp").iterdir())
+
+
+def test_scratch_folders_tell_whose_they_are(tmp_path: Path) -> None:
+    with Store(tmp_path).scratch() as folder:
+        assert folder.name.startswith(temporary_prefix())
+        Store(tmp_path)
+        assert folder.is_dir()
+
+
+@pytest.mark.parametrize("durable", [True, False])
+def test_file_is_the_old_one_until_it_is_the_new_one(tmp_path: Path, durable: bool) -> None:
+    path = tmp_path / "a" / "b.txt"
+    write_text(path, "old", durable=durable)
+
+    def fail_half_way() -> None:
+        with replacing(path, durable=durable) as temporary:
+            temporary.write_text("new")
+            assert path.read_text() == "old"
+            raise ValueError("half way")
+
+    with pytest.raises(ValueError, match="half way"):
+        fail_half_way()
+    assert [found.name for found in path.parent.iterdir()] == ["b.txt"]
+    write_text(path, "new", durable=durable, temporary_in=tmp_path)
+    assert path.read_text() == "new"
+
+
+def test_file_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(StoreError, match=r"file.b\.txt cannot be written: (Not a directory|File exists)"):
+        write_text(tmp_path / "file" / "b.txt", "x")
+
+
+def test_age_of_what_is_gone_is_no_error(tmp_path: Path) -> None:
+    assert not files.is_older(tmp_path / "gone", 0)
+    files.remove_whole(tmp_path / "gone")
