@@ -242,3 +242,15 @@ def test_impossible_settings_are_named(view, settings, words):
 def test_a_guide_of_another_size_is_refused(view):
     with pytest.raises(UsageError, match="guide must be"):
         smooth_all(as_map(view[1]), view[0][::2, ::2])
+
+
+@pytest.mark.parametrize("height", [25, 50, 75, 100, 150])
+def test_corners_of_cells_without_a_pixel_do_not_stop_the_solution(height: int) -> None:
+    """In pictures of some heights (75, 100, 150, 333, 375 rows …) their 0 / 0 once made the solver return its input."""
+    size_hw = height, 2 * height
+    rows, columns = np.indices(size_hw)
+    picture = np.repeat(((rows + columns) % 200).astype(np.uint8)[..., None], 3, axis=-1)
+    ranges = np.random.default_rng(height).uniform(1.9, 2.1, size_hw).astype(np.float32)
+    solved = fast_bilateral_solver(RangeMap(ranges, np.full(size_hw, 90, np.uint8)), picture)
+    assert solved.valid.all()
+    assert solved.range.std() < 0.5 * ranges.std()
