@@ -48,7 +48,7 @@ def collect(
     cache: CacheOption = None,
     delete: Annotated[bool, typer.Option("--delete", help="Delete it; else it is only shown.")] = False,
     unused: Annotated[
-        str, typer.Option("--unused", metavar="TIME", help="Keep what was used within this time.")
+        str, typer.Option("--unused", metavar="TIME", help="Keep what was computed within this time.")
     ] = "1d",
     older_than: Annotated[
         str, typer.Option("--older-than", metavar="TIME", help="Forget runs that ended longer ago, such as 30d.")

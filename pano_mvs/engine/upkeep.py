@@ -1,8 +1,8 @@
 """Look after a store: what it holds, whether it is sound, and what nothing needs any more.
 
-A collection marks what the runs and the pins of the book name, and sweeps the rest once it has not been used for a
-while. It takes no lock: a run that finds a blob gone computes it again, and what a run has just written or found of use
-is too young to be swept.
+A collection marks what the runs and the pins of the book name, and sweeps the rest once it has not been computed for a
+while. It takes no lock: what a run has just computed is too young to be swept, and a run that finds something gone
+computes it again.
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ def collect(store: Store, *, unused_s: float, forget_after_s: float | None = Non
 
     Args:
         store: the store.
-        unused_s: what was written or used within this time stays.
+        unused_s: what was computed within this time stays, needed or not.
         forget_after_s: forget runs that ended longer ago than this; None forgets none. Pins stay.
         delete: remove; else only tell.
 
