@@ -108,11 +108,11 @@ class Publisher:
 
     def _write(self, name: str, blob: BlobRef) -> None:
         target = self.out / name
+        if not _is_inside(target, self.out):
+            raise StoreError(_cannot_write(target, "it would leave the output folder (a link leads outside)"))
         self._clear(target.parent)
         if target.is_file() and not target.is_symlink() and self.store.stat_cache.digest(target) == blob.digest:
             return
-        if not _is_inside(target, self.out):
-            raise StoreError(_cannot_write(target, "it would leave the output folder (a link leads outside)"))
         source = self.store.blobs.verified_path(blob)
         try:
             copy_file(source, target)
