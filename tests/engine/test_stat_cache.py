@@ -13,7 +13,10 @@ from hypothesis import strategies as st
 
 from pano_mvs.core.digest import digest_from_bytes
 from pano_mvs.engine import stat_cache
+from pano_mvs.engine.executors.processes import ProcessExecutor
+from pano_mvs.engine.run import Run
 from pano_mvs.engine.stat_cache import StatCache
+from pano_mvs.engine.store import Store
 from tests.engine.conftest import Toy, settle
 from tests.engine.test_hostile_store import anything, fuzzing, signed
 
@@ -147,8 +150,15 @@ def list_items''').replace("import os\n", "import os\nfrom pano_mvs.scene import
     lies = {name: [*entry[:4], "0" * 32] for name, entry in json.loads(path.read_bytes().partition(b"\n")[2]).items()}
     assert len(lies) >= 5
     path.write_bytes(signed(lies))
-    result = toy.run()
+    session = toy.session()
+    store = Store(session.store_root)
+    executor = ProcessExecutor(store, workers=1, threads=1)  # what a worker notices, we have to forget
+    try:
+        result = Run(session.workflow, session.graph, store, session.out, executor=executor).execute()
+    finally:
+        executor.close()
     assert result.exit_code == 0
+    assert any("is damaged or gone" in text for text in result.warnings)
     assert toy.deliverables() == clean
 
 
