@@ -1,6 +1,6 @@
 """How long the sweep takes: `python -m tests.benchmarks.sweep [--small] [--rows 512] [--planes 128] [--sources 3]`.
 
-CPU time of one process, so that other work on the machine counts less; each work in turn, several rounds, the median.
+CPU time of one process, so that other work on the machine counts less; each work in turn, several rounds, the best.
 Pictures are noise: the sweep's work does not depend on what is in them. The floor is RGB bilinear sampling from L2 with
 the coordinates known; "cv2.remap" does the work of SAD + box with maps that are there already. All run in one thread.
 """
@@ -8,7 +8,6 @@ the coordinates known; "cv2.remap" does the work of SAD + box with maps that are
 from __future__ import annotations
 
 import argparse
-import statistics
 from collections.abc import Sequence
 from functools import partial
 from unittest.mock import patch
@@ -41,7 +40,7 @@ def pictures(rows: int, sources: int) -> tuple[list[np.ndarray], list[Rigid3]]:
 
 
 def measure(*, rows: int, planes: int, sources: int, rounds: int) -> dict[str, float]:
-    """Return the median nanoseconds a sample of each work, the floors' among them."""
+    """Return the least nanoseconds a sample of each work, the floors' among them."""
     images, poses = pictures(rows, sources)
     sad = SweepSettings(planes=planes, cost="sad", aggregation="box", combination="sum", exposure=False)
     configurations = {
@@ -66,7 +65,7 @@ def measure(*, rows: int, planes: int, sources: int, rounds: int) -> dict[str, f
         times[REMAP] = remap_pipeline(images, poses, ranges) / samples if turn else np.nan
         for name, seconds in times.items() if turn else ():  # the first turn compiles
             found.setdefault(name, []).append(1e9 * seconds)
-    return {name: statistics.median(values) for name, values in found.items()}
+    return {name: min(values) for name, values in found.items()}
 
 
 def table(found: dict[str, float], samples: int) -> str:

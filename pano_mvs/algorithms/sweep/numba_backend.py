@@ -1,7 +1,7 @@
 """The sweep, compiled: bands of rows in threads, no volume unless semi-global matching needs one.
 
 Memory beyond the pictures and the result: a source's packed copy has 4 bytes a pixel if it is grey, 8 in colour, or 12
-without vector instructions; for "box" about 2 MB a thread at 1,000 columns and 3 sources, whatever the planes and the
+without vector instructions; for "box" about 3 MB a thread at 1,000 columns and 3 sources, whatever the planes and the
 rows; for "sgm" on top of it 3 bytes for each pixel and plane (a uint8 volume of costs and a uint16 volume of path sums;
 201 MB at 512×1024×128).
 
