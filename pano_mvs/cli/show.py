@@ -95,7 +95,7 @@ def _registry(workflow: str | None, files: Sequence[Path]) -> tuple[Registry, Wo
     if workflow is None:
         return registry, None
     try:
-        load_workflow(find_workflow(workflow, presets_folder())[0], registry)
+        load_workflow(find_workflow(workflow, presets_folder())[0], registry, presets=presets_folder())
     except WorkflowError as error:  # what its plugins define can be shown all the same
         return registry, error
     return registry, None

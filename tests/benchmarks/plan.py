@@ -1,10 +1,10 @@
 """Planning at scale: `python -m tests.benchmarks.plan [ITEMS]`.
 
 A capture of ITEMS small files, features of each, pairs of each with its eight followers, a match of each pair, one
-solve of all, a range and a filtered range of each view with four neighbours, and one file for all: at 5,000 items 60,000
-units.
-The stages do next to nothing; what is measured is the plan before anything is cached, the plan and the run when all is,
-and the plan after one image is added. Limits are on the processor time and the peak memory of a process of its own.
+solve of all, a range and a filtered range of each view with four neighbours, and one file for all: at 5,000 items
+60,000 units. The stages do next to nothing; what is measured is the plan before anything is cached, the plan and the
+run when all is, and the plan after one image is added. The processor time and the peak memory are those of a process
+of its own.
 """
 
 from __future__ import annotations
