@@ -35,8 +35,8 @@ class SweepSettings:
         cost: "census" (Hamming distance of the signs of differences to the window's centre; blind to exposure), "zncc"
             (1 − zero-mean normalised cross-correlation; blind to it too), "sad" (sum of absolute differences of R, G
             and B; the paper's), "sad_gradient" (differences of colours and of their gradients, both cut off),
-            "census_gradient" (census and, with a quarter of its weight, differences of grey levels and of their gradients, cut
-            off) or a plugin's.
+            "census_gradient" (census and, with a quarter of its weight, differences of grey levels and of their
+            gradients, cut off) or a plugin's.
         window: side in pixels, odd, of the window of either cost (the paper: 7).
         spherical_window: widen the windows' columns by 1/cos of the elevation, so that they keep their solid angle.
         combination: "sum" over the sources (the paper's), or the mean of the "best_half" of them at each pixel and
