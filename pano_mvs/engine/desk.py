@@ -10,6 +10,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from pano_mvs.engine.blobs import DamagedBlobError
+from pano_mvs.engine.execute import arguments_of
 from pano_mvs.engine.executors.capture import tail
 from pano_mvs.engine.executors.protocol import Executor, Job, Outcome
 from pano_mvs.engine.memory import size_text
@@ -69,7 +71,7 @@ class Desk:
 
     def fits(self, unit: Unit) -> bool:
         """Return whether a unit's declared memory is free beside that of those that are out."""
-        wanted = memory_of(unit)
+        wanted = memory_of(unit, self._store)
         if not wanted:
             return True
         used = sum(out.memory_bytes for out in self._out.values())
@@ -79,7 +81,7 @@ class Desk:
 
     def refusal(self, unit: Unit) -> str:
         """Return why a unit that does not fit, though nothing else is out, cannot run at all."""
-        wanted, free = size_text(memory_of(unit)), size_text(self._free_bytes)
+        wanted, free = size_text(memory_of(unit, self._store)), size_text(self._free_bytes)
         return (
             f"it declares {wanted} of memory, and {free} are free. Close other programs, use smaller pictures or "
             f"settings, or say with `memory:` in stage {unit.entry.name!r} what it really needs"
@@ -91,7 +93,7 @@ class Desk:
         log = self._store.blobs.temporary / f"log-{uuid.uuid4().hex}.txt"
         job = Job(self._next, unit, threads, unit.entry.policy.timeout_s, log, self._plugins)
         self._next += 1
-        self._out[job.number] = _Out(job, memory_of(unit))
+        self._out[job.number] = _Out(job, memory_of(unit, self._store))
         self._executor.submit(job)
 
     def take(self, timeout_s: float | None = None) -> Ended | None:
@@ -136,9 +138,15 @@ class Desk:
         return None, said
 
 
-def memory_of(unit: Unit) -> int:
+def memory_of(unit: Unit, store: Store) -> int:
     """Return the bytes that a unit declares, in the workflow or else in its stage; 0 if it does not."""
-    return unit.entry.policy.memory_bytes or unit.entry.spec.memory_bytes
+    spec, stated = unit.entry.spec, unit.entry.policy.memory_bytes
+    if stated or spec.memory_needed is None:
+        return stated or spec.memory_bytes
+    try:
+        return spec.memory_needed(unit.entry.params, arguments_of(unit, store))
+    except DamagedBlobError:
+        return 0  # the unit meets it too, and is computed again with what it reads
 
 
 def log_name(stage: str, item: str) -> str:

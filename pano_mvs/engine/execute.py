@@ -28,7 +28,7 @@ def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
     started = time.perf_counter()
     with store.scratch() as scratch:
         context = Context(np.random.default_rng(int(unit.key, 16)), scratch, threads)
-        arguments = _arguments(unit, store)
+        arguments = arguments_of(unit, store)
         value = unit.entry.spec.function(**arguments, **_extras(unit, context))
         _check_kind(value, unit)
         try:
@@ -51,7 +51,8 @@ def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
     return record
 
 
-def _arguments(unit: Unit, store: Store) -> dict[str, Any]:
+def arguments_of(unit: Unit, store: Store) -> dict[str, Any]:
+    """Return what a unit reads, by port; arrays are memory-mapped, and those of All are loaded on access."""
     ports = {port.name: port for port in unit.entry.spec.ports}
     return {name: _load(ports[name], value, store) for name, value in unit.inputs.items()}
 

@@ -36,6 +36,8 @@ class SourceItem:
 
 
 ListItems = Callable[[Any], Iterable[SourceItem]]
+MemoryNeeded = Callable[[Any, Mapping[str, Any]], int]
+"""Takes a unit's params and its inputs by port; returns bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +56,7 @@ class StageSpec:
         code_digest: digest of the code, for stages from user files; else empty.
         extras: argument name to what it takes beside the ports.
         memory_bytes: what one unit needs, if the author says so.
+        memory_needed: finds it for each unit, if it depends on settings and inputs.
     """
 
     name: str
@@ -67,6 +70,7 @@ class StageSpec:
     code_digest: str = ""
     extras: Mapping[str, Literal["params", "ctx", "item"]] = field(default_factory=dict)
     memory_bytes: int = 0
+    memory_needed: MemoryNeeded | None = None
 
     @property
     def doc(self) -> str:
@@ -103,12 +107,14 @@ class _Signature:
     extras: Mapping[str, Literal["params", "ctx", "item"]]
 
 
-def stage(name: str, *, version: int = 1, memory: str | int = 0) -> Callable[[Function], Function]:
+def stage(name: str, *, version: int = 1, memory: str | int | MemoryNeeded = 0) -> Callable[[Function], Function]:
     """Declare a function as a stage.
 
     The function takes ports annotated `One/Each/Near/All[Kind]`, `params` annotated with a `Params` model (optional),
     and `ctx: Context` (optional), and is annotated to return a kind. It is called with keywords. `memory`, such as
-    "2GB", is what one unit needs at most; no more of them run at a time than there is room for.
+    "2GB", is what one unit needs at most; no more of them run at a time than there is room for. Where that depends on
+    the unit it is a function `(params, inputs) -> bytes`, given what the stage itself would be given; it is called in
+    the main process, so it must be quick.
 
     Raises:
         PluginError: if the signature is not that of a stage.
@@ -149,7 +155,7 @@ def _spec(
     function: Callable[..., Any],
     signature: _Signature,
     list_items: ListItems | None,
-    memory: str | int = 0,
+    memory: str | int | MemoryNeeded = 0,
 ) -> StageSpec:
     return StageSpec(
         name=name,
@@ -161,7 +167,8 @@ def _spec(
         list_items=list_items,
         origin=_origin(function),
         extras=signature.extras,
-        memory_bytes=bytes_from_size(memory),
+        memory_bytes=0 if callable(memory) else bytes_from_size(memory),
+        memory_needed=memory if callable(memory) else None,
     )
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -98,8 +99,24 @@ class SweepParams(Params):
 
 _NOT_SETTINGS = {"backend", "device", "near", "far"}
 
+# Bytes a pixel and plane of semi-global matching: costs and sums, 1 and 2; torch keeps paths, numpy 64 bits of all.
+_VOLUME_BYTES = {"torch": 8, "numpy": 24}
+_PICTURE_BYTES, _RESULT_BYTES = 16, 40
 
-@stage("depth.sweep")
+
+def sweep_memory_bytes(params: SweepParams, inputs: Mapping[str, Any]) -> int:
+    """Return what a sweep takes at its most: the volume of semi-global matching, pictures as they are packed, winners.
+
+    From coarse to fine the volume is that of the coarsest level.
+    """
+    panoramas: list[Panorama] = [inputs["ref"], *inputs["sources"]]
+    pixels, *others = (panorama.size_hw[0] * panorama.size_hw[1] for panorama in panoramas)
+    volume = pixels * params.planes * _VOLUME_BYTES.get(params.backend, 3) if params.aggregation == "sgm" else 0
+    pictures = _PICTURE_BYTES * (pixels + sum(others))
+    return (volume >> 2 * (params.levels - 1)) + pictures + _RESULT_BYTES * pixels
+
+
+@stage("depth.sweep", memory=sweep_memory_bytes)
 def sweep(
     ref: Each[Panorama],
     pose: Each[Pose],

@@ -240,6 +240,20 @@ def test_stage_may_declare_its_memory(toy: Toy, monkeypatch: pytest.MonkeyPatch)
     assert run_with(toy, SerialExecutor, "mean.memory=1MB").exit_code == 0
 
 
+def test_memory_may_depend_on_settings_and_inputs(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(SerialExecutor, "free_memory_bytes", lambda self: 1_000_000)
+    toy.edit("plug.py", lambda text: text.replace(
+        '@stage("toy.mean")',
+        'def needed(params, inputs):\n    return 2_000_000 * (inputs["own"].value > 50 and bool(inputs["around"]))\n\n'
+        '@stage("toy.mean", memory=needed)',
+    ))  # fmt: skip
+    result = run_with(toy, SerialExecutor)
+    refused = [failure for failure in result.failures if failure.stage == "mean"]
+    assert all("declares 2 MB of memory, and 1 MB are free" in failure.cause for failure in refused)
+    assert 0 < len(refused) < 5
+    assert not run_with(toy, SerialExecutor, "mean.memory=1MB", name="y").failures
+
+
 def test_what_a_unit_prints_is_kept_whoever_prints_it(toy: Toy) -> None:
     toy.edit("plug.py", lambda text: text.replace('    """Multiply."""', '''    """Multiply."""
     import ctypes, logging, sys
