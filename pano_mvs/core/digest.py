@@ -52,10 +52,11 @@ def digest_from_stream(stream: IO[bytes]) -> str:
 
 def _encode(value: object, chunks: list[bytes]) -> None:
     """Append the canonical form; the commonest types come first, since a plan encodes a hundred thousand keys."""
+    if isinstance(value, str):
+        text = value.encode()
+        chunks.append(b"s%d:%b" % (len(text), text))
+        return
     match value:
-        case str():
-            text = value.encode()
-            chunks.append(b"s%d:%b" % (len(text), text))
         case bool():
             chunks.append(b"b1;" if value else b"b0;")
         case int():

@@ -279,6 +279,6 @@ def record_from_bytes(data: bytes) -> UnitRecord | None:
     try:
         if checksum.decode() != digest_from_bytes(body):
             return None
-        return UnitRecord.from_json(json.loads(body))
+        return UnitRecord.from_json(json.loads(body.decode()))
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
         return None

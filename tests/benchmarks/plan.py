@@ -16,6 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 
+from pano_mvs.cli.plan_command import without_collector
 from pano_mvs.cli.session import open_session
 from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.plan import StagePlan, make_plan
@@ -177,7 +178,8 @@ def _measure(step: str, folder: Path) -> None:
     cpu, wall = time.process_time(), time.perf_counter()
     store = Store(session.store_root)
     if step.startswith("plan"):
-        counts = _count(make_plan(session.workflow, session.graph, store, workflow_id(session.workflow)))
+        with without_collector():
+            counts = _count(make_plan(session.workflow, session.graph, store, workflow_id(session.workflow)))
         store.stat_cache.save()
     else:
         result = Run(session.workflow, session.graph, store, session.out, executor=SerialExecutor(store)).execute()
