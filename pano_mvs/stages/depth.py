@@ -13,6 +13,10 @@ from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.sweep import sweep_range
 from pano_mvs.api import NOT_IN_KEY, Context, Each, Near, Panorama, Params, PartOf, Pose, RangeMap, stage
+from pano_mvs.core.errors import UsageError
+from pano_mvs.stages.fields import Odd
+
+_NOT_SETTINGS = {"backend", "device", "near", "far"}
 
 
 class SweepParams(Params):
@@ -37,7 +41,7 @@ class SweepParams(Params):
         description="census, census_gradient (with grey levels and their gradients), zncc (correlation), sad (the "
         "paper's sum of absolute differences), sad_gradient (colours with their gradients), or a plugin's",
     )
-    window: int = Field(default=7, ge=1, le=15, description="side of the cost's window in pixels, odd")
+    window: Odd = Field(default=7, ge=1, le=15, description="side of the cost's window in pixels, odd")
     spherical_window: bool = Field(
         default=True, description="widen windows towards the poles so that they keep their solid angle"
     )
@@ -50,11 +54,11 @@ class SweepParams(Params):
     aggregation: Literal["box", "sgm"] = Field(
         default="sgm", description="winner takes all after a box (the paper), or semi-global matching"
     )
-    support: int = Field(
+    support: Odd = Field(
         default=5, ge=1, le=15, description="side of the box over which census costs, and plugins', are averaged, odd"
     )
-    p1: int = Field(default=80, ge=0, le=5000, description="SGM's penalty of a step by one plane, for 512 rows")
-    p2: int = Field(default=1600, ge=0, le=7900, description="SGM's penalty of a larger step, for 512 rows")
+    p1: int = Field(default=80, ge=0, le=4000, description="SGM's penalty of a step by one plane, for 512 rows")
+    p2: int = Field(default=1600, ge=0, le=4000, description="SGM's penalty of a larger step, for 512 rows")
     p2_contrast: float = Field(
         default=15.0, ge=0, description="grey levels of contrast at which p2 is halved; 0 keeps it"
     )
@@ -91,13 +95,14 @@ class SweepParams(Params):
     )
 
     @model_validator(mode="after")
-    def _backend_has_cost(self) -> SweepParams:
+    def _fit_together(self) -> SweepParams:
         backend_for(self.backend, self.cost)
         check_levels(self.backend, self.levels)
+        SweepSettings(**self.model_dump(exclude=_NOT_SETTINGS))
+        if self.near is not None and self.far is not None and not self.near < self.far:
+            raise UsageError(f"near must be less than far, got {self.near} and {self.far}")
         return self
 
-
-_NOT_SETTINGS = {"backend", "device", "near", "far"}
 
 # Bytes a pixel and plane of semi-global matching: costs and sums, 1 and 2; torch keeps paths, numpy 64 bits of all.
 _VOLUME_BYTES = {"torch": 8, "numpy": 24}

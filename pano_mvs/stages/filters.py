@@ -20,12 +20,13 @@ from pano_mvs.algorithms.filters.replacement import with_ranges
 from pano_mvs.algorithms.filters.speckle import remove_speckles
 from pano_mvs.api import Context, Each, Near, Panorama, Params, Pose, RangeMap, stage
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
+from pano_mvs.stages.fields import Odd
 
 
 class MedianParams(Params):
     """Settings of filters.median."""
 
-    window: int = Field(default=5, ge=3, le=15, description="side in pixels, odd")
+    window: Odd = Field(default=5, ge=3, le=15, description="side in pixels, odd")
 
 
 @stage("filters.median")
@@ -37,7 +38,7 @@ def median(range_map: Each[RangeMap], params: MedianParams, ctx: Context) -> Ran
 class GaussianParams(Params):
     """Settings of filters.gaussian."""
 
-    window: int = Field(default=5, ge=3, le=15, description="side in pixels, odd")
+    window: Odd = Field(default=5, ge=3, le=15, description="side in pixels, odd")
     sigma_px: float = Field(default=1.1, gt=0, description="width in pixels (the paper: 1.1)")
 
 

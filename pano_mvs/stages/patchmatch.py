@@ -6,13 +6,14 @@ from pydantic import Field
 
 from pano_mvs.algorithms.patchmatch.refine import refine_range
 from pano_mvs.api import Context, Each, Near, Panorama, Params, Pose, RangeMap, stage
+from pano_mvs.stages.fields import Odd
 
 
 class PatchMatchParams(Params):
     """Settings of depth.patchmatch."""
 
     rounds: int = Field(default=4, ge=0, le=32, description="how often planes are laid and matched")
-    window: int = Field(
+    window: Odd = Field(
         default=5, ge=3, le=15, description="samples along either side of the window, two pixels apart, odd"
     )
     prior_px: float = Field(

@@ -1,0 +1,39 @@
+"""Settings that no stage can use are refused before anything runs, as `pano-mvs check` promises."""
+
+from __future__ import annotations
+
+import pytest
+from pydantic import ValidationError
+
+from pano_mvs.stages.depth import SweepParams
+from pano_mvs.stages.filters import GaussianParams, MedianParams
+from pano_mvs.stages.patchmatch import PatchMatchParams
+
+
+@pytest.mark.parametrize("params", [SweepParams, MedianParams, GaussianParams, PatchMatchParams])
+def test_windows_are_odd(params: type) -> None:
+    with pytest.raises(ValidationError, match="must be odd"):
+        params(window=4)
+    assert params(window=3).window == 3
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"support": 4},
+        {"p2": 5000},
+        {"p1": 1000, "p2": 500},
+        {"cost": "zncc", "window": 1},
+        {"near": 5.0, "far": 1.0},
+        {"near": 2.0, "far": 2.0},
+    ],
+)
+def test_a_sweep_that_cannot_run_is_refused(settings: dict[str, object]) -> None:
+    with pytest.raises(ValidationError):
+        SweepParams.model_validate(settings)
+
+
+def test_the_largest_penalties_and_smallest_windows_are_taken() -> None:
+    SweepParams(p1=4000, p2=4000)
+    SweepParams(cost="sad", window=1, support=1)
+    SweepParams(near=1.0, far=1.1)
