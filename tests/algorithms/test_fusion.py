@@ -320,6 +320,13 @@ class TestStreaming:
         poses = [Rigid3.from_center(np.eye(3), (x, 0, 0)) for x in (0, 10, 1, 3, 3)]
         assert nearest_views(poses, 2) == [[2, 3], [3, 4], [0, 3], [2, 4], [2, 3]]
         assert nearest_views(poses, 9) == [[o for o in range(5) if o != i] for i in range(5)]
+        assert nearest_views(poses, 0) == [[], [], [], [], []]
+
+    def test_without_neighbours_each_view_stands_alone(self):
+        views = ball_views(3)
+        assert len(fuse_views(views, FusionSettings(neighbours=0))) == 0
+        alone = fuse_views(views, FusionSettings(neighbours=0, min_views=1, even_density=False))
+        assert len(alone) == sum(int(view.range_map.valid.sum()) for view in views)
 
     def test_normals_that_came_with_the_ranges_are_taken(self):
         ahead = np.tile(np.float16([0, 0, -1]), (*SIZE, 1))

@@ -114,7 +114,8 @@ def nearest_views(poses: Sequence[Rigid3], count: int) -> list[list[int]]:
     if len(poses) <= count + 1:
         return [[other for other in range(len(poses)) if other != idx] for idx in range(len(poses))]
     centers = np.array([pose.center for pose in poses])
-    distances, found = (np.asarray(values) for values in cKDTree(centers).query(centers, k=count + 1))
+    # A list of ranks, since for k=1 alone the query leaves out an axis.
+    distances, found = (np.asarray(values) for values in cKDTree(centers).query(centers, k=list(range(1, count + 2))))
     nearest = []
     for idx in range(len(poses)):
         others = [(distance, other) for distance, other in zip(distances[idx], found[idx], strict=True) if other != idx]
