@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -114,7 +114,8 @@ def _run_for_programs(session: Session, store: Store, executor: Executor, events
                  executor=executor.name, workers=executor.capacity, threads=executor.threads,
                  out=str(session.out))  # fmt: skip
     try:
-        result, summary = _run(session, store, executor, events)
+        with redirect_stdout(sys.stderr):  # a plugin that lists its items does so in this process
+            result, summary = _run(session, store, executor, events)
         exit_code, stopped, counts = result.exit_code, result.stopped, summary["units"]
     except PanoMvsError as error:
         exit_code, stopped = error.exit_code, str(error)

@@ -23,8 +23,15 @@ def cause_of(unit: Unit, error: BaseException) -> tuple[str, str]:
     if own and isinstance(error, ModuleNotFoundError):
         notes += " (a plugin imports the files beside it at its top, not inside functions)"
     frame = next((f for f in reversed(frames) if f.filename == own), frames[-1])
-    cause = f"{frame.filename}:{frame.lineno}: {type(error).__name__}: {error}{notes}"
+    cause = f"{frame.filename}:{frame.lineno}: {type(error).__name__}: {_text(error)}{notes}"
     return cause, "".join(traceback.format_exception(error))
+
+
+def _text(error: BaseException) -> str:
+    try:
+        return str(error)
+    except Exception as second:  # the text is a plugin's code too
+        return f"(its message cannot be shown: {type(second).__name__})"
 
 
 def lost(entry: StageEntry, item: str) -> str:

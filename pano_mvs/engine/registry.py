@@ -10,6 +10,7 @@ import importlib.util
 import sys
 import traceback
 from collections.abc import Collection, Iterator
+from contextlib import redirect_stdout
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from importlib.metadata import EntryPoint, entry_points
@@ -119,7 +120,9 @@ class Registry:
             if self._files.get(path.resolve(), ("", None))[0] == digest:
                 return None  # named twice, or named by the workflow and in the user's folder
             module = _import_file(path)
-        except (Exception, SystemExit) as error:
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # also what is no Exception, such as pytest.skip() or a panic in Rust
             raise PluginError(f"plugin file {path} failed to import: {_where(error, path)}") from error
         if not any(_specs(module, own_only=True)) and not any(_marks(module, own_only=False)):
             raise PluginError(f'plugin file {path} defines no stage: decorate a function with @stage("kind.name")')
@@ -158,11 +161,14 @@ class Registry:
     def _load_entry_point(self, entry: EntryPoint) -> None:
         origin = f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value
         try:
-            module = entry.load()
+            with redirect_stdout(sys.stderr):
+                module = entry.load()
             if not isinstance(module, ModuleType):
                 raise PluginError(f"the entry point {entry.name} = {entry.value} must name a module")
             clashes = self._clashes(module, own_only=False)
-        except (Exception, SystemExit) as error:
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
             self.plugins.append(_broken(origin, names_in_package(entry), error))
             return
         self.clashes |= clashes
@@ -269,7 +275,8 @@ def _import_file(path: Path) -> ModuleType:
     sys.path.insert(0, folder)
     importlib.invalidate_caches()
     try:
-        spec.loader.exec_module(module)
+        with redirect_stdout(sys.stderr):  # the standard output is for what a command gives
+            spec.loader.exec_module(module)
     except BaseException:
         del sys.modules[name]
         raise
@@ -286,7 +293,7 @@ def _where(error: BaseException, path: Path) -> str:
     if isinstance(error, SyntaxError):
         return f"{error.filename or path}:{error.lineno}: {error.msg}"
     frames = traceback.extract_tb(error.__traceback__)
-    own = [frame for frame in frames if Path(frame.filename) == path]
+    own = [frame for frame in frames if Path(frame.filename) == path.absolute()]
     place = f"{path}:{own[-1].lineno}: " if own else ""
     deeper = own and own[-1] is not frames[-1] and "importlib" not in frames[-1].filename
     return f"{place}{type(error).__name__}: {error}" + (f"\n{_trace(error).rstrip()}" if deeper else "")

@@ -72,6 +72,7 @@ class Run:
         self._desk = Desk(self.executor, store, out, workflow.plugins)
         self._keys: dict[str, dict[str, str]] = {}
         self._computed: dict[str, UnitRecord] = {}
+        self._refreshed: set[str] = set()
         self._last_keys = store.runs.last_keys(workflow_id(workflow)) if demands.accept_code else {}
 
     def execute(self, *, earlier_files: Mapping[str, str] | None = None) -> RunResult:
@@ -90,6 +91,9 @@ class Run:
         self._warn_of_timeouts()
         try:
             self._execute_healing()
+            for unit in self.demands.refresh:
+                if ":" in unit and unit not in self._refreshed:
+                    self._warn(f"--refresh {unit}: nothing was computed again, no unit of that name was reached")
             if self.result.exit_code == 0 and not self.graph.is_part:
                 self.result.removed = self._publisher.remove_stale(earlier)
         except KeyboardInterrupt:
@@ -162,8 +166,10 @@ class Run:
 
     def _find(self, unit: Unit) -> UnitRecord | None:
         """Return a unit's record if the store has it and nobody asked for it anew."""
-        if self.demands.refreshes(unit) and unit.key not in self._computed:
-            return None
+        if self.demands.refreshes(unit):
+            self._refreshed.add(f"{unit.entry.name}:{unit.item}")
+            if unit.key not in self._computed:
+                return None
         last = self._last_keys.get(unit.entry.name, {}).get(unit.item)
         return self.store.find(unit.key) or self.demands.accepted(unit, last, self.store)
 

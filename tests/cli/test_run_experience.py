@@ -68,6 +68,15 @@ def test_events_are_complete_and_nothing_else_is_printed(toy: Toy) -> None:  # n
     assert set(begun.values()) == {1}
 
 
+def test_nothing_but_events_is_on_the_standard_output(toy: Toy) -> None:  # noqa: F811
+    toy.edit("plug.py", lambda text: text.replace("def list_items(params):", "print('a')\ndef list_items(params):\n"
+                                                  "    print('b')"))  # fmt: skip
+    code, out, err = finish(start(toy, "--json", "--executor", "serial"))
+    assert code == 0
+    assert events_of(out)[0]["event"] == "run_started"
+    assert {"a", "b"} <= set(err.split())
+
+
 def test_events_of_a_run_that_cannot_begin_end_as_well(toy: Toy) -> None:  # noqa: F811
     for number in range(1, 6):
         toy.number(f"{number}.txt", "not a number")

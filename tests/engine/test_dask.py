@@ -135,6 +135,12 @@ def test_other_versions_and_a_store_that_is_not_seen_are_refused(
             DaskExecutor(store, workers=1, threads=1)
 
 
+@pytest.mark.parametrize("scheduler", ["host", "tcp://host", "tcp://host:port", "tcp://:8786"])
+def test_scheduler_without_host_or_port_is_refused_before_dask_is_asked(tmp_path: Path, scheduler: str) -> None:
+    with pytest.raises(UsageError, match="must be an address such as"):
+        DaskExecutor(Store(tmp_path), scheduler=scheduler)
+
+
 def test_scheduler_that_does_not_answer_is_a_usage_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dask_cluster, "_CONNECT_S", 1.0)
     with pytest.raises(UsageError, match="does not answer"):

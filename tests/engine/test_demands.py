@@ -45,6 +45,11 @@ def test_refresh_computes_again_and_what_turns_out_the_same_ends_there(toy: Toy)
     assert ran(toy.run()) == {}
 
 
+def test_refresh_of_a_unit_that_there_is_not_says_so(toy: Toy) -> None:
+    assert any("--refresh mean:7.txt" in warning for warning in run(toy, Demands(refresh=("mean:7.txt",))).warnings)
+    assert not run(toy, Demands(refresh=("mean:1.txt",))).warnings
+
+
 def test_accepted_code_keeps_what_was_computed(toy: Toy) -> None:
     toy.run()
     toy.edit("plug.py", lambda text: text.replace("double(x.value) * params.by / 2", "double(x.value) / 2 * params.by"))

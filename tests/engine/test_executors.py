@@ -136,6 +136,21 @@ def test_unit_that_kills_its_worker_again_is_listed_and_the_others_go_on(toy: To
     assert ran(result)["scaled"] == 4
 
 
+@pytest.mark.parametrize("make", [SerialExecutor, two_processes])
+@pytest.mark.parametrize("kind", ["BaseException", "Exception"])
+def test_whatever_a_stage_raises_is_a_unit_that_failed(toy: Toy, make: Make, kind: str) -> None:
+    toy.edit("plug.py", lambda text: text.replace('    """Multiply."""', f'''    """Multiply."""
+    class Odd({kind}):
+        def __str__(self):
+            return 1 / 0
+    if x.value == 30: raise Odd'''))  # fmt: skip
+    result = run_with(toy, make)
+    failure = next(f for f in result.failures if f.stage == "scaled")
+    assert failure.item == "3.txt"
+    assert "Odd: (its message cannot be shown: ZeroDivisionError)" in failure.cause
+    assert ran(result)["scaled"] == 4
+
+
 def test_timeout_ends_the_unit_and_not_the_run(toy: Toy) -> None:
     kill_once(toy, when="x.value == 20", how="time.sleep(600)")
     (toy.folder / "died").unlink(missing_ok=True)

@@ -67,7 +67,8 @@ def test_the_users_folder_is_that_of_the_platform(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("broken", [BROKEN, "def f(:\n" + STAGE.format(name="filters.unlucky"), "import sys\n"
-                                    "sys.exit(3)\n" + STAGE.format(name="filters.unlucky")])  # fmt: skip
+                                    "sys.exit(3)\n" + STAGE.format(name="filters.unlucky"),
+                                    "raise BaseException\n" + STAGE.format(name="filters.unlucky")])  # fmt: skip
 def test_a_broken_plugin_is_told_when_its_name_is_used_and_only_then(mine: Path, broken: str) -> None:
     (mine / "bad.py").write_text(broken)
     (mine / "same.py").write_text(STAGE.format(name="filters.same"))
@@ -77,7 +78,7 @@ def test_a_broken_plugin_is_told_when_its_name_is_used_and_only_then(mine: Path,
     assert "'filters.unlucky'" in registry.suggest("filters.unluky")
     told = registry.suggest("filters.unlucky")
     assert f"{mine / 'bad.py'}, failed to load:" in told
-    assert "Traceback" in told or "SyntaxError" in told or "SystemExit" in told
+    assert any(word in told for word in ("Traceback", "SyntaxError", "SystemExit", "BaseException"))
     assert "registry.py" not in told
 
 
@@ -203,6 +204,23 @@ def test_an_error_deep_in_a_named_plugin_is_shown_whole(toy: Toy) -> None:
     toy.edit("plug.py", lambda text: text + "\nimport json\nVALUES = json.loads('{')\n")
     with pytest.raises(WorkflowError, match=r"plug\.py:\d+: JSONDecodeError(?s:.*)Traceback"):
         toy.session()
+
+
+def test_an_error_in_a_plugin_that_is_named_by_a_relative_path_has_its_line(
+    toy: Toy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    toy.edit("plug.py", lambda text: text + "\nNOTHING = 1 / 0\n")
+    monkeypatch.chdir(toy.folder)
+    with pytest.raises(PluginError, match=r"plug\.py:\d+: ZeroDivisionError"):
+        Registry().add_file(Path("plug.py"))
+
+
+def test_what_a_plugin_prints_when_it_is_loaded_is_no_output_of_the_command(
+    mine: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (mine / "chatty.py").write_text("print('hello')\n" + STAGE.format(name="filters.same"))
+    assert "filters.same" in Registry.installed().stages
+    assert capsys.readouterr().out == ""
 
 
 def test_names_are_told_from_the_text() -> None:

@@ -13,6 +13,7 @@ import uuid
 from collections import Counter
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.engine.code_digest import code_texts
@@ -48,6 +49,8 @@ class DaskExecutor:
                 not see the store.
         """
         distributed = _import_distributed()
+        if scheduler:
+            _check_address(scheduler)
         self._store = store
         self._run = uuid.uuid4().hex
         self._ended: queue.SimpleQueue[tuple[int, int, Any]] = queue.SimpleQueue()
@@ -180,6 +183,16 @@ def _outcome(future: Any) -> Outcome:
     if future.status == "error":
         return Outcome("failed", cause=f"its dask worker failed: {future.exception()}", died=True)
     return Outcome("failed", cause=f"the dask cluster lost it ({future.status})", died=True)
+
+
+def _check_address(scheduler: str) -> None:
+    parts = urlsplit(scheduler if "://" in scheduler else f"tcp://{scheduler}")
+    try:
+        is_complete = bool(parts.hostname and parts.port) or parts.scheme in {"inproc", "ucx"}
+    except ValueError:
+        is_complete = False
+    if not is_complete:
+        raise UsageError(f"--scheduler {scheduler}: must be an address such as tcp://host:8786")
 
 
 def _import_distributed() -> Any:

@@ -34,7 +34,9 @@ def perform(unit: Unit, store: Store, *, threads: int, log: Path) -> Outcome:
     except (StoreError, GateError) as error:
         kind = StoreError if isinstance(error, StoreError) else GateError
         return Outcome("stopped", cause=str(error), error=kind.__name__, exit_code=error.exit_code)
-    except (Exception, SystemExit) as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # a stage that exits, or raises what is no Exception, is a unit that failed
         gone = next((ref for ref in input_blobs(unit) if not store.blobs.exists(ref)), None)
         if gone is not None:  # somebody has collected it while the stage was about to read it: no fault of the stage
             return Outcome("damaged", cause=str(store.blobs.discard(gone, "is gone")))
