@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,7 @@ COUNT = 60
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Iterator[Path]:
+def folder(tmp_path: Path) -> Path:
     (tmp_path / "plug.py").write_text(PLUGIN)
     (tmp_path / "wf.yaml").write_text(WORKFLOW)
     (tmp_path / "capture").mkdir()
@@ -25,7 +24,7 @@ def folder(tmp_path: Path) -> Iterator[Path]:
         path = tmp_path / "capture" / f"{number:05d}.txt"
         path.write_text(str(number))
         settle(path)
-    yield tmp_path
+    return tmp_path
 
 
 def run(folder: Path) -> dict[str, int]:
