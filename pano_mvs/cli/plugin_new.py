@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import keyword
 import re
+import sys
 from dataclasses import dataclass
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -66,6 +68,8 @@ def rendered(kind: str, name: str) -> tuple[str, str]:
         raise UsageError(f"there is no kind of plugin {kind!r}; there are {', '.join(KINDS)}")
     if not _NAME.fullmatch(name) or keyword.iskeyword(name):
         raise UsageError(f"a plugin cannot be called {name!r}: use small letters, digits and '_', a letter first")
+    if name in sys.stdlib_module_names or name in packages_distributions():
+        raise UsageError(f"a plugin cannot be called {name!r}: its file would hide the Python package of that name")
     environment = Environment(
         loader=PackageLoader("pano_mvs.cli", "plugin_templates"),
         undefined=StrictUndefined,

@@ -133,7 +133,7 @@ def replacing(path: Path, *, temporary_in: Path | None = None, durable: bool = F
 def write_text(path: Path, text: str, *, temporary_in: Path | None = None, durable: bool = False) -> None:
     """Write a text file in one step (UTF-8, as given); see `replacing`."""
     with replacing(path, temporary_in=temporary_in, durable=durable) as temporary:
-        temporary.write_bytes(text.encode())
+        temporary.write_bytes(text.encode(errors="backslashreplace"))  # names of files need not be text
 
 
 def copy_file(source: Path, target: Path) -> None:

@@ -98,6 +98,8 @@ def test_the_command_writes_both_files_and_overwrites_none(pano_mvs: Command) ->
         ("filter", "../mine", "cannot be called '../mine'"),
         ("filter", "Mine", "cannot be called 'Mine'"),
         ("filter", "class", "cannot be called 'class'"),
+        ("filter", "json", "would hide the Python package"),
+        ("filter", "numpy", "would hide the Python package"),
     ],
 )
 def test_what_cannot_be_written_is_refused(pano_mvs: Command, kind: str, name: str, what: str) -> None:

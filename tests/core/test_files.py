@@ -89,3 +89,8 @@ def test_file_that_cannot_be_written_is_named(tmp_path: Path) -> None:
 def test_age_of_what_is_gone_is_no_error(tmp_path: Path) -> None:
     assert not files.is_older(tmp_path / "gone", 0)
     files.remove_whole(tmp_path / "gone")
+
+
+def test_names_of_files_that_are_no_text_can_be_written_of(tmp_path: Path) -> None:
+    write_text(tmp_path / "page.html", "of \udcff.png")
+    assert (tmp_path / "page.html").read_text(encoding="utf-8") == "of \\udcff.png"
