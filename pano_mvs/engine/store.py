@@ -248,7 +248,9 @@ class Store:
             self._create(path)
             return
         except (OSError, ValueError, RecursionError) as error:
-            raise UsageError(f"cache {self.root} cannot be read: {error}. Choose another with --cache DIR") from error
+            raise UsageError(f"{path} cannot be read ({error}), so it is not known how the cache is laid out. If it "
+                             "is one of this version, delete that file and nothing is lost; else choose another "
+                             "folder with --cache DIR")  from error  # fmt: skip
         if not isinstance(layout, dict) or layout.get("layout") != LAYOUT_VERSION:
             raise UsageError(
                 f"cache {self.root} has layout {layout!r}, this version uses {LAYOUT_VERSION}. "

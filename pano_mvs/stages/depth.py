@@ -70,7 +70,8 @@ class SweepParams(Params):
     )
     no_match: Literal["invalid", "keep"] = Field(
         default="invalid",
-        description="bare pixels that run to the nearest or farthest plane, and the sky; the paper keeps them",
+        description="bare pixels that run to the nearest or farthest plane, and all (the sky) that run to a farthest "
+        "plane as good as infinitely far: leave `far` to be found outdoors; the paper keeps them",
     )
     prefilter_diameter: int = Field(
         default=0,

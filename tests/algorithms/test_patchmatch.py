@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.patchmatch import kernels_planes, kernels_refine
-from pano_mvs.algorithms.patchmatch.refine import _reference_arrays, _source_arrays, refine_range
+from pano_mvs.algorithms.patchmatch.refine import (
+    _range_map_from_planes,
+    _reference_arrays,
+    _source_arrays,
+    refine_range,
+)
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
 from pano_mvs.core.errors import UsageError
@@ -247,3 +252,16 @@ def test_impossible_pictures_are_named(views, swept):
         refine_range(swept, pictures[0], [pictures[1][..., 0]], poses[1:2])
     with pytest.raises(UsageError, match="another place"):
         refine_range(swept, pictures[0], pictures[1:2], [Rigid3.identity()])
+
+
+def test_planes_that_meet_their_rays_far_beyond_what_was_swept_are_not_believed():
+    """A plane nearly along its ray once sent pixels ten times as far as the sweep had looked."""
+    rays = ray_grid((16, 32))
+    swept = RangeMap(np.full((16, 32), 2, np.float32), np.full((16, 32), 100, np.uint8))
+    planes = np.moveaxis(rays / 2.2, -1, 0).astype(np.float32)
+    planes[:, 3, 4] /= 20
+    planes[:, 5, 6] *= 20
+    found = _range_map_from_planes(planes, swept, np.ones((16, 32), np.bool_))
+    assert found.range[3, 4] == found.range[5, 6] == 2
+    assert np.isnan(found.normals_in_cam[[3, 5], [4, 6]].astype(float)).all()
+    assert np.sum(np.isclose(found.range, 2.2)) == 16 * 32 - 2

@@ -36,6 +36,8 @@ Mask = NDArray[np.bool_]
 FloatImage = NDArray[np.float32]
 
 _LUMA = np.array([0.2126, 0.7152, 0.0722])
+# A refined range is at most so many times the farthest swept one.
+_BEYOND = 1.5
 # Samples of a window are neighbours, and not independent: of 25 so many count.
 _SAMPLES = 10.0
 # No step is larger, in pixels of the reference at the widest baseline: beyond that pictures are not linear.
@@ -126,10 +128,15 @@ def refine_range(
 
 
 def _range_map_from_planes(planes: FloatImage, before: RangeMap, seen: Mask) -> RangeMap:
-    """Return the ranges along the rays and the normals of planes (3, H, W) where they mean something."""
+    """Return the ranges along the rays and the normals of planes (3, H, W) where they mean something.
+
+    A plane that meets its ray far outside of all that was swept was led there by chance: the swept range stays.
+    """
     height, width = before.range.shape
     inverse = np.einsum("ahw,hwa->hw", planes.astype(np.float64), ray_grid((height, width)))
-    met = seen & (inverse > 0)
+    swept = before.range[seen]
+    farthest, nearest = (_BEYOND * float(swept.max()), float(swept.min()) / _BEYOND) if len(swept) else (1.0, 1.0)
+    met = seen & (inverse * farthest > 1) & (inverse * nearest < 1)
     ranges = np.divide(1.0, inverse, out=before.range.astype(np.float64), where=met)
     length = np.linalg.norm(planes, axis=0)
     normals = np.full((height, width, 3), np.nan, np.float16)
