@@ -65,6 +65,8 @@ def told(result: RunResult) -> object:
     return stages, failures, result.exit_code, result.stopped, dict(result.published), result.written, result.rejected
 
 
+# Slow tests of dask run before the slow ones here, and its loops are collected late.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize(
     "workers", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(4, marks=pytest.mark.slow)]
 )
