@@ -350,7 +350,7 @@ def test_layout_of_another_version_is_refused_by_all_commands(toy: Toy, cache: C
     for command in (["du"], ["verify"], ["gc", "--delete", "--unused", "0s"]):
         code, said = cache(*command)
         assert code == 2
-        assert "Choose another with --cache DIR" in said
+        assert "with --cache DIR" in said
     assert files_of(toy.folder / "cache") == before
 
 
