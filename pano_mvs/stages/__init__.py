@@ -5,7 +5,8 @@ They are registered through the entry point `pano_mvs.plugins`, like anybody's.
 
 from pano_mvs.stages.depth import sweep
 from pano_mvs.stages.evaluate import truth
-from pano_mvs.stages.export import colmap, ply, previews, ranges
+from pano_mvs.stages.export import ply, previews, ranges
+from pano_mvs.stages.export_colmap import colmap
 from pano_mvs.stages.features import orb_tangent, sift_tangent, sphorb
 from pano_mvs.stages.filters import (
     bilateral_solver,

@@ -4,20 +4,10 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from pano_mvs.api import All, Context, Each, Files, One, Panorama, Params, PointCloud, Poses, RangeMap, stage
-from pano_mvs.io.colmap_model import write_colmap_model
+from pano_mvs.api import Context, Each, Files, One, Panorama, Params, PointCloud, RangeMap, stage
 from pano_mvs.io.ply import write_ply
 from pano_mvs.io.preview import write_preview
 from pano_mvs.io.range_files import write_confidence_png, write_range_tiff
-
-
-@stage("export.colmap")
-def colmap(poses: One[Poses], images: All[Panorama], ctx: Context) -> Files:
-    """COLMAP model of EQUIRECTANGULAR cameras, with points and tracks, in colmap/sparse/0."""
-    folder = ctx.scratch / "model"
-    folder.mkdir()
-    write_colmap_model(folder, poses, {name: images[name].source_size_hw for name in poses.names if name in images})
-    return Files({f"colmap/sparse/0/{path.name}": path for path in sorted(folder.iterdir())})
 
 
 class PlyParams(Params):
