@@ -72,6 +72,32 @@ def sweep_range(
     settings = settings or SweepSettings()
     compute = backend_for(backend, settings.cost).find_winners
     check_levels(backend, settings.levels)
+    work = sweep_input(
+        reference, sources, source_from_reference, near=near, far=far, settings=settings, backend=backend,
+        device=device, reference_mask=reference_mask, source_masks=source_masks,
+    )  # fmt: skip
+    winners = compute(work)
+    seen = np.ones(reference.shape[:2], np.bool_) if reference_mask is None else reference_mask
+    seen = seen & sees_winner(winners, work)
+    if settings.no_match == "invalid":
+        seen &= has_match(winners, work)
+    return range_map_from_winners(winners, near=near, far=far, settings=settings, seen=seen)
+
+
+def sweep_input(
+    reference: Picture,
+    sources: Sequence[Picture],
+    source_from_reference: Sequence[Rigid3],
+    *,
+    near: float,
+    far: float,
+    settings: SweepSettings,
+    backend: str = "numba",
+    device: str = "auto",
+    reference_mask: Mask | None = None,
+    source_masks: Sequence[Mask | None] | None = None,
+) -> SweepInput:
+    """Return what a backend is given for a sweep, checked and prepared; arguments and errors of `sweep_range`."""
     _check_picture("reference", reference, reference_mask)
     masks = _checked_sources(sources, source_from_reference, source_masks)
     ranges = virtual_ranges(near, far, planes=settings.planes, spacing=settings.spacing)
@@ -83,7 +109,7 @@ def sweep_range(
     poses = tuple(source_from_reference)
     if settings.derotate:
         sources, poses, masks = derotated(sources, poses, masks)
-    work = SweepInput(
+    return SweepInput(
         reference=prepare_picture(reference, settings),
         sources=tuple(prepare_picture(source, settings) for source in sources),
         source_from_reference=poses,
@@ -92,12 +118,6 @@ def sweep_range(
         settings=settings,
         device=device,
     )
-    winners = compute(work)
-    seen = np.ones(reference.shape[:2], np.bool_) if reference_mask is None else reference_mask
-    seen = seen & sees_winner(winners, work)
-    if settings.no_match == "invalid":
-        seen &= has_match(winners, work)
-    return range_map_from_winners(winners, near=near, far=far, settings=settings, seen=seen)
 
 
 def _rough_range(
