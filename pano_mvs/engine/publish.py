@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
@@ -13,6 +14,8 @@ from pano_mvs.engine.blobs import BlobRef, DamagedBlobError
 from pano_mvs.engine.room import is_full_disk
 from pano_mvs.engine.store import ItemRef, Store
 from pano_mvs.scene import Files
+
+_PLACEHOLDER = re.compile(r"\{(?:item|name)\}")
 
 
 class Publisher:
@@ -67,7 +70,7 @@ class Publisher:
             DamagedBlobError: if the store's copy is damaged.
         """
         for target, blob in self._files(ref):
-            name = str(PurePosixPath(to) / target.replace("{item}", self._stems.get(item, item)))
+            name = str(PurePosixPath(to) / self._placed(target, item))
             owner = self._owners.setdefault(name, f"{stage}:{item}")
             if owner != f"{stage}:{item}":
                 other = owner.partition(":")[0]
@@ -87,6 +90,10 @@ class Publisher:
                 path.unlink()
                 removed.append(name)
         return removed
+
+    def _placed(self, target: str, item: str) -> str:
+        texts = {"{item}": self._stems.get(item, item), "{name}": item}
+        return _PLACEHOLDER.sub(lambda match: texts[match[0]], target)
 
     def _files(self, ref: ItemRef) -> list[tuple[str, BlobRef]]:
         """Return the targets of a unit's files and the blobs with their bytes, which are not read."""

@@ -17,7 +17,8 @@ class Files(Record):
     Attributes:
         files: target, relative to the output folder with forward slashes, to the file that a stage wrote into its
             scratch folder. `{item}` in a target stands for the image's path relative to the capture without its
-            extension; the stage need not know it, so renaming an image recomputes nothing.
+            extension, `{name}` for the path with it; the stage need not know them, so renaming an image recomputes
+            nothing.
     """
 
     axis: ClassVar[Axis | None] = None
