@@ -11,10 +11,11 @@ import numpy as np
 import pycolmap
 import pytest
 
+from pano_mvs.algorithms.faces.layout import CUBE_ROTATIONS
 from pano_mvs.algorithms.metrics.poses import relative_pose_errors
 from pano_mvs.algorithms.poses.colmap import solve_colmap
 from pano_mvs.algorithms.poses.colmap_database import Cameras, write_database
-from pano_mvs.algorithms.poses.colmap_faces import FACE_ROTATIONS, face_of_bearing, face_pixels, face_size
+from pano_mvs.algorithms.poses.colmap_faces import face_of_bearing, face_pixels, face_size
 from pano_mvs.algorithms.poses.colmap_mapping import Mapper
 from pano_mvs.algorithms.poses.colmap_sift import colmap_sift
 from pano_mvs.algorithms.poses.refine import refine_poses
@@ -151,7 +152,7 @@ def test_faces_are_rotations_that_cover_the_sphere_and_agree_with_colmaps_pinhol
     assert set(faces) == set(range(6))
     size = face_size((512, 1024))
     camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=size, height=size, params=[size / 2, size / 2, size / 2])
-    for idx, rotation in enumerate(FACE_ROTATIONS):
+    for idx, rotation in enumerate(CUBE_ROTATIONS):
         assert np.linalg.det(rotation) == pytest.approx(1)
         inside = rays[faces == idx]
         pixels = face_pixels(inside, idx, size)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from pano_mvs.algorithms.features.icosahedron import face_centers, sample_tile, tangent_tiles
+from pano_mvs.algorithms.faces.sampling import sample_view
+from pano_mvs.algorithms.features.icosahedron import face_centers, tangent_tiles
 from pano_mvs.algorithms.features.selection import distinct_keypoints, spread_keypoints
 from pano_mvs.algorithms.features.sphorb import extract_sphorb
 from pano_mvs.algorithms.features.tangent import extract_orb, extract_sift
@@ -67,7 +68,7 @@ def test_every_direction_lies_well_inside_the_tile_that_owns_it(size_hw):
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     owner = np.argmax(rays @ face_centers().T, axis=1)
     for idx, tile in enumerate(tangent_tiles(size_hw)):
-        in_tile = rays[owner == idx] @ tile.tile_from_cam.T
+        in_tile = rays[owner == idx] @ tile.view_from_cam.T
         pixels = in_tile[:, :2] / in_tile[:, 2:] * tile.focal_px + tile.principal_xy
         assert pixels.min() > 20
         assert np.all(np.array(tile.size_hw[::-1]) - pixels > 20)
@@ -81,7 +82,7 @@ def test_a_tile_shows_what_lies_in_its_directions():
     for tile in tangent_tiles(SIZE):
         rays = tile.rays()
         expected = 127 + 120 * (rays @ axis) / np.linalg.norm(rays, axis=-1)
-        assert np.abs(sample_tile(image, tile) - expected).max() < 2.0
+        assert np.abs(sample_view(image, tile) - expected).max() < 2.0
 
 
 @pytest.mark.parametrize(("name", "bias_px", "rms_px"), [("sift", 0.02, 0.06), ("orb", 0.1, 0.8), ("sphorb", 0.1, 1.0)])
@@ -103,7 +104,7 @@ def test_key_points_have_no_bias(name, bias_px, rms_px):
     for direction in (east, north):
         assert abs(np.mean(np.sum(offset[away] * direction, axis=1))) < bias_px
     # A shift on the tiles points elsewhere on each of them and would cancel on the panorama.
-    tile_from_cam = np.array([tile.tile_from_cam for tile in tangent_tiles(SIZE)])
+    tile_from_cam = np.array([tile.view_from_cam for tile in tangent_tiles(SIZE)])
     owner = np.argmax(true @ face_centers().T, axis=1)
     assert np.abs(np.mean(np.einsum("nij,nj->ni", tile_from_cam[owner], offset), axis=0)[:2]).max() < bias_px
 

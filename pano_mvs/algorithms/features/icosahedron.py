@@ -8,54 +8,18 @@ part of the sphere that is nearest to a tile's centre is exactly a triangle: the
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 from itertools import combinations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.geometry import pad_panorama, pixel_from_ray
+from pano_mvs.algorithms.faces.view import PinholeView
 
 FloatArray = NDArray[np.float64]
 
 _MARGIN = 0.17  # in units of the focal length; what a detector and its descriptor need beyond the face
 _MIN_MARGIN_PX = 24
-_PAD_PX = 4
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Tile:
-    """A pinhole picture tangent to the sphere.
-
-    Attributes:
-        tile_from_cam: (3, 3) rotation; the tile's z axis is the direction of its centre.
-        focal_px: focal length; one radian at the centre.
-        principal_xy: (2,) pixel of the centre, (0, 0) the upper-left corner of the tile.
-        size_hw: (height, width) of the tile.
-    """
-
-    tile_from_cam: FloatArray
-    focal_px: float
-    principal_xy: FloatArray
-    size_hw: tuple[int, int]
-
-    def rays(self) -> FloatArray:
-        """Return the (H, W, 3) rays, not of unit length, through the tile's pixel centres, in the camera frame."""
-        y, x = np.mgrid[0 : self.size_hw[0], 0 : self.size_hw[1]] + 0.5
-        return self._rays_from_pixels(np.stack([x, y], axis=-1))
-
-    def bearings_from_pixels(self, pixels_px: FloatArray) -> FloatArray:
-        """Return the unit bearings (..., 3) in the camera frame of pixels (..., 2), (0, 0) the tile's corner."""
-        rays = self._rays_from_pixels(pixels_px)
-        unit: FloatArray = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-        return unit
-
-    def _rays_from_pixels(self, pixels_px: FloatArray) -> FloatArray:
-        plane = (pixels_px - self.principal_xy) / self.focal_px
-        rays: FloatArray = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1) @ self.tile_from_cam
-        return rays
 
 
 @cache
@@ -70,20 +34,10 @@ def face_corners() -> FloatArray:
     return np.array(_faces())
 
 
-def tangent_tiles(size_hw: tuple[int, int]) -> list[Tile]:
+def tangent_tiles(size_hw: tuple[int, int]) -> list[PinholeView]:
     """Return the twenty tiles for a panorama, at its own resolution at the equator (W / 2π px per radian)."""
     focal_px = size_hw[1] / (2 * np.pi)
     return [_tile(triangle, focal_px) for triangle in _faces()]
-
-
-def sample_tile(panorama: NDArray[np.uint8], tile: Tile, *, interpolation: int = cv2.INTER_CUBIC) -> NDArray[np.uint8]:
-    """Return a tile's picture, (h, w) or (h, w, C) uint8, of a panorama (H, W) or (H, W, C): over seam and poles."""
-    height, width = panorama.shape[:2]
-    # OpenCV puts (0, 0) at the first pixel's centre.
-    pixels = (pixel_from_ray(tile.rays(), (height, width)) + (_PAD_PX - 0.5)).astype(np.float32)
-    padded = pad_panorama(panorama, _PAD_PX)
-    sampled: NDArray[np.uint8] = cv2.remap(padded, pixels[..., 0], pixels[..., 1], interpolation)
-    return sampled
 
 
 @cache
@@ -96,7 +50,7 @@ def _faces() -> tuple[FloatArray, ...]:
     return tuple(face / np.linalg.norm(face[0]) for face in faces)
 
 
-def _tile(triangle: FloatArray, focal_px: float) -> Tile:
+def _tile(triangle: FloatArray, focal_px: float) -> PinholeView:
     """Return the tile around a face, upright so that one corner of the face points along the tile's y axis."""
     z = triangle.mean(axis=0) / np.linalg.norm(triangle.mean(axis=0))
     y = triangle[0] - (triangle[0] @ z) * z
@@ -107,4 +61,4 @@ def _tile(triangle: FloatArray, focal_px: float) -> Tile:
     margin = max(_MARGIN, _MIN_MARGIN_PX / focal_px)
     low, high = plane.min(axis=0) - margin, plane.max(axis=0) + margin
     width, height = np.ceil((high - low) * focal_px).astype(int)
-    return Tile(tile_from_cam, focal_px, -low * focal_px, (int(height), int(width)))
+    return PinholeView(tile_from_cam, focal_px, -low * focal_px, (int(height), int(width)))

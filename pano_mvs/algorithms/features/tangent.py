@@ -10,7 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.features.icosahedron import Tile, face_centers, sample_tile, tangent_tiles
+from pano_mvs.algorithms.faces.sampling import sample_view
+from pano_mvs.algorithms.faces.view import PinholeView
+from pano_mvs.algorithms.features.icosahedron import face_centers, tangent_tiles
 from pano_mvs.algorithms.features.selection import distinct_keypoints, spread_keypoints
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import pixel_from_ray
@@ -125,7 +127,7 @@ def _extract(
     gray: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     valid = mask.astype(np.uint8)
     tiles = tangent_tiles(size_hw)
-    found = [_owned(_unmasked(detect(sample_tile(gray, t)), valid, t), t, i) for i, t in enumerate(tiles)]
+    found = [_owned(_unmasked(detect(sample_view(gray, t)), valid, t), t, i) for i, t in enumerate(tiles)]
     bearings = np.concatenate([t.bearings_from_pixels(f.pixels_px) for t, f in zip(tiles, found, strict=True)])
     sizes = np.concatenate([_angular_sizes(t, f) for t, f in zip(tiles, found, strict=True)])
     scores = np.concatenate([f.scores for f in found])
@@ -147,11 +149,11 @@ def _extract(
     )
 
 
-def _unmasked(found: _Found, valid: NDArray[np.uint8], tile: Tile) -> _Found:
+def _unmasked(found: _Found, valid: NDArray[np.uint8], tile: PinholeView) -> _Found:
     """Drop key points that lie in the mask, or so close to it that its edge may have made them."""
     if valid.all() or not len(found.scores):
         return found
-    valid_in_tile = sample_tile(valid, tile, interpolation=cv2.INTER_NEAREST)
+    valid_in_tile = sample_view(valid, tile, interpolation=cv2.INTER_NEAREST)
     # The frame of the tile is no border, so the distance is to masked pixels only.
     clearance_px = cv2.distanceTransform(valid_in_tile, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     x, y = np.floor(found.pixels_px).astype(np.intp).T
@@ -159,7 +161,7 @@ def _unmasked(found: _Found, valid: NDArray[np.uint8], tile: Tile) -> _Found:
     return found[clear > 1.0 + 1.5 * np.minimum(found.sizes_px, 31.0)]
 
 
-def _owned(found: _Found, tile: Tile, tile_idx: int) -> _Found:
+def _owned(found: _Found, tile: PinholeView, tile_idx: int) -> _Found:
     """Keep the key points whose nearest tile centre is this tile's.
 
     Two tiles place a key point on their common edge a little differently, and each might leave it to the other; so
@@ -173,9 +175,9 @@ def _owned(found: _Found, tile: Tile, tile_idx: int) -> _Found:
     return found[beyond_rad.max(axis=1) < _EDGE_PX / tile.focal_px]
 
 
-def _angular_sizes(tile: Tile, found: _Found) -> NDArray[np.float64]:
+def _angular_sizes(tile: PinholeView, found: _Found) -> NDArray[np.float64]:
     """Return patch diameters in radians; off the centre a gnomonic pixel shrinks by cos² along, cos across."""
-    cosine = tile.bearings_from_pixels(found.pixels_px) @ tile.tile_from_cam[2]
+    cosine = tile.bearings_from_pixels(found.pixels_px) @ tile.view_from_cam[2]
     sizes: NDArray[np.float64] = found.sizes_px / tile.focal_px * cosine**1.5
     return sizes
 

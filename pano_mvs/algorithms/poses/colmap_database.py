@@ -10,13 +10,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.poses.colmap_faces import (
-    FACE_NAMES,
-    FACE_ROTATIONS,
-    face_of_bearing,
-    face_pixels,
-    face_size,
-)
+from pano_mvs.algorithms.faces.layout import CUBE_NAMES, CUBE_ROTATIONS
+from pano_mvs.algorithms.poses.colmap_faces import face_of_bearing, face_pixels, face_size
 from pano_mvs.geometry import Rigid3, pixel_from_ray, skew
 from pano_mvs.scene import Features, TwoView
 
@@ -94,13 +89,13 @@ def _write_faces(database: Any, sensors: dict[Any, Any], idx: int, name: str, fo
         half = size / 2  # of a face of 90° the focal length is half the width
         faces = [
             pycolmap.Camera(model="SIMPLE_PINHOLE", width=size, height=size, params=[half, half, half])
-            for _ in FACE_ROTATIONS
+            for _ in CUBE_ROTATIONS
         ]
         for camera in faces:
             camera.has_prior_focal_length = True
-        sensors[found.size_hw] = _write_rig(database, faces, FACE_ROTATIONS)
+        sensors[found.size_hw] = _write_rig(database, faces, CUBE_ROTATIONS)
     rig_id, camera_ids = sensors[found.size_hw]
-    image_ids = _write_frame(database, rig_id, camera_ids, [f"{face}/{name}" for face in FACE_NAMES])
+    image_ids = _write_frame(database, rig_id, camera_ids, [f"{face}/{name}" for face in CUBE_NAMES])
     face_of_keypoint = face_of_bearing(found.bearings)
     written = {}
     for face_idx, image_id in enumerate(image_ids):
@@ -108,7 +103,7 @@ def _write_faces(database: Any, sensors: dict[Any, Any], idx: int, name: str, fo
         database.write_keypoints(
             image_id, face_pixels(found.bearings[inside], face_idx, size).astype(np.float32).reshape(-1, 2)
         )
-        written[image_id] = DatabaseImage(idx, inside, FACE_ROTATIONS[face_idx])
+        written[image_id] = DatabaseImage(idx, inside, CUBE_ROTATIONS[face_idx])
     return written
 
 

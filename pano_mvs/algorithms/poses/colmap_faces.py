@@ -5,21 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from pano_mvs.algorithms.faces.layout import CUBE_ROTATIONS
 
-# face_from_panorama, rows: the face's x, y and z axis in the panorama's camera frame.
-FACE_ROTATIONS: FloatArray = np.array(
-    [
-        [[1, 0, 0], [0, 1, 0], [0, 0, 1]],  # front
-        [[0, 0, -1], [0, 1, 0], [1, 0, 0]],  # right
-        [[-1, 0, 0], [0, 1, 0], [0, 0, -1]],  # back
-        [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],  # left
-        [[1, 0, 0], [0, 0, 1], [0, -1, 0]],  # up
-        [[1, 0, 0], [0, 0, -1], [0, 1, 0]],  # down
-    ],
-    dtype=np.float64,
-)
-FACE_NAMES = ("front", "right", "back", "left", "up", "down")
+FloatArray = NDArray[np.float64]
 
 
 def face_size(size_hw: tuple[int, int]) -> int:
@@ -29,12 +17,12 @@ def face_size(size_hw: tuple[int, int]) -> int:
 
 def face_of_bearing(bearings: FloatArray) -> NDArray[np.int32]:
     """Return the face in which each ray of the panorama, (N, 3), lies, (N,); of two at an edge the first."""
-    faces: NDArray[np.int32] = (bearings @ FACE_ROTATIONS[:, 2].T).argmax(axis=1).astype(np.int32)
+    faces: NDArray[np.int32] = (bearings @ CUBE_ROTATIONS[:, 2].T).argmax(axis=1).astype(np.int32)
     return faces
 
 
 def face_pixels(bearings: FloatArray, face_idx: int, size: int) -> FloatArray:
     """Return where rays of the panorama, (N, 3), lie in a face of 90° and size × size pixels, (N, 2)."""
-    in_face = bearings @ FACE_ROTATIONS[face_idx].T
+    in_face = bearings @ CUBE_ROTATIONS[face_idx].T
     pixels: FloatArray = (in_face[:, :2] / in_face[:, 2:] + 1) * (size / 2)
     return pixels

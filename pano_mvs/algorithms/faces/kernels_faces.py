@@ -1,0 +1,35 @@
+"""Compiled: a pinhole view's z-depth from the range map of a panorama."""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from pano_mvs.algorithms.filters.kernels_reprojection import sample_range
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def z_depth_rows(first, rows, ranges, view, max_step, z_depth):  # type: ignore[no-untyped-def]
+    """Write the z-depths of some rows of a view.
+
+    Args:
+        first: the first row.
+        rows: how many.
+        ranges: (H, W) float32 of the panorama, NaN invalid.
+        view: (rotation view_from_cam (3, 3), focal length in px, principal point x, y).
+        max_step: as in `sample_range`.
+        z_depth: (h, w) float32, written.
+    """
+    rotation, focal, center_x, center_y = view
+    height, width = ranges.shape
+    for row in range(first, first + rows):
+        b = (row + 0.5 - center_y) / focal
+        for column in range(z_depth.shape[1]):
+            a = (column + 0.5 - center_x) / focal
+            ray_x = rotation[0, 0] * a + rotation[1, 0] * b + rotation[2, 0]
+            ray_y = rotation[0, 1] * a + rotation[1, 1] * b + rotation[2, 1]
+            ray_z = rotation[0, 2] * a + rotation[1, 2] * b + rotation[2, 2]
+            x = (math.atan2(ray_x, ray_z) / (2 * math.pi) + 0.5) * width
+            y = (0.5 - math.atan2(-ray_y, math.hypot(ray_x, ray_z)) / math.pi) * height
+            z_depth[row, column] = sample_range(ranges, x, y, max_step) / math.sqrt(1 + a * a + b * b)

@@ -1,0 +1,124 @@
+"""Which faces a panorama is cut into: overlapping pinhole views that share its centre.
+
+    for face in panorama_faces((512, 1024)):
+        picture = face_image(panorama, face.view)
+
+A layout is a list of directions. All faces of one panorama are squares of one size and one focal length, so that one
+camera model serves a whole rig.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.faces.view import PinholeView
+from pano_mvs.core.errors import UsageError
+
+FloatArray = NDArray[np.float64]
+FaceLayout = Literal["cube", "octagon", "icosahedron"]
+
+# face_from_cam, rows: the face's x, y and z axis in the panorama's camera frame.
+CUBE_ROTATIONS: FloatArray = np.array(
+    [
+        [[1, 0, 0], [0, 1, 0], [0, 0, 1]],  # front
+        [[0, 0, -1], [0, 1, 0], [1, 0, 0]],  # right
+        [[-1, 0, 0], [0, 1, 0], [0, 0, -1]],  # back
+        [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],  # left
+        [[1, 0, 0], [0, 0, 1], [0, -1, 0]],  # up
+        [[1, 0, 0], [0, 0, -1], [0, 1, 0]],  # down
+    ],
+    dtype=np.float64,
+)
+CUBE_NAMES = ("front", "right", "back", "left", "up", "down")
+_OCTAGON_NAMES = ("front", "front_right", "right", "back_right", "back", "back_left", "left", "front_left")
+_LEAST_FOV_DEG, _LARGEST_FOV_DEG, _LEAST_SIZE_PX = 30.0, 150.0, 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Face:
+    """One face of a layout.
+
+    Attributes:
+        name: a plain word, unique in its layout; names files and folders.
+        view: the face as a pinhole view; `view.view_from_cam` is face_from_cam, `view.calibration` is K.
+    """
+
+    name: str
+    view: PinholeView
+
+
+def panorama_faces(
+    size_hw: tuple[int, int], *, layout: FaceLayout = "cube", fov_deg: float = 96.0, size_px: int | None = None
+) -> tuple[Face, ...]:
+    """Return the faces of a panorama.
+
+    The cube has six faces: front, right, back, left, up, down; "up" has the front below it, "down" above it. The
+    octagon has eight around the horizon and the cube's up and down. The icosahedron has twenty, each upright. Below 90°
+    (71° of the icosahedron) faces leave gaps; see `covers_sphere`.
+
+    Args:
+        size_hw: (height, width) of the full sphere.
+        layout: which directions.
+        fov_deg: field of view from edge to edge, from 30 to 150, both ways.
+        size_px: width and height of a face; None: `default_face_size`.
+
+    Raises:
+        UsageError: if the field of view or the size is out of bounds.
+    """
+    if not _LEAST_FOV_DEG <= fov_deg <= _LARGEST_FOV_DEG:
+        raise UsageError(f"the field of view of a face must be from 30 to 150 degrees, got {fov_deg}")
+    size = default_face_size(size_hw, fov_deg=fov_deg) if size_px is None else size_px
+    if size < _LEAST_SIZE_PX:
+        raise UsageError(f"a face must be {_LEAST_SIZE_PX} pixels wide or more, got {size}")
+    focal_px = size / (2 * np.tan(np.radians(fov_deg) / 2))
+    center = np.array([size / 2, size / 2])
+    return tuple(
+        Face(name, PinholeView(rotation, float(focal_px), center, (size, size)))
+        for name, rotation in _rotations(layout)
+    )
+
+
+def default_face_size(size_hw: tuple[int, int], *, fov_deg: float = 96.0) -> int:
+    """Return the width at which the middle of a face is as fine as the panorama's equator: (w / π) tan(fov / 2).
+
+    Rounded up to an even number of pixels; towards its edges a face is finer.
+    """
+    exact = size_hw[1] / np.pi * np.tan(np.radians(fov_deg) / 2)
+    return max(2 * int(np.ceil(exact / 2 - 1e-9)), _LEAST_SIZE_PX)
+
+
+def covers_sphere(faces: tuple[Face, ...]) -> bool:
+    """Return whether every direction lies in a face, tried on 20,000 evenly spread ones (Fibonacci's spiral)."""
+    count = 20_000
+    y = 1 - (2 * np.arange(count) + 1) / count
+    azimuth = np.pi * (1 + np.sqrt(5)) * np.arange(count)
+    flat = np.sqrt(1 - y**2)
+    rays = np.stack([flat * np.sin(azimuth), y, flat * np.cos(azimuth)], axis=-1)
+    seen = np.zeros(count, np.bool_)
+    for face in faces:
+        seen |= face.view.contains(face.view.pixels_from_rays(rays))
+    return bool(seen.all())
+
+
+def upright_rotation(axis_in_cam: FloatArray) -> FloatArray:
+    """Return the face_from_cam (3, 3) of a face that looks along a direction (3,) not up or down, with no roll."""
+    z = axis_in_cam / np.linalg.norm(axis_in_cam)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    return np.array([x, np.cross(z, x), z])
+
+
+def _rotations(layout: FaceLayout) -> list[tuple[str, FloatArray]]:
+    from pano_mvs.algorithms.features.icosahedron import face_centers  # which itself is made of pinhole views
+
+    if layout == "cube":
+        return list(zip(CUBE_NAMES, CUBE_ROTATIONS, strict=True))
+    if layout == "octagon":
+        azimuths = 2 * np.pi * np.arange(8) / 8
+        around = [upright_rotation(np.array([np.sin(azimuth), 0.0, np.cos(azimuth)])) for azimuth in azimuths]
+        return [*zip(_OCTAGON_NAMES, around, strict=True), *zip(CUBE_NAMES[4:], CUBE_ROTATIONS[4:], strict=True)]
+    return [(f"tile{idx:02d}", upright_rotation(center)) for idx, center in enumerate(face_centers())]

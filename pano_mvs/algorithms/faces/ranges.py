@@ -1,0 +1,68 @@
+"""Z-depths, normals and confidences of a face of a panorama."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.faces.sampling import nearest_pixels
+from pano_mvs.algorithms.faces.view import PinholeView
+from pano_mvs.core.bands import for_bands
+from pano_mvs.core.errors import UsageError
+
+# Four neighbouring pixels further apart than this are two surfaces: no value lies between them.
+_MAX_SURFACE_STEP = 0.05
+
+
+def face_z_depth(ranges: NDArray[np.float32], view: PinholeView, *, threads: int = 1) -> NDArray[np.float32]:
+    """Return the z-depth of a face, (h, w) float32 in the ranges' unit, NaN where it is not known.
+
+    z = range · cos α, α the angle between the ray through the face pixel's centre and the face's axis. The range
+    between the panorama's four nearest pixels is bilinear in 1 / range, in which planes are all but linear, where all
+    four are valid and the farthest is at most 5 % farther than the nearest. Elsewhere, at a step or a hole, it is that
+    of the pixel in which the ray lies, which may be none: nothing is mixed across a discontinuity, no hole is closed.
+
+    Args:
+        ranges: (H, W) float32 along the rays of the full sphere, NaN invalid.
+        view: the face.
+        threads: how many to use; they change no bit.
+
+    Raises:
+        UsageError: if the ranges are another array.
+    """
+    from pano_mvs.algorithms.faces.kernels_faces import z_depth_rows  # compiles on import
+
+    if ranges.ndim != 2 or ranges.dtype != np.float32 or ranges.shape[1] % 2:
+        raise UsageError(f"ranges are (H, W) float32 with even W, got {ranges.shape} {ranges.dtype}")
+    x, y = (float(value) for value in view.principal_xy)
+    camera = np.ascontiguousarray(view.view_from_cam), float(view.focal_px), x, y
+    given = np.ascontiguousarray(ranges)
+    result = np.empty(view.size_hw, np.float32)
+    for_bands(
+        lambda first, rows: z_depth_rows(first, rows, given, camera, _MAX_SURFACE_STEP, result),
+        view.size_hw[0],
+        threads=threads,
+    )
+    return result
+
+
+def face_normals(normals_in_cam: NDArray[np.floating], view: PinholeView) -> NDArray[np.float32]:
+    """Return the normals of a face in ITS camera frame, (h, w, 3) float32: of the pixel in which each ray lies.
+
+    Args:
+        normals_in_cam: (H, W, 3) in the panorama's camera frame, NaN where unknown (and so in the result).
+        view: the face.
+    """
+    at = nearest_pixels(view, (normals_in_cam.shape[0], normals_in_cam.shape[1]))
+    turned: NDArray[np.float32] = normals_in_cam[at].astype(np.float32) @ view.view_from_cam.T.astype(np.float32)
+    return turned
+
+
+def face_confidence(confidence: NDArray[np.uint8], view: PinholeView) -> NDArray[np.uint8]:
+    """Return the confidences of a face, (h, w) uint8: of the pixel in which each ray lies.
+
+    Args:
+        confidence: (H, W) uint8 of the panorama.
+        view: the face.
+    """
+    return confidence[nearest_pixels(view, (confidence.shape[0], confidence.shape[1]))]

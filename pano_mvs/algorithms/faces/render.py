@@ -1,0 +1,111 @@
+"""All that a dense workspace holds of one face."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.faces.pictures import face_image, face_mask
+from pano_mvs.algorithms.faces.ranges import face_confidence, face_normals, face_z_depth
+from pano_mvs.algorithms.faces.view import PinholeView
+from pano_mvs.algorithms.fusion.normals import normals_from_range
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import ray_grid
+from pano_mvs.scene import RangeMap
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FaceRender:
+    """What is seen in a face; nothing of it comes from a masked pixel of the panorama.
+
+    Attributes:
+        image: (h, w, 3) uint8 RGB, black where masked.
+        mask: (h, w) bool, False where masked.
+        z_depth: (h, w) float32 in scene units, NaN where unknown or masked.
+        normals_in_face: (h, w, 3) float32 unit normals in the face's camera frame, towards the camera; NaN exactly
+            where the z-depth is.
+        confidence: (h, w) uint8, 0 exactly where the z-depth is NaN.
+    """
+
+    image: NDArray[np.uint8]
+    mask: NDArray[np.bool_]
+    z_depth: NDArray[np.float32]
+    normals_in_face: NDArray[np.float32]
+    confidence: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FaceSource:
+    """A panorama with its range map, made ready for the rendering of faces.
+
+    Attributes:
+        image: (H, W, 3) uint8 RGB.
+        valid: (H, W) bool, False is masked.
+        ranges: (H, W) float32, NaN where unknown, masked or of too little confidence.
+        normals_in_cam: (H, W, 3) float32, NaN where unknown.
+        confidence: (H, W) uint8, 0 where the ranges are NaN.
+    """
+
+    image: NDArray[np.uint8]
+    valid: NDArray[np.bool_]
+    ranges: NDArray[np.float32]
+    normals_in_cam: NDArray[np.float32]
+    confidence: NDArray[np.uint8]
+
+
+def face_source(
+    image: NDArray[np.uint8],
+    valid: NDArray[np.bool_],
+    range_map: RangeMap,
+    *,
+    min_confidence: int = 64,
+    threads: int = 1,
+) -> FaceSource:
+    """Return a panorama ready for `render_face`: what is masked or doubtful has no range.
+
+    Normals are the range map's own; where it has none they are fitted to the ranges (`normals_from_range`); where that
+    is impossible a surface is taken to face the camera.
+
+    Args:
+        image: (H, W, 3) uint8 RGB.
+        valid: (H, W) bool, False is to be ignored.
+        range_map: of the same size.
+        min_confidence: ranges below are left out.
+        threads: how many to use; they change no bit.
+
+    Raises:
+        UsageError: if the sizes differ.
+    """
+    ranges = range_map.range
+    if image.shape[:2] != ranges.shape or valid.shape != ranges.shape:
+        raise UsageError(f"picture {image.shape[:2]}, mask {valid.shape} and range map {ranges.shape} differ in size")
+    kept = valid & (range_map.confidence >= min_confidence) & range_map.valid
+    given = None if range_map.normals_in_cam is None else range_map.normals_in_cam.astype(np.float32)
+    seen = np.where(kept, ranges, np.float32(np.nan))
+    normals = normals_from_range(seen, given=given, threads=threads)
+    unknown = ~np.isfinite(normals[..., 0])
+    normals[unknown] = -ray_grid((ranges.shape[0], ranges.shape[1]))[unknown]
+    return FaceSource(image, valid, seen, normals, np.where(kept, range_map.confidence, np.uint8(0)))
+
+
+def render_face(source: FaceSource, view: PinholeView, *, threads: int = 1) -> FaceRender:
+    """Return what is seen of a panorama in one face.
+
+    Args:
+        source: the panorama.
+        view: the face.
+        threads: how many to use; they change no bit.
+    """
+    mask = face_mask(source.valid, view)
+    z_depth = face_z_depth(source.ranges, view, threads=threads)
+    z_depth[~mask] = np.nan
+    known = np.isfinite(z_depth)
+    normals = face_normals(source.normals_in_cam, view)
+    normals[~known] = np.nan
+    confidence = face_confidence(source.confidence, view)
+    confidence[~known] = 0
+    image = face_image(source.image, view)
+    image[~mask] = 0
+    return FaceRender(image, mask, z_depth, normals, confidence)
