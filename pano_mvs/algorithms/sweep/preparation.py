@@ -114,9 +114,14 @@ def sees_winner(winners: Winners, work: SweepInput) -> NDArray[np.bool_]:
     seen = np.zeros(winners.plane.shape, np.bool_)
     points = ray_grid((work.reference.shape[0], work.reference.shape[1])) * work.ranges[winners.plane][..., None]
     for pose, valid in zip(work.source_from_reference, work.source_valid, strict=True):
-        height, width = valid.shape
-        pixels = pixel_from_ray(pose.apply(points), (height, width))
-        column = np.floor(pixels[..., 0]).astype(np.intp) % width
-        row = np.minimum(np.floor(pixels[..., 1]).astype(np.intp), height - 1)
-        seen |= valid[row, column]
+        seen |= valid_where_seen(valid, pose.apply(points))
     return seen
+
+
+def valid_where_seen(valid: NDArray[np.bool_], points_in_source: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return whether the pixel of a source, `valid` (H, W), in which each point (..., 3) is seen is valid, (...,)."""
+    height, width = valid.shape
+    pixels = pixel_from_ray(points_in_source, (height, width))
+    column = np.floor(pixels[..., 0]).astype(np.intp) % width
+    row = np.minimum(np.floor(pixels[..., 1]).astype(np.intp), height - 1)
+    return np.asarray(valid[row, column])

@@ -1,0 +1,190 @@
+"""The costs of one pixel over all virtual ranges, as a sweep has them: for people who tune one.
+
+Nothing is approximated by a crop. Before the decision a pixel's cost depends on its window alone. Semi-global matching
+adds, for eight directions, the path that ends in the pixel; each path reads the costs along one line from pole to
+pole, or once around. So the costs along these lines, with their warm-up, give the very sums of the whole panorama.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.sweep.no_match import has_match
+from pano_mvs.algorithms.sweep.numpy_backend import path_step, winners_of
+from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, step_penalties, warm_up
+from pano_mvs.algorithms.sweep.pixel_costs import costs_at, is_seen, votes_at
+from pano_mvs.algorithms.sweep.preparation import SweepInput
+from pano_mvs.algorithms.sweep.winner import Winners, range_map_from_winners
+from pano_mvs.core.errors import UsageError
+
+FloatArray = NDArray[np.float64]
+
+_PATHS, _WORST = 8, 255
+
+
+@dataclass(frozen=True, eq=False)
+class CostCurve:
+    """What one pixel costs at every virtual range; costs are shares of the worst there is, a chance match has ½.
+
+    Attributes:
+        ranges: (D,) virtual ranges in scene units, ascending.
+        by_source: (S, D) cost in each source; NaN where the source has no vote.
+        raw: (D,) cost combined from the sources, before the decision.
+        aggregated: (D,) mean cost of the eight paths of semi-global matching; None if it is not asked for.
+        winner: index of the range that wins.
+        runner_up: index of the cheapest range that is not next to the winner; None if there is none.
+        range: of the pixel, between the virtual ones as `selection` says; NaN if the sweep leaves it without.
+        confidence: 64–127, or 0 where there is no range.
+        reason: why it has no range; empty if it has.
+    """
+
+    ranges: FloatArray
+    by_source: FloatArray
+    raw: FloatArray
+    aggregated: FloatArray | None
+    winner: int
+    runner_up: int | None
+    range: float
+    confidence: int
+    reason: str = ""
+
+    @property
+    def decisive(self) -> FloatArray:
+        """The costs by which the winner was chosen, (D,)."""
+        return self.raw if self.aggregated is None else self.aggregated
+
+    @property
+    def uniqueness(self) -> float:
+        """How much dearer the runner-up is than the winner, as a share of its cost: 0 says that both are as good."""
+        if self.runner_up is None:
+            return 1.0
+        rival = float(self.decisive[self.runner_up])
+        return (rival - float(self.decisive[self.winner])) / rival if rival > 0 else 0.0
+
+
+def cost_curve(work: SweepInput, *, column: int, row: int, masked: bool = False) -> CostCurve:
+    """Return the costs of one pixel of the reference over all virtual ranges.
+
+    They are those of a sweep from which every range is tried everywhere (`levels` 1), by the compiled backend for
+    built-in costs and by the readable one for a plugin's, which takes as long as a sweep by it.
+
+    Args:
+        work: what would be swept, see `sweep_input`.
+        column: of the pixel, from 0.
+        row: likewise.
+        masked: whether the reference is masked there.
+
+    Raises:
+        UsageError: if the picture has no such pixel.
+    """
+    height, width = work.reference.shape[:2]
+    if not (0 <= column < width and 0 <= row < height):
+        raise UsageError(f"pixel ({column}, {row}) is not in a picture of {width}×{height}: columns are 0 to "
+                         f"{width - 1}, rows 0 to {height - 1}")  # fmt: skip
+    here = np.array([row]), np.array([column])
+    worst = work.settings.worst_cost
+    raw = costs_at(work, *here)[:, 0]
+    sums = _path_sums(work, row, column) if work.settings.aggregation == "sgm" else None
+    decisive = raw if sums is None else sums
+    winners = winners_of(decisive[None, :, None])
+    reason = _why_not(work, winners, row, column, masked=masked)
+    found = range_map_from_winners(
+        winners, near=float(work.ranges[0]), far=float(work.ranges[-1]), settings=work.settings,
+        seen=np.full((1, 1), not reason),
+    )  # fmt: skip
+    winner = int(winners.plane[0, 0])
+    apart = np.where(np.abs(np.arange(len(decisive)) - winner) <= 1, np.inf, decisive)
+    return CostCurve(
+        ranges=work.ranges,
+        by_source=np.stack([_of_source(work, idx, row, column) for idx in range(len(work.sources))]) / worst,
+        raw=raw / worst,
+        aggregated=None if sums is None else sums / (_PATHS * _WORST),
+        winner=winner,
+        runner_up=int(np.argmin(apart)) if np.isfinite(apart).any() else None,
+        range=float(found.range[0, 0]),
+        confidence=int(found.confidence[0, 0]),
+        reason=reason,
+    )
+
+
+def _of_source(work: SweepInput, idx: int, row: int, column: int) -> FloatArray:
+    """Return the costs, (D,), of a source by itself, NaN where it has no vote."""
+    alone = replace(
+        work,
+        sources=work.sources[idx : idx + 1],
+        source_from_reference=work.source_from_reference[idx : idx + 1],
+        source_valid=None if work.source_valid is None else work.source_valid[idx : idx + 1],
+        settings=work.settings.replace(combination="sum"),
+    )
+    costs = costs_at(alone, np.array([row]), np.array([column]))[:, 0]
+    return np.where(votes_at(work, idx, row, column), costs, np.nan)
+
+
+def _why_not(work: SweepInput, winners: Winners, row: int, column: int, *, masked: bool) -> str:
+    """Return why the pixel is left without a range; empty if it is not."""
+    plane = int(winners.plane[0, 0])
+    if masked:
+        return "the picture is masked here"
+    if not is_seen(work, row, column, plane):
+        return "every source is masked where the winner would be"
+    if work.settings.no_match == "keep":
+        return ""
+    everywhere = np.full(work.reference.shape[:2], plane, np.int32)
+    nowhere = np.zeros((0, 0), np.float32)
+    if has_match(Winners(everywhere, nowhere, nowhere, nowhere, nowhere), work)[row, column]:
+        return ""
+    return "it runs to a limit where nothing tells ranges apart (no_match: invalid)"
+
+
+def _path_sums(work: SweepInput, row: int, column: int) -> FloatArray:
+    """Return the sums of the eight paths' costs in a pixel, (D,)."""
+    lines = _lines(work, row, column)
+    rows, columns = (np.concatenate([line[part] for line in lines]) for part in (0, 1))
+    pixels, back = np.unique(rows * work.reference.shape[1] + columns, return_inverse=True)
+    costs = costs_at(work, *np.divmod(pixels, work.reference.shape[1]))
+    stored = np.floor(np.minimum(costs * np.float32(work.settings.cost_scale) + np.float32(0.5), _WORST))
+    of_lines = stored.astype(np.int64)[:, back]
+    p1, _ = work.settings.penalties(work.reference.shape[0])
+    total = np.zeros(len(work.ranges), np.int64)
+    start = 0
+    for line_rows, _, penalties in lines:
+        line = of_lines[:, start : start + len(line_rows)]
+        start += len(line_rows)
+        path = np.zeros((len(total), 1), np.int64)
+        for i, penalty in enumerate(penalties):
+            path = path_step(line[:, i : i + 1], path, penalty, p1)
+        total += path[:, 0]
+    return total.astype(np.float64)
+
+
+Line = tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.int64]]
+
+
+def _lines(work: SweepInput, row: int, column: int) -> list[Line]:
+    """Return the rows, the columns and the penalties of the steps of each path that ends in a pixel."""
+    height, width = work.reference.shape[:2]
+    before_pole, before_seam = warm_up((height, width))
+    lines = []
+    for direction in DIRECTIONS:
+        down, drift = direction
+        last = row if down > 0 else height - 1 - row
+        steps = np.arange(-before_pole, last + 1)
+        # Before the pole a path runs on the other side of the sphere, towards it.
+        walked = np.where(steps >= 0, steps, -1 - steps)
+        rows = walked if down > 0 else height - 1 - walked
+        columns = column - drift * (last - steps) - np.where(steps >= 0, 0, width // 2)
+        lines.append(_line(work, direction, rows, columns % width))
+    for step in (1, -1):
+        last = column if step > 0 else width - 1 - column
+        steps = np.arange(-before_seam, last + 1) % width
+        columns = steps if step > 0 else width - 1 - steps
+        lines.append(_line(work, (0, step), np.full(len(columns), row), columns))
+    return lines
+
+
+def _line(work: SweepInput, direction: tuple[int, int], rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Line:
+    penalties = step_penalties(work.reference, direction, work.settings)[rows, columns]
+    return rows, columns, penalties.astype(np.int64)[:, None]

@@ -1,0 +1,78 @@
+"""The costs of some pixels at all virtual ranges, without those of all the others."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.sweep.costs import plugin_cost
+from pano_mvs.algorithms.sweep.numpy_backend import _combined_cost
+from pano_mvs.algorithms.sweep.preparation import SweepInput, valid_where_seen
+from pano_mvs.geometry import pixel_from_ray, ray_from_pixel, sample_panorama
+
+_NO_VOLUME = np.empty((0, 0, 0), np.uint8)
+
+
+def costs_at(work: SweepInput, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float32]:
+    """Return the mean costs of pixels before the decision, (D, N), combined from the sources, not scaled.
+
+    Args:
+        work: what is swept.
+        rows: (N,) of the pixels.
+        columns: (N,) likewise.
+    """
+    if plugin_cost(work.settings.cost) is not None:
+        planes = [_combined_cost(work, virtual_range)[rows, columns] for virtual_range in work.ranges]
+        return np.asarray(planes, dtype=np.float32)
+    return _compiled_costs(work, rows, columns)
+
+
+def _compiled_costs(work: SweepInput, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float32]:
+    """Sweep the tiles in which the pixels lie, range by range: the winner's cost is then that of the range."""
+    # On use: numba is slow to import.
+    from pano_mvs.algorithms.sweep.kernels_band import sweep_band
+    from pano_mvs.algorithms.sweep.kernels_winner import BEST
+    from pano_mvs.algorithms.sweep.numba_backend import _fresh_state
+    from pano_mvs.algorithms.sweep.tiles import run_arguments, runs_of, shared_arguments, tile_means
+
+    height, width = work.reference.shape[:2]
+    wanted = np.zeros((height, width), np.bool_)
+    wanted[rows, columns] = True
+    shared = shared_arguments(work)
+    costs = np.empty((len(work.ranges), len(rows)), np.float32)
+    for run in runs_of(tile_means(wanted) > 0, (height, width), shared):
+        here = np.zeros((height, width), np.bool_)
+        here[run.place] = True
+        own = np.flatnonzero(here[rows, columns])
+        place = rows[own] - run.first, columns[own] - run.start + run.margin
+        arguments = run_arguments(shared, run)
+        for idx in range(len(work.ranges)):
+            state, planes = _fresh_state(run.rows, run.columns + 2 * run.margin)
+            arguments["ranges"] = work.ranges[idx : idx + 1]
+            sweep_band(run.first, *arguments.values(), _NO_VOLUME, state, planes)
+            costs[idx, own] = state[BEST][place]
+    return costs
+
+
+def votes_at(work: SweepInput, source_idx: int, row: int, column: int) -> NDArray[np.bool_]:
+    """Return at which virtual ranges a source may vote on a pixel, (D,): all that is sampled there is valid."""
+    if work.source_valid is None:
+        return np.ones(len(work.ranges), np.bool_)
+    valid = work.source_valid[source_idx]
+    points = work.source_from_reference[source_idx].apply(_points_at(work, row, column))
+    pixels = pixel_from_ray(points, (valid.shape[0], valid.shape[1]))
+    return np.asarray(sample_panorama(valid, pixels) > 1 - 1e-9)
+
+
+def is_seen(work: SweepInput, row: int, column: int, plane: int) -> bool:
+    """Return whether a sweep keeps a pixel's winner: a source sees it in a valid pixel; see `sees_winner`."""
+    point = _points_at(work, row, column)[plane]
+    return work.source_valid is None or any(
+        bool(valid_where_seen(valid, pose.apply(point)))
+        for pose, valid in zip(work.source_from_reference, work.source_valid, strict=True)
+    )
+
+
+def _points_at(work: SweepInput, row: int, column: int) -> NDArray[np.float64]:
+    ray = ray_from_pixel([column + 0.5, row + 0.5], (work.reference.shape[0], work.reference.shape[1]))
+    return work.ranges[:, None] * ray
