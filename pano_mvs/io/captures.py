@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import os
 import re
-import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.files import OUTPUT_MARK
-from pano_mvs.io.exif_gps import find_gps
-from pano_mvs.io.gpano import GPano, find_gpano, read_head
+from pano_mvs.io.containers import read_container
+from pano_mvs.io.exif import orientation_from_exif, position_from_exif
+from pano_mvs.io.gpano import GPano, find_gpano, read_file
 from pano_mvs.scene.image_file import decode_image
 
-PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp"})
+PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif", ".heic", ".heif"})
 _IGNORED_FOLDERS = frozenset({"masks"})
-# Start-of-frame markers of JPEG: C0–CF without the tables DHT (C4), JPG (C8) and DAC (CC).
-_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-_JPEG_ALONE = frozenset({0x01, *range(0xD0, 0xD9)})
+_TURNED = ("an EXIF orientation that turns or mirrors them, which was ignored: the pixels of a panorama are taken as "
+           "they are stored")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -31,7 +30,8 @@ class PictureInfo:
         file_size_hw: (height, width) of the picture in the file.
         crop_ltwh: (left, top, width, height) of the part of the sphere that the file holds, or None for all of it.
         gpano: its metadata, or None.
-        warnings: what the user should know of it, without the file's name.
+        warnings: what the user should know of this picture, without the file's name.
+        traits: what else it has that the user should know, in words that are the same for all such pictures.
         position_lla: (latitude deg, longitude deg, altitude m) from its EXIF metadata, or None.
     """
 
@@ -40,6 +40,7 @@ class PictureInfo:
     crop_ltwh: tuple[int, int, int, int] | None
     gpano: GPano | None
     warnings: tuple[str, ...] = ()
+    traits: tuple[str, ...] = ()
     position_lla: tuple[float, float, float] | None = None
 
 
@@ -67,7 +68,7 @@ def natural_key(name: str) -> tuple[list[tuple[int, int, str]], str]:
 
 
 def describe_picture(path: Path) -> PictureInfo:
-    """Return what is known of a panorama, reading no more than its header (TIFF and WebP are decoded).
+    """Return what is known of a panorama without decoding it (but for HEIC and AVIF).
 
     A picture is a panorama if its GPano metadata say so, whole or cropped, or, with a warning, if it is exactly
     twice as wide as high.
@@ -75,26 +76,30 @@ def describe_picture(path: Path) -> PictureInfo:
     Raises:
         InputError: if the file cannot be read, is no picture, or is no equirectangular panorama.
     """
-    head = read_head(path)
-    gpano, warnings = find_gpano(head)
-    position = find_gps(head)
-    size = _jpeg_size(head) or _png_size(head) or decode_image(path).shape[:2]
+    data = read_file(path)
+    container = read_container(data)
+    gpano, warnings = find_gpano(container.xmp, data)
+    del data  # decoding reads it anew
+    size = container.size_hw or decode_image(path).shape[:2]
     height, width = int(size[0]), int(size[1])
     if gpano is not None and gpano.projection_type != "equirectangular":
         raise InputError(f"{path}: its metadata say that it is {gpano.projection_type}, not equirectangular. "
                          "Export it as an equirectangular panorama, or remove it")  # fmt: skip
+    sphere, crop = (height, width), None
     if gpano is not None and gpano.full_size_hw is not None and gpano.crop_ltwh is not None:
         sphere, crop, more = _placed(path, (height, width), gpano.full_size_hw, gpano.crop_ltwh)
-        return PictureInfo(sphere, (height, width), crop, gpano, (*warnings, *more), position)
-    if width != 2 * height:
+        warnings = (*warnings, *more)
+    elif width != 2 * height:
         raise InputError(
             f"{path}: {width}×{height} px is not a full sphere (the width must be twice the height) and no GPano "
             "metadata place it on one. Remove it, export it anew as a full equirectangular panorama, or, if it is "
             "cropped, write the GPano FullPano and CroppedArea fields into it"
         )
+    exif = container.exif
+    traits = (_TURNED,) if orientation_from_exif(exif) != 1 else ()
     if gpano is None:
-        warnings = (*warnings, "no GPano metadata; taken as full spheres, since the width is twice the height")
-    return PictureInfo((height, width), (height, width), None, gpano, warnings, position)
+        traits = (*traits, "no GPano metadata; taken as full spheres, since the width is twice the height")
+    return PictureInfo(sphere, (height, width), crop, gpano, warnings, traits, position_from_exif(exif))
 
 
 def _files_below(folder: Path) -> Iterator[Path]:
@@ -142,30 +147,3 @@ def _placed(
                          "the width must be twice the height. Correct the metadata, or remove them")  # fmt: skip
     whole = (height, width) == (full_height, full_width)
     return (full_height, full_width), None if whole else (left, top, width, height), warnings
-
-
-def _jpeg_size(head: bytes) -> tuple[int, int] | None:
-    """Return (height, width) from a JPEG's frame header, or None."""
-    if head[:2] != b"\xff\xd8":
-        return None
-    offset = 2
-    while offset + 9 <= len(head):
-        if head[offset] != 0xFF:
-            return None
-        marker = head[offset + 1]
-        if marker in _JPEG_FRAMES:
-            height, width = struct.unpack_from(">HH", head, offset + 5)
-            return (height, width) if height and width else None
-        if marker == 0xFF:  # fill byte
-            offset += 1
-        else:
-            offset += 2 if marker in _JPEG_ALONE else 2 + struct.unpack_from(">H", head, offset + 2)[0]
-    return None
-
-
-def _png_size(head: bytes) -> tuple[int, int] | None:
-    """Return (height, width) from a PNG's header chunk, or None."""
-    if not head.startswith(b"\x89PNG\r\n\x1a\n") or len(head) < 24:
-        return None
-    width, height = struct.unpack_from(">II", head, 16)
-    return (height, width) if height and width else None

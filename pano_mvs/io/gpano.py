@@ -1,26 +1,23 @@
 """Google's photo sphere metadata (GPano XMP): is it a panorama, which part of the sphere, which way is up.
 
 The fields are those of the "Photo Sphere XMP Metadata" specification. Cameras write them as elements, editors as
-attributes, and both are read, in a JPEG's APP1, a PNG's iTXt, or wherever else the packet lies in the file's head.
+attributes, and both are read, where the container keeps its metadata or wherever else in the file a packet lies.
 """
 
 from __future__ import annotations
 
 import math
-import struct
-import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.io.containers import read_container
 
 _NAMESPACE = "{http://ns.google.com/photos/1.0/panorama/}"
 _WRAPPED, _BARE = (b"<x:xmpmeta", b"</x:xmpmeta>"), (b"<rdf:RDF", b"</rdf:RDF>")
-_HEAD_BYTES = 4 << 20
 _PACKET_BYTES = 1 << 20
-_PNG_START = b"\x89PNG\r\n\x1a\n"
 
 
 @dataclass(frozen=True)
@@ -61,49 +58,54 @@ def read_gpano(path: Path) -> GPano | None:
     Raises:
         InputError: if the file cannot be read at all.
     """
-    return find_gpano(read_head(path))[0]
+    data = read_file(path)
+    return find_gpano(read_container(data).xmp, data)[0]
 
 
-def read_head(path: Path) -> bytes:
-    """Return the first 4 MiB of a file: all metadata that can matter stands there.
+def read_file(path: Path) -> bytes:
+    """Return the bytes of a file.
 
     Raises:
-        InputError: if the file cannot be read.
+        InputError: if it cannot be read.
     """
     try:
-        with path.open("rb") as stream:
-            return stream.read(_HEAD_BYTES)
+        return path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
 
 
-def find_gpano(head: bytes) -> tuple[GPano | None, tuple[str, ...]]:
-    """Return the GPano metadata in the head of a picture file, if any, and what was wrong with it.
+def find_gpano(chunks: Iterable[bytes], data: bytes = b"") -> tuple[GPano | None, tuple[str, ...]]:
+    """Return the GPano metadata of a picture file, if any, and what was wrong with it.
 
     Args:
-        head: the file's first bytes.
+        chunks: what the container keeps as XMP.
+        data: the whole file, searched where those have no such fields: some programs append packets behind the
+            pixels, or write containers that are read here for their marks alone.
 
     Returns:
         The metadata or None, and warnings: packets and fields that were left out because they are malformed.
     """
     warnings: list[str] = []
-    for packet in _packets(head):
-        try:
-            fields = _fields(packet)
-        except (ElementTree.ParseError, ValueError) as error:
-            warnings.append(f"its XMP metadata is malformed ({error}) and was ignored")
-            continue
-        if fields:
-            return _gpano(fields, warnings), tuple(warnings)
+    seen: set[bytes] = set()
+    for source in (*chunks, data):
+        for packet in _packets(source):
+            if packet in seen:
+                continue
+            seen.add(packet)
+            try:
+                fields = _fields(packet)
+            except (ElementTree.ParseError, ValueError) as error:
+                warnings.append(f"its XMP metadata is malformed ({error}) and was ignored")
+                continue
+            if fields:
+                return _gpano(fields, warnings), tuple(warnings)
     return None, tuple(warnings)
 
 
-def _packets(head: bytes) -> Iterator[bytes]:
-    """Yield every XMP packet of a file, those of compressed PNG chunks too."""
-    sources = [*_png_texts(head), head] if head.startswith(_PNG_START) else [head]
-    for source in sources:
-        wrapped = list(_between(source, *_WRAPPED))
-        yield from wrapped or _between(source, *_BARE)
+def _packets(source: bytes) -> Iterator[bytes]:
+    """Yield every XMP packet in some bytes."""
+    wrapped = list(_between(source, *_WRAPPED))
+    yield from wrapped or _between(source, *_BARE)
 
 
 def _between(source: bytes, start_mark: bytes, end_mark: bytes) -> Iterator[bytes]:
@@ -116,27 +118,6 @@ def _between(source: bytes, start_mark: bytes, end_mark: bytes) -> Iterator[byte
         if end - start <= _PACKET_BYTES:
             yield source[start : end + len(end_mark)]
         start = source.find(start_mark, end)
-
-
-def _png_texts(head: bytes) -> Iterator[bytes]:
-    """Yield the texts of a PNG's international text chunks (iTXt), decompressed."""
-    offset = len(_PNG_START)
-    while offset + 8 <= len(head):
-        length, kind = struct.unpack_from(">I4s", head, offset)
-        chunk = head[offset + 8 : offset + 8 + length]
-        if kind == b"iTXt":
-            keyword, _, rest = chunk.partition(b"\0")
-            parts = rest[2:].split(b"\0", 2)
-            if keyword == b"XML:com.adobe.xmp" and len(parts) == 3:
-                yield _inflated(parts[2]) if rest[:1] == b"\1" else parts[2]
-        offset += 12 + length
-
-
-def _inflated(data: bytes) -> bytes:
-    try:
-        return zlib.decompressobj().decompress(data, _PACKET_BYTES)
-    except zlib.error:
-        return b""
 
 
 def _fields(packet: bytes) -> dict[str, str]:

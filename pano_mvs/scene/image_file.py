@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 
 import cv2
@@ -9,39 +10,60 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.scene.jpeg import JPEG_START, is_cut_short
 
 # What OpenCV prints of pictures that it cannot decode is said better by our own error.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
-# The JPEG decoder fills what a truncated file lacks with grey and only warns; the end marker tells.
-_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
 
 
 def decode_image(path: Path) -> NDArray[np.uint8]:
     """Return a picture as (H, W, 3) uint8 RGB; 16-bit pictures are scaled, EXIF orientation is ignored.
 
+    Of pictures with transparency the colours are taken, of those with several pages the first.
+
     Raises:
-        InputError: if the file cannot be read, is no picture, or is truncated.
+        InputError: if the file cannot be read, is no picture, is truncated, or needs an extra that is not installed.
     """
     try:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
-    if data[:2] == _JPEG_START and _JPEG_END not in data[-(1 << 16) :]:
+    if data.startswith(JPEG_START) and is_cut_short(data):
         raise InputError(
             f"{path}: the JPEG ends early (truncated after {len(data)} bytes). Copy it again from the camera"
         )
+    if data[4:8] == b"ftyp" and data[8:12] in _HEIC_BRANDS and b"avif" not in data[:64]:
+        return _decode_heic(data, path)
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     if image is None:
         raise InputError(f"{path}: not a picture that can be decoded ({len(data)} bytes). Remove it or convert it to "
-                         f"JPEG or PNG")  # fmt: skip
+                         f"JPEG, or to PNG or TIFF of 8 or 16 bits")  # fmt: skip
     if image.dtype == np.uint16:
-        image = (image >> 8).astype(np.uint8)
+        image = (image >> 8).astype(np.uint8)  # both 257 v and 256 v, as which programs write 8 bits in 16, give v
     elif image.dtype != np.uint8:
         raise InputError(f"{path}: {image.dtype} pictures are not supported. Convert it to 8 or 16 bits")
     rgb: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
     return rgb
+
+
+def _decode_heic(data: bytes, path: Path) -> NDArray[np.uint8]:
+    """Return a HEIC picture as (H, W, 3) uint8 RGB; what it holds of 10 or 12 bits is scaled."""
+    try:
+        pillow_heif = import_module("pillow_heif")
+    except ImportError as error:
+        raise InputError(f"{path}: HEIC pictures need an extra: pip install 'pano-mvs[heic]', or convert it to JPEG") \
+            from error  # fmt: skip
+    try:
+        picture = pillow_heif.open_heif(data, convert_hdr_to_8bit=True)
+        image = np.asarray(picture)
+    except (ValueError, EOFError, OSError, RuntimeError, SyntaxError) as error:
+        raise InputError(f"{path}: not a HEIC picture that can be decoded ({error}). Copy it again, or convert it to "
+                         "JPEG")  from error  # fmt: skip
+    rgb = image[..., :3] if image.ndim == 3 and image.shape[-1] >= 3 else np.atleast_3d(image)[..., :1].repeat(3, -1)
+    return np.ascontiguousarray(rgb, dtype=np.uint8)
 
 
 def write_png(path: Path, picture: NDArray[np.uint8]) -> None:

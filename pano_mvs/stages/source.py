@@ -61,7 +61,9 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
     path = item.files["image"]
     info = describe_picture(path)
     for warning in info.warnings:
-        ctx.note(f"{item.name}: {warning}" if info.gpano is not None else f"some pictures have {warning}")
+        ctx.note(f"{item.name}: {warning}")
+    for trait in info.traits:
+        ctx.note(f"some pictures have {trait}")
     _check_decodes(path, info)
     mask = item.files.get("mask")
     if mask is None and params.masks is not None:

@@ -17,8 +17,7 @@ from pano_mvs.io.pose_files import read_poses
 from pano_mvs.io.range_files import read_range_tiff
 from tests.algorithms.synthetic_capture import random_rotation
 from tests.cli.conftest import SMALL, Command, run_json
-from tests.io.pictures import full_sphere, xmp
-from tests.io.test_exif_gps import exif
+from tests.io.pictures import exif, full_sphere, xmp
 from tests.test_docs_frames import block
 
 UP = np.array([0.0, -1.0, 0.0])

@@ -10,7 +10,7 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.io import captures
 from pano_mvs.io.captures import describe_picture, list_pictures, natural_key
 from pano_mvs.scene import FilePart, Panorama
-from tests.io.pictures import full_sphere, picture, write_jpeg, write_png, xmp
+from tests.io.pictures import by_pillow, full_sphere, picture, sound_files, write_jpeg, write_png, xmp
 
 
 def test_pictures_come_in_the_order_in_which_people_count(tmp_path):
@@ -59,15 +59,20 @@ def test_twice_as_wide_as_high_is_a_panorama_with_a_warning(tmp_path, suffix):
     info = describe_picture(path)
     assert info.size_hw == (32, 64)
     assert info.gpano is None
-    assert "no GPano metadata" in info.warnings[0]
+    assert info.warnings == ()
+    assert "no GPano metadata" in info.traits[0]
 
 
 def test_headers_are_read_without_decoding(tmp_path, monkeypatch):
     monkeypatch.setattr(captures, "decode_image", None)
-    progressive = bytes(cv2.imencode(".jpg", picture((32, 64)), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1])
-    (tmp_path / "b.jpg").write_bytes(progressive)
-    for path in (write_jpeg(tmp_path / "a.jpg", (32, 64)), tmp_path / "b.jpg", write_png(tmp_path / "a.png", (32, 64))):
-        assert describe_picture(path).size_hw == (32, 64)
+    write_jpeg(tmp_path / "a.jpg", (32, 64))
+    write_jpeg(tmp_path / "b.jpg", (32, 64), progressive=True)
+    write_png(tmp_path / "c.png", (32, 64))
+    for number, data in enumerate([*sound_files((32, 64), b""), by_pillow((32, 64), "WEBP"),
+                                   by_pillow((32, 64), "WEBP", lossless=True)]):  # fmt: skip
+        (tmp_path / f"{number}.webp").write_bytes(data)
+    for path in tmp_path.iterdir():
+        assert describe_picture(path).size_hw == (32, 64), path
 
 
 def test_tables_before_the_frame_are_no_frame(tmp_path):

@@ -1,0 +1,139 @@
+"""Pictures as cameras and programs write them, against what Pillow reads of them."""
+
+from __future__ import annotations
+
+import io
+import sys
+import tracemalloc
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pillow_heif
+import pytest
+from PIL import Image
+
+from pano_mvs.core.errors import InputError
+from pano_mvs.scene.image_file import decode_image
+from tests.io.pictures import app1, by_pillow, exif
+
+SIZE = (32, 64)
+SMOOTH = cv2.resize(np.random.default_rng(1).integers(0, 256, (4, 8, 3)).astype(np.uint8), SIZE[::-1])
+
+
+def saved(kind: str, mode: str = "RGB", **more: object) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(SMOOTH).convert(mode).save(stream, kind, **more)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("kind", "mode", "more"),
+    [
+        ("JPEG", "RGB", {"progressive": True}),
+        ("JPEG", "L", {}),
+        ("JPEG", "CMYK", {"quality": 95}),
+        ("PNG", "RGB", {}),
+        ("PNG", "RGBA", {}),
+        ("PNG", "LA", {}),
+        ("PNG", "L", {}),
+        ("PNG", "P", {}),
+        ("PNG", "1", {}),
+        ("TIFF", "RGB", {"compression": "tiff_lzw"}),
+        ("TIFF", "RGB", {"compression": "jpeg"}),
+        ("TIFF", "RGB", {"big_tiff": True}),
+        ("TIFF", "RGBA", {}),
+        ("TIFF", "L", {}),
+        ("WEBP", "RGB", {"quality": 95}),
+        ("WEBP", "RGBA", {"lossless": True}),
+        ("AVIF", "RGB", {"quality": 90}),
+    ],
+)
+def test_what_pillow_writes_is_read_as_pillow_reads_it(
+    tmp_path: Path, kind: str, mode: str, more: dict[str, object]
+) -> None:
+    path = tmp_path / "picture of 1° – ünïcode.X"
+    path.write_bytes(saved(kind, mode, **more))
+    expected = np.asarray(Image.open(path).convert("RGB")).astype(int)
+    tolerance = 0 if kind == "PNG" or more.get("lossless") else 12  # decoders of lossy pictures round on their own
+    np.testing.assert_allclose(decode_image(path), expected, atol=tolerance)
+
+
+@pytest.mark.parametrize("factor", [257, 256])
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_eight_bits_written_as_sixteen_come_back(tmp_path: Path, factor: int, suffix: str) -> None:
+    """255 is 65535 to programs that repeat the byte, and 65280 to those that shift it; either way none is lost."""
+    levels = np.arange(256, dtype=np.uint16).repeat(3).reshape(8, 32, 3)
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(bytes(cv2.imencode(suffix, levels * np.uint16(factor))[1]))
+    np.testing.assert_array_equal(decode_image(path), levels)
+
+
+def test_a_float_picture_is_refused_with_the_remedy(tmp_path: Path) -> None:
+    (tmp_path / "a.tif").write_bytes(bytes(cv2.imencode(".tif", np.zeros((8, 16, 3), np.float32))[1]))
+    with pytest.raises(InputError, match=r"a\.tif: float32 pictures are not supported\. Convert it to 8 or 16 bits"):
+        decode_image(tmp_path / "a.tif")
+    (tmp_path / "b.tif").write_bytes(by_pillow(SIZE, "TIFF", mode="F"))
+    with pytest.raises(InputError, match=r"b\.tif: .*convert it to JPEG, or to PNG or TIFF of 8 or 16 bits"):
+        decode_image(tmp_path / "b.tif")
+
+
+def test_orientation_does_not_turn_the_pixels(tmp_path: Path) -> None:
+    data = saved("JPEG")
+    for orientation in (1, 3, 6):
+        segment = app1(b"Exif\0\0" + exif(orientation=orientation))
+        (tmp_path / f"{orientation}.jpg").write_bytes(data[:2] + segment + data[2:])
+    for orientation in (3, 6):
+        np.testing.assert_array_equal(decode_image(tmp_path / f"{orientation}.jpg"), decode_image(tmp_path / "1.jpg"))
+
+
+def test_what_cameras_append_to_a_jpeg_is_not_taken_for_its_end(tmp_path: Path) -> None:
+    """A video of some hundred kB behind the end marker made a sound picture count as truncated once."""
+    data = saved("JPEG")
+    (tmp_path / "sound.jpg").write_bytes(data + bytes(200_000))
+    assert decode_image(tmp_path / "sound.jpg").shape == (*SIZE, 3)
+    thumbnail = app1(b"Exif\0\0" + data)  # has an end marker of its own
+    (tmp_path / "short.jpg").write_bytes((data[:2] + thumbnail + data[2:])[:-40])
+    with pytest.raises(InputError, match="the JPEG ends early"):
+        decode_image(tmp_path / "short.jpg")
+
+
+@pytest.mark.parametrize("kind", ["PNG", "TIFF", "WEBP", "HEIC"])
+def test_what_is_cut_short_is_refused(tmp_path: Path, kind: str) -> None:
+    data = heic(SMOOTH) if kind == "HEIC" else saved(kind)
+    (tmp_path / "a.X").write_bytes(data[: len(data) // 2])
+    with pytest.raises(InputError, match=r"a\.X: not a .*picture that can be decoded"):
+        decode_image(tmp_path / "a.X")
+
+
+def heic(picture: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    pillow_heif.from_pillow(Image.fromarray(picture)).save(stream, quality=95)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("shape", ["RGB", "L", "RGBA"])
+def test_heic_is_read(tmp_path: Path, shape: str) -> None:
+    picture = np.asarray(Image.fromarray(SMOOTH).convert(shape))
+    (tmp_path / "a.heic").write_bytes(heic(picture))
+    decoded = decode_image(tmp_path / "a.heic")
+    assert decoded.shape == (*SIZE, 3)
+    np.testing.assert_allclose(decoded, np.asarray(Image.fromarray(picture).convert("RGB")).astype(int), atol=40)
+
+
+def test_heic_without_its_extra_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.heic").write_bytes(heic(SMOOTH))
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    with pytest.raises(InputError, match=r"a\.heic: .*pip install 'pano-mvs\[heic\]', or convert it to JPEG"):
+        decode_image(tmp_path / "a.heic")
+
+
+def test_eight_k_is_read_within_its_budget(tmp_path: Path) -> None:
+    """8192 × 4096: the decoder's picture and ours, 100 MB each, and the file."""
+    ramp = np.add.outer(np.arange(4096), np.arange(8192)).astype(np.uint8)
+    (tmp_path / "a.jpg").write_bytes(bytes(cv2.imencode(".jpg", np.dstack([ramp] * 3))[1]))
+    tracemalloc.start()
+    assert decode_image(tmp_path / "a.jpg").shape == (4096, 8192, 3)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert 100e6 < peak < 250e6
