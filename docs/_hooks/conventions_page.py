@@ -1,0 +1,45 @@
+"""The page of the conventions: the docstring of pano_mvs.geometry, which states them once, as it stands there."""
+
+from __future__ import annotations
+
+import inspect
+import re
+
+from markdown_text import escaped, table
+
+from pano_mvs import geometry
+
+_INTRODUCTION = """# Conventions
+
+Stated once, in the docstring of `pano_mvs.geometry`, from which this page is made; every sentence is held by a test.
+Where the world's origin, axes and unit are is told in [Frames and scale](../frames_and_scale.md)."""
+
+_ELSEWHERE = (
+    ("COLMAP", "`EQUIRECTANGULAR`, camera x right, y down, z forward, corners at integers", "nothing: it is ours"),
+    ("nerfstudio", "camera-to-world, x right, y up, z backward (OpenGL)", "read by `poses.from_model`"),
+    ("OpenSfM", "u = longitude / 2π, v = −latitude / 2π", "read by `poses.from_model`"),
+    ("SphereSfM", "a camera model SPHERE, with COLMAP's number 11", "read by `poses.from_model`"),
+    ("papers with z up", "θ = 2πu/w, φ = πv/h, no half pixel", "ranges are the same, a cloud is mirrored"),
+)
+
+
+def conventions_page() -> str:
+    """Return the page."""
+    text = inspect.getdoc(geometry) or ""
+    title, *sections = re.split(r"\n\n(?=\w+\n {4})", text)
+    parts = [_INTRODUCTION, escaped(title)]
+    for section in sections:
+        name, _, body = section.partition("\n")
+        parts += [f"## {name}", _body(inspect.cleandoc(body))]
+    elsewhere = table(("program", "its convention", "what to do"), _ELSEWHERE)
+    return "\n\n".join([*parts, "## How others say it", elsewhere]) + "\n"
+
+
+def _body(text: str) -> str:
+    """Return prose as prose, and lines in columns as they are."""
+    lines = text.splitlines()
+    formulas = [line for line in lines if re.search(r"\S {2,}\S", line)]
+    if not formulas:
+        return escaped(text)
+    prose = "\n".join(line for line in lines if line not in formulas)
+    return "\n\n".join(["```\n" + "\n".join(formulas) + "\n```", escaped(prose)])

@@ -1,0 +1,17 @@
+"""Equations as MathML, made when the site is built: browsers show it by themselves, without a script or a font."""
+
+from __future__ import annotations
+
+import html
+import re
+
+from latex2mathml.converter import convert
+
+_INLINE = re.compile(r'<span class="arithmatex">\\\((.*?)\\\)</span>', re.DOTALL)
+_BLOCK = re.compile(r'<div class="arithmatex">\s*\\\[(.*?)\\\]\s*</div>', re.DOTALL)
+
+
+def with_mathml(page: str) -> str:
+    """Return a page with its TeX, as pymdownx.arithmatex marks it, in MathML."""
+    page = _BLOCK.sub(lambda found: convert(html.unescape(found[1]).strip(), display="block"), page)
+    return _INLINE.sub(lambda found: convert(html.unescape(found[1]).strip()), page)

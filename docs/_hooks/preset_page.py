@@ -1,0 +1,37 @@
+"""The shipped workflows, as they are, and which stages they use."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+
+WORKFLOWS = Path(__file__).parents[2] / "workflows"
+
+_INTRODUCTION = """# Shipped workflows
+
+Each is run by its name (`pano-mvs run quickstart --images photos`), or laid under a workflow of yours by `extends:`
+([Workflows](../workflows.md)). In all of them the source is called `images`, the pose solver `poses`, the sweep
+`depth`, so that `--set depth.planes=192` works on each. By themselves they run on a sample capture that comes along.
+This page shows the files as they are."""
+
+
+def preset_page() -> str:
+    """Return the page of all shipped workflows."""
+    parts = [_INTRODUCTION]
+    for path in sorted(WORKFLOWS.glob("*.yaml")):
+        parts += [f"## {path.stem}", f"```yaml\n{path.read_text(encoding='utf-8').rstrip()}\n```"]
+    return "\n\n".join(parts) + "\n"
+
+
+def presets_that_use(stage: str) -> str:
+    """Return a sentence that names the presets in which a stage is, with links; empty if there is none."""
+    names = [path.stem for path in sorted(WORKFLOWS.glob("*.yaml")) if stage in _uses(path)]
+    links = ", ".join(f"[{name}](presets.md#{name})" for name in names)
+    return f"In the presets {links}." if names else ""
+
+
+def _uses(path: Path) -> set[str]:
+    stages: dict[str, Any] = YAML(typ="safe").load(path)["stages"]
+    return {entry["use"] for entry in stages.values() if entry and "use" in entry}

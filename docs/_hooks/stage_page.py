@@ -1,0 +1,137 @@
+"""The reference of all stages, from the registry: what each reads and gives, its settings, and who uses it."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+
+from markdown_text import cell, docstring, table
+from preset_page import presets_that_use
+from pydantic.fields import FieldInfo
+from setting_schema import limits_of, type_of
+
+from pano_mvs.engine.params import NOT_IN_KEY
+from pano_mvs.engine.policy import Policy
+from pano_mvs.engine.ports import Port
+from pano_mvs.engine.registry import Registry
+from pano_mvs.engine.schema import workflow_schema
+from pano_mvs.engine.stage import StageSpec
+
+KINDS = {
+    "source": "which pictures there are, and how one is read",
+    "video": "pictures out of a video",
+    "mask": "what is to be ignored in a picture",
+    "features": "key points of one panorama, as bearings on the sphere",
+    "global": "one vector that sums up a picture",
+    "pairs": "which pictures are matched",
+    "matches": "which key points are the same, and the geometry of two views",
+    "poses": "where the pictures were taken, and what is done to poses",
+    "views": "which sources each reference is swept against",
+    "depth": "the range of every pixel of a reference",
+    "filters": "range map in, range map out",
+    "fusion": "from all range maps to one cloud",
+    "mesh": "from the cloud to a surface",
+    "export": "files in the output folder",
+    "evaluate": "comparison with the truth",
+}
+"""What the stages of a kind do, in the order of a workflow."""
+
+
+def stage_page() -> str:
+    """Return the page of all stages, by kind in the order of a workflow."""
+    kinds: dict[str, list[StageSpec]] = defaultdict(list)
+    for name, spec in sorted(Registry.installed().stages.items()):
+        kinds[name.partition(".")[0]].append(spec)
+    order = [kind for kind in KINDS if kind in kinds] + sorted(kinds.keys() - KINDS.keys())
+    rows = [
+        (kind, ", ".join(f"[`{spec.name}`](#{_anchor(spec.name)})" for spec in kinds[kind]), KINDS.get(kind, ""))
+        for kind in order
+    ]
+    parts = [_INTRODUCTION, table(("kind", "stages", ""), rows), _COMMON, _policy()]
+    for kind in order:
+        about = f"{KINDS[kind][0].upper()}{KINDS[kind][1:]}." if kind in KINDS else ""
+        parts += [f"## {kind}", about, *map(_stage, kinds[kind])]
+    return "\n\n".join(parts) + "\n"
+
+
+def schema_text() -> str:
+    """Return the JSON Schema of workflow files, as `pano-mvs schema` writes it."""
+    return json.dumps(workflow_schema(Registry.installed()), indent=1, ensure_ascii=False)
+
+
+def _anchor(name: str) -> str:
+    return name.replace(".", "-")
+
+
+_INTRODUCTION = """# Stages
+
+This page is made from the installed stages themselves, when the site is built: it is what `pano-mvs stage show NAME`
+says, all at once. How stages are put together is told in [Workflows](../workflows.md), how to write one in
+[Plugins](../plugins.md). The same as a [JSON Schema](pano-mvs.schema.json), for editors that complete and check."""
+
+_COMMON = """## What every stage takes
+
+Beside its own settings; none of these counts towards the cache."""
+
+
+def _policy() -> str:
+    properties = Policy.model_json_schema(by_alias=True)["properties"]
+    fields = Policy.model_fields.items()
+    rows = [
+        (f"`{info.alias or name}`", _default(info), cell(info.description or ""))
+        for name, info in fields
+        if (info.alias or name) in properties
+    ]
+    return table(("key", "default", ""), rows)
+
+
+def _stage(spec: StageSpec) -> str:
+    reads = [f"- `{port.name}` {_port(port)}" for port in spec.all_ports] or ["- files that the settings name"]
+    parts = [
+        f"### {spec.name} {{ #{_anchor(spec.name)} }}",
+        docstring(spec.doc),
+        '<div class="ports" markdown>\n',
+        "Reads\n",
+        "\n".join(reads),
+        f"\nGives {_kind(spec.output.kind_name())}, version {spec.version}{_memory(spec)}.\n\n</div>",
+        _settings(spec),
+        presets_that_use(spec.name),
+    ]
+    return "\n\n".join(part for part in parts if part)
+
+
+def _port(port: Port) -> str:
+    return f"`{port.cardinality}` {_kind(port.kind.kind_name())}{', if there is one' if port.optional else ''}"
+
+
+def _kind(name: str) -> str:
+    return f"[{name}](api.md#{name.lower()})"
+
+
+def _memory(spec: StageSpec) -> str:
+    if spec.memory_needed is not None:
+        return "; says for each unit how much memory it needs"
+    return f"; a unit needs up to {spec.memory_bytes / 1e9:.1f} GB" if spec.memory_bytes else ""
+
+
+def _settings(spec: StageSpec) -> str:
+    """Return the table of a stage's settings."""
+    if not spec.params_type.model_fields:
+        return "No settings of its own."
+    schema = spec.params_type.model_json_schema(by_alias=True)
+    rows = []
+    for name, info in spec.params_type.model_fields.items():
+        field = schema["properties"][info.alias or name]
+        free = " *Does not count towards the cache.*" if NOT_IN_KEY in info.metadata else ""
+        about = cell(info.description or "") + free
+        rows.append((f"`{info.alias or name}`", type_of(field, schema), _default(info), limits_of(field), about))
+    return f'<div class="settings" markdown>\n\n{table(("setting", "type", "default", "limits", ""), rows)}\n\n</div>'
+
+
+def _default(info: FieldInfo) -> str:
+    if info.is_required():
+        return "required"
+    value = info.get_default(call_default_factory=True)
+    if value is None or value == "":
+        return "–"
+    return f"`{json.dumps(value, default=str, ensure_ascii=False)}`".replace('"', "")
