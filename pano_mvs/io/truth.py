@@ -15,6 +15,7 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.names import match_image_names
 from pano_mvs.io.pose_json import PosedView, read_posed_views
+from pano_mvs.io.range_folders import RangeFile, find_ranges
 
 # All that zipfile, zlib and the .npy reader raise on damaged files.
 _DAMAGE = (OSError, ValueError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
@@ -91,6 +92,26 @@ def read_truth(folder: Path) -> Truth:
     posed, metric = read_posed_views(folder / "poses.json")
     keys = _range_keys(folder / "depth.npz")
     return Truth(folder, {view.name: _truth_view(view, keys) for view in posed}, metric)
+
+
+def find_true_ranges(path: Path, *, unit: float = 1.0) -> dict[str, RangeFile]:
+    """Return the true range maps in a folder or file, by the picture's name.
+
+    Args:
+        path: a folder with poses.json and depth.npz as of `read_truth`, or anything that `find_ranges` takes: a folder
+            of range maps, the output of a run, an .npz file with one array for each picture.
+        unit: what a 1 in the files stands for.
+
+    Raises:
+        InputError: if there are none, or a file is damaged.
+    """
+    if not ((path / "poses.json").is_file() and (path / "depth.npz").is_file()):
+        return find_ranges(path, unit=unit)
+    views = read_truth(path).views.values()
+    found = {view.name: RangeFile(path / "depth.npz", view.range_key, unit) for view in views if view.range_key}
+    if not found:
+        raise InputError(f"{path / 'depth.npz'}: holds no array called like a picture of poses.json, or like its id")
+    return found
 
 
 def _range_keys(path: Path) -> frozenset[str]:

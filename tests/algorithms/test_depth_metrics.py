@@ -98,7 +98,11 @@ def test_all_figures_come_as_a_dict_of_numbers():
 
 @pytest.mark.parametrize(
     ("settings", "words"),
-    [({"scale": 0}, "scale and peak"), ({"peak": -1}, "scale and peak"), ({"mask": np.ones((2, 2), bool)}, "one size")],
+    [
+        ({"scale": 0}, "scale .* must be positive"),
+        ({"peak": -1}, "peak must be a positive"),
+        ({"mask": np.ones((2, 2), bool)}, "one size"),
+    ],
 )
 def test_impossible_settings_are_named(settings, words):
     with pytest.raises(UsageError, match=words):

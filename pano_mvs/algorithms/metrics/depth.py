@@ -8,15 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import pixel_solid_angle
-
-_DELTA_105, _DELTA_125, _BAD = 1.05, 1.25, 0.05
+from pano_mvs.algorithms.metrics.judged import has_range, judged_pixels
+from pano_mvs.algorithms.metrics.view_scores import Judging, pixel_scores
 
 
 @dataclass(frozen=True, slots=True)
 class DepthMetrics:
-    """How far a range map is from the truth.
+    """How far a range map is from the truth: the usual ones of the scores of `score_view`, as attributes.
 
     Two protocols. FILLED (no prefix): every pixel with truth counts, and one without an estimate has an error equal
     to the truth. VALID-ONLY (prefix `valid_`): only pixels with an estimate count; read it with `completeness`. A `w_`
@@ -94,33 +92,10 @@ def depth_metrics(
     Raises:
         UsageError: if the shapes differ, or scale or peak is not positive.
     """
-    if estimated.shape != truth.shape or truth.ndim != 2 or (mask is not None and mask.shape != truth.shape):
-        raise UsageError(f"estimated {estimated.shape}, truth {truth.shape} and mask must be (H, W) of one size")
-    if not (scale > 0 and peak > 0):
-        raise UsageError(f"scale and peak must be positive, got {scale} and {peak}")
-    counted = np.isfinite(truth) & (truth > 0)
-    if mask is not None:
-        counted &= mask
-    true = truth[counted].astype(np.float64)
-    found = scale * estimated[counted].astype(np.float64)
-    weight = np.broadcast_to(pixel_solid_angle(truth.shape)[:, None], truth.shape)[counted]
-    valid = np.isfinite(found)
-    equal = np.ones_like(true)
-    filled = _averages(found, true, equal, peak)
-    weighted = _averages(found, true, weight, peak)
-    only = _averages(found[valid], true[valid], equal[valid], peak)
-    weighted_only = _averages(found[valid], true[valid], weight[valid], peak)
-    relative = np.abs(found[valid] - true[valid]) / true[valid]
-    return DepthMetrics(
-        pixels=int(counted.sum()),
-        completeness=_mean(valid, equal),
-        w_completeness=_mean(valid, weight),
-        **filled,
-        **{f"w_{name}": value for name, value in weighted.items()},
-        **{f"valid_{name}": value for name, value in only.items()},
-        **{f"valid_w_{name}": weighted_only[name] for name in ("mae", "abs_rel", "delta_105")},
-        median_relative_error=float(np.median(relative)) if len(relative) else float("nan"),
-    )
+    pixels = judged_pixels(estimated, truth, scale=scale, mask=mask)
+    scores = pixel_scores(pixels, Judging(peak=peak))
+    chosen = {field.name: scores[field.name] for field in dataclasses.fields(DepthMetrics)[1:]}
+    return DepthMetrics(pixels=len(pixels.true), **chosen)
 
 
 def constant_baseline(
@@ -133,38 +108,8 @@ def constant_baseline(
         peak: as in `depth_metrics`.
         mask: as in `depth_metrics`.
     """
-    counted = np.isfinite(truth) & (truth > 0)
+    counted = has_range(truth)
     if mask is not None:
         counted &= mask
     middle = np.median(truth[counted]) if counted.any() else np.nan
     return depth_metrics(np.full(truth.shape, middle, np.float64), truth, peak=peak, mask=mask)
-
-
-def _averages(
-    found: NDArray[np.float64], true: NDArray[np.float64], weight: NDArray[np.float64], peak: float
-) -> dict[str, float]:
-    """Return the weighted averages of one protocol; a found NaN has an error equal to the truth."""
-    error = np.abs(np.where(np.isfinite(found), found - true, true))
-    relative = error / true
-    # A missing or negative estimate has no ratio: it fails every delta.
-    ratio = np.full_like(true, np.inf)
-    np.divide(np.maximum(found, true), np.minimum(found, true), out=ratio, where=np.isfinite(found) & (found > 0))
-    mse = _mean((error / peak) ** 2, weight)
-    with np.errstate(divide="ignore"):
-        psnr_db = float(-10 * np.log10(mse))
-    return {
-        "mse": mse,
-        "psnr_db": psnr_db,
-        "mae": _mean(error, weight),
-        "rmse": float(peak * np.sqrt(mse)),
-        "abs_rel": _mean(relative, weight),
-        "delta_105": _mean(ratio < _DELTA_105, weight),
-        "delta_125": _mean(ratio < _DELTA_125, weight),
-        "bad_5": _mean(relative > _BAD, weight),
-    }
-
-
-def _mean(values: NDArray[np.float64] | NDArray[np.bool_], weight: NDArray[np.float64]) -> float:
-    """Return the weighted mean, NaN of nothing."""
-    total = float(weight.sum())
-    return float((values * weight).sum()) / total if total > 0 else float("nan")

@@ -7,13 +7,15 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.metrics.depth import constant_baseline, depth_metrics
 from pano_mvs.algorithms.metrics.poses import align_centers, relative_pose_errors
-from pano_mvs.algorithms.metrics.sparsification import sparsify
+from pano_mvs.algorithms.metrics.resize import resized_labels, resized_range
+from pano_mvs.algorithms.metrics.view_scores import score_view
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Scores
 
+KEPT = "psnr_db", "w_mae", "w_delta_105", "bad_5", "completeness", "median_relative_error"
+KEPT_OF_CONFIDENCE = "sparsification_area", "sparsification_oracle_area", "ause"
 RangeReader = Callable[[], "NDArray[np.float32] | None"]
 
 
@@ -29,12 +31,13 @@ def score_capture(
 
     Ranges are multiplied by the scale of the similarity that aligns the estimated camera centres with the true ones;
     they are never fitted to the true ranges. Pixels without true surface are left out; a pixel without an estimate
-    counts as an error equal to the truth.
+    counts as an error equal to the truth. Names of scores are those of `score_view`; `constant_` before one is what the
+    median of the view's true ranges scores in its place, `best_constant_` what the constant that is best for it does.
 
     Args:
         estimated_poses: cam_from_world by image.
         true_poses: cam_from_world by image, in the truth's unit.
-        estimated_ranges: (H, W) by image, NaN invalid.
+        estimated_ranges: (H, W) by image, NaN invalid; of another size than the truth they are read at its pixels.
         true_ranges: image to a function that returns its (H, W) true range, or None where it is not known.
         confidences: (H, W) by image: how well they rank the errors is scored too where they are given.
     """
@@ -62,34 +65,25 @@ def score_capture(
     views: dict[str, dict[str, float]] = {}
     for name, estimated in estimated_ranges.items():
         truth = true_ranges[name]() if name in true_ranges else None
-        if truth is None or truth.shape != estimated.shape:
-            notes.append(f"{name}: no true range map of its size")
+        if truth is None:
+            notes.append(f"{name}: no true range map")
             continue
-        views[name] = _view_scores(np.asarray(estimated), truth, scale)
-        confidence = (confidences or {}).get(name)
-        judged = np.isfinite(estimated) & np.isfinite(truth)
-        if confidence is not None and confidence.shape == truth.shape and judged.any():
-            views[name] |= _confidence_scores(np.asarray(estimated), np.asarray(confidence), truth, scale)
+        views[name] = _view_scores(np.asarray(estimated), truth, scale, (confidences or {}).get(name))
     return Scores(poses, views, tuple(notes))
 
 
-def _view_scores(estimated: NDArray[np.float32], truth: NDArray[np.float32], scale: float) -> dict[str, float]:
-    metrics = depth_metrics(estimated, truth, scale=scale)
-    constant = constant_baseline(truth)
-    return {
-        "psnr_db": metrics.psnr_db,
-        "w_mae": metrics.w_mae,
-        "w_delta_105": metrics.w_delta_105,
-        "bad_5": metrics.bad_5,
-        "completeness": metrics.completeness,
-        "median_relative_error": metrics.median_relative_error,
-        "constant_psnr_db": constant.psnr_db,
-        "constant_w_delta_105": constant.w_delta_105,
-    }
-
-
-def _confidence_scores(
-    estimated: NDArray[np.float32], confidence: NDArray[np.uint8], truth: NDArray[np.float32], scale: float
+def _view_scores(
+    estimated: NDArray[np.float32], truth: NDArray[np.float32], scale: float, confidence: NDArray[np.uint8] | None
 ) -> dict[str, float]:
-    curve = sparsify(estimated, confidence, truth, scale=scale)
-    return {"sparsification_area": curve.area, "sparsification_oracle_area": curve.oracle_area, "ause": curve.ause}
+    """Return the scores that are kept with a run, then what constants score under each of these names."""
+    size_hw = truth.shape[0], truth.shape[1]
+    if confidence is not None:
+        confidence = resized_labels(np.asarray(confidence), size_hw)
+    found = score_view(resized_range(estimated, size_hw), truth, scale=scale, confidence=confidence)
+    scores = {name: found.scores[name] for name in (*KEPT, *KEPT_OF_CONFIDENCE) if name in found.scores}
+    for prefix, constants in (("constant_", found.constants["median"]), ("best_constant_", found.constants["best"])):
+        scores |= {f"{prefix}{name}": constants[name] for name in (*KEPT, "ause") if name in constants}
+    left_out = {"constant_completeness", "best_constant_completeness"} | {
+        name for name, value in scores.items() if np.isnan(value)
+    }
+    return {name: value for name, value in scores.items() if name not in left_out}

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.metrics.judged import has_range
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import pixel_solid_angle
 
@@ -19,7 +20,8 @@ class Sparsification:
     """The mean error of the surest pixels against the share of the pixels that is kept.
 
     Pixels of the same confidence are kept or left out together; between two confidences the curve is that of a random
-    order. Errors are |error| / truth, at most 1; pixels count by their solid angle.
+    order. Errors are |error| / truth, at most 1; pixels count by their solid angle, or all
+    alike.
 
     Attributes:
         kept: (N,) float64 share of all pixels with truth and estimate that is kept, growing to 1.
@@ -40,6 +42,11 @@ class Sparsification:
         """The area between the two curves: 0 if confidence orders the pixels like their errors; less is better."""
         return self.area - self.oracle_area
 
+    @property
+    def unranked_area(self) -> float:
+        """The area if all pixels were of one confidence: the mean error."""
+        return float(self.error[-1]) if len(self.error) else float("nan")
+
 
 def sparsify(
     estimated: NDArray[np.floating],
@@ -47,6 +54,7 @@ def sparsify(
     truth: NDArray[np.floating],
     *,
     scale: float = 1.0,
+    by_solid_angle: bool = True,
 ) -> Sparsification:
     """Return the sparsification curve of a range map, NaN areas and an empty curve if no pixel can be judged.
 
@@ -57,6 +65,7 @@ def sparsify(
         confidence: (H, W), larger is surer.
         truth: (H, W) true ranges; infinite or NaN where there is no surface.
         scale: factor from scene units to the truth's unit.
+        by_solid_angle: whether pixels count by their solid angle; else all alike.
 
     Raises:
         UsageError: if the shapes differ or the scale is not positive.
@@ -64,8 +73,10 @@ def sparsify(
     if not estimated.shape == confidence.shape == truth.shape or truth.ndim != 2 or not scale > 0:
         raise UsageError(f"estimated {estimated.shape}, confidence {confidence.shape} and truth {truth.shape} must be "
                          f"(H, W) of one size, and the scale {scale} positive")  # fmt: skip
-    judged = np.isfinite(truth) & (truth > 0) & np.isfinite(estimated)
+    judged = has_range(truth) & has_range(estimated)
     weight = np.broadcast_to(pixel_solid_angle((truth.shape[0], truth.shape[1]))[:, None], truth.shape)[judged]
+    if not by_solid_angle:
+        weight = np.ones_like(weight)
     if len(weight) == 0:
         nothing = np.zeros(0)
         return Sparsification(nothing, nothing, nothing, float("nan"), float("nan"))

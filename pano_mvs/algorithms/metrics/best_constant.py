@@ -1,0 +1,84 @@
+"""What the best range map without any content scores: one constant, chosen for each score by the truth itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.metrics.judged import weighted_median
+from pano_mvs.algorithms.metrics.range_errors import DEFAULT_BAD, DELTAS, BadLimit, mse_scores, weighted_mean
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sorted:
+    """True ranges in rising order, and the weight up to each, the first at 0."""
+
+    true: NDArray[np.float64]
+    reached: NDArray[np.float64]
+
+    def best_share(self, ends: NDArray[np.intp]) -> float:
+        """Return the largest share of the weight in any window that begins at a pixel and ends before `ends`."""
+        inside = self.reached[ends] - self.reached[:-1]
+        return float(min(inside.max() / self.reached[-1], 1.0))
+
+
+def best_constant_errors(
+    true: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    *,
+    peak: float = 10.0,
+    bad: Sequence[BadLimit] = DEFAULT_BAD,
+) -> dict[str, float]:
+    """Return, for each score of `range_errors`, the best that any one constant reaches; NaN of no pixels.
+
+    mse, psnr_db and rmse: the weighted mean of the truth. mae: its weighted median. abs_rel: its median by weight over
+    truth. A delta t: the constant c with the most weight in c / t < true < c t, which is the best window of ratio t² in
+    the sorted truth. A bad b: likewise, of true in [c / (1 + b), c / (1 − b)], or in [c − b, c + b] for a length.
+
+    Args:
+        true: (N,) true ranges, positive.
+        weight: (N,) what each pixel counts.
+        peak: as in `range_errors`.
+        bad: limits of bad pixels.
+    """
+    names = [*mse_scores(1.0, peak), "mae", "abs_rel", *DELTAS, *(limit.name for limit in bad)]
+    if not len(true):
+        return dict.fromkeys(names, float("nan"))
+    order = np.argsort(true, kind="stable")
+    ranges, weight = true[order], weight[order]
+    line = _Sorted(ranges, np.concatenate([[0.0], np.cumsum(weight)]))
+    best = mse_scores(weighted_mean(((ranges - weighted_mean(ranges, weight)) / peak) ** 2, weight), peak)
+    best["mae"] = weighted_mean(np.abs(ranges - weighted_median(ranges, weight)), weight)
+    best["abs_rel"] = weighted_mean(np.abs(weighted_median(ranges, weight / ranges) / ranges - 1), weight)
+    for name, ratio in DELTAS.items():
+        best[name] = line.best_share(np.searchsorted(ranges, ranges * ratio**2, "left"))
+    return best | {limit.name: 1 - line.best_share(_bad_ends(ranges, limit)) for limit in bad}
+
+
+def best_constant_median(true: NDArray[np.float64], weight: NDArray[np.float64]) -> float:
+    """Return the least weighted median of |c − true| / true that any one constant c reaches; NaN of no pixels.
+
+    Half the weight must lie in a window [c / (1 + m), c / (1 − m)]: of all windows with that weight the one of least
+    ratio r gives m = (r − 1) / (r + 1).
+    """
+    if not len(true):
+        return float("nan")
+    order = np.argsort(true, kind="stable")
+    ranges, reached = true[order], np.cumsum(weight[order])
+    before = np.concatenate([[0.0], reached[:-1]])
+    last = np.searchsorted(reached, before + reached[-1] / 2 * (1 - 1e-12))
+    full = last < len(ranges)
+    ratio = float((ranges[last[full]] / ranges[full]).min())
+    return (ratio - 1) / (ratio + 1)
+
+
+def _bad_ends(ranges: NDArray[np.float64], limit: BadLimit) -> NDArray[np.intp]:
+    """Return, for the window that begins at each sorted range, the first position that no constant spans with it."""
+    if not limit.relative:
+        return np.searchsorted(ranges, ranges + 2 * limit.value, "right")
+    if limit.value >= 1:  # c − true is never more than c: the nearest range as constant is within 100 % of all
+        return np.full(len(ranges), len(ranges), np.intp)
+    return np.searchsorted(ranges, ranges * (1 + limit.value) / (1 - limit.value), "right")
