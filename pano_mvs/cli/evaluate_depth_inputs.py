@@ -1,0 +1,184 @@
+"""What `evaluate depth` compares: two sets of range maps, and what is known beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.metrics.poses import align_centers
+from pano_mvs.algorithms.metrics.resize import resized_labels
+from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.geometry import Rigid3
+from pano_mvs.io.captures import PICTURE_SUFFIXES, describe_picture, list_pictures
+from pano_mvs.io.pose_files import read_poses
+from pano_mvs.io.range_folders import RangeFile, find_ranges, match_pictures, without_extension
+from pano_mvs.io.truth import find_true_ranges
+from pano_mvs.scene import FilePart, Panorama
+from pano_mvs.scene.image_file import decode_image
+
+
+@dataclass(frozen=True)
+class DepthInputs:
+    """Range maps and their truth, by the names of the estimates.
+
+    Attributes:
+        estimates: name to range map.
+        truths: name to true range map, of the names that have both.
+        true_names: name to what the truth calls it.
+        without_truth: estimates that have none.
+        without_estimate: names that the truth knows and nobody estimated.
+    """
+
+    estimates: Mapping[str, RangeFile]
+    truths: Mapping[str, RangeFile]
+    true_names: Mapping[str, str] = field(default_factory=dict)
+    without_truth: tuple[str, ...] = ()
+    without_estimate: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class FoundScale:
+    """What the estimates are multiplied by to have the truth's unit.
+
+    Attributes:
+        value: the factor.
+        reason: where it comes from.
+    """
+
+    value: float
+    reason: str
+
+
+def find_inputs(source: Path, truth: Path, *, unit: float, truth_unit: float) -> DepthInputs:
+    """Return the range maps of two folders or files, paired by the pictures' names.
+
+    Raises:
+        InputError: if either holds none, or no picture is in both.
+    """
+    estimates, truths = find_ranges(source, unit=unit), find_true_ranges(truth, unit=truth_unit)
+    names = match_pictures(estimates, truths)
+    if not names:
+        raise InputError(f"{source} and {truth} have no picture in common: the one has {_some(estimates)}, the other "
+                         f"{_some(truths)}. Range maps are paired by their paths without extension")  # fmt: skip
+    ours = {name: names[name] for name in estimates if name in names}
+    return DepthInputs(
+        estimates,
+        {name: truths[true_name] for name, true_name in ours.items()},
+        ours,
+        tuple(name for name in estimates if name not in ours),
+        tuple(name for name in truths if name not in set(ours.values())),
+    )
+
+
+def find_scale(source: Path, truth: Path, given: str, poses: Path | None, true_poses: Path | None) -> FoundScale:
+    """Return the factor from the estimates' unit to the truth's, from the cameras' centres unless it is given.
+
+    Args:
+        source: whose range maps are estimates; its poses are used if it holds any.
+        truth: likewise of the truth.
+        given: a number, or "auto".
+        poses: the estimated poses, in any form that `read_poses` takes; None: those in `source`.
+        true_poses: likewise of the truth.
+
+    Raises:
+        UsageError: if a number is no positive one, or poses that were given determine no scale.
+        InputError: if poses that were given cannot be read.
+    """
+    if given != "auto":
+        return FoundScale(_positive(given), "as given")
+    named = poses is not None or true_poses is not None
+    try:
+        estimated, true = _poses(poses or source), _poses(true_poses or truth)
+    except InputError as error:
+        if named:
+            raise
+        return FoundScale(1.0, f"no poses on both sides, so both are taken to have one unit ({error})")
+    names = match_pictures(estimated, true)
+    try:
+        aligned = align_centers(estimated, {name: true[other] for name, other in names.items()})
+    except UsageError as error:
+        if named:
+            raise
+        return FoundScale(1.0, f"the poses determine no scale, so both are taken to have one unit ({error})")
+    return FoundScale(aligned.scale, f"from the centres of {len(names)} cameras, never from the ranges")
+
+
+def mask_reader(masks: Path | None, mask: Path | None) -> Callable[[str, tuple[int, int]], NDArray[np.bool_] | None]:
+    """Return what gives, for a name and (height, width), the pixels that count, or None for all.
+
+    Args:
+        masks: a folder of masks by picture, `<image name>.png` or `<name without extension>.png`; 0 is left out.
+        mask: one more for all pictures.
+
+    Raises:
+        InputError: if the folder is none.
+    """
+    if masks is not None and not masks.is_dir():
+        raise InputError(f"{masks}: masks must be a folder. Give one mask for all pictures as --mask")
+
+    def read(name: str, size_hw: tuple[int, int]) -> NDArray[np.bool_] | None:
+        paths = [mask] if mask is not None else []
+        if masks is not None and (own := _mask_of(masks, name)) is not None:
+            paths.append(own)
+        counted = [resized_labels(decode_image(path).max(axis=-1) > 0, size_hw) for path in paths]
+        return np.asarray(np.logical_and.reduce(counted)) if counted else None
+
+    return read
+
+
+def picture_reader(images: Path | None, truth: Path, inputs: DepthInputs) -> Callable[[str], NDArray[np.uint8] | None]:
+    """Return what gives a name's panorama, (H, W, 3) RGB, or None where it is not known.
+
+    Args:
+        images: the folder of the capture; None: where the truth's poses.json says that they are.
+        truth: the truth's folder.
+        inputs: whose pictures.
+    """
+    if images is not None:
+        files = {path.relative_to(images).as_posix(): path for path in list_pictures(images)}
+        paths = {name: files[other] for name, other in match_pictures(inputs.truths, files).items()}
+    else:
+        places = {name: (truth / other, truth.parent / other) for name, other in inputs.true_names.items()}
+        found = {name: next((path for path in pair if path.is_file()), None) for name, pair in places.items()}
+        paths = {name: path for name, path in found.items() if path is not None}
+        paths = {name: path for name, path in paths.items() if path.suffix.lower() in PICTURE_SUFFIXES}
+
+    def read(name: str) -> NDArray[np.uint8] | None:
+        if name not in paths:
+            return None
+        info = describe_picture(paths[name])
+        file = FilePart(paths[name], external=True)
+        return Panorama(file, info.size_hw, info.size_hw, crop_ltwh=info.crop_ltwh).load()
+
+    return read
+
+
+def _mask_of(masks: Path, name: str) -> Path | None:
+    plain = PurePosixPath(without_extension(name))
+    endings = [f"{suffix}.png" for suffix in sorted(PICTURE_SUFFIXES)]
+    tried = [masks / f"{name}.png", *(masks / f"{plain}{ending}" for ending in endings), masks / f"{plain}.png"]
+    return next((path for path in tried if path.is_file()), None)
+
+
+def _poses(path: Path) -> dict[str, Rigid3]:
+    poses = read_poses(path)
+    return {name: poses.cam_from_world(idx) for idx, name in enumerate(poses.names)}
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not 0 < value < float("inf"):
+        raise UsageError(f"'{text}' is no scale: give a positive number, or auto to find it from the cameras' centres")
+    return value
+
+
+def _some(names: Mapping[str, RangeFile]) -> str:
+    shown = ", ".join(list(names)[:3])
+    return shown + (f" … ({len(names)} in all)" if len(names) > 3 else "")
