@@ -19,6 +19,7 @@ from rich.markup import escape
 from pano_mvs import __version__
 from pano_mvs.cli.cache_app import cache_app
 from pano_mvs.cli.default_command import RunByDefault
+from pano_mvs.cli.evaluate_depth_command import evaluate_ranges
 from pano_mvs.cli.guard import guarded
 from pano_mvs.cli.options import (
     AcceptOption,
@@ -183,6 +184,9 @@ def evaluate_run(
     from pano_mvs.cli.evaluate import evaluate_folder
 
     evaluate_folder(out, truth, Console())
+
+
+evaluate_app.command("depth")(evaluate_ranges)
 
 
 @evaluate_app.command("poses")
