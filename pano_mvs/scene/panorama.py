@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import ClassVar
 
 import cv2
@@ -10,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.scene.image_file import decode_image
+from pano_mvs.scene.cropping import inside_crop, placed_picture, same_shape
+from pano_mvs.scene.image_file import decode_image, write_png
+from pano_mvs.scene.masking import decode_mask, painted_over, placed_mask
 from pano_mvs.scene.record import Axis, FilePart, Record, require
 
 
@@ -24,7 +27,9 @@ class Panorama(Record):
         source_size_hw: (height, width) of the full sphere at the file's own resolution.
         crop_ltwh: (left, top, width, height) in source pixels of the part of the sphere that the file holds, if it is
             not all of it (GPano's CroppedArea).
-        mask_file: a picture, 0 where the panorama must be ignored, or None.
+        mask_file: a picture, 0 where the panorama must be ignored, or None. It covers what the picture covers, at any
+            resolution; that of a cropped picture may cover the whole sphere instead (its shape tells; one of size_hw
+            covers the sphere).
         nadir_deg: everything closer than this to the straight down direction is ignored (tripod, operator).
         zenith_deg: likewise around the straight up direction.
         up_in_cam: the direction away from gravity as the camera's own sensors saw it, unit (3,), or None.
@@ -51,38 +56,93 @@ class Panorama(Record):
         require(width == 2 * height and height > 0, self, f"size_hw {self.size_hw} is not that of a full sphere")
 
     def load(self) -> NDArray[np.uint8]:
-        """Return the picture at working resolution, (H, W, 3) uint8 RGB; black where a cropped file has nothing.
+        """Return the picture at working resolution, (H, W, 3) uint8 RGB, without what is masked.
+
+        Masked pixels, and those that a cropped file does not have, show the colours of what is around them
+        (`painted_over`): nothing that a stage makes of the picture depends on what they showed.
 
         Raises:
-            InputError: if the file is gone, truncated or no picture.
+            InputError: if the file, or its mask, is gone, truncated or no picture, or has changed its size.
+        """
+        picture, valid = self.load_unmasked(), self.load_mask()
+        return picture if valid.all() else painted_over(picture, valid)
+
+    def load_unmasked(self) -> NDArray[np.uint8]:
+        """Return the picture as it was taken, with all that is masked, (H, W, 3) uint8 RGB: for people to look at.
+
+        Where a cropped file has nothing it is black.
+
+        Raises:
+            InputError: as `load`.
         """
         image = decode_image(self.image.path)
-        if self.crop_ltwh is not None:
-            left, top, width, height = self.crop_ltwh
-            sphere = np.zeros((*self.source_size_hw, 3), np.uint8)
-            sphere[top : top + height, left : left + width] = image
-            image = sphere
-        if image.shape[:2] != self.source_size_hw:
-            raise InputError(f"{self.image.path}: {image.shape[1]}×{image.shape[0]} px, but it had "
-                             f"{self.source_size_hw[1]}×{self.source_size_hw[0]} when it was listed. "
-                             "Run again to read it anew")  # fmt: skip
-        return _resized(image, self.size_hw)
+        _, _, width, height = self.covers_ltwh
+        if (not same_shape(image.shape[:2], (height, width))) or (
+            self.crop_ltwh is None and image.shape[:2] != self.source_size_hw
+        ):
+            raise InputError(f"{self.image.path}: {image.shape[1]}×{image.shape[0]} px, but it had {width}×{height} "
+                             "when it was listed. Run again to read it anew")  # fmt: skip
+        if self.crop_ltwh is None:
+            return _resized(image, self.size_hw)
+        return placed_picture(image, self.size_hw, of=self.crop_ltwh, whole_hw=self.source_size_hw)
 
     def load_mask(self) -> NDArray[np.bool_]:
-        """Return the valid pixels at working resolution, (H, W) bool: False is to be ignored by every stage."""
-        height, width = self.size_hw
-        valid = np.ones((height, width), np.bool_)
-        elevation_deg = 90 - (np.arange(height) + 0.5) * 180 / height
-        valid[(elevation_deg < self.nadir_deg - 90) | (elevation_deg > 90 - self.zenith_deg)] = False
-        if self.crop_ltwh is not None:
-            left, top, crop_width, crop_height = self.crop_ltwh
-            inside = np.zeros(self.source_size_hw, np.uint8)
-            inside[top : top + crop_height, left : left + crop_width] = 255
-            valid &= _resized(inside, self.size_hw) == 255
+        """Return the valid pixels at working resolution, (H, W) bool: False is to be ignored by every stage.
+
+        A pixel is valid if no part of it is masked, within the nadir's or the zenith's cut, or outside of the crop.
+
+        Raises:
+            InputError: if the mask file is gone or no picture, or covers neither the sphere nor the crop.
+        """
+        height = self.size_hw[0]
+        valid = np.zeros(self.size_hw, np.bool_)
+        valid[inside_crop(self.size_hw, self.covers_ltwh, self.source_size_hw)] = True
+        nearest_deg = np.arange(height + 1) * 180 / height  # of the rows' upper edges, from straight up
+        valid[(nearest_deg[:-1] < self.zenith_deg) | (nearest_deg[1:] > 180 - self.nadir_deg)] = False
         if self.mask_file is not None:
-            mask = decode_image(self.mask_file.path).max(axis=-1)
-            valid &= cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST) > 0
+            valid &= self._placed(decode_mask(self.mask_file.path), f"{self.mask_file.path}: the mask")
         return valid
+
+    def with_mask(self, valid: NDArray[np.bool_], folder: Path) -> Panorama:
+        """Return the panorama with more of it to be ignored, besides all that already is.
+
+        Args:
+            valid: bool, False is to be ignored: (H, W) at working resolution, or of any other size that a mask
+                file may have.
+            folder: where the mask file is written: `ctx.scratch` of a stage.
+
+        Raises:
+            InputError: if the size fits neither the sphere nor the crop.
+        """
+        path = folder / f"{Path(self.image.path).stem}.mask.png"
+        keep = self.load_mask() & self._placed(np.asarray(valid, np.bool_), "a stage's mask")
+        write_png(path, np.where(keep, np.uint8(255), np.uint8(0)))
+        return replace(self, mask_file=FilePart(path))
+
+    @property
+    def covers_ltwh(self) -> tuple[int, int, int, int]:
+        """What the file covers: (left, top, width, height) in source pixels; the whole sphere unless it is cropped."""
+        height, width = self.source_size_hw
+        return self.crop_ltwh or (0, 0, width, height)
+
+    def _placed(self, mask: NDArray[np.bool_], what: str) -> NDArray[np.bool_]:
+        """Return a mask at working resolution; its size, or else its shape, says whether it is of sphere or crop."""
+        height, width = self.source_size_hw
+        sphere, crop = (0, 0, width, height), self.covers_ltwh
+        size = mask.shape[0], mask.shape[1]
+        if size in (self.size_hw, self.source_size_hw):
+            covered = sphere
+        elif same_shape(size, (crop[3], crop[2])):
+            covered = crop
+        elif same_shape(size, self.source_size_hw):
+            covered = sphere
+        else:
+            of = f"{width}×{height} px" if crop == sphere else f"a part of {crop[2]}×{crop[3]} px of {width}×{height}"
+            raise InputError(
+                f"{what} has {size[1]}×{size[0]} px, which is the shape neither of the full sphere nor of the picture "
+                f"({self.image.path.name}, {of}). Draw it over the picture itself; its resolution does not matter"
+            )
+        return placed_mask(mask, self.size_hw, of=covered, whole_hw=self.source_size_hw)
 
 
 def _resized(image: NDArray[np.uint8], size_hw: tuple[int, int]) -> NDArray[np.uint8]:

@@ -179,6 +179,18 @@ def _masks(case: StageCase) -> None:
         assert not wrong, f"{case.spec.name} finds {wrong} key points where all is masked"
 
 
+def _masked_content(case: StageCase) -> None:
+    """Whatever masked pixels show, the result is the same: `Panorama.load` shows none of it, the file itself does."""
+    size_hw = (64, 128) if case.spec.output is Features else case.size_hw
+    first, second = (case.call(tiny_capture(Variant(size_hw, masked=True, scribbled=noise))) for noise in (False, True))
+    if first.mask is not None and second.mask is not None:
+        wrong = int((first.mask != second.mask).sum())
+        assert not wrong, f"{case.spec.name} masks {wrong} pixels by what masked pixels show"
+    else:
+        same = first.digest == second.digest
+        assert same, f"{case.spec.name} returns something else when masked pixels show something else"
+
+
 def _rolls(case: StageCase) -> None:
     """Rolled pictures, with the cameras turned, give the rolled result: no border exists at the seam."""
     size_hw = (64, 128) if case.spec.output is Features else case.size_hw
@@ -218,6 +230,7 @@ _LAWS: dict[str, Callable[[StageCase], None]] = {
     "takes or refuses nothing to see": _nothing_to_see,
     "takes or refuses inputs left out": _optional_inputs,
     "respects masks": _masks,
+    "does not see what is masked": _masked_content,
     "rolls with its pictures": _rolls,
 }
 
@@ -232,6 +245,8 @@ def _applies(what: str, spec: StageSpec) -> bool:
             return any(port.optional for port in spec.ports)
         case "respects" | "rolls":
             return spec.output in _LEAST_ROLL_AGREEMENT and bool(own & {Panorama, RangeMap})
+        case "does":
+            return any(port.kind is Panorama for port in spec.ports)
     return True
 
 

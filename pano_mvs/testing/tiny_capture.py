@@ -48,6 +48,7 @@ class Variant:
         size_hw: (height, width) of the pictures.
         rolled: columns by which all pictures are rolled to the right, and the cameras turned with them.
         masked: whether the tripod and a patch over the seam are masked in every picture.
+        scribbled: whether what is masked shows noise instead of the room.
         cropped: whether the files lack the uppermost and lowest eighth of the sphere.
         mixed: whether every second picture has half as many rows.
         blank: whether there is nothing to see: all is masked, and no stage before found anything.
@@ -56,6 +57,7 @@ class Variant:
     size_hw: tuple[int, int] = (32, 64)
     rolled: int = 0
     masked: bool = False
+    scribbled: bool = False
     cropped: bool = False
     mixed: bool = False
     blank: bool = False
@@ -70,7 +72,7 @@ class TinyCapture:
         variant: how it is.
         names: of the pictures.
         poses: cam_from_world of each.
-        pictures: as the files hold them where they are not cropped.
+        pictures: as the files hold them where they are neither cropped nor scribbled over.
         ranges: the true ones, (H, W) float32.
     """
 
@@ -270,13 +272,17 @@ def tiny_capture(variant: Variant = Variant()) -> TinyCapture:
 def _write_picture(folder: Path, variant: Variant, idx: int, picture: NDArray[np.uint8]) -> None:
     height, width = picture.shape[:2]
     edge = height // 8 if variant.cropped else 0
-    write_png(folder / "images" / f"{idx:03d}.png", picture[edge : height - edge])
+    keep = np.full((height, width), 0 if variant.blank else 255, np.uint8)
+    keep[-height // 5 :] = 0
+    keep[height // 4 : height // 2, : width // 10] = 0
+    keep[height // 4 : height // 2, -width // 10 :] = 0
+    keep = np.roll(keep, variant.rolled, axis=1)
     if variant.masked or variant.blank:
-        keep = np.full((height, width), 0 if variant.blank else 255, np.uint8)
-        keep[-height // 5 :] = 0
-        keep[height // 4 : height // 2, : width // 10] = 0
-        keep[height // 4 : height // 2, -width // 10 :] = 0
-        write_png(folder / f"mask{idx}.png", np.roll(keep, variant.rolled, axis=1))
+        write_png(folder / f"mask{idx}.png", keep)
+    if variant.scribbled:
+        noise = np.random.default_rng([10, idx]).integers(0, 256, picture.shape, np.uint8)
+        picture = np.where(keep[..., None] > 0, picture, noise)
+    write_png(folder / "images" / f"{idx:03d}.png", picture[edge : height - edge])
 
 
 def _half(size_hw: tuple[int, int]) -> tuple[int, int]:

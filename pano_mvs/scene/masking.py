@@ -1,0 +1,124 @@
+"""Masks: read from whatever people draw them in, brought to size without losing a line, and painted over."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import InputError
+from pano_mvs.geometry import pad_panorama
+from pano_mvs.scene.cropping import Crop
+
+Mask = NDArray[np.bool_]
+
+_JPEG_START = b"\xff\xd8"
+_JPEG_LEAST = 127  # compression turns black and white into greys
+# What is painted over takes the mean colour of the smallest box that sees anything, up to this radius.
+_WIDEST_BOX = 64
+_NOTHING_SEEN = 128
+
+
+def decode_mask(path: Path) -> Mask:
+    """Return a mask file as (H, W) bool, False where its value is 0: to be ignored.
+
+    Grey or colour (the brightest channel counts) of any depth, with a palette (its colours count), or with an alpha
+    channel: what is transparent is ignored as well, and where all colours are black alpha alone decides. A JPEG's
+    blacks are not 0, so there half the brightness decides.
+
+    Raises:
+        InputError: if the file cannot be read or is no picture.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: the mask cannot be read ({error.strerror}). Check that it exists and may be read "
+                         "by you") from error  # fmt: skip
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    if picture is None:
+        raise InputError(f"{path}: the mask is not a picture that can be decoded ({len(data)} bytes). Save it as PNG")
+    channels = np.atleast_3d(picture)
+    has_alpha = channels.shape[2] in (2, 4)
+    colors = channels[..., :-1] if has_alpha else channels
+    least = _JPEG_LEAST if data.startswith(_JPEG_START) else 0
+    valid = np.asarray((colors > least).any(axis=-1))
+    if not has_alpha:
+        return valid
+    opaque = np.asarray(channels[..., -1] > 0)
+    return valid & opaque if valid.any() else opaque
+
+
+def placed_mask(mask: Mask, size_hw: tuple[int, int], *, of: Crop, whole_hw: tuple[int, int]) -> Mask:
+    """Return a mask at the size of a panorama, (H, W): a pixel is valid if all that it is made of is.
+
+    However thin a masked line is, no pixel that it touches stays valid.
+
+    Args:
+        mask: (h, w), False is to be ignored, of any size.
+        size_hw: (H, W) that is wanted, of the full sphere.
+        of: (left, top, width, height) of what the mask covers, in pixels of the sphere at `whole_hw`; nothing
+            outside of it is masked.
+        whole_hw: height and width of that sphere.
+    """
+    left, top, width, height = of
+    if mask.shape == size_hw and of == (0, 0, whole_hw[1], whole_hw[0]):
+        return mask
+    upper, lower = _spans(size_hw[0], whole_hw[0], top, height, mask.shape[0])
+    first, last = _spans(size_hw[1], whole_hw[1], left, width, mask.shape[1])
+    before = cv2.integral((~mask).astype(np.uint8), sdepth=cv2.CV_32S)
+    masked = before[lower] - before[upper]
+    return np.asarray(masked[:, last] == masked[:, first])
+
+
+def painted_over(picture: NDArray[np.uint8], valid: Mask) -> NDArray[np.uint8]:
+    """Return a panorama, (H, W, C), whose masked pixels show the colours around them instead of what was there.
+
+    Each has the mean of the valid pixels in the smallest box around it that holds any, over the seam and the poles;
+    far from all the mean of all. Nothing of what they showed is left, and no edge is drawn around them.
+    """
+    painted = picture.copy()
+    shown = valid.astype(np.uint8)
+    if not shown.any():
+        painted[...] = _NOTHING_SEEN
+        return painted
+    margin = min(_WIDEST_BOX, picture.shape[0])
+    seen = pad_panorama(np.dstack([cv2.bitwise_and(picture, picture, mask=shown), shown]), margin)
+    todo, radius = 1 - shown, 1
+    while radius <= margin and todo.any():
+        rows, columns = _bounds(todo)
+        around = (_widened(rows, margin, radius), _widened(columns, margin, radius))
+        side = 2 * radius + 1
+        sums = cv2.boxFilter(np.ascontiguousarray(seen[around]), cv2.CV_32S, (side, side), normalize=False)
+        sums = sums[radius:-radius, radius:-radius]
+        found = (todo[rows, columns] > 0) & (sums[..., -1] > 0)
+        counts = sums[found][:, -1:]
+        painted[rows, columns][found] = (2 * sums[found][:, :-1] + counts) // (2 * counts)
+        todo[rows, columns][found] = 0
+        radius *= 2
+    if todo.any():
+        painted[todo > 0] = np.rint(cv2.mean(picture, mask=shown)[:3]).astype(np.uint8)
+    return painted
+
+
+def _spans(count: int, whole: int, first: int, length: int, pixels: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return for `count` pixels of a side of `whole` which pixels of a mask, start to stop, they touch.
+
+    The mask's `pixels` pixels cover the side from `first` over `length`.
+    """
+    edges = (np.arange(count + 1, dtype=np.int64) * whole - first * count) * pixels
+    starts = edges[:-1] // (count * length)
+    stops = -(-edges[1:] // (count * length))
+    return np.clip(starts, 0, pixels), np.clip(stops, 0, pixels)
+
+
+def _bounds(pixels: NDArray[np.uint8]) -> tuple[slice, slice]:
+    """Return the rows and columns between which all pixels lie that are not 0."""
+    left, top, width, height = cv2.boundingRect(pixels)
+    return slice(top, top + height), slice(left, left + width)
+
+
+def _widened(part: slice, margin: int, radius: int) -> slice:
+    """Return a part of a picture, and `radius` pixels around it, in the picture with its margin."""
+    return slice(part.start + margin - radius, part.stop + margin + radius)
