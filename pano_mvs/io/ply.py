@@ -6,8 +6,10 @@ import re
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.io.thinning import Kept, chunks
 from pano_mvs.scene import PointCloud
 
 _PLAIN = np.dtype([
@@ -18,25 +20,36 @@ _WITH_QUALITY = np.dtype([*_PLAIN.descr, ("views", "u1"), ("confidence", "u1")])
 _PLY_TYPES = {"f": "float", "u": "uchar"}
 
 
-def write_ply(path: Path, cloud: PointCloud, *, quality: bool = False) -> None:
+def write_ply(path: Path, cloud: PointCloud, *, quality: bool = False, kept: Kept | None = None) -> None:
     """Write a cloud as binary little-endian PLY: x y z nx ny nz (float), red green blue (uchar).
+
+    It is written in chunks: a cloud whose arrays are memory-mapped need not fit in memory.
 
     Args:
         path: the file to write.
         cloud: the points.
         quality: whether each point is followed by views, how many agree on it, and confidence (uchar).
+        kept: the points to write, in their order; None: all.
     """
-    vertices = np.zeros(len(cloud), _WITH_QUALITY if quality else _PLAIN)
-    for idx, name in enumerate("xyz"):
-        vertices[name], vertices[f"n{name}"] = cloud.points_in_world[:, idx], cloud.normals_in_world[:, idx]
-    for idx, name in enumerate(("red", "green", "blue")):
-        vertices[name] = cloud.colors_rgb[:, idx]
-    if quality:
-        vertices["views"] = cloud.view_counts
-        vertices["confidence"] = 0 if cloud.confidence is None else cloud.confidence
+    layout = _WITH_QUALITY if quality else _PLAIN
     with path.open("wb") as stream:
-        stream.write(_header(len(cloud), vertices.dtype))
-        vertices.tofile(stream)
+        stream.write(_header(len(cloud) if kept is None else kept.count, layout))
+        for chunk in chunks(len(cloud)):
+            written = _vertices(cloud, chunk, layout)
+            stream.write((written if kept is None else written[kept.within(chunk)]).tobytes())
+
+
+def _vertices(cloud: PointCloud, chunk: slice, layout: np.dtype[np.void]) -> NDArray[np.void]:
+    vertices = np.zeros(chunk.stop - chunk.start, layout)
+    for idx, name in enumerate("xyz"):
+        vertices[name] = cloud.points_in_world[chunk, idx]
+        vertices[f"n{name}"] = cloud.normals_in_world[chunk, idx]
+    for idx, name in enumerate(("red", "green", "blue")):
+        vertices[name] = cloud.colors_rgb[chunk, idx]
+    if layout == _WITH_QUALITY:
+        vertices["views"] = cloud.view_counts[chunk]
+        vertices["confidence"] = 0 if cloud.confidence is None else cloud.confidence[chunk]
+    return vertices
 
 
 def read_ply(path: Path) -> PointCloud:
