@@ -72,7 +72,7 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
         decode_image(mask)
     return Panorama(
         image=FilePart(path, external=True),
-        size_hw=_working_size(info.size_hw, params.max_width),
+        size_hw=working_size(info.size_hw, params.max_width),
         source_size_hw=info.size_hw,
         crop_ltwh=info.crop_ltwh,
         mask_file=None if mask is None else FilePart(mask, external=True),
@@ -92,7 +92,7 @@ def _check_decodes(path: Path, info: PictureInfo) -> None:
                          "Save it anew")  # fmt: skip
 
 
-def _working_size(source_hw: tuple[int, int], max_width: int) -> tuple[int, int]:
+def working_size(source_hw: tuple[int, int], max_width: int) -> tuple[int, int]:
     """Return the size to work at: the width a multiple of four, so that height and half a turn are whole pixels."""
     width = min(source_hw[1], max_width) // 4 * 4
     if width < 16:
