@@ -29,6 +29,7 @@ Units
     `_bytes`; `_m` is written only where the scale is metric.
 """
 
+from pano_mvs.geometry.pinhole import PinholeView
 from pano_mvs.geometry.resample import (
     pad_panorama,
     roll_panorama,
@@ -56,6 +57,7 @@ from pano_mvs.geometry.transforms import Rigid3, Similarity3, similarity_from_po
 from pano_mvs.geometry.triangulation import ranges_from_bearings, triangulate_bearings
 
 __all__ = [
+    "PinholeView",
     "Rigid3",
     "Similarity3",
     "angle_between",

@@ -10,9 +10,8 @@ from pano_mvs.algorithms.faces.layout import covers_sphere, default_face_size, p
 from pano_mvs.algorithms.faces.pictures import face_image, face_mask
 from pano_mvs.algorithms.faces.ranges import face_confidence, face_normals, face_z_depth
 from pano_mvs.algorithms.faces.render import face_source, render_face
-from pano_mvs.algorithms.faces.view import PinholeView
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import ray_grid, roll_panorama, rotation_from_rotvec
+from pano_mvs.geometry import PinholeView, ray_grid, roll_panorama, rotation_from_rotvec
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.room import capture_poses, default_room, range_along, render
 from tests.oracles.faces import z_depth as slow_z_depth

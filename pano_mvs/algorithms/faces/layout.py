@@ -15,8 +15,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.faces.view import PinholeView
 from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import PinholeView
 
 FloatArray = NDArray[np.float64]
 FaceLayout = Literal["cube", "octagon", "icosahedron"]

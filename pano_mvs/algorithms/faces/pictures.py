@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.sampling import nearest_pixels, sample_view
-from pano_mvs.algorithms.faces.view import PinholeView
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import pad_panorama
+from pano_mvs.geometry import PinholeView, pad_panorama
 
 # Bicubic interpolation reaches no pixel farther away than this from the one that holds the place.
 _REACH_PX = 2

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.sampling import nearest_pixels
-from pano_mvs.algorithms.faces.view import PinholeView
 from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import PinholeView
 
 # Four neighbouring pixels further apart than this are two surfaces: no value lies between them.
 _MAX_SURFACE_STEP = 0.05

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.pictures import face_image, face_mask
 from pano_mvs.algorithms.faces.ranges import face_confidence, face_normals, face_z_depth
-from pano_mvs.algorithms.faces.view import PinholeView
 from pano_mvs.algorithms.fusion.normals import normals_from_range
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import ray_grid
+from pano_mvs.geometry import PinholeView, ray_grid
 from pano_mvs.scene import RangeMap
 
 

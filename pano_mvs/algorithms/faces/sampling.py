@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.faces.view import PinholeView
-from pano_mvs.geometry import pad_panorama, pixel_from_ray
+from pano_mvs.geometry import PinholeView, pad_panorama, pixel_from_ray
 
 _PAD_PX = 4
 _BAND_ROWS = 256

@@ -14,7 +14,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.faces.view import PinholeView
+from pano_mvs.geometry import PinholeView
 
 FloatArray = NDArray[np.float64]
 

@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.sampling import sample_view
-from pano_mvs.algorithms.faces.view import PinholeView
 from pano_mvs.algorithms.features.icosahedron import face_centers, tangent_tiles
 from pano_mvs.algorithms.features.selection import distinct_keypoints, spread_keypoints
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import pixel_from_ray
+from pano_mvs.geometry import PinholeView, pixel_from_ray
 from pano_mvs.scene import Features
 
 _ORB_SCALE, _ORB_LEVELS = 1.2, 8
