@@ -105,13 +105,16 @@ def voxel_for_count(cloud: PointCloud, good: Kept, selection: Selection) -> floa
     wanted = 0.98 * selection.max_points
     if good.count <= selection.max_points and not selection.voxel:
         return 0.0
+    share = max(1, selection.max_points // _COUNTED_VOXELS)
+    if selection.voxel and _occupied(cloud, good, selection.voxel, share=share) <= selection.max_points:
+        return selection.voxel
     reach = _reach(cloud, good)
     smallest = max(selection.voxel, 2 * reach / (_MOST_PLACES - 2))
     edge, slope = max(smallest, reach / np.sqrt(wanted)), -2.0
     tried: list[tuple[float, float]] = []
     fitting: list[float] = []
     while len(tried) < _FEWEST_ROUNDS or (not fitting and edge < 4 * reach):
-        count = max(1, _occupied(cloud, good, edge, share=max(1, selection.max_points // _COUNTED_VOXELS)))
+        count = max(1, _occupied(cloud, good, edge, share=share))
         if count <= wanted:
             fitting.append(edge)
             if count >= _FULL_ENOUGH * wanted or edge <= smallest:

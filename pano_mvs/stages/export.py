@@ -99,7 +99,7 @@ def ranges(range_map: Each[RangeMap], image: Each[Panorama] | None, params: Rang
 def previews(range_map: Each[RangeMap], image: Each[Panorama], ctx: Context) -> Files:
     """A picture for each view, preview/<image>.jpg: the panorama beside its colour-mapped range with a scale bar."""
     path = ctx.scratch / "preview.jpg"
-    write_preview(path, image.load(), range_map.range)
+    write_preview(path, image.load_unmasked(), range_map.range)
     return Files({"preview/{item}.jpg": path})
 
 
