@@ -174,6 +174,30 @@ def status(
 app.command()(plugins)
 
 
+@app.command("inspect")
+@guarded
+def inspect_pixel(
+    target: Annotated[str, typer.Argument(metavar="WORKFLOW|OUT", help="A workflow file, the name of a preset, or the "
+                                          "output folder of a run.")],
+    image: Annotated[str, typer.Argument(help="Name of the image, or a part of it that fits one alone.")],
+    x: Annotated[float, typer.Argument(help="Column from the left edge at the swept size; fractions are dropped.")],
+    y: Annotated[float, typer.Argument(help="Row from the upper edge, likewise.")],
+    stage: Annotated[str, typer.Option("--stage", help="Which sweep; else the first.", show_default=False)] = "",
+    overrides: SetOption = None,
+    images: ImagesOption = None,
+    cache: CacheOption = None,
+    truth: Annotated[Optional[Path], typer.Option("--truth", help="Folder with poses.json and depth.npz; else the "  # noqa: UP045
+                                                  "workflow's own.")] = None,
+    plot: Annotated[Optional[Path], typer.Option("--plot", metavar="FILE.png", help="Draw the curve there.")] = None,  # noqa: UP045
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:  # fmt: skip
+    """Show one pixel: its ray, its range after each stage, what its neighbours see, its cost at every virtual range."""
+    from pano_mvs.cli.inspect_command import PixelWanted, inspect, open_run
+
+    session = open_run(target, overrides=overrides or [], images=images, cache=cache)
+    inspect(session, PixelWanted(image, x, y, stage, truth), Console(), plot=plot, as_json=as_json)
+
+
 @evaluate_app.command("run")
 @guarded
 def evaluate_run(

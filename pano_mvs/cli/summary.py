@@ -26,6 +26,7 @@ def summarise(run: Run, result: RunResult, *, started: datetime, seconds: float)
     scores = _scores(run)
     return {
         "workflow": {"name": workflow.name, "path": str(workflow.path or ""), "overrides": list(workflow.overrides)},
+        "cache": str(run.store.root.resolve()),
         "version": pano_mvs.__version__,
         "started": started.isoformat(timespec="seconds"),
         "executor": {"name": run.executor.name, "workers": run.executor.capacity, "threads": run.executor.threads},

@@ -33,7 +33,8 @@ class CostCurve:
         ranges: (D,) virtual ranges in scene units, ascending.
         by_source: (S, D) cost in each source; NaN where the source has no vote.
         raw: (D,) cost combined from the sources, before the decision.
-        aggregated: (D,) mean cost of the eight paths of semi-global matching; None if it is not asked for.
+        aggregated: (D,) mean cost of the eight paths of semi-global matching, what steps between the planes cost
+            included, so it may exceed 1; None if it is not asked for.
         winner: index of the range that wins.
         runner_up: index of the cheapest range that is not next to the winner; None if there is none.
         range: of the pixel, between the virtual ones as `selection` says; NaN if the sweep leaves it without.
@@ -86,7 +87,7 @@ def cost_curve(work: SweepInput, *, column: int, row: int, masked: bool = False)
                          f"{width - 1}, rows 0 to {height - 1}")  # fmt: skip
     here = np.array([row]), np.array([column])
     worst = work.settings.worst_cost
-    raw = costs_at(work, *here)[:, 0]
+    raw = costs_at(work, *here)[:, 0].astype(np.float64)
     sums = _path_sums(work, row, column) if work.settings.aggregation == "sgm" else None
     decisive = raw if sums is None else sums
     winners = winners_of(decisive[None, :, None])

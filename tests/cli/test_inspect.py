@@ -1,0 +1,164 @@
+"""`pano-mvs inspect`: a pixel of a run, by the run's own settings, from what it stored."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from pano_mvs.cli.app import app
+from pano_mvs.geometry import ray_from_pixel
+from pano_mvs.scene.image_file import decode_image, write_png
+from pano_mvs.testing.room import capture_poses, default_room, write_capture
+from tests.cli.conftest import Outcome
+
+WORKFLOW = """\
+pano_mvs: 1
+name: tuned
+stages:
+  images:  {use: source.folder, path: capture/images, nadir_deg: 20}
+  poses:   {use: poses.from_model, path: capture/truth/poses.json}
+  views:   {use: views.nearest, sources: 2}
+  depth:   {use: depth.sweep, planes: 24, near: 0.6, far: 8}
+  boxed:   {use: depth.sweep, planes: 24, aggregation: box}
+  checked: {use: filters.consistency, in: {range_map: depth, sources: depth}}
+  scores:  {use: evaluate.truth, truth: capture/truth, in: {ranges: checked}}
+"""
+SIZE_HW = (64, 128)
+
+
+def call(*arguments: object) -> Outcome:
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments], env={"COLUMNS": "140"})
+    return Outcome(result.exit_code, result.output)
+
+
+def inspected(*arguments: object) -> dict:
+    found = call("inspect", *arguments, "--json")
+    assert found.code == 0, found.text
+    return json.loads(found.text)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("inspected")
+    write_capture(folder / "capture", default_room(), capture_poses(3, spread=0.4), SIZE_HW)
+    (folder / "wf.yaml").write_text(WORKFLOW)
+    outcome = call("run", folder / "wf.yaml", "--out", folder / "out", "--cache", folder / "cache")
+    assert outcome.code == 0, outcome.text
+    return folder
+
+
+@pytest.mark.parametrize("stage", ["depth", "boxed"])
+@pytest.mark.parametrize(("x", "y"), [(0, 3), (64, 30), (127, 40), (20.9, 55.5)])
+def test_the_curves_winner_is_what_the_stage_stored(run: Path, stage: str, x: float, y: float) -> None:
+    found = inspected(run / "out", "001.png", x, y, "--stage", stage)
+    stored = next(one for one in found["stages"] if one["stage"] == stage)
+    assert found["curve"]["range"] == pytest.approx(stored["range"], rel=1e-6)
+    assert found["curve"]["confidence"] == stored["confidence"]
+    assert (found["curve"]["aggregated"] is None) == (stage == "boxed")
+    assert found["notes"] == []
+
+
+def test_rays_colours_neighbours_and_the_truth_are_those_of_the_capture(run: Path) -> None:
+    found = inspected(run / "wf.yaml", "000", 40, 28, "--cache", run / "cache")
+    ray = ray_from_pixel([40.5, 28.5], SIZE_HW)
+    np.testing.assert_allclose(found["ray_in_cam"], ray, atol=1e-12)
+    with np.load(run / "capture" / "truth" / "depth.npz") as truth:
+        assert found["true_range"] == pytest.approx(float(truth["000"][28, 40]), rel=1e-5)
+    picture = decode_image(run / "capture" / "images" / "000.png")
+    assert found["color_rgb"] == picture[28, 40].tolist()
+    assert {one["name"] for one in found["sources"]} == {"001.png", "002.png"}
+    point = np.array(found["center_in_world"]) + np.array(found["ray_in_world"]) * found["curve"]["range"]
+    poses = {f"{idx:03}.png": pose for idx, pose in enumerate(capture_poses(3, spread=0.4))}
+    for one in found["sources"]:
+        seen = poses[one["name"]].apply(point)
+        expected = ray_from_pixel(one["pixel_px"], SIZE_HW) * np.linalg.norm(seen)
+        np.testing.assert_allclose(expected, seen, atol=1e-6)
+        here = decode_image(run / "capture" / "images" / one["name"])[int(one["pixel_px"][1]), int(one["pixel_px"][0])]
+        assert one["color_rgb"] == here.tolist()
+
+
+def test_other_settings_are_tried_without_a_run(run: Path) -> None:
+    found = inspected(run / "out", "000.png", 40, 28, "--set", "depth.cost=zncc", "--set", "depth.planes=40")
+    assert len(found["curve"]["ranges"]) == 40
+    assert [one["stage"] for one in found["stages"]] == ["boxed"]
+    assert "not stored with these settings" in found["notes"][0]
+    assert found["curve"]["range"] == pytest.approx(found["true_range"], rel=0.15)
+
+
+def test_a_masked_pixel_has_a_curve_and_no_range(run: Path) -> None:
+    found = inspected(run / "out", "000.png", 40, 63)
+    assert found["curve"]["range"] is None
+    assert "masked" in found["notes"][0]
+
+
+def test_people_see_tables_a_plot_and_a_picture(run: Path, tmp_path: Path) -> None:
+    plot = tmp_path / "plots" / "curve.png"
+    outcome = call("inspect", run / "out", "000.png", 40, 28, "--plot", plot)
+    assert outcome.code == 0, outcome.text
+    for word in (
+        "azimuth",
+        "filters.consistency",
+        "parallax",
+        "after semi-global matching",
+        "▲ winner",
+        "off the truth",
+    ):
+        assert word in outcome.text
+    picture = decode_image(plot)
+    assert picture.shape[1] == 1040
+    red = (picture.astype(int) - [200, 50, 50]).__abs__().sum(axis=-1) < 40
+    assert red.any()  # the winner's mark
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("000.png", 500, 3), "there is no pixel (500, 3); x is 0 to 127"),
+        (("0", 5, 3), "3 images are called '0'"),
+        (("lobby.jpg", 5, 3), "no images are called 'lobby.jpg'; there are: 000.png"),
+        (("000.png", 5, 3, "--stage", "checked"), "its sweeps: depth, boxed"),
+        (("000.png", 5, 3, "--plot", "curve.pdf"), "the plot is a PNG"),
+        (("000.png", 5, 3, "--set", "images.nadir_deg=30"), "Run the workflow first"),
+    ],
+)
+def test_mistakes_are_told_with_a_remedy(run: Path, arguments: tuple[object, ...], message: str) -> None:
+    outcome = call("inspect", run / "out", *arguments)
+    assert outcome.code == 2
+    assert message.casefold() in outcome.flat.casefold()
+
+
+def test_folders_that_are_no_output_are_refused(run: Path, tmp_path: Path) -> None:
+    outcome = call("inspect", tmp_path, "000.png", 1, 1)
+    assert outcome.code == 2
+    assert "holds no run.json" in outcome.flat
+    moved = shutil.copytree(run / "out", tmp_path / "out")
+    summary = json.loads((moved / "run.json").read_text())
+    summary["workflow"]["path"] = "/nowhere/wf.yaml"
+    (moved / "run.json").write_text(json.dumps(summary))
+    assert "its workflow /nowhere/wf.yaml is gone" in call("inspect", moved, "000.png", 1, 1).flat
+
+
+def test_the_pictures_of_the_run_are_found_from_anywhere(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`--images` relative to where the run was started is not relative to where it is inspected."""
+    shutil.copytree(run / "capture", tmp_path / "here" / "capture")
+    picture = tmp_path / "here" / "capture" / "images" / "000.png"
+    write_png(picture, decode_image(picture)[::-1].copy())
+    monkeypatch.chdir(tmp_path / "here")
+    outcome = call("run", run / "wf.yaml", "--images", "capture/images", "--out", "out", "--until", "depth")
+    assert outcome.code == 0, outcome.text
+    monkeypatch.chdir(tmp_path)
+    found = inspected("here/out", "000.png", 40, 28)
+    assert found["color_rgb"] == decode_image(picture)[28, 40].tolist()
+
+
+def test_a_workflow_without_a_sweep_is_told(tmp_path: Path, run: Path) -> None:
+    text = WORKFLOW.replace("capture/", f"{run}/capture/").split("  depth:")[0]
+    (tmp_path / "none.yaml").write_text(text)
+    assert "no depth.sweep" in call("inspect", tmp_path / "none.yaml", "000.png", 1, 1).flat
