@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import PurePosixPath
 
+_SEPARATOR = "|"  # of the two names of a pair
+
 
 def match_image_names(wanted: Iterable[str], available: Iterable[str]) -> dict[str, str]:
     """Return, for each wanted image name that has exactly one counterpart, that counterpart.
@@ -37,6 +39,15 @@ def match_image_names(wanted: Iterable[str], available: Iterable[str]) -> dict[s
                     matched[name] = found[0]
                 break
     return matched
+
+
+def printable_name(name: str) -> tuple[str, str]:
+    """Return a file's name as an item may have it, and why the file cannot be used under it; empty if it can."""
+    shown = name.encode(errors="replace").decode()
+    if _SEPARATOR not in name and shown == name:
+        return name, ""
+    what = repr(_SEPARATOR) if _SEPARATOR in name else "bytes that are no UTF-8"
+    return shown, f"{shown}: a file name with {what} cannot be used; rename it"
 
 
 def _clean(name: str) -> tuple[str, ...]:

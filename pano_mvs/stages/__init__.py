@@ -27,6 +27,7 @@ from pano_mvs.stages.patchmatch import patchmatch
 from pano_mvs.stages.poses import from_model, refine, scaled_translation, triangulate
 from pano_mvs.stages.poses_colmap import colmap_poses, colmap_sift_poses, extend
 from pano_mvs.stages.source import folder
+from pano_mvs.stages.source_video import video
 from pano_mvs.stages.views import nearest
 
 __all__ = [
@@ -66,6 +67,7 @@ __all__ = [
     "triangulate",
     "truth",
     "unit_translations",
+    "video",
     "vlad",
     "vote",
 ]

@@ -6,11 +6,13 @@ import pytest
 
 from pano_mvs.engine.registry import Registry
 from pano_mvs.testing.conformance import Law, stage_laws
+from tests.io.videos import tiny_video
 
 SETTINGS = {
     "poses.from_model": {"path": "{capture}/truth/poses.json"},
     "poses.extend": {"path": "{capture}/truth/poses.json"},
     "poses.scale": {"factor": 2.0},
+    "source.video": {"path": str(tiny_video())},
 }
 SIZES_HW = {"poses.colmap_sift": (96, 192)}
 

@@ -1,0 +1,213 @@
+"""Panoramas from videos: the right frames, the sharpest of them, and clear words for what is no panoramic video."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from pano_mvs.core.errors import InputError
+from pano_mvs.engine.context import Context
+from pano_mvs.io.video import describe_video, frames_between
+from pano_mvs.scene import Panorama
+from pano_mvs.scene.image_file import decode_image
+from pano_mvs.stages.source_video import VideoParams, list_frames, video
+from tests.io.videos import Picture, counted, number_of, retimed, write_video
+
+
+def params(path: Path | list[Path], **more: Any) -> VideoParams:
+    return VideoParams.model_validate({"path": path, **more})
+
+
+def taken(settings: VideoParams, tmp_path: Path) -> dict[str, tuple[int, Context, Panorama]]:
+    """Return, by name, the number in each frame that the source takes, what it reported, and the panorama."""
+    found = {}
+    for idx, item in enumerate(list_frames(settings)):
+        context = Context(np.random.default_rng(0), tmp_path / f"scratch{idx}")
+        context.scratch.mkdir()
+        panorama = video(item, settings, context)
+        panorama.check()
+        found[item.name] = number_of(decode_image(panorama.image.path)), context, panorama
+    return found
+
+
+def test_frames_come_at_even_steps_under_names_with_their_time(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "walk.avi", 60)
+    found = taken(params(path, every_s=0.5, pick="nearest"), tmp_path)
+    assert list(found) == [f"walk_{ms:08d}ms.png" for ms in range(0, 3000, 500)]
+    assert [number for number, _, _ in found.values()] == [0, 10, 20, 30, 40, 50]
+    times = [context.metrics["time_s"] for _, context, _ in found.values()]
+    assert times == pytest.approx([0, 0.5, 1, 1.5, 2, 2.5])
+    panorama = found["walk_00000500ms.png"][2]
+    assert (panorama.size_hw, panorama.source_size_hw) == ((64, 128), (64, 128))
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({"every_frames": 20}, [0, 20, 40]),
+        ({"start_s": 0.25, "end_s": 1.6}, [5, 25]),
+        ({"every_s": 0.1, "max_frames": 4}, [0, 20, 39, 59]),
+        ({"every_frames": 1, "start_s": 2.9}, [58, 59]),
+    ],
+)
+def test_steps_in_frames_a_part_of_the_video_and_a_limit(
+    tmp_path: Path, settings: dict[str, Any], expected: list[int]
+) -> None:
+    path = write_video(tmp_path / "walk.avi", 60)
+    found = taken(params(path, pick="nearest", **settings), tmp_path)
+    numbers = [number for number, _, _ in found.values()]
+    assert numbers == pytest.approx(expected, abs=1)  # a limit puts steps between two frames
+    assert len(set(numbers)) == len(expected)
+
+
+def test_the_sharpest_frame_within_a_quarter_of_a_step_is_taken(tmp_path: Path) -> None:
+    blur = {10: 1, 28: 1, 1: 2, 18: 2, 44: 2}  # the sharpest of all, 10 and 28, are near no step
+
+    def shaken(number: int) -> Picture:
+        frame = counted(number)
+        shake = cv2.blur(frame, (blur.get(number, 5), 1))
+        return np.clip(shake * (0.6 if number == 18 else 1.0), 0, 255).astype(np.uint8)  # in a dark moment
+
+    path = write_video(tmp_path / "walk.avi", 50, shaken, per_s=10)
+    found = taken(params(path, every_s=2.0), tmp_path)
+    assert [number for number, _, _ in found.values()] == [1, 18, 44]
+    context = found["walk_00002000ms.png"][1]
+    assert context.metrics["time_s"] == pytest.approx(1.8)
+
+
+def test_frames_are_kept_without_loss(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "walk.mp4", 10)
+    capture = cv2.VideoCapture(str(path))
+    decoded = [capture.read()[1] for _ in range(10)]
+    found = taken(params(path, every_frames=5), tmp_path)
+    for number, _, panorama in found.values():
+        np.testing.assert_array_equal(decode_image(panorama.image.path)[..., ::-1], decoded[number])
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".avi"])
+def test_seeking_finds_what_reading_through_finds(tmp_path: Path, suffix: str) -> None:
+    path = write_video(tmp_path / f"walk{suffix}", 60)
+    through = [(time_s, number_of(frame)) for time_s, frame in frames_between(path, 0, 99)]
+    assert [number for _, number in through] == list(range(60))
+    for begin, end in ((0.0, 0.0), (0.72, 0.93), (1.0, 1.3), (2.9, 9.0), (5.0, 6.0)):
+        found = [number_of(frame) for _, frame in frames_between(path, begin, end)]
+        assert found == [number for time_s, number in through if begin - 0.001 <= time_s <= end + 0.001]
+
+
+def test_a_frame_rate_that_varies_does_no_harm(tmp_path: Path) -> None:
+    """OpenCV seeks as if frames came evenly; the container's own time stamps decide."""
+    path = write_video(tmp_path / "walk.mp4", 60)
+    durations = np.random.default_rng(0).uniform(0.02, 0.25, 60)
+    durations[30] = 3.0  # nothing moved, so nothing was recorded
+    retimed(path, durations.tolist())
+    times = np.concatenate([[0], np.cumsum(durations)[:-1]])
+    for begin in (0.5, 2.0, times[30] - 0.3, times[31], times[50]):
+        found = [number_of(frame) for _, frame in frames_between(path, begin, begin + 0.6)]
+        expected = np.flatnonzero((times >= begin - 0.001) & (times <= begin + 0.601))
+        assert found == expected.tolist()
+    settings = params(path, start_s=float(times[30] + 1), every_s=0.5)
+    with pytest.raises(InputError, match=r"walk\.mp4: has no frame between .* or pauses"):
+        taken(settings, tmp_path)
+
+
+def test_several_videos_and_folders_of_them(tmp_path: Path) -> None:
+    (tmp_path / "walks/day 2").mkdir(parents=True)
+    for name in ("walks/b.avi", "walks/a10.avi", "walks/a2.AVI", "walks/day 2/b.avi"):
+        write_video((tmp_path / name).with_suffix(".avi"), 12)
+    (tmp_path / "walks/a2.avi").rename(tmp_path / "walks/a2.AVI")
+    (tmp_path / "walks/notes.txt").write_text("x")
+    names = [item.name for item in list_frames(params(tmp_path / "walks", every_s=0.5))]
+    assert [name.rpartition("_")[0] for name in names[::2]] == ["a2", "a10", "b", "day 2/b"]
+    both = params([tmp_path / "walks/b.avi", tmp_path / "walks/a10.avi"], every_s=0.5)
+    assert [item.name for item in list_frames(both)][::2] == ["b_00000000ms.png", "a10_00000000ms.png"]
+
+
+def test_mask_and_cuts_are_as_for_pictures(tmp_path: Path) -> None:
+    keep = np.full((64, 128), 255, np.uint8)
+    keep[:, :32] = 0
+    cv2.imwrite(str(tmp_path / "mask.png"), keep)
+    path = write_video(tmp_path / "walk.avi", 20)
+    found = taken(params(path, every_s=0.5, mask=tmp_path / "mask.png", nadir_deg=30, max_width=64), tmp_path)
+    panorama = next(iter(found.values()))[2]
+    assert panorama.size_hw == (32, 64)
+    valid = panorama.load_mask()
+    assert not valid[:, :15].any()
+    assert not valid[-5:].any()
+    assert valid[5:20, 20:60].all()
+
+
+def fisheyes(number: int) -> Picture:
+    frame = np.zeros((64, 128, 3), np.uint8)
+    for left in (32, 96):
+        cv2.circle(frame, (left, 32), 30, (150, 120, 90 + number), -1)
+    return frame
+
+
+@pytest.mark.parametrize(
+    ("name", "picture", "what"),
+    [
+        ("square.avi", lambda number: counted(number, (128, 128)), "128×128 px are no equirectangular frames"),
+        ("flat.avi", lambda number: counted(number, (72, 128)), "128×72 px are no equirectangular frames"),
+        ("two.avi", fisheyes, "two fisheye images side by side"),
+    ],
+)
+def test_what_is_no_panorama_must_be_stitched_first(tmp_path: Path, name: str, picture: Any, what: str) -> None:
+    path = write_video(tmp_path / name, 12, picture)
+    with pytest.raises(InputError, match=rf"{name}: .*{what}.*export|{name}: {what}.*Export"):
+        list(list_frames(params(path, every_s=0.2)))
+
+
+def test_what_the_camera_records_before_stitching_is_known_by_its_name(tmp_path: Path) -> None:
+    (tmp_path / "VID_1.insv").write_bytes(b"x")
+    for path in (tmp_path, tmp_path / "VID_1.insv"):
+        with pytest.raises(InputError, match=r"equirectangular video with the camera maker's program first"):
+            list(list_frames(params(path)))
+
+
+@pytest.mark.parametrize("damage", ["unfinished", "text", "empty"])
+def test_what_cannot_be_opened_is_named(tmp_path: Path, damage: str, capfd: pytest.CaptureFixture[str]) -> None:
+    path = write_video(tmp_path / "walk.mp4", 20)
+    data = path.read_bytes()
+    path.write_bytes({"unfinished": data[: len(data) // 2], "text": b"hello", "empty": b""}[damage])
+    with pytest.raises(InputError, match=r"walk\.mp4: cannot be opened as a video.* or repair it"):
+        list(list_frames(params(path)))
+    assert capfd.readouterr() == ("", ""), "FFmpeg's own messages are not for people"
+
+
+def test_a_video_that_ends_early_gives_what_it_has(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "walk.avi", 60)
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    assert describe_video(path).frames == 60
+    items = list(list_frames(params(path, every_s=0.5)))
+    context = Context(np.random.default_rng(0), tmp_path)
+    assert number_of(decode_image(video(items[1], params(path, every_s=0.5), context).image.path)) in range(8, 13)
+    with pytest.raises(InputError, match=r"has no frame between 2\.375 s and 2\.625 s .*ends early"):
+        video(items[5], params(path, every_s=0.5), context)
+
+
+@pytest.mark.parametrize(
+    ("settings", "what"),
+    [
+        ({"every_s": 1, "every_frames": 3}, "give every_s or every_frames, not both"),
+        ({"start_s": 2, "end_s": 1}, "end_s must be greater than start_s"),
+    ],
+)
+def test_settings_that_contradict_each_other(tmp_path: Path, settings: dict[str, Any], what: str) -> None:
+    with pytest.raises(ValueError, match=what):
+        params(tmp_path, **settings)
+
+
+def test_too_few_frames_are_told(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "walk.avi", 10)
+    with pytest.raises(InputError, match=r"walk\.avi: gives 1 frames; .*every_s"):
+        list(list_frames(params(path, every_s=5)))
+    with pytest.raises(InputError, match=r"no such video or folder"):
+        list(list_frames(params(tmp_path / "gone.mp4")))
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"no videos here.*source\.folder"):
+        list(list_frames(params(tmp_path / "empty")))
