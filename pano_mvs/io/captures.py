@@ -26,7 +26,8 @@ class PictureInfo:
     """What is known of a panorama without decoding it.
 
     Attributes:
-        size_hw: (height, width) of the full sphere at the file's own resolution, width = 2 × height.
+        size_hw: (height, width) of the full sphere, width = 2 × height: at the file's own resolution, or, of a crop
+            that was resized since, at that of the original, in whose pixels alone its place is exact.
         file_size_hw: (height, width) of the picture in the file.
         crop_ltwh: (left, top, width, height) of the part of the sphere that the file holds, or None for all of it.
         gpano: its metadata, or None.
@@ -42,6 +43,12 @@ class PictureInfo:
     warnings: tuple[str, ...] = ()
     traits: tuple[str, ...] = ()
     position_lla: tuple[float, float, float] | None = None
+
+    @property
+    def full_width_px(self) -> int:
+        """How many columns the full sphere has at the file's own resolution."""
+        share = 1.0 if self.crop_ltwh is None else self.file_size_hw[1] / self.crop_ltwh[2]
+        return max(1, round(self.size_hw[1] * share))
 
 
 def list_pictures(folder: Path) -> list[Path]:
@@ -137,13 +144,12 @@ def _placed(
                 f"{path}: {width}×{height} px, but its GPano metadata speak of {crop_width}×{crop_height}. It was cut "
                 "after it was taken: restore the original, or remove the metadata"
             )
-        scale = width / crop_width
         warnings = (f"resized from {crop_width}×{crop_height} to {width}×{height} px after it was taken; its GPano "
-                    "fields were scaled",)  # fmt: skip
-        full_width, full_height = round(full_width * scale / 2) * 2, round(full_height * scale)
-        left, top = min(round(left * scale), full_width - width), min(round(top * scale), full_height - height)
+                    "fields count the original's pixels",)  # fmt: skip
+    whole = (crop_height, crop_width) == full_hw
+    if whole:
+        full_height, full_width = size_hw
     if full_width != 2 * full_height or left < 0 or top < 0:
         raise InputError(f"{path}: its GPano metadata say that the full sphere is {full_width}×{full_height} px, but "
                          "the width must be twice the height. Correct the metadata, or remove them")  # fmt: skip
-    whole = (height, width) == (full_height, full_width)
-    return (full_height, full_width), None if whole else (left, top, width, height), warnings
+    return (full_height, full_width), None if whole else crop_ltwh, warnings

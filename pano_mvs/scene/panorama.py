@@ -28,8 +28,8 @@ class Panorama(Record):
         crop_ltwh: (left, top, width, height) in source pixels of the part of the sphere that the file holds, if it is
             not all of it (GPano's CroppedArea).
         mask_file: a picture, 0 where the panorama must be ignored, or None. It covers what the picture covers, at any
-            resolution; that of a cropped picture may cover the whole sphere instead (its shape tells; one of size_hw
-            covers the sphere).
+            resolution, or the whole sphere: its shape tells, and of a crop twice as wide as high only a mask of
+            source_size_hw covers the sphere.
         nadir_deg: everything closer than this to the straight down direction is ignored (tripod, operator).
         zenith_deg: likewise around the straight up direction.
         up_in_cam: the direction away from gravity as the camera's own sensors saw it, unit (3,), or None.
@@ -107,15 +107,20 @@ class Panorama(Record):
         """Return the panorama with more of it to be ignored, besides all that already is.
 
         Args:
-            valid: bool, False is to be ignored: (H, W) at working resolution, or of any other size that a mask
-                file may have.
+            valid: bool, False is to be ignored: (H, W), or of any other size that a mask file may have.
             folder: where the mask file is written: `ctx.scratch` of a stage.
 
         Raises:
             InputError: if the size fits neither the sphere nor the crop.
         """
-        path = folder / f"{Path(self.image.path).stem}.mask.png"
-        keep = self.load_mask() & self._placed(np.asarray(valid, np.bool_), "a stage's mask")
+        further = np.asarray(valid, np.bool_)
+        keep = self.load_mask() & (
+            further if further.shape == self.size_hw else self._placed(further, "a stage's mask")
+        )
+        if self.crop_ltwh is not None and same_shape(self.size_hw, (self.crop_ltwh[3], self.crop_ltwh[2])):
+            height, width = whole = self.source_size_hw  # at working resolution it would be taken for the crop's
+            keep = placed_mask(keep, whole, of=(0, 0, width, height), whole_hw=whole)
+        path = folder / f"{self.image.path.stem}.mask.png"
         write_png(path, np.where(keep, np.uint8(255), np.uint8(0)))
         return replace(self, mask_file=FilePart(path))
 
@@ -130,7 +135,7 @@ class Panorama(Record):
         height, width = self.source_size_hw
         sphere, crop = (0, 0, width, height), self.covers_ltwh
         size = mask.shape[0], mask.shape[1]
-        if size in (self.size_hw, self.source_size_hw):
+        if size == self.source_size_hw:
             covered = sphere
         elif same_shape(size, (crop[3], crop[2])):
             covered = crop

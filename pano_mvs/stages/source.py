@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from pydantic import Field
 
 from pano_mvs.api import Context, FilePart, InputError, Panorama, Params, SourceItem, SourcePath, source
 from pano_mvs.io.captures import PictureInfo, describe_picture, list_pictures
+from pano_mvs.io.mask_files import find_mask, require_masks
+from pano_mvs.io.names import printable_name
 from pano_mvs.scene.image_file import decode_image
-
-_SEPARATOR = "|"
 
 
 class FolderParams(Params):
@@ -20,7 +20,9 @@ class FolderParams(Params):
     path: SourcePath = Field(description="folder of the pictures, searched with its subfolders")
     masks: SourcePath | None = Field(default=None, description="folder of masks <image name>.png; 0 is ignored")
     mask: SourcePath | None = Field(default=None, description="one mask for all pictures; 0 is ignored")
-    nadir_deg: float = Field(default=0.0, ge=0, le=90, description="ignore so much around straight down (tripod)")
+    nadir_deg: float = Field(
+        default=0.0, ge=0, le=90, description="ignore so much around straight down (tripod); 45 is the lowest quarter"
+    )
     zenith_deg: float = Field(default=0.0, ge=0, le=90, description="ignore so much around straight up")
     max_width: int = Field(default=4096, ge=16, description="wider panoramas are scaled down to this width")
 
@@ -31,19 +33,14 @@ def list_folder(params: FolderParams) -> Iterator[SourceItem]:
     Raises:
         InputError: if the folder does not hold two pictures or more.
     """
-    pictures = list_pictures(params.path)
+    pictures = [path for path in list_pictures(params.path) if not _is_mask(path, params)]
     if len(pictures) < 2:
         raise InputError(f"{params.path}: holds one picture only ({pictures[0].name}); depth needs two or more "
                          "panoramas of the same place, taken from different positions")  # fmt: skip
-    if params.masks is not None and not params.masks.is_dir():
-        raise InputError(f"{params.masks}: masks must be a folder. Give one mask for all pictures as `mask`")
+    if params.masks is not None:
+        require_masks([path.relative_to(params.path).as_posix() for path in pictures], params.masks)
     for path in pictures:
-        name = path.relative_to(params.path).as_posix()
-        printable = name.encode(errors="replace").decode()
-        problem = ""
-        if _SEPARATOR in name or printable != name:
-            what = repr(_SEPARATOR) if _SEPARATOR in name else "bytes that are no UTF-8"
-            problem, name = f"{printable}: a file name with {what} cannot be used; rename it", printable
+        name, problem = printable_name(path.relative_to(params.path).as_posix())
         files = {"image": path}
         mask = None if problem else _mask_of(name, params)
         if mask is not None:
@@ -56,7 +53,8 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
     """Read the panoramas of a folder and its subfolders.
 
     A picture is a panorama if its GPano metadata say so (whole or cropped), or if it is twice as wide as high. Masks
-    are looked for as `<masks>/<image name>.png`, then `<masks>/<name without extension>.png`, then `mask`.
+    are looked for as `<masks>/<image name>.png`, then `<masks>/<name without extension>.png`, then `mask`; they cover
+    what the picture covers, or the whole sphere, at any resolution.
     """
     path = item.files["image"]
     info = describe_picture(path)
@@ -68,11 +66,9 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
     mask = item.files.get("mask")
     if mask is None and params.masks is not None:
         ctx.note(f"{item.name} has no mask in {params.masks.name}; all of it is used")
-    if mask is not None:
-        decode_image(mask)
-    return Panorama(
+    panorama = Panorama(
         image=FilePart(path, external=True),
-        size_hw=working_size(info.size_hw, params.max_width),
+        size_hw=working_size(info.size_hw, min(params.max_width, info.full_width_px)),
         source_size_hw=info.size_hw,
         crop_ltwh=info.crop_ltwh,
         mask_file=None if mask is None else FilePart(mask, external=True),
@@ -82,6 +78,11 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
         heading_deg=info.gpano.heading_deg if info.gpano else None,
         position_lla=info.position_lla,
     )
+    valid = panorama.load_mask().mean()
+    ctx.metric("valid", float(valid))
+    if not valid:
+        ctx.note(f"{item.name}: all of it is masked; nothing can be seen in it")
+    return panorama
 
 
 def _check_decodes(path: Path, info: PictureInfo) -> None:
@@ -101,9 +102,11 @@ def working_size(source_hw: tuple[int, int], max_width: int) -> tuple[int, int]:
 
 
 def _mask_of(name: str, params: FolderParams) -> Path | None:
-    if params.masks is not None:
-        candidates = (params.masks / f"{name}.png", params.masks / PurePosixPath(name).with_suffix(".png"))
-        for candidate in candidates:
-            if candidate.is_file():
-                return candidate
-    return params.mask
+    own = None if params.masks is None else find_mask(name, params.masks)
+    return own or params.mask
+
+
+def _is_mask(path: Path, params: FolderParams) -> bool:
+    """Return whether a picture found among the panoramas is one of their masks."""
+    masks, mask = (given and given.absolute() for given in (params.masks, params.mask))
+    return path.absolute() == mask or (masks is not None and path.absolute().is_relative_to(masks))

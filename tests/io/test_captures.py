@@ -126,7 +126,7 @@ def test_a_panorama_made_smaller_keeps_its_place(tmp_path):
         "CroppedAreaLeftPixels": 100, "CroppedAreaTopPixels": 70,
     }  # fmt: skip
     info = describe_picture(write_png(tmp_path / "a.png", (30, 60), xmp(fields)))
-    assert (info.size_hw, info.crop_ltwh) == ((40, 80), (10, 7, 60, 30))
+    assert (info.size_hw, info.crop_ltwh, info.full_width_px) == ((400, 800), (100, 70, 600, 300), 80)
     assert "resized from 600×300 to 60×30 px" in info.warnings[0]
 
 
