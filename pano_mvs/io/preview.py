@@ -16,15 +16,20 @@ _PAPER, _INK = (255, 255, 255), (60, 60, 60)
 _TEXT_SIZE, _TEXT_WEIGHT = 0.9, 2  # legible when the picture is shown at a third of its width
 
 
-def write_preview(path: Path, image: NDArray[np.uint8], range_map: NDArray[np.float32]) -> None:
+def write_preview(
+    path: Path, image: NDArray[np.uint8], range_map: NDArray[np.float32], *, mask: NDArray[np.bool_] | None = None
+) -> None:
     """Write a JPEG of a panorama above its range map, with a scale bar that carries numbers.
 
     Args:
         path: the file to write.
         image: (H, W, 3) uint8 RGB.
         range_map: (h, w) float32 range in scene units, NaN where invalid (shown grey).
+        mask: (H, W), False where the picture is to be ignored (shown grey), or None.
     """
     height = _WIDTH // 2
+    if mask is not None:
+        image = np.where(mask[..., None], image, np.uint8(_INVALID_GREY))
     shown = cv2.resize(image, (_WIDTH, height), interpolation=cv2.INTER_AREA)
     resized = cv2.resize(range_map, (_WIDTH, height), interpolation=cv2.INTER_NEAREST)
     near, far = range_limits(resized)

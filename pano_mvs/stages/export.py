@@ -97,9 +97,12 @@ def ranges(range_map: Each[RangeMap], image: Each[Panorama] | None, params: Rang
 
 @stage("export.previews")
 def previews(range_map: Each[RangeMap], image: Each[Panorama], ctx: Context) -> Files:
-    """A picture for each view, preview/<image>.jpg: the panorama beside its colour-mapped range with a scale bar."""
+    """A picture for each view, preview/<image>.jpg: the panorama beside its colour-mapped range with a scale bar.
+
+    What is masked is grey, like pixels without a range.
+    """
     path = ctx.scratch / "preview.jpg"
-    write_preview(path, image.load_unmasked(), range_map.range)
+    write_preview(path, image.load(), range_map.range, mask=image.load_mask())
     return Files({"preview/{item}.jpg": path})
 
 
