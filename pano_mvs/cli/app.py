@@ -18,8 +18,7 @@ from rich.markup import escape
 
 from pano_mvs import __version__
 from pano_mvs.cli.cache_app import cache_app
-from pano_mvs.cli.default_command import RunByDefault
-from pano_mvs.cli.evaluate_depth_command import evaluate_ranges
+from pano_mvs.cli.evaluate_app import evaluate_app
 from pano_mvs.cli.guard import guarded
 from pano_mvs.cli.options import (
     AcceptOption,
@@ -46,11 +45,6 @@ app = typer.Typer(
 )
 app.add_typer(stage_app, name="stage")
 app.add_typer(plugin_app, name="plugin")
-evaluate_app = typer.Typer(
-    cls=RunByDefault,
-    help="Compare with the truth; `evaluate OUT --truth DIR` is `evaluate run OUT --truth DIR`.",
-    no_args_is_help=True,
-)
 app.add_typer(evaluate_app, name="evaluate")
 app.add_typer(cache_app, name="cache")
 
@@ -171,6 +165,15 @@ def status(
     show_status(open_session(workflow, images=images, out=out, cache=cache), Console())
 
 
+@app.command()
+@guarded
+def report(out: Annotated[Path, typer.Argument(help="The output folder of a run.")], cache: CacheOption = None) -> None:
+    """Write report.html anew from run.json and the cache; nothing is computed again."""
+    from pano_mvs.cli.report_command import rewrite_report
+
+    rewrite_report(out, cache, Console())
+
+
 app.command()(plugins)
 
 
@@ -196,71 +199,6 @@ def inspect_pixel(
 
     session = open_run(target, overrides=overrides or [], images=images, cache=cache)
     inspect(session, PixelWanted(image, x, y, stage, truth), Console(), plot=plot, as_json=as_json)
-
-
-@evaluate_app.command("run")
-@guarded
-def evaluate_run(
-    out: Annotated[Path, typer.Argument(help="The output folder of a run.")],
-    truth: Annotated[Path, typer.Option("--truth", help="Folder with poses.json and depth.npz.")],
-) -> None:
-    """Compare a run's poses and range maps with the truth."""
-    from pano_mvs.cli.evaluate import evaluate_folder
-
-    evaluate_folder(out, truth, Console())
-
-
-evaluate_app.command("depth")(evaluate_ranges)
-
-
-@evaluate_app.command("poses")
-@guarded
-def evaluate_model(
-    model: Annotated[Path, typer.Argument(help="COLMAP model, poses.json, transforms.json, CSV, or a run's output.")],
-    truth: Annotated[Path, typer.Option("--truth", help="The true poses, in any of these forms.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
-) -> None:
-    """Compare the poses in any file with the truth, whatever their frames and units."""
-    from pano_mvs.cli.evaluate_poses import evaluate_poses
-
-    evaluate_poses(model, truth, Console(), as_json=as_json)
-
-
-@evaluate_app.command("cloud")
-@guarded
-def evaluate_points(
-    cloud: Annotated[Path, typer.Argument(help="A PLY file, or the output folder of a run.")],
-    truth: Annotated[Path, typer.Option("--truth", help="Folder with poses.json and depth.npz, or a reference PLY.")],
-    poses: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option("--poses", help="The poses it was made with; without, a PLY lies in the truth's frame."),
-    ] = None,
-    true_poses: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option("--true-poses", help="The true poses in the frame of a reference PLY."),
-    ] = None,
-    thresholds: Annotated[
-        list[float], typer.Option("--threshold", help="A tolerance in the truth's unit; may be given repeatedly.")
-    ] = [0.05, 0.02],  # noqa: B006  # typer reads it and never changes it
-    picture: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option("--picture", help="A PNG to write of where the errors are."),
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
-) -> None:
-    """Compare a cloud with the true surface: accuracy, completeness, F-score."""
-    from pano_mvs.cli.evaluate_cloud import evaluate_cloud
-
-    evaluate_cloud(
-        cloud,
-        truth,
-        Console(),
-        poses=poses,
-        true_poses=true_poses,
-        thresholds=thresholds,
-        picture=picture,
-        as_json=as_json,
-    )
 
 
 def main() -> None:

@@ -1,59 +1,94 @@
-"""Compare the output folder of a run with ground truth."""
+"""Compare all that is in the output folder of a run with ground truth."""
 
 from __future__ import annotations
 
-from functools import partial
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 
 from pano_mvs.algorithms.metrics.score import score_capture
+from pano_mvs.algorithms.metrics.view_scores import Judging
+from pano_mvs.cli.evaluate_cloud import CloudRequest, evaluate_cloud
+from pano_mvs.cli.evaluate_depth import DepthRequest, evaluate_depth
 from pano_mvs.cli.run_command import print_scores
-from pano_mvs.core.errors import InputError
-from pano_mvs.io.colmap_model import read_colmap_model
-from pano_mvs.io.range_files import read_confidence_png, read_range_tiff
-from pano_mvs.io.truth import read_truth
+from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.geometry import Rigid3
+from pano_mvs.io.colmap_model import is_colmap_model
+from pano_mvs.io.pose_files import read_poses
+from pano_mvs.io.range_folders import find_ranges, match_pictures
+from pano_mvs.io.truth import find_true_ranges
 
-MODEL = "colmap/sparse/0"
+MODEL, CLOUD, RANGES = "colmap/sparse/0", "cloud.ply", "range"
 
 
-def evaluate_folder(out: Path, truth_folder: Path, console: Console) -> None:
-    """Print how far the poses and range maps in an output folder are from the truth.
+def evaluate_folder(out: Path, truth: Path, console: Console) -> None:
+    """Print how far the poses, the range maps and the cloud in an output folder are from the truth.
+
+    What is not there, on either side, is left out with a line that says so.
 
     Raises:
-        InputError: if the folder holds no model, or no image of it has truth.
+        InputError: if nothing can be compared, with what is missing for each, or a file is damaged.
     """
-    if not (out / MODEL).is_dir():
-        raise InputError(f"{out}: holds no {MODEL}. Give the output folder of a finished run")
-    truth = read_truth(truth_folder)
-    poses = read_colmap_model(out / MODEL)
-    estimated = {name: poses.cam_from_world(idx) for idx, name in enumerate(poses.names)}
-    ours = {view.name: name for name, view in truth.match(list(estimated)).items()}
+    reasons = {"poses": _poses(out, truth, console), "ranges": _ranges(out, truth, console),
+               "cloud": _cloud(out, truth, console)}  # fmt: skip
+    if all(reasons.values()):
+        raise InputError(f"{out}: nothing here can be compared with {truth}: "
+                         f"{'; '.join(reason for reason in reasons.values() if reason)}. Give the output folder of a "
+                         "finished run, and a truth that knows its pictures")  # fmt: skip
+    for what, reason in reasons.items():
+        if reason:
+            console.print(f"{what}: not compared, {reason}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _poses(out: Path, truth: Path, console: Console) -> str:
+    """Print the scores of the poses; return why not, or an empty text."""
+    if not is_colmap_model(out / MODEL):
+        return f"there is no {MODEL}"
+    try:
+        true = _cameras(truth)
+    except InputError as error:
+        return f"the truth has no poses ({error})"
+    estimated = _cameras(out / MODEL)
+    ours = {known: name for name, known in match_pictures(estimated, true).items()}
     if not ours:
-        raise InputError(f"{truth_folder}: knows none of the images in {out} ({', '.join(list(estimated)[:3])} …)")
+        return f"the truth knows none of its images ({', '.join(list(estimated)[:3])})"
     # An image that the truth knows and the run did not register keeps the truth's name, and counts as a failure.
-    true_views = {ours.get(known, known): view for known, view in truth.views.items()}
-    paths = {name: path for name in ours.values() if (path := _written(out, "range", name, ".tiff")) is not None}
-    scores = score_capture(
-        estimated,
-        {name: view.cam_from_world for name, view in true_views.items()},
-        {name: read_range_tiff(path) for name, path in paths.items()},
-        {name: partial(truth.range_map, view) for name, view in true_views.items()},
-        confidences=_confidences(out, list(paths)),
-    )
-    print_scores({"poses": scores.poses, "views": scores.views}, console)
-    for note in scores.notes:
-        console.print(f"note: {note}", highlight=False)
+    scores = score_capture(estimated, {ours.get(known, known): pose for known, pose in true.items()}, {}, {})
+    print_scores({"poses": scores.poses, "views": {}}, console)
+    return "" if scores.poses else "; ".join(scores.notes)
 
 
-def _confidences(out: Path, names: list[str]) -> dict[str, NDArray[np.uint8]]:
-    """Return the confidences, (H, W) by image, of those images that have any."""
-    paths = {name: _written(out, "confidence", name, ".png") for name in names}
-    return {name: read_confidence_png(path) for name, path in paths.items() if path is not None}
+def _ranges(out: Path, truth: Path, console: Console) -> str:
+    """Print the scores of the range maps; return why not, or an empty text."""
+    if not (out / RANGES).is_dir():
+        return f"there is no folder {RANGES}"
+    estimates = find_ranges(out)
+    try:
+        true = find_true_ranges(truth)
+    except InputError as error:
+        return f"the truth has none ({error})"
+    if not match_pictures(estimates, true):
+        return f"the truth knows none of their pictures ({', '.join(list(estimates)[:3])})"
+    request = DepthRequest(out, truth, Judging())
+    evaluate_depth(request, console, out=None, csv=None, baseline="best", as_json=False)
+    return ""
 
 
-def _written(out: Path, folder: str, name: str, suffix: str) -> Path | None:
-    candidates = (out / folder / PurePosixPath(name).with_suffix(suffix), out / folder / f"{name}{suffix}")
-    return next((path for path in candidates if path.is_file()), None)
+def _cloud(out: Path, truth: Path, console: Console) -> str:
+    """Print the scores of the cloud; return why not, or an empty text."""
+    if not (out / CLOUD).is_file():
+        return f"there is no {CLOUD}"
+    if not is_colmap_model(out / MODEL):
+        return f"there is no {MODEL} that tells in which frame it is"
+    if not ((truth / "poses.json").is_file() and (truth / "depth.npz").is_file()):
+        return "the truth has no poses.json with a depth.npz"
+    try:
+        evaluate_cloud(CloudRequest(out, truth), console, as_json=False)
+    except UsageError as error:
+        return str(error)
+    return ""
+
+
+def _cameras(path: Path) -> dict[str, Rigid3]:
+    poses = read_poses(path)
+    return {name: poses.cam_from_world(idx) for idx, name in enumerate(poses.names)}

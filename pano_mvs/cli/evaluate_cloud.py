@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,81 +12,160 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from pano_mvs.algorithms.metrics.cloud import CloudDistances, CloudScore, cloud_distances, score_cloud
+from pano_mvs.algorithms.metrics.cloud import (
+    DEFAULT_THRESHOLDS,
+    CloudDistances,
+    CloudScore,
+    PointChunks,
+    cloud_distances,
+    score_cloud,
+)
 from pano_mvs.algorithms.metrics.poses import align_centers
 from pano_mvs.algorithms.metrics.surface import TrueSurface, TrueView, surface_of_cloud, surface_of_views, view_points
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.geometry import Rigid3, Similarity3
-from pano_mvs.io.cloud_picture import write_cloud_picture
 from pano_mvs.io.names import match_image_names
-from pano_mvs.io.ply_points import read_ply_points
+from pano_mvs.io.ply_points import PlyPoints, open_ply_points, read_ply_points
 from pano_mvs.io.pose_files import read_poses
 from pano_mvs.io.truth import read_truth
 
 _CLOUD, _MODEL = "cloud.ply", "colmap/sparse/0"
+# Distances are told apart up to this many times the largest tolerance; for quantiles and files, not for scores.
+_FARTHEST = 20.0
 
 
-@dataclass(frozen=True, eq=False)
-class _CloudTruth:
-    """What a cloud is compared with: the whole surface in pieces, the part to be found, and the views that show it."""
+@dataclass(frozen=True)
+class CloudRequest:
+    """What `evaluate cloud` is asked for.
 
-    pieces: Sequence[NDArray[np.float32]]
-    surface: TrueSurface
-    used: dict[str, TrueView]
-    views: int
-    unit: str
-
-
-def evaluate_cloud(
-    cloud: Path,
-    truth: Path,
-    console: Console,
-    *,
-    poses: Path | None,
-    true_poses: Path | None,
-    thresholds: Sequence[float],
-    picture: Path | None,
-    as_json: bool,
-) -> None:
-    """Print accuracy, completeness and F-score of a cloud.
-
-    Args:
+    Attributes:
         cloud: a PLY file, or the output folder of a run.
         truth: a folder with poses.json and depth.npz, or a reference cloud as a PLY file.
-        console: where to print.
         poses: the poses with which the cloud was made, of the cameras that were used, in any form that `read_poses`
             reads; None: those in the output folder, or, beside a PLY file, a cloud in the truth's own frame from all
             of the truth's cameras.
         true_poses: those of a reference cloud's frame; None: the truth folder's.
         thresholds: tolerances in the truth's unit.
-        picture: where to write a PNG that shows the errors; None: nowhere.
+    """
+
+    cloud: Path
+    truth: Path
+    poses: Path | None = None
+    true_poses: Path | None = None
+    thresholds: tuple[float, ...] = DEFAULT_THRESHOLDS
+
+
+@dataclass(frozen=True, eq=False)
+class CloudTruth:
+    """What a cloud is compared with.
+
+    Attributes:
+        pieces: begins anew to give the whole true surface, one piece (K, 3) in memory at a time.
+        surface: the part to be found.
+        used: the views that show it, by name; none of a reference cloud.
+        views: number of views with truth.
+        unit: of lengths.
+        cameras: (M, 3) where the cameras that were used stood, in the truth's world.
+    """
+
+    pieces: Callable[[], Iterable[NDArray[np.float32]]]
+    surface: TrueSurface
+    used: dict[str, TrueView]
+    views: int
+    unit: str
+    cameras: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedCloud:
+    """A cloud and its distances from the truth.
+
+    Attributes:
+        file: the cloud's vertices, in its own frame.
+        truth_from_cloud: what brings it into the truth's; None: it is there.
+        compared: with what.
+        distances: from the truth and back, told apart up to `farthest`.
+        thresholds: tolerances in rising order.
+        farthest: in the truth's unit.
+    """
+
+    file: PlyPoints
+    truth_from_cloud: Similarity3 | None
+    compared: CloudTruth
+    distances: CloudDistances
+    thresholds: tuple[float, ...]
+    farthest: float
+
+    def points(self) -> Iterator[NDArray[np.float32]]:
+        """Return the cloud's points in chunks (K, 3), in the truth's frame."""
+        return _in_truth(self.file, self.truth_from_cloud)
+
+
+def evaluate_cloud(
+    request: CloudRequest, console: Console, *, out: Path | None = None, picture: Path | None = None, as_json: bool
+) -> None:
+    """Print accuracy, completeness and F-score of a cloud.
+
+    Args:
+        request: what is compared.
+        console: where to print.
+        out: folder for the clouds coloured by their errors, and for pictures of them; None: nowhere.
+        picture: where to write a PNG that shows the errors in the views and from above; None: nowhere.
         as_json: print one JSON object and nothing else.
 
     Raises:
         InputError: if a file is missing or damaged, or the two do not belong together.
         UsageError: if a tolerance is not positive, or the poses do not determine how the frames lie.
     """
-    if not thresholds or not min(thresholds) > 0:
+    judged = judge_cloud(request)
+    scores = score_cloud(judged.distances, judged.compared.surface, request.thresholds)
+    if picture is not None or out is not None:
+        # The modules that draw are needed here alone.
+        from pano_mvs.cli.evaluate_cloud_pictures import write_error_clouds, write_overview
+
+        if picture is not None:
+            write_overview(picture, judged)
+        if out is not None:
+            write_error_clouds(out, judged)
+    if as_json:
+        print(json.dumps(_as_json(request, judged, scores), indent=1, ensure_ascii=False, allow_nan=False))
+        return
+    _print(judged, scores, console)
+    if out is not None:
+        console.print(f"accuracy.ply, completeness.ply and pictures of the errors are in {out}", highlight=False,
+                      markup=False, soft_wrap=True)  # fmt: skip
+
+
+def judge_cloud(request: CloudRequest) -> JudgedCloud:
+    """Return how far a cloud is from the truth.
+
+    Raises:
+        InputError: if a file is missing or damaged, or the two do not belong together.
+        UsageError: if a tolerance is not positive, or the poses do not determine how the frames lie.
+    """
+    thresholds = tuple(sorted(request.thresholds))
+    if not thresholds or not thresholds[0] > 0:
         raise UsageError(f"tolerances must be positive, got {', '.join(map(str, thresholds)) or 'none'}")
-    points = read_ply_points(cloud / _CLOUD if cloud.is_dir() else cloud)
-    model = cloud / _MODEL if cloud.is_dir() and poses is None else poses
-    known = _true_poses(truth, true_poses)
-    used = list(known)
+    cloud, truth = request.cloud, request.truth
+    file = open_ply_points(cloud / _CLOUD if cloud.is_dir() else cloud)
+    model = cloud / _MODEL if cloud.is_dir() and request.poses is None else request.poses
+    known = _true_poses(truth, request.true_poses)
+    used, truth_from_cloud = list(known), None
     if model is not None:
         if not known:
             raise InputError(f"{truth}: a reference cloud knows no cameras: give --true-poses to bring the cloud of "
                              f"{model} into its frame")  # fmt: skip
         truth_from_cloud, used = _alignment(model, known)
-        points = truth_from_cloud.apply(points).astype(np.float32)
-    compared = _cloud_truth(truth, used, min(thresholds))
-    distances = cloud_distances(points, compared.pieces, compared.surface, limit=2 * max(thresholds))
-    scores = score_cloud(distances, compared.surface, thresholds)
-    if picture is not None:
-        _write_picture(picture, points, distances, compared, thresholds)
-    if as_json:
-        print(json.dumps(_as_json(cloud, truth, points, compared, scores), indent=1, ensure_ascii=False))
-    else:
-        _print(points, compared, scores, console)
+    compared = _cloud_truth(truth, used, thresholds[0], known)
+    farthest = _FARTHEST * thresholds[-1]
+    points = PointChunks(file.count, lambda: _in_truth(file, truth_from_cloud))
+    distances = cloud_distances(points, compared.pieces(), compared.surface, limit=farthest)
+    return JudgedCloud(file, truth_from_cloud, compared, distances, thresholds, farthest)
+
+
+def _in_truth(file: PlyPoints, truth_from_cloud: Similarity3 | None) -> Iterator[NDArray[np.float32]]:
+    for chunk in file.chunks():
+        yield chunk if truth_from_cloud is None else truth_from_cloud.apply(chunk).astype(np.float32)
 
 
 def _true_poses(truth: Path, true_poses: Path | None) -> dict[str, Rigid3]:
@@ -108,63 +187,60 @@ def _alignment(model: Path, known: dict[str, Rigid3]) -> tuple[Similarity3, list
     return aligned, list(ours)
 
 
-def _cloud_truth(truth: Path, used: list[str], voxel_size: float) -> _CloudTruth:
+def _cloud_truth(truth: Path, used: list[str], voxel_size: float, known: dict[str, Rigid3]) -> CloudTruth:
+    cameras = np.array([known[name].center for name in used if name in known]).reshape(-1, 3)
     if not truth.is_dir():
         reference = read_ply_points(truth)
         surface = surface_of_cloud(reference, voxel_size=voxel_size)
-        return _CloudTruth([reference], surface, {}, 0, "units of the truth")
-    known = read_truth(truth)
+        return CloudTruth(lambda: PointChunks.of(reference).read(), surface, {}, 0, "units of the truth", cameras)
+    true = read_truth(truth)
     views = {
         name: TrueView(view.cam_from_world, ranges)
-        for name, view in known.views.items()
-        if (ranges := known.range_map(view)) is not None
+        for name, view in true.views.items()
+        if (ranges := true.range_map(view)) is not None
     }
     chosen = {name: views[name] for name in used if name in views}
     if not chosen:
         raise InputError(f"{truth}: holds no range map of a camera that was used ({', '.join(used[:3]) or 'none'})")
-    pieces = [view_points(view) for view in views.values()]
-    unit = "m" if known.metric else "units of the truth"
-    return _CloudTruth(pieces, surface_of_views(list(chosen.values())), chosen, len(views), unit)
+    unit = "m" if true.metric else "units of the truth"
+    surface = surface_of_views(list(chosen.values()))
+    return CloudTruth(lambda: map(view_points, views.values()), surface, chosen, len(views), unit, cameras)
 
 
-def _write_picture(
-    path: Path,
-    points: NDArray[np.float32],
-    distances: CloudDistances,
-    compared: _CloudTruth,
-    thresholds: Sequence[float],
-) -> None:
-    """Draw what was found of the surface in each view that was used, and the cloud from above."""
-    surface = compared.surface
-    maps = {}
-    for idx, (name, view) in enumerate(compared.used.items()):
-        panorama = np.full(view.range.shape, np.nan, np.float32)
-        own = surface.view_idx == idx
-        panorama.reshape(-1)[surface.pixel_idx[own]] = distances.of_surface[own]
-        maps[name] = panorama
-    write_cloud_picture(path, maps, points, distances.of_points, limits=sorted(thresholds))
-
-
-def _as_json(
-    cloud: Path, truth: Path, points: NDArray[np.float32], compared: _CloudTruth, scores: Sequence[CloudScore]
-) -> dict[str, object]:
+def _as_json(request: CloudRequest, judged: JudgedCloud, scores: Sequence[CloudScore]) -> dict[str, object]:
+    compared = judged.compared
+    told = {
+        name: {"median": _finite(median), "p90": _finite(p90)}
+        for name, (median, p90) in judged.distances.quantiles(compared.surface).items()
+    }
     return {
-        "cloud": str(cloud),
-        "truth": str(truth),
+        "cloud": str(request.cloud),
+        "truth": str(request.truth),
         "unit": compared.unit,
-        "points": len(points),
+        "points": judged.file.count,
         "cameras": list(compared.used),
         "views_with_truth": compared.views,
         "scores": [score.as_dict() for score in scores],
+        "distances": told | {"told_up_to": judged.farthest},
     }
 
 
-def _print(points: NDArray[np.float32], compared: _CloudTruth, scores: Sequence[CloudScore], console: Console) -> None:
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+def _print(judged: JudgedCloud, scores: Sequence[CloudScore], console: Console) -> None:
+    compared = judged.compared
     against = (f"the surface that {compared.views} views see; of it to be found is what at least 2 of "
                f"{len(compared.used)} cameras see") if compared.used else "a reference cloud"  # fmt: skip
-    console.print(f"{len(points)} points against {against}", highlight=False, markup=False)
+    console.print(f"{judged.file.count} points against {against}", highlight=False, markup=False)
     table = Table(f"within, {compared.unit}", "accuracy %", "completeness %", "F-score %")
     for score in scores:
         shares = (score.accuracy, score.completeness, score.f_score)
         table.add_row(f"{score.threshold:g}", *(f"{100 * share:.2f}" for share in shares))
     console.print(table)
+    found = judged.distances.quantiles(compared.surface)
+    for label, name in (("points from the surface", "accuracy"), ("surface from the points", "completeness")):
+        median, p90 = (f"{value:.4g}" if np.isfinite(value) else f"over {judged.farthest:g}" for value in found[name])
+        text = f"{label}: median {median}, 90 % within {p90} {compared.unit}"
+        console.print(text, highlight=False, markup=False, soft_wrap=True)

@@ -28,7 +28,7 @@ def write_cloud_picture(
 ) -> None:
     """Write a PNG: for each view how far its surface is from the cloud, and the cloud from above by its own distance.
 
-    A distance has the colour of the smallest limit that it keeps, dark to light, and red beyond the last.
+    Colours are those of `distance_colors`.
 
     Args:
         path: the file to write.
@@ -42,12 +42,12 @@ def write_cloud_picture(
     """
     if not limits:
         raise UsageError("give at least one limit to colour distances by")
-    parts = [_legend(limits)]
+    parts = [distance_legend(limits)]
     for name, panorama in maps.items():
         step = _smallest_step(np.nonzero(~np.isnan(panorama))[0])
-        shown = _colored(panorama[step // 2 :: step, step // 2 :: step], limits)
-        parts += [_caption(f"{name}: true surface, by its distance from the cloud"), _scaled(shown)]
-    parts += [_caption("cloud from above, by its distance from the true surface"),
+        shown = distance_colors(panorama[step // 2 :: step, step // 2 :: step], limits)
+        parts += [caption(f"{name}: true surface, by its distance from the cloud"), _scaled(shown)]
+    parts += [caption("cloud from above, by its distance from the true surface"),
               _top_view(points_in_world, distances, limits)]  # fmt: skip
     encoded, data = cv2.imencode(".png", cv2.cvtColor(np.vstack(parts), cv2.COLOR_RGB2BGR))
     assert encoded
@@ -61,8 +61,11 @@ def _smallest_step(rows: NDArray[np.int64]) -> int:
     return int(np.diff(used).min()) if len(used) > 1 else 1
 
 
-def _colored(distances: NDArray[np.float32], limits: Sequence[float]) -> NDArray[np.uint8]:
-    """Return the colour, (..., 3) uint8, of each distance."""
+def distance_colors(distances: NDArray[np.float32], limits: Sequence[float]) -> NDArray[np.uint8]:
+    """Return the colour, (..., 3) uint8 RGB, of each distance (...,).
+
+    That of the smallest limit that it keeps, dark to light, and red beyond the last; grey where NaN.
+    """
     shares = np.linspace(0, 1, len(limits))[:, None]
     table = np.vstack([(1 - shares) * _NEAREST + shares * _FARTHEST, _BEYOND]).astype(np.uint8)
     colors = table[np.searchsorted(np.asarray(limits, np.float32), distances.clip(0, np.float32(3e38)))
@@ -86,7 +89,7 @@ def _top_view(
     order = np.flatnonzero(inside)[np.argsort(distances[inside], kind="stable")]
     view = np.full((size[1], _WIDTH, 3), _PAPER, np.uint8)
     # z is ahead: it goes up in the picture.
-    view[size[1] - 1 - pixel[order, 1], pixel[order, 0]] = _colored(distances[order], limits)
+    view[size[1] - 1 - pixel[order, 1], pixel[order, 0]] = distance_colors(distances[order], limits)
     return view
 
 
@@ -95,17 +98,19 @@ def _scaled(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST), np.uint8)
 
 
-def _caption(text: str) -> NDArray[np.uint8]:
+def caption(text: str) -> NDArray[np.uint8]:
+    """Return a strip (h, 1024, 3) RGB with a line of text."""
     strip = np.full((_MARGIN, _WIDTH, 3), _PAPER, np.uint8)
     cv2.putText(strip, text, (8, _MARGIN - 9), cv2.FONT_HERSHEY_SIMPLEX, 0.5, _INK, 1, cv2.LINE_AA)
     return strip
 
 
-def _legend(limits: Sequence[float]) -> NDArray[np.uint8]:
+def distance_legend(limits: Sequence[float]) -> NDArray[np.uint8]:
+    """Return a strip (h, 1024, 3) RGB with the colours of `distance_colors` and the distances for which they stand."""
     strip = np.full((_MARGIN, _WIDTH, 3), _PAPER, np.uint8)
     entries = [(limit, f"up to {limit:g}") for limit in limits] + [(np.inf, "farther"), (np.nan, "not counted")]
     for idx, (distance, text) in enumerate(entries):
         left = 8 + idx * (_WIDTH - 8) // len(entries)
-        strip[6 : _MARGIN - 6, left : left + 20] = _colored(np.array([distance], np.float32), limits)[0]
+        strip[6 : _MARGIN - 6, left : left + 20] = distance_colors(np.array([distance], np.float32), limits)[0]
         cv2.putText(strip, text, (left + 26, _MARGIN - 9), cv2.FONT_HERSHEY_SIMPLEX, 0.5, _INK, 1, cv2.LINE_AA)
     return strip

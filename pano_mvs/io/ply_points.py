@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +20,7 @@ _NUMBERS = {
 }  # fmt: skip
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _MARK = b"end_header"
+_LONGEST_HEAD = 1 << 20
 
 
 class _Layout(NamedTuple):
@@ -28,41 +31,97 @@ class _Layout(NamedTuple):
     text: bool
 
 
+@dataclass(frozen=True, eq=False)
+class PlyPoints:
+    """The vertices of a PLY file, which need not fit in memory.
+
+    Attributes:
+        path: the file.
+        count: number of vertices.
+        has_normals: whether they have nx, ny, nz.
+        vertices: (N,) with a field for each property, mapped from the file if that is binary.
+    """
+
+    path: Path
+    count: int
+    has_normals: bool
+    vertices: NDArray[np.void]
+
+    def chunks(self, size: int = 2_000_000) -> Iterator[NDArray[np.float32]]:
+        """Return the places, (K, 3) float32, of up to `size` vertices at a time.
+
+        Raises:
+            InputError: if one is not finite.
+        """
+        for start in range(0, self.count, size):
+            yield self._places(slice(start, start + size))
+
+    def some(self, step: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return the places and normals, both (K, 3) float32, of every step-th vertex; normals not known are 0.
+
+        Raises:
+            InputError: if a place is not finite.
+        """
+        points = self._places(slice(None, None, step))
+        if not self.has_normals:
+            return points, np.zeros_like(points)
+        return points, np.nan_to_num(self._stacked(("nx", "ny", "nz"), slice(None, None, step)))
+
+    def _places(self, part: slice) -> NDArray[np.float32]:
+        points = self._stacked(("x", "y", "z"), part)
+        if not np.isfinite(points).all():
+            raise InputError(f"{self.path}: a point has no finite place. Leave such points out")
+        return points
+
+    def _stacked(self, names: tuple[str, ...], part: slice) -> NDArray[np.float32]:
+        chosen = self.vertices[part]
+        return np.stack([chosen[name].astype(np.float32) for name in names], axis=-1)
+
+
 def read_ply_points(path: Path) -> NDArray[np.float32]:
-    """Return the places of the vertices, (N, 3) float32, in a PLY file of any program.
+    """Return the places of the vertices, (N, 3) float32, in a PLY file of any program, as of `open_ply_points`.
+
+    Raises:
+        InputError: if the file cannot be read, is no such PLY file, or ends early.
+    """
+    return np.concatenate([np.zeros((0, 3), np.float32), *open_ply_points(path).chunks()])
+
+
+def open_ply_points(path: Path) -> PlyPoints:
+    """Return the vertices of a PLY file of any program.
 
     Text or binary, of either byte order, with any other properties and elements, as long as the vertices come first
-    and have no lists.
+    and have no lists. Those of a binary file stay on the disk until they are asked for.
 
     Raises:
         InputError: if the file cannot be read, is no such PLY file, or ends early.
     """
     try:
-        data = path.read_bytes()
+        with path.open("rb") as stream:
+            head, mark, rest = stream.read(_LONGEST_HEAD).partition(_MARK)
+        size = path.stat().st_size
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
-    head, mark, rest = data.partition(_MARK)
     if not mark:
         raise InputError(f"{path}: not a PLY file: it has no end_header line")
     layout = _layout(head.decode("ascii", "replace").splitlines(), path)
-    body = rest[rest.find(b"\n") + 1 :]
-    vertices = _text_vertices(body, layout) if layout.text else _binary_vertices(body, layout)
+    offset = len(head) + len(mark) + rest.find(b"\n") + 1
+    vertices = _text_vertices(path, offset, layout) if layout.text else _binary_vertices(path, offset, size, layout)
     if vertices is None:
         raise InputError(f"{path}: its header promises {layout.points} points, but it holds fewer. Write it again")
-    points = np.stack([vertices[name] for name in "xyz"], axis=-1).astype(np.float32)
-    if not np.isfinite(points).all():
-        raise InputError(f"{path}: a point has no finite place. Leave such points out")
-    return points
+    return PlyPoints(path, layout.points, {"nx", "ny", "nz"} <= set(layout.vertex.names or ()), vertices)
 
 
-def _binary_vertices(body: bytes, layout: _Layout) -> NDArray[np.void] | None:
-    if len(body) < layout.points * layout.vertex.itemsize:
+def _binary_vertices(path: Path, offset: int, size: int, layout: _Layout) -> NDArray[np.void] | None:
+    if size - offset < layout.points * layout.vertex.itemsize:
         return None
-    return np.frombuffer(body, layout.vertex, layout.points)
+    if not layout.points:  # nothing can be mapped
+        return np.zeros(0, layout.vertex)
+    return np.memmap(path, layout.vertex, "r", offset, (layout.points,))
 
 
-def _text_vertices(body: bytes, layout: _Layout) -> NDArray[np.void] | None:
-    lines = body.splitlines()[: layout.points]
+def _text_vertices(path: Path, offset: int, layout: _Layout) -> NDArray[np.void] | None:
+    lines = path.read_bytes()[offset:].splitlines()[: layout.points]
     try:
         rows = [tuple(float(number) for number in line.split()) for line in lines]
         return (

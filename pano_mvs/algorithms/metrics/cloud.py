@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pano_mvs.algorithms.metrics.judged import weighted_quantile
 from pano_mvs.algorithms.metrics.surface import TrueSurface
 from pano_mvs.core.errors import UsageError
 
 DEFAULT_THRESHOLDS = 0.05, 0.02
+CHUNK_POINTS = 2_000_000
+"""How many points of a cloud are in memory, and in a search tree, at a time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +42,7 @@ class CloudScore:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CloudDistances:
-    """Distances between a cloud and the true surface; infinite where larger than any tolerance.
+    """Distances between a cloud and the true surface; infinite where larger than any that had to be told apart.
 
     Attributes:
         of_points: (N,) float32, from each point of the cloud to the nearest sample of the whole true surface.
@@ -49,15 +52,45 @@ class CloudDistances:
     of_points: NDArray[np.float32]
     of_surface: NDArray[np.float32]
 
+    def quantiles(self, surface: TrueSurface, shares: Sequence[float] = (0.5, 0.9)) -> dict[str, tuple[float, ...]]:
+        """Return the quantiles of both: "accuracy" of all points alike, "completeness" by area; NaN of nothing."""
+        alike = np.ones(len(self.of_points))
+        return {
+            "accuracy": tuple(weighted_quantile(self.of_points, alike, share) for share in shares),
+            "completeness": tuple(weighted_quantile(self.of_surface, surface.area, share) for share in shares),
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointChunks:
+    """A cloud that need not fit in memory.
+
+    Attributes:
+        count: number of points.
+        read: begins anew to give the points in chunks (K, 3) float32, in one order.
+    """
+
+    count: int
+    read: Callable[[], Iterable[NDArray[np.float32]]]
+
+    @classmethod
+    def of(cls, points: NDArray[np.float32]) -> PointChunks:
+        """Return the chunks of points (N, 3) that are in memory."""
+        starts = range(0, len(points), CHUNK_POINTS)
+        return cls(len(points), lambda: (points[start : start + CHUNK_POINTS] for start in starts))
+
 
 def cloud_distances(
-    points_in_world: NDArray[np.float32],
+    points_in_world: NDArray[np.float32] | PointChunks,
     true_points: Iterable[NDArray[np.float32]],
     surface: TrueSurface,
     *,
     limit: float,
 ) -> CloudDistances:
     """Return the distances from a cloud to the truth and back.
+
+    Search trees are built of one piece of the truth, or of one chunk of the cloud, at a time: memory is that of one of
+    either, and four bytes for each point and sample.
 
     Args:
         points_in_world: (N, 3) the cloud, in the truth's frame and unit.
@@ -69,11 +102,17 @@ def cloud_distances(
         UsageError: if the limit is not positive.
     """
     if not limit > 0:
-        raise UsageError(f"the largest tolerance must be positive, got {limit}")
-    of_points = np.full(len(points_in_world), np.inf, np.float32)
+        raise UsageError(f"the largest distance to be told must be positive, got {limit}")
+    cloud = points_in_world if isinstance(points_in_world, PointChunks) else PointChunks.of(points_in_world)
+    of_points = np.full(cloud.count, np.inf, np.float32)
     for piece in true_points:
-        np.minimum(of_points, _nearest(points_in_world, piece, limit), out=of_points)
-    return CloudDistances(of_points, _nearest(surface.points_in_world, points_in_world, limit))
+        tree = _tree(piece)
+        for part, chunk in _placed(cloud):
+            np.minimum(of_points[part], _nearest(chunk, tree, limit), out=of_points[part])
+    of_surface = np.full(len(surface.points_in_world), np.inf, np.float32)
+    for _, chunk in _placed(cloud):
+        np.minimum(of_surface, _nearest(surface.points_in_world, _tree(chunk), limit), out=of_surface)
+    return CloudDistances(of_points, of_surface)
 
 
 def score_cloud(
@@ -98,11 +137,25 @@ def score_cloud(
     return tuple(scores)
 
 
-def _nearest(points: NDArray[np.float32], others: NDArray[np.float32], limit: float) -> NDArray[np.float32]:
-    """Return the distance, (N,), from each point to the nearest other; infinite beyond the limit or without others."""
-    if not len(others) or not len(points):
-        return np.full(len(points), np.inf, np.float32)
+def _placed(cloud: PointChunks) -> Iterator[tuple[slice, NDArray[np.float32]]]:
+    """Return the chunks of a cloud, none larger than `CHUNK_POINTS`, with where they lie in it."""
+    start = 0
+    for chunk in cloud.read():
+        for first in range(0, len(chunk), CHUNK_POINTS):
+            part = chunk[first : first + CHUNK_POINTS]
+            yield slice(start, start + len(part)), part
+            start += len(part)
+
+
+def _tree(points: NDArray[np.float32]) -> cKDTree | None:
+    """Return what finds the nearest of some points; None without points."""
     # Split in the middle of the box, not at the median: as good for points on surfaces, and built in half the time.
-    tree = cKDTree(others, balanced_tree=False, compact_nodes=False)
-    distance, _ = tree.query(points, distance_upper_bound=np.nextafter(limit, np.inf))
+    return cKDTree(points, balanced_tree=False, compact_nodes=False) if len(points) else None
+
+
+def _nearest(points: NDArray[np.float32], others: cKDTree | None, limit: float) -> NDArray[np.float32]:
+    """Return the distance, (N,), from each point to the nearest other; infinite beyond the limit or without others."""
+    if others is None or not len(points):
+        return np.full(len(points), np.inf, np.float32)
+    distance, _ = others.query(points, distance_upper_bound=np.nextafter(limit, np.inf))
     return np.asarray(distance, np.float32)

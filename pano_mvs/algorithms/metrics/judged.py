@@ -94,10 +94,15 @@ def aligning_scale(pixels: JudgedPixels, align: Align) -> float:
     return float(np.sum(both.weight * both.found * both.true) / np.sum(both.weight * both.found**2))
 
 
-def weighted_median(values: NDArray[np.float64], weight: NDArray[np.float64]) -> float:
+def weighted_median(values: NDArray[np.floating], weight: NDArray[np.float64]) -> float:
     """Return the smallest value at which half the weight is reached; NaN of nothing."""
+    return weighted_quantile(values, weight, 0.5)
+
+
+def weighted_quantile(values: NDArray[np.floating], weight: NDArray[np.float64], share: float) -> float:
+    """Return the smallest value (N,) at which a share of the weight (N,) is reached; NaN of nothing."""
     if not len(values):
         return float("nan")
     order = np.argsort(values, kind="stable")
     reached = np.cumsum(weight[order])
-    return float(values[order[np.searchsorted(reached, reached[-1] / 2)]])
+    return float(values[order[np.searchsorted(reached, reached[-1] * share)]])

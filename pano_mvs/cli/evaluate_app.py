@@ -1,4 +1,4 @@
-"""The options of `pano-mvs evaluate depth`."""
+"""The commands `pano-mvs evaluate …`."""
 
 from __future__ import annotations
 
@@ -8,11 +8,77 @@ from typing import Annotated, Literal, Optional
 import typer
 from rich.console import Console
 
+from pano_mvs.cli.default_command import RunByDefault
 from pano_mvs.cli.guard import guarded
+
+evaluate_app = typer.Typer(
+    cls=RunByDefault,
+    help="Compare with the truth; `evaluate OUT --truth DIR` is `evaluate run OUT --truth DIR`.",
+    no_args_is_help=True,
+)
 
 _FILES = "Folder of range maps (.tiff, .exr, .npy, .npz, 16-bit .png, paired by path without extension) or .npz file"
 
 
+@evaluate_app.command("run")
+@guarded
+def evaluate_run(
+    out: Annotated[Path, typer.Argument(help="The output folder of a run.")],
+    truth: Annotated[Path, typer.Option("--truth", help="Folder with poses.json and depth.npz, or a part of that.")],
+) -> None:
+    """Compare a run's poses, range maps and cloud with the truth, as far as both are there."""
+    from pano_mvs.cli.evaluate import evaluate_folder
+
+    evaluate_folder(out, truth, Console())
+
+
+@evaluate_app.command("poses")
+@guarded
+def evaluate_model(
+    model: Annotated[Path, typer.Argument(help="COLMAP model, poses.json, transforms.json, CSV, or a run's output.")],
+    truth: Annotated[Path, typer.Option("--truth", help="The true poses, in any of these forms.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Compare the poses in any file with the truth, whatever their frames and units."""
+    from pano_mvs.cli.evaluate_poses import evaluate_poses
+
+    evaluate_poses(model, truth, Console(), as_json=as_json)
+
+
+@evaluate_app.command("cloud")
+@guarded
+def evaluate_points(
+    cloud: Annotated[Path, typer.Argument(help="A PLY file, or the output folder of a run.")],
+    truth: Annotated[Path, typer.Option("--truth", help="Folder with poses.json and depth.npz, or a reference PLY.")],
+    poses: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--poses", help="The poses it was made with; without, a PLY lies in the truth's frame."),
+    ] = None,
+    true_poses: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--true-poses", help="The true poses in the frame of a reference PLY."),
+    ] = None,
+    thresholds: Annotated[
+        list[float], typer.Option("--threshold", help="A tolerance in the truth's unit; may be given repeatedly.")
+    ] = [0.05, 0.02],  # noqa: B006  # typer reads it and never changes it
+    out: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--out", help="Folder for the cloud and the surface coloured by their errors, and pictures."),
+    ] = None,
+    picture: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--picture", help="A PNG to write of where the errors are, in the views and from above."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Compare a cloud with the true surface: accuracy, completeness, F-score."""
+    from pano_mvs.cli.evaluate_cloud import CloudRequest, evaluate_cloud
+
+    request = CloudRequest(cloud, truth, poses, true_poses, tuple(thresholds))
+    evaluate_cloud(request, Console(), out=out, picture=picture, as_json=as_json)
+
+
+@evaluate_app.command("depth")
 @guarded
 def evaluate_ranges(
     source: Annotated[Path, typer.Argument(help=f"The output folder of a run. {_FILES}.")],
