@@ -7,6 +7,7 @@ from pano_mvs.stages.depth import sweep
 from pano_mvs.stages.evaluate import truth
 from pano_mvs.stages.export import ply, previews, ranges
 from pano_mvs.stages.export_colmap import colmap
+from pano_mvs.stages.export_mesh import mesh
 from pano_mvs.stages.features import orb_tangent, sift_tangent, sphorb
 from pano_mvs.stages.filters import (
     bilateral_solver,
@@ -47,6 +48,7 @@ __all__ = [
     "guided",
     "level",
     "median",
+    "mesh",
     "nearest",
     "orb_tangent",
     "patchmatch",

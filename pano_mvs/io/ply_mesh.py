@@ -1,0 +1,80 @@
+"""Meshes as binary PLY files."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import InputError
+
+_VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
+# Our own files count a face's corners in a byte, as most programs write and all read; COLMAP's in four.
+_FACE = np.dtype([("count", "u1"), ("corners", "<i4", (3,))])
+_COLMAP_FACE = np.dtype([("count", "<i4"), ("corners", "<i4", (3,))])
+_FACE_PROPERTIES = {
+    "property list uchar int vertex_indices": _FACE,
+    "property list int int vertex_indices": _COLMAP_FACE,
+}
+
+MeshArrays = tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.int32]]
+"""Vertices (V, 3), their colours (V, 3) RGB, triangles (F, 3)."""
+
+
+def write_ply_mesh(path: Path, mesh: MeshArrays) -> None:
+    """Write a mesh as binary little-endian PLY: x y z red green blue, and triangles as lists of three corners.
+
+    Args:
+        path: the file to write.
+        mesh: vertices (V, 3) float32, colours (V, 3) uint8, triangles (F, 3) int32.
+    """
+    points, colors, triangles = mesh
+    vertices, faces = np.zeros(len(points), _VERTEX), np.zeros(len(triangles), _FACE)
+    for idx, (axis, color) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):
+        vertices[axis], vertices[color] = points[:, idx], colors[:, idx]
+    faces["count"], faces["corners"] = 3, triangles
+    with path.open("wb") as stream:
+        stream.write(_header(len(vertices), len(faces), "property list uchar int vertex_indices"))
+        stream.write(vertices.tobytes())
+        stream.write(faces.tobytes())
+
+
+def read_ply_mesh(path: Path) -> MeshArrays:
+    """Return the mesh in a PLY file of `write_ply_mesh`, or of COLMAP's Poisson solver.
+
+    Raises:
+        InputError: if the file cannot be read, has another layout, or ends early.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
+    head, mark, body = data.partition(b"end_header\n")
+    counts = [int(count) for count in re.findall(rb"^element (?:vertex|face) ([0-9]+)$", head, re.MULTILINE)]
+    layouts = [
+        layout
+        for line, layout in _FACE_PROPERTIES.items()
+        if len(counts) == 2 and head + mark == _header(counts[0], counts[1], line)
+    ]
+    if not layouts:
+        raise InputError(f"{path}: not a PLY mesh of pano-mvs or COLMAP (x y z red green blue, and triangles)")
+    split = counts[0] * _VERTEX.itemsize
+    if len(body) != split + counts[1] * layouts[0].itemsize:
+        raise InputError(f"{path}: its header promises {counts[0]} vertices and {counts[1]} faces, but it holds other "
+                         "numbers. Write it again")  # fmt: skip
+    vertices, faces = np.frombuffer(body[:split], _VERTEX), np.frombuffer(body[split:], layouts[0])
+    if (faces["count"] != 3).any():
+        raise InputError(f"{path}: not all of its faces are triangles")
+    points = np.stack([vertices[name] for name in "xyz"], axis=-1)
+    return points, np.stack([vertices[name] for name in ("red", "green", "blue")], axis=-1), faces["corners"].copy()
+
+
+def _header(vertices: int, faces: int, face_property: str) -> bytes:
+    lines = [
+        "ply", "format binary_little_endian 1.0", f"element vertex {vertices}",
+        *(f"property float {name}" for name in "xyz"), *(f"property uchar {name}" for name in ("red", "green", "blue")),
+        f"element face {faces}", face_property, "end_header", "",
+    ]  # fmt: skip
+    return "\n".join(lines).encode()

@@ -1,0 +1,60 @@
+"""Exports: the scene's surface as a mesh."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import Field
+
+from pano_mvs.algorithms.mesh.poisson import FEWEST_POINTS, poisson_depth, solve_poisson
+from pano_mvs.algorithms.mesh.triangles import Mesh, point_spacings, trimmed_mesh, without_crumbs
+from pano_mvs.api import Context, Files, InputError, One, Params, PointCloud, stage
+from pano_mvs.io.ply import read_ply, write_ply
+from pano_mvs.io.ply_mesh import read_ply_mesh, write_ply_mesh
+from pano_mvs.io.thinning import Selection, select_points
+
+
+class MeshParams(Params):
+    """Settings of export.mesh."""
+
+    depth: int = Field(
+        default=0, ge=0, le=14, description="of the octree: cells are the extent / 2^depth wide; 0: as points lie apart"
+    )
+    point_weight: float = Field(default=1.0, ge=0, description="how much the surface is drawn to the points")
+    trim: float = Field(
+        default=4.0, ge=0, description="cut off what is farther from the points than so many of their spacings; 0: keep"
+    )
+    smallest_part: float = Field(
+        default=0.001, ge=0, le=1, description="loose parts with less than this share of the triangles are left out"
+    )
+    max_points: int = Field(default=1_000_000, ge=0, description="the cloud is thinned evenly to so many; 0: never")
+    min_views: int = Field(default=2, ge=0, le=255, description="points on which fewer views agree are left out")
+    min_confidence: int = Field(default=64, ge=0, le=255, description="points below are left out")
+
+
+@stage("export.mesh", memory="4GB")
+def mesh(cloud: One[PointCloud], params: MeshParams, ctx: Context) -> Files:
+    """The surface through the fused cloud as mesh.ply: coloured triangles, by screened Poisson reconstruction.
+
+    The solver closes everything; what lies away from all points is cut off again. Triangles face the side that was
+    seen. One thread, whatever the run has: with more the result would differ from time to time.
+    """
+    source = ctx.scratch / "points.ply"
+    selection = Selection(params.min_confidence, params.min_views, max_points=params.max_points)
+    write_ply(source, cloud, kept=select_points(cloud, selection, ctx.scratch))
+    points = read_ply(source).points_in_world
+    if len(points) < FEWEST_POINTS:
+        raise InputError(f"{len(points)} of {len(cloud)} points are left for a mesh; {FEWEST_POINTS} are needed. Lower "
+                         "`min_views` or `min_confidence`, or look at why the cloud is empty")  # fmt: skip
+    spacing = float(np.median(point_spacings(points)))
+    depth = params.depth or poisson_depth(points, spacing)
+    solved = Mesh(*read_ply_mesh(solve_poisson(source, ctx.scratch, depth=depth, point_weight=params.point_weight)))
+    if params.trim:
+        solved = trimmed_mesh(solved, points, max_spacings=params.trim)
+    solved = without_crumbs(solved, smallest_share=params.smallest_part)
+    if not len(solved.faces):
+        raise InputError("the mesh has no faces: the points have no common surface. Raise `trim` or `max_points`")
+    ctx.metric("faces", len(solved.faces))
+    ctx.metric("depth", depth)
+    path = ctx.scratch / "mesh.ply"
+    write_ply_mesh(path, (solved.vertices_in_world, solved.colors_rgb, solved.faces))
+    return Files({"mesh.ply": path})
