@@ -18,6 +18,7 @@ from rich.markup import escape
 
 from pano_mvs import __version__
 from pano_mvs.cli.cache_app import cache_app
+from pano_mvs.cli.doctor.command import doctor
 from pano_mvs.cli.evaluate_app import evaluate_app
 from pano_mvs.cli.guard import guarded
 from pano_mvs.cli.options import (
@@ -175,6 +176,7 @@ def report(out: Annotated[Path, typer.Argument(help="The output folder of a run.
 
 
 app.command()(plugins)
+app.command()(doctor)
 
 
 @app.command("inspect")

@@ -1,0 +1,92 @@
+"""`pano-mvs doctor`: look at everything, show it, and say by the exit code whether a run can work."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from pano_mvs.cli.doctor.finding import Finding
+from pano_mvs.cli.guard import guarded
+from pano_mvs.cli.options import CacheOption, OutOption
+
+_COLOURS = {"ok": "green", "note": "cyan", "warning": "yellow", "failed": "red"}
+_EXIT_FAILED = 2
+
+
+@guarded
+def doctor(
+    cache: CacheOption = None,
+    out: OutOption = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Check the installation, the machine and the folders of a run; exit code 2 if a run cannot work."""
+    console = Console()
+    if console.is_terminal and not as_json:
+        with console.status("trying the libraries, a few seconds …"):
+            findings = list(all_findings(cache, out))
+    else:
+        findings = list(all_findings(cache, out))
+    show(findings, console, as_json=as_json)
+    if any(finding.state == "failed" for finding in findings):
+        raise typer.Exit(_EXIT_FAILED)
+
+
+def all_findings(cache: Path | None = None, out: Path | None = None) -> Iterator[Finding]:
+    """Yield all that there is to say.
+
+    Args:
+        cache: folder of the cache; by default where a preset run from here would have it.
+        out: folder of the results; likewise.
+    """
+    import pano_mvs
+    from pano_mvs.cli.doctor.disk import folder_findings
+    from pano_mvs.cli.doctor.machine import kernel_cache_finding, machine_findings
+    from pano_mvs.cli.doctor.packages import package_findings
+    from pano_mvs.cli.doctor.plugins import plugin_findings
+    from pano_mvs.cli.doctor.probes import library_findings
+    from pano_mvs.cli.session import CACHE_VARIABLE, presets_folder
+    from pano_mvs.engine.registry import Registry
+
+    yield from package_findings()
+    yield from library_findings()
+    yield from machine_findings()
+    yield kernel_cache_finding(Path(pano_mvs.__file__).parent)
+    variable = os.environ.get(CACHE_VARIABLE)
+    yield from folder_findings("cache", cache or Path(variable or ".pano-mvs"), "--cache DIR")
+    yield from folder_findings("results", out or Path("out"), "--out DIR")
+    yield from plugin_findings(Registry.installed(), presets_folder())
+
+
+def show(findings: Sequence[Finding], console: Console, *, as_json: bool = False) -> None:
+    """Print what was found: as a table with the remedies below it, or as one JSON object."""
+    failed = [finding for finding in findings if finding.state == "failed"]
+    if as_json:
+        text = {"ok": not failed, "findings": [dataclasses.asdict(finding) for finding in findings]}
+        console.print(json.dumps(text, indent=1, ensure_ascii=False), highlight=False, markup=False, soft_wrap=True)
+        return
+    table = Table("", "what", "", "found")
+    group = ""
+    for finding in findings:
+        if group and finding.group != group:
+            table.add_section()
+        shown = finding.group if finding.group != group else ""
+        group = finding.group
+        state = f"[{_COLOURS[finding.state]}]{finding.state}[/]"
+        table.add_row(shown, escape(finding.what), state, escape(finding.detail))
+    console.print(table)
+    for finding in findings:
+        if finding.remedy:
+            head = f"[{_COLOURS[finding.state]}]{finding.state}:[/] {escape(finding.what)}"
+            console.print(f"{head}: {escape(finding.remedy)}", highlight=False, soft_wrap=True)
+    warned = sum(finding.state == "warning" for finding in findings)
+    verdict = f"{len(failed)} failed: a run cannot work" if failed else "a run can work"
+    console.print(f"{verdict}; {warned} warnings", highlight=False)

@@ -1,0 +1,229 @@
+"""The doctor finds what is wrong, says what to do about it, and tells by its exit code whether a run can work."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+import pytest
+
+import pano_mvs
+from pano_mvs.cli.doctor import command, machine, probes
+from pano_mvs.cli.doctor.disk import folder_findings
+from pano_mvs.cli.doctor.finding import Finding
+from pano_mvs.cli.doctor.machine import kernel_cache_finding, machine_findings
+from pano_mvs.cli.doctor.packages import is_older, package_findings
+from pano_mvs.cli.doctor.plugins import plugin_findings
+from pano_mvs.cli.doctor.probes import Outcome, library_findings, run_probe
+from pano_mvs.cli.session import presets_folder
+from pano_mvs.engine.registry import Registry
+from tests.cli.conftest import Command
+
+NEEDS = [
+    "numba>=0.60",
+    "opencv-python-headless>=4.10",
+    "mkdocs<2,>=1.6; extra == 'docs'",
+    "pillow-heif>=0.18; extra == 'heic'",
+    "colorama; sys_platform == 'win32'",
+]
+
+
+def by_what(findings: Iterable[Finding]) -> dict[str, Finding]:
+    found = list(findings)
+    assert all(finding.remedy for finding in found if finding.state in ("warning", "failed"))
+    assert len({finding.what for finding in found}) == len(found)
+    return {finding.what: finding for finding in found}
+
+
+@pytest.mark.parametrize(
+    ("found", "least", "older"),
+    [
+        ("4.9", "4.10", True),
+        ("4.10.0.84", "4.10", False),
+        ("5.0rc1", "5.0", False),
+        ("2", "2.0.1", True),
+        ("x", "1", True),
+    ],
+)
+def test_versions_compare_by_their_numbers(found: str, least: str, older: bool) -> None:
+    assert is_older(found, least) is older
+
+
+def test_packages_are_held_against_the_metadata() -> None:
+    sound = {"numba": "0.61.2", "opencv-python-headless": "4.11.0.86", "pillow-heif": "1.0"}
+    found = by_what(package_findings(NEEDS, sound.get))
+    assert {finding.state for finding in found.values()} == {"ok"}
+    assert "extra docs" not in found
+    assert "colorama" not in found
+
+    found = by_what(package_findings(NEEDS, {"numba": "0.59.1", "opencv-python": "4.9.0"}.get))
+    assert (found["numba"].state, found["numba"].remedy) == ("failed", "pip install -U 'numba>=0.60'")
+    assert found["opencv-python-headless"].detail == "opencv-python 4.9.0 in its place"
+    assert (found["extra heic"].state, found["extra heic"].remedy) == ("note", "pip install 'pano-mvs[heic]'")
+
+    found = by_what(package_findings(NEEDS, {"opencv-python": "5.0", "opencv-python-headless": "5.0"}.get))
+    assert found["numba"].detail == "is not installed"
+    assert found["OpenCV"].state == "warning"
+    assert "more than once" in found["OpenCV"].detail
+
+
+def test_this_installation_has_what_it_needs() -> None:
+    found = by_what(package_findings())
+    assert "numba" in found
+    assert not [finding for finding in found.values() if finding.state == "failed"]
+
+
+GOOD = {
+    "numba": {"version": "1", "seconds": 1.0, "disabled": False},
+    "pycolmap": {"version": "2", "cuda": False},
+    "cv2": {"version": "3", "missing": [], "video": True, "avif": True},
+    "pyvista": {"version": "4"},
+    "torch": {"version": "5", "devices": ["Card 7, 24 GB"], "built_for": "12.4"},
+}
+
+
+def fake(**answers: object) -> probes.Try:
+    def attempt(code: str) -> Outcome:
+        name = next(name for name in ("numba", "pycolmap", "cv2", "pyvista", "torch") if f"import {name}" in code
+                    or f", {name}" in code)  # fmt: skip
+        answer = answers.get(name, GOOD[name])
+        return Outcome(None, answer) if isinstance(answer, str) else Outcome(answer)
+
+    return attempt
+
+
+def test_libraries_that_work_are_ok() -> None:
+    found = by_what(library_findings(fake(), has_torch_plugin=True))
+    assert {what: finding.state for what, finding in found.items()} == dict.fromkeys(
+        ["numba", "pycolmap", "OpenCV", "PyVista", "torch"], "ok"
+    )
+    assert "Card 7" in found["torch"].detail
+
+
+@pytest.mark.parametrize(
+    ("answers", "what", "state", "text"),
+    [
+        ({"numba": "ImportError: llvmlite"}, "numba", "failed", "llvmlite"),
+        ({"numba": {"version": "1", "seconds": 0.0, "disabled": True}}, "numba", "warning", "unset NUMBA_DISABLE_JIT"),
+        ({"pycolmap": "the process died of signal 6"}, "pycolmap", "failed", "died of signal 6"),
+        ({"cv2": {**GOOD["cv2"], "missing": ["tiff"]}}, "OpenCV", "failed", "lacks tiff"),
+        ({"cv2": {**GOOD["cv2"], "video": False}}, "OpenCV video", "warning", "reads no videos"),
+        ({"cv2": {**GOOD["cv2"], "avif": False}}, "OpenCV AVIF", "note", "reads no AVIF"),
+        ({"pyvista": "gave no answer within 180 s"}, "PyVista", "warning", "libgl1"),
+        ({"torch": {"version": "5", "devices": [], "built_for": None}}, "torch", "note", "built without CUDA"),
+        ({"torch": "ImportError: libcuda"}, "torch", "warning", "backend: numba"),
+    ],
+)
+def test_a_library_that_does_not_work_is_told_with_the_remedy(
+    answers: dict[str, object], what: str, state: str, text: str
+) -> None:
+    finding = by_what(library_findings(fake(**answers), has_torch_plugin=True))[what]
+    assert finding.state == state
+    assert text in f"{finding.detail} {finding.remedy}"
+
+
+def test_a_probe_that_dies_or_hangs_takes_nothing_along() -> None:
+    assert run_probe("print('noise'); print('{\"a\": 1}')").said == {"a": 1}
+    assert run_probe("import os; os.abort()").why == "the process died of signal 6"
+    assert run_probe("raise ValueError('broken')").why == "ValueError: broken"
+    assert run_probe("import time; time.sleep(60)", timeout_s=0.3).why == "gave no answer within 0 s"
+
+
+def test_the_machine_and_slips_in_the_environment() -> None:
+    found = by_what(machine_findings({}, threads=8, processors=8, memory_bytes=16 * 10**9))
+    assert {finding.state for finding in found.values()} == {"ok"}
+    found = by_what(
+        machine_findings(
+            {"NUMBA_NUM_THREADS": "2", "OMP_NUM_THREADS": "8", "PANO_MVS_PLUGIN": "/x", "PANO_MVS_CACHE": "/y"},
+            threads=8,
+            processors=64,
+            memory_bytes=10**9,
+        )
+    )
+    assert found["processors"].state == "note"
+    assert found["NUMBA_NUM_THREADS"].remedy == "unset NUMBA_NUM_THREADS"
+    assert "OMP_NUM_THREADS" not in found
+    assert found["memory"].state == "warning"
+    assert found["PANO_MVS_PLUGIN"].remedy == "did you mean PANO_MVS_PLUGINS?"
+    assert "PANO_MVS_CACHE" not in found
+
+
+def test_every_variable_that_the_program_reads_is_known() -> None:
+    import re
+
+    package = Path(pano_mvs.__file__).parent
+    read = {name for path in package.rglob("*.py") if "doctor" not in path.parts
+            for name in re.findall(r'"(PANO_MVS_[A-Z_]+)"', path.read_text(encoding="utf-8"))}  # fmt: skip
+    assert read <= set(machine.KNOWN_VARIABLES)
+
+
+def test_a_folder_for_kernels_that_cannot_be_written(tmp_path: Path) -> None:
+    package = Path(pano_mvs.__file__).parent
+    assert kernel_cache_finding(package, {"NUMBA_CACHE_DIR": str(tmp_path / "new")}).state == "ok"
+    (tmp_path / "file").write_text("x")
+    finding = kernel_cache_finding(package, {"NUMBA_CACHE_DIR": str(tmp_path / "file")})
+    assert finding.state == "warning"
+    assert "NUMBA_CACHE_DIR" in finding.remedy
+
+
+def test_folders_of_a_run(tmp_path: Path) -> None:
+    deep = tmp_path / "not" / "yet"
+    (found,) = folder_findings("cache", deep, "--cache DIR", free_bytes_of=lambda path: 10**11)
+    assert (found.state, "100.0 GB free" in found.detail) == ("ok", True)
+    assert not deep.exists()
+    assert not list(tmp_path.iterdir())
+    (found,) = folder_findings("cache", deep, "--cache DIR", free_bytes_of=lambda path: 10**9)
+    assert (found.state, "--cache DIR" in found.remedy) == ("warning", True)
+    (tmp_path / "file").write_text("x")
+    (found,) = folder_findings("cache", tmp_path / "file" / "below", "--cache DIR")
+    assert found.state == "failed"
+    assert "is no folder" in found.detail
+    if os.geteuid() != 0:  # root may write anywhere
+        tmp_path.chmod(0o500)
+        (found,) = folder_findings("results", tmp_path / "out", "--out DIR")
+        assert (found.state, "--out DIR" in found.remedy) == ("failed", True)
+
+
+def test_plugins_that_fail_clash_or_are_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    (folder / "bad.py").write_text('from pano_mvs.api import stage\n1 / 0\n@stage("filters.mine")\ndef f(): ...\n')
+    environment = {"PANO_MVS_PLUGINS": os.pathsep.join([str(folder), str(tmp_path / "gone")])}
+    monkeypatch.setattr("pano_mvs.engine.registry.user_plugin_folders", lambda: [folder])
+    found = by_what(plugin_findings(Registry.installed(), presets_folder(), environment))
+    bad = found[str(folder / "bad.py")]
+    assert "ZeroDivisionError" in bad.detail
+    assert "pano-mvs stage show filters.mine" in bad.remedy
+    assert found["PANO_MVS_PLUGINS"].detail == f"{tmp_path / 'gone'} is no folder"
+    assert found["stages"].state == found["presets"].state == "ok"
+    nothing = by_what(plugin_findings(Registry(), tmp_path, {}))
+    assert nothing["stages"].state == nothing["presets"].state == "failed"
+
+
+def test_the_command_shows_the_remedies_and_ends_with_2_if_a_run_cannot_work(
+    pano_mvs: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answers: dict[str, object] = {"pyvista": "no libGL.so.1"}
+    monkeypatch.setattr(probes, "run_probe", lambda code: fake(**answers)(code))
+    result = pano_mvs("doctor", "--cache", "c", "--out", "o")
+    assert result.code == 0, result.text
+    assert "a run can work; 1 warnings" in result.flat
+    assert "warning: PyVista: install the system's OpenGL libraries" in result.flat
+    answers["pycolmap"] = "the process died of signal 11"
+    result = pano_mvs("doctor", "--json")
+    assert result.code == 2
+    said = json.loads(result.text)
+    assert said["ok"] is False
+    assert {"group": "libraries", "what": "pycolmap", "state": "failed", "detail": "the process died of signal 11",
+            "remedy": "pip install --force-reinstall --no-deps pycolmap"} in said["findings"]  # fmt: skip
+    assert not Path("c").exists()
+
+
+@pytest.mark.slow
+def test_the_real_libraries_work_here() -> None:
+    found = {finding.what: finding.state for finding in command.all_findings()}
+    assert found["numba"] == found["pycolmap"] == found["OpenCV"] == "ok"
+    assert sys.version_info >= (3, 11)
