@@ -1,0 +1,131 @@
+"""What the documentation tells people to type exists: commands and their options, workflows and their settings."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import textwrap
+from contextlib import suppress
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from pano_mvs.cli.app import app
+
+ROOT = Path(__file__).parent.parent
+PAGES = sorted([*ROOT.glob("docs/**/*.md"), ROOT / "README.md"])
+FENCED = re.compile(r"^( *)```(\w+)\n(.*?)^ *```$", re.DOTALL | re.MULTILINE)
+# What the workflows of the pages read; empty files will do, since nothing is run.
+FOLDERS = (
+    "photos/lobby",
+    "photos/flat",
+    "photos/site",
+    "masks",
+    "out/site/colmap/sparse/0",
+    "colmap/sparse/0",
+    "truth",
+)
+
+
+def blocks(language: str) -> list[Any]:
+    """Return the fenced blocks of all pages, each with the place where it stands."""
+    found = []
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        for match in FENCED.finditer(text):
+            if match[2] == language and not text[: match.start()].endswith("<!-- variants -->\n"):
+                place = f"{page.relative_to(ROOT)}:{text[: match.start()].count(chr(10)) + 1}"
+                found.append(pytest.param(page, textwrap.dedent(match[3]), id=place))
+    return found
+
+
+def commands(script: str) -> list[list[str]]:
+    """Return the words after `pano-mvs` of each command in a script."""
+    lines = re.sub(r"\\\n", " ", script).splitlines()
+    parts = [part for line in lines for part in re.split(r"&&|\||;", re.sub(r"(^|\s)#.*", "", line))]
+    words = [shlex.split(part) for part in parts]
+    return [found[1:] for found in words if found and Path(found[0]).name == "pano-mvs"]
+
+
+def parse(arguments: list[str]) -> None:
+    """Parse a command line as the program does, down to the command that it calls, without calling it."""
+    command: Any = typer.main.get_command(app)
+    context = command.make_context("pano-mvs", list(arguments))
+    while getattr(command, "commands", None):
+        name, command, arguments = command.resolve_command(context, [*context._protected_args, *context.args])
+        context = command.make_context(name, arguments, parent=context)
+
+
+def inline_commands() -> list[Any]:
+    """Return what stands in running text as code and begins with the program's name, with the page."""
+    found = []
+    for page in PAGES:
+        prose = FENCED.sub("", page.read_text(encoding="utf-8")).replace("\n", " ")
+        spans = sorted(set(re.findall(r"`(pano-mvs [a-z][^`]*)`", prose)))
+        found += [pytest.param(page, span, id=f"{page.relative_to(ROOT)}: {span}") for span in spans]
+    return found
+
+
+@pytest.mark.parametrize(("page", "script"), blocks("bash"))
+def test_every_command_can_be_parsed(page: Path, script: str) -> None:
+    for arguments in commands(script):
+        with suppress(typer.Exit):  # `--help`
+            parse(arguments)
+
+
+@pytest.mark.parametrize(("page", "mention"), inline_commands())
+def test_every_command_in_running_text_exists(page: Path, mention: str) -> None:
+    for arguments in commands(mention):
+        try:
+            parse(arguments)
+        except Exception as error:
+            if "Missing" not in type(error).__name__:  # named without its arguments
+                raise
+
+
+@pytest.mark.parametrize("wrong", ["run quickstart --imags photos", "run", "evaluate nothing", "rnu quickstart"])
+def test_a_command_that_there_is_not_is_noticed(wrong: str) -> None:
+    with pytest.raises(Exception, match=r"[Nn]o such|[Mm]issing"):
+        parse(wrong.split())
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with what the pages' workflows read."""
+    for name in FOLDERS:
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "my.yaml").write_text("pano_mvs: 1\nextends: quickstart\n")
+    for page in PAGES:
+        for name, text in re.findall(r"Save this as `([^`/]+)`.*?```\w+\n(.*?)```", page.read_text(), re.DOTALL):
+            (tmp_path / name).write_text(text)
+    return tmp_path
+
+
+def as_workflow(text: str) -> str:
+    """Return a block as a workflow: a piece of one is laid over quickstart."""
+    if re.search(r"^(pano_mvs|extends):", text, re.MULTILINE):
+        return text
+    return f"pano_mvs: 1\nextends: quickstart\nstages:\n{textwrap.indent(textwrap.dedent(text), '  ')}"
+
+
+@pytest.mark.parametrize(("page", "text"), blocks("yaml"))
+def test_every_workflow_is_sound(folder: Path, page: Path, text: str) -> None:
+    (folder / "mine.yaml").write_text(as_workflow(text))
+    result = CliRunner().invoke(app, ["check", str(folder / "mine.yaml")])
+    assert result.exit_code == 0, result.output
+
+
+@pytest.mark.parametrize(("page", "script"), blocks("bash"))
+def test_every_setting_of_a_command_exists(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, page: Path, script: str
+) -> None:
+    monkeypatch.chdir(folder)
+    for verb, *arguments in commands(script):
+        if verb in ("run", "plan", "check") and not arguments[0].startswith("workflows/"):
+            changes = [word for name, value in pairwise(arguments) if name == "--set" for word in (name, value)]
+            result = CliRunner().invoke(app, ["check", arguments[0], *changes])
+            assert result.exit_code == 0, result.output
