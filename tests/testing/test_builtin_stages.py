@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from pano_mvs.engine.registry import Registry
+from pano_mvs.io.nerfstudio_frames import NerfstudioFrame, NerfstudioFrames
 from pano_mvs.testing.conformance import Law, stage_laws
 from tests.io.videos import tiny_video
 
@@ -13,6 +14,12 @@ SETTINGS = {
     "poses.extend": {"path": "{capture}/truth/poses.json"},
     "poses.scale": {"factor": 2.0},
     "source.video": {"path": str(tiny_video())},
+}
+FRAME = NerfstudioFrame(
+    "equirectangular", "images/{name}", "", "", (64, 32), (32.0, 32.0), ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+)
+INPUTS = {
+    "export.nerfstudio": {"frames": {f"{idx:03d}.png": NerfstudioFrames({}, frames=(FRAME,)) for idx in range(4)}},
 }
 SIZES_HW = {"poses.colmap_sift": (96, 192)}
 
@@ -24,7 +31,9 @@ def laws() -> list[Law]:
     return [
         law
         for name in builtin
-        for law in stage_laws(stages[name], settings=SETTINGS.get(name), size_hw=SIZES_HW.get(name, (32, 64)))
+        for law in stage_laws(
+            stages[name], settings=SETTINGS.get(name), inputs=INPUTS.get(name), size_hw=SIZES_HW.get(name, (32, 64))
+        )
     ]
 
 

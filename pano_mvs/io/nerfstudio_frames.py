@@ -1,0 +1,90 @@
+"""What nerfstudio gets of one panorama: frames without poses, and their files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, ClassVar, Literal, Self
+
+from pano_mvs.scene import Axis, FilePart, Files
+from pano_mvs.scene.record import Parts
+
+Variant = Literal["equirectangular", "faces"]
+
+
+@dataclass(frozen=True, slots=True)
+class NerfstudioFrame:
+    """One frame, but for the pose of its panorama.
+
+    Attributes:
+        variant: of which transforms.json it is.
+        image: path beside that file, likewise `mask` (empty: nothing is masked) and `depth` (empty: there is none);
+            `{name}` in them stands for the panorama's name.
+        mask: see `image`.
+        depth: see `image`.
+        size_wh: (width, height) in pixels.
+        focal_xy: fl_x, fl_y in pixels; the principal point is the middle.
+        frame_from_cam: rotation, three rows, from the panorama's camera frame (y down, z forward).
+    """
+
+    variant: Variant
+    image: str
+    mask: str
+    depth: str
+    size_wh: tuple[int, int]
+    focal_xy: tuple[float, float]
+    frame_from_cam: tuple[tuple[float, ...], ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the frame as a JSON object."""
+        return asdict(self)
+
+    @staticmethod
+    def from_json(value: Mapping[str, Any]) -> NerfstudioFrame:
+        """Return the frame that `to_json` gave."""
+        rows = tuple(tuple(map(float, row)) for row in value["frame_from_cam"])
+        size, focal = tuple(value["size_wh"]), tuple(value["focal_xy"])
+        return NerfstudioFrame(**{**value, "size_wh": size, "focal_xy": focal, "frame_from_cam": rows})
+
+
+@dataclass(frozen=True, eq=False)
+class NerfstudioFrames(Files):
+    """The frames that nerfstudio gets of one panorama, with their files.
+
+    Attributes:
+        pictures: targets of pictures that are delivered as they were given, in the source's files.
+        frames: what transforms.json says of each, but for the pose.
+        depth_unit: scene units of one step of the depths.
+    """
+
+    axis: ClassVar[Axis | None] = Axis.IMAGE
+
+    pictures: Mapping[str, FilePart] = field(default_factory=dict)
+    frames: tuple[NerfstudioFrame, ...] = ()
+    depth_unit: float = 0.001
+
+    def to_parts(self) -> Parts:
+        """Return the files under numbers, their targets and the frames as JSON."""
+        parts = {target: FilePart(path) for target, path in self.files.items()} | dict(self.pictures)
+        targets = sorted(parts)
+        meta = {
+            "targets": targets,
+            "pictures": sorted(self.pictures),
+            "frames": [frame.to_json() for frame in self.frames],
+            "depth_unit": self.depth_unit,
+        }
+        return {"meta": meta, **{str(number): parts[target] for number, target in enumerate(targets)}}
+
+    @classmethod
+    def from_parts(cls, parts: Parts) -> Self:
+        """Return the frames that `to_parts` gave."""
+        meta = parts["meta"]
+        assert isinstance(meta, dict)
+        files = {target: parts[str(number)] for number, target in enumerate(meta["targets"])}
+        given = {target: part for target, part in files.items() if isinstance(part, FilePart)}
+        return cls(
+            {target: part.path for target, part in given.items() if target not in meta["pictures"]},
+            {target: given[target] for target in meta["pictures"]},
+            tuple(NerfstudioFrame.from_json(frame) for frame in meta["frames"]),
+            float(meta["depth_unit"]),
+        )

@@ -1,0 +1,326 @@
+"""transforms.json with its pictures, masks and depths, read as nerfstudio's data parser and cameras are documented."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from pano_mvs.api import Context, FilePart, InputError, Panorama, PointCloud, Poses, RangeMap
+from pano_mvs.engine.publish import Publisher
+from pano_mvs.engine.store import Store
+from pano_mvs.io.nerfstudio_frames import NerfstudioFrames
+from pano_mvs.io.ply import read_ply
+from pano_mvs.io.pose_files import read_poses
+from pano_mvs.stages.export_nerfstudio import (
+    NerfstudioFramesParams,
+    NerfstudioParams,
+    nerfstudio,
+    nerfstudio_frames,
+)
+from pano_mvs.testing.room import default_room, range_along
+from pano_mvs.testing.tiny_capture import TinyCapture, Variant, tiny_capture
+
+HEIGHT, WIDTH = 192, 384
+PLAIN = Variant((HEIGHT, WIDTH))
+MASKED = Variant((64, 128), masked=True)
+
+
+def exported(
+    capture: TinyCapture,
+    folder: Path,
+    *,
+    images: dict[str, Panorama] | None = None,
+    settings: dict[str, Any] | None = None,
+    cloud: PointCloud | None = None,
+    seed_points: int = 100,
+) -> Path:
+    """Write both variants with true ranges everywhere, as a run would, and return the folder nerfstudio/."""
+    images = images or capture.images
+    store = Store(folder / "cache")
+    publisher = Publisher(folder / "out", store)
+    publisher.name_items(capture.names)
+    frames = {}
+    for idx, name in enumerate(capture.names):
+        scratch = folder / f"scratch_{idx}"
+        scratch.mkdir()
+        everywhere = RangeMap(capture.ranges[idx], np.full(capture.ranges[idx].shape, 200, np.uint8))
+        params = NerfstudioFramesParams.model_validate(settings or {})
+        made = nerfstudio_frames(images[name], everywhere, params, Context(np.random.default_rng(0), scratch))
+        ref = store.put_value(made)
+        publisher.publish("frames", name, ref)
+        frames[name] = store.load(ref, NerfstudioFrames)
+    scratch = folder / "scratch"
+    scratch.mkdir()
+    poses = capture.wholes[Poses]
+    assert isinstance(poses, Poses)
+    params = NerfstudioParams(seed_points=seed_points)
+    files = nerfstudio(frames, poses, cloud, params, Context(np.random.default_rng(0), scratch))
+    publisher.publish("nerfstudio", "", store.put_value(files))
+    return folder / "out" / "nerfstudio"
+
+
+def documented_rays(document: dict[str, Any], frame: dict[str, Any], size_wh: tuple[int, int]) -> np.ndarray:
+    """Return world rays (h, w, 3) of the pixels of a depth picture, by the camera that the file describes.
+
+    Nerfstudio's cameras: image coordinates of pixel centres are x + 0.5, y + 0.5; OpenGL's axes; a PINHOLE ray is
+    (x, y, −1), whose depth is z; an EQUIRECTANGULAR one has θ from −π to π and φ from 0 at the zenith, length 1.
+    """
+    said = document | frame
+    scale_x, scale_y = said["w"] / size_wh[0], said["h"] / size_wh[1]
+    x = ((np.arange(size_wh[0]) + 0.5) * scale_x - said["cx"]) / said["fl_x"]
+    y = -((np.arange(size_wh[1]) + 0.5) * scale_y - said["cy"]) / said["fl_y"]
+    x, y = np.meshgrid(x, y)
+    if said["camera_model"] == "EQUIRECTANGULAR":
+        theta, phi = -np.pi * x, np.pi * (0.5 - y)
+        rays = np.stack([-np.sin(theta) * np.sin(phi), np.cos(phi), -np.cos(theta) * np.sin(phi)], axis=-1)
+    else:
+        assert said["camera_model"] == "PINHOLE"
+        rays = np.stack([x, y, -np.ones_like(x)], axis=-1)
+    return rays @ np.array(frame["transform_matrix"])[:3, :3].T
+
+
+def world_points(folder: Path, document: dict[str, Any], frame: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points of a frame's known depths, (N, 3), and which pixels they are of, (h, w)."""
+    steps = cv2.imread(str(folder / frame["depth_file_path"]), cv2.IMREAD_ANYDEPTH)
+    assert steps.dtype == np.uint16
+    depths = steps * document["depth_unit_scale_factor"]
+    rays = documented_rays(document, frame, steps.shape[::-1])
+    origin = np.array(frame["transform_matrix"])[:3, 3]
+    return (origin + rays * depths[..., None])[steps > 0], steps > 0
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return exported(tiny_capture(PLAIN), tmp_path_factory.mktemp("plain"))
+
+
+@pytest.fixture(scope="module")
+def masked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Some of the panoramas are masked, some are not."""
+    capture, folder = tiny_capture(MASKED), tmp_path_factory.mktemp("masked")
+    images = dict(capture.images)
+    images["001.png"] = replace(images["001.png"], mask_file=None)
+    return exported(capture, folder, images=images)
+
+
+@pytest.mark.parametrize("variant", ["equirectangular", "faces"])
+def test_depths_are_on_the_walls(plain: Path, variant: str) -> None:
+    """Each unprojected pixel lies on the room: as far along its ray as the room is, whatever the camera."""
+    folder = plain / variant
+    document = json.loads((folder / "transforms.json").read_text())
+    capture = tiny_capture(PLAIN)
+    assert len(document["frames"]) == len(capture.names) * (1 if variant == "equirectangular" else 6)
+    errors = []
+    for frame in document["frames"]:
+        points, known = world_points(folder, document, frame)
+        assert known.mean() > 0.98
+        origin = np.array(frame["transform_matrix"])[:3, 3]
+        length = np.linalg.norm(points - origin, axis=1)
+        truth = range_along(default_room(), origin, (points - origin) / length[:, None])
+        errors.append(np.abs(length - truth))
+    found = np.concatenate(errors)
+    if variant == "equirectangular":
+        assert found.max() < 0.00051  # half a step
+    else:
+        assert np.median(found) < 0.001  # interpolated between range pixels 0.9° apart …
+        assert np.quantile(found, 0.9) < 0.02  # … but at the edges of the furniture
+
+
+def test_both_variants_are_one_cloud(plain: Path) -> None:
+    clouds = []
+    for variant in ("equirectangular", "faces"):
+        document = json.loads((plain / variant / "transforms.json").read_text())
+        clouds.append(np.concatenate([world_points(plain / variant, document, f)[0] for f in document["frames"]]))
+    distances, _ = cKDTree(clouds[0]).query(clouds[1])
+    assert np.median(distances) < 0.02  # pixels of 0.9° at 2 to 3 units
+
+
+def test_poses_are_read_back_by_our_own_reader(plain: Path) -> None:
+    capture = tiny_capture(PLAIN)
+    poses = read_poses(plain / "equirectangular")
+    assert list(poses.names) == [f"images/{name}" for name in capture.names]
+    for idx, pose in enumerate(capture.poses):
+        np.testing.assert_allclose(poses.rotations[idx], pose.rotation, atol=1e-12)
+        np.testing.assert_allclose(poses.translations[idx], pose.translation, atol=1e-12)
+
+
+def test_faces_look_where_their_cameras_say(plain: Path) -> None:
+    """A colour of a face is that of the panorama along the ray that the file describes."""
+    capture = tiny_capture(PLAIN)
+    document = json.loads((plain / "faces" / "transforms.json").read_text())
+    differences = []
+    for frame in document["frames"]:
+        name = Path(frame["file_path"]).name.split(".png.")[0] + ".png"
+        picture = cv2.imread(str(plain / "faces" / frame["file_path"]))[..., ::-1].astype(int)
+        assert picture.shape[1::-1] == (document["w"], document["h"])
+        rays = documented_rays(document, frame, picture.shape[1::-1])
+        pose = capture.poses[capture.names.index(name)]
+        in_cam = rays @ pose.rotation.T
+        column = ((np.arctan2(in_cam[..., 0], in_cam[..., 2]) / (2 * np.pi) + 0.5) * WIDTH).astype(int) % WIDTH
+        row = (0.5 + np.arctan2(in_cam[..., 1], np.hypot(in_cam[..., 0], in_cam[..., 2])) / np.pi) * HEIGHT
+        seen = capture.pictures[capture.names.index(name)][np.minimum(row.astype(int), HEIGHT - 1), column]
+        differences.append(np.abs(picture - seen).mean(axis=-1))
+    assert np.median(differences) < 8  # a wrong sign or half a turn gives 40 and more
+
+
+def test_the_file_says_what_nerfstudio_looks_for(plain: Path) -> None:
+    for variant, model in (("equirectangular", "EQUIRECTANGULAR"), ("faces", "PINHOLE")):
+        document = json.loads((plain / variant / "transforms.json").read_text())
+        assert document["camera_model"] == model
+        assert document["applied_transform"] == [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
+        assert document["depth_unit_scale_factor"] == 0.001
+        assert (document["cx"], document["cy"]) == (document["w"] / 2, document["h"] / 2)
+        assert not any("mask_path" in frame for frame in document["frames"])
+        assert not (plain / variant / "masks").exists()
+        for frame in document["frames"]:
+            assert (plain / variant / frame["file_path"]).is_file()
+    document = json.loads((plain / "equirectangular" / "transforms.json").read_text())
+    assert (document["w"], document["h"], document["fl_x"], document["fl_y"]) == (WIDTH, HEIGHT, WIDTH / 2, HEIGHT)
+
+
+def test_seed_points_are_in_the_world_of_the_cameras(plain: Path) -> None:
+    """Without a cloud the sparse points are taken, which lie on the walls."""
+    for variant in ("equirectangular", "faces"):
+        document = json.loads((plain / variant / "transforms.json").read_text())
+        seed = read_ply(plain / variant / document["ply_file_path"])
+        assert 85 <= len(seed) <= 100
+        sparse = tiny_capture(PLAIN).points_in_world
+        assert cKDTree(sparse).query(seed.points_in_world)[0].max() < 1e-5
+
+
+def test_a_picture_is_delivered_as_it_is_and_not_kept_twice(plain: Path) -> None:
+    for name in tiny_capture(PLAIN).names:
+        given = tiny_capture(PLAIN).folder / "images" / name
+        assert (plain / "equirectangular" / "images" / name).read_bytes() == given.read_bytes()
+        cached = [path for path in (plain.parents[1] / "cache" / "blobs").rglob("*.png")
+                  if path.read_bytes() == given.read_bytes()]  # fmt: skip
+        assert not cached
+
+
+@pytest.mark.parametrize("variant", ["equirectangular", "faces"])
+def test_no_depth_comes_from_a_masked_pixel(masked: Path, variant: str) -> None:
+    """Every frame has a mask, though one panorama has none of its own; pictures show nothing that is masked."""
+    capture = tiny_capture(MASKED)
+    document = json.loads((masked / variant / "transforms.json").read_text())
+    hidden = 0
+    for frame in document["frames"]:
+        mask = cv2.imread(str(masked / variant / frame["mask_path"]), cv2.IMREAD_UNCHANGED)
+        steps = cv2.imread(str(masked / variant / frame["depth_file_path"]), cv2.IMREAD_UNCHANGED)
+        picture = cv2.imread(str(masked / variant / frame["file_path"]))
+        assert mask.shape == steps.shape == picture.shape[:2]
+        assert set(np.unique(mask)) <= {0, 255}
+        assert not steps[mask == 0].any()
+        hidden += int((mask == 0).sum())
+        if "001" in frame["file_path"]:
+            assert variant == "faces" or frame["file_path"] == "images/001.png"  # nothing to paint over
+            assert (mask == 255).all()
+            assert frame["mask_path"].startswith("masks/none_")
+        elif variant == "equirectangular":
+            name = Path(frame["file_path"]).stem
+            np.testing.assert_array_equal(mask > 0, capture.images[name].load_mask())
+            shown = picture[..., ::-1].astype(int) - capture.images[name].load()
+            assert np.abs(shown).mean() < 4  # JPEG of what is painted over
+    assert hidden > 1000
+
+
+def test_nothing_unprojects_to_where_only_masked_pixels_look(masked: Path) -> None:
+    """Faces too: no depth pixel's ray falls into a masked pixel of its panorama."""
+    capture = tiny_capture(MASKED)
+    document = json.loads((masked / "faces" / "transforms.json").read_text())
+    for frame in document["frames"]:
+        name = Path(frame["file_path"]).name.split(".png.")[0] + ".png"
+        if name == "001.png":
+            continue
+        points, _ = world_points(masked / "faces", document, frame)
+        in_cam = capture.poses[capture.names.index(name)].apply(points)
+        column = ((np.arctan2(in_cam[:, 0], in_cam[:, 2]) / (2 * np.pi) + 0.5) * 128).astype(int) % 128
+        row = ((0.5 + np.arctan2(in_cam[:, 1], np.hypot(in_cam[:, 0], in_cam[:, 2])) / np.pi) * 64).astype(int)
+        assert capture.images[name].load_mask()[np.minimum(row, 63), column].all()
+
+
+def test_cropped_and_scaled_panoramas_are_written_whole(tmp_path: Path) -> None:
+    capture = tiny_capture(Variant((64, 128), cropped=True))
+    images = dict(capture.images)
+    images["001.png"] = replace(tiny_capture(PLAIN).images["001.png"], size_hw=(32, 64))
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    for image, size_hw in ((images["000.png"], (64, 128)), (images["001.png"], (32, 64))):
+        params = NerfstudioFramesParams(variants=("equirectangular",), image_format="png")
+        made = nerfstudio_frames(image, None, params, Context(np.random.default_rng(0), scratch))
+        assert not made.pictures
+        path = made.files["nerfstudio/equirectangular/images/{name}.png"]
+        picture = cv2.imread(str(path))[..., ::-1]
+        assert picture.shape[:2] == size_hw
+        np.testing.assert_array_equal(picture, image.load())
+        assert made.frames[0].size_wh == size_hw[::-1]
+        assert not made.frames[0].depth
+        assert bool(made.frames[0].mask) == (image is images["000.png"])
+
+
+def test_captures_of_two_sizes_say_the_intrinsics_of_each(tmp_path: Path) -> None:
+    folder = exported(tiny_capture(Variant((64, 128), mixed=True)), tmp_path)
+    for variant in ("equirectangular", "faces"):
+        document = json.loads((folder / variant / "transforms.json").read_text())
+        assert "fl_x" not in document
+        widths = {frame["w"] for frame in document["frames"]}
+        assert len(widths) == 2
+        for frame in document["frames"][:3]:
+            points, known = world_points(folder / variant, document, frame)
+            assert len(points) == known.sum() > 100
+
+
+def test_ranges_beyond_16_bits_are_unknown_and_told(tmp_path: Path) -> None:
+    image = tiny_capture(PLAIN).images["000.png"]
+    far = np.full((HEIGHT, WIDTH), 70.0, np.float32)
+    far[:96] = 2
+    doubtful = np.full((HEIGHT, WIDTH), 200, np.uint8)
+    doubtful[:48] = 40
+    ctx = Context(np.random.default_rng(0), tmp_path)
+    params = NerfstudioFramesParams(variants=("equirectangular",))
+    made = nerfstudio_frames(image, RangeMap(far, doubtful), params, ctx)
+    steps = cv2.imread(str(made.files["nerfstudio/equirectangular/depths/{name}.png"]), cv2.IMREAD_UNCHANGED)
+    assert np.unique(steps[:48]).tolist() == np.unique(steps[96:]).tolist() == [0]
+    assert np.unique(steps[48:96]).tolist() == [2000]
+    assert ctx.metrics["beyond_depth"] == pytest.approx(2 / 3)
+    assert "beyond the 65.535 scene units" in ctx.notes[0]
+    assert "a larger depth_unit" in ctx.notes[0]
+
+
+def test_panoramas_without_frames_are_told_and_none_at_all_is_refused(tmp_path: Path) -> None:
+    capture = tiny_capture(PLAIN)
+    poses = capture.wholes[Poses]
+    assert isinstance(poses, Poses)
+    (tmp_path / "a").mkdir()
+    params = NerfstudioFramesParams(variants=("faces",), size_px=32)
+    made = nerfstudio_frames(capture.images["002.png"], None, params, Context(np.random.default_rng(0), tmp_path / "a"))
+    ctx = Context(np.random.default_rng(0), tmp_path)
+    files = nerfstudio({"002.png": made}, poses, None, NerfstudioParams(seed_points=0), ctx).files
+    assert set(files) == {"nerfstudio/faces/transforms.json"}
+    document = json.loads(files["nerfstudio/faces/transforms.json"].read_text())
+    assert "ply_file_path" not in document
+    assert not any("depth_file_path" in frame for frame in document["frames"])
+    assert ctx.notes == ["3 of 4 registered panoramas have no ranges and are not in transforms.json"]
+    with pytest.raises(InputError, match="no panorama has both a pose and frames"):
+        nerfstudio({}, poses, None, NerfstudioParams(), ctx)
+
+
+def test_grey_and_16_bit_pictures_are_written_anew(tmp_path: Path) -> None:
+    """Trainers read 8 bits a channel; what is no such file is decoded once, here."""
+    image = tiny_capture(PLAIN).images["000.png"]
+    deep = cv2.imread(str(image.image.path)).astype(np.uint16) * 257
+    cv2.imwrite(str(tmp_path / "deep.png"), deep)
+    cv2.imwrite(str(tmp_path / "grey.png"), (deep[..., 0] >> 8).astype(np.uint8))
+    for idx, name in enumerate(("deep.png", "grey.png")):
+        scratch = tmp_path / str(idx)
+        scratch.mkdir()
+        given = replace(image, image=FilePart(tmp_path / name, external=True))
+        params = NerfstudioFramesParams(variants=("equirectangular",))
+        made = nerfstudio_frames(given, None, params, Context(np.random.default_rng(0), scratch))
+        assert list(made.files) == ["nerfstudio/equirectangular/images/{name}.jpg"]
