@@ -8,6 +8,7 @@ from pano_mvs.stages.evaluate import truth
 from pano_mvs.stages.export import ply, previews, ranges
 from pano_mvs.stages.export_colmap import colmap
 from pano_mvs.stages.export_mesh import mesh
+from pano_mvs.stages.export_nerfstudio import nerfstudio, nerfstudio_frames
 from pano_mvs.stages.features import orb_tangent, sift_tangent, sphorb
 from pano_mvs.stages.filters import (
     bilateral_solver,
@@ -50,6 +51,8 @@ __all__ = [
     "median",
     "mesh",
     "nearest",
+    "nerfstudio",
+    "nerfstudio_frames",
     "orb_tangent",
     "patchmatch",
     "planes",
