@@ -14,4 +14,7 @@ _BLOCK = re.compile(r'<div class="arithmatex">\s*\\\[(.*?)\\\]\s*</div>', re.DOT
 def with_mathml(page: str) -> str:
     """Return a page with its TeX, as pymdownx.arithmatex marks it, in MathML."""
     page = _BLOCK.sub(lambda found: convert(html.unescape(found[1]).strip(), display="block"), page)
-    return _INLINE.sub(lambda found: convert(html.unescape(found[1]).strip()), page)
+    page = _INLINE.sub(lambda found: convert(html.unescape(found[1]).strip()), page)
+    if "arithmatex" in page:
+        raise ValueError(f"an equation is not shown: … {page[page.index('arithmatex') :][:120]} …")
+    return page

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ def presets_that_use(stage: str) -> str:
     return f"In the presets {links}." if names else ""
 
 
+@cache
 def _uses(path: Path) -> set[str]:
     stages: dict[str, Any] = YAML(typ="safe").load(path)["stages"]
     return {entry["use"] for entry in stages.values() if entry and "use" in entry}

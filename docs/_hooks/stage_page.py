@@ -10,6 +10,7 @@ from preset_page import presets_that_use
 from pydantic.fields import FieldInfo
 from setting_schema import limits_of, type_of
 
+from pano_mvs import api
 from pano_mvs.engine.params import NOT_IN_KEY
 from pano_mvs.engine.policy import Policy
 from pano_mvs.engine.ports import Port
@@ -30,6 +31,7 @@ KINDS = {
     "depth": "the range of every pixel of a reference",
     "filters": "range map in, range map out",
     "fusion": "from all range maps to one cloud",
+    "points": "points to start from, for programs that want few and good ones",
     "mesh": "from the cloud to a surface",
     "export": "files in the output folder",
     "evaluate": "comparison with the truth",
@@ -105,7 +107,7 @@ def _port(port: Port) -> str:
 
 
 def _kind(name: str) -> str:
-    return f"[{name}](api.md#{name.lower()})"
+    return f"[{name}](api.md#{name.lower()})" if name in api.__all__ else f"`{name}`"
 
 
 def _memory(spec: StageSpec) -> str:
