@@ -7,14 +7,24 @@ from typing import Annotated, Optional
 
 import typer
 
-WorkflowArgument = Annotated[str, typer.Argument(metavar="WORKFLOW", help="A workflow file, or the name of a preset.")]
+from pano_mvs.cli.completion import complete_setting, complete_stage, complete_workflow
+
+WorkflowArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="WORKFLOW", help="A workflow file, or the name of a preset.", autocompletion=complete_workflow
+    ),
+]
 ImagesOption = Annotated[Optional[Path], typer.Option("--images", help="Folder of panoramas to use instead.")]  # noqa: UP045
-SetOption = Annotated[Optional[list[str]], typer.Option("--set", metavar="STAGE.PARAM=VALUE", help="Change a setting.")]  # noqa: UP045
+SetOption = Annotated[
+    Optional[list[str]],  # noqa: UP045
+    typer.Option("--set", metavar="STAGE.PARAM=VALUE", help="Change a setting.", autocompletion=complete_setting),
+]
 CacheOption = Annotated[Optional[Path], typer.Option("--cache", help="Folder of the cache.")]  # noqa: UP045
 OutOption = Annotated[Optional[Path], typer.Option("--out", help="Folder of the results; default out/<workflow>.")]  # noqa: UP045
 UntilOption = Annotated[
     Optional[list[str]],  # noqa: UP045
-    typer.Option("--until", metavar="STAGE", help="Only this stage and what it needs."),
+    typer.Option("--until", metavar="STAGE", help="Only this stage and what it needs.", autocompletion=complete_stage),
 ]
 OnlyOption = Annotated[
     Optional[list[str]],  # noqa: UP045
@@ -22,7 +32,12 @@ OnlyOption = Annotated[
 ]
 RefreshOption = Annotated[
     Optional[list[str]],  # noqa: UP045
-    typer.Option("--refresh", metavar="STAGE[:ITEM]", help="Compute it again though it is cached."),
+    typer.Option(
+        "--refresh",
+        metavar="STAGE[:ITEM]",
+        help="Compute it again though it is cached.",
+        autocompletion=complete_stage,
+    ),
 ]
 MinFreeOption = Annotated[
     str,

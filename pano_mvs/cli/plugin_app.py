@@ -8,6 +8,7 @@ from typing import Annotated, Optional
 import typer
 from rich.console import Console
 
+from pano_mvs.cli.completion import complete_plugin_kind, complete_stage_kind
 from pano_mvs.cli.guard import guarded
 
 plugin_app = typer.Typer(help="Write plugins.", no_args_is_help=True)
@@ -34,7 +35,9 @@ def plugins(workflow: WorkflowOption = None, files: FileOption = None) -> None:
 @stage_app.command("show")
 @guarded
 def stage_show(
-    name: Annotated[str, typer.Argument(help="A stage's name, such as depth.sweep.")],
+    name: Annotated[
+        str, typer.Argument(help="A stage's name, such as depth.sweep.", autocompletion=complete_stage_kind)
+    ],
     workflow: WorkflowOption = None,
     files: FileOption = None,
 ) -> None:
@@ -47,7 +50,12 @@ def stage_show(
 @plugin_app.command("new")
 @guarded
 def plugin_new(
-    kind: Annotated[str, typer.Argument(help="What it is to be; `pano-mvs plugin kinds` lists the kinds.")],
+    kind: Annotated[
+        str,
+        typer.Argument(
+            help="What it is to be; `pano-mvs plugin kinds` lists the kinds.", autocompletion=complete_plugin_kind
+        ),
+    ],
     name: Annotated[str, typer.Argument(help="A word of small letters, digits and '_'.")],
     folder: Annotated[Path, typer.Option("--dir", help="Where to write the file and its test.")] = Path(),
 ) -> None:

@@ -1,0 +1,117 @@
+"""What a shell offers when the tab key is pressed: presets and workflow files, stages, settings and their values.
+
+A shell is to stay silent whatever is wrong with a workflow or a plugin: `pano-mvs check` is for that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from inspect import signature
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from pano_mvs.core.errors import PanoMvsError
+from pano_mvs.engine.workflow import StageEntry
+
+Offer = tuple[str, str]
+"""What may be put there, and what it is."""
+
+
+def _silent(complete: Callable[..., Iterator[Offer]]) -> Callable[..., list[Offer]]:
+    """Return a completer that keeps to what begins with what is there, and offers nothing where something is wrong."""
+
+    def offers(ctx: typer.Context, incomplete: str) -> list[Offer]:
+        known = {"ctx": ctx, "incomplete": incomplete}
+        wanted = {name: known[name] for name in signature(complete).parameters}
+        try:
+            return [(text, what) for text, what in complete(**wanted) if text.startswith(incomplete)]
+        except (PanoMvsError, OSError):
+            return []
+
+    return offers
+
+
+@_silent
+def complete_workflow(incomplete: str) -> Iterator[Offer]:
+    """Offer the presets, and workflow files and folders."""
+    from pano_mvs.cli.session import presets_folder
+
+    for preset in sorted(presets_folder().glob("*.yaml")):
+        yield preset.stem, _first_comment(preset)
+    folder = incomplete.rpartition("/")[0]
+    for path in sorted(Path(f"{folder}/" if folder or incomplete.startswith("/") else ".").iterdir()):
+        shown = f"{folder}/{path.name}" if "/" in incomplete else path.name
+        if path.is_dir() and not path.name.startswith("."):
+            yield f"{shown}/", "folder"
+        elif path.suffix in (".yaml", ".yml"):
+            yield shown, "workflow file"
+
+
+@_silent
+def complete_stage_kind() -> Iterator[Offer]:
+    """Offer the names of all registered stages."""
+    from pano_mvs.engine.registry import Registry
+
+    for name, spec in sorted(Registry.installed().stages.items()):
+        yield name, spec.doc.partition("\n")[0]
+
+
+@_silent
+def complete_stage(ctx: typer.Context) -> Iterator[Offer]:
+    """Offer the stages of the workflow that the command line names."""
+    for name, entry in _stages(ctx).items():
+        yield name, entry.spec.name
+
+
+@_silent
+def complete_setting(ctx: typer.Context, incomplete: str) -> Iterator[Offer]:
+    """Offer STAGE.PARAM= of the workflow that the command line names, and behind the sign what a setting may be."""
+    target, equals, _ = incomplete.partition("=")
+    for name, entry in _stages(ctx).items():
+        schema = entry.spec.params_type.model_json_schema(by_alias=True) if entry.spec.params_type.model_fields else {}
+        for param, field in schema.get("properties", {}).items():
+            setting = f"{name}.{param}"
+            if not equals:
+                yield f"{setting}=", str(field.get("description", ""))
+            elif setting == target:
+                yield from ((f"{setting}={value}", "") for value in _values(field))
+
+
+@_silent
+def complete_plugin_kind() -> Iterator[Offer]:
+    """Offer the kinds of plugins that can be written."""
+    from pano_mvs.cli.plugin_new import KINDS
+
+    for name, kind in KINDS.items():
+        yield name, kind.what
+
+
+def _stages(ctx: typer.Context) -> Mapping[str, StageEntry]:
+    from pano_mvs.cli.session import presets_folder
+    from pano_mvs.engine.registry import Registry
+    from pano_mvs.engine.workflow import find_workflow, load_workflow
+
+    # click leaves arguments where they are once it has met an option that still lacks its value.
+    named = ctx.params.get("workflow") or next((word for word in ctx.args if not word.startswith("-")), None)
+    if not isinstance(named, str):
+        return {}
+    path, _ = find_workflow(named, presets_folder())
+    return load_workflow(path, Registry.installed(), presets=presets_folder()).stages
+
+
+def _values(field: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what a setting may be, where that is a choice."""
+    if field.get("type") == "boolean":
+        yield from ("true", "false")
+    for option in (field, *field.get("anyOf", ())):
+        yield from (str(value) for value in option.get("enum", ()))
+        if option.get("type") == "null":
+            yield "null"
+
+
+def _first_comment(path: Path) -> str:
+    with path.open(encoding="utf-8") as stream:
+        line = stream.readline().strip()
+    return line.removeprefix("#").strip() if line.startswith("#") else "preset"

@@ -1,0 +1,78 @@
+"""Shell completion, by the protocol that the scripts of the shells speak."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from pano_mvs.cli.app import app
+from tests.cli.conftest import Command
+
+
+def offered(*words: str, shell: str = "bash") -> list[str]:
+    """Return what bash is offered behind some words, the last one perhaps unfinished."""
+    line = shlex.join(["pano-mvs", *words]) if words[-1] else shlex.join(["pano-mvs", *words[:-1]]) + " "
+    environment = {"_PANO_MVS_COMPLETE": f"complete_{shell}", "COMP_WORDS": line, "COMP_CWORD": str(len(words)),
+                   "_TYPER_COMPLETE_ARGS": line, "_TYPER_COMPLETE_FISH_ACTION": "get-args",
+                   "_TYPER_COMPLETE_WORD_TO_COMPLETE": words[-1]}  # fmt: skip
+    result = CliRunner().invoke(app, [], env=environment, prog_name="pano-mvs")
+    assert result.exit_code == 0, result.output
+    return [text for text in result.output.splitlines() if text]
+
+
+def test_commands_and_options_are_offered() -> None:
+    assert offered("ru") == ["run"]
+    assert "doctor" in offered("")
+    assert "--images" in offered("run", "quickstart", "--i")
+
+
+def test_presets_and_workflow_files_are_offered(pano_mvs: Command) -> None:
+    Path("quick tests").mkdir()
+    Path("quick tests/mine.yaml").write_text("pano_mvs: 1\n")
+    Path("quiet.yml").write_text("pano_mvs: 1\n")
+    Path("quoted.txt").write_text("x")
+    assert offered("run", "qui") == ["quickstart", "quick tests/", "quiet.yml"]
+    assert offered("plan", "quick tests/m") == ["quick tests/mine.yaml"]
+    assert offered("run", "/nowhere/at/all") == []
+
+
+def test_settings_of_the_workflow_and_their_values_are_offered() -> None:
+    assert offered("run", "quickstart", "--set", "depth.pl") == ["depth.planes="]
+    found = offered("run", "quickstart", "--set", "images.")
+    assert {"images.path=", "images.nadir_deg=", "images.masks="} <= set(found)
+    assert all(text.startswith("images.") for text in found)
+    assert offered("run", "known_poses", "--set", "poses.p") == ["poses.path="]
+    backends = offered("run", "quickstart", "--set", "depth.backend=")
+    assert {"depth.backend=numba", "depth.backend=opencv", "depth.backend=numpy"} <= set(backends)
+
+
+def test_stages_of_the_workflow_and_registered_ones_are_offered() -> None:
+    assert offered("run", "quickstart", "--until", "p") == ["pairs", "poses", "ply", "previews"]
+    assert offered("plan", "quickstart", "--refresh", "de") == ["depth"]
+    assert "depth.sweep" in offered("stage", "show", "depth.")
+    assert offered("plugin", "new", "sweep") == ["sweep_cost", "sweep_backend"]
+
+
+@pytest.mark.parametrize("text", ["pano_mvs: 1\nstages: {a: {use: nothing.such}}\n", "a: [", ""])
+def test_a_shell_stays_silent_whatever_is_wrong(pano_mvs: Command, text: str) -> None:
+    Path("bad.yaml").write_text(text)
+    assert offered("run", "bad.yaml", "--set", "a") == []
+    assert offered("run", "bad.yaml", "--until", "a") == []
+    assert offered("run", "--set", "a") == []
+
+
+@pytest.mark.parametrize("shell", ["zsh", "fish", "powershell"])
+def test_other_shells_get_the_help_too(shell: str) -> None:
+    (text,) = offered("run", "quickstart", "--set", "depth.planes", shell=shell)
+    assert "depth.planes=" in text
+    assert "virtual" in text
+
+
+def test_the_script_for_a_shell_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    result = CliRunner().invoke(app, ["--show-completion", "bash"], prog_name="pano-mvs")
+    assert result.exit_code == 0
+    assert "complete_bash" in result.output
+    assert "_PANO_MVS_COMPLETE" in result.output
