@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from statistics import median
 from types import FrameType
@@ -25,9 +26,8 @@ from pano_mvs.cli.json_events import SCHEMA, JsonEvents
 from pano_mvs.cli.progress import ProgressBars
 from pano_mvs.cli.session import Session
 from pano_mvs.cli.streams import apart
-from pano_mvs.cli.summary import summarise
+from pano_mvs.cli.telling import INTERRUPTED, tell, tell_of_end
 from pano_mvs.core.errors import PanoMvsError, UsageError
-from pano_mvs.core.files import write_text
 from pano_mvs.engine.blobs import DamagedBlobError
 from pano_mvs.engine.events import Observer, RunResult
 from pano_mvs.engine.executors.choose import make_executor
@@ -36,9 +36,7 @@ from pano_mvs.engine.memory import bytes_from_size
 from pano_mvs.engine.params import files_of
 from pano_mvs.engine.run import Run
 from pano_mvs.engine.store import LEAST_FREE_BYTES, Store
-from pano_mvs.report.page import write_report
 
-INTERRUPTED = 130
 MIN_FREE_VARIABLE = "PANO_MVS_MIN_FREE"
 _SHOWN_FAILURES = 20
 
@@ -137,14 +135,16 @@ def _run(session: Session, store: Store, executor: Executor, observer: Observer)
     run = Run(session.workflow, session.graph, store, session.out, observer=observer, executor=executor,
               demands=session.demands)  # fmt: skip
     while True:
-        result = run.execute(earlier_files=earlier)
         try:
-            summary = summarise(run, result, started=started, seconds=time.perf_counter() - clock)
+            result = run.execute(earlier_files=earlier)
+        except (Exception, KeyboardInterrupt) as error:
+            tell_of_end(run, error, partial(tell, session.out, run, started=started, clock=clock))
+            raise
+        try:
+            summary = tell(session.out, run, started=started, clock=clock)
             break
         except DamagedBlobError as error:  # found only now; it has been removed, so a further round computes it
             observer.warn(str(error))
-    write_text(session.out / "run.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
-    write_report(session.out, summary)
     return result, summary
 
 

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import os
 import platform
 from collections.abc import Mapping
+from contextlib import suppress
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import PurePosixPath
 from typing import Any
 
+import numpy as np
+
 import pano_mvs
 from pano_mvs.engine.events import RunResult, StageSummary
+from pano_mvs.engine.executors.threads import available_threads
 from pano_mvs.engine.run import Run
 from pano_mvs.engine.wiring import Graph
 from pano_mvs.engine.workflow import Workflow
-from pano_mvs.scene import Axis, PointCloud, Poses, RangeMap, Record, Scores, TwoView
+from pano_mvs.scene import Axis, Panorama, PointCloud, Poses, RangeMap, Record, Scores, TwoView
 from pano_mvs.scene.index import pair_from_name
 
-_LIBRARIES = ("numpy", "numba", "opencv-python-headless", "pycolmap", "scipy")
+_LIBRARIES = ("numpy", "numba", "opencv-python-headless", "pycolmap", "pyvista", "scipy")
+_ROLES: Mapping[str, type[Record]] = {"images": Panorama, "pairs": TwoView, "poses": Poses, "ranges": RangeMap,
+                                      "cloud": PointCloud}  # fmt: skip
 
 
 def summarise(run: Run, result: RunResult, *, started: datetime, seconds: float) -> dict[str, Any]:
@@ -29,6 +36,7 @@ def summarise(run: Run, result: RunResult, *, started: datetime, seconds: float)
         "cache": str(run.store.root.resolve()),
         "version": pano_mvs.__version__,
         "started": started.isoformat(timespec="seconds"),
+        "machine": _machine(),
         "executor": {"name": run.executor.name, "workers": run.executor.capacity, "threads": run.executor.threads},
         "seconds": round(seconds, 3),
         "exit_code": result.exit_code,
@@ -56,6 +64,7 @@ def summarise(run: Run, result: RunResult, *, started: datetime, seconds: float)
         "rejected": {image: {"stage": stage, "reason": why} for image, (stage, why) in result.rejected.items()},
         "warnings": list(result.warnings),
         "notes": [note for summary in result.stages for note in summary.notes],
+        "results": _result_stages(run),
         "poses": _poses(run, result),
         "scores": next(iter(scores.values()), {}),
         "all_scores": scores if len(scores) > 1 else {},
@@ -123,8 +132,7 @@ def _poses(run: Run, result: RunResult) -> dict[str, Any]:
     links = []
     for stage in result.stages:
         if issubclass(run.workflow.stages[stage.name].spec.output, TwoView):
-            pairs = stage.unit_metrics.items()
-            links = [[*pair_from_name(pair), int(metrics.get("inliers", 0))] for pair, metrics in pairs]
+            links = [_link(pair, metrics) for pair, metrics in stage.unit_metrics.items()]
     return {
         "registered": list(poses.names),
         "blocked": [{"stage": f.stage, "item": f.item, "cause": f.cause} for f in result.failures if f.blocked],
@@ -134,8 +142,34 @@ def _poses(run: Run, result: RunResult) -> dict[str, Any]:
         "frame": poses.frame,
         "scale": poses.scale,
         "metric": poses.metric,
+        "up": _up(poses),
         "links": links,
     }
+
+
+def _link(pair: str, metrics: Mapping[str, float]) -> list[Any]:
+    """Return both images, the inliers (0: rejected), and the candidates and the residual where they are known."""
+    candidates, residual_deg = metrics.get("candidates"), metrics.get("residual_deg")
+    return [*pair_from_name(pair), int(metrics.get("inliers", 0)), None if candidates is None else int(candidates),
+            None if residual_deg is None else round(residual_deg, 5)]  # fmt: skip
+
+
+def _up(poses: Poses) -> list[float] | None:
+    """Return the mean of the cameras' up directions in the world, None if they point everywhere."""
+    mean = -np.asarray(poses.rotations)[:, 1].sum(axis=0) / max(1, len(poses.names))
+    length = float(np.linalg.norm(mean))
+    return [round(float(part) / length, 6) for part in mean] if length > 0.1 else None
+
+
+def _result_stages(run: Run) -> dict[str, str]:
+    """Return which stage made what the report shows: the last one, of the first chain, that made anything."""
+    found: dict[str, str] = {}
+    for role, kind in _ROLES.items():
+        chain = reversed(chain_of(run.workflow, run.graph, kind))
+        made = (name for name in chain if name in run.states and run.states[name].items)
+        if (name := next(made, None)) is not None:
+            found[role] = name
+    return found
 
 
 def _scores(run: Run) -> dict[str, Any]:
@@ -174,6 +208,14 @@ def _cloud(run: Run, result: RunResult) -> dict[str, Any]:
 
 def _rounded(metrics: Mapping[str, float]) -> dict[str, float]:
     return {name: round(value, 6) for name, value in metrics.items()}
+
+
+def _machine() -> dict[str, Any]:
+    """Return what a run's times depend on."""
+    found: dict[str, Any] = {"processor": platform.machine(), "cores": available_threads()}
+    with suppress(AttributeError, ValueError, OSError):  # not every system tells
+        found["memory_gb"] = round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1)
+    return found
 
 
 def _versions() -> dict[str, str]:

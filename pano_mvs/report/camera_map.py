@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Any
@@ -12,10 +13,31 @@ from numpy.typing import NDArray
 
 from pano_mvs.geometry import rotation_from_two_vectors
 
-_WIDTH, _HEIGHT = 480, 360
+FloatArray = NDArray[np.float64]
+
+_WIDTH, _HEIGHT, _SIDE_HEIGHT = 480, 400, 200
 _BORDER = 44
-_MOST_LABELS, _MOST_LINKS = 40, 1500
+_MOST_LABELS, _MOST_LINKS, _MOST_REJECTED, _MOST_NAMED = 40, 1500, 600, 600
 _ABOVE, _SIDE = ((0, 1.0), (2, -1.0)), ((0, 1.0), (1, 1.0))
+_ALONG_NORTH = re.compile(r"\bz north\b")
+_DOWN = re.compile(r"\by down\b")
+
+
+@dataclass(frozen=True)
+class Link:
+    """One matched pair, drawn.
+
+    Attributes:
+        ends: x1, y1, x2, y2.
+        strength: from 0 to 1, by its inliers.
+        text: what it says when pointed at.
+        rejected: whether no common geometry was found.
+    """
+
+    ends: tuple[float, float, float, float]
+    strength: float
+    text: str
+    rejected: bool
 
 
 @dataclass(frozen=True)
@@ -24,78 +46,131 @@ class CameraMap:
 
     Attributes:
         title: from where the cameras are seen.
+        text: the same for people who do not see it.
         size_wh: of the view box.
-        links: (x1, y1, x2, y2, strength from 0 to 1, what it says when pointed at).
+        links: rejected ones first, then the others, strong ones last and so on top.
         cameras: (x, y, name, where its label goes: x and y, or None).
+        dots: an SVG path of cameras that are too many to be named.
         bar: (x, y, length, text) of the scale bar.
+        north: whether north is upwards.
     """
 
     title: str
+    text: str
     size_wh: tuple[int, int]
-    links: tuple[tuple[float, float, float, float, float, str], ...]
+    links: tuple[Link, ...]
     cameras: tuple[tuple[float, float, str, tuple[float, float] | None], ...]
+    dots: str
     bar: tuple[float, float, float, str]
+    north: bool = False
+
+    @property
+    def rejected(self) -> int:
+        """The number of rejected pairs that are drawn."""
+        return sum(link.rejected for link in self.links)
 
 
-def camera_maps(poses: Mapping[str, Any]) -> tuple[CameraMap, ...]:
+def camera_maps(
+    poses: Mapping[str, Any], reasons: Mapping[tuple[str, str], str] | None = None
+) -> tuple[CameraMap, ...]:
     """Return the cameras from above and from the side; none where no centre is known.
 
-    The direction up is `poses["up"]`, or −y (the camera frame of the first picture) where that is not given.
+    Args:
+        poses: as in run.json: `registered`, `centers`, `links`, `metric`, `frame`, `up`.
+        reasons: why pairs have no common geometry, where that is known.
     """
     names = [str(name) for name in poses.get("registered") or []]
     centers = np.array(poses.get("centers") or [], dtype=np.float64).reshape(-1, 3)
     if not names or len(centers) != len(names) or not np.isfinite(centers).all():
         return ()
-    level_from_world = rotation_from_two_vectors(poses.get("up") or (0, -1, 0), (0, -1, 0))
-    centers = centers @ level_from_world.T
-    links = _strongest(poses.get("links") or [], names)
+    centers = centers @ rotation_from_two_vectors(up_of(poses), (0, -1, 0)).T
     unit = "m" if poses.get("metric") else "units"
-    labels = _labels(names)
+    labels = short_names(names)
+    links = _chosen(poses.get("links") or [], names, labels, reasons or {})
+    north = bool(_ALONG_NORTH.search(str(poses.get("frame") or "")))
     return tuple(
-        _drawn(title, np.stack([sign * centers[:, axis] for axis, sign in axes], axis=-1), labels, links, unit)
-        for title, axes in (("From above", _ABOVE), ("From the side", _SIDE))
-    )
+        _drawn(title, np.stack([sign * centers[:, axis] for axis, sign in axes], axis=-1), labels, links, unit=unit,
+               tallest=tallest, north=north and title == "From above")
+        for title, axes, tallest in (("From above", _ABOVE, _HEIGHT), ("From the side", _SIDE, _SIDE_HEIGHT))
+    )  # fmt: skip
 
 
-def _strongest(links: list[Any], names: list[str]) -> list[tuple[int, int, int]]:
-    """Return the links between registered cameras as positions and inliers, weak ones first, so strong ones on top."""
-    position = {name: idx for idx, name in enumerate(names)}
-    known = [(position[a], position[b], int(n)) for a, b, n in links if a in position and b in position]
-    return sorted(known, key=lambda link: link[2])[-_MOST_LINKS:]
+def up_of(poses: Mapping[str, Any]) -> FloatArray:
+    """Return the direction up in the world, unit (3,).
+
+    That is −y where the frame says so; else the mean of the cameras' own, `up`, since they are mostly held upright;
+    else −y, the first camera's.
+    """
+    up = np.array(poses.get("up") or (0, -1, 0), np.float64)
+    usable = up.shape == (3,) and np.isfinite(up).all() and np.linalg.norm(up) > 1e-6
+    if not usable or _DOWN.search(str(poses.get("frame") or "")):
+        return np.array([0.0, -1.0, 0.0])
+    return np.asarray(up / np.linalg.norm(up))
 
 
-def _labels(names: list[str]) -> list[str]:
+def short_names(names: Sequence[str]) -> list[str]:
     """Return names without folder and extension, where that leaves them distinct."""
     short = [PurePosixPath(name).stem for name in names]
-    return short if len(set(short)) == len(short) else names
+    return short if len(set(short)) == len(short) else list(names)
+
+
+@dataclass(frozen=True)
+class _Joined:
+    """A link before it is drawn: the positions of two cameras, the inliers, and words."""
+
+    first: int
+    second: int
+    inliers: int
+    text: str
+
+
+def _chosen(
+    links: Sequence[Any], names: list[str], labels: list[str], reasons: Mapping[tuple[str, str], str]
+) -> list[_Joined]:
+    """Return the links between registered cameras: some rejected ones, then the strongest, weak ones first."""
+    position = {name: idx for idx, name in enumerate(names)}
+    found: list[_Joined] = []
+    for first, second, inliers, *more in links:
+        if first in position and second in position:
+            a, b = position[first], position[second]
+            candidates = f" of {more[0]} candidates" if more and more[0] is not None else ""
+            words = f"{inliers} matches{candidates}" if inliers else f"rejected{candidates and f', none{candidates}'}"
+            why = reasons.get((first, second), "")
+            found.append(_Joined(a, b, int(inliers), f"{labels[a]} – {labels[b]}: {words}{why and f'; {why}'}"))
+    found.sort(key=lambda link: link.inliers)
+    split = sum(not link.inliers for link in found)
+    return found[:split][:_MOST_REJECTED] + found[split:][-_MOST_LINKS:]
 
 
 def _drawn(
-    title: str, flat: NDArray[np.float64], labels: list[str], links: list[tuple[int, int, int]], unit: str
+    title: str, flat: FloatArray, labels: list[str], links: list[_Joined], *, unit: str, tallest: int, north: bool
 ) -> CameraMap:
     """Return the drawing of cameras at (N, 2), x to the right and y down."""
     low, high = flat.min(axis=0), flat.max(axis=0)
     extent = np.maximum(high - low, 1e-9 + 0.02 * float((high - low).max()))
     if not (high - low).any():
         extent = np.ones(2)
-    scale = float(min((_WIDTH - 2 * _BORDER) / extent[0], (_HEIGHT - 2 * _BORDER) / extent[1]))
-    height = int(np.clip(extent[1] * scale + 2 * _BORDER, 150, _HEIGHT))
+    scale = float(min((_WIDTH - 2 * _BORDER) / extent[0], (tallest - 2 * _BORDER) / extent[1]))
+    height = int(np.clip(extent[1] * scale + 2 * _BORDER, 150, tallest))
     placed = np.round((flat - (low + high) / 2) * scale + (_WIDTH / 2, height / 2 - 6), 1)
-    most = max((inliers for _, _, inliers in links), default=1) or 1
-    drawn_links = tuple(
-        (*map(float, (*placed[a], *placed[b])), inliers / most, f"{labels[a]} – {labels[b]}: {inliers} matches")
-        for a, b, inliers in links
-    )
+    most = max((link.inliers for link in links), default=1) or 1
+    lines = tuple(
+        Link((*map(float, (*placed[link.first], *placed[link.second])),), link.inliers / most, link.text,  # type: ignore[arg-type]
+             not link.inliers)
+        for link in links
+    )  # fmt: skip
+    named = len(labels) <= _MOST_NAMED
     spots = _label_spots(placed, labels)
-    cameras = tuple(
-        (float(x), float(y), label, spot) for (x, y), label, spot in zip(placed, labels, spots, strict=True)
-    )
+    cameras = [(float(x), float(y), label, spot) for (x, y), label, spot in zip(placed, labels, spots, strict=True)]
     length = _round_length(110 / scale)
     bar = (14.0, height - 14.0, round(length * scale, 1), f"{length:g} {unit}")
-    return CameraMap(title, (_WIDTH, height), drawn_links, cameras, bar)  # type: ignore[arg-type]
+    wide, deep = (f"{float(size):.3g} {unit}" for size in high - low)
+    text = f"{len(labels)} cameras {title.lower()}, {wide} across and {deep} {'deep' if tallest == _HEIGHT else 'high'}"
+    dots = "" if named else "".join(f"M{x:g} {y:g}h0" for x, y in placed)
+    return CameraMap(title, text, (_WIDTH, height), lines, tuple(cameras if named else ()), dots, bar, north)
 
 
-def _label_spots(placed: NDArray[np.float64], labels: list[str]) -> list[tuple[float, float] | None]:
+def _label_spots(placed: FloatArray, labels: list[str]) -> list[tuple[float, float] | None]:
     """Return where each label goes, below one another where cameras coincide; none where there are too many."""
     if len(labels) > _MOST_LABELS:
         return [None] * len(labels)

@@ -50,6 +50,11 @@ def duration(seconds: Any) -> str:
     return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
 
 
+def degrees(value: Any) -> str:
+    """Return an angle in degrees with two significant digits."""
+    return f"{value:.2g}°" if _is_number(value) else "–"
+
+
 def figure(value: Any) -> str:
     """Return a value with four significant digits, thousands apart."""
     if isinstance(value, bool) or value is None:

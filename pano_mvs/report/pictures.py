@@ -1,81 +1,81 @@
-"""The previews of the views, small enough to travel within the page."""
+"""Pictures that travel within the page: JPEG of at most so many bytes, as data URIs."""
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-_MOST = 24
-_WIDTH = 1024
-_QUALITY = 80
+_QUALITIES = (82, 70, 55, 40)
+_SMALLEST_PX = 32
+_LINE_PX = 4
 
 
 @dataclass(frozen=True)
-class Preview:
-    """One view as the page shows it.
+class Picture:
+    """One picture of the page.
 
     Attributes:
-        name: of the image.
-        data: base64 of a JPEG, or "" where there is no preview.
-        size_hw: (height, width) of that JPEG.
-        completeness: share of pixels with a range, or None.
-        consistent: share of pixels on which other views agree, or None.
+        uri: `data:image/jpeg;base64,…`.
+        size_hw: (height, width) in pixels.
+        key: under which a later page finds it again; "" if it never does.
     """
 
-    name: str
-    data: str
+    uri: str
     size_hw: tuple[int, int]
-    completeness: float | None
-    consistent: float | None
+    key: str = ""
 
 
-@dataclass(frozen=True)
-class Previews:
-    """The views that the page shows, and how many there are.
+def picture(image: NDArray[np.uint8], *, width: int, most_bytes: int, key: str = "") -> Picture:
+    """Return an image as JPEG: first with a lower quality, then smaller, until it takes no more than its share.
 
-    Attributes:
-        shown: at most 24, in the order of the capture.
-        total: number of views.
+    Args:
+        image: (H, W, 3) uint8 RGB.
+        width: in pixels, at most.
+        most_bytes: of the JPEG, before it is written as text.
+        key: see `Picture`.
     """
-
-    shown: tuple[Preview, ...]
-    total: int
-
-
-def previews(out_dir: Path, views: Sequence[Mapping[str, Any]]) -> Previews:
-    """Return the views to show; of many, the eight least complete and others evenly apart."""
-    chosen = range(len(views))
-    if len(views) > _MOST:
-        by_completeness = sorted(chosen, key=lambda idx: (views[idx].get("completeness") or 0.0, idx))
-        worst = by_completeness[: _MOST // 3]
-        rest = by_completeness[_MOST // 3 :]
-        evenly = [sorted(rest)[round(at)] for at in np.linspace(0, len(rest) - 1, _MOST - len(worst))]
-        return Previews(tuple(_preview(out_dir, views[idx]) for idx in sorted({*worst, *evenly})), len(views))
-    return Previews(tuple(_preview(out_dir, views[idx]) for idx in chosen), len(views))
+    shown = resized(image, width)
+    while True:
+        bgr = cv2.cvtColor(shown, cv2.COLOR_RGB2BGR)
+        for quality in _QUALITIES:
+            data = bytes(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
+            if len(data) <= most_bytes or (min(shown.shape[:2]) <= _SMALLEST_PX and quality == _QUALITIES[-1]):
+                size_hw = int(shown.shape[0]), int(shown.shape[1])
+                return Picture(f"data:image/jpeg;base64,{base64.b64encode(data).decode('ascii')}", size_hw, key)
+        shown = resized(shown, shown.shape[1] * 3 // 4)
 
 
-def _preview(out_dir: Path, view: Mapping[str, Any]) -> Preview:
-    data, size_hw = _embedded(out_dir, str(view.get("preview") or ""))
-    return Preview(str(view.get("name", "")), data, size_hw, view.get("completeness"), view.get("consistent"))
+def resized(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
+    """Return an image of at most a width."""
+    if image.shape[1] <= width:
+        return image
+    size = width, max(1, round(image.shape[0] * width / image.shape[1]))
+    smaller: NDArray[np.uint8] = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return smaller
 
 
-def _embedded(out_dir: Path, relative: str) -> tuple[str, tuple[int, int]]:
-    """Return a picture below the output folder as base64 JPEG of at most 1024 px width, "" if there is none."""
+def preview_panels(out_dir: Path, relative: str, *, small: bool = False) -> tuple[NDArray[np.uint8], ...]:
+    """Return the panorama and the range map of a preview, (H, W, 3) RGB each; none if it is none of ours.
+
+    Args:
+        out_dir: the output folder, outside of which nothing is read.
+        relative: the preview's path below it.
+        small: an eighth of the size, which is decoded sooner.
+    """
     path = (out_dir / relative).resolve()
     if not relative or not path.is_relative_to(out_dir.resolve()) or not path.is_file():
-        return "", (0, 0)
-    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR) if path.stat().st_size else None
-    if image is None:
-        return "", (0, 0)
-    height, width = image.shape[:2]
-    if width > _WIDTH:
-        height, width = round(height * _WIDTH / width), _WIDTH
-        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
-    return base64.b64encode(bytes(data)).decode("ascii"), (height, width)
+        return ()
+    data = np.fromfile(path, np.uint8)
+    image = cv2.imdecode(data, cv2.IMREAD_REDUCED_COLOR_8 if small else cv2.IMREAD_COLOR) if len(data) else None
+    if image is None or image.shape[0] < image.shape[1] or image.shape[1] < 2:
+        return ()
+    rgb: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    height = rgb.shape[1] // 2
+    # Between them is a white line; below is the scale.
+    start = height if small else height + _LINE_PX
+    return rgb[:height], rgb[start : start + height]

@@ -7,6 +7,20 @@ from dataclasses import dataclass
 from typing import Any
 
 from pano_mvs.report.figures import figure, median, share
+from pano_mvs.report.findings import (
+    FAIR_COMPLETE,
+    FAIR_CONSISTENT,
+    FAIR_REGISTERED,
+    FAIR_RESIDUAL_PX,
+    GOOD_COMPLETE,
+    GOOD_CONSISTENT,
+    GOOD_REGISTERED,
+    GOOD_RESIDUAL_PX,
+    Finding,
+    findings,
+    mood_of,
+)
+from pano_mvs.report.residuals import Residuals
 
 _OUTCOMES = {
     0: ("good", "Finished"),
@@ -15,6 +29,12 @@ _OUTCOMES = {
     3: ("fair", "Finished, with failed items"),
     4: ("bad", "Stopped by a quality gate or a guard"),
     130: ("fair", "Interrupted"),
+}
+_JUDGEMENTS = {
+    "good": "The result looks sound.",
+    "fair": "Usable, with doubts: see below.",
+    "bad": "Do not rely on this result.",
+    "": "",
 }
 
 
@@ -40,23 +60,41 @@ class Verdict:
     Attributes:
         mood: "good", "fair" or "bad".
         outcome: how the run ended.
-        sentence: what came out of it, in one sentence.
+        judgement: whether the result can be relied on, in a sentence; empty where there is nothing to judge.
+        sentence: what was done, in one sentence.
         tiles: the headline figures.
+        findings: what is wrong or doubtful, the worst first.
     """
 
     mood: str
     outcome: str
+    judgement: str
     sentence: str
     tiles: tuple[Tile, ...]
+    findings: tuple[Finding, ...]
 
 
-def verdict(summary: Mapping[str, Any]) -> Verdict:
-    """Return the verdict on a run from its summary; figures that are not known are left out."""
-    mood, outcome = _OUTCOMES.get(summary.get("exit_code", 0), ("bad", f"Ended with code {summary.get('exit_code')}"))
-    tiles = [*_registered(summary), *_coverage(summary), *_cloud(summary), *_accuracy(summary)]
-    if mood == "good" and any(tile.mood == "bad" for tile in tiles):
-        mood = "fair"
-    return Verdict(mood, outcome, _sentence(summary), tuple(tiles))
+def verdict(
+    summary: Mapping[str, Any], *, residuals: Residuals | None = None, image_width: int | None = None
+) -> Verdict:
+    """Return the verdict on a run; figures that are not known are left out.
+
+    Args:
+        summary: what run.json holds; every key may be missing.
+        residuals: of the points, if known.
+        image_width: of the panoramas in pixels, if known.
+    """
+    code = summary.get("exit_code", 0)
+    mood, outcome = _OUTCOMES.get(code, ("bad", f"Ended with code {code}"))
+    residual_deg = residuals.overall.median_deg if residuals else None
+    residual_px = residual_deg * image_width / 360 if residual_deg is not None and image_width else None
+    tiles = [*_registered(summary), *_residual(residual_deg, residual_px), *_coverage(summary), *_cloud(summary),
+             *_accuracy(summary)]  # fmt: skip
+    found = findings(summary, residual_px=residual_px)
+    moods = {mood, *(tile.mood for tile in tiles), *(finding.mood for finding in found)}
+    overall = next((name for name in ("bad", "fair", "good") if name in moods), "good")
+    judged = any(tile.mood for tile in tiles) or overall == "bad"
+    return Verdict(overall, outcome, _JUDGEMENTS[overall] if judged else "", _sentence(summary), tuple(tiles), found)
 
 
 def _sentence(summary: Mapping[str, Any]) -> str:
@@ -78,22 +116,28 @@ def _registered(summary: Mapping[str, Any]) -> list[Tile]:
     registered, rejected = len(poses.get("registered") or []), len(poses.get("rejected") or {})
     if not registered + rejected:
         return []
-    part = registered / (registered + rejected)
-    mood = "good" if part >= 0.95 else "fair" if part >= 0.5 else "bad"
+    mood = mood_of(registered / (registered + rejected), GOOD_REGISTERED, FAIR_REGISTERED)
     return [Tile(f"{registered} of {registered + rejected}", "panoramas registered", mood)]
+
+
+def _residual(residual_deg: float | None, residual_px: float | None) -> list[Tile]:
+    if residual_deg is None:
+        return []
+    mood = mood_of(residual_px, GOOD_RESIDUAL_PX, FAIR_RESIDUAL_PX) if residual_px is not None else ""
+    pixels = f", {residual_px:.1f} px" if residual_px is not None else ""
+    return [Tile(f"{residual_deg:.2g}°", f"median reprojection residual{pixels}", mood)]
 
 
 def _coverage(summary: Mapping[str, Any]) -> list[Tile]:
     views = summary.get("views") or []
     tiles = []
     for key, label, limits in (
-        ("completeness", "of pixels have a range", (0.9, 0.6)),
-        ("consistent", "of pixels agree with other views", (0.5, 0.25)),
+        ("completeness", "of pixels have a range", (GOOD_COMPLETE, FAIR_COMPLETE)),
+        ("consistent", "of pixels agree with other views", (GOOD_CONSISTENT, FAIR_CONSISTENT)),
     ):
         value = median([view.get(key) for view in views])
         if value is not None:
-            mood = "good" if value >= limits[0] else "fair" if value >= limits[1] else "bad"
-            tiles.append(Tile(share(value), label, mood))
+            tiles.append(Tile(share(value), label, mood_of(value, *limits)))
     return tiles
 
 

@@ -1,0 +1,41 @@
+"""Write what there is to say of a run into its output folder, however it ended: run.json and the report."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from pano_mvs.cli.summary import summarise
+from pano_mvs.core.errors import PanoMvsError
+from pano_mvs.core.files import write_text
+from pano_mvs.engine.run import Run
+from pano_mvs.report.page import write_report
+from pano_mvs.report.results import Results
+
+INTERRUPTED = 130
+"""The exit code of a run that was interrupted."""
+
+
+def tell(out: Path, run: Run, *, started: datetime, clock: float) -> dict[str, Any]:
+    """Write run.json and the report, and return what they say."""
+    summary = summarise(run, run.result, started=started, seconds=time.perf_counter() - clock)
+    write_text(out / "run.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
+    write_report(out, summary, Results.of_run(run, summary["results"]))
+    return summary
+
+
+def tell_of_end(run: Run, error: BaseException, tell: Callable[[], object]) -> None:
+    """Tell of a run that did not get to its end, unless it did nothing: then the report before stays."""
+    if not any(stage.run + stage.cached + stage.failed for stage in run.result.stages):
+        return
+    interrupted = isinstance(error, KeyboardInterrupt)
+    run.result.stopped = "interrupted" if interrupted else str(error)
+    run.result.exit_code = INTERRUPTED if interrupted else error.exit_code if isinstance(error, PanoMvsError) else 1
+    try:
+        tell()
+    except (PanoMvsError, OSError) as second:
+        error.add_note(f"Nor could the report be written: {second}")

@@ -1,0 +1,122 @@
+"""Pictures of the fused cloud from three places: by PyVista, or without it where there is no graphics driver."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.report.cloud_renderer import read_pictures, write_scene
+from pano_mvs.report.kept import Kept
+from pano_mvs.report.pictures import Picture, picture
+from pano_mvs.report.results import Results
+from pano_mvs.report.software_cloud import draw_cloud
+from pano_mvs.report.viewpoints import Viewpoint, inside_camera, viewpoints
+from pano_mvs.scene import PointCloud
+
+RENDERER_VARIABLE = "PANO_MVS_RENDERER"
+"""`software` draws without PyVista; anything else, or nothing, tries PyVista first."""
+
+VERSION = 1
+"""Raise it when the pictures change: earlier pages' are then drawn again."""
+
+_SIZE_HW = (600, 960)
+_MOST_POINTS = 800_000
+_MOST_BYTES = 300_000
+_TIMEOUT_S = 120.0
+_COMMAND = (sys.executable, "-m", "pano_mvs.report.cloud_renderer")
+
+Arrays = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]
+
+
+@dataclass(frozen=True)
+class CloudPictures:
+    """The pictures of a cloud.
+
+    Attributes:
+        shown: (what is seen, picture); none where there is no cloud.
+        note: how they were made, where that needs saying.
+    """
+
+    shown: tuple[tuple[str, Picture], ...] = ()
+    note: str = ""
+
+
+def cloud_pictures(
+    results: Results, kept: Kept, *, up: NDArray[np.float64], command: Sequence[str] = _COMMAND
+) -> CloudPictures:
+    """Return pictures of the cloud: those of an earlier page, if they are of the same cloud, else new ones.
+
+    Args:
+        results: with the cloud and the poses.
+        kept: the earlier page's.
+        up: (3,) unit vector away from the ground, in the world.
+        command: what draws; it is given a folder.
+    """
+    digest = results.digest("cloud")
+    if not digest:
+        return CloudPictures()
+    software = os.environ.get(RENDERER_VARIABLE, "") == "software"
+    stem = f"{digest[:24]}.{results.digest('poses')[:16]}.{'s' if software else 'g'}{VERSION}"
+    known = kept.fact(stem)
+    earlier = [kept.picture(f"{stem}.{number}") for number in range(3)]
+    if isinstance(known, dict) and all(earlier) and len(known.get("titles", ())) == 3:
+        titles = [str(title) for title in known["titles"]]
+        pairs = tuple((title, found) for title, found in zip(titles, earlier, strict=True) if found is not None)
+        return CloudPictures(pairs, str(known.get("note", "")))
+    cloud, poses = results.cloud, results.poses
+    if cloud is None or not len(cloud):
+        return CloudPictures()
+    centers = poses.centers if poses is not None else np.zeros((0, 3))
+    place = poses.names[inside_camera(centers)] if poses is not None and len(centers) else ""
+    arrays = _thinned(cloud)
+    seen_from = viewpoints(arrays[0], centers, up, aspect=_SIZE_HW[1] / _SIZE_HW[0], place=place)
+    images, note = _drawn(arrays, seen_from, software=software, command=command)
+    titles = [view.title for view in seen_from]
+    kept.keep(stem, {"titles": titles, "note": note})
+    return CloudPictures(
+        tuple(
+            (title, picture(image, width=_SIZE_HW[1], most_bytes=_MOST_BYTES, key=f"{stem}.{number}"))
+            for number, (title, image) in enumerate(zip(titles, images, strict=True))
+        ),
+        note,
+    )
+
+
+def _thinned(cloud: PointCloud) -> Arrays:
+    """Return every n-th point of a cloud, so that no more are drawn than a picture can show."""
+    step = -(-len(cloud) // _MOST_POINTS)
+    return (np.ascontiguousarray(cloud.points_in_world[::step]), np.ascontiguousarray(cloud.normals_in_world[::step]),
+            np.ascontiguousarray(cloud.colors_rgb[::step]))  # fmt: skip
+
+
+def _drawn(
+    arrays: Arrays, seen_from: Sequence[Viewpoint], *, software: bool, command: Sequence[str]
+) -> tuple[list[NDArray[np.uint8]], str]:
+    if not software:
+        images = _drawn_apart(arrays, seen_from, command)
+        if images:
+            return images, ""
+    note = "" if software else "PyVista could not draw here (no graphics driver), so these are plainer pictures"
+    return [draw_cloud(*arrays, view, size_hw=_SIZE_HW) for view in seen_from], note
+
+
+def _drawn_apart(arrays: Arrays, seen_from: Sequence[Viewpoint], command: Sequence[str]) -> list[NDArray[np.uint8]]:
+    """Return the pictures of another process; none if it fails, crashes or takes too long."""
+    with TemporaryDirectory(prefix="pano-mvs-report-") as name:
+        folder = Path(name)
+        write_scene(folder, arrays, seen_from, size_hw=_SIZE_HW)
+        try:
+            done = subprocess.run(  # noqa: S603  # our own interpreter and module
+                [*command, name], stdin=subprocess.DEVNULL, capture_output=True, timeout=_TIMEOUT_S, check=False
+            )
+        except (OSError, subprocess.TimeoutExpired):
+            return []
+        return read_pictures(folder, len(seen_from), size_hw=_SIZE_HW) if done.returncode == 0 else []

@@ -1,0 +1,143 @@
+"""Everything that the page shows of a run's results, gathered from the summary, the store and an earlier page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pano_mvs.report.camera_map import CameraMap, camera_maps, up_of
+from pano_mvs.report.cloud_pictures import CloudPictures, cloud_pictures
+from pano_mvs.report.completeness import Shares
+from pano_mvs.report.figures import score_tables
+from pano_mvs.report.findings import scores_by_stage
+from pano_mvs.report.kept import Kept
+from pano_mvs.report.panoramas import Row, panorama_rows
+from pano_mvs.report.residuals import Histogram, Residuals, histogram, reprojection_residuals
+from pano_mvs.report.results import Results
+from pano_mvs.report.thumbnails import measured_shares, thumbnails
+from pano_mvs.report.verdict import Verdict, verdict
+from pano_mvs.report.view_cards import ViewCard, chosen_views, view_cards
+from pano_mvs.scene.index import pair_name
+
+_MOST_REASONS = 300
+_NO_POSES: Mapping[str, Any] = {"registered": [], "rejected": {}, "centers": [], "links": [], "frame": "", "scale": "",
+                                "metric": False}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Content:
+    """What the page shows.
+
+    Attributes:
+        verdict: the head of the page.
+        poses: as in run.json, without gaps.
+        maps: the cameras from above and from the side.
+        rejected_pairs: (first, second, candidates or None, reason) of pairs without a common geometry.
+        pairs: number of pairs that were looked at.
+        cloud: pictures of the cloud.
+        cards: views shown in full.
+        total_views: number of views.
+        rows: one for each panorama.
+        total_rows: number of panoramas.
+        mean_shares: of the sphere, over all measured views.
+        residuals: of the points.
+        pair_residuals: medians of the pairs' residuals.
+        scores: (stage, tables) of each branch that has some.
+        notes: what could not be shown.
+    """
+
+    verdict: Verdict
+    poses: Mapping[str, Any]
+    maps: tuple[CameraMap, ...]
+    rejected_pairs: tuple[tuple[str, str, int | None, str], ...]
+    pairs: int
+    cloud: CloudPictures
+    cards: tuple[ViewCard, ...]
+    total_views: int
+    rows: tuple[Row, ...]
+    total_rows: int
+    mean_shares: Shares | None
+    residuals: Residuals | None
+    pair_residuals: Histogram | None
+    scores: tuple[tuple[str, Mapping[str, Any]], ...]
+    notes: tuple[str, ...]
+
+
+def gather(out_dir: Path, summary: Mapping[str, Any], results: Results, kept: Kept) -> Content:
+    """Return what the page shows; what is missing or damaged is left out and told.
+
+    Args:
+        out_dir: the output folder.
+        summary: what run.json holds; every key may be missing.
+        results: the values behind it.
+        kept: the earlier page's pictures and figures; those that go on are marked.
+    """
+    known = dict(summary.get("poses") or {})
+    poses = {name: known.get(name) or empty for name, empty in _NO_POSES.items()} | {"up": known.get("up")}
+    views = summary.get("views") or []
+    links = poses["links"]
+    rejected_pairs = _rejected_pairs(links, results)
+    record = results.poses
+    residuals = reprojection_residuals(record) if record is not None else None
+    cards = view_cards(out_dir, [views[idx] for idx in chosen_views(views)], results, kept)
+    shares = measured_shares(views, results, kept) | {card.name: card.shares for card in cards if card.shares}
+    rows = panorama_rows(summary, shares=shares, residuals=residuals,
+                         thumbnails=thumbnails(out_dir, views, results, kept))  # fmt: skip
+    judged = dict(summary) | {"views": [_judged(view, shares) for view in views]}
+    return Content(
+        verdict=verdict(judged, residuals=residuals, image_width=_image_width(results)),
+        poses=poses,
+        maps=camera_maps(poses, {(first, second): why for first, second, _, why in rejected_pairs}),
+        rejected_pairs=rejected_pairs,
+        pairs=len(links),
+        cloud=cloud_pictures(results, kept, up=up_of(poses)),
+        cards=cards,
+        total_views=len(views),
+        rows=rows,
+        total_rows=len({*map(str, poses["registered"]), *(str(view.get("name", "")) for view in views),
+                        *map(str, poses["rejected"]), *map(str, summary.get("rejected") or {})}),
+        mean_shares=_mean(list(shares.values())),
+        residuals=residuals,
+        pair_residuals=histogram([link[4] for link in links if len(link) > 4 and link[4] is not None]),
+        scores=tuple((stage, score_tables(scores)) for stage, scores in scores_by_stage(summary).items()),
+        notes=tuple(sorted(set(results.notes))),
+    )  # fmt: skip
+
+
+def _rejected_pairs(links: Any, results: Results) -> tuple[tuple[str, str, int | None, str], ...]:
+    """Return the pairs without inliers, those with most candidates first, and why, of the first 300."""
+    rejected = [(str(first), str(second), more[0] if more else None) for first, second, inliers, *more in links
+                if not inliers]  # fmt: skip
+    rejected.sort(key=lambda pair: -(pair[2] or 0))
+    return tuple(
+        (first, second, candidates, results.pair_reason(pair_name(first, second)) if idx < _MOST_REASONS else "")
+        for idx, (first, second, candidates) in enumerate(rejected)
+    )
+
+
+def _judged(view: Mapping[str, Any], shares: Mapping[str, Shares]) -> dict[str, Any]:
+    """Return a view with its shares of the unmasked sphere, where they were measured, in place of its pixels'."""
+    own = shares.get(str(view.get("name", "")))
+    return dict(view) | ({"completeness": own.complete, "consistent": own.confirmed} if own else {})
+
+
+def _image_width(results: Results) -> int | None:
+    for name in results.refs.get("images", {}):
+        panorama = results.panorama(name)
+        return panorama.size_hw[1] if panorama is not None else None
+    return None
+
+
+def _mean(shares: list[Shares]) -> Shares | None:
+    if not shares:
+        return None
+    count = len(shares)
+    return Shares(
+        consistent=sum(one.consistent for one in shares) / count,
+        weak=sum(one.weak for one in shares) / count,
+        filled=sum(one.filled for one in shares) / count,
+        invalid=sum(one.invalid for one in shares) / count,
+        masked=sum(one.masked for one in shares) / count,
+    )

@@ -1,0 +1,173 @@
+"""What a person should know of a run before anything else: what is wrong or doubtful, and what to do about it."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pano_mvs.report.figures import figure, median, share
+
+GOOD_REGISTERED, FAIR_REGISTERED = 0.95, 0.5
+# Residuals are compared with a pixel of the panorama: what is measured to within one is measured well.
+GOOD_RESIDUAL_PX, FAIR_RESIDUAL_PX = 1.0, 2.0
+# A sky takes up to half of the sphere, so it is not for much less that a result is bad.
+GOOD_COMPLETE, FAIR_COMPLETE = 0.8, 0.35
+# Plain walls are confirmed by nobody: a third of a furnished room is as much as can be had.
+GOOD_CONSISTENT, FAIR_CONSISTENT = 0.3, 0.12
+_FEW_LINKS = 2
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing to know.
+
+    Attributes:
+        mood: "bad" or "fair"; "" for what is only worth knowing.
+        text: what it is.
+        remedy: what to do, "" if nothing.
+    """
+
+    mood: str
+    text: str
+    remedy: str = ""
+
+
+def mood_of(value: float, good: float, fair: float) -> str:
+    """Return "good", "fair" or "bad": limits that fall from good to fair are lower ones, else upper ones."""
+    if good > fair:
+        return "good" if value >= good else "fair" if value >= fair else "bad"
+    return "good" if value <= good else "fair" if value <= fair else "bad"
+
+
+def findings(summary: Mapping[str, Any], *, residual_px: float | None = None) -> tuple[Finding, ...]:
+    """Return what is wrong or doubtful in a run, the worst first.
+
+    Args:
+        summary: what run.json holds; every key may be missing.
+        residual_px: median reprojection residual in pixels of the panoramas, if known.
+    """
+    found = [
+        *_stopped(summary),
+        *_failures(summary),
+        *_registration(summary),
+        *_graph(summary),
+        *_residual(residual_px),
+        *_views(summary.get("views") or []),
+        *_cloud(summary),
+        *_baseline(summary),
+    ]
+    return tuple(sorted(found, key=lambda finding: ("bad", "fair", "").index(finding.mood)))
+
+
+def _stopped(summary: Mapping[str, Any]) -> list[Finding]:
+    stopped = str(summary.get("stopped") or "")
+    if not stopped:
+        return []
+    if stopped == "interrupted":
+        return [Finding("fair", "The run was interrupted: what is shown is what it had finished.",
+                        "Run the same command again; what is finished is not computed again.")]  # fmt: skip
+    return [Finding("bad", f"The run stopped early: {stopped}", "Mend this and run the same command again.")]
+
+
+def _failures(summary: Mapping[str, Any]) -> list[Finding]:
+    failures, blocked = summary.get("failures") or [], summary.get("blocked") or []
+    if not failures:
+        return []
+    stages = Counter(str(failure.get("stage", "")) for failure in failures)
+    where = ", ".join(f"{count} in {stage}" for stage, count in stages.most_common(3))
+    more = f"; {_units(len(blocked))} could not run because of them" if blocked else ""
+    verb = "unit of work failed" if len(failures) == 1 else "units of work failed"
+    return [Finding("fair", f"{figure(len(failures))} {verb} ({where}){more}.", "Their causes are listed below.")]
+
+
+def _registration(summary: Mapping[str, Any]) -> list[Finding]:
+    poses = summary.get("poses") or {}
+    registered = len(poses.get("registered") or [])
+    rejected = poses.get("rejected") or {}
+    total = registered + len(rejected)
+    if not total or not rejected:
+        return []
+    mood = mood_of(registered / total, GOOD_REGISTERED, FAIR_REGISTERED)
+    kinds = Counter(re.sub(r"\d+([.,]\d+)?", "…", str(reason)) for reason in rejected.values())
+    ((_, count),) = kinds.most_common(1)
+    example = next(str(why) for why in rejected.values() if re.sub(r"\d+([.,]\d+)?", "…", str(why)) == _top(kinds))
+    most = f"mostly: {example}" if len(kinds) > 1 else example
+    text = f"{len(rejected)} of {total} panoramas have no pose ({most}{f', {count} times' if count > 1 else ''})."
+    return [Finding("" if mood == "good" else mood, text,
+                    "" if mood == "good" else "Take more pictures between those, 0.5–1 m apart indoors, each seeing "
+                    "much of what the next one sees.")]  # fmt: skip
+
+
+def _top(kinds: Counter[str]) -> str:
+    return kinds.most_common(1)[0][0]
+
+
+def _graph(summary: Mapping[str, Any]) -> list[Finding]:
+    """Return which registered cameras hang on one link alone, where there are cameras enough to tell."""
+    poses = summary.get("poses") or {}
+    names, links = poses.get("registered") or [], poses.get("links") or []
+    if len(names) < 4 or not links:
+        return []
+    count = Counter(name for first, second, inliers, *_ in links if inliers for name in (first, second))
+    loose = [str(name) for name in names if 0 < count[name] < _FEW_LINKS]
+    if not loose:
+        return []
+    shown = ", ".join(loose[:3]) + (" …" if len(loose) > 3 else "")
+    verb = "camera hangs" if len(loose) == 1 else "cameras hang"
+    return [Finding("fair" if len(loose) > len(names) / 4 else "", f"{len(loose)} {verb} on one link alone ({shown}): "
+                    "nothing confirms where it is." if len(loose) == 1 else f"{len(loose)} {verb} on one link alone "
+                    f"({shown}): nothing confirms where they are.")]  # fmt: skip
+
+
+def _residual(residual_px: float | None) -> list[Finding]:
+    if residual_px is None or (mood := mood_of(residual_px, GOOD_RESIDUAL_PX, FAIR_RESIDUAL_PX)) == "good":
+        return []
+    text = f"The points miss the pictures by {residual_px:.1f} pixels in the median: the poses are not sharp."
+    return [Finding(mood, text, "Check that the pictures are sharp, unstitched seams aside, and not edited one by one; "
+                    "put poses.refine behind the solver if it is not there.")]  # fmt: skip
+
+
+def _views(views: Sequence[Mapping[str, Any]]) -> list[Finding]:
+    found = []
+    complete, consistent = (median([view.get(key) for view in views]) for key in ("completeness", "consistent"))
+    if complete is not None and (mood := mood_of(complete, GOOD_COMPLETE, FAIR_COMPLETE)) != "good":
+        found.append(Finding(mood, f"Half of the views have a range for less than {share(complete)} of their pixels.",
+                             "Sky and masks have none; elsewhere look at the views below."))  # fmt: skip
+    if consistent is not None and (mood := mood_of(consistent, GOOD_CONSISTENT, FAIR_CONSISTENT)) != "good":
+        found.append(Finding(mood, f"Other views confirm only {share(consistent)} of the pixels in the median view.",
+                             "Plain walls cannot be confirmed; if textured ones are not either, the cameras are too "
+                             "far apart or the poses are wrong."))  # fmt: skip
+    return found
+
+
+def _cloud(summary: Mapping[str, Any]) -> list[Finding]:
+    if (summary.get("cloud") or {}).get("points") == 0:
+        return [Finding("bad", "The cloud has no points: no two views agree on any surface.",
+                        "Look at the ranges below; if they are sound, the poses are not.")]  # fmt: skip
+    return []
+
+
+def _baseline(summary: Mapping[str, Any]) -> list[Finding]:
+    """Return whether a constant range would have scored as well."""
+    found = []
+    for stage, scores in scores_by_stage(summary).items():
+        views = (scores.get("views") or {}).values()
+        ours, constant = (median([view.get(key) for view in views]) for key in ("psnr_db", "constant_psnr_db"))
+        if ours is not None and constant is not None and ours <= constant:
+            text = f"Against the truth ({stage}), one constant range for all pixels does as well"
+            found.append(Finding("bad", f"{text}: {ours:.1f} dB to {constant:.1f} dB."))
+    return found
+
+
+def scores_by_stage(summary: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the scores of every branch that has some, by the stage that scored it."""
+    several = summary.get("all_scores") or {}
+    single = summary.get("scores") or {}
+    return dict(several) if several else {"scores": single} if single else {}
+
+
+def _units(count: int) -> str:
+    return "1 further unit" if count == 1 else f"{figure(count)} further units"

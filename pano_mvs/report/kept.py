@@ -1,0 +1,66 @@
+"""What an earlier page holds, so that a run that computed nothing draws nothing again.
+
+Each picture bears a key: the digest of what it was made of. A page that was edited, or of another version, just has
+fewer of them.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pano_mvs.report.pictures import Picture
+
+_PICTURE = re.compile(
+    r'<img data-key="([0-9a-z.]{1,80})" src="(data:image/jpeg;base64,[A-Za-z0-9+/=]+)" width="(\d{1,5})" '
+    r'height="(\d{1,5})"'
+)
+_FACTS = re.compile(r'<script type="application/json" id="facts">([^<]*)</script>')
+_LARGEST_BYTES = 100_000_000
+
+
+class Kept:
+    """The pictures and the figures of an earlier page, by key, and those that the next one is to keep."""
+
+    def __init__(self, pictures: Mapping[str, Picture] | None = None, facts: Mapping[str, Any] | None = None) -> None:
+        self._pictures = dict(pictures or {})
+        self._facts = dict(facts or {})
+        self.facts: dict[str, Any] = {}
+
+    @staticmethod
+    def of_page(path: Path) -> Kept:
+        """Return what a page holds; nothing if it is not there or no page of ours."""
+        try:
+            text = path.read_text(encoding="utf-8") if path.stat().st_size <= _LARGEST_BYTES else ""
+        except (OSError, UnicodeDecodeError):
+            return Kept()
+        pictures = {
+            key: Picture(uri, (int(height), int(width)), key) for key, uri, width, height in _PICTURE.findall(text)
+        }
+        return Kept(pictures, _facts(text))
+
+    def picture(self, key: str) -> Picture | None:
+        """Return a picture, None if it was not kept."""
+        return self._pictures.get(key)
+
+    def fact(self, key: str) -> Any:
+        """Return figures, None if they were not kept; what is asked for is kept on."""
+        if key in self._facts:
+            self.facts[key] = self._facts[key]
+        return self._facts.get(key)
+
+    def keep(self, key: str, fact: Any) -> None:
+        """Keep figures for the next page."""
+        self.facts[key] = fact
+
+
+def _facts(text: str) -> dict[str, Any]:
+    found = _FACTS.search(text)
+    try:
+        facts = json.loads(found[1]) if found else {}
+    except (ValueError, RecursionError):
+        return {}
+    return facts if isinstance(facts, dict) else {}

@@ -1,0 +1,136 @@
+"""What a run left in the store, as far as the report shows it: nothing is computed again, what is gone is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import InputError, StoreError
+from pano_mvs.engine.run import Run
+from pano_mvs.engine.store import ItemRef, Store
+from pano_mvs.scene import Panorama, PointCloud, Poses, RangeMap, Record
+
+ROLES = ("images", "pairs", "poses", "ranges", "cloud")
+"""Of which values the report speaks; run.json says which stage made each."""
+
+_Kind = TypeVar("_Kind", bound=Record)
+
+
+@dataclass(frozen=True)
+class Results:
+    """The values of one run.
+
+    Attributes:
+        store: where they are; None if it is not known or not there any more.
+        refs: role to item to the stored value; see `ROLES`. The items of what there is one of are called "".
+        notes: what could not be had, and why; grows while the page is made.
+    """
+
+    store: Store | None = None
+    refs: Mapping[str, Mapping[str, ItemRef]] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    @staticmethod
+    def of_run(run: Run, stages: Mapping[str, str]) -> Results:
+        """Return what a run in this process made.
+
+        Args:
+            run: the run, finished or not.
+            stages: role to the stage that made it.
+        """
+        refs = {role: run.states[stage].items for role, stage in stages.items() if stage in run.states}
+        return Results(run.store, refs)
+
+    @staticmethod
+    def of_folder(out: Path, summary: Mapping[str, Any], store: Store) -> Results:
+        """Return what the latest run into a folder made, by the store's book of runs.
+
+        Args:
+            out: the output folder.
+            summary: its run.json.
+            store: the store that the run used.
+
+        Raises:
+            StoreError: if the book is damaged.
+        """
+        own = str(out.resolve())
+        entry = next((run for run in store.runs.entries() if run.out == own and not run.pinned), None)
+        if entry is None:
+            return Results(notes=[f"the cache {store.root} knows no run into {out}, so pictures are missing"])
+        stages = {role: str(stage) for role, stage in (summary.get("results") or {}).items() if role in ROLES}
+        records = {
+            role: {item: store.read_record(key) for item, key in entry.keys.get(stage, {}).items()}
+            for role, stage in stages.items()
+        }
+        refs = {role: {item: rec.output for item, rec in found.items() if rec} for role, found in records.items()}
+        _find_pictures(store, summary, stages.get("images", ""), refs.get("images", {}))
+        return Results(store, refs)
+
+    @property
+    def poses(self) -> Poses | None:
+        """The poses that the ranges were made with."""
+        return self._load("poses", "", Poses)
+
+    @property
+    def cloud(self) -> PointCloud | None:
+        """The fused cloud."""
+        return self._load("cloud", "", PointCloud)
+
+    def panorama(self, name: str) -> Panorama | None:
+        """Return a panorama, whose picture is decoded on demand."""
+        return self._load("images", name, Panorama)
+
+    def range_map(self, name: str) -> RangeMap | None:
+        """Return the final range map of a view."""
+        return self._load("ranges", name, RangeMap)
+
+    def confidence(self, name: str) -> NDArray[np.uint8] | None:
+        """Return the confidence (H, W) of the final range map of a view, without reading the rest of it."""
+        part = self._part("ranges", name, "confidence")
+        return part if isinstance(part, np.ndarray) else None
+
+    def pair_reason(self, name: str) -> str:
+        """Return why a pair has no general geometry, "" if that is not known."""
+        meta = self._part("pairs", name, "meta")
+        return str(meta.get("reason", "")) if isinstance(meta, dict) else ""
+
+    def digest(self, role: str, name: str = "") -> str:
+        """Return the digest of a value, "" if there is none."""
+        ref = self.refs.get(role, {}).get(name)
+        return ref.digest if ref is not None else ""
+
+    def _part(self, role: str, name: str, part: str) -> Any:
+        ref = self.refs.get(role, {}).get(name)
+        if self.store is None or ref is None or part not in ref.parts:
+            return None
+        try:
+            return self.store.blobs.get(ref.parts[part])
+        except StoreError as error:
+            self.notes.append(str(error))
+            return None
+
+    def _load(self, role: str, name: str, kind: type[_Kind]) -> _Kind | None:
+        ref = self.refs.get(role, {}).get(name)
+        if self.store is None or ref is None:
+            return None
+        try:
+            value = self.store.load(ref, kind)
+        except (StoreError, InputError) as error:
+            self.notes.append(str(error))
+            return None
+        return value if isinstance(value, kind) else None
+
+
+def _find_pictures(store: Store, summary: Mapping[str, Any], stage: str, refs: Mapping[str, ItemRef]) -> None:
+    """Tell the store where the user's own pictures are: it knows them by their digests alone."""
+    entries = [entry for entry in summary.get("stages") or [] if entry.get("name") == stage]
+    folder = (entries[0].get("params") or {}).get("path") if entries else None
+    for name, ref in refs.items() if folder else ():
+        path = Path(str(folder)) / name
+        if any(part.external for part in ref.parts.values()) and path.is_file():
+            store.blobs.register_external(path)
