@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
@@ -14,6 +13,7 @@ from pano_mvs.engine.blobs import BlobRef, DamagedBlobError
 from pano_mvs.engine.room import is_full_disk
 from pano_mvs.engine.store import ItemRef, Store
 from pano_mvs.scene import Files
+from pano_mvs.scene.files import item_stems
 
 _PLACEHOLDER = re.compile(r"\{(?:item|name)\}")
 
@@ -52,14 +52,7 @@ class Publisher:
 
     def name_items(self, names: Iterable[str]) -> None:
         """Fix the `{item}` of each image: its path without the extension, kept where two would collide."""
-        found = list(names)
-        self._stems = {name: str(PurePosixPath(name).with_suffix("")) for name in found}
-        while True:
-            count = Counter(stem.casefold() for stem in self._stems.values())
-            clashing = [name for name in found if count[self._stems[name].casefold()] > 1 and self._stems[name] != name]
-            if not clashing:
-                return
-            self._stems.update({name: name for name in clashing})
+        self._stems = item_stems(names)
 
     def publish(self, stage: str, item: str, ref: ItemRef, *, to: str = "") -> None:
         """Write the files of one unit, unless they are there with the right bytes.

@@ -52,6 +52,7 @@ from pano_mvs.geometry.sphere import (
     pixel_solid_angle,
     ray_from_pixel,
     ray_grid,
+    spiral_rays,
 )
 from pano_mvs.geometry.transforms import Rigid3, Similarity3, similarity_from_points
 from pano_mvs.geometry.triangulation import ranges_from_bearings, triangulate_bearings
@@ -79,5 +80,6 @@ __all__ = [
     "sample_panorama",
     "similarity_from_points",
     "skew",
+    "spiral_rays",
     "triangulate_bearings",
 ]

@@ -54,6 +54,14 @@ def ray_grid(size_hw: tuple[int, int]) -> FloatArray:
     return ray_from_pixel(np.stack([x, y], axis=-1), size_hw)
 
 
+def spiral_rays(count: int) -> FloatArray:
+    """Return evenly spread unit rays, (count, 3): Fibonacci's spiral (Swinbank & Purser 2006)."""
+    y = 1 - (2 * np.arange(count) + 1) / count
+    azimuth = np.pi * (1 + np.sqrt(5)) * np.arange(count)
+    flat = np.sqrt(1 - y**2)
+    return np.stack([flat * np.sin(azimuth), y, flat * np.cos(azimuth)], axis=-1)
+
+
 def pixel_solid_angle(size_hw: tuple[int, int]) -> FloatArray:
     """Return the exact solid angle of a pixel in each row, (height,), in steradians; all pixels sum to 4π."""
     height, width = _checked_size(size_hw)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.geometry import pixel_from_ray, ray_from_pixel
 from pano_mvs.io.captures import natural_key
+from pano_mvs.io.colmap_points import ModelForm, ModelPoints, write_model
 from pano_mvs.io.colmap_sphere import has_sphere_cameras, read_sphere_model
 from pano_mvs.io.pose_json import require_distinct
 from pano_mvs.scene import Poses
@@ -20,16 +21,19 @@ _MAX_QUAT_ERROR = 1e-3
 _MODEL_FILES = (("cameras.bin", "images.bin", "points3D.bin"), ("cameras.txt", "images.txt", "points3D.txt"))
 
 
-def write_colmap_model(folder: Path, poses: Poses, sizes_hw: Mapping[str, tuple[int, int]]) -> None:
-    """Write poses, tracks and points as one COLMAP model: cameras, images, points3D, rigs and frames .bin.
+def write_colmap_model(
+    folder: Path, poses: Poses, sizes_hw: Mapping[str, tuple[int, int]], *, form: ModelForm = "bin"
+) -> None:
+    """Write poses, tracks and points as one COLMAP model: cameras, images, points3D, rigs and frames.
 
     One EQUIRECTANGULAR camera for each distinct picture size, each its own trivial rig; the key points of an image
     are its track observations, in pixels of the size given. The same poses give the same bytes.
 
     Args:
-        folder: where the five files go; made if it is not there.
+        folder: where the files go; made if it is not there.
         poses: what to write. Errors become pixels at the equator (w / 2π per radian).
         sizes_hw: (height, width) of each picture, by the name of the image.
+        form: "bin" (COLMAP's usual), "txt", or "both"; COLMAP reads the binary files if it finds both.
 
     Raises:
         UsageError: if the size of an image is not given.
@@ -41,23 +45,18 @@ def write_colmap_model(folder: Path, poses: Poses, sizes_hw: Mapping[str, tuple[
         raise UsageError(f"the size of {missing[0]} is not given (nor of {len(missing) - 1} more images)")
     model = pycolmap.Reconstruction()
     camera_ids = _add_cameras(model, [sizes_hw[name] for name in poses.names])
-    tracks: list[Any] = [pycolmap.Track() for _ in range(len(poses.points_in_world))]
+    points = ModelPoints(poses)
     for idx, name in enumerate(poses.names):
-        observed = np.flatnonzero(poses.track_image_idx == idx)
+        observed = points.observations(idx)
         pixels = pixel_from_ray(poses.track_bearings[observed], sizes_hw[name])
         image = pycolmap.Image(
             name=name, keypoints=pixels.reshape(-1, 2), camera_id=camera_ids[sizes_hw[name]], image_id=idx + 1
         )
         rotation = pycolmap.Rotation3d(np.asarray(poses.rotations[idx]))
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(rotation, np.asarray(poses.translations[idx])))
-        for point2d_idx, point_idx in enumerate(poses.track_point_idx[observed]):
-            tracks[point_idx].add_element(idx + 1, point2d_idx)
-    errors_px = _errors_px(poses, sizes_hw)
-    for idx, track in enumerate(tracks):
-        point_id = model.add_point3D(poses.points_in_world[idx], track, poses.point_colors_rgb[idx])
-        model.points3D[point_id].error = float(errors_px[idx])
-    folder.mkdir(parents=True, exist_ok=True)
-    model.write_binary(str(folder))
+        points.observe(idx + 1, observed, pixels_per_rad=sizes_hw[name][1] / (2 * np.pi))
+    points.add_to(model)
+    write_model(model, folder, form)
 
 
 def read_colmap_model(folder: Path) -> Poses:
@@ -125,16 +124,6 @@ def _add_cameras(model: Any, sizes_hw: list[tuple[int, int]]) -> dict[tuple[int,
             camera.camera_id = ids[height, width]
             model.add_camera_with_trivial_rig(camera)
     return ids
-
-
-def _errors_px(poses: Poses, sizes_hw: Mapping[str, tuple[int, int]]) -> NDArray[np.float64]:
-    """Return the error of each point in pixels at the equator, by the mean width of the images that observe it."""
-    widths = np.array([sizes_hw[name][1] for name in poses.names], np.float64)
-    count = len(poses.points_in_world)
-    seen = np.bincount(poses.track_point_idx, minlength=count)
-    total = np.bincount(poses.track_point_idx, weights=widths[poses.track_image_idx], minlength=count)
-    errors: NDArray[np.float64] = poses.point_errors_rad * total / np.maximum(seen, 1) / (2 * np.pi)
-    return errors
 
 
 def _loaded(folder: Path) -> Any:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import ClassVar, Self
@@ -51,3 +52,15 @@ class Files(Record):
             assert isinstance(part, FilePart)
             files[target] = part.path
         return cls(files)
+
+
+def item_stems(names: Iterable[str]) -> dict[str, str]:
+    """Return the `{item}` of each image: its path without the extension, kept where two would collide."""
+    found = list(names)
+    stems = {name: str(PurePosixPath(name).with_suffix("")) for name in found}
+    while True:
+        count = Counter(stem.casefold() for stem in stems.values())
+        clashing = [name for name in found if count[stems[name].casefold()] > 1 and stems[name] != name]
+        if not clashing:
+            return stems
+        stems.update({name: name for name in clashing})

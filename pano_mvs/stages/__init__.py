@@ -6,7 +6,7 @@ They are registered through the entry point `pano_mvs.plugins`, like anybody's.
 from pano_mvs.stages.depth import sweep
 from pano_mvs.stages.evaluate import truth
 from pano_mvs.stages.export import ply, previews, ranges
-from pano_mvs.stages.export_colmap import colmap
+from pano_mvs.stages.export_colmap import colmap, colmap_dense, colmap_dense_init, colmap_faces, colmap_masks
 from pano_mvs.stages.export_mesh import mesh
 from pano_mvs.stages.export_nerfstudio import nerfstudio, nerfstudio_frames
 from pano_mvs.stages.features import orb_tangent, sift_tangent, sphorb
@@ -26,6 +26,7 @@ from pano_mvs.stages.fusion import vote
 from pano_mvs.stages.matches import brute_force
 from pano_mvs.stages.pairs import exhaustive, position, retrieval, sequential, vlad
 from pano_mvs.stages.patchmatch import patchmatch
+from pano_mvs.stages.points import surface, tracked
 from pano_mvs.stages.poses import from_model, refine, scaled_translation, triangulate
 from pano_mvs.stages.poses_colmap import colmap_poses, colmap_sift_poses, extend
 from pano_mvs.stages.source import folder
@@ -36,6 +37,10 @@ __all__ = [
     "bilateral_solver",
     "brute_force",
     "colmap",
+    "colmap_dense",
+    "colmap_dense_init",
+    "colmap_faces",
+    "colmap_masks",
     "colmap_poses",
     "colmap_sift_poses",
     "confidence",
@@ -68,7 +73,9 @@ __all__ = [
     "sift_tangent",
     "speckle",
     "sphorb",
+    "surface",
     "sweep",
+    "tracked",
     "triangulate",
     "truth",
     "unit_translations",

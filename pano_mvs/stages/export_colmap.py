@@ -1,15 +1,169 @@
-"""Exports for COLMAP and what reads its files: sparse models and dense workspaces."""
+"""Exports for COLMAP and what reads its files: sparse models, dense workspaces, seeds for splats."""
 
 from __future__ import annotations
 
-from pano_mvs.api import All, Context, Files, One, Panorama, Poses, stage
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from pano_mvs.algorithms.faces.layout import Face, covers_sphere, panorama_faces
+from pano_mvs.algorithms.faces.render import colmap_depth_view, face_source, render_face
+from pano_mvs.api import All, Context, Each, Files, Names, One, Panorama, Params, Poses, RangeMap, UsageError, stage
+from pano_mvs.geometry import PinholeView
 from pano_mvs.io.colmap_model import write_colmap_model
+from pano_mvs.io.colmap_points import ModelForm
+from pano_mvs.io.colmap_rig import CutPanorama, write_rig_model
+from pano_mvs.io.colmap_workspace import WORKSPACE, face_image_name, write_face, write_stereo_configs
+from pano_mvs.scene.face_files import FaceFiles, FaceLayout
+from pano_mvs.scene.files import item_stems
+from pano_mvs.scene.image_file import write_png
+from pano_mvs.scene.tracked_points import TrackedPoints
 
 
-@stage("export.colmap")
-def colmap(poses: One[Poses], images: All[Panorama], ctx: Context) -> Files:
+class ModelParams(Params):
+    """Settings of export.colmap."""
+
+    format: ModelForm = Field(default="bin", description="binary files, text files, or both (COLMAP prefers binary)")
+
+
+@stage("export.colmap", version=2)
+def colmap(poses: One[Poses], images: All[Panorama], params: ModelParams, ctx: Context) -> Files:
     """COLMAP model of EQUIRECTANGULAR cameras, with points and tracks, in colmap/sparse/0."""
+    return _sparse_model(poses, images, params.format, ctx, "colmap/sparse/0")
+
+
+@stage("export.colmap_masks")
+def colmap_masks(image: Each[Panorama], ctx: Context) -> Files:
+    """A mask for each picture where COLMAP looks for it, colmap/masks/<image>.png: 0 is ignored, 255 is used.
+
+    In the size of the model's cameras, and also of pictures of which nothing is masked: COLMAP leaves out a picture
+    whose mask it does not find.
+    """
+    path = ctx.scratch / "mask.png"
+    mask = image.load_mask().astype(np.uint8) * 255
+    rows, columns = (
+        np.minimum(np.arange(source) * size // source, size - 1)
+        for source, size in zip(image.source_size_hw, mask.shape, strict=True)
+    )
+    write_png(path, mask[rows[:, None], columns])
+    ctx.metric("masked_share", float((mask == 0).mean()))
+    return Files({"colmap/masks/{name}.png": path})
+
+
+class FacesParams(Params):
+    """Settings of export.colmap_faces."""
+
+    layout: FaceLayout = Field(default="cube", description="cube: 6 faces, octagon: 10, icosahedron: 20")
+    fov_deg: float = Field(default=96.0, ge=30, le=150, description="field of view of a face; 90 and more overlap")
+    size_px: int | None = Field(default=None, ge=4, le=16384, description="width of a face; null: as fine as the image")
+    min_confidence: int = Field(default=64, ge=1, le=255, description="ranges below have no depth (64: seen)")
+    image_format: Literal["jpg", "png"] = Field(default="jpg", description="of the faces' pictures (JPEG: quality 95)")
+
+
+@stage("export.colmap_faces")
+def colmap_faces(image: Each[Panorama], range_map: Each[RangeMap], params: FacesParams, ctx: Context) -> FaceFiles:
+    """The pinhole faces of each panorama for COLMAP's dense tools: pictures, masks, z-depth and normal maps.
+
+    In colmap_dense/; export.colmap_dense writes the model that goes with them.
+    """
+    picture = image.load()
+    source = face_source(
+        picture, image.load_mask(), range_map, min_confidence=params.min_confidence, threads=ctx.threads
+    )
+    faces = panorama_faces(image.size_hw, layout=params.layout, fov_deg=params.fov_deg, size_px=params.size_px)
+    if not covers_sphere(faces):
+        ctx.note(f"{params.layout} faces of {params.fov_deg:g}° do not cover the sphere: some directions are in none")
+    suffix, depths = f".{params.image_format}", []
+    files: dict[str, Path] = {}
+    for face in faces:
+        seen = render_face(source, face.view, depth_view=colmap_depth_view(face.view), threads=ctx.threads)
+        files |= write_face(
+            ctx.scratch, face.name, suffix, image=seen.image, mask=seen.mask, z_depth=seen.z_depth,
+            normals_in_face=seen.normals_in_face,
+        )  # fmt: skip
+        depths.append(np.isfinite(seen.z_depth).mean())
+    ctx.metric("share_with_depth", float(np.mean(depths)))
+    return FaceFiles(files, params.layout, params.fov_deg, faces[0].view.size_hw[0], suffix)
+
+
+class DenseParams(Params):
+    """Settings of export.colmap_dense."""
+
+    format: ModelForm = Field(default="both", description="of the model; some versions of OpenMVS read text alone")
+
+
+@stage("export.colmap_dense")
+def colmap_dense(
+    poses: One[Poses],
+    faces: All[FaceFiles],
+    images: Names[Panorama],
+    points: One[TrackedPoints] | None,
+    params: DenseParams,
+    ctx: Context,
+) -> Files:
+    """The model of export.colmap_faces' pictures: a dense workspace for COLMAP's fusion, OpenMVS and splat trainers.
+
+    colmap_dense/sparse: a rig of PINHOLE cameras, a frame for each panorama, points with tracks; stereo/*.cfg. With
+    points.tracked its points are added to the sparse ones, so that no face is without.
+    """
+    joined = poses if points is None else points.joined_to(poses, keep_points=True)
+    cuts = _cuts(poses.names, faces, item_stems(images))
+    if not cuts:
+        raise UsageError("no panorama has both a pose and faces, so there is no workspace to describe")
+    folder = ctx.scratch / "sparse"
+    seen = write_rig_model(folder, joined, cuts, form=params.format)
+    blind = sum(not count for count in seen.values())
+    ctx.metric("faces_without_points", blind)
+    if blind:
+        ctx.note(f"{blind} of {len(seen)} faces see no point of the model: COLMAP fuses none of their depths. Add a "
+                 "stage points.tracked, or raise its count")  # fmt: skip
+    files = {f"{WORKSPACE}/sparse/{path.name}": path for path in sorted(folder.iterdir())}
+    return Files(files | write_stereo_configs(ctx.scratch, seen))
+
+
+class DenseInitParams(ModelParams):
+    """Settings of export.colmap_dense_init."""
+
+    keep_sfm: bool = Field(default=True, description="also the sparse points that the poses were solved with")
+
+
+@stage("export.colmap_dense_init")
+def colmap_dense_init(
+    poses: One[Poses], points: One[TrackedPoints], images: All[Panorama], params: DenseInitParams, ctx: Context
+) -> Files:
+    """COLMAP model with the many points of points.tracked, in colmap_dense_init/sparse/0: what splats begin with.
+
+    The cameras are those of export.colmap, EQUIRECTANGULAR.
+    """
+    joined = points.joined_to(poses, keep_points=params.keep_sfm)
+    ctx.metric("points", len(joined.points_in_world))
+    return _sparse_model(joined, images, params.format, ctx, "colmap_dense_init/sparse/0")
+
+
+def _sparse_model(poses: Poses, images: Mapping[str, Panorama], form: ModelForm, ctx: Context, target: str) -> Files:
     folder = ctx.scratch / "model"
-    folder.mkdir()
-    write_colmap_model(folder, poses, {name: images[name].source_size_hw for name in poses.names if name in images})
-    return Files({f"colmap/sparse/0/{path.name}": path for path in sorted(folder.iterdir())})
+    sizes_hw = {name: images[name].source_size_hw for name in poses.names if name in images}
+    write_colmap_model(folder, poses, sizes_hw, form=form)
+    return Files({f"{target}/{path.name}": path for path in sorted(folder.iterdir())})
+
+
+def _cuts(names: Iterable[str], faces: Mapping[str, FaceFiles], stems: Mapping[str, str]) -> dict[str, CutPanorama]:
+    """Return how each panorama that has faces was cut; those that were cut alike share their views."""
+    shared: dict[tuple[str, float, int], tuple[Face, ...]] = {}
+    views: dict[tuple[str, float, int], list[PinholeView]] = {}
+    cuts: dict[str, CutPanorama] = {}
+    for name in names:
+        if name not in faces:
+            continue
+        cut = faces[name]
+        way = cut.layout, cut.fov_deg, cut.size_px
+        if way not in shared:
+            shared[way] = panorama_faces((0, 0), layout=cut.layout, fov_deg=cut.fov_deg, size_px=cut.size_px)
+            views[way] = [face.view for face in shared[way]]
+        cuts[name] = CutPanorama(
+            views[way], [face_image_name(face.name, stems[name], cut.suffix) for face in shared[way]]
+        )
+    return cuts

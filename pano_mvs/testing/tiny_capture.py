@@ -29,7 +29,10 @@ from pano_mvs.scene import (
     TwoView,
     Views,
 )
+from pano_mvs.scene.face_files import FaceFiles
 from pano_mvs.scene.image_file import write_png
+from pano_mvs.scene.surface_samples import SurfaceSamples
+from pano_mvs.scene.tracked_points import TrackedPoints
 from pano_mvs.testing.room import capture_poses, default_room, range_along, render
 
 Frozen = TypeVar("Frozen", bound=Record)
@@ -99,6 +102,8 @@ class TinyCapture:
             Features: {name: self._features(idx) for idx, name in enumerate(self.names)},
             GlobalDescriptor: {name: self._descriptor(idx) for idx, name in enumerate(self.names)},
             RangeMap: {name: self._range_map(idx) for idx, name in enumerate(self.names)},
+            FaceFiles: {name: FaceFiles({}, size_px=12) for name in self.names},
+            SurfaceSamples: {name: self._samples(idx) for idx, name in enumerate(self.names)},
             TwoView: {pair: self._two_view(*pair) for pair in pairs.pairs},
         }
 
@@ -113,6 +118,7 @@ class TinyCapture:
             Views: Views(others),
             Poses: self._poses_with_points(),
             PointCloud: self._cloud(),
+            TrackedPoints: self._tracked_points(),
             Scores: Scores({"registered": 1.0}, {}),
         }
 
@@ -221,6 +227,27 @@ class TinyCapture:
                 track_image_idx=np.repeat(np.arange(count, dtype=np.int32), _POINTS),
                 track_bearings=np.concatenate([self.bearings(idx) for idx in range(count)]),
                 rejected={},
+            )
+        )
+
+    def _samples(self, idx: int) -> SurfaceSamples:
+        """Return the points as one view sees them, as if each had been found in its range map."""
+        count = 0 if self.variant.blank else _POINTS
+        distances = np.linalg.norm(self.poses[idx].apply(self.points_in_world), axis=1)[:count]
+        colors, sure = np.full((count, 3), 128, np.uint8), np.full(count, 200, np.uint8)
+        return frozen(SurfaceSamples(self.bearings(idx)[:count], distances.astype(np.float32), colors, sure))
+
+    def _tracked_points(self) -> TrackedPoints:
+        poses = self._poses_with_points()
+        return frozen(
+            TrackedPoints(
+                names=poses.names,
+                points_in_world=poses.points_in_world,
+                colors_rgb=poses.point_colors_rgb,
+                errors_rad=poses.point_errors_rad,
+                track_point_idx=poses.track_point_idx,
+                track_image_idx=poses.track_image_idx,
+                track_bearings=poses.track_bearings,
             )
         )
 

@@ -10,16 +10,17 @@ camera model serves a whole rig.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import PinholeView
+from pano_mvs.geometry import PinholeView, spiral_rays
+from pano_mvs.scene.face_files import FaceLayout
+
+__all__ = ["CUBE_NAMES", "CUBE_ROTATIONS", "Face", "FaceLayout", "covers_sphere", "default_face_size", "panorama_faces"]
 
 FloatArray = NDArray[np.float64]
-FaceLayout = Literal["cube", "octagon", "icosahedron"]
 
 # face_from_cam, rows: the face's x, y and z axis in the panorama's camera frame.
 CUBE_ROTATIONS: FloatArray = np.array(
@@ -92,13 +93,9 @@ def default_face_size(size_hw: tuple[int, int], *, fov_deg: float = 96.0) -> int
 
 
 def covers_sphere(faces: tuple[Face, ...]) -> bool:
-    """Return whether every direction lies in a face, tried on 20,000 evenly spread ones (Fibonacci's spiral)."""
-    count = 20_000
-    y = 1 - (2 * np.arange(count) + 1) / count
-    azimuth = np.pi * (1 + np.sqrt(5)) * np.arange(count)
-    flat = np.sqrt(1 - y**2)
-    rays = np.stack([flat * np.sin(azimuth), y, flat * np.cos(azimuth)], axis=-1)
-    seen = np.zeros(count, np.bool_)
+    """Return whether every direction lies in a face, tried on 20,000 evenly spread ones."""
+    rays = spiral_rays(20_000)
+    seen = np.zeros(len(rays), np.bool_)
     for face in faces:
         seen |= face.view.contains(face.view.pixels_from_rays(rays))
     return bool(seen.all())

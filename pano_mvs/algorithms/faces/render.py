@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,22 +89,37 @@ def face_source(
     return FaceSource(image, valid, seen, normals, np.where(kept, range_map.confidence, np.uint8(0)))
 
 
-def render_face(source: FaceSource, view: PinholeView, *, threads: int = 1) -> FaceRender:
+def render_face(
+    source: FaceSource, view: PinholeView, *, depth_view: PinholeView | None = None, threads: int = 1
+) -> FaceRender:
     """Return what is seen of a panorama in one face.
 
     Args:
         source: the panorama.
         view: the face.
+        depth_view: of which view the z-depths, normals and confidences are, such as `colmap_depth_view(view)`; None:
+            the face itself.
         threads: how many to use; they change no bit.
     """
+    depth_view = view if depth_view is None else depth_view
     mask = face_mask(source.valid, view)
-    z_depth = face_z_depth(source.ranges, view, threads=threads)
+    z_depth = face_z_depth(source.ranges, depth_view, threads=threads)
     z_depth[~mask] = np.nan
     known = np.isfinite(z_depth)
-    normals = face_normals(source.normals_in_cam, view)
+    normals = face_normals(source.normals_in_cam, depth_view)
     normals[~known] = np.nan
-    confidence = face_confidence(source.confidence, view)
+    confidence = face_confidence(source.confidence, depth_view)
     confidence[~known] = 0
     image = face_image(source.image, view)
     image[~mask] = 0
     return FaceRender(image, mask, z_depth, normals, confidence)
+
+
+def colmap_depth_view(view: PinholeView) -> PinholeView:
+    """Return the view whose pixel centres are the places that COLMAP's dense code takes a face's pixels for.
+
+    To its fusion and its patch matching the pixel in column c and row r is the ray K⁻¹ (c, r, 1): the pixel's upper
+    left corner, since (0, 0) is a corner everywhere else in COLMAP. Depth maps of the pixels' centres would be fused
+    half a pixel off.
+    """
+    return replace(view, principal_xy=view.principal_xy + 0.5)

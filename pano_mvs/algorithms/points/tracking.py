@@ -1,0 +1,194 @@
+"""Points of many range maps with the views that see them: what splat trainers begin with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from pano_mvs.algorithms.points.selection import spread_points
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import Rigid3
+from pano_mvs.scene import Poses, RangeMap
+from pano_mvs.scene.surface_samples import SurfaceSamples
+from pano_mvs.scene.tracked_points import TrackedPoints
+
+FloatArray = NDArray[np.float64]
+
+# Even in space would leave what is near to a camera coarse, even in every view what is far away; so half of each: the
+# distance of neighbouring points goes with the square root of the distance from the nearest camera.
+_SPACING_POWER = 0.5
+_MAX_SURFACE_STEP = 0.05
+_MAX_REPROJECTION_PX = 1.0
+# More points than are wanted go into the test of who sees them, since some fail it.
+_SURPLUS = 1.3
+_MOST_CANDIDATES = 12_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Candidates:
+    """Points of all views: in the world (M, 3), position of the view that each is of (M,), colour (M, 3)."""
+
+    points: FloatArray
+    home_idx: NDArray[np.int32]
+    colors_rgb: NDArray[np.uint8]
+
+    def __getitem__(self, keep: NDArray[np.intp]) -> _Candidates:
+        return _Candidates(self.points[keep], self.home_idx[keep], self.colors_rgb[keep])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sightings:
+    """Who sees what: position of the point and of the view (T,), unit ray in the view (T, 3), error in radians (T,)."""
+
+    point_idx: NDArray[np.intp]
+    view_idx: NDArray[np.intp]
+    bearings: FloatArray
+    errors_rad: FloatArray
+
+
+def track_points(
+    samples: Mapping[str, SurfaceSamples],
+    poses: Poses,
+    load_range: Callable[[str], RangeMap],
+    *,
+    rng: np.random.Generator,
+    count: int = 100_000,
+    min_views: int = 2,
+    neighbours: int = 16,
+    max_relative_error: float = 0.02,
+    min_confidence: int = 64,
+) -> TrackedPoints:
+    """Return evenly spread points of range maps, each with the views that see it.
+
+    Points are spread (`spread_points`) so that the distance between neighbours goes with the square root of that from
+    the nearest camera. A view sees a point if its own range there agrees, forward and backward, by the test of
+    `check_consistency`, with a range of at least `min_confidence`; what is hidden or masked does not agree.
+
+    Args:
+        samples: image name to points of its surfaces.
+        poses: of the images; names that it lacks are left out.
+        load_range: image name to its range map; called once for each.
+        rng: what excess points are drawn with.
+        count: how many points are wanted; there may be fewer.
+        min_views: points that fewer views see are left out.
+        neighbours: so many views, the nearest to a point, are asked.
+        max_relative_error: largest relative difference between a view's range and the point's distance.
+        min_confidence: a view's range of a lower confidence does not see.
+
+    Raises:
+        UsageError: if a number is not positive.
+    """
+    if count < 1 or min_views < 1 or neighbours < 1 or not max_relative_error > 0:
+        raise UsageError("count, min_views, neighbours and max_relative_error must be positive")
+    names = [name for name in poses.names if name in samples]
+    position = {name: idx for idx, name in enumerate(poses.names)}
+    pose_idx = np.array([position[name] for name in names], np.intp)
+    candidates = _candidates(samples, poses, names, pose_idx, rng)
+    if not len(candidates.points):
+        return _tracked(names, candidates, _joined([]), np.zeros(0, np.intp))
+    centers = poses.centers[pose_idx]
+    tree = cKDTree(centers)
+    spacing = np.maximum(np.asarray(tree.query(candidates.points)[0]), 1e-9) ** _SPACING_POWER
+    few = spread_points(candidates.points, spacing, int(np.ceil(_SURPLUS * count)), rng)
+    chosen, spacing = candidates[few], spacing[few]
+    asked = _asked(tree, chosen, min(neighbours, len(names)))
+    limits = np.array([max_relative_error, _MAX_SURFACE_STEP, float(min_confidence)])
+    found = [
+        _sightings(chosen, asked[idx], idx, centers, poses.cam_from_world(pose_idx[idx]), load_range(name), limits)
+        for idx, name in enumerate(names)
+    ]
+    sightings = _joined(found)
+    kept = np.flatnonzero(np.bincount(sightings.point_idx, minlength=len(few)) >= min_views)
+    return _tracked(names, chosen, sightings, kept[spread_points(chosen.points[kept], spacing[kept], count, rng)])
+
+
+def _candidates(
+    samples: Mapping[str, SurfaceSamples],
+    poses: Poses,
+    names: list[str],
+    pose_idx: NDArray[np.intp],
+    rng: np.random.Generator,
+) -> _Candidates:
+    """Return the samples of all views in the world, thinned at random if there are too many to sort."""
+    share = min(1.0, _MOST_CANDIDATES / max(sum(len(samples[name]) for name in names), 1))
+    points, homes, colors = [np.zeros((0, 3))], [np.zeros(0, np.int32)], [np.zeros((0, 3), np.uint8)]
+    for idx, name in enumerate(names):
+        view = samples[name]
+        kept = slice(None) if share == 1 else np.flatnonzero(rng.random(len(view)) < share)
+        in_cam = view.bearings[kept] * view.ranges[kept].astype(np.float64)[:, None]
+        points.append(poses.cam_from_world(int(pose_idx[idx])).inverse().apply(in_cam))
+        homes.append(np.full(len(in_cam), idx, np.int32))
+        colors.append(view.colors_rgb[kept])
+    return _Candidates(np.concatenate(points), np.concatenate(homes), np.concatenate(colors))
+
+
+def _asked(tree: cKDTree, chosen: _Candidates, neighbours: int) -> list[NDArray[np.intp]]:
+    """Return for each view the points that it is asked about: those among whose nearest views it is, and its own."""
+    # A list of ranks, since for k=1 alone the query leaves out an axis.
+    nearest = np.asarray(tree.query(chosen.points, k=list(range(1, neighbours + 1)))[1])
+    point_idx = np.repeat(np.arange(len(nearest)), neighbours)
+    view_idx = nearest.ravel()
+    own = ~(nearest == chosen.home_idx[:, None]).any(axis=1)
+    point_idx = np.concatenate([point_idx, np.flatnonzero(own)])
+    view_idx = np.concatenate([view_idx, chosen.home_idx[own]])
+    order = np.lexsort((point_idx, view_idx))
+    ends = np.searchsorted(view_idx[order], np.arange(tree.n + 1))
+    return [point_idx[order[first:end]] for first, end in pairwise(ends)]
+
+
+def _sightings(
+    chosen: _Candidates,
+    asked: NDArray[np.intp],
+    view_idx: int,
+    centers: FloatArray,
+    pose: Rigid3,
+    range_map: RangeMap,
+    limits: FloatArray,
+) -> _Sightings:
+    """Return which of the points that one view is asked about it sees."""
+    from pano_mvs.algorithms.points.kernels_seen import see_points  # compiles on import
+
+    points, homes = chosen.points[asked], centers[chosen.home_idx[asked]]
+    seen, errors, bearings = np.zeros(len(asked), np.bool_), np.zeros(len(asked)), np.zeros((len(asked), 3))
+    max_angle = _MAX_REPROJECTION_PX * 2 * np.pi / range_map.range.shape[1]
+    view = np.ascontiguousarray(pose.rotation), np.ascontiguousarray(pose.translation)
+    ranges, confidence = np.ascontiguousarray(range_map.range), np.ascontiguousarray(range_map.confidence)
+    see_points(points, homes, max_angle, view, ranges, confidence, limits, seen, errors, bearings)
+    views = np.full(int(seen.sum()), view_idx, np.intp)
+    return _Sightings(asked[seen], views, bearings[seen], errors[seen])
+
+
+def _joined(found: list[_Sightings]) -> _Sightings:
+    none = np.zeros(0, np.intp)
+    return _Sightings(
+        np.concatenate([none, *(part.point_idx for part in found)]),
+        np.concatenate([none, *(part.view_idx for part in found)]),
+        np.concatenate([np.zeros((0, 3)), *(part.bearings for part in found)]),
+        np.concatenate([np.zeros(0), *(part.errors_rad for part in found)]),
+    )
+
+
+def _tracked(names: list[str], chosen: _Candidates, sightings: _Sightings, kept: NDArray[np.intp]) -> TrackedPoints:
+    """Return the points that are kept with their tracks, in the order of the views."""
+    total = len(chosen.points)
+    number = np.full(total, -1, np.int32)
+    number[kept] = np.arange(len(kept), dtype=np.int32)
+    # The view that a point is from puts it where it is: its error of nothing is no evidence.
+    others = sightings.view_idx != chosen.home_idx[sightings.point_idx]
+    errors = np.bincount(sightings.point_idx[others], sightings.errors_rad[others], minlength=total)
+    confirming = np.bincount(sightings.point_idx[others], minlength=total)
+    of_kept = number[sightings.point_idx] >= 0
+    return TrackedPoints(
+        names=tuple(names),
+        points_in_world=chosen.points[kept],
+        colors_rgb=chosen.colors_rgb[kept],
+        errors_rad=(errors / np.maximum(confirming, 1))[kept].astype(np.float32),
+        track_point_idx=number[sightings.point_idx[of_kept]],
+        track_image_idx=sightings.view_idx[of_kept].astype(np.int32),
+        track_bearings=sightings.bearings[of_kept],
+    )

@@ -1,0 +1,78 @@
+"""Points taken from range maps, with the images that see them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.scene.poses import Poses
+from pano_mvs.scene.record import Axis, Record, require, require_array
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedPoints(Record):
+    """Points with tracks, as `Poses` has them, but taken from range maps.
+
+    Attributes:
+        names: (N) names of the images that the tracks refer to.
+        points_in_world: (P, 3) float64.
+        colors_rgb: (P, 3) uint8.
+        errors_rad: (P,) float32 mean angle, at the image that the point was taken from, between it and where the other
+            images of its track put it.
+        track_point_idx: (T,) int32: observation t is of this point …
+        track_image_idx: (T,) int32: … in this image (a position in `names`) …
+        track_bearings: (T, 3) float64: … along this unit ray in the camera frame.
+    """
+
+    axis: ClassVar[Axis | None] = Axis.ONE
+
+    names: tuple[str, ...]
+    points_in_world: NDArray[np.float64]
+    colors_rgb: NDArray[np.uint8]
+    errors_rad: NDArray[np.float32]
+    track_point_idx: NDArray[np.int32]
+    track_image_idx: NDArray[np.int32]
+    track_bearings: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.points_in_world)
+
+    def check(self) -> None:
+        """Raise ContractError unless all arrays agree."""
+        points, tracks = len(self.points_in_world), len(self.track_point_idx)
+        require_array(self, "points_in_world", dtype=np.float64, shape=(points, 3))
+        require_array(self, "colors_rgb", dtype=np.uint8, shape=(points, 3))
+        require_array(self, "errors_rad", dtype=np.float32, shape=(points,))
+        require_array(self, "track_point_idx", dtype=np.int32, shape=(tracks,))
+        require_array(self, "track_image_idx", dtype=np.int32, shape=(tracks,))
+        require_array(self, "track_bearings", dtype=np.float64, shape=(tracks, 3))
+        if tracks:
+            require(
+                0 <= self.track_point_idx.min() <= self.track_point_idx.max() < points, self, "a track has no point"
+            )
+            inside = 0 <= self.track_image_idx.min() <= self.track_image_idx.max() < len(self.names)
+            require(inside, self, "a track has no image")
+
+    def joined_to(self, poses: Poses, *, keep_points: bool) -> Poses:
+        """Return poses with these points, behind their own or in their place.
+
+        Tracks in images that the poses do not have are left out.
+        """
+        position = {name: idx for idx, name in enumerate(poses.names)}
+        image_idx = np.array([position.get(name, -1) for name in self.names], np.int32)[self.track_image_idx]
+        known = image_idx >= 0
+        own = slice(None) if keep_points else slice(0)
+        first = len(poses.points_in_world[own])
+        return replace(
+            poses,
+            points_in_world=np.concatenate([poses.points_in_world[own], self.points_in_world]),
+            point_colors_rgb=np.concatenate([poses.point_colors_rgb[own], self.colors_rgb]),
+            point_errors_rad=np.concatenate([poses.point_errors_rad[own], self.errors_rad]),
+            track_point_idx=np.concatenate([poses.track_point_idx[own], self.track_point_idx[known] + np.int32(first)]),
+            track_image_idx=np.concatenate([poses.track_image_idx[own], image_idx[known]]),
+            track_bearings=np.concatenate([poses.track_bearings[own], self.track_bearings[known]]),
+        )
