@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from rich.box import SIMPLE
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -20,13 +21,12 @@ from pano_mvs.cli.evaluate_depth_inputs import FoundScale
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.files import write_text
 
-_PROTOCOL_HEADINGS = ("every pixel", "… on the sphere", "where estimated", "… on the sphere")
+_PROTOCOL_HEADINGS = ("every pixel", "… on sphere", "estimated", "… on sphere")
 _LABELS = {"psnr_db": "PSNR dB", "mse": "MSE ×10⁻²", "rmse": "RMSE", "mae": "MAE", "abs_rel": "AbsRel %"} | dict(
     zip(DELTAS, ("δ<1.05 %", "δ<1.25 %", "δ<1.25² %", "δ<1.25³ %"), strict=True)
 )
-_FACTORS = {"psnr_db": 1.0, "rmse": 1.0, "mae": 1.0, "ause": 1.0}  # all others are shown in hundredths
-_OF_A_VIEW = ("psnr_db", "w_mae", "w_abs_rel", "w_delta_105", "valid_w_delta_105", "completeness",
-              "median_relative_error", "ause")  # fmt: skip
+_FACTORS = {"psnr_db": 1.0, "rmse": 1.0, "mae": 1.0}  # all others are shown in hundredths
+_OF_A_VIEW = "psnr_db", "w_mae", "w_delta_105", "completeness", "valid_w_delta_105", "median_relative_error", "ause"
 _BASELINE_WORDS = {
     "best": "the constant that is best for the very score, chosen by the truth",
     "median": "the median of the view's true ranges everywhere",
@@ -163,45 +163,46 @@ def _mean_table(report: DepthReport, baseline: str) -> Table:
     complete = (_cell(name, scores, constant) for name in ("completeness", "w_completeness"))
     table.add_row("complete %", *complete, "", "")
     median = (_cell(name, scores, constant) for name in ("median_relative_error", "w_median_relative_error"))
-    table.add_row("median error %", "", "", *median)
+    table.add_row("median %", "", "", *median)
     if "ause" in scores:
-        table.add_row(
-            "AUSE of the confidence", "", "", *(_cell(name, scores, constant) for name in ("plain_ause", "ause"))
-        )
+        table.add_row("AUSE ×10⁻²", "", "", *(_cell(name, scores, constant) for name in ("plain_ause", "ause")))
     return table
 
 
 def _view_table(report: DepthReport, baseline: str) -> Table:
     names = [name for name in _OF_A_VIEW if any(name in view.scores for view in report.views.values())]
-    table = Table("view", *(_view_heading(name) for name in names))
+    table = Table("view", *(_view_heading(name) for name in names), box=SIMPLE, collapse_padding=True)
     for label, view in report.views.items():
-        table.add_row(escape(label), *(_cell(name, view.scores, view.constants[baseline]) for name in names))
+        constant = view.constants[baseline]
+        table.add_row(escape(label), *(_shown(name, view.scores) for name in names))
+        table.add_row("constant", *(_shown(name, constant) for name in names), style="dim", end_section=True)
     return table
 
 
 def _view_heading(name: str) -> str:
     base = name.removeprefix("valid_").removeprefix("w_")
-    label = (_LABELS | {"completeness": "complete %", "median_relative_error": "median error %", "ause": "AUSE"})[base]
-    where = ", estimated" if name.startswith("valid_") else ""
+    label = (_LABELS | {"completeness": "complete %", "median_relative_error": "median %", "ause": "AUSE ×10⁻²"})[base]
+    where = ", seen" if name.startswith("valid_") else ""
     return label + where + (", sphere" if "w_" in name else "")
 
 
 def _bad_label(name: str) -> str:
     relative = not name.startswith("bad_abs_")
-    return f"off by > {name.removeprefix('bad_')} %, %" if relative else f"off by > {name.removeprefix('bad_abs_')}, %"
+    return f"bad > {name.removeprefix('bad_')} %" if relative else f"bad > {name.removeprefix('bad_abs_')}"
 
 
 def _cell(name: str, scores: Mapping[str, float], constant: Mapping[str, float]) -> str:
-    if name not in scores:
-        return "–"
-    factor = _FACTORS.get(name.removeprefix("valid_").removeprefix("w_").removeprefix("plain_"), 100.0)
-    return f"{_number(factor * scores[name])} ({_number(factor * constant[name])})"
+    return f"{_shown(name, scores)} ({_shown(name, constant)})"
 
 
-def _number(value: float) -> str:
+def _shown(name: str, scores: Mapping[str, float]) -> str:
+    """Return a score as it is printed, "–" where there is none."""
+    value = _FACTORS.get(name.removeprefix("valid_").removeprefix("w_").removeprefix("plain_"), 100.0) * scores.get(
+        name, float("nan")
+    )
     if np.isnan(value):
         return "–"
-    return f"{value:.3g}" if abs(value) < 1 else f"{value:.2f}"
+    return f"{value:.3g}" if abs(value) < 1 else f"{value:.2f}" if abs(value) < 99.995 else f"{value:.1f}"
 
 
 def _finite(values: Mapping[str, float]) -> dict[str, float | None]:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.io.captures import PICTURE_SUFFIXES
+from pano_mvs.io.exr import read_exr
 from pano_mvs.io.range_files import read_confidence_png
 
 RANGE_SUFFIXES = (".tiff", ".tif", ".exr", ".npy", ".npz", ".png")
@@ -127,7 +127,7 @@ def match_pictures(names: Iterable[str], available: Iterable[str]) -> dict[str, 
     for ours, theirs in groups.values():
         if len(ours) == len(theirs) == 1:
             matched[ours[0]] = theirs[0]
-        elif theirs:
+        elif ours and theirs:
             of_ours = {name: _closest(name, theirs) for name in ours}
             of_theirs = {name: _closest(name, ours) for name in theirs}
             matched |= {name: other for name, other in of_ours.items() if other and of_theirs[other] == name}
@@ -205,18 +205,11 @@ def _read_npz(path: Path, key: str) -> NDArray[Any]:
 
 
 def _read_exr(path: Path, _key: str) -> NDArray[Any]:
-    try:
-        openexr = import_module("OpenEXR")
-    except ImportError as error:
-        raise InputError(f"{path}: EXR files need the OpenEXR package (pip install OpenEXR), or convert it to float "
-                         "TIFF") from error  # fmt: skip
-    try:
-        with openexr.File(str(path), separate_channels=True) as file:
-            channels: Mapping[str, Any] = {name: channel.pixels for name, channel in file.channels().items()}
-            name = next((name for name in (*_EXR_CHANNELS, *channels) if name in channels), "")
-            return np.array(channels[name])
-    except (RuntimeError, ValueError, OSError, KeyError) as error:
-        raise InputError(f"{path}: not an EXR file that can be read ({error}). Write it again") from error
+    channels = read_exr(path)
+    name = next((name for name in (*_EXR_CHANNELS, *channels) if name in channels), None)
+    if name is None:
+        raise InputError(f"{path}: an EXR file without channels. Write it again")
+    return channels[name]
 
 
 _READERS: dict[str, Callable[[Path, str], NDArray[Any]]] = {
