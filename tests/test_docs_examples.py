@@ -98,7 +98,8 @@ def folder(tmp_path: Path) -> Path:
     """A folder with what the pages' workflows read."""
     for name in FOLDERS:
         (tmp_path / name).mkdir(parents=True)
-    (tmp_path / "my.yaml").write_text("pano_mvs: 1\nextends: quickstart\n")
+    for name in ("my.yaml", "workflow.yaml"):
+        (tmp_path / name).write_text("pano_mvs: 1\nextends: quickstart\n")
     for page in PAGES:
         for name, text in re.findall(r"Save this as `([^`/]+)`.*?```\w+\n(.*?)```", page.read_text(), re.DOTALL):
             (tmp_path / name).write_text(text)
