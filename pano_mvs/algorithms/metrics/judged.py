@@ -16,7 +16,7 @@ Align = Literal["none", "median", "lsq"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JudgedPixels:
-    """The pixels of one view that have truth, in row-major order.
+    """The pixels of one view that have truth, in any order.
 
     Attributes:
         found: (N,) float64 estimated ranges in the truth's unit, NaN where there is no estimate.
@@ -41,6 +41,11 @@ class JudgedPixels:
     def scaled(self, scale: float) -> JudgedPixels:
         """Return the same pixels with all estimates multiplied by a factor."""
         return JudgedPixels(scale * self.found, self.true, self.weight)
+
+    def by_truth(self) -> JudgedPixels:
+        """Return the same pixels from the nearest to the farthest."""
+        order = np.argsort(self.true, kind="stable")
+        return JudgedPixels(self.found[order], self.true[order], self.weight[order])
 
 
 def has_range(ranges: NDArray[np.floating]) -> NDArray[np.bool_]:
