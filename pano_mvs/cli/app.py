@@ -179,6 +179,29 @@ app.command()(plugins)
 app.command()(doctor)
 
 
+@app.command("view")
+@guarded
+def view_results(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="The output folder of a run, or a .ply file.")],
+    screenshot: Annotated[Optional[Path], typer.Option("--screenshot", metavar="FILE", help="Write a picture instead "  # noqa: UP045
+                                                       "of opening a window; needs no display.")] = None,
+    view: Annotated[str, typer.Option("--view", help="overview, top, front or inside:NAME of an image.")] = "overview",
+    color: Annotated[str, typer.Option("--color", help="rgb, confidence, views, normals or height.")] = "rgb",
+    points: Annotated[int, typer.Option("--points", min=0, help="Draw at most so many points; 0: all.")] = 2_000_000,
+    size: Annotated[str, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Of the window in pixels.")] = "1280x860",
+    images: Annotated[Optional[Path], typer.Option("--images", help="Folder of the panoramas, if they "  # noqa: UP045
+                                                   "have moved.")] = None,
+    labels: Annotated[bool, typer.Option("--labels", help="Name the cameras.")] = False,
+    blended: Annotated[bool, typer.Option("--blend", help="Show the cloud within a panorama.")] = False,
+    backs: Annotated[bool, typer.Option("--backs", help="Show points that turn their back to the eye too.")] = False,
+) -> None:  # fmt: skip
+    """Look at cloud, mesh and cameras, and step inside the panoramas."""
+    from pano_mvs.cli.view_command import ViewOptions, view_scene
+
+    options = ViewOptions(images, screenshot, view, color, points, size, labels, blended, backs)
+    view_scene(out, options, Console())
+
+
 @app.command("inspect")
 @guarded
 def inspect_pixel(

@@ -22,7 +22,8 @@ from pano_mvs.engine.units import Unit
 from pano_mvs.io.names import match_image_names
 from pano_mvs.scene import RangeMap
 from pano_mvs.stages.depth import SweepParams
-from pano_mvs.viewer.inspection import Inspection, UnitFound, inspect_pixel
+from pano_mvs.viewer.inspect_pixel import UnitFound, inspect_pixel
+from pano_mvs.viewer.inspection import Inspection
 
 _SHOWN = 6
 

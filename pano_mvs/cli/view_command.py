@@ -1,0 +1,132 @@
+"""Look at a run: a window, or a picture of what it would show."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.markup import escape
+
+from pano_mvs.core.errors import InputError, StoreError, UsageError
+from pano_mvs.viewer.cloud_colors import POINT_BUDGET, color_cloud, drawn_cloud
+from pano_mvs.viewer.display import quiet_vtk, require_display, require_drawing, require_window
+from pano_mvs.viewer.shown_scene import ShownScene, open_scene
+from pano_mvs.viewer.tour import Tour, box_of
+
+_SIZE = re.compile(r"([1-9][0-9]{1,4})[x×]([1-9][0-9]{1,4})")
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
+_QUALITY = 90
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """How to look.
+
+    Attributes:
+        images: folder of the panoramas; None: where the run read them.
+        screenshot: a picture to write instead of opening a window.
+        view: "overview", "top", "front" or "inside:NAME".
+        color: of the cloud, see `COLORINGS`.
+        points: at most so many are drawn; 0: all.
+        size: WIDTHxHEIGHT of the window in pixels.
+        labels: whether cameras are named.
+        blended: whether the cloud is shown within a panorama.
+        backs: whether points are shown that turn their back to the eye.
+    """
+
+    images: Path | None = None
+    screenshot: Path | None = None
+    view: str = "overview"
+    color: str = "rgb"
+    points: int = POINT_BUDGET
+    size: str = "1280x860"
+    labels: bool = False
+    blended: bool = False
+    backs: bool = False
+
+
+def view_scene(path: Path, options: ViewOptions, console: Console) -> None:
+    """Open a window on an output folder or a PLY file, or write a picture of it.
+
+    Raises:
+        InputError: if there is nothing to show, or a file is damaged.
+        UsageError: if an option cannot be, or there is no display.
+        StoreError: if the picture cannot be written.
+    """
+    size_wh = _size_wh(options.size)
+    if options.screenshot is None:
+        require_display()
+    else:
+        _check_screenshot(options.screenshot)
+        require_drawing()
+    scene = open_scene(path, images=options.images)
+    tour = _tour(scene, options, size_wh)
+    from pano_mvs.viewer.window import SceneWindow  # on use: pyvista is slow to import
+
+    if options.screenshot is not None:
+        quiet_vtk()
+    window = SceneWindow(tour, size_wh=size_wh, off_screen=options.screenshot is not None, budget=options.points)
+    for note in scene.notes:
+        console.print(f"note: {escape(note)}", highlight=False, soft_wrap=True)
+    if options.screenshot is None:
+        require_window(window.plotter.render_window.GetClassName())
+        window.run()
+        return
+    picture = window.picture()
+    window.close()
+    _write(options.screenshot, picture)
+    console.print(f"picture in {escape(str(options.screenshot))}", highlight=False, soft_wrap=True)
+
+
+def _tour(scene: ShownScene, options: ViewOptions, size_wh: tuple[int, int]) -> Tour:
+    cloud = drawn_cloud(scene.cloud, budget=options.points) if scene.cloud is not None else None
+    if cloud is not None:
+        color_cloud(cloud, options.color, up=scene.up, unit=scene.unit)  # refuses what it cannot do
+    points = cloud.points if cloud is not None else np.zeros((0, 3), np.float32)
+    if not len(points) and scene.mesh is not None:
+        points = mesh_points(scene.mesh)
+    tour = Tour(scene, cloud, box_of(points, scene.centers), aspect=size_wh[0] / size_wh[1])
+    tour.see(options.view)
+    tour.begin(color=options.color, labels=options.labels, blended=options.blended, backs=options.backs)
+    return tour
+
+
+def mesh_points(path: Path) -> NDArray[np.float32]:
+    """Return the corners of a mesh, (N, 3) float32.
+
+    Raises:
+        InputError: if it cannot be read.
+    """
+    from pano_mvs.io.ply_points import read_ply_points
+
+    points = read_ply_points(path)
+    if not len(points):
+        raise InputError(f"{path}: a mesh without corners. Write it again")
+    return points
+
+
+def _size_wh(text: str) -> tuple[int, int]:
+    found = _SIZE.fullmatch(text.strip())
+    if found is None:
+        raise UsageError(f"--size {text}: give the width and the height in pixels, such as 1280x860")
+    return int(found[1]), int(found[2])
+
+
+def _check_screenshot(path: Path) -> None:
+    if path.suffix.lower() not in _SUFFIXES:
+        raise UsageError(f"--screenshot {path}: pictures are {', '.join(_SUFFIXES)}")
+
+
+def _write(path: Path, picture: NDArray[np.uint8]) -> None:
+    quality = {".webp": cv2.IMWRITE_WEBP_QUALITY}.get(path.suffix.lower(), cv2.IMWRITE_JPEG_QUALITY)
+    data = cv2.imencode(path.suffix.lower(), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [quality, _QUALITY])[1]
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data.tobytes())
+    except OSError as error:
+        raise StoreError(f"--screenshot {path}: cannot be written ({error.strerror}). Choose another place") from error

@@ -1,0 +1,50 @@
+"""Whether there is a display, and whether pictures can be drawn without one."""
+
+from __future__ import annotations
+
+import ctypes.util
+import os
+import sys
+from collections.abc import Mapping
+
+from pano_mvs.core.errors import UsageError
+
+_REMEDY = "Give --screenshot FILE to draw a picture without a window"
+
+
+def require_display(environment: Mapping[str, str] = os.environ, platform: str = sys.platform) -> None:
+    """Raise UsageError if no window can be opened.
+
+    Args:
+        environment: the process's.
+        platform: of Python.
+    """
+    if platform.startswith("linux") and not environment.get("DISPLAY"):
+        raise UsageError(f"there is no display (DISPLAY is not set), so no window can be opened. {_REMEDY}, or run "
+                         "this on a machine with a screen, or over ssh -X")  # fmt: skip
+
+
+def require_window(window_class: str) -> None:
+    """Raise UsageError if VTK fell back to drawing without a window, because the display does not answer."""
+    if window_class in ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow"):
+        raise UsageError(f"the display {os.environ.get('DISPLAY', '')} does not answer. {_REMEDY}")
+
+
+def require_drawing(platform: str = sys.platform, find: object = ctypes.util.find_library) -> None:
+    """Raise UsageError if there is neither a display nor a library that draws without one; VTK would crash.
+
+    Args:
+        platform: of Python.
+        find: finds a library by its name.
+    """
+    assert callable(find)
+    if platform.startswith("linux") and not any(find(name) for name in ("EGL", "OSMesa")):
+        raise UsageError("pictures cannot be drawn here: neither EGL nor OSMesa is installed. Install one: for Debian "
+                         "and Ubuntu `apt install libegl1 libgl1-mesa-dri`")  # fmt: skip
+
+
+def quiet_vtk() -> None:
+    """Keep VTK from printing that it found no X server before it draws without one."""
+    from vtkmodules.vtkCommonCore import vtkLogger
+
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)

@@ -1,0 +1,48 @@
+"""A panorama on a sphere: from within as the camera saw it, and from outside too."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.geometry import Rigid3, ray_from_pixel
+
+
+@dataclass(frozen=True, eq=False)
+class SphereMesh:
+    """Triangles of a sphere with places in a picture.
+
+    Attributes:
+        vertices: (V, 3) float64 in the world.
+        triangles: (T, 3) int64; seen from inside, their corners run clockwise.
+        texture_uv: (V, 2) float32, u to the right, v upwards from the picture's lower edge.
+    """
+
+    vertices: NDArray[np.float64]
+    triangles: NDArray[np.int64]
+    texture_uv: NDArray[np.float32]
+
+
+def panorama_sphere(cam_from_world: Rigid3, radius: float, *, rows: int = 48) -> SphereMesh:
+    """Return a sphere around a camera that shows each pixel of its panorama along that pixel's ray.
+
+    Drawn without the triangles that face the eye, it shows from outside what one would see through it, as a crystal
+    ball does: the far side, from within. Neither way is writing mirrored.
+
+    Args:
+        cam_from_world: pose.
+        radius: in scene units.
+        rows: of quadrilaterals from pole to pole, twice as many around.
+    """
+    columns = 2 * rows
+    y, x = np.mgrid[0 : rows + 1, 0 : columns + 1].astype(np.float64)
+    rays = ray_from_pixel(np.stack([x, y], axis=-1), (rows, columns)).reshape(-1, 3)
+    vertices = cam_from_world.inverse().apply(rays * radius)
+    first = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).reshape(-1)
+    corners = np.stack([first, first + 1, first + columns + 2, first + columns + 1], axis=-1)
+    # Towards the inside a quadrilateral's corners run from left to right, then down: clockwise.
+    triangles = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
+    texture_uv = np.stack([x / columns, 1 - y / rows], axis=-1).reshape(-1, 2).astype(np.float32)
+    return SphereMesh(vertices, triangles, texture_uv)

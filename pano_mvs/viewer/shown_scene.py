@@ -1,0 +1,178 @@
+"""What there is to look at in an output folder, or in a lone PLY file."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import InputError
+from pano_mvs.geometry import Rigid3
+from pano_mvs.io.ply_points import PlyPoints, open_ply_points
+from pano_mvs.io.pose_files import read_poses
+
+FloatArray = NDArray[np.float64]
+
+_CLOUD, _MESH, _MODEL = "cloud.ply", "mesh.ply", "colmap/sparse/0"
+_HEAD_BYTES = 1 << 14
+# The cameras' own directions up must agree this well to count as the scene's.
+_LEAST_AGREEMENT = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class ShownCamera:
+    """A camera to step into.
+
+    Attributes:
+        name: of its image.
+        cam_from_world: its pose.
+        picture: its panorama, or None where no file is there.
+        preview: a small picture whose upper half is the panorama, or None.
+    """
+
+    name: str
+    cam_from_world: Rigid3
+    picture: Path | None
+    preview: Path | None
+
+
+@dataclass(frozen=True, eq=False)
+class ShownScene:
+    """What is there.
+
+    Attributes:
+        name: of the folder or file.
+        cloud: the vertices of the cloud, or None.
+        mesh: a PLY file with faces, or None.
+        cameras: in the order of the capture.
+        unit: of lengths: "m" or "scene units".
+        up: (3,) unit, upright in the world.
+        ahead: (3,) unit across `up`: where the first camera looks.
+        notes: what is missing, and why.
+    """
+
+    name: str
+    cloud: PlyPoints | None
+    mesh: Path | None
+    cameras: tuple[ShownCamera, ...]
+    unit: str
+    up: FloatArray
+    ahead: FloatArray
+    notes: tuple[str, ...] = ()
+
+    @property
+    def centers(self) -> FloatArray:
+        """Of the cameras, (N, 3)."""
+        return np.array([camera.cam_from_world.center for camera in self.cameras]).reshape(-1, 3)
+
+
+def open_scene(path: Path, *, images: Path | None = None) -> ShownScene:
+    """Return what there is to look at.
+
+    Args:
+        path: the output folder of a run, or a PLY file, a cloud or a mesh.
+        images: folder of the panoramas; None: where the run read them, else the previews that it wrote.
+
+    Raises:
+        InputError: if there is nothing to show, or a file is damaged.
+    """
+    if path.is_file():
+        cloud, mesh = (None, path) if has_faces(path) else (open_ply_points(path), None)
+        return ShownScene(path.name, cloud, mesh, (), "scene units", *_frame(()))
+    if not path.is_dir():
+        raise InputError(f"{path}: no such file or folder. Give the output folder of a run, or a .ply file")
+    run = _run_json(path)
+    notes: list[str] = []
+    cloud_file, mesh_file = _written(path, run, _CLOUD), _written(path, run, _MESH)
+    cameras = _cameras(path, run, images, notes)
+    if cloud_file is None:
+        notes.append(f"no {_CLOUD}: the workflow has no export.ply, or the run did not get there")
+    if cloud_file is None and mesh_file is None and not cameras:
+        raise InputError(f"{path}: holds no {_CLOUD}, no {_MESH} and no {_MODEL}. Give the output folder of a run")
+    metric = bool((run.get("poses") or {}).get("metric"))
+    return ShownScene(
+        name=path.resolve().name,
+        cloud=open_ply_points(cloud_file) if cloud_file is not None else None,
+        mesh=mesh_file,
+        cameras=cameras,
+        unit="m" if metric else "scene units",
+        **dict(zip(("up", "ahead"), _frame(cameras), strict=True)),
+        notes=tuple(notes),
+    )
+
+
+def has_faces(path: Path) -> bool:
+    """Return whether a PLY file holds faces."""
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(_HEAD_BYTES)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
+    counted = re.search(rb"^element face ([0-9]+)\s*$", head.partition(b"end_header")[0], re.MULTILINE)
+    return counted is not None and int(counted[1]) > 0
+
+
+def _run_json(folder: Path) -> Mapping[str, Any]:
+    """Return what run.json says; nothing if there is none, or it is no object: the files speak for themselves."""
+    try:
+        value = json.loads((folder / "run.json").read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return value if isinstance(value, dict) else {}
+
+
+def _written(folder: Path, run: Mapping[str, Any], name: str) -> Path | None:
+    """Return the file of that name in the folder, or the first that the run wrote below it."""
+    names = [name, *(written for written in run.get("files") or () if PurePosixPath(written).name == name)]
+    return next((folder / found for found in names if (folder / found).is_file()), None)
+
+
+def _cameras(folder: Path, run: Mapping[str, Any], images: Path | None, notes: list[str]) -> tuple[ShownCamera, ...]:
+    model = folder / _MODEL
+    if not model.is_dir():
+        notes.append(f"no {_MODEL}: the workflow has no export.colmap, or the run did not get there; no cameras")
+        return ()
+    poses = read_poses(model)
+    source = images or _source_folder(run)
+    previews = {str(view.get("name")): str(view.get("preview") or "") for view in run.get("views") or ()}
+    cameras = []
+    for idx, name in enumerate(poses.names):
+        picture = source / name if source is not None else None
+        preview = folder / (previews.get(name) or f"preview/{PurePosixPath(name).with_suffix('.jpg')}")
+        cameras.append(ShownCamera(
+            name=name,
+            cam_from_world=poses.cam_from_world(idx),
+            picture=picture if picture is not None and picture.is_file() else None,
+            preview=preview if preview.is_file() else None,
+        ))  # fmt: skip
+    if any(camera.picture is None for camera in cameras):
+        where = source if source is not None else "the place from which the run read them"
+        notes.append(f"panoramas are not in {where}: shown by their previews; give --images DIR for the pictures")
+    return tuple(cameras)
+
+
+def _source_folder(run: Mapping[str, Any]) -> Path | None:
+    """Return the folder from which the run read its pictures."""
+    for stage in run.get("stages") or ():
+        if str(stage.get("use", "")).startswith("source.") and (stage.get("params") or {}).get("path"):
+            return Path(stage["params"]["path"])
+    return None
+
+
+def _frame(cameras: tuple[ShownCamera, ...]) -> tuple[FloatArray, FloatArray]:
+    """Return the directions up and ahead: those of the cameras where they agree, else −y and z."""
+    ups = np.array([-camera.cam_from_world.rotation[1] for camera in cameras]).reshape(-1, 3)
+    mean = ups.mean(axis=0) if len(ups) else np.zeros(3)
+    length = float(np.linalg.norm(mean))
+    up = mean / length if length > _LEAST_AGREEMENT else np.array([0.0, -1.0, 0.0])
+    ahead = cameras[0].cam_from_world.rotation[2] if cameras else np.array([0.0, 0.0, 1.0])
+    ahead = ahead - up * float(ahead @ up)
+    if np.linalg.norm(ahead) < 1e-6:
+        ahead = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    return up, ahead / np.linalg.norm(ahead)

@@ -1,0 +1,298 @@
+"""What the viewer does when somebody clicks, drags or presses a key; it knows no window, and is tested without one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import UsageError
+from pano_mvs.io.names import match_image_names
+from pano_mvs.viewer.cloud_colors import DrawnCloud
+from pano_mvs.viewer.picking import camera_under, point_under
+from pano_mvs.viewer.shown_scene import ShownScene
+from pano_mvs.viewer.viewpoint import Viewpoint, looking_along, outside_view
+
+FloatArray = NDArray[np.float64]
+
+HELP = """\
+left drag    turn            wheel, right drag   nearer, farther
+click camera step inside     Esc, right click    step out
+left, right  next camera     m                   measure: click two points
+o  t  y      overview, from the top, from the front
+c            colours         x                   points that turn their back
+l            names           k                   cameras
+b            cloud within the panorama (inside a camera)
+d            all points      h                   this help        q   quit"""
+
+# A sphere is this share of the way to the next camera, within these shares of the scene.
+_RADIUS_SHARE, _RADIUS_LIMITS = 0.18, (0.005, 0.025)
+_BOX_SHARES = 0.01, 0.99
+_PARALLEL_REACH = 0.006
+
+
+@dataclass(frozen=True, eq=False)
+class TourState:
+    """What the window shows.
+
+    Attributes:
+        viewpoint: from where.
+        coloring: of the cloud.
+        inside: index of the camera whose panorama is all around, or None.
+        outside: where to come back to from inside.
+        measuring: whether clicks pick points.
+        picked: none, one or two points (3,) in the world.
+        hovered: index of the camera under the pointer, or None.
+        labels: whether all cameras are named.
+        cameras: whether cameras are shown.
+        blended: whether the cloud is shown inside a panorama.
+        backs: whether points that turn their back to the eye are shown; not showing them opens rooms to the eye.
+        all_points: whether all points of the file are drawn.
+        help: whether the keys are listed.
+        message: the latest news.
+    """
+
+    viewpoint: Viewpoint
+    coloring: str = "rgb"
+    inside: int | None = None
+    outside: Viewpoint | None = None
+    measuring: bool = False
+    picked: tuple[FloatArray, ...] = ()
+    hovered: int | None = None
+    labels: bool = False
+    cameras: bool = True
+    blended: bool = False
+    backs: bool = False
+    all_points: bool = False
+    help: bool = False
+    message: str = ""
+
+
+@dataclass(eq=False)
+class Tour:
+    """A scene, and how it is looked at.
+
+    Attributes:
+        scene: what there is.
+        cloud: the points that are drawn, or None.
+        box: (2, 3) in which nearly all lies.
+        aspect: width of the window as a multiple of its height.
+        state: what is shown now.
+    """
+
+    scene: ShownScene
+    cloud: DrawnCloud | None
+    box: FloatArray
+    aspect: float = 1.5
+    state: TourState = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Begin with the overview."""
+        self.centers = self.scene.centers
+        self.radius = sphere_radius(self.centers, self.box)
+        self.state = TourState(self.from_outside("overview"), help=False)
+
+    def from_outside(self, name: str) -> Viewpoint:
+        """Return the view called "overview", "top" or "front"."""
+        return outside_view(name, self.box, self.scene.up, self.scene.ahead, aspect=self.aspect)
+
+    def see(self, view: str) -> None:
+        """Go to a view by name: "overview", "top", "front" or "inside:NAME".
+
+        Raises:
+            UsageError: if there is no such view or camera.
+        """
+        kind, _, name = view.partition(":")
+        if kind == "inside":
+            found = self._camera_called(name)
+            self.step_into(found)
+            pose = self.scene.cameras[found].cam_from_world
+            self.moved_to(looking_along(pose.center, pose.rotation[2], self.scene.up))
+        elif view in ("overview", "top", "front"):
+            self._look(self.from_outside(view))
+        else:
+            raise UsageError(f"there is no view {view!r}; there are overview, top, front and inside:NAME")
+
+    def begin(self, *, color: str, labels: bool, blended: bool, backs: bool) -> None:
+        """Begin with other than the usual settings."""
+        self.state = replace(self.state, coloring=color, labels=labels, blended=blended, backs=backs)
+
+    def step_into(self, camera_idx: int) -> None:
+        """Go to a camera, looking on in the same direction: its panorama is all around."""
+        state = self.state
+        center = self.centers[camera_idx]
+        forward = self.scene.ahead if state.viewpoint.height else state.viewpoint.axes[2]
+        if abs(float(forward @ self.scene.up)) > 0.7 and state.inside is None:
+            forward = self.scene.ahead  # from high above one does not want to look at the floor
+        self.state = replace(
+            state,
+            inside=camera_idx,
+            outside=state.viewpoint if state.inside is None else state.outside,
+            viewpoint=looking_along(center, forward, self.scene.up),
+            hovered=None,
+            message=self.scene.cameras[camera_idx].name,
+        )
+
+    def step_out(self) -> None:
+        """Go back to where one stepped in from; elsewhere, give up measuring."""
+        state = self.state
+        if state.inside is None or state.outside is None:
+            self.state = replace(state, measuring=False, picked=(), message="")
+            return
+        self.state = replace(state, inside=None, outside=None, viewpoint=state.outside, message="")
+
+    def click(self, x: float, y: float, size_wh: tuple[int, int]) -> None:
+        """Do what a click at a place in the window asks for: pick a point, or step into a camera."""
+        start, direction = self.state.viewpoint.ray(x, y, size_wh)
+        if self.state.measuring:
+            self._pick(start, direction)
+            return
+        found = self._camera_at(start, direction)
+        if found is not None:
+            self.step_into(found)
+
+    def hover(self, x: float, y: float, size_wh: tuple[int, int]) -> bool:
+        """Note which camera is under the pointer, and return whether that is another one than before."""
+        before = self.state.hovered
+        self.state = replace(self.state, hovered=self._camera_at(*self.state.viewpoint.ray(x, y, size_wh)))
+        return self.state.hovered != before
+
+    def drag(self, dx_px: float, dy_px: float, *, window_height: int) -> None:
+        """Look around."""
+        viewpoint = self.state.viewpoint.turned(dx_px, dy_px, window_height=window_height)
+        self.state = replace(self.state, viewpoint=viewpoint)
+
+    def zoom(self, steps: float) -> None:
+        """See less, or more for negative steps, of what is around."""
+        self.state = replace(self.state, viewpoint=self.state.viewpoint.zoomed(steps))
+
+    def key(self, name: str) -> bool:
+        """Do what a key asks for, and return whether it asks for anything."""
+        action = self._keys.get(name)
+        if action is not None:
+            action()
+        return action is not None
+
+    def moved_to(self, viewpoint: Viewpoint) -> None:
+        """Note where the window's own mouse handling went."""
+        self.state = replace(self.state, viewpoint=viewpoint)
+
+    @property
+    def distance(self) -> float | None:
+        """Between the two picked points in scene units, or None."""
+        if len(self.state.picked) < 2:
+            return None
+        return float(np.linalg.norm(self.state.picked[1] - self.state.picked[0]))
+
+    @property
+    def _keys(self) -> Mapping[str, Callable[[], None]]:
+        return {
+            "Escape": self.step_out,
+            "c": self._next_coloring,
+            "m": lambda: self._toggle("measuring"),
+            "l": lambda: self._toggle("labels"),
+            "k": lambda: self._toggle("cameras"),
+            "b": lambda: self._toggle("blended"),
+            "x": lambda: self._toggle("backs"),
+            "d": lambda: self._toggle("all_points"),
+            "h": lambda: self._toggle("help"),
+            "Right": lambda: self._next_camera(1),
+            "Left": lambda: self._next_camera(-1),
+            "o": lambda: self._look(self.from_outside("overview")),
+            "t": lambda: self._look(self.from_outside("top")),
+            "y": lambda: self._look(self.from_outside("front")),
+        }
+
+    def _look(self, viewpoint: Viewpoint) -> None:
+        """Look from outside."""
+        self.state = replace(self.state, viewpoint=viewpoint, inside=None, outside=None, message="")
+
+    def _toggle(self, name: str) -> None:
+        self.state = replace(self.state, **{name: not getattr(self.state, name)})  # type: ignore[arg-type]
+        if name == "measuring":
+            message = "measuring: click two points" if self.state.measuring else ""
+            self.state = replace(self.state, picked=(), message=message)
+
+    def _next_coloring(self) -> None:
+        names = self.cloud.colorings if self.cloud is not None else ()
+        if names:
+            place = names.index(self.state.coloring) if self.state.coloring in names else -1
+            self.state = replace(self.state, coloring=names[(place + 1) % len(names)])
+
+    def _next_camera(self, step: int) -> None:
+        if self.scene.cameras:
+            here = self.state.inside if self.state.inside is not None else (-1 if step > 0 else 0)
+            self.step_into((here + step) % len(self.scene.cameras))
+
+    def _camera_at(self, start: FloatArray, direction: FloatArray) -> int | None:
+        if not self.state.cameras or not len(self.centers):
+            return None
+        found = camera_under(start, direction, self.centers, self.radius)
+        return found if found != self.state.inside else None
+
+    def _pick(self, start: FloatArray, direction: FloatArray) -> None:
+        if self.cloud is None:
+            self.state = replace(self.state, message="there is no cloud to measure in")
+            return
+        height = self.state.viewpoint.height
+        normals = None if self.state.backs else self.cloud.normals
+        found = point_under(start, direction, self.cloud.points, normals=normals,
+                            parallel_reach=_PARALLEL_REACH * height)  # fmt: skip
+        if found is None:
+            self.state = replace(self.state, message="no point there: click on the cloud")
+            return
+        point = self.cloud.points[found].astype(np.float64)
+        picked = (*self.state.picked, point) if len(self.state.picked) < 2 else (point,)
+        self.state = replace(self.state, picked=picked)
+        distance = self.distance
+        said = "click the second point" if distance is None else length_text(distance, self.scene.unit)
+        self.state = replace(self.state, message=said)
+
+    def _camera_called(self, name: str) -> int:
+        names = [camera.name for camera in self.scene.cameras]
+        matched = match_image_names([name], names)
+        if name not in matched:
+            shown = ", ".join(names[:6]) + (" …" if len(names) > 6 else "")
+            raise UsageError(f"there is no camera {name!r}; there are: {shown or 'none'}")
+        return names.index(matched[name])
+
+
+def sphere_radius(centers: FloatArray, box: FloatArray) -> float:
+    """Return how large the spheres of cameras are, so that they neither touch nor vanish; scene units."""
+    size = float(np.linalg.norm(box[1] - box[0])) or 1.0
+    least, most = (share * size for share in _RADIUS_LIMITS)
+    if len(centers) < 2:
+        return most
+    from scipy.spatial import cKDTree
+
+    gaps = np.asarray(cKDTree(centers).query(centers, k=2)[0])[:, 1]
+    return float(np.clip(_RADIUS_SHARE * float(np.median(gaps)), least, most))
+
+
+def box_of(points: NDArray[np.floating], centers: FloatArray) -> FloatArray:
+    """Return the box, (2, 3), in which nearly all points (N, 3) and all cameras (M, 3) lie; never empty."""
+    corners = [centers] if len(centers) else []
+    if len(points):
+        corners.append(np.asarray(np.quantile(np.asarray(points, np.float64), _BOX_SHARES, axis=0)))
+    if not corners:
+        return np.array([[-1.0, -1, -1], [1, 1, 1]])
+    together = np.concatenate(corners)
+    box = np.stack([together.min(axis=0), together.max(axis=0)])
+    if np.ptp(box, axis=0).max() < 1e-9:
+        box = box + np.array([[-1.0], [1.0]])
+    return box
+
+
+def length_text(length: float, unit: str) -> str:
+    """Return a length as people read it, with its unit."""
+    if unit != "m":
+        return f"{length:.4g} {unit.removesuffix('s') if length == 1 else unit}"
+    return f"{length:.3f} m" if length >= 1 else f"{100 * length:.1f} cm"
+
+
+def bar_length(extent: float) -> float:
+    """Return the longest of 1, 2, 5 × 10ⁿ that is no longer than a quarter of an extent."""
+    power = 10.0 ** np.floor(np.log10(extent / 4))
+    return float(next(step * power for step in (5, 2, 1) if step * power <= extent / 4 * (1 + 1e-9)))

@@ -1,0 +1,127 @@
+"""From where the scene is looked at, and which ray a place in the window is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+
+OUTSIDE_ANGLE_DEG, INSIDE_ANGLE_DEG = 45.0, 80.0
+_LEAST_ANGLE_DEG, _LARGEST_ANGLE_DEG = 15.0, 110.0
+# One does not look straight up or down: there the direction up has no meaning.
+_STEEPEST_DEG = 89.0
+# The scene fills the window up to this share.
+_FILLED = 0.94
+
+
+@dataclass(frozen=True, eq=False)
+class Viewpoint:
+    """Where the eye is and what it sees.
+
+    Attributes:
+        eye: (3,) in the world.
+        target: (3,) what is in the middle of the window.
+        up: (3,) unit direction that is upright in the window.
+        angle_deg: vertical field of view.
+        height: of what is seen in parallel projection, scene units; 0 for perspective.
+    """
+
+    eye: FloatArray
+    target: FloatArray
+    up: FloatArray
+    angle_deg: float = OUTSIDE_ANGLE_DEG
+    height: float = 0.0
+
+    @property
+    def axes(self) -> FloatArray:
+        """The directions right, down and forward of the window in the world, (3, 3), one in each row."""
+        forward = self.target - self.eye
+        forward = forward / np.linalg.norm(forward)
+        right = np.cross(forward, self.up)
+        if np.linalg.norm(right) < 1e-9:
+            right = np.cross(forward, np.eye(3)[int(np.argmin(np.abs(forward)))])
+        right = right / np.linalg.norm(right)
+        return np.stack([right, np.cross(forward, right), forward])
+
+    def ray(self, x: float, y: float, size_wh: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+        """Return where the ray of a place in the window begins, and its unit direction.
+
+        Args:
+            x: from the left edge in pixels.
+            y: from the upper edge.
+            size_wh: (width, height) of the window.
+        """
+        width, height = size_wh
+        right, down, forward = self.axes
+        # In halves of the height, from the middle.
+        across, below = (2 * x - width) / height, (2 * y - height) / height
+        if self.height:
+            return self.eye + self.height / 2 * (across * right + below * down), forward
+        reach = np.tan(np.deg2rad(self.angle_deg) / 2)
+        direction = forward + reach * (across * right + below * down)
+        return self.eye, direction / np.linalg.norm(direction)
+
+    def turned(self, dx_px: float, dy_px: float, *, window_height: int) -> Viewpoint:
+        """Return the view from the same place after the picture was dragged by so many pixels, right and down.
+
+        What was under the pointer stays under it, near the middle of the window.
+        """
+        rad_per_px = np.deg2rad(self.angle_deg) / window_height
+        _, _, forward = self.axes
+        up = self.up
+        level = forward - up * float(forward @ up)
+        elevation = np.arctan2(float(forward @ up), float(np.linalg.norm(level)))
+        steepest = np.deg2rad(_STEEPEST_DEG)
+        elevation = float(np.clip(elevation + dy_px * rad_per_px, -steepest, steepest))
+        level = level / max(float(np.linalg.norm(level)), 1e-12)
+        aside = np.cross(level, up)
+        turn = -dx_px * rad_per_px
+        level = np.cos(turn) * level + np.sin(turn) * aside
+        distance = float(np.linalg.norm(self.target - self.eye))
+        target = self.eye + distance * (np.cos(elevation) * level + np.sin(elevation) * up)
+        return replace(self, target=target)
+
+    def zoomed(self, steps: float) -> Viewpoint:
+        """Return the view with a smaller angle for positive steps, within reason."""
+        angle = float(np.clip(self.angle_deg * 0.9**steps, _LEAST_ANGLE_DEG, _LARGEST_ANGLE_DEG))
+        return replace(self, angle_deg=angle)
+
+
+def looking_along(eye: ArrayLike, direction: ArrayLike, up: ArrayLike) -> Viewpoint:
+    """Return the view from inside a panorama along a direction (3,)."""
+    place, along = np.asarray(eye, np.float64), np.asarray(direction, np.float64)
+    return Viewpoint(place, place + along / np.linalg.norm(along), np.asarray(up, np.float64), INSIDE_ANGLE_DEG)
+
+
+def outside_view(name: str, box: FloatArray, up: FloatArray, ahead: FloatArray, *, aspect: float) -> Viewpoint:
+    """Return a view from outside of all that lies in a box.
+
+    Args:
+        name: "overview", from above at an angle; "top", a plan; "front", an elevation, along `ahead`.
+        box: (2, 3) least and greatest coordinates.
+        up: (3,) unit.
+        ahead: (3,) unit, across `up`: what is upwards in the plan, and farthest in the others.
+        aspect: width of the window as a multiple of its height.
+    """
+    middle, right = box.mean(axis=0), np.cross(ahead, up)
+    corners = np.array(np.meshgrid(*box.T)).reshape(3, -1).T - middle
+    radius = float(np.linalg.norm(corners[0])) or 1.0
+    if name == "overview":
+        direction = 0.45 * right - 0.75 * ahead + 0.7 * up
+        direction = direction / np.linalg.norm(direction)
+        seen = Viewpoint(direction, np.zeros(3), up)
+        return Viewpoint(middle + _distance(corners @ seen.axes.T, aspect) * direction, middle, up)
+    away, upright = (up, ahead) if name == "top" else (-ahead, up)
+    across, high = np.abs(corners @ right).max(), np.abs(corners @ upright).max()
+    height = 2.15 * max(float(high), float(across) / aspect)
+    return Viewpoint(middle + 2 * radius * away, middle, upright, height=height)
+
+
+def _distance(corners: FloatArray, aspect: float) -> float:
+    """Return from how far away all corners, (N, 3) right, down and forward of the middle, are in the window."""
+    reach = np.tan(np.deg2rad(OUTSIDE_ANGLE_DEG) / 2) * _FILLED
+    needed = np.maximum(np.abs(corners[:, 0]) / aspect, np.abs(corners[:, 1])) / reach - corners[:, 2]
+    return float(needed.max())

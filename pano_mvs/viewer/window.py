@@ -1,0 +1,288 @@
+"""The window: PyVista shows what the tour says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.viewer.cloud_actor import CloudActor
+from pano_mvs.viewer.cloud_colors import POINT_BUDGET, color_cloud, drawn_cloud
+from pano_mvs.viewer.hands import Hands
+from pano_mvs.viewer.panorama_pictures import LARGE_WIDTH, SMALL_WIDTH, sphere_picture
+from pano_mvs.viewer.sphere_actors import rims_actor, sphere_actor
+from pano_mvs.viewer.tour import HELP, Tour, TourState, bar_length, length_text
+from pano_mvs.viewer.viewpoint import Viewpoint
+
+TEXTURED = 64
+"""At most so many cameras, the nearest ones, are spheres with pictures; all others are dots."""
+
+_BACKGROUND, _BACKGROUND_TOP, _INK = "#15181d", "#2b313a", "#e8ebf0"
+_ACCENT, _DOTS, _RIM = "#ffb454", "#7fb4ff", "#4da3ff"
+_MOST_LABELS = 300
+_SURROUND_SHARE = 2.0
+_FONT_SHARE = 1 / 72
+
+
+class SceneWindow:
+    """A plotter with the scene of a tour.
+
+    Attributes:
+        plotter: PyVista's.
+        tour: what is shown.
+    """
+
+    def __init__(self, tour: Tour, *, size_wh: tuple[int, int], off_screen: bool, budget: int = POINT_BUDGET) -> None:
+        import pyvista
+
+        self.tour, self._budget = tour, budget
+        plotter: Any = pyvista.Plotter
+        self.plotter: Any = plotter(
+            off_screen=off_screen, window_size=list(size_wh), lighting="none", title=f"pano-mvs · {tour.scene.name}"
+        )
+        self.plotter.set_background(_BACKGROUND, top=_BACKGROUND_TOP)
+        self._font = max(7, round(size_wh[1] * _FONT_SHARE))
+        self._shown: TourState | None = None
+        self._cloud: CloudActor | None = None
+        self._spheres: dict[int, Any] = {}
+        self._surroundings: Any = None
+        self._rims: Any = None
+        self._legend = ""
+        self._add_mesh()
+        self._add_cloud()
+        self._add_dots()
+        self._add_bar()
+        self.plotter.add_axes(color=_INK, xlabel="x", ylabel="y", zlabel="z", line_width=2)
+        self._hands = Hands(tour, seen_from=self.seen_from, update=self.update)
+        self.plotter.clear_events_for_key("b")
+        self.plotter.iren.style = self._hands.attach(self.plotter.iren.interactor)
+        self.update()
+
+    def run(self) -> None:
+        """Show the window until it is closed."""
+        self.plotter.show(auto_close=False)
+        self.plotter.close()
+
+    def picture(self) -> NDArray[np.uint8]:
+        """Return what the window shows, (H, W, 3) RGB."""
+        image = self.plotter.screenshot(return_img=True)
+        return np.asarray(image, np.uint8)[..., :3]
+
+    def close(self) -> None:
+        """Give the window's memory back."""
+        self.plotter.close()
+
+    def seen_from(self) -> Viewpoint:
+        """Return where the window's camera is; the trackball may have moved it."""
+        camera = self.plotter.camera
+        parallel = bool(camera.parallel_projection)
+        return replace(
+            self.tour.state.viewpoint,
+            eye=np.array(camera.position), target=np.array(camera.focal_point), up=np.array(camera.up),
+            angle_deg=float(camera.view_angle), height=2 * float(camera.parallel_scale) if parallel else 0.0,
+        )  # fmt: skip
+
+    def update(self) -> None:
+        """Show the tour's state."""
+        state, before = self.tour.state, self._shown
+        self._shown = state
+        self._place_camera(state.viewpoint)
+        if before is None or before.all_points != state.all_points:
+            self._reload_points(state)
+        if before is None or before.inside != state.inside:
+            self._surround(state.inside)
+        self._show_cloud(state, before)
+        self._show_cameras(state, before)
+        self._show_picked(state)
+        self._show_texts(state)
+        self.plotter.renderer.ResetCameraClippingRange()
+        self.plotter.render()
+
+    def _place_camera(self, viewpoint: Viewpoint) -> None:
+        camera = self.plotter.camera
+        camera.position, camera.focal_point = tuple(viewpoint.eye), tuple(viewpoint.target)
+        camera.up, camera.view_angle = tuple(viewpoint.up), viewpoint.angle_deg
+        camera.parallel_projection = bool(viewpoint.height)
+        if viewpoint.height:
+            camera.parallel_scale = viewpoint.height / 2
+
+    def _add_cloud(self) -> None:
+        if self.tour.cloud is not None:
+            self._cloud = CloudActor(self.tour.cloud)
+            self.plotter.add_actor(self._cloud.actor, name="cloud", reset_camera=False)
+
+    def _add_mesh(self) -> None:
+        import pyvista
+
+        self._mesh: Any = None
+        if self.tour.scene.mesh is not None:
+            mesh = pyvista.read(self.tour.scene.mesh)
+            colored = "RGB" in mesh.array_names
+            self._mesh = self.plotter.add_mesh(mesh, scalars="RGB" if colored else None, rgb=colored,
+                                               color=None if colored else "#b8bcc4", name="mesh",
+                                               reset_camera=False)  # fmt: skip
+
+    def _add_dots(self) -> None:
+        self._dots: Any = None
+        if len(self.tour.centers):
+            self._dots = self.plotter.add_points(
+                self.tour.centers, color=_DOTS, point_size=self._font * 0.7, render_points_as_spheres=False,
+                name="dots", reset_camera=False, pickable=False,
+            )  # fmt: skip
+
+    def _add_bar(self) -> None:
+        """Lay a line of known length along the lower front edge of the scene."""
+        scene, box = self.tour.scene, self.tour.box
+        right = np.cross(scene.ahead, scene.up)
+        corners = np.array(np.meshgrid(*box.T)).reshape(3, -1).T
+        extent = float(np.ptp(corners @ right))
+        if extent <= 0:
+            return
+        length = bar_length(extent)
+        low = [float((corners @ axis).min()) for axis in (right, scene.up, scene.ahead)]
+        start = low[0] * right + low[1] * scene.up + (low[2] - 0.03 * extent) * scene.ahead
+        ends = np.stack([start, start + length * right])
+        self.plotter.add_lines(ends, color=_INK, width=4, name="bar")
+        self._label(ends[1:] + 0.02 * extent * right, [length_text(length, scene.unit)], "bar label")
+
+    def _reload_points(self, state: TourState) -> None:
+        """Read all points of the file, or as many as a display needs."""
+        cloud = self.tour.cloud
+        wanted = 0 if state.all_points else self._budget
+        if cloud is None or self.tour.scene.cloud is None or (not wanted and len(cloud.points) == cloud.total):
+            return
+        if wanted and len(cloud.points) <= wanted:
+            return
+        self.tour.cloud = drawn_cloud(self.tour.scene.cloud, budget=wanted)
+        self._add_cloud()
+        self._recolor(state)
+
+    def _recolor(self, state: TourState) -> None:
+        self._legend = ""
+        if self.tour.cloud is None or self._cloud is None:
+            return
+        coloring = color_cloud(self.tour.cloud, state.coloring, up=self.tour.scene.up, unit=self.tour.scene.unit)
+        self._cloud.color(coloring)
+        self._legend = coloring.legend
+
+    def _show_cloud(self, state: TourState, before: TourState | None) -> None:
+        if before is None or before.coloring != state.coloring:
+            self._recolor(state)
+        visible = state.inside is None or state.blended
+        for actor in (self._cloud.actor if self._cloud is not None else None, self._mesh):
+            if actor is not None:
+                actor.SetVisibility(visible)
+        if self._cloud is not None:
+            if before is None or before.backs != state.backs or before.all_points != state.all_points:
+                self._cloud.show_backs(wanted=state.backs)
+            self._cloud.size(self._point_size(state))
+
+    def _point_size(self, state: TourState) -> float:
+        """Return points large enough for surfaces to close, in pixels."""
+        count = max(1, len(self.tour.cloud.points) if self.tour.cloud is not None else 1)
+        width, height = self.plotter.window_size
+        share = 1.6 if state.inside is not None else 1.1
+        return float(np.clip(share * np.sqrt(width * height / count), 1.5, 6.0))
+
+    def _surround(self, camera_idx: int | None) -> None:
+        """Lay the panorama of a camera all around, or take it away."""
+        if self._surroundings is not None:
+            self.plotter.remove_actor(self._surroundings, render=False)
+            self._surroundings = None
+        outside = camera_idx is None
+        for name in ("bar", "bar label"):
+            if name in self.plotter.actors:
+                self.plotter.actors[name].SetVisibility(outside)
+        if camera_idx is None:
+            return
+        camera = self.tour.scene.cameras[camera_idx]
+        radius = _SURROUND_SHARE * float(np.linalg.norm(np.ptp(self.tour.box, axis=0)))
+        picture = sphere_picture(camera, LARGE_WIDTH)
+        self._surroundings = sphere_actor(picture, camera.cam_from_world, radius, surrounds=True)
+        self.plotter.add_actor(self._surroundings, name="surroundings", reset_camera=False, pickable=False)
+
+    def _show_cameras(self, state: TourState, before: TourState | None) -> None:
+        centers = self.tour.centers
+        if not len(centers):
+            return
+        moved = before is None or not np.array_equal(before.viewpoint.eye, state.viewpoint.eye)
+        moved = moved or (before is not None and before.inside != state.inside)
+        if moved and state.cameras:
+            self._texture_nearest(state.viewpoint.eye)
+        for idx, actor in self._spheres.items():
+            actor.SetVisibility(state.cameras and idx != state.inside)
+        self._rims.SetVisibility(state.cameras)
+        self._dots.SetVisibility(state.cameras and len(centers) > len(self._spheres))
+        self.plotter.remove_actor("names", render=False)
+        named = [state.hovered] if state.hovered is not None else []
+        if state.labels and state.cameras:
+            named = [int(idx) for idx in self._nearest(state.viewpoint.eye, _MOST_LABELS) if idx != state.inside]
+        if named:
+            above = centers[named] + 1.4 * self.tour.radius * self.tour.scene.up
+            self._label(above, [self.tour.scene.cameras[idx].name for idx in named], "names")
+
+    def _nearest(self, eye: NDArray[np.float64], count: int) -> NDArray[np.intp]:
+        """Return the cameras nearest to the eye."""
+        return np.argsort(np.linalg.norm(self.tour.centers - eye, axis=1), kind="stable")[:count]
+
+    def _texture_nearest(self, eye: NDArray[np.float64]) -> None:
+        """Make the nearest cameras spheres with pictures, and forget those of others."""
+        wanted = {int(idx) for idx in self._nearest(eye, TEXTURED)}
+        for idx in [idx for idx in self._spheres if idx not in wanted]:
+            self.plotter.remove_actor(self._spheres.pop(idx), render=False)
+        for idx in sorted(wanted - self._spheres.keys()):
+            camera = self.tour.scene.cameras[idx]
+            actor = sphere_actor(sphere_picture(camera, SMALL_WIDTH), camera.cam_from_world, self.tour.radius)
+            self.plotter.add_actor(actor, name=f"camera {idx}", reset_camera=False)
+            self._spheres[idx] = actor
+        shown = self.tour.centers[[idx for idx in sorted(wanted) if idx != self.tour.state.inside]]
+        self.plotter.remove_actor("rims", render=False)
+        if len(shown):
+            self._rims = rims_actor(shown, self.tour.radius, _RIM)
+            self.plotter.add_actor(self._rims, name="rims", reset_camera=False, pickable=False)
+
+    def _show_picked(self, state: TourState) -> None:
+        for name in ("picked", "measured", "distance"):
+            self.plotter.remove_actor(name, render=False)
+        if not state.picked:
+            return
+        points = np.array(state.picked)
+        self.plotter.add_points(points, color=_ACCENT, point_size=self._font, render_points_as_spheres=True,
+                                name="picked", reset_camera=False, pickable=False)  # fmt: skip
+        distance = self.tour.distance
+        if distance is not None:
+            self.plotter.add_lines(points, color=_ACCENT, width=3, name="measured")
+            text = length_text(distance, self.tour.scene.unit)
+            self._label(points.mean(axis=0, keepdims=True), [text], "distance", color=_ACCENT)
+
+    def _show_texts(self, state: TourState) -> None:
+        scene, cloud = self.tour.scene, self.tour.cloud
+        title = scene.name
+        if state.inside is not None:
+            title = f"inside {scene.cameras[state.inside].name}   (Esc or right click: out)"
+        news = state.message if state.inside is None or state.measuring else ""
+        self._text("\n".join([title, *([news] if news else [])]), "upper_left", "title", _INK)
+        counts = []
+        if cloud is not None:
+            of = f" of {cloud.total:,}" if len(cloud.points) < cloud.total else ""
+            counts.append(f"{len(cloud.points):,}{of} points")
+        if scene.cameras:
+            counts.append(f"{len(scene.cameras):,} cameras")
+        lines = [*([self._legend] if self._legend else []), "   ".join([*counts, "h: keys"])]
+        self._text("\n".join(lines), "lower_right", "legend", _INK)
+        self._text(HELP if state.help else "", "upper_right", "help", _INK, font="courier")
+
+    def _text(self, text: str, place: str, name: str, color: str, *, font: str = "arial") -> None:
+        self.plotter.remove_actor(name, render=False)
+        if text:
+            self.plotter.add_text(text, position=place, font_size=self._font * 0.8, color=color, font=font, name=name,
+                                  render=False)  # fmt: skip
+
+    def _label(self, points: NDArray[np.float64], texts: list[str], name: str, *, color: str = _INK) -> Any:
+        return self.plotter.add_point_labels(
+            points, texts, name=name, font_size=round(self._font * 1.5), text_color=color, shape="rounded_rect",
+            shape_color=_BACKGROUND, shape_opacity=0.7, margin=4, always_visible=True, show_points=False,
+            reset_camera=False, render=False, pickable=False,
+        )  # fmt: skip
