@@ -94,6 +94,11 @@ class SweepParams(Params):
         description="1: every plane everywhere; 2 or 3: a sweep at half or a quarter of the resolution says where to "
         "look, which is faster",
     )
+    volume_limit_gb: float = Field(
+        default=4.0,
+        gt=0,
+        description="memory (10⁹ bytes) of semi-global matching; larger panoramas are matched in parts that overlap",
+    )
 
     @model_validator(mode="after")
     def _fit_together(self) -> SweepParams:
@@ -113,13 +118,16 @@ _PICTURE_BYTES, _RESULT_BYTES = 16, 40
 def sweep_memory_bytes(params: SweepParams, inputs: Mapping[str, Any]) -> int:
     """Return what a sweep takes at its most: the volume of semi-global matching, pictures as they are packed, winners.
 
-    From coarse to fine the volume is that of the coarsest level.
+    From coarse to fine the volume is that of the coarsest level; numba's is limited by a setting.
     """
     panoramas: list[Panorama] = [inputs["ref"], *inputs["sources"]]
     pixels, *others = (panorama.size_hw[0] * panorama.size_hw[1] for panorama in panoramas)
     volume = pixels * params.planes * _VOLUME_BYTES.get(params.backend, 3) if params.aggregation == "sgm" else 0
     pictures = _PICTURE_BYTES * (pixels + sum(others))
-    return (volume >> 2 * (params.levels - 1)) + pictures + _RESULT_BYTES * pixels
+    volume >>= 2 * (params.levels - 1)
+    if params.backend == "numba":
+        volume = min(volume, int(params.volume_limit_gb * 1e9))
+    return volume + pictures + _RESULT_BYTES * pixels
 
 
 @stage("depth.sweep", memory=sweep_memory_bytes)

@@ -58,7 +58,7 @@ def test_around_a_flat_guide_costs_are_those_of_the_plain_sweep(changes):
     plain = np.empty((64, 20, 128), np.uint8)
     shared = shared_arguments(work)
     for first in (0, 32):
-        sweep_band(first, *shared.values(), plain, *_fresh_state(32, 128))
+        sweep_band(first, *shared.values(), plain[first : first + 32], *_fresh_state(32, 128))
     with ThreadPoolExecutor(1) as pool:
         sweep = GuidedSweep(work, np.full((2, 64, 128), 9.0, np.float32), pool)
         sweep._sweep(0, np.ones((64, 128), np.bool_))

@@ -1,7 +1,8 @@
-"""How much memory a sweep takes: `python -m tests.benchmarks.memory [--small]`.
+"""How much memory a sweep takes: `python -m tests.benchmarks.memory [--small | --large]`.
 
 The peak of the resident memory of a fresh process for each configuration, less that of one that has made the pictures
-and loaded the kernels but swept nothing larger than 16 × 32.
+and loaded the kernels but swept nothing larger than 16 × 32. With --large: all that a process takes in which a panorama
+of 8192 × 4096 pixels is swept against two others, pictures and limits included.
 """
 
 from __future__ import annotations
@@ -14,8 +15,11 @@ import sys
 from collections.abc import Sequence
 
 import numba
+import numpy as np
 
+from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
+from pano_mvs.geometry import Rigid3
 from tests.benchmarks.sweep import FAR, NEAR, pictures
 
 ROWS, PLANES, SOURCES = 512, 128, 3
@@ -33,6 +37,19 @@ def peak_mb(rows: int, planes: int, sources: int, aggregation: str, threads: int
     return (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
 
 
+def large_peak_mb(rows: int, planes: int, aggregation: str, threads: int) -> float:
+    """Return the peak of a process, in MB, that runs the stage on three panoramas; to be called once in a process."""
+    numba.set_num_threads(threads)
+    images, poses = pictures(rows, 2)
+    cams = [Rigid3(np.eye(3), np.zeros(3)), *poses]
+    masks = [np.ones(image.shape[:2], np.bool_) for image in images]
+    near, far = limits_by_sweeping(images, cams, masks=masks)
+    settings = SweepSettings(planes=planes, aggregation=aggregation)
+    sweep_range(images[0], images[1:], poses, near=near, far=far, settings=settings,
+                reference_mask=masks[0], source_masks=masks[1:])  # fmt: skip
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
 def fresh_peak_mb(*configuration: object) -> float:
     """Return `peak_mb` of a fresh process."""
     command = [sys.executable, "-m", "tests.benchmarks.memory", "--one", json.dumps(configuration)]
@@ -43,10 +60,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table, or the one figure that a fresh process is asked for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--small", action="store_true", help="a quarter of the rows and of the planes")
+    parser.add_argument("--large", action="store_true", help="8192 × 4096 pixels")
     parser.add_argument("--one", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.one:
-        print(peak_mb(*json.loads(options.one)))
+        configuration = json.loads(options.one)
+        print(peak_mb(*configuration) if len(configuration) == 5 else large_peak_mb(*configuration))
+        return
+    if options.large:
+        print("| rows | planes | aggregation | threads | peak, MB |\n|---|---|---|---|---|")
+        for large in ((4096, 32, "box", 2), (4096, 128, "sgm", 2)):
+            print("| " + " | ".join(map(str, large)) + f" | {fresh_peak_mb(*large):.0f} |", flush=True)
         return
     part = 4 if options.small else 1
     rows, planes = ROWS // part, PLANES // part

@@ -144,7 +144,7 @@ def sweep_band(  # type: ignore[no-untyped-def]
         most: likewise.
         scale: float32 from mean costs to the volume's.
         neutral: float32 mean cost where no source votes.
-        volume: (H, D, W) uint8, written; empty if the winner is wanted at once.
+        volume: (rows, D, W) uint8, the band's, written; empty if the winner is wanted at once.
         state: (STATES, rows, W) float32, infinite; see `update_plain`.
         planes: (rows, W) int32, written if the volume is empty.
     """
@@ -190,6 +190,6 @@ def sweep_band(  # type: ignore[no-untyped-def]
             else:
                 combine_row(costs, j, weights, first + j, share, most, len(valid) == 0, neutral, row)
             if len(volume):
-                store_row(row, scale, volume[first + j, d])
+                store_row(row, scale, volume[j, d])
             elif held == PLANES_AT_ONCE - 1 or d == len(ranges) - 1:
                 update_winners(combined[j], 0, held + 1, d - held, state, j, planes)

@@ -10,10 +10,11 @@ from pano_mvs.geometry import pad_panorama
 
 # (rows, columns) of one step of the six paths from pole to pole; the two along a row are handled on their own.
 DIRECTIONS = ((1, 0), (1, 1), (1, -1), (-1, 0), (-1, 1), (-1, -1))
+_ROWS_AT_ONCE = 256
 
 
 def step_penalties(
-    reference: NDArray[np.uint8], direction: tuple[int, int], settings: SweepSettings
+    reference: NDArray[np.uint8], direction: tuple[int, int], settings: SweepSettings, rows: slice = slice(None)
 ) -> NDArray[np.uint16]:
     """Return P2 of the step into each pixel, (H, W) uint16: smaller where the picture has an edge.
 
@@ -23,17 +24,23 @@ def step_penalties(
         reference: (H, W, C).
         direction: (rows, columns) of the step, each −1, 0 or 1.
         settings: p1, p2, p2_contrast.
+        rows: of which rows to return them.
     """
     height, width = reference.shape[:2]
     p1, p2 = settings.penalties(height)
+    start, stop, _ = rows.indices(height)
     if settings.p2_contrast == 0:
-        return np.full((height, width), p2, np.uint16)
-    padded = pad_panorama(reference.mean(axis=-1), 1)
-    rows, columns = direction
-    before = padded[1 - rows : 1 - rows + height, 1 - columns : 1 - columns + width]
-    contrast = np.abs(padded[1:-1, 1:-1] - before)
-    penalty = np.maximum(p1, p2 / (1 + contrast / settings.p2_contrast))
-    return np.asarray(np.rint(penalty), dtype=np.uint16)
+        return np.full((stop - start, width), p2, np.uint16)
+    padded = pad_panorama(reference, 1)
+    penalties = np.empty((stop - start, width), np.uint16)
+    for first in range(start, stop, _ROWS_AT_ONCE):  # in 64 bits, a whole picture would take a gigabyte at 8192×4096
+        last = min(first + _ROWS_AT_ONCE, stop)
+        around = padded[first : last + 2].mean(axis=-1)
+        before = around[1 - direction[0] : 1 - direction[0] + last - first, 1 - direction[1] : 1 - direction[1] + width]
+        contrast = np.abs(around[1:-1, 1:-1] - before)
+        penalty = np.maximum(p1, p2 / (1 + contrast / settings.p2_contrast))
+        penalties[first - start : last - start] = np.rint(penalty)
+    return penalties
 
 
 def warm_up(size_hw: tuple[int, int]) -> tuple[int, int]:

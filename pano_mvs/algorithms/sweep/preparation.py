@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.windows import column_offsets
 from pano_mvs.algorithms.sweep.winner import Winners
-from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, ray_grid, rotate_panorama
+from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, ray_from_pixel, rotate_panorama
 
 # Rec. 709 luma in 1/256.
 _LUMA = np.array([54, 183, 19])
+_ROWS_AT_ONCE = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +48,11 @@ def prepare_picture(picture: NDArray[np.uint8], settings: SweepSettings) -> NDAr
         picture = _bilateral(picture, settings)
     if settings.compares_colors:
         return np.ascontiguousarray(picture)
-    luma = (picture.astype(np.uint16) @ _LUMA.astype(np.uint16) + 128) >> 8
-    return luma.astype(np.uint8)[..., None]
+    grey = np.empty((*picture.shape[:2], 1), np.uint8)
+    for first in range(0, len(picture), _ROWS_AT_ONCE):  # 16 bits of all colours at once would be a picture six times
+        some = picture[first : first + _ROWS_AT_ONCE].astype(np.uint16)
+        grey[first : first + _ROWS_AT_ONCE, :, 0] = (some @ _LUMA.astype(np.uint16) + 128) >> 8
+    return grey
 
 
 def _bilateral(picture: NDArray[np.uint8], settings: SweepSettings) -> NDArray[np.uint8]:
@@ -111,10 +115,15 @@ def sees_winner(winners: Winners, work: SweepInput) -> NDArray[np.bool_]:
     """Return where at least one source may vote on the plane that won, (H, W)."""
     if work.source_valid is None:
         return np.ones(winners.plane.shape, np.bool_)
-    seen = np.zeros(winners.plane.shape, np.bool_)
-    points = ray_grid((work.reference.shape[0], work.reference.shape[1])) * work.ranges[winners.plane][..., None]
-    for pose, valid in zip(work.source_from_reference, work.source_valid, strict=True):
-        seen |= valid_where_seen(valid, pose.apply(points))
+    height, width = winners.plane.shape
+    seen = np.zeros((height, width), np.bool_)
+    for first in range(0, height, _ROWS_AT_ONCE):  # the points of all rows would take gigabytes at 8192×4096
+        rows = slice(first, first + _ROWS_AT_ONCE)
+        y, x = np.mgrid[first : min(rows.stop, height), 0:width] + 0.5
+        rays = ray_from_pixel(np.stack([x, y], axis=-1), (height, width))
+        points = rays * work.ranges[winners.plane[rows]][..., None]
+        for pose, valid in zip(work.source_from_reference, work.source_valid, strict=True):
+            seen[rows] |= valid_where_seen(valid, pose.apply(points))
     return seen
 
 

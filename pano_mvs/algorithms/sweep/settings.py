@@ -66,6 +66,8 @@ class SweepSettings:
             differences; census and zncc need none.
         levels: 1: every plane everywhere; 2: a sweep at half the resolution guides that at the full one, 3: one at a
             quarter guides that; see `coarse_to_fine`. More is faster. Needs the backend numba.
+        volume_limit_gb: the memory in 10⁹ bytes that semi-global matching may take for its volume. A larger one is
+            matched in parts that overlap, which changes next to nothing. Needs the backend numba.
     """
 
     planes: int = 128
@@ -89,6 +91,7 @@ class SweepSettings:
     derotate: bool = False
     exposure: bool = True
     levels: int = 1
+    volume_limit_gb: float = 4.0
 
     def __post_init__(self) -> None:
         """Raise UsageError for values that no sweep can use."""
@@ -100,6 +103,7 @@ class SweepSettings:
         least = 3 if self.cost in ("census", "census_gradient", "zncc") else 1
         _require(self.window >= least, f"{self.cost} needs a window of at least {least}")
         _require(1 <= self.levels <= 4, f"levels must be 1 to 4, got {self.levels}")
+        _require(self.volume_limit_gb > 0, f"volume_limit_gb must be positive, got {self.volume_limit_gb}")
         _require(self.best >= 1, f"best must be at least 1, got {self.best}")
         _require(0 <= self.p1 <= self.p2 <= 4000, f"0 ≤ p1 ≤ p2 ≤ 4000 must hold, got {self.p1} and {self.p2}")
         _require(self.p2_contrast >= 0, f"p2_contrast cannot be negative, got {self.p2_contrast}")

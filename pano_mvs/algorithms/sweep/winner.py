@@ -16,6 +16,7 @@ from pano_mvs.scene.range_map import WEAK_CONFIDENCE, RangeMap
 _SURE_MARGIN = 0.8
 # Likewise one that is cheaper than the planes next to it.
 _SHARP_MARGIN = 0.5
+_ROWS_AT_ONCE = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +45,16 @@ class Winners:
         plane = self.plane.astype(np.float64)
         return plane if self.lean is None else plane + self.lean
 
+    def put(self, rows: slice, some: Winners) -> None:
+        """Write those of some rows."""
+        for name in ("plane", "cost", "before", "after", "rival"):
+            getattr(self, name)[rows] = getattr(some, name)
+
+    def of_rows(self, rows: slice) -> Winners:
+        """Return those of some rows, as views."""
+        lean = None if self.lean is None else self.lean[rows]
+        return Winners(self.plane[rows], self.cost[rows], self.before[rows], self.after[rows], self.rival[rows], lean)
+
 
 def range_map_from_winners(
     winners: Winners, *, near: float, far: float, settings: SweepSettings, seen: NDArray[np.bool_]
@@ -57,12 +68,17 @@ def range_map_from_winners(
         settings: planes, spacing, selection and confidence.
         seen: (H, W) where the reference is valid and at least one source saw the winner.
     """
-    position = winners.position
-    if settings.selection != "winner":
-        position += subplane_offset(winners, planes=settings.planes, shape=settings.selection)
-    ranges = range_at(position, near, far, planes=settings.planes, spacing=settings.spacing)
-    result = np.where(seen, ranges, np.nan).astype(np.float32)
-    return RangeMap(result, np.where(seen, confidence(winners, measure=settings.confidence), 0).astype(np.uint8))
+    result, sure = np.empty(seen.shape, np.float32), np.empty(seen.shape, np.uint8)
+    for first in range(0, len(seen), _ROWS_AT_ONCE):  # in 64 bits, whole pictures would take gigabytes at 8192×4096
+        rows = slice(first, first + _ROWS_AT_ONCE)
+        some = winners.of_rows(rows)
+        position = some.position
+        if settings.selection != "winner":
+            position += subplane_offset(some, planes=settings.planes, shape=settings.selection)
+        ranges = range_at(position, near, far, planes=settings.planes, spacing=settings.spacing)
+        result[rows] = np.where(seen[rows], ranges, np.nan)
+        sure[rows] = np.where(seen[rows], confidence(some, measure=settings.confidence), 0)
+    return RangeMap(result, sure)
 
 
 def subplane_offset(winners: Winners, *, planes: int, shape: Literal["parabola", "vfit"]) -> NDArray[np.float64]:
