@@ -15,6 +15,7 @@ _EXCESS = 0.02
 # What the voxels leave for the discs to choose from, and how many of a point's neighbours those look at: points lie on
 # surfaces, where no more fit around one.
 _CHOICE, _NEIGHBOURS = 2.5, 16
+_LEVELS_PER_OCTAVE = 3
 # Odd numbers without structure, which spread the places of voxels over all 64-bit numbers.
 _MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9, 0xD6E8FEB86659FD93], np.uint64)
 
@@ -25,7 +26,7 @@ def spread_points(
     """Return which points to keep so that `count` are left whose distances to their neighbours go with `spacing`.
 
     Two steps, each with the largest width, to about 2 %, that leaves enough. First space is divided into voxels with
-    edges that go with the spacing, rounded to powers of two; of those in one voxel the point nearest to its centre
+    edges that go with the spacing, rounded to one of a few sizes; of those in one voxel the point nearest to its centre
     stays: about 2.5 times as many as are wanted. Then, in a random order, a point stays unless one that does is closer
     than a disc's radius, which goes with the spacing (Poisson discs: Cook, "Stochastic sampling in computer graphics",
     1986). The rest of the excess is drawn.
@@ -68,9 +69,9 @@ def _widest(low: float, high: float, wanted: int, left: Callable[[float], int]) 
 def _one_per_voxel(points: NDArray[np.float64], spacing: NDArray[np.float64], wanted: int) -> NDArray[np.intp]:
     if len(points) <= wanted:
         return np.arange(len(points))
-    levels = np.rint(np.log2(spacing / spacing.min()))
-    edges = np.exp2(levels)
-    extent = max(float((np.ptp(points, axis=0)).max()), 1e-300)
+    levels = np.rint(_LEVELS_PER_OCTAVE * np.log2(spacing / spacing.min()))
+    edges = np.exp2(levels / _LEVELS_PER_OCTAVE)
+    extent = max(float(np.ptp(points, axis=0).max()), 1e-9)
     width = _widest(1e-7 * extent, 2 * extent, wanted, lambda width: _occupied(points, edges * width, levels))
     return _nearest_to_centers(points, edges * width, levels)
 
