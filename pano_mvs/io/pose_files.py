@@ -41,11 +41,9 @@ def read_poses(path: Path) -> Poses:
     Raises:
         InputError: naming the file, and the line or the key, that cannot be used.
     """
+    path = _file_or_model(path)
     if path.is_dir():
-        return _poses_from_folder(path)
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder. Give a COLMAP model, a transforms.json, a "
-                         "poses.json, a reconstruction.json or a CSV file")  # fmt: skip
+        return read_colmap_model(path)
     suffix = path.suffix.lower()
     if suffix == ".csv":
         return _from_file(read_csv(path), path, metric=False)
@@ -63,6 +61,19 @@ def read_poses(path: Path) -> Poses:
         return _from_file({view.name: view.cam_from_world for view in views}, path, metric=metric)
     raise InputError(f"{path}: neither key 'frames' (nerfstudio) nor key 'views' (pano-mvs), nor a list with 'shots' "
                      "(OpenSfM): no poses here")  # fmt: skip
+
+
+def recorded_pictures(path: Path) -> dict[str, str]:
+    """Return the SHA-256 of the pictures that poses belong to, by name, as far as a file states them (poses.json).
+
+    Raises:
+        InputError: as `read_poses`.
+    """
+    path = _file_or_model(path)
+    value = read_json_value(path) if path.suffix.lower() == ".json" else None
+    if not isinstance(value, dict) or "views" not in value:
+        return {}
+    return {view.name: view.sha256 for view in read_posed_views(path)[0] if view.sha256 is not None}
 
 
 def read_csv(path: Path) -> dict[str, Rigid3]:
@@ -89,14 +100,20 @@ def read_csv(path: Path) -> dict[str, Rigid3]:
     return dict(poses)
 
 
-def _poses_from_folder(folder: Path) -> Poses:
-    for model in (folder, folder / "sparse" / "0", folder / "colmap" / "sparse" / "0"):
+def _file_or_model(path: Path) -> Path:
+    """Return the file with poses, or the folder of a COLMAP model, that a file or folder is or holds."""
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder. Give a COLMAP model, a transforms.json, a "
+                         "poses.json, a reconstruction.json or a CSV file")  # fmt: skip
+    if not path.is_dir():
+        return path
+    for model in (path, path / "sparse" / "0", path / "colmap" / "sparse" / "0"):
         if is_colmap_model(model):
-            return read_colmap_model(model)
+            return model
     for name in _IN_A_FOLDER:
-        if (folder / name).is_file():
-            return read_poses(folder / name)
-    raise InputError(f"{folder}: no poses here. A folder must hold a COLMAP model (cameras, images, points3D), or one "
+        if (path / name).is_file():
+            return path / name
+    raise InputError(f"{path}: no poses here. A folder must hold a COLMAP model (cameras, images, points3D), or one "
                      f"of {', '.join(_IN_A_FOLDER)}")  # fmt: skip
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
-from pathlib import Path
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
 from typing import Literal
 
 import numpy as np
@@ -19,7 +21,6 @@ from pano_mvs.api import (
     GateError,
     InputError,
     InputPath,
-    Names,
     One,
     Panorama,
     Params,
@@ -28,7 +29,7 @@ from pano_mvs.api import (
     stage,
 )
 from pano_mvs.io.names import match_image_names
-from pano_mvs.io.pose_files import read_poses
+from pano_mvs.io.pose_files import read_poses, recorded_pictures
 
 
 class ScaledTranslationParams(Params):
@@ -94,13 +95,36 @@ class FromModelParams(Params):
 
 
 @stage("poses.from_model")
-def from_model(images: Names[Panorama], params: FromModelParams, ctx: Context) -> Poses:
+def from_model(images: All[Panorama], params: FromModelParams, ctx: Context) -> Poses:
     """Poses that are known already: a COLMAP model, poses.json, nerfstudio's transforms.json, or CSV.
 
-    Image names are compared with and without their folders and extensions.
+    Image names are compared with and without their folders and extensions. Where the file records the SHA-256 of its
+    pictures, they are compared too: poses of other pictures that happen to have the same names are refused.
     """
-    known = known_poses(params.path, images)
+    _require_its_pictures(params.path, images, ctx)
+    known = known_poses(params.path, tuple(images))
     return checked_poses(known, ctx, remedy=f"{params.path} must know two pictures of the capture at least")
+
+
+def _require_its_pictures(path: Path, images: Mapping[str, Panorama], ctx: Context) -> None:
+    """Raise InputError if a file of poses records other pictures under the names of the capture; note single ones."""
+    recorded = recorded_pictures(path)
+    matched = {name: there for name, there in match_image_names(images, recorded).items()
+               if PurePosixPath(name).suffix == PurePosixPath(there).suffix}  # fmt: skip
+    others = [name for name, there in matched.items() if _sha256(images[name].image.path) != recorded[there]]
+    if others and len(others) == len(matched):
+        raise InputError(
+            f"{path}: records other pictures under these names: not one of {len(others)} ({others[0]} …) has the "
+            "SHA-256 that it states. Give the poses of these pictures: --set poses.path=FILE. If they are the same "
+            "pictures, saved anew, take the sha256 out of the file"
+        )
+    for name in others:
+        ctx.note(f"{name} is not the picture, byte for byte, whose pose {path.name} records")
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 class TriangulateParams(Params):

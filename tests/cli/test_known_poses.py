@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
 import pytest
 
 from tests.cli.conftest import Command, run_json
@@ -68,3 +69,35 @@ def test_names_of_another_capture_are_an_input_error(pano_mvs: Command, known: P
     result = pano_mvs("run", known, "--out", "out")
     assert result.code == 2
     assert "none of its 2 images is one of this capture" in result.flat
+
+
+def test_poses_of_other_pictures_of_the_same_names_are_refused(pano_mvs: Command, known: Path, capture: Path) -> None:
+    """The sample's own poses were given to anybody's 000.png to 003.png once."""
+    write(known, capture, ["000.png", "001.png", "002.png", "003.png"])
+    known.write_text(
+        known.read_text().partition("  features")[0] + "  poses: {use: poses.from_model, path: poses.json}\n"
+    )
+    assert pano_mvs("run", known, "--out", "out").code == 0
+    for path in sorted((capture / "images").iterdir()):
+        picture = cv2.imread(str(path))
+        if path.name == "001.png":
+            picture[0, 0] ^= 1
+            cv2.imwrite(str(path), picture)
+    touched = pano_mvs("run", known, "--out", "out")
+    assert touched.code == 0
+    assert "001.png is not the picture, byte for byte, whose pose poses.json records" in touched.flat
+    for path in sorted((capture / "images").iterdir()):
+        cv2.imwrite(str(path), 255 - cv2.imread(str(path)))
+    others = pano_mvs("run", known, "--out", "out")
+    assert others.code == 2
+    assert "records other pictures under these names: not one of 4" in others.flat
+    for path in sorted((capture / "images").iterdir()):
+        cv2.imwrite(str(path.with_suffix(".jpg")), cv2.imread(str(path)))
+        path.unlink()
+    assert pano_mvs("run", known, "--out", "out").code == 0, "saved in another format, they must be others"
+
+
+def test_the_presets_own_poses_are_for_its_own_pictures(pano_mvs: Command, capture: Path) -> None:
+    result = pano_mvs("run", "known_poses", "--images", capture / "images", "--until", "poses", "--out", "out")
+    assert result.code == 2
+    assert "--set poses.path=FILE" in result.flat
