@@ -9,8 +9,6 @@ from typing import Any
 # The figures of the scores, in words; others are spelt out from their names.
 _WORDS = {
     "psnr_db": "PSNR dB",
-    "constant_psnr_db": "PSNR dB of a constant",
-    "constant_w_delta_105": "within 5 % by a constant",
     "mae": "mean error",
     "w_mae": "mean error on the sphere",
     "abs_rel": "mean relative error",
@@ -22,6 +20,9 @@ _WORDS = {
     "ause": "area between the two (AUSE)",
     "of": "of panoramas with truth",
 }
+_CONSTANTS = "best_constant_", "constant_"
+_BRACKETS = ("In brackets: what one constant range for all pixels scores, the constant that is best for the very score "
+             "(in runs of earlier versions the median of the true ranges).")  # fmt: skip
 _UNITS = {"deg": "°", "rad": "rad", "px": "px", "s": "s", "db": "dB", "mb": "MB"}
 
 
@@ -83,17 +84,31 @@ def words(name: str) -> str:
 
 
 def score_tables(scores: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the scores of the poses as rows, and those of the views as a table with one column for each metric."""
+    """Return the scores of the poses as rows, and those of the views as a table with one column for each metric.
+
+    What a constant range map scores (`best_constant_…`, or in older runs `constant_…`) stands in brackets beside.
+    """
     views = scores.get("views") or {}
-    columns = list(dict.fromkeys(metric for values in views.values() for metric in values))
-    rows = [(name, [values.get(metric) for metric in columns]) for name, values in views.items()]
+    columns = [metric for metric in _metrics(views) if not metric.startswith(_CONSTANTS)]
+    middle = {metric: median([view.get(metric) for view in views.values()]) for metric in _metrics(views)}
     return {
         "poses": list((scores.get("poses") or {}).items()),
         "columns": columns,
-        "views": rows,
-        "median": [median([row[1][idx] for row in rows]) for idx in range(len(columns))] if len(rows) > 1 else [],
-        "notes": list(scores.get("notes") or []),
+        "views": [(name, [_beside_constant(values, metric) for metric in columns]) for name, values in views.items()],
+        "median": [_beside_constant(middle, metric) for metric in columns] if len(views) > 1 else [],
+        "notes": [*([_BRACKETS] if _metrics(views) != columns else []), *(scores.get("notes") or [])],
     }
+
+
+def _metrics(views: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    return list(dict.fromkeys(metric for values in views.values() for metric in values))
+
+
+def _beside_constant(values: Mapping[str, Any], metric: str) -> str:
+    """Return a score, and in brackets what a constant scores where that is known."""
+    found = figure(values.get(metric))
+    constant = next((values[prefix + metric] for prefix in _CONSTANTS if values.get(prefix + metric) is not None), None)
+    return found if constant is None else f"{found} ({figure(constant)})"
 
 
 def median(values: list[Any]) -> float | None:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from pano_mvs.report.figures import duration, figure, median, share, words
+from pano_mvs.report.figures import duration, figure, median, score_tables, share, words
 
 
 @pytest.mark.parametrize(
@@ -45,3 +45,20 @@ def test_the_median_leaves_out_what_is_no_number():
     assert median([3, None, float("nan"), 1.0, "x", 2]) == 2
     assert median([1, 2]) == 1.5
     assert median([None]) is None
+
+
+def test_a_score_stands_beside_what_a_constant_scores():
+    views = {
+        "a": {"psnr_db": 30.0, "ause": 0.02, "constant_psnr_db": 18.0, "best_constant_psnr_db": 19.0},
+        "b": {"psnr_db": 20.0, "constant_psnr_db": 10.0},
+        "c": {"psnr_db": None},
+    }
+    tables = score_tables({"poses": {"of": 3}, "views": views, "notes": ["a note"]})
+    assert tables["columns"] == ["psnr_db", "ause"]
+    assert tables["views"] == [("a", ["30 (19)", "0.02"]), ("b", ["20 (10)", "–"]), ("c", ["–", "–"])]
+    assert tables["median"] == ["25 (19)", "0.02"]
+    assert "best for the very score" in tables["notes"][0]
+    assert tables["notes"][1:] == ["a note"]
+    assert score_tables({"views": {"a": {"psnr_db": 1.0}}}) == {
+        "poses": [], "columns": ["psnr_db"], "views": [("a", ["1"])], "median": [], "notes": [],
+    }  # fmt: skip
