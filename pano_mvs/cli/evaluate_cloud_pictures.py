@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.metrics.cloud import PointChunks
 from pano_mvs.cli.evaluate_cloud import JudgedCloud
+from pano_mvs.cli.evaluate_cloud_views import write_cloud_views
 from pano_mvs.io.cloud_picture import write_cloud_picture
 from pano_mvs.io.error_cloud import write_error_cloud
 
@@ -37,7 +38,7 @@ def write_overview(path: Path, judged: JudgedCloud) -> None:
 
 
 def write_error_clouds(folder: Path, judged: JudgedCloud) -> None:
-    """Write accuracy.ply, completeness.ply, and errors.png with the views.
+    """Write accuracy.ply, completeness.ply, a picture of each, and errors.png with the views.
 
     Both clouds lie in the truth's frame: the points that were judged by their distance from the true surface, and the
     surface that was to be found by its distance from the points.
@@ -47,6 +48,13 @@ def write_error_clouds(folder: Path, judged: JudgedCloud) -> None:
                       farthest=judged.farthest)  # fmt: skip
     write_error_cloud(folder / "completeness.ply", PointChunks.of(surface.points_in_world).read(),
                       judged.distances.of_surface, limits=limits, farthest=judged.farthest)  # fmt: skip
+    cameras = judged.compared.cameras
+    write_cloud_views(folder / "accuracy.png", *_some_points(judged), limits=limits, cameras=cameras,
+                      title="cloud by its distance from the true surface")  # fmt: skip
+    step = -(-len(surface.points_in_world) // _MOST_POINTS) or 1
+    write_cloud_views(folder / "completeness.png", surface.points_in_world[::step], _towards_cameras(judged, step),
+                      judged.distances.of_surface[::step], limits=limits, cameras=cameras,
+                      title="true surface by its distance from the cloud")  # fmt: skip
     write_overview(folder / "errors.png", judged)
 
 
@@ -59,3 +67,14 @@ def _some_points(judged: JudgedCloud) -> tuple[NDArray[np.float32], NDArray[np.f
         points = moved.apply(points).astype(np.float32)
         normals = (normals @ moved.rotation.T).astype(np.float32)
     return points, normals, judged.distances.of_points[::step]
+
+
+def _towards_cameras(judged: JudgedCloud, step: int) -> NDArray[np.float32]:
+    """Return unit vectors (N, 3) from samples of the surface to the cameras that saw them; 0 for a reference cloud."""
+    surface = judged.compared.surface
+    points = surface.points_in_world[::step]
+    if not judged.compared.used:
+        return np.zeros_like(points)
+    centers = np.array([view.cam_from_world.center for view in judged.compared.used.values()])
+    towards = centers[surface.view_idx[::step]] - points
+    return np.asarray(towards / np.linalg.norm(towards, axis=1, keepdims=True), np.float32)
