@@ -10,7 +10,7 @@ import pytest
 
 from pano_mvs.algorithms.poses.gauge import moved_poses
 from pano_mvs.algorithms.poses.geodesy import lla_from_local, local_from_lla
-from pano_mvs.algorithms.poses.georeference import fit_gps, georeferenced_poses, scaled_by_gps
+from pano_mvs.algorithms.poses.georeference import fit_gps, georeferenced_poses, origin_of_frame, scaled_by_gps
 from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec
 from pano_mvs.scene import Poses
 from tests.algorithms.synthetic_capture import random_rotation
@@ -158,3 +158,16 @@ def test_two_positions_are_too_few():
     true = street(rng, 5)
     known = dict(list(positions(true, rng, 0.0).items())[:2])
     assert "2 of 5 registered panoramas have a GPS position; 3" in fit_gps(true, known, UP, rng=rng).reason
+
+
+@pytest.mark.parametrize("home", [HOME, np.array([-33.9, -70.65, -12.3]), np.array([0.0000001, 179.9, 0.0])])
+def test_the_world_tells_where_its_origin_is(home):
+    rng = np.random.default_rng(11)
+    poses = street(rng, 12)
+    lla = {name: tuple(lla_from_local(center, home)) for name, center in zip(poses.names, poses.centers, strict=True)}
+    world = georeferenced_poses(poses, fit_gps(poses, lla, UP, gps_noise_m=0.01, rng=rng))
+    origin = origin_of_frame(world.frame)
+    assert origin is not None
+    assert np.abs(local_from_lla(origin, lla[poses.names[0]])).max() < 0.06
+    assert origin_of_frame("the first registered camera") is None
+    assert origin_of_frame("") is None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -23,6 +24,7 @@ _MOST_HYPOTHESES = 2000
 # A scale that is less certain than this is no scale.
 _MAX_SCALE_ERROR = 0.1
 _OUTLIER_SIGMAS = 3.0
+_GEOREFERENCED = re.compile(r"x east, y down, z north, by GPS; [^(]*\((-?[\d.]+)°, (-?[\d.]+)°, (-?[\d.]+) m\)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +131,19 @@ def georeferenced_poses(poses: Poses, fit: GpsFit) -> Poses:
     frame = (f"x east, y down, z north, by GPS; origin at the first registered camera ({latitude:.7f}°, "
              f"{longitude:.7f}°, {altitude:.1f} m)")  # fmt: skip
     return replace(moved, frame=frame, scale=f"metres, by {fit.words}", metric=True)
+
+
+def origin_of_frame(frame: str) -> tuple[float, float, float] | None:
+    """Return latitude deg, longitude deg and altitude m of a world's origin, as `georeferenced_poses` states them.
+
+    Args:
+        frame: what the world frame is, in words (`Poses.frame`).
+
+    Returns:
+        None if the world is not turned east, down, north by GPS.
+    """
+    found = _GEOREFERENCED.match(frame)
+    return None if found is None else (float(found[1]), float(found[2]), float(found[3]))
 
 
 def _judged(fit: GpsFit, factor: complex, source: ComplexArray, residuals_m: FloatArray, gps_noise_m: float) -> GpsFit:
