@@ -16,6 +16,7 @@ from pano_mvs.algorithms.sweep.sweep import sweep_range
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pad_panorama, pixel_solid_angle
 from pano_mvs.scene import RangeMap
+from pano_mvs.scene.masking import placed_mask
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
 # Rounding the limits outward to steps of a quarter octave keeps the planes, and with them the ranges, the same when
@@ -133,9 +134,8 @@ def _small_mask(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return where a small pixel has no ignored pixel in it."""
     if mask.shape[1] <= _WIDTH:
         return mask
-    share = cv2.resize(mask.astype(np.float32), (_WIDTH, _WIDTH // 2), interpolation=cv2.INTER_AREA)
-    valid: NDArray[np.bool_] = share > 1 - 1e-3
-    return valid
+    height, width = mask.shape
+    return placed_mask(mask, (_WIDTH // 2, _WIDTH), of=(0, 0, width, height), whole_hw=(height, width))
 
 
 def _textured(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:

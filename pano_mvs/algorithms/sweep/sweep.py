@@ -22,6 +22,7 @@ from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.winner import range_map_from_winners
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3
+from pano_mvs.scene.masking import placed_mask
 from pano_mvs.scene.range_map import RangeMap
 
 __all__ = ["SweepSettings", "sweep_range"]
@@ -103,8 +104,9 @@ def sweep_input(
     ranges = virtual_ranges(near, far, planes=settings.planes, spacing=settings.spacing)
     if settings.exposure and settings.minds_exposure:
         rough = _rough_range(
-            reference, sources, source_from_reference, near=near, far=far, backend=backend, device=device
-        )
+            reference, sources, source_from_reference, near=near, far=far, backend=backend, device=device,
+            masks=(reference_mask, masks),
+        )  # fmt: skip
         sources = match_all(reference, sources, source_from_reference, rough, masks)
     poses = tuple(source_from_reference)
     if settings.derotate:
@@ -129,16 +131,31 @@ def _rough_range(
     far: float,
     backend: str,
     device: str,
+    masks: tuple[Mask | None, Sequence[Mask] | None],
 ) -> NDArray[np.float32]:
-    """Return ranges at low resolution by census, which exposure does not disturb; the surer half of them."""
+    """Return ranges at low resolution by census, which exposure does not disturb; the surer half of them.
+
+    `masks` are those of the reference and of the sources.
+    """
     settings = SweepSettings(planes=_ROUGH_PLANES, cost="census", window=5, aggregation="box", no_match="keep")
     small = [shrink(source, _ROUGH_ROWS) for source in sources]
+    small_reference = shrink(reference, _ROUGH_ROWS)
+    sources_valid = None if masks[1] is None else [_shrunk(m, like=s) for m, s in zip(masks[1], small, strict=True)]
     found = sweep_range(
-        shrink(reference, _ROUGH_ROWS), small, source_from_reference,
+        small_reference, small, source_from_reference,
         near=near, far=far, settings=settings, backend=helper_backend(backend), device=device,
+        reference_mask=None if masks[0] is None else _shrunk(masks[0], like=small_reference),
+        source_masks=sources_valid,
     )  # fmt: skip
-    sure = found.confidence >= np.median(found.confidence)
+    if not found.valid.any():
+        return found.range
+    sure = found.confidence >= np.median(found.confidence[found.valid])
     return np.where(sure, found.range, np.nan).astype(np.float32)
+
+
+def _shrunk(mask: Mask, *, like: Picture) -> Mask:
+    height, width = mask.shape
+    return placed_mask(mask, (like.shape[0], like.shape[1]), of=(0, 0, width, height), whole_hw=(height, width))
 
 
 def _voting(masks: tuple[Mask, ...] | None, settings: SweepSettings, *, rows: int) -> tuple[Mask, ...] | None:
