@@ -243,9 +243,9 @@ def print_scores(scores: Mapping[str, Any], console: Console) -> None:
         console.print(f"against the ground truth: {text}", highlight=False)
     if not scores.get("views"):
         return
-    table = Table("view", *_SHOWN_SCORES.values())
+    table = Table("view (a constant)", *_SHOWN_SCORES.values())
     for view, values in scores["views"].items():
-        table.add_row(escape(view), *(_shown(values.get(name)) for name in _SHOWN_SCORES))
+        table.add_row(escape(view), *(_beside_constant(values, name) for name in _SHOWN_SCORES))
     console.print(table)
 
 
@@ -253,11 +253,13 @@ def _print_comparison(all_scores: Mapping[str, Any], console: Console) -> None:
     """Print, where several branches are scored, the medians over their views side by side."""
     if len(all_scores) < 2:
         return
-    table = Table("median over views", *_SHOWN_SCORES.values())
+    table = Table("median (a constant)", *_SHOWN_SCORES.values())
     for stage, scores in all_scores.items():
         views = scores["views"].values()
-        values = ([view[name] for view in views if view.get(name) is not None] for name in _SHOWN_SCORES)
-        table.add_row(escape(stage), *(_shown(median(found) if found else None) for found in values))
+        names = {name for view in views for name in view}
+        found = {name: [view[name] for view in views if view.get(name) is not None] for name in names}
+        middle = {name: median(values) for name, values in found.items() if values}
+        table.add_row(escape(stage), *(_beside_constant(middle, name) for name in _SHOWN_SCORES))
     console.print(table)
 
 
@@ -267,13 +269,17 @@ _SHOWN_SCORES = {
     "w_delta_105": "δ<1.05",
     "completeness": "complete",
     "ause": "AUSE",
-    "constant_psnr_db": "constant: dB",
-    "constant_w_delta_105": "constant: δ<1.05",
 }
 """Score to the heading under which it is printed; MAE and δ are weighted by solid angle.
 
-AUSE is the area between the sparsification curve of the confidence and that of the true errors.
+AUSE is the area between the sparsification curve of the confidence and that of the true errors. In brackets stands what
+the constant range scores that is best for the very score.
 """
+
+
+def _beside_constant(values: Mapping[str, float], name: str) -> str:
+    constant = values.get(f"best_constant_{name}")
+    return _shown(values.get(name)) + ("" if constant is None else f" ({_shown(constant)})")
 
 
 def _shown(value: float | None) -> str:
