@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import pano_mvs
+from pano_mvs import algorithms
 from pano_mvs.cli.doctor import command, machine, probes
 from pano_mvs.cli.doctor.disk import folder_findings
 from pano_mvs.cli.doctor.finding import Finding
@@ -19,6 +20,7 @@ from pano_mvs.cli.doctor.packages import is_older, package_findings
 from pano_mvs.cli.doctor.plugins import plugin_findings
 from pano_mvs.cli.doctor.probes import Outcome, library_findings, run_probe
 from pano_mvs.cli.session import presets_folder
+from pano_mvs.core.kernel_cache import kernel_cache_folder
 from pano_mvs.engine.registry import Registry
 from tests.cli.conftest import Command
 
@@ -161,7 +163,7 @@ def test_every_variable_that_the_program_reads_is_known() -> None:
 
 
 def test_a_folder_for_kernels_that_cannot_be_written(tmp_path: Path) -> None:
-    package = Path(pano_mvs.__file__).parent
+    package = Path(pano_mvs.__file__).parent / "algorithms"
     assert kernel_cache_finding(package, {"NUMBA_CACHE_DIR": str(tmp_path / "new")}).state == "ok"
     (tmp_path / "file").write_text("x")
     finding = kernel_cache_finding(package, {"NUMBA_CACHE_DIR": str(tmp_path / "file")})
@@ -224,6 +226,10 @@ def test_the_command_shows_the_remedies_and_ends_with_2_if_a_run_cannot_work(
 
 @pytest.mark.slow
 def test_the_real_libraries_work_here() -> None:
-    found = {finding.what: finding.state for finding in command.all_findings()}
+    findings = list(command.all_findings())
+    found = {finding.what: finding.state for finding in findings}
     assert found["numba"] == found["pycolmap"] == found["OpenCV"] == "ok"
+    assert str(kernel_cache_folder(Path(algorithms.__file__).parent)) in next(
+        finding.detail for finding in findings if finding.what == "compiled kernels"
+    )
     assert sys.version_info >= (3, 11)

@@ -59,7 +59,7 @@ def all_findings(cache: Path | None = None, out: Path | None = None) -> Iterator
     yield from package_findings()
     yield from library_findings()
     yield from machine_findings()
-    yield kernel_cache_finding(Path(pano_mvs.__file__).parent)
+    yield kernel_cache_finding(Path(pano_mvs.__file__).parent / "algorithms")
     variable = os.environ.get(CACHE_VARIABLE)
     yield from folder_findings("cache", cache or Path(variable or ".pano-mvs"), "--cache DIR")
     yield from folder_findings("results", out or Path("out"), "--out DIR")

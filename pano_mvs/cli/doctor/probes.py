@@ -34,10 +34,6 @@ Try = Callable[[str], Outcome]
 
 _NUMBA = """
 import json, time
-import pano_mvs.core.kernel_cache as places
-from pathlib import Path
-import pano_mvs
-places.use_kernel_cache(Path(pano_mvs.__file__).parent)
 import numba, numpy
 began = time.perf_counter()
 @numba.njit(error_model="numpy", nogil=True)
