@@ -53,10 +53,15 @@ class Hands:
     def _inside(self) -> bool:
         return self._tour.state.inside is not None
 
+    @property
+    def _size_wh(self) -> tuple[int, int]:
+        width, height = self._interactor.GetRenderWindow().GetSize()
+        return max(1, width), max(1, height)
+
     def _place(self) -> tuple[int, int]:
         """Return where the pointer is, from the upper left corner; VTK counts from the lower one."""
         x, y = self._interactor.GetEventPosition()
-        return x, self._interactor.GetSize()[1] - 1 - y
+        return x, self._size_wh[1] - 1 - y
 
     def _press(self, _style: Any, event: str) -> None:
         button = event.removesuffix("PressEvent")
@@ -72,7 +77,7 @@ class Hands:
             self._tour.moved_to(self._seen_from())
         if start is not None and max(abs(start[0] - here[0]), abs(start[1] - here[1])) < _CLICK_PX:
             if button == _LEFT:
-                self._tour.click(here[0] + 0.5, here[1] + 0.5, self._interactor.GetSize())
+                self._tour.click(here[0] + 0.5, here[1] + 0.5, self._size_wh)
             else:
                 self._tour.step_out()
         self._update()
@@ -83,10 +88,10 @@ class Hands:
         if not self._pressed:
             if not self._inside:
                 self._tour.moved_to(self._seen_from())
-            if self._tour.hover(here[0] + 0.5, here[1] + 0.5, self._interactor.GetSize()):
+            if self._tour.hover(here[0] + 0.5, here[1] + 0.5, self._size_wh):
                 self._update()
         elif self._inside:
-            self._tour.drag(here[0] - before[0], here[1] - before[1], window_height=self._interactor.GetSize()[1])
+            self._tour.drag(here[0] - before[0], here[1] - before[1], window_height=self._size_wh[1])
             self._update()
         else:
             self._style.OnMouseMove()

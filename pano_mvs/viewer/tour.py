@@ -288,8 +288,13 @@ def box_of(points: NDArray[np.floating], centers: FloatArray) -> FloatArray:
 def length_text(length: float, unit: str) -> str:
     """Return a length as people read it, with its unit."""
     if unit != "m":
-        return f"{length:.4g} {unit.removesuffix('s') if length == 1 else unit}"
+        return f"{length:.4g} {unit}"
     return f"{length:.3f} m" if length >= 1 else f"{100 * length:.1f} cm"
+
+
+def bar_text(length: float, unit: str) -> str:
+    """Return a round length with its unit."""
+    return f"{length:g} {unit.removesuffix('s') if length == 1 else unit}"
 
 
 def bar_length(extent: float) -> float:

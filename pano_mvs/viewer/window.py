@@ -13,7 +13,7 @@ from pano_mvs.viewer.cloud_colors import POINT_BUDGET, color_cloud, drawn_cloud
 from pano_mvs.viewer.hands import Hands
 from pano_mvs.viewer.panorama_pictures import LARGE_WIDTH, SMALL_WIDTH, sphere_picture
 from pano_mvs.viewer.sphere_actors import rims_actor, sphere_actor
-from pano_mvs.viewer.tour import HELP, Tour, TourState, bar_length, length_text
+from pano_mvs.viewer.tour import HELP, Tour, TourState, bar_length, bar_text, length_text
 from pano_mvs.viewer.viewpoint import Viewpoint
 
 TEXTURED = 64
@@ -145,7 +145,7 @@ class SceneWindow:
         start = low[0] * right + low[1] * scene.up + (low[2] - 0.03 * extent) * scene.ahead
         ends = np.stack([start, start + length * right])
         self.plotter.add_lines(ends, color=_INK, width=4, name="bar")
-        self._label(ends[1:] + 0.02 * extent * right, [length_text(length, scene.unit)], "bar label")
+        self._label(ends[1:] + 0.02 * extent * right, [bar_text(length, scene.unit)], "bar label")
 
     def _reload_points(self, state: TourState) -> None:
         """Read all points of the file, or as many as a display needs."""
@@ -183,7 +183,7 @@ class SceneWindow:
         """Return points large enough for surfaces to close, in pixels."""
         count = max(1, len(self.tour.cloud.points) if self.tour.cloud is not None else 1)
         width, height = self.plotter.window_size
-        share = 1.6 if state.inside is not None else 1.1
+        share = 2.0 if state.inside is not None else 1.6
         return float(np.clip(share * np.sqrt(width * height / count), 1.5, 6.0))
 
     def _surround(self, camera_idx: int | None) -> None:

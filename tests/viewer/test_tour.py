@@ -1,0 +1,202 @@
+"""What clicks, drags and keys do, without a window."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pano_mvs.core.errors import UsageError
+from pano_mvs.viewer.cloud_colors import drawn_cloud
+from pano_mvs.viewer.picking import camera_under, point_under
+from pano_mvs.viewer.shown_scene import open_scene
+from pano_mvs.viewer.tour import Tour, bar_length, bar_text, box_of, length_text, sphere_radius
+from pano_mvs.viewer.viewpoint import Viewpoint
+from tests.viewer.scenes import HALF, turned_poses, write_output
+
+SIZE = (900, 600)
+
+
+@pytest.fixture
+def tour(tmp_path: Path) -> Tour:
+    return tour_of(write_output(tmp_path, turned_poses(6), points=150_000))
+
+
+def tour_of(out: Path) -> Tour:
+    scene = open_scene(out)
+    cloud = drawn_cloud(scene.cloud) if scene.cloud is not None else None
+    points = cloud.points if cloud is not None else np.zeros((0, 3))
+    return Tour(scene, cloud, box_of(points, scene.centers))
+
+
+def place_of(point: np.ndarray, view: Viewpoint) -> tuple[float, float]:
+    """Return where in the window a point is."""
+    x, y, z = view.axes @ (point - view.eye)
+    scale = SIZE[1] / 2 / (view.height / 2 if view.height else z * np.tan(np.deg2rad(view.angle_deg) / 2))
+    return SIZE[0] / 2 + x * scale, SIZE[1] / 2 + y * scale
+
+
+@pytest.mark.parametrize("view", ["overview", "top", "front"])
+def test_clicking_a_camera_steps_inside_and_out_again(tour: Tour, view: str) -> None:
+    tour.see(view)
+    before = tour.state.viewpoint
+    distances = np.linalg.norm(tour.centers - before.eye, axis=1)
+    nearest = int(np.argmin(distances))
+    tour.click(*place_of(tour.centers[nearest], before), SIZE)
+    assert tour.state.inside == nearest
+    np.testing.assert_allclose(tour.state.viewpoint.eye, tour.centers[nearest])
+    assert tour.state.viewpoint.height == 0
+    tour.step_out()
+    assert tour.state.inside is None
+    assert tour.state.viewpoint is before
+
+
+def test_a_click_beside_all_cameras_does_nothing(tour: Tour) -> None:
+    before = tour.state
+    tour.click(1, 1, SIZE)
+    assert tour.state is before
+
+
+def test_one_goes_on_from_camera_to_camera_and_comes_back_to_the_start(tour: Tour) -> None:
+    start = tour.state.viewpoint
+    tour.key("Right")
+    assert tour.state.inside == 0
+    looking = tour.state.viewpoint.axes[2]
+    tour.key("Right")
+    assert tour.state.inside == 1
+    np.testing.assert_allclose(tour.state.viewpoint.axes[2], looking, atol=1e-12)
+    other = next(idx for idx in range(6) if (tour.centers[idx] - tour.centers[1]) @ looking > 0.3)
+    tour.click(*place_of(tour.centers[other], tour.state.viewpoint), SIZE)
+    assert tour.state.inside == other
+    tour.key("Escape")
+    assert tour.state.viewpoint is start
+    tour.key("Left")
+    assert tour.state.inside == 5
+
+
+def test_inside_by_name_looks_where_the_camera_looked(tour: Tour) -> None:
+    tour.see("inside:003")
+    assert tour.state.inside == 3
+    np.testing.assert_allclose(tour.state.viewpoint.axes[2], tour.scene.cameras[3].cam_from_world.rotation[2])
+    with pytest.raises(UsageError, match=r"no camera 'attic'; there are: lobby/000\.png"):
+        tour.see("inside:attic")
+    with pytest.raises(UsageError, match="no view 'below'"):
+        tour.see("below")
+
+
+def test_two_clicks_measure_what_the_cloud_says(tour: Tour) -> None:
+    tour.key("m")
+    tour.key("x")
+    view = tour.state.viewpoint
+    clicked = []
+    for _ in range(2):
+        tour.click(*place_of(HALF * [0.2, 1, len(clicked) - 0.5], view), SIZE)
+        clicked.append(tour.state.picked[-1])
+    assert tour.distance == pytest.approx(np.linalg.norm(clicked[0] - clicked[1]))
+    assert tour.state.message == f"{tour.distance:.3f} m"
+    for point in clicked:
+        assert np.isclose(np.abs(point), HALF).any()
+    tour.click(*place_of(clicked[0], view), SIZE)  # a third click begins anew
+    assert tour.distance is None
+    tour.click(2, 2, SIZE)
+    assert "no point there" in tour.state.message
+    tour.key("Escape")
+    assert (tour.state.measuring, tour.state.picked) == (False, ())
+
+
+def test_points_that_turn_their_back_are_not_picked(tour: Tour) -> None:
+    """From above the ceiling is not drawn, so a click goes through it to the floor."""
+    tour.see("top")
+    for key, height in (("m", HALF[1]), ("x", -HALF[1])):
+        tour.key(key)
+        tour.click(430, 310, SIZE)
+        assert tour.state.picked[-1][1] == pytest.approx(height)
+
+
+def test_measuring_works_inside_a_panorama(tour: Tour) -> None:
+    tour.see("inside:000")
+    tour.key("m")
+    tour.click(450, 300, SIZE)
+    picked = tour.state.picked[0]
+    eye = tour.state.viewpoint.eye
+    along = tour.state.viewpoint.axes[2]
+    assert (picked - eye) @ along / np.linalg.norm(picked - eye) > 0.999
+    assert tour.state.inside == 0
+
+
+def test_keys_change_what_is_shown(tmp_path: Path) -> None:
+    tour = tour_of(write_output(tmp_path, turned_poses(2), quality=True))
+    seen = [tour.state.coloring]
+    for _ in range(5):
+        tour.key("c")
+        seen.append(tour.state.coloring)
+    assert seen == ["rgb", "confidence", "views", "normals", "height", "rgb"]
+    for key, name in {
+        "l": "labels",
+        "k": "cameras",
+        "b": "blended",
+        "x": "backs",
+        "d": "all_points",
+        "h": "help",
+    }.items():
+        before = getattr(tour.state, name)
+        assert tour.key(key)
+        assert getattr(tour.state, name) is not before
+    assert not tour.key("z")
+
+
+def test_hovering_tells_which_camera_is_there(tour: Tour) -> None:
+    nearest = int(np.argmin(np.linalg.norm(tour.centers - tour.state.viewpoint.eye, axis=1)))
+    assert tour.hover(*place_of(tour.centers[nearest], tour.state.viewpoint), SIZE)
+    assert tour.state.hovered == nearest
+    assert not tour.hover(*place_of(tour.centers[nearest], tour.state.viewpoint), SIZE)
+    tour.key("k")
+    assert tour.hover(*place_of(tour.centers[nearest], tour.state.viewpoint), SIZE)
+    assert tour.state.hovered is None
+
+
+def test_a_tour_without_cloud_or_without_cameras_goes_on(tmp_path: Path) -> None:
+    bare = tour_of(write_output(tmp_path / "bare", turned_poses(1), points=0))
+    bare.key("m")
+    bare.click(450, 300, SIZE)
+    assert "no cloud" in bare.state.message
+    assert not bare.key("c") or bare.state.coloring == "rgb"
+    alone = tour_of(write_output(tmp_path / "alone", {}))
+    alone.key("Right")
+    alone.click(450, 300, SIZE)
+    assert alone.state.inside is None
+
+
+def test_the_nearest_of_several_things_under_the_pointer_is_taken() -> None:
+    start, ahead = np.zeros(3), np.array([0.0, 0, 1])
+    centers = np.array([[0.0, 0, 9], [0, 0.05, 5], [0, 0, -3], [2, 0, 4]])
+    assert camera_under(start, ahead, centers, 0.1) == 1
+    assert camera_under(start, -ahead, centers, 0.1) == 2
+    assert camera_under(start, np.array([0, 1.0, 0]), centers, 0.1) is None
+    points = np.array([[0, 0, 8], [0.001, 0, 6], [0.02, 0, 6.01], [0, 0.5, 2], [0, 0, -1]], np.float32)
+    assert point_under(start, ahead, points) == 1
+    away = np.tile(np.float32([0, 0, 1]), (5, 1))
+    assert point_under(start, ahead, points, normals=away) is None
+    away[0] = [0, 0, -1]
+    assert point_under(start, ahead, points, normals=away) == 0
+    assert point_under(start, ahead, points[:0]) is None
+
+
+def test_sizes_suit_the_scene() -> None:
+    box = np.array([[0.0, 0, 0], [10, 3, 8]])
+    apart = np.array([[1.0, 1, 1], [2, 1, 1], [3, 1, 1]])
+    assert sphere_radius(apart, box) == pytest.approx(0.18)
+    assert sphere_radius(apart * 1e-3, box) == pytest.approx(0.005 * np.linalg.norm([10, 3, 8]))
+    assert sphere_radius(apart[:1], box) == sphere_radius(apart * 1e3, box)
+    assert [bar_length(extent) for extent in (4.0, 8.1, 19.9, 20, 0.3)] == [1, 2, 2, 5, 0.05]
+    assert length_text(0.4321, "m") == "43.2 cm"
+    assert length_text(2.5, "m") == "2.500 m"
+    assert length_text(1.23456, "scene units") == "1.235 scene units"
+    assert (bar_text(1, "scene units"), bar_text(0.5, "scene units"), bar_text(2, "m")) == (
+        "1 scene unit",
+        "0.5 scene units",
+        "2 m",
+    )
+    flat = box_of(np.zeros((0, 3)), np.zeros((1, 3)))
+    assert np.ptp(flat, axis=0).min() > 0
