@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from pano_mvs.algorithms.points.kernels_seen import see_points
 from pano_mvs.algorithms.points.samples import sample_surface
 from pano_mvs.algorithms.points.selection import spread_points
 from pano_mvs.algorithms.points.tracking import track_points
@@ -13,6 +14,7 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import ray_grid
 from pano_mvs.scene import Poses, RangeMap
 from pano_mvs.testing.room import capture_poses, default_room, range_along, render
+from tests.oracles.points import sees
 
 SIZE = (128, 256)
 NAMES = ("a/1.png", "a/2.png", "b/1.png")
@@ -184,3 +186,25 @@ def test_points_join_poses_behind_or_in_place_of_theirs(room):
 def test_settings_out_of_bounds_are_refused(room, wrong):
     with pytest.raises(UsageError, match="must be positive"):
         tracked(room, **wrong)
+
+
+def test_the_compiled_test_is_the_obvious_one(room):
+    """On points of the room, some moved, and a range map with holes and doubtful pixels."""
+    poses, maps, samples = room
+    rng = np.random.default_rng(6)
+    ranges, confidence = maps[NAMES[2]].range.copy(), rng.integers(30, 200, SIZE).astype(np.uint8)
+    ranges[rng.random(SIZE) < 0.05] = np.nan
+    confidence[np.isnan(ranges)] = 0
+    seeing, pose, home = RangeMap(ranges, confidence), poses.cam_from_world(2), poses.centers[0]
+    sample = samples[NAMES[0]]
+    in_cam = sample.bearings * (sample.ranges * rng.choice([1, 1, 1, 0.99, 1.05], len(sample)))[:, None]
+    points = poses.cam_from_world(0).inverse().apply(in_cam)[::20]
+    seen, errors, bearings = np.zeros(len(points), np.bool_), np.zeros(len(points)), np.zeros((len(points), 3))
+    view = pose.rotation.copy(), pose.translation.copy()
+    homes, limits = np.broadcast_to(home, points.shape).copy(), np.array([0.02, 0.05, 64.0])
+    see_points(points, homes, 2 * np.pi / SIZE[1], view, ranges, confidence, limits, seen, errors, bearings)
+    expected = [sees(point, home, pose, seeing, 0.02, 64) for point in points]
+    assert seen.tolist() == [found is not None for found in expected]
+    assert 20 < seen.sum() < 0.8 * len(points)
+    assert bearings[seen] == pytest.approx(np.array([found[0] for found in expected if found]), abs=1e-9)
+    assert errors[seen] == pytest.approx(np.array([found[1] for found in expected if found]), abs=2e-7)
