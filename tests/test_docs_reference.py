@@ -14,7 +14,6 @@ from ruamel.yaml import YAML
 
 from pano_mvs import api
 from pano_mvs.engine.policy import RESERVED_KEYS
-from pano_mvs.engine.registry import Registry
 
 ROOT = Path(__file__).parent.parent
 HOOKS = ROOT / "docs" / "_hooks"
@@ -47,7 +46,7 @@ def section(page: str, title: str) -> str:
 
 
 def test_every_stage_is_described_with_all_its_settings_and_ports(stages: str) -> None:
-    for name, spec in Registry.installed().stages.items():
+    for name, spec in hook("stage_page").built_in().stages.items():
         told = section(stages, name)
         assert spec.doc.split()[0] in told
         for setting, info in spec.params_type.model_fields.items():
@@ -58,7 +57,7 @@ def test_every_stage_is_described_with_all_its_settings_and_ports(stages: str) -
 
 def test_every_kind_of_stage_is_introduced() -> None:
     known = hook("stage_page").KINDS
-    assert {name.partition(".")[0] for name in Registry.installed().stages} <= known.keys()
+    assert {name.partition(".")[0] for name in hook("stage_page").built_in().stages} <= known.keys()
 
 
 def test_what_every_stage_takes_is_listed(stages: str) -> None:

@@ -10,7 +10,7 @@ from preset_page import presets_that_use
 from pydantic.fields import FieldInfo
 from setting_schema import limits_of, type_of
 
-from pano_mvs import api
+from pano_mvs import api, stages
 from pano_mvs.engine.params import NOT_IN_KEY
 from pano_mvs.engine.policy import Policy
 from pano_mvs.engine.ports import Port
@@ -42,7 +42,7 @@ KINDS = {
 def stage_page() -> str:
     """Return the page of all stages, by kind in the order of a workflow."""
     kinds: dict[str, list[StageSpec]] = defaultdict(list)
-    for name, spec in sorted(Registry.installed().stages.items()):
+    for name, spec in sorted(built_in().stages.items()):
         kinds[name.partition(".")[0]].append(spec)
     order = [kind for kind in KINDS if kind in kinds] + sorted(kinds.keys() - KINDS.keys())
     rows = [
@@ -58,7 +58,14 @@ def stage_page() -> str:
 
 def schema_text() -> str:
     """Return the JSON Schema of workflow files, as `pano-mvs schema` writes it."""
-    return json.dumps(workflow_schema(Registry.installed()), indent=1, ensure_ascii=False)
+    return json.dumps(workflow_schema(built_in()), indent=1, ensure_ascii=False)
+
+
+def built_in() -> Registry:
+    """Return our own stages, whatever plugins are installed where the site is built."""
+    registry = Registry()
+    registry.add_module(stages, "pano-mvs")
+    return registry
 
 
 def _anchor(name: str) -> str:
@@ -67,7 +74,7 @@ def _anchor(name: str) -> str:
 
 _INTRODUCTION = """# Stages
 
-This page is made from the installed stages themselves, when the site is built: it is what `pano-mvs stage show NAME`
+This page is made from the stages themselves, when the site is built: it is what `pano-mvs stage show NAME`
 says, all at once. How stages are put together is told in [Workflows](../workflows.md), how to write one in
 [Plugins](../plugins.md). The same as a [JSON Schema](pano-mvs.schema.json), for editors that complete and check."""
 
