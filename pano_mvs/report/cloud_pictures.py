@@ -29,7 +29,7 @@ VERSION = 1
 
 _SIZE_HW = (600, 960)
 _MOST_POINTS = 800_000
-_MOST_BYTES = 300_000
+MOST_BYTES = 300_000
 _TIMEOUT_S = 120.0
 _COMMAND = (sys.executable, "-m", "pano_mvs.report.cloud_renderer")
 
@@ -83,7 +83,7 @@ def cloud_pictures(
     kept.keep(stem, {"titles": titles, "note": note})
     return CloudPictures(
         tuple(
-            (title, picture(image, width=_SIZE_HW[1], most_bytes=_MOST_BYTES, key=f"{stem}.{number}"))
+            (title, picture(image, width=_SIZE_HW[1], most_bytes=MOST_BYTES, key=f"{stem}.{number}"))
             for number, (title, image) in enumerate(zip(titles, images, strict=True))
         ),
         note,

@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+# What a person looks at first; other scores follow as they come.
+_FIRST = ("psnr_db", "w_mae", "w_delta_105", "median_relative_error", "completeness")
 # The figures of the scores, in words; others are spelt out from their names.
 _WORDS = {
     "psnr_db": "PSNR dB",
@@ -89,14 +91,15 @@ def score_tables(scores: Mapping[str, Any]) -> dict[str, Any]:
     What a constant range map scores (`best_constant_…`, or in older runs `constant_…`) stands in brackets beside.
     """
     views = scores.get("views") or {}
-    columns = [metric for metric in _metrics(views) if not metric.startswith(_CONSTANTS)]
+    known = [metric for metric in _metrics(views) if not metric.startswith(_CONSTANTS)]
+    columns = [metric for metric in _FIRST if metric in known] + [metric for metric in known if metric not in _FIRST]
     middle = {metric: median([view.get(metric) for view in views.values()]) for metric in _metrics(views)}
     return {
         "poses": list((scores.get("poses") or {}).items()),
         "columns": columns,
         "views": [(name, [_beside_constant(values, metric) for metric in columns]) for name, values in views.items()],
         "median": [_beside_constant(middle, metric) for metric in columns] if len(views) > 1 else [],
-        "notes": [*([_BRACKETS] if _metrics(views) != columns else []), *(scores.get("notes") or [])],
+        "notes": [*([_BRACKETS] if len(_metrics(views)) > len(columns) else []), *(scores.get("notes") or [])],
     }
 
 

@@ -91,18 +91,19 @@ def _registration(summary: Mapping[str, Any]) -> list[Finding]:
     if not total or not rejected:
         return []
     mood = mood_of(registered / total, GOOD_REGISTERED, FAIR_REGISTERED)
-    kinds = Counter(re.sub(r"\d+([.,]\d+)?", "…", str(reason)) for reason in rejected.values())
-    ((_, count),) = kinds.most_common(1)
-    example = next(str(why) for why in rejected.values() if re.sub(r"\d+([.,]\d+)?", "…", str(why)) == _top(kinds))
-    most = f"mostly: {example}" if len(kinds) > 1 else example
-    text = f"{len(rejected)} of {total} panoramas have no pose ({most}{f', {count} times' if count > 1 else ''})."
-    return [Finding("" if mood == "good" else mood, text,
-                    "" if mood == "good" else "Take more pictures between those, 0.5–1 m apart indoors, each seeing "
-                    "much of what the next one sees.")]  # fmt: skip
+    text = f"{len(rejected)} of {total} panoramas have no pose: {_commonest(list(map(str, rejected.values())))}."
+    if mood == "good":
+        return [Finding("", text)]
+    return [Finding(mood, text, "Take more pictures between those, 0.5–1 m apart indoors, each seeing much of what the "
+                    "next one sees.")]  # fmt: skip
 
 
-def _top(kinds: Counter[str]) -> str:
-    return kinds.most_common(1)[0][0]
+def _commonest(reasons: Sequence[str]) -> str:
+    """Return the reason that is given most often, whatever the figures and names in it, and how often it is."""
+    kinds = [re.sub(r"\d+([.,]\d+)?|'[^']*'", "…", reason) for reason in reasons]
+    ((kind, count),) = Counter(kinds).most_common(1)
+    example = reasons[kinds.index(kind)]
+    return example if len(reasons) == 1 else f"{count} times such as “{example}”"
 
 
 def _graph(summary: Mapping[str, Any]) -> list[Finding]:
@@ -116,10 +117,10 @@ def _graph(summary: Mapping[str, Any]) -> list[Finding]:
     if not loose:
         return []
     shown = ", ".join(loose[:3]) + (" …" if len(loose) > 3 else "")
-    verb = "camera hangs" if len(loose) == 1 else "cameras hang"
-    return [Finding("fair" if len(loose) > len(names) / 4 else "", f"{len(loose)} {verb} on one link alone ({shown}): "
-                    "nothing confirms where it is." if len(loose) == 1 else f"{len(loose)} {verb} on one link alone "
-                    f"({shown}): nothing confirms where they are.")]  # fmt: skip
+    mood = "fair" if len(loose) > len(names) / 4 else ""
+    if len(loose) == 1:
+        return [Finding(mood, f"{shown} hangs on one link alone: nothing confirms where it is.")]
+    return [Finding(mood, f"{len(loose)} cameras hang on one link alone ({shown}): nothing confirms where they are.")]
 
 
 def _residual(residual_px: float | None) -> list[Finding]:
@@ -155,7 +156,8 @@ def _baseline(summary: Mapping[str, Any]) -> list[Finding]:
     found = []
     for stage, scores in scores_by_stage(summary).items():
         views = (scores.get("views") or {}).values()
-        ours, constant = (median([view.get(key) for view in views]) for key in ("psnr_db", "constant_psnr_db"))
+        ours = median([view.get("psnr_db") for view in views])
+        constant = median([view.get("best_constant_psnr_db", view.get("constant_psnr_db")) for view in views])
         if ours is not None and constant is not None and ours <= constant:
             text = f"Against the truth ({stage}), one constant range for all pixels does as well"
             found.append(Finding("bad", f"{text}: {ours:.1f} dB to {constant:.1f} dB."))

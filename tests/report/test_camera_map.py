@@ -1,0 +1,96 @@
+"""The map: true to scale, whatever lies where; links by their inliers, rejected ones apart."""
+
+import numpy as np
+import pytest
+
+from pano_mvs.algorithms.poses.levelling import level_poses
+from pano_mvs.report.camera_map import camera_maps, up_of
+from pano_mvs.scene import Poses
+
+NAMES = ["a/1.png", "a/2.png", "a/3.png"]
+POSES = {
+    "registered": NAMES,
+    "centers": [[0, 0, 0], [1, 0.1, 0.2], [0.4, 0, 2]],
+    "links": [["a/1.png", "a/2.png", 300, 410, 0.02], ["a/2.png", "a/3.png", 30], ["a/1.png", "a/4.png", 3],
+              ["a/1.png", "a/3.png", 0, 12, None]],
+}  # fmt: skip
+
+
+def places(drawn):
+    return np.array([camera[:2] for camera in drawn.cameras])
+
+
+def test_the_map_shows_the_cameras_true_to_scale_from_above_and_from_the_side():
+    above, side = camera_maps(POSES)
+    centers = np.array(POSES["centers"])
+    for drawn, flat in ((above, centers[:, [0, 2]] * (1, -1)), (side, centers[:, [0, 1]])):
+        found = places(drawn)
+        scale = np.linalg.norm(found[1] - found[0]) / np.linalg.norm(flat[1] - flat[0])
+        assert found - found[0] == pytest.approx((flat - flat[0]) * scale, abs=1)
+        length, words = drawn.bar[2:]
+        assert words == f"{length / scale:.2g} units"
+
+
+def test_links_are_weighted_by_their_inliers_and_rejected_ones_told_apart():
+    above, _ = camera_maps(POSES, {("a/1.png", "a/3.png"): "too little in common"})
+    assert [link.strength for link in above.links] == [0, 0.1, 1]
+    assert [link.rejected for link in above.links] == [True, False, False]
+    assert above.rejected == 1
+    assert above.links[0].text == "1 – 3: rejected, none of 12 candidates; too little in common"
+    assert above.links[2].text == "1 – 2: 300 matches of 410 candidates"
+
+
+def test_of_very_many_links_the_strongest_are_drawn():
+    names = [str(number) for number in range(200)]
+    links = [[a, b, idx] for idx, (a, b) in enumerate((a, b) for a in names for b in names if a < b)]
+    above, _ = camera_maps({"registered": names, "centers": [[i, 0, i % 7] for i in range(200)], "links": links})
+    strengths = [link.strength for link in above.links if not link.rejected]
+    assert len(strengths) == 1500
+    assert strengths == sorted(strengths)
+    assert strengths[-1] == 1
+
+
+def test_of_very_many_cameras_only_dots_are_drawn():
+    above, _ = camera_maps({"registered": [str(i) for i in range(5000)], "centers": [[i, 0, i] for i in range(5000)]})
+    assert not above.cameras
+    assert above.dots.count("M") == 5000
+    assert "5000 cameras from above" in above.text
+
+
+def test_the_map_is_drawn_along_the_direction_up():
+    """Cameras on a wall of the world stand side by side from above if that wall is the ground."""
+    above, side = camera_maps({"registered": NAMES, "centers": [[0, 0, 0], [1, 0, 0], [0, 3, 0]], "up": [0, 0, 1]})
+    assert np.ptp(places(above)[:, 1]) == pytest.approx(3 * np.ptp(places(above)[:, 0]), rel=0.02)
+    assert np.ptp(places(side)[:, 1]) == pytest.approx(0, abs=0.11)
+
+
+@pytest.mark.parametrize("up", [None, [0, 0, 0], [1, 2], [float("nan")] * 3])
+def test_a_direction_up_that_is_none_is_that_of_the_first_camera(up):
+    assert up_of({"up": up}).tolist() == [0, -1, 0]
+
+
+def test_north_is_shown_where_the_levelled_frame_says_it(tiny):
+    """The words are those of poses.level: who changes them learns it here."""
+    poses = tiny.wholes[Poses]
+    up = {name: tuple(-rotation[:, 1]) for name, rotation in zip(tiny.names, poses.rotations, strict=True)}
+    forward = poses.rotations[:, 2]
+    headings = dict(zip(tiny.names, np.rad2deg(np.arctan2(forward[:, 0], forward[:, 2])) + 40, strict=True))
+    for known, north in ((headings, True), ({}, False)):
+        level, _ = level_poses(poses, up, known)
+        above, side = camera_maps({"registered": list(level.names), "centers": level.centers.tolist(),
+                                   "frame": level.frame, "up": [1, 0, 0]})  # fmt: skip
+        assert (above.north, side.north) == (north, False)
+        assert up_of({"frame": level.frame, "up": [1, 0, 0]}).tolist() == [0, -1, 0]
+
+
+@pytest.mark.parametrize(
+    "centers", [[[0, 0, 0]] * 3, [[0, 0, 0], [0, 1e-12, 0], [0, 0, 0]], [[0, 0, 0], [1e6, 0, 0], [2e6, 0, 0]]]
+)
+def test_cameras_in_one_place_or_in_a_row_are_drawn_within_the_map(centers):
+    for drawn in camera_maps({"registered": ["a rather long name of a picture", "b", "c"], "centers": centers}):
+        assert np.all((places(drawn) > 0) & (places(drawn) < drawn.size_wh))
+
+
+@pytest.mark.parametrize("centers", [[[0, 0, 0]], [[0, 0, float("nan")]] * 3])
+def test_centres_that_do_not_fit_give_no_map(centers):
+    assert camera_maps({"registered": NAMES, "centers": centers}) == ()

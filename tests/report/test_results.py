@@ -1,0 +1,153 @@
+"""What the page takes from the store: pictures of views and cloud, residuals, reasons; and what it keeps for later."""
+
+import base64
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pano_mvs.engine.store import Store, UnitRecord
+from pano_mvs.report import write_report
+from pano_mvs.report.cloud_pictures import RENDERER_VARIABLE, cloud_pictures
+from pano_mvs.report.kept import Kept
+from pano_mvs.report.results import Results
+from tests.report.conftest import summary_of
+from tests.report.html_page import Page
+from tests.report.test_report import assert_sound
+
+UP = np.array([0.0, -1.0, 0.0])
+
+
+def reported(out_dir, summary, results):
+    write_report(out_dir, summary, results)
+    return Page((out_dir / "report.html").read_text(encoding="utf-8"))
+
+
+def test_views_are_shown_with_panorama_range_and_confidence(out_dir, results, tiny):
+    page = reported(out_dir, summary_of(tiny), results)
+    assert_sound(page)
+    for name in tiny.names:
+        words = [attrs["alt"] for attrs in page.all("img") if str(attrs["alt"]).startswith(f"{name}:")]
+        assert [word.split()[-1] for word in words] == ["panorama", "blue", "class"]
+    assert page.all("img", alt="The cloud: From above")
+    assert "From inside, where" in page.words
+    assert "only 7 of 31 matches agree" in page.words
+    assert "median reprojection residual" in page.words
+    assert "Median epipolar residual of each matched pair: 5 values" in page.words
+    assert "Not shown" not in page.words
+
+
+def test_nothing_is_drawn_again_where_nothing_changed(out_dir, results, tiny, monkeypatch):
+    """The second page is the first, byte for byte, and decodes no picture."""
+    write_report(out_dir, summary_of(tiny), results)
+    before = (out_dir / "report.html").read_bytes()
+    for decoder in ("pano_mvs.report.view_cards.color_mapped", "pano_mvs.report.cloud_pictures.draw_cloud"):
+        monkeypatch.setattr(decoder, lambda *_, **__: pytest.fail("drawn again"))
+    write_report(out_dir, summary_of(tiny), results)
+    assert (out_dir / "report.html").read_bytes() == before
+
+
+def test_what_changed_is_drawn_again(out_dir, results, tiny):
+    """A view whose range map is another shows it; the others' pictures stay."""
+    first = reported(out_dir, summary_of(tiny), results)
+    names = tiny.names
+    ranges = dict(results.refs["ranges"]) | {names[0]: results.refs["ranges"][names[1]]}
+    second = reported(out_dir, summary_of(tiny), Results(results.store, dict(results.refs) | {"ranges": ranges}))
+    pictures = [{attrs["alt"]: attrs["src"] for attrs in page.all("img")} for page in (first, second)]
+    changed = {str(alt).partition(":")[0] for alt in pictures[0] if pictures[0][alt] != pictures[1][alt]}
+    assert changed == {names[0]}
+
+
+def test_a_page_that_was_tampered_with_is_no_source_of_markup(out_dir, results, tiny):
+    write_report(out_dir, summary_of(tiny), results)
+    path = out_dir / "report.html"
+    text = path.read_text()
+    facts = text.index('id="facts">') + len('id="facts">')
+    end = text.index("</script>", facts)
+    path.write_text(text[:facts] + "[1, {" + text[end:])
+    assert_sound(reported(out_dir, summary_of(tiny), results))
+    path.write_text(text.replace('"ticks":', '"ticks": "<b>", "other":'))
+    page = reported(out_dir, summary_of(tiny), results)
+    assert_sound(page)
+    assert "<b>" not in page.words
+    path.write_bytes(b"\xff\xfe")
+    assert_sound(reported(out_dir, summary_of(tiny), results))
+
+
+@pytest.mark.parametrize("role", ["images", "pairs", "poses", "ranges", "cloud"])
+def test_what_is_damaged_or_gone_is_left_out_and_told(out_dir, results, tiny, role):
+    for ref in results.refs[role].values():
+        for part in ref.parts.values():
+            if not part.external:
+                results.store.blobs.path(part).unlink(missing_ok=True)
+    store = Store(results.store.root)  # one that knows no paths of pictures either
+    page = reported(out_dir, summary_of(tiny), Results(store, results.refs))
+    assert_sound(page)
+    assert "Not shown:" in page.words
+
+
+def test_a_folder_and_its_cache_give_the_page_of_the_run(out_dir, results, tiny):
+    """`Results.of_folder` finds by the book of runs what the run had in its hands."""
+    store = results.store
+    keys = {}
+    for role, refs in results.refs.items():
+        keys[role] = {item: f"{number:064x}" for number, item in enumerate(refs, start=1000 * len(keys))}
+    for role, items in keys.items():
+        for item, key in items.items():
+            store.put(UnitRecord(key, {"stage": role}, results.refs[role][item]))
+    store.runs.remember("f" * 64, keys, workflow="tiny", out=out_dir)
+    summary = summary_of(tiny) | {"results": {role: role for role in keys}}
+    summary["stages"] = [{"name": "images", "params": {"path": str(tiny.folder / "images")}}]
+    again = Results.of_folder(out_dir, summary, Store(store.root))
+    assert {role: dict(refs) for role, refs in again.refs.items()} == results.refs
+    assert again.panorama(tiny.names[0]).load().shape == (32, 64, 3)
+    assert again.notes == []
+    elsewhere = Results.of_folder(out_dir / "other", summary, store)
+    assert "knows no run" in elsewhere.notes[0]
+
+
+def drawing(folder: Path, body: str) -> tuple[str, ...]:
+    """Return a command that does something else than to draw."""
+    script = folder / "renderer.py"
+    script.write_text(body)
+    return sys.executable, str(script)
+
+
+@pytest.mark.parametrize(
+    "body",
+    ["raise SystemExit(1)", "import os; os.abort()", "", "import numpy, sys; from pathlib import Path\n"
+     "for n in range(3): numpy.save(Path(sys.argv[1]) / f'picture{n}.npy', numpy.zeros((600, 960, 3), 'uint8'))"],
+    ids=["fails", "crashes", "draws nothing", "draws black"],
+)  # fmt: skip
+def test_where_there_is_no_graphics_driver_plainer_pictures_are_drawn(tmp_path, results, monkeypatch, body):
+    monkeypatch.setenv(RENDERER_VARIABLE, "")
+    made = cloud_pictures(results, Kept(), up=UP, command=drawing(tmp_path, body))
+    assert len(made.shown) == 3
+    assert "PyVista could not draw here" in made.note
+
+
+def test_a_missing_interpreter_is_no_reason_to_fail(tmp_path, results, monkeypatch):
+    monkeypatch.setenv(RENDERER_VARIABLE, "")
+    made = cloud_pictures(results, Kept(), up=UP, command=(str(tmp_path / "nowhere"),))
+    assert len(made.shown) == 3
+
+
+def decoded(picture):
+    data = base64.b64decode(picture.uri.partition(",")[2])
+    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+
+
+@pytest.mark.slow
+def test_pyvista_draws_the_cloud_as_the_plain_pictures_do(results, monkeypatch):
+    """Both show the same points from the same places: their pictures agree but for the size of the points."""
+    monkeypatch.setenv(RENDERER_VARIABLE, "")
+    by_pyvista = cloud_pictures(results, Kept(), up=UP)
+    monkeypatch.setenv(RENDERER_VARIABLE, "software")
+    plain = cloud_pictures(results, Kept(), up=UP)
+    assert [title for title, _ in by_pyvista.shown] == [title for title, _ in plain.shown]
+    for (_, drawn), (_, expected) in zip(by_pyvista.shown, plain.shown, strict=True):
+        marks = [decoded(picture).astype(int).min(axis=-1) < 225 for picture in (drawn, expected)]
+        assert (marks[0] & marks[1]).sum() > 0.4 * min(mark.sum() for mark in marks)
+        assert marks[1].any()

@@ -1,0 +1,90 @@
+"""What a person sees first: good runs are called good, bad ones bad, and why."""
+
+import pytest
+
+from pano_mvs.report.residuals import Histogram, Residuals
+from pano_mvs.report.verdict import verdict
+
+NAMES = [f"{number}.png" for number in range(10)]
+GOOD = {
+    "exit_code": 0,
+    "stages": [{"name": "depth", "run": 10}],
+    "poses": {"registered": NAMES, "rejected": {}, "links": [[a, b, 90] for a in NAMES for b in NAMES if a < b]},
+    "views": [{"name": name, "completeness": 0.99, "consistent": 0.45} for name in NAMES],
+    "cloud": {"points": 100_000},
+    "scores": {"views": {name: {"psnr_db": 30.0, "constant_psnr_db": 18.0} for name in NAMES}},
+}
+
+
+def residuals(median_deg):
+    return Residuals(Histogram((1,), 1.0, median_deg, 2 * median_deg, 1), {}, sampled=False)
+
+
+def test_a_good_run_is_called_good_and_nothing_is_found():
+    found = verdict(GOOD, residuals=residuals(0.04), image_width=1024)
+    assert (found.mood, found.judgement, found.findings) == ("good", "The result looks sound.", ())
+
+
+def rejecting(count):
+    reasons = {f"x{number}.png": f"{number} matches, 20 needed" for number in range(count)}
+    return GOOD["poses"] | {"rejected": reasons}
+
+
+@pytest.mark.parametrize(
+    ("change", "mood", "words"),
+    [
+        ({"poses": rejecting(2)}, "fair", "2 of 12 panoramas have no pose: 2 times such as “0 matches, 20 needed”"),
+        ({"poses": rejecting(30)}, "bad", "30 of 40"),
+        ({"views": [{"completeness": 0.6, "consistent": 0.5}]}, "fair", "less than 60 %"),
+        ({"views": [{"completeness": 0.2, "consistent": 0.5}]}, "bad", "less than 20 %"),
+        ({"views": [{"completeness": 1.0, "consistent": 0.05}]}, "bad", "confirm only 5"),
+        ({"cloud": {"points": 0}}, "bad", "The cloud has no points"),
+        ({"scores": {"views": {"1": {"psnr_db": 17.0, "constant_psnr_db": 18.0}}}}, "bad", "17.0 dB to 18.0 dB"),
+        ({"all_scores": {"a": GOOD["scores"], "b": {"views": {"1": {"psnr_db": 9.0, "constant_psnr_db": 18.0}}}}},
+         "bad", "(b)"),
+        ({"exit_code": 4, "stopped": "registered is 0.2, the gate asks for 0.8"}, "bad", "the gate asks for 0.8"),
+        ({"exit_code": 130, "stopped": "interrupted"}, "fair", "was interrupted"),
+        ({"exit_code": 3, "failures": [{"stage": "depth", "item": "1.png"}]}, "fair", "1 in depth"),
+        ({"exit_code": 1, "stopped": "division by zero"}, "bad", "division by zero"),
+        ({"poses": GOOD["poses"] | {"links": [[NAMES[0], name, 90] for name in NAMES[1:]]}}, "fair",
+         "9 cameras hang on one link"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_found_and_named(change, mood, words):
+    found = verdict(GOOD | change)
+    assert found.mood == mood
+    assert any(words in finding.text for finding in found.findings), found.findings
+    assert found.judgement != "The result looks sound."
+
+
+@pytest.mark.parametrize(("median_deg", "mood"), [(0.3, "good"), (0.5, "fair"), (1.0, "bad")])
+def test_residuals_are_judged_by_the_pixels_of_the_pictures(median_deg, mood):
+    """In pictures 1,024 wide a pixel is 0.35°; in larger ones the same angle is worse."""
+    assert verdict(GOOD, residuals=residuals(median_deg), image_width=1024).mood == mood
+    assert verdict(GOOD, residuals=residuals(median_deg), image_width=8192).mood == "bad"
+    assert verdict(GOOD, residuals=residuals(median_deg)).mood == "good", "not judged where that is not known"
+
+
+def test_the_worst_comes_first():
+    found = verdict(GOOD | {"exit_code": 3, "failures": [{"stage": "depth"}], "cloud": {"points": 0}})
+    assert [finding.mood for finding in found.findings] == ["bad", "fair"]
+
+
+@pytest.mark.parametrize(
+    ("code", "text", "mood"),
+    [(0, "Finished", "good"), (1, "internal error", "bad"), (4, "Stopped by a quality gate", "bad"),
+     (130, "Interrupted", "fair"), (77, "Ended with code 77", "bad")],
+)  # fmt: skip
+def test_the_outcome_is_that_of_the_exit_code(code, text, mood):
+    found = verdict({"exit_code": code})
+    assert text in found.outcome
+    assert found.mood == mood
+
+
+def test_where_nothing_is_known_nothing_is_judged():
+    assert verdict({}).judgement == ""
+
+
+def test_a_run_that_computed_nothing_says_so():
+    stages = [{"name": "depth", "cached": 7}, {"name": "ply", "cached": 1}]
+    assert "Nothing had changed: all 8 units" in verdict({"stages": stages}).sentence
