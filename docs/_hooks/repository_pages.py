@@ -15,6 +15,7 @@ PAGES = {
 }
 """Page of the site to the file of the repository that it is."""
 
+_CODE = re.compile(r"`[^`\n]*`")
 _LINK = re.compile(r"\[([^\]]*)\]\(([^)#\s]+)(#[^)]*)?\)")
 _FENCE = re.compile(r"(^```.*?^```$)", re.DOTALL | re.MULTILINE)
 
@@ -35,7 +36,12 @@ def with_site_links(text: str, page: str, file: str) -> str:
         file: its place in the repository, from which its links start.
     """
     parts = _FENCE.split(text)
-    return "".join(part if part.startswith("```") else _with_links(part, page, file) for part in parts)
+    return "".join(part if part.startswith("```") else _with_links(_bare_pipes(part), page, file) for part in parts)
+
+
+def _bare_pipes(text: str) -> str:
+    """Return a text for mkdocs, which shows the backslash that others want before a pipe in code in a table."""
+    return _CODE.sub(lambda found: found[0].replace("\\|", "|"), text)
 
 
 def _with_links(text: str, page: str, file: str) -> str:
