@@ -243,7 +243,7 @@ def print_scores(scores: Mapping[str, Any], console: Console) -> None:
         console.print(f"against the ground truth: {text}", highlight=False)
     if not scores.get("views"):
         return
-    table = Table("view (a constant)", *_SHOWN_SCORES.values())
+    table = Table("view", *_SHOWN_SCORES.values(), caption=_IN_BRACKETS)
     for view, values in scores["views"].items():
         table.add_row(escape(view), *(_beside_constant(values, name) for name in _SHOWN_SCORES))
     console.print(table)
@@ -253,7 +253,7 @@ def _print_comparison(all_scores: Mapping[str, Any], console: Console) -> None:
     """Print, where several branches are scored, the medians over their views side by side."""
     if len(all_scores) < 2:
         return
-    table = Table("median (a constant)", *_SHOWN_SCORES.values())
+    table = Table("median over views", *_SHOWN_SCORES.values(), caption=_IN_BRACKETS)
     for stage, scores in all_scores.items():
         views = scores["views"].values()
         names = {name for view in views for name in view}
@@ -263,6 +263,7 @@ def _print_comparison(all_scores: Mapping[str, Any], console: Console) -> None:
     console.print(table)
 
 
+_IN_BRACKETS = "in brackets: the best of all constant ranges"
 _SHOWN_SCORES = {
     "psnr_db": "PSNR dB",
     "w_mae": "MAE",
@@ -272,8 +273,7 @@ _SHOWN_SCORES = {
 }
 """Score to the heading under which it is printed; MAE and δ are weighted by solid angle.
 
-AUSE is the area between the sparsification curve of the confidence and that of the true errors. In brackets stands what
-the constant range scores that is best for the very score.
+AUSE is the area between the sparsification curve of the confidence and that of the true errors.
 """
 
 

@@ -1,9 +1,12 @@
 """Accuracy, completeness and F-score of clouds against true surfaces."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.metrics.cloud import CloudDistances, cloud_distances, score_cloud
+from pano_mvs.algorithms.metrics import cloud
+from pano_mvs.algorithms.metrics.cloud import CloudDistances, PointChunks, cloud_distances, score_cloud
 from pano_mvs.algorithms.metrics.surface import TrueView, surface_of_cloud, surface_of_views, view_points
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, ray_grid
@@ -110,6 +113,24 @@ class TestScores:
         np.testing.assert_array_equal(whole.of_points, apart.of_points)
         nearest = np.array([np.linalg.norm(np.concatenate(pieces) - point, axis=1).min() for point in points])
         np.testing.assert_allclose(whole.of_points, nearest, rtol=1e-5)
+
+    def test_a_cloud_in_chunks_is_the_cloud(self, monkeypatch):
+        points = np.random.default_rng(3).normal(size=(900, 3)).astype(np.float32)
+        surface, pieces = surface_of_views(VIEWS), [view_points(view) for view in VIEWS]
+        whole = cloud_distances(points, pieces, surface, limit=9)
+        monkeypatch.setattr(cloud, "CHUNK_POINTS", 100)
+        for chunks in (points, PointChunks(900, lambda: iter(np.split(points, [7, 350, 350])))):
+            apart = cloud_distances(chunks, pieces, surface, limit=9)
+            np.testing.assert_array_equal(whole.of_points, apart.of_points)
+            np.testing.assert_array_equal(whole.of_surface, apart.of_surface)
+
+    def test_quantiles_count_points_alike_and_the_surface_by_area(self):
+        surface = surface_of_cloud(np.float32([[0, 0, 0], [9, 9, 9]]), voxel_size=1)
+        weighted = dataclasses.replace(surface, area=np.array([9.0, 1.0]))
+        found = CloudDistances(np.float32([1, 2, 3, np.inf]), np.float32([5, 7])).quantiles(weighted, (0.5, 0.9, 0.95))
+        assert found == {"accuracy": (2, np.inf, np.inf), "completeness": (5, 5, 7)}
+        nothing = CloudDistances(np.zeros(0, np.float32), np.zeros(0, np.float32))
+        assert np.isnan(nothing.quantiles(dataclasses.replace(surface, area=np.zeros(0)))["accuracy"]).all()
 
     def test_an_empty_cloud_scores_nothing_and_a_bad_limit_is_named(self):
         surface = surface_of_views(VIEWS)

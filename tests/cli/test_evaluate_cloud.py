@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,7 @@ import pytest
 from pano_mvs.algorithms.metrics.surface import TrueView, view_points
 from pano_mvs.geometry import Rigid3, Similarity3
 from pano_mvs.io.ply import write_ply
+from pano_mvs.io.ply_points import open_ply_points
 from pano_mvs.io.truth import read_truth
 from pano_mvs.scene import PointCloud
 from tests.algorithms.synthetic_capture import random_rotation
@@ -19,9 +21,9 @@ from tests.cli.conftest import Command
 from tests.cli.test_evaluate_poses import write_json
 
 
-def save(path: Path, points: np.ndarray) -> Path:
+def save(path: Path, points: np.ndarray, normal: Sequence[float] = (0, -1, 0)) -> Path:
     count = len(points)
-    up = np.tile(np.float32([0, -1, 0]), (count, 1))
+    up = np.tile(np.float32(normal), (count, 1))
     grey = np.full((count, 3), 99, np.uint8)
     write_ply(path, PointCloud(points.astype(np.float32), up, grey, np.ones(count, np.uint8)))
     return path
@@ -96,6 +98,53 @@ def test_the_picture_shows_each_view_and_the_cloud(
     assert (width, height > 4 * 512) == (1024, True)
     red = (picture == (45, 30, 190)).all(axis=-1)
     assert 0.1 < red[28 : 4 * 512].mean() < 0.9
+
+
+def test_a_cloud_against_itself_is_perfect_and_no_distance_from_it(
+    pano_mvs: Command, tmp_path: Path, surface: np.ndarray
+) -> None:
+    own = save(tmp_path / "a.ply", surface)
+    told = json.loads(pano_mvs("evaluate", "cloud", own, "--truth", own, "--threshold", "1e-6", "--json").text)
+    assert told["scores"] == [{"threshold": 1e-6, "accuracy": 1, "completeness": 1, "f_score": 1}]
+    assert told["distances"]["accuracy"] == told["distances"]["completeness"] == {"median": 0, "p90": 0}
+    away = save(tmp_path / "b.ply", surface + 100)
+    text = pano_mvs("evaluate", "cloud", away, "--truth", own, "--threshold", "0.5").flat
+    assert "points from the surface: median over 10, 90 % within over 10" in text
+
+
+def test_errors_are_written_as_clouds_and_drawn(
+    pano_mvs: Command, tmp_path: Path, folder: Path, surface: np.ndarray
+) -> None:
+    """Half of the cloud lies 0.2 off: those points, and that half of the surface, are red in files and pictures."""
+    half = surface[:, 0] > 0
+    points = np.where(half[:, None], surface * 1.2, surface)
+    moved = Similarity3(0.5, random_rotation(np.random.default_rng(2)), np.array([3.0, 0, 1]))
+    poses = {name: moved.move_camera(pose) for name, pose in read_truth(folder).poses.items()}
+    model = write_json(tmp_path / "m.json", poses)
+    cloud = save(tmp_path / "a.ply", moved.apply(points), moved.rotation @ (0, -1, 0))
+    arguments = ("--poses", model, "--truth", folder, "--out", tmp_path / "e", "--json")
+    told = json.loads(pano_mvs("evaluate", "cloud", cloud, *arguments).text)
+    files = ["accuracy.ply", "accuracy.png", "completeness.ply", "completeness.png", "errors.png"]
+    assert sorted(path.name for path in (tmp_path / "e").iterdir()) == files
+    accuracy = open_ply_points(tmp_path / "e" / "accuracy.ply")
+    np.testing.assert_allclose(np.concatenate(list(accuracy.chunks())), points, atol=1e-4)  # in the truth's frame
+    within = accuracy.vertices["distance"] <= 0.05
+    assert within.mean() == pytest.approx(told["scores"][0]["accuracy"], abs=1e-9)
+    assert within[~half].all()
+    np.testing.assert_array_equal(accuracy.vertices["red"] == 190, ~within)
+    missed = open_ply_points(tmp_path / "e" / "completeness.ply").vertices
+    assert missed["distance"][missed["x"] > 0.5].mean() > 5 * missed["distance"][missed["x"] < -0.5].mean()
+    for name in ("accuracy.png", "completeness.png"):
+        picture = cv2.imread(str(tmp_path / "e" / name))
+        assert picture is not None
+        assert picture.shape == (28 + 3 * (28 + 640), 1024, 3)
+        above = picture[56 : 56 + 640]
+        red, right = (
+            (np.abs(above.astype(int) - color).max(axis=-1) < 3)
+            for color in ((45, 30, 190), (142, 130, 38))
+        )  # fmt: skip
+        assert min(red.mean(), right.mean()) > 0.01
+        assert np.nonzero(red)[1].mean() > np.nonzero(right)[1].mean()  # x grows to the right
 
 
 def test_what_cannot_be_compared_is_named(pano_mvs: Command, tmp_path: Path, folder: Path) -> None:

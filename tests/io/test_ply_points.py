@@ -6,7 +6,7 @@ import pytest
 from pano_mvs.api import Context
 from pano_mvs.core.errors import InputError
 from pano_mvs.io.ply import read_ply, write_ply
-from pano_mvs.io.ply_points import read_ply_points
+from pano_mvs.io.ply_points import open_ply_points, read_ply_points
 from pano_mvs.scene import PointCloud
 from pano_mvs.stages.export import PlyParams, ply
 
@@ -83,3 +83,22 @@ def test_the_export_writes_quality_on_demand(tmp_path):
         files = ply(cloud, PlyParams(quality=quality), context)
         back = read_ply(files.files["cloud.ply"])
         assert (None if back.confidence is None else back.confidence.tolist()) == confidence
+
+
+def test_a_file_is_read_in_parts_with_its_normals(tmp_path):
+    """Nothing but the part that is asked for comes into memory."""
+    points = np.random.default_rng(0).normal(size=(11, 3)).astype(np.float32)
+    normals = np.tile(np.float32([0, 0, -1]), (11, 1))
+    write_ply(tmp_path / "a.ply", PointCloud(points, normals, np.zeros((11, 3), np.uint8), np.ones(11, np.uint8)))
+    file = open_ply_points(tmp_path / "a.ply")
+    assert (file.count, file.has_normals) == (11, True)
+    assert isinstance(file.vertices, np.memmap)
+    assert [len(chunk) for chunk in file.chunks(4)] == [4, 4, 3]
+    np.testing.assert_array_equal(np.concatenate(list(file.chunks(4))), points)
+    some, towards = file.some(3)
+    np.testing.assert_array_equal(some, points[::3])
+    np.testing.assert_array_equal(towards, normals[::3])
+    (tmp_path / "b.ply").write_bytes(header("ascii", ["float x", "float y", "float z"], 1) + b"1 2 3\n")
+    np.testing.assert_array_equal(open_ply_points(tmp_path / "b.ply").some(1)[1], [[0, 0, 0]])
+    (tmp_path / "c.ply").write_bytes(header("binary_little_endian", ["float x", "float y", "float z"], 0))
+    assert list(open_ply_points(tmp_path / "c.ply").chunks()) == []
