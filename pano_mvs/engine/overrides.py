@@ -25,8 +25,8 @@ def apply_overrides(
 ) -> list[Located]:
     """Change stages in place and return the plugin files that are added.
 
-    `plugins` come first, then what changes a stage's `use` or removes a stage, then the rest in the order given: so
-    a setting of the new stage may stand before the `use` that brings it.
+    `plugins` come first, then what changes a stage's `use` or removes a stage, then the folder of images, then the
+    rest in the order given: so a setting of the new stage may stand before the `use` that brings it.
 
     Args:
         stages: the merged entries.
@@ -34,11 +34,6 @@ def apply_overrides(
         problems: where mistakes go.
         images: a folder for the stage called `images` to read instead of its own.
     """
-    if images is not None:
-        if "images" in stages:
-            _set(stages["images"], ("path",), Located(str(images.resolve()), 0, 0, origin=f"--images {images}"))
-        else:
-            problems.add("--images", "this workflow has no stage called 'images'; use --set STAGE.path=DIR")
     plugins: list[Located] = []
     rest: list[_Override] = []
     for override in filter(None, (_read(text, problems) for text in overrides)):
@@ -50,6 +45,11 @@ def apply_overrides(
             _replace(stages, override)
         else:
             rest.append(override)
+    if images is not None:
+        if "images" in stages:
+            _set(stages["images"], ("path",), Located(str(images.resolve()), 0, 0, origin=f"--images {images}"))
+        else:
+            problems.add("--images", "this workflow has no stage called 'images'; use --set STAGE.path=DIR")
     for override in rest:
         _apply(stages, override, problems)
     return plugins

@@ -16,6 +16,7 @@ from pano_mvs.io.gpano import GPano, find_gpano, read_file
 from pano_mvs.scene.image_file import decode_image
 
 PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif", ".heic", ".heif"})
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi"})
 _IGNORED_FOLDERS = frozenset({"masks"})
 _TURNED = ("an EXIF orientation that turns or mirrors them, which was ignored: the pixels of a panorama are taken as "
            "they are stored")  # fmt: skip
@@ -61,7 +62,11 @@ def list_pictures(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder. Give the folder that holds the panoramas")
-    pictures = [path for path in _files_below(folder) if path.suffix.lower() in PICTURE_SUFFIXES]
+    files = list(_files_below(folder))
+    pictures = [path for path in files if path.suffix.lower() in PICTURE_SUFFIXES]
+    if not pictures and (film := next((path for path in files if path.suffix.lower() in VIDEO_SUFFIXES), None)):
+        raise InputError(f"{folder}: no pictures here, but the video {film.name}. Use source.video: "
+                         "--set images.use=source.video --set pairs.use=pairs.sequential")  # fmt: skip
     if not pictures:
         kinds = ", ".join(sorted(suffix.lstrip(".") for suffix in PICTURE_SUFFIXES))
         raise InputError(f"{folder}: no pictures here. Panoramas may be {kinds}; folders called masks are left out")

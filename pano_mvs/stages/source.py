@@ -7,6 +7,7 @@ from pathlib import Path
 
 from pydantic import Field
 
+from pano_mvs.algorithms.dual_fisheye import is_dual_fisheye
 from pano_mvs.api import Context, FilePart, InputError, Panorama, Params, SourceItem, SourcePath, source
 from pano_mvs.io.captures import PictureInfo, describe_picture, list_pictures
 from pano_mvs.io.mask_files import find_mask, require_masks
@@ -62,7 +63,7 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
         ctx.note(f"{item.name}: {warning}")
     for trait in info.traits:
         ctx.note(f"some pictures have {trait}")
-    _check_decodes(path, info)
+    _check_pixels(path, info)
     mask = item.files.get("mask")
     if mask is None and params.masks is not None:
         ctx.note(f"{item.name} has no mask in {params.masks.name}; all of it is used")
@@ -85,12 +86,16 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
     return panorama
 
 
-def _check_decodes(path: Path, info: PictureInfo) -> None:
+def _check_pixels(path: Path, info: PictureInfo) -> None:
     """Decode the whole picture once, so that a damaged file is named here and not in the middle of a sweep."""
-    height, width = decode_image(path).shape[:2]
+    picture = decode_image(path)
+    height, width = picture.shape[:2]
     if (height, width) != info.file_size_hw:
         raise InputError(f"{path}: decodes to {width}×{height} px, its header says {info.file_size_hw[::-1]}. "
                          "Save it anew")  # fmt: skip
+    if info.gpano is None and is_dual_fisheye(picture):
+        raise InputError(f"{path}: two fisheye images side by side, not an equirectangular panorama. Export it as one "
+                         "with the camera maker's program first (stitching)")  # fmt: skip
 
 
 def working_size(source_hw: tuple[int, int], max_width: int) -> tuple[int, int]:

@@ -1,0 +1,91 @@
+"""Pictures and videos of all kinds through the command line."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pillow_heif
+from PIL import Image
+
+from tests.cli.conftest import Command, run_json
+from tests.io.pictures import app1, exif
+from tests.io.videos import counted, write_video
+
+LOOK = "pano_mvs: 1\nstages: {images: {use: source.folder, path: photos}}\n"
+FILM = """
+pano_mvs: 1
+stages:
+  images:   {use: source.video, path: walk.avi, every_s: 0.5}
+  features: {use: features.orb_tangent, max_keypoints: 200}
+  pairs:    {use: pairs.sequential, window: 1}
+"""
+
+
+def test_pictures_of_every_kind_are_one_capture(pano_mvs: Command, tmp_path: Path) -> None:
+    photos = tmp_path / "photos" / "day 1 – außen"
+    photos.mkdir(parents=True)
+    picture = Image.fromarray(cv2.resize(counted(3), (128, 64)))
+    for suffix, kind in (("JPG", "JPEG"), ("png", "PNG"), ("Tif", "TIFF"), ("webp", "WEBP"), ("AVIF", "AVIF")):
+        picture.save(photos / f"{kind}.{suffix}", kind)
+    stream = io.BytesIO()
+    pillow_heif.from_pillow(picture).save(stream)
+    (photos / "phone.HEIC").write_bytes(stream.getvalue())
+    sixteen = np.asarray(picture).astype(np.uint16) * 257
+    (photos / "deep.png").write_bytes(bytes(cv2.imencode(".png", sixteen)[1]))
+    data = (photos / "JPEG.JPG").read_bytes()
+    turned = data[:2] + app1(b"Exif\0\0" + exif(orientation=6)) + data[2:]
+    (photos / "turned.jpg").write_bytes(turned)
+    (tmp_path / "look.yaml").write_text(LOOK)
+    result = pano_mvs("run", tmp_path / "look.yaml", "--out", "out")
+    assert result.code == 0, result.text
+    assert run_json(Path("out"))["stages"][0]["run"] == 8
+    assert "EXIF orientation that turns or mirrors them, which was ignored" in result.flat
+
+
+def test_two_fisheyes_among_panoramas_are_told(pano_mvs: Command, tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    raw = np.zeros((64, 128, 3), np.uint8)
+    for left in (32, 96):
+        cv2.circle(raw, (left, 32), 30, (150, 120, 90), -1)
+    for name, picture in (("a", counted(1)), ("b", raw), ("c", counted(2))):
+        cv2.imwrite(str(tmp_path / "photos" / f"{name}.png"), picture)
+    (tmp_path / "look.yaml").write_text(LOOK)
+    result = pano_mvs("run", tmp_path / "look.yaml", "--out", "out")
+    assert result.code == 3
+    assert "b.png: two fisheye images side by side" in result.flat
+
+
+def test_a_video_is_read_once_and_only_what_is_new_again(pano_mvs: Command, tmp_path: Path) -> None:
+    write_video(tmp_path / "walk.avi", 60)
+    (tmp_path / "film.yaml").write_text(FILM)
+    run = ("run", tmp_path / "film.yaml", "--out", "out", "--cache", "cache")
+    first = pano_mvs(*run)
+    assert first.code == 0, first.text
+    stages = {stage["name"]: stage for stage in run_json(Path("out"))["stages"]}
+    assert (stages["images"]["run"], stages["features"]["run"]) == (6, 6)
+    assert "0 units computed" in pano_mvs(*run).text
+
+    shorter = pano_mvs(*run, "--set", "images.end_s=1.2")
+    assert shorter.code == 0
+    stages = {stage["name"]: stage for stage in run_json(Path("out"))["stages"]}
+    assert (stages["images"]["run"], stages["images"]["cached"], stages["features"]["run"]) == (0, 3, 0)
+
+    next(Path("cache/blobs").rglob("*.png")).write_bytes(b"damaged")
+    again = pano_mvs(*run)
+    assert again.code == 0, again.text
+    plan = pano_mvs("plan", *run[1:2], "--cache", "cache", "--set", "images.every_s=0.25")
+    assert "12" in plan.text.splitlines()[3]
+
+
+def test_a_folder_of_videos_is_pointed_to_the_other_source(pano_mvs: Command, tmp_path: Path) -> None:
+    (tmp_path / "films").mkdir()
+    write_video(tmp_path / "films" / "walk.avi", 60)
+    result = pano_mvs("run", "quickstart", "--images", tmp_path / "films")
+    assert result.code == 2
+    assert "walk.avi. Use source.video: --set images.use=source.video --set pairs.use=pairs.sequential" in result.flat
+    settings = ("--set", "images.use=source.video", "--set", "pairs.use=pairs.sequential", "--until", "pairs")
+    result = pano_mvs("run", "quickstart", "--images", tmp_path / "films", *settings, "--out", "out")
+    assert result.code == 0, result.text
