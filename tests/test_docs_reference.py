@@ -60,6 +60,11 @@ def test_every_kind_of_stage_is_introduced() -> None:
     assert {name.partition(".")[0] for name in hook("stage_page").built_in().stages} <= known.keys()
 
 
+def test_a_stage_names_the_pages_that_tell_of_it(stages: str) -> None:
+    assert "[Frames and scale](../frames_and_scale.md)" in section(stages, "poses.level")
+    assert "[quality](presets.md#quality)" in section(stages, "depth.patchmatch")
+
+
 def test_what_every_stage_takes_is_listed(stages: str) -> None:
     told = section(stages, "What every stage takes")
     assert set(RESERVED_KEYS) == set(re.findall(r"^\| `(\w+)` \|", told, re.MULTILINE))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 
+from guide_pages import pages_that_tell_of
 from markdown_text import cell, docstring, table
 from preset_page import presets_that_use
 from pydantic.fields import FieldInfo
@@ -104,7 +105,7 @@ def _stage(spec: StageSpec) -> str:
         "\n".join(reads),
         f"\nGives {_kind(spec.output.kind_name())}, version {spec.version}{_memory(spec)}.\n\n</div>",
         _settings(spec),
-        presets_that_use(spec.name),
+        " ".join(sentence for sentence in (presets_that_use(spec.name), pages_that_tell_of(spec.name)) if sentence),
     ]
     return "\n\n".join(part for part in parts if part)
 
