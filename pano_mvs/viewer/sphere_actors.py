@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from pano_mvs.geometry import Rigid3
 from pano_mvs.viewer.panorama_sphere import panorama_sphere
 
-_RIM = 1.1
-
 
 def sphere_actor(picture: NDArray[np.uint8], cam_from_world: Rigid3, radius: float, *, surrounds: bool = False) -> Any:
     """Return the actor of a sphere that shows a panorama, (H, W, 3) RGB, around its camera.
@@ -41,11 +39,11 @@ def sphere_actor(picture: NDArray[np.uint8], cam_from_world: Rigid3, radius: flo
 def rims_actor(centers: NDArray[np.float64], radius: float, color: str) -> Any:
     """Return the actor of rims around spheres, (N, 3), by which they stand out from what is behind them.
 
-    Of a slightly larger sphere the far half is drawn: what of it looks out behind the sphere itself is its rim.
+    Of larger spheres, of that radius, the far half is drawn: what of them looks out behind the spheres is their rim.
     """
     import pyvista
 
-    ball: Any = pyvista.Sphere(radius=_RIM * radius, theta_resolution=32, phi_resolution=24)
+    ball: Any = pyvista.Sphere(radius=radius, theta_resolution=32, phi_resolution=24)
     data: Any = pyvista.PolyData(centers).glyph(geom=ball, scale=False, orient=False)
     actor = _actor(data)
     actor.GetProperty().SetColor(*pyvista.Color(color).float_rgb)

@@ -17,16 +17,6 @@ from pano_mvs.viewer.viewpoint import Viewpoint, looking_along, outside_view
 
 FloatArray = NDArray[np.float64]
 
-HELP = """\
-left drag    turn            wheel, right drag   nearer, farther
-click camera step inside     Esc, right click    step out
-left, right  next camera     m                   measure: click two points
-o  t  y      overview, from the top, from the front
-c            colours         x                   points that turn their back
-l            names           k                   cameras
-b            cloud within the panorama (inside a camera)
-d            all points      h                   this help        q   quit"""
-
 # A sphere is this share of the way to the next camera, within these shares of the scene.
 _RADIUS_SHARE, _RADIUS_LIMITS = 0.18, (0.005, 0.025)
 _BOX_SHARES = 0.01, 0.99

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from pano_mvs.viewer.cloud_actor import CloudActor
 from pano_mvs.viewer.cloud_colors import POINT_BUDGET, color_cloud, drawn_cloud
 from pano_mvs.viewer.hands import Hands
+from pano_mvs.viewer.overlay import Overlay
 from pano_mvs.viewer.panorama_pictures import LARGE_WIDTH, SMALL_WIDTH, sphere_picture
 from pano_mvs.viewer.sphere_actors import rims_actor, sphere_actor
-from pano_mvs.viewer.tour import HELP, Tour, TourState, bar_length, bar_text, length_text
+from pano_mvs.viewer.tour import Tour, TourState, bar_length, bar_text, length_text
 from pano_mvs.viewer.viewpoint import Viewpoint
 
 TEXTURED = 64
@@ -21,6 +22,7 @@ TEXTURED = 64
 
 _BACKGROUND, _BACKGROUND_TOP, _INK = "#15181d", "#2b313a", "#e8ebf0"
 _ACCENT, _DOTS, _RIM = "#ffb454", "#7fb4ff", "#4da3ff"
+_RIM_OUTSIDE, _RIM_INSIDE = 1.1, 1.03
 _MOST_LABELS = 300
 _SURROUND_SHARE = 2.0
 _FONT_SHARE = 1 / 72
@@ -44,6 +46,7 @@ class SceneWindow:
         )
         self.plotter.set_background(_BACKGROUND, top=_BACKGROUND_TOP)
         self._font = max(7, round(size_wh[1] * _FONT_SHARE))
+        self._overlay = Overlay(self.plotter, self._font, ink=_INK, paper=_BACKGROUND)
         self._shown: TourState | None = None
         self._cloud: CloudActor | None = None
         self._spheres: dict[int, Any] = {}
@@ -88,6 +91,7 @@ class SceneWindow:
         """Show the tour's state."""
         state, before = self.tour.state, self._shown
         self._shown = state
+        self.plotter.suppress_rendering = True  # once, at the end
         self._place_camera(state.viewpoint)
         if before is None or before.all_points != state.all_points:
             self._reload_points(state)
@@ -97,6 +101,7 @@ class SceneWindow:
         self._show_cameras(state, before)
         self._show_picked(state)
         self._show_texts(state)
+        self.plotter.suppress_rendering = False
         self.plotter.renderer.ResetCameraClippingRange()
         self.plotter.render()
 
@@ -145,7 +150,7 @@ class SceneWindow:
         start = low[0] * right + low[1] * scene.up + (low[2] - 0.03 * extent) * scene.ahead
         ends = np.stack([start, start + length * right])
         self.plotter.add_lines(ends, color=_INK, width=4, name="bar")
-        self._label(ends[1:] + 0.02 * extent * right, [bar_text(length, scene.unit)], "bar label")
+        self._overlay.label(ends[1:] + 0.02 * extent * right, [bar_text(length, scene.unit)], "bar label")
 
     def _reload_points(self, state: TourState) -> None:
         """Read all points of the file, or as many as a display needs."""
@@ -221,7 +226,7 @@ class SceneWindow:
             named = [int(idx) for idx in self._nearest(state.viewpoint.eye, _MOST_LABELS) if idx != state.inside]
         if named:
             above = centers[named] + 1.4 * self.tour.radius * self.tour.scene.up
-            self._label(above, [self.tour.scene.cameras[idx].name for idx in named], "names")
+            self._overlay.label(above, [self.tour.scene.cameras[idx].name for idx in named], "names")
 
     def _nearest(self, eye: NDArray[np.float64], count: int) -> NDArray[np.intp]:
         """Return the cameras nearest to the eye."""
@@ -240,7 +245,8 @@ class SceneWindow:
         shown = self.tour.centers[[idx for idx in sorted(wanted) if idx != self.tour.state.inside]]
         self.plotter.remove_actor("rims", render=False)
         if len(shown):
-            self._rims = rims_actor(shown, self.tour.radius, _RIM)
+            share = _RIM_INSIDE if self.tour.state.inside is not None else _RIM_OUTSIDE
+            self._rims = rims_actor(shown, share * self.tour.radius, _RIM)
             self.plotter.add_actor(self._rims, name="rims", reset_camera=False, pickable=False)
 
     def _show_picked(self, state: TourState) -> None:
@@ -255,7 +261,7 @@ class SceneWindow:
         if distance is not None:
             self.plotter.add_lines(points, color=_ACCENT, width=3, name="measured")
             text = length_text(distance, self.tour.scene.unit)
-            self._label(points.mean(axis=0, keepdims=True), [text], "distance", color=_ACCENT)
+            self._overlay.label(points.mean(axis=0, keepdims=True), [text], "distance", color=_ACCENT)
 
     def _show_texts(self, state: TourState) -> None:
         scene, cloud = self.tour.scene, self.tour.cloud
@@ -263,26 +269,12 @@ class SceneWindow:
         if state.inside is not None:
             title = f"inside {scene.cameras[state.inside].name}   (Esc or right click: out)"
         news = state.message if state.inside is None or state.measuring else ""
-        self._text("\n".join([title, *([news] if news else [])]), "upper_left", "title", _INK)
         counts = []
         if cloud is not None:
             of = f" of {cloud.total:,}" if len(cloud.points) < cloud.total else ""
             counts.append(f"{len(cloud.points):,}{of} points")
         if scene.cameras:
             counts.append(f"{len(scene.cameras):,} cameras")
-        lines = [*([self._legend] if self._legend else []), "   ".join([*counts, "h: keys"])]
-        self._text("\n".join(lines), "lower_right", "legend", _INK)
-        self._text(HELP if state.help else "", "upper_right", "help", _INK, font="courier")
-
-    def _text(self, text: str, place: str, name: str, color: str, *, font: str = "arial") -> None:
-        self.plotter.remove_actor(name, render=False)
-        if text:
-            self.plotter.add_text(text, position=place, font_size=self._font * 0.8, color=color, font=font, name=name,
-                                  render=False)  # fmt: skip
-
-    def _label(self, points: NDArray[np.float64], texts: list[str], name: str, *, color: str = _INK) -> Any:
-        return self.plotter.add_point_labels(
-            points, texts, name=name, font_size=round(self._font * 1.5), text_color=color, shape="rounded_rect",
-            shape_color=_BACKGROUND, shape_opacity=0.7, margin=4, always_visible=True, show_points=False,
-            reset_camera=False, render=False, pickable=False,
-        )  # fmt: skip
+        self._overlay.text([title, news], "upper_left")
+        self._overlay.text([self._legend, "   ".join([*counts, "h: keys"])], "lower_right")
+        self._overlay.help(wanted=state.help)
