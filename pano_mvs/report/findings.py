@@ -107,7 +107,7 @@ def _commonest(reasons: Sequence[str]) -> str:
 
 
 def _graph(summary: Mapping[str, Any]) -> list[Finding]:
-    """Return which registered cameras hang on one link alone, where there are cameras enough to tell."""
+    """Return which registered cameras are linked to one other alone, where there are cameras enough to tell."""
     poses = summary.get("poses") or {}
     names, links = poses.get("registered") or [], poses.get("links") or []
     if len(names) < 4 or not links:
@@ -118,15 +118,15 @@ def _graph(summary: Mapping[str, Any]) -> list[Finding]:
         return []
     shown = ", ".join(loose[:3]) + (" …" if len(loose) > 3 else "")
     mood = "fair" if len(loose) > len(names) / 4 else ""
-    if len(loose) == 1:
-        return [Finding(mood, f"{shown} hangs on one link alone: nothing confirms where it is.")]
-    return [Finding(mood, f"{len(loose)} cameras hang on one link alone ({shown}): nothing confirms where they are.")]
+    count_text = "1 camera shares" if len(loose) == 1 else f"{len(loose)} cameras share"
+    return [Finding(mood, f"{count_text} a verified geometry with one other alone ({shown}): unless their poses were "
+                    "given, nothing confirms them.")]  # fmt: skip
 
 
 def _residual(residual_px: float | None) -> list[Finding]:
     if residual_px is None or (mood := mood_of(residual_px, GOOD_RESIDUAL_PX, FAIR_RESIDUAL_PX)) == "good":
         return []
-    text = f"The points miss the pictures by {residual_px:.1f} pixels in the median: the poses are not sharp."
+    text = f"The points miss the pictures by {residual_px:.2g} pixels in the median: the poses are not sharp."
     return [Finding(mood, text, "Check that the pictures are sharp, unstitched seams aside, and not edited one by one; "
                     "put poses.refine behind the solver if it is not there.")]  # fmt: skip
 

@@ -124,7 +124,7 @@ def _residual(residual_deg: float | None, residual_px: float | None) -> list[Til
     if residual_deg is None:
         return []
     mood = mood_of(residual_px, GOOD_RESIDUAL_PX, FAIR_RESIDUAL_PX) if residual_px is not None else ""
-    pixels = f", {residual_px:.1f} px" if residual_px is not None else ""
+    pixels = f", {residual_px:.2g} px" if residual_px is not None else ""
     return [Tile(f"{residual_deg:.2g}°", f"median reprojection residual{pixels}", mood)]
 
 

@@ -47,7 +47,7 @@ def rejecting(count):
         ({"exit_code": 3, "failures": [{"stage": "depth", "item": "1.png"}]}, "fair", "1 in depth"),
         ({"exit_code": 1, "stopped": "division by zero"}, "bad", "division by zero"),
         ({"poses": GOOD["poses"] | {"links": [[NAMES[0], name, 90] for name in NAMES[1:]]}}, "fair",
-         "9 cameras hang on one link"),
+         "9 cameras share a verified geometry with one other alone"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_found_and_named(change, mood, words):

@@ -1,0 +1,119 @@
+"""The report of runs as they happen: finished, cached, interrupted, stopped, broken; and written anew on demand."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from pano_mvs.engine.publish import Publisher
+from pano_mvs.testing.room import capture_poses, default_room, write_capture
+from tests.cli.conftest import Command, run_json
+from tests.engine.conftest import Toy, toy  # noqa: F401 (a fixture)
+from tests.report.html_page import Page
+from tests.report.test_report import assert_sound
+
+
+def page_in(out: Path) -> Page:
+    page = Page((out / "report.html").read_text(encoding="utf-8"))
+    assert_sound(page)
+    return page
+
+
+def pictures(page: Page) -> dict[str | None, str | None]:
+    return {attrs["alt"]: attrs["src"] for attrs in page.all("img") if attrs["alt"]}
+
+
+def test_a_run_its_repetition_and_the_command_show_the_same(pano_mvs: Command, tmp_path: Path) -> None:
+    write_capture(tmp_path / "capture", default_room(), capture_poses(3, spread=0.4), (48, 96))
+    truth = tmp_path / "capture" / "truth"
+    command = ("known_poses", "--images", tmp_path / "capture" / "images", "--out", "out", "--cache", "cache",
+               "--set", f"poses.path={truth / 'poses.json'}", "--set", f"scores.truth={truth}",
+               "--set", "depth.planes=16", "--set", "features.max_keypoints=400")  # fmt: skip
+    assert pano_mvs("run", *command).code == 0
+    out = Path("out")
+    first = page_in(out)
+    for name in ("000.png", "001.png", "002.png"):
+        assert sum(str(alt).startswith(f"{name}:") for alt in pictures(first)) == 3
+    assert len(pictures(first)) == 9 + 3, "of the cloud from three places"
+    assert "metres, as the file has it" in first.words
+    assert "Against the truth" in first.words
+    summary = run_json(out)
+    assert set(summary["results"]) == {"images", "pairs", "poses", "ranges", "cloud"}
+    assert summary["machine"]["cores"] >= 1
+    assert all(len(link) == 5 for link in summary["poses"]["links"])
+
+    (out / "report.html").unlink()
+    assert pano_mvs("report", "out").code == 0
+    assert (out / "report.html").read_text() == first.source
+
+    assert pano_mvs("run", *command).code == 0
+    again = page_in(out)
+    assert "Nothing had changed" in again.words
+    assert pictures(again) == pictures(first)
+
+    shutil.rmtree("cache")
+    result = pano_mvs("report", "out")
+    assert result.code == 2
+    assert "there is no cache" in result.flat
+    assert page_in(out).source == again.source, "the page with pictures stays"
+
+
+@pytest.mark.parametrize("text", [None, "no json", "[]", '{"stages": 1}'])
+def test_a_folder_without_a_run_is_refused(pano_mvs: Command, text: str | None) -> None:
+    Path("out").mkdir()
+    if text is not None:
+        Path("out/run.json").write_text(text)
+    result = pano_mvs("report", "out")
+    assert result.code == 2
+    assert "run.json" in result.flat
+
+
+def run(pano_mvs: Command, toy: Toy, *options: str) -> int:  # noqa: F811
+    folder = toy.folder
+    return pano_mvs("run", folder / "wf.yaml", "--cache", folder / "cache", "--out", folder / "out", *options).code
+
+
+def test_an_interrupted_run_has_a_report(pano_mvs: Command, toy: Toy) -> None:  # noqa: F811
+    toy.edit("plug.py", lambda text: text.replace('"""Mean of the', 'raise KeyboardInterrupt\n    """Mean of the'))
+    assert run(pano_mvs, toy) == 130
+    summary = run_json(toy.folder / "out")
+    assert (summary["exit_code"], summary["stopped"]) == (130, "interrupted")
+    page = page_in(toy.folder / "out")
+    assert "Interrupted" in page.words
+    assert "what is finished is not computed again" in page.words
+
+
+def test_a_run_that_a_gate_stops_says_why_at_once(pano_mvs: Command, toy: Toy) -> None:  # noqa: F811
+    toy.edit("wf.yaml", lambda text: text.replace("use: toy.scale", "use: toy.scale, gate: {value: 1000}"))
+    assert run(pano_mvs, toy) == 4
+    page = page_in(toy.folder / "out")
+    assert "Stopped by a quality gate" in page.words
+    assert page.words.index("the gate asks for") < page.words.index("Stages")
+
+
+def test_a_run_that_breaks_has_a_report_and_keeps_its_error(
+    pano_mvs: Command, toy: Toy, monkeypatch: pytest.MonkeyPatch  # noqa: F811
+) -> None:  # fmt: skip
+    def broken(*_args: object, **_options: object) -> None:
+        raise OSError("the disk has gone")
+
+    monkeypatch.setattr(Publisher, "publish", broken)
+    assert run(pano_mvs, toy) == 1
+    assert run_json(toy.folder / "out")["exit_code"] == 1
+    page = page_in(toy.folder / "out")
+    assert "Stopped by an internal error" in page.words
+    assert "the disk has gone" in page.words
+
+
+def test_a_run_that_does_nothing_leaves_the_report_before(pano_mvs: Command, toy: Toy) -> None:  # noqa: F811
+    assert run(pano_mvs, toy) == 0
+    before = (toy.folder / "out" / "report.html").read_bytes()
+    toy.edit(
+        "plug.py", lambda text: text.replace("for path in sorted", "raise ValueError('no')\n    for path in sorted")
+    )
+    assert run(pano_mvs, toy) not in (0, 3)
+    assert (toy.folder / "out" / "report.html").read_bytes() == before
+    assert json.loads((toy.folder / "out" / "run.json").read_text())["exit_code"] == 0
