@@ -15,7 +15,10 @@ from pano_mvs.io.range_files import read_confidence_png, read_range_tiff
 from tests.cli.conftest import SMALL, Command
 
 # What makes quality slow is tested with it.
-PLAIN_RANGES = ("--set", "slanted=null", "--set", "filled=null", "--set", "planes=null", "--set", "views.sources=3")
+PLAIN_RANGES = (
+    *("--set", "slanted=null", "--set", "filled=null", "--set", "planes=null", "--set", "smooth=null"),
+    *("--set", "previews=null", "--set", "views.sources=2", "--set", "depth.cost=census", "--set", "depth.planes=16"),
+)
 
 
 def test_splat_writes_panoramas_faces_and_seeds_that_agree(pano_mvs: Command, rendered: Path, tmp_path: Path) -> None:
