@@ -79,4 +79,4 @@ def _items_by_stage(units: Iterable[str]) -> Mapping[str, frozenset[str]]:
     for unit in units:
         stage, _, item = unit.partition(":")
         found.setdefault(stage, set()).add(item)
-    return {stage: frozenset(items) for stage, items in found.items() if items != {""}}
+    return {stage: frozenset(items) for stage, items in found.items() if "" not in items}

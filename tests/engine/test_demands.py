@@ -26,6 +26,10 @@ def test_only_runs_one_unit_and_what_it_needs(toy: Toy) -> None:
     assert ran(run(toy, Demands(only=("mean:2.txt", "mean:3.txt")))) == {"mean": 1}
 
 
+def test_only_of_a_stage_beside_one_of_its_units_runs_the_stage(toy: Toy) -> None:
+    assert ran(run(toy, Demands(only=("scaled", "scaled:2.txt")))) == {"images": 5, "scaled": 5}
+
+
 def test_part_of_a_run_deletes_no_file_of_the_whole(toy: Toy) -> None:
     earlier = toy.run().published
     files = toy.deliverables()
