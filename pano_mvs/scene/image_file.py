@@ -41,9 +41,11 @@ def decode_image(path: Path) -> NDArray[np.uint8]:
     if image is None:
         raise InputError(f"{path}: not a picture that can be decoded ({len(data)} bytes). Remove it or convert it to "
                          f"JPEG, or to PNG or TIFF of 8 or 16 bits")  # fmt: skip
+    del data  # of large pictures each copy counts
     if image.dtype == np.uint16:
-        image = (image >> 8).astype(np.uint8)  # both 257 v and 256 v, as which programs write 8 bits in 16, give v
-    elif image.dtype != np.uint8:
+        image >>= 8  # both 257 v and 256 v, as which programs write 8 bits in 16, give v
+        return np.asarray(image[..., ::-1].astype(np.uint8, order="C"))
+    if image.dtype != np.uint8:
         raise InputError(f"{path}: {image.dtype} pictures are not supported. Convert it to 8 or 16 bits")
     rgb: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
     return rgb
