@@ -137,7 +137,7 @@ def test_z_depths_are_the_true_ones_between_steps(panorama):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_the_compiled_loop_is_the_obvious_one(panorama, layout):
+def test_the_compiled_loop_is_the_plain_one(panorama, layout):
     ranges = panorama[1].copy()
     ranges[np.random.default_rng(2).random(SIZE) < 0.02] = np.nan
     turn = rotation_from_rotvec((0.11, 0.23, 0.05))  # so that no ray lies exactly between two pixels

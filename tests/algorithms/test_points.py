@@ -188,7 +188,7 @@ def test_settings_out_of_bounds_are_refused(room, wrong):
         tracked(room, **wrong)
 
 
-def test_the_compiled_test_is_the_obvious_one(room):
+def test_the_compiled_test_is_the_plain_one(room):
     """On points of the room, some moved, and a range map with holes and doubtful pixels."""
     poses, maps, samples = room
     rng = np.random.default_rng(6)

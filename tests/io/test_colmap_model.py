@@ -182,3 +182,17 @@ def test_points_that_no_image_sees_are_kept(tmp_path):
     back = read_colmap_model(tmp_path)
     assert back.points_in_world == pytest.approx(poses.points_in_world)
     assert 3 not in back.track_point_idx
+
+
+@pytest.mark.parametrize(("form", "suffixes"), [("bin", ["bin"]), ("txt", ["txt"]), ("both", ["bin", "txt"])])
+def test_models_are_written_as_text_binary_or_both(tmp_path, form, suffixes):
+    write_colmap_model(tmp_path / "model", noisy_poses(), SIZES, form=form)
+    files = [f"{name}.{suffix}" for name in FILES for suffix in suffixes]
+    assert sorted(path.name for path in (tmp_path / "model").iterdir()) == sorted(files)
+    model = pycolmap.Reconstruction()
+    (model.read_text if form == "txt" else model.read_binary)(str(tmp_path / "model"))
+    assert (model.num_rigs(), model.num_frames(), model.num_reg_images()) == (2, 4, 4)
+    colors = {tuple(point.xyz.round(9)): tuple(point.color) for point in model.points3D.values()}
+    expected = zip(noisy_poses().points_in_world, noisy_poses().point_colors_rgb, strict=True)
+    assert colors == {tuple(xyz.round(9)): tuple(color) for xyz, color in expected}
+    assert {point.track.length() for point in model.points3D.values()} == {2, 3}
