@@ -70,6 +70,12 @@ def inline_commands() -> list[Any]:
     return found
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_no_number_is_taken_for_a_heading(page: Path) -> None:
+    """The number of an issue that began a line, #1494, was shown as a heading."""
+    assert not re.search(r"^#+[^#\s]", FENCED.sub("", page.read_text(encoding="utf-8")), re.MULTILINE)
+
+
 @pytest.mark.parametrize(("page", "script"), blocks("bash"))
 def test_every_command_can_be_parsed(page: Path, script: str) -> None:
     for arguments in commands(script):
