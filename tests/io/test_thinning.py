@@ -166,7 +166,7 @@ print(tracemalloc.get_traced_memory()[1], count if kept is None else kept.count)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("max_points", "most_bytes"), [(0, 60e6), (500_000, 500e6)])
+@pytest.mark.parametrize(("max_points", "most_bytes"), [(0, 30e6), (500_000, 200e6)])
 def test_memory_does_not_grow_with_the_cloud(tmp_path: Path, max_points: int, most_bytes: float) -> None:
     """Eight million points are 220 MB in arrays; numpy's memory is traced, mapped files are the system's."""
     count = 8_000_000
