@@ -121,6 +121,7 @@ class _Joined:
     first: int
     second: int
     inliers: int
+    candidates: int
     text: str
 
 
@@ -136,8 +137,10 @@ def _chosen(
             candidates = f" of {more[0]} candidates" if more and more[0] is not None else ""
             words = f"{inliers} matches{candidates}" if inliers else f"rejected{candidates and f', none{candidates}'}"
             why = reasons.get((first, second), "")
-            found.append(_Joined(a, b, int(inliers), f"{labels[a]} – {labels[b]}: {words}{why and f'; {why}'}"))
-    found.sort(key=lambda link: link.inliers)
+            known = int(more[0] or 0) if more else 0
+            found.append(_Joined(a, b, int(inliers), known, f"{labels[a]} – {labels[b]}: {words}{why and f'; {why}'}"))
+    # Of rejected ones those that came nearest, with most candidates.
+    found.sort(key=lambda link: (link.inliers, -link.candidates))
     split = sum(not link.inliers for link in found)
     return found[:split][:_MOST_REJECTED] + found[split:][-_MOST_LINKS:]
 

@@ -20,12 +20,13 @@ from pano_mvs.report.pictures import Picture, picture, preview_panels, resized
 from pano_mvs.report.results import Results
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, WEAK_CONFIDENCE
 
-VERSION = 1
+VERSION = 2
 """Raise it when the pictures change: earlier pages' are then drawn again."""
 
 MOST_CARDS = 36
 WIDTH = 768
 MOST_BYTES = 80_000
+_TICKS_APART = 0.09
 _DECODERS = 2  # a large panorama takes 100 MB while it is decoded
 _PARTS = ("panorama", "range", "confidence")
 # Confidence in colours that are apart for colour-blind eyes and in grey: low and high end of each class.
@@ -137,14 +138,23 @@ def _new_card(results: Results, kept: Kept, name: str, out_dir: Path, preview: s
         pictures["confidence"] = _part(confidence_colors(_shrunk(range_map.confidence)), stem, "confidence")
         fits = mask is not None and mask.shape == range_map.range.shape
         shares = shares_of(range_map.confidence, mask if fits else None)
-        places = {value: float(np.log(value / near) / np.log(far / near)) for value in scale_ticks(near, far)}
-        ticks = tuple((round(at, 4), value) for value, at in places.items())
+        ticks = _ticks(near, far)
     if stem and len(pictures) == len(_PARTS):  # what is missing may be back for the next page
         kept.keep(stem, {"ticks": ticks, "shares": fact_of(shares) if shares else None})
     panels = preview_panels(out_dir, preview) if len(pictures) < len(_PARTS) else ()
     for part, panel in zip(_PARTS, panels, strict=False):
         pictures.setdefault(part, _part(panel, "", part))
     return ViewCard(name, {part: pictures[part] for part in _PARTS if part in pictures}, shares, ticks)
+
+
+def _ticks(near: float, far: float) -> tuple[tuple[float, float], ...]:
+    """Return where on the scale of a range map which ranges are written, so that no two overlap."""
+    found: list[tuple[float, float]] = []
+    for value in scale_ticks(near, far):
+        at = round(float(np.log(value / near) / np.log(far / near)), 4)
+        if 0.02 < at < 0.98 and (not found or at - found[-1][0] >= _TICKS_APART):
+            found.append((at, value))
+    return tuple(found)
 
 
 def _part(image: NDArray[np.uint8], stem: str, part: str) -> Picture:

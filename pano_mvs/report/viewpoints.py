@@ -51,7 +51,7 @@ def viewpoints(
     level = np.asarray(points_in_world, np.float64) @ np.stack([right, up, forward], axis=1)
     low, high = np.quantile(level, [0.01, 0.99], axis=0)
     middle = (low + high) / 2 @ np.stack([right, up, forward])
-    extent = np.maximum(high - low, 1e-9)
+    extent = np.maximum(high - low, 1e-6 * (1 + np.abs(middle).max()))
     radius = float(np.linalg.norm(extent)) / 2
     height = float(max(extent[2], extent[0] / aspect)) * 1.06
     above = Viewpoint("From above", middle + up * 3 * radius, middle, forward, height=height)

@@ -1,0 +1,91 @@
+"""From where the cloud is shown, and the plain pictures of it."""
+
+import numpy as np
+import pytest
+
+from pano_mvs.report.software_cloud import draw_cloud
+from pano_mvs.report.viewpoints import Viewpoint, facing, horizontal_axes, inside_camera, viewpoints
+
+UP = np.array([0.0, -1.0, 0.0])
+SIZE_HW = (60, 96)
+
+
+def room(rng, count=20_000):
+    """Return points on the inside of a box 6 × 3 × 4 around the origin, their normals inwards, one colour a side."""
+    points = rng.uniform(-1, 1, (count, 3))
+    axis = rng.integers(0, 3, count)
+    side = rng.choice([-1.0, 1.0], count)
+    points[np.arange(count), axis] = side
+    normals = np.zeros((count, 3))
+    normals[np.arange(count), axis] = -side
+    colors = np.array([[200, 0, 0], [0, 200, 0], [0, 0, 200]], np.uint8)[axis] + (side > 0)[:, None] * np.uint8(50)
+    return (points * (3, 1.5, 2)).astype(np.float32), normals.astype(np.float32), colors.astype(np.uint8)
+
+
+def test_from_above_the_floor_is_seen_and_no_ceiling():
+    points, normals, colors = room(np.random.default_rng(1))
+    above, outside, _ = viewpoints(points, np.zeros((1, 3)), UP, aspect=1.6)
+    for viewpoint in (above, outside):
+        shown = facing(points, normals, viewpoint)
+        assert shown[normals[:, 1] < 0].all(), "the floor: y is down"
+        assert not shown[normals[:, 1] > 0].any(), "the ceiling"
+    image = draw_cloud(points, normals, colors, above, size_hw=SIZE_HW)
+    assert (image[30, 48] == (50, 250, 50)).all(), "the floor in the middle"
+
+
+def test_from_above_it_is_true_to_scale_with_z_upwards():
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1], [-1, 0, -1]], np.float32)
+    normals = np.tile(UP.astype(np.float32), (4, 1))
+    colors = np.array([[9, 9, 9], [255, 0, 0], [0, 255, 0], [0, 0, 255]], np.uint8)
+    above, _, _ = viewpoints(points, np.zeros((0, 3)), UP, aspect=1.6)
+    image = draw_cloud(points, normals, colors, above, size_hw=SIZE_HW).astype(int)
+    places = {channel: np.argwhere((image[..., channel] == 255) & (image.sum(axis=-1) == 255)).mean(axis=0)
+              for channel in range(3)}  # fmt: skip
+    red, green, blue = places[0], places[1], places[2]
+    assert red[1] > green[1] > blue[1], "x to the right"
+    assert green[0] < red[0] < blue[0], "z upwards"
+    assert np.linalg.norm(red - green) == pytest.approx(np.sqrt(2) * (blue[0] - red[0]), abs=1.5)
+
+
+def test_from_inside_the_outermost_camera_looks_at_the_others():
+    centers = np.array([[0, 0, 0], [0.2, 0, 0], [4, 0.5, 0]], float)
+    assert inside_camera(centers) == 2
+    *_, inside = viewpoints(np.eye(3, dtype=np.float32), centers, UP, aspect=1.6, place="2.jpg")
+    assert inside.eye.tolist() == [4, 0.5, 0]
+    assert inside.target - inside.eye == pytest.approx([-1, 0, 0], abs=1e-9), "level"
+    assert "2.jpg" in inside.title
+
+
+@pytest.mark.parametrize("points", [[[1, 2, 3]], [[1, 2, 3]] * 5, [[0, 0, 0], [0, 9, 0]], [[1e6, 0, 0], [1e6, 1, 0]]])
+@pytest.mark.parametrize("centers", [[], [[1, 2, 3]], [[1, 2, 3]] * 3, [[0, 0, 0], [0, 5, 0]]])
+@pytest.mark.parametrize("up", [[0, -1, 0], [0, 0, 1], [1, 0, 0]])
+def test_whatever_lies_where_there_is_a_picture(points, centers, up):
+    points = np.array(points, np.float32)
+    found = viewpoints(points, np.array(centers, float).reshape(-1, 3), np.array(up, float), aspect=1.6)
+    for viewpoint in found:
+        for vector in (viewpoint.eye, viewpoint.target, viewpoint.up):
+            assert np.isfinite(vector).all()
+        assert np.linalg.norm(viewpoint.target - viewpoint.eye) > 0
+        image = draw_cloud(
+            points, np.zeros_like(points), np.full(points.shape, 7, np.uint8), viewpoint, size_hw=SIZE_HW
+        )
+        assert image.shape == (*SIZE_HW, 3)
+
+
+def test_the_nearer_point_hides_the_farther_one():
+    ahead = Viewpoint("", np.zeros(3), np.array([0.0, 0, 1]), UP, fov_deg=60)
+    points = np.array([[0, 0, 2], [0, 0, 1], [0, 0, 3], [0, 0, -1]], np.float32)
+    colors = np.array([[1, 1, 1], [250, 0, 0], [2, 2, 2], [3, 3, 3]], np.uint8)
+    image = draw_cloud(points, np.zeros_like(points), colors, ahead, size_hw=SIZE_HW)
+    drawn = np.unique(image.reshape(-1, 3), axis=0).tolist()
+    assert drawn == [[238, 241, 244], [250, 0, 0]]
+    assert (image[30, 48] == (250, 0, 0)).all()
+
+
+@pytest.mark.parametrize("up", [[0, -1, 0], [0, 0, 1], [0.6, 0, 0.8], [0, 0, -1]])
+def test_horizontal_axes_are_across_up_and_right_handed(up):
+    up = np.array(up, float)
+    right, forward = horizontal_axes(up)
+    frame = np.stack([right, up, forward])
+    assert frame @ frame.T == pytest.approx(np.eye(3), abs=1e-12)
+    assert np.linalg.det(frame) == pytest.approx(1)
