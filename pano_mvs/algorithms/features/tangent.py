@@ -22,6 +22,9 @@ _ORB_SMOOTHING_PX = 1.2
 _EDGE_PX = 0.5
 # Twice the usual: on plain walls many a key point lies on an edge, and the geometry sorts out those that slide.
 _SIFT_EDGE_RATIO = 20
+# How far from what is masked, in sizes: SIFT's patch reaches three sizes from its middle, with falling weights, and has
+# less than a quarter of itself beyond; ORB's reaches half a size, and what is smoothed into it a tenth more.
+_SIFT_CLEARANCE, _ORB_CLEARANCE = 1.5, 0.6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,7 +77,7 @@ def extract_sift(
         described = np.zeros((0, 128), np.float32) if descriptors is None else descriptors
         return _Found(pixels, *_sizes_and_scores(keypoints), _rooted(described) if root else described)
 
-    return _extract(image, mask, detect, max_keypoints=max_keypoints, metric="l2")
+    return _extract(image, mask, detect, max_keypoints=max_keypoints, metric="l2", clearance=_SIFT_CLEARANCE)
 
 
 def extract_orb(
@@ -108,7 +111,7 @@ def extract_orb(
         described = np.zeros((0, 32), np.uint8) if descriptors is None else descriptors
         return _Found(_orb_pixels(keypoints, tile_image), *_sizes_and_scores(keypoints), described)
 
-    return _extract(image, mask, detect, max_keypoints=max_keypoints, metric="hamming")
+    return _extract(image, mask, detect, max_keypoints=max_keypoints, metric="hamming", clearance=_ORB_CLEARANCE)
 
 
 def _extract(
@@ -118,15 +121,16 @@ def _extract(
     *,
     max_keypoints: int,
     metric: Literal["l2", "hamming"],
+    clearance: float,
 ) -> Features:
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or mask.shape != image.shape[:2]:
         raise UsageError(f"features need an (H, W, 3) uint8 picture and an (H, W) mask, got {image.shape} "
                          f"{image.dtype} and {mask.shape}")  # fmt: skip
     size_hw = (image.shape[0], image.shape[1])
     gray: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    valid = mask.astype(np.uint8)
+    valid = np.where(mask, np.uint8(255), np.uint8(0))
     tiles = tangent_tiles(size_hw)
-    found = [_owned(_unmasked(detect(sample_view(gray, t)), valid, t), t, i) for i, t in enumerate(tiles)]
+    found = [_owned(_unmasked(detect(sample_view(gray, t)), valid, t, clearance), t, i) for i, t in enumerate(tiles)]
     bearings = np.concatenate([t.bearings_from_pixels(f.pixels_px) for t, f in zip(tiles, found, strict=True)])
     sizes = np.concatenate([_angular_sizes(t, f) for t, f in zip(tiles, found, strict=True)])
     scores = np.concatenate([f.scores for f in found])
@@ -148,16 +152,16 @@ def _extract(
     )
 
 
-def _unmasked(found: _Found, valid: NDArray[np.uint8], tile: PinholeView) -> _Found:
-    """Drop key points that lie in the mask, or so close to it that its edge may have made them."""
+def _unmasked(found: _Found, valid: NDArray[np.uint8], tile: PinholeView, clearance: float) -> _Found:
+    """Drop key points in the mask, or closer to it than `clearance` times their size; `valid` is 255 or 0."""
     if valid.all() or not len(found.scores):
         return found
-    valid_in_tile = sample_view(valid, tile, interpolation=cv2.INTER_NEAREST)
+    valid_in_tile = (sample_view(valid, tile, interpolation=cv2.INTER_LINEAR) == 255).astype(np.uint8)
     # The frame of the tile is no border, so the distance is to masked pixels only.
-    clearance_px = cv2.distanceTransform(valid_in_tile, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    distance_px = cv2.distanceTransform(valid_in_tile, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     x, y = np.floor(found.pixels_px).astype(np.intp).T
-    clear = clearance_px[np.clip(y, 0, tile.size_hw[0] - 1), np.clip(x, 0, tile.size_hw[1] - 1)]
-    return found[clear > 1.0 + 1.5 * np.minimum(found.sizes_px, 31.0)]
+    distance_px = distance_px[np.clip(y, 0, tile.size_hw[0] - 1), np.clip(x, 0, tile.size_hw[1] - 1)]
+    return found[distance_px > 1.0 + clearance * found.sizes_px]
 
 
 def _owned(found: _Found, tile: PinholeView, tile_idx: int) -> _Found:

@@ -5,15 +5,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_grid, sample_panorama
+from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, ray_from_pixel, ray_grid, sample_panorama
 
 _ROUNDS = 10
 _FEWEST_PIXELS = 50
 # No camera's exposures differ by more; a fit that says so has met moved things or bare walls.
 _GAIN_LIMITS = 0.4, 2.5
+# What changes no grey level by more than this is none: wrong ranges and noise make as much of it.
+_LEAST_CHANGE = 2.0
+# A source is looked up between its pixels, which takes contrast away; so far from pixel centres along both axes the
+# reference loses as much on average (w (1 − w) is 1/6, its mean), and smoothing leaves little of either.
+_BETWEEN_PIXELS, _SMOOTHING_PX = 0.2113, 0.8
+# Colours beyond these are cut off, and what of it (255 is all) smoothing may bring into a pixel.
+_ENDS, _LARGEST_CUT_OFF = (3, 252), 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,13 +61,17 @@ def match_exposure(
         ranges: (h, w) rough ranges of the reference, at any resolution; NaN is left out.
         source_mask: (Hs, Ws) False is left out.
     """
-    rays = ray_grid((ranges.shape[0], ranges.shape[1]))
     known = np.isfinite(ranges)
-    rays, known_ranges = rays[known], ranges[known].astype(np.float64)
-    pixels = pixel_from_ray(source_from_reference.apply(rays * known_ranges[:, None]), source.shape[:2])
-    seen = sample_panorama(source, pixels)
-    wanted = sample_panorama(reference, pixel_from_ray(rays, reference.shape[:2]))
-    usable = ((seen > 3) & (seen < 252) & (wanted > 3) & (wanted < 252)).all(axis=-1)
+    size_hw = reference.shape[0], reference.shape[1]
+    ours = pixel_from_ray(ray_grid((ranges.shape[0], ranges.shape[1]))[known], size_hw)
+    ours = np.floor(ours) + 0.5 + _BETWEEN_PIXELS
+    points = ray_from_pixel(ours, size_hw) * ranges[known].astype(np.float64)[:, None]
+    pixels = pixel_from_ray(source_from_reference.apply(points), source.shape[:2])
+    seen, wanted = sample_panorama(_smooth(source), pixels), sample_panorama(_smooth(reference), ours)
+    cut_off = sample_panorama(_smooth(_at_an_end(source)), pixels) + sample_panorama(
+        _smooth(_at_an_end(reference)), ours
+    )
+    usable = cut_off[..., 0] < _LARGEST_CUT_OFF
     if source_mask is not None:
         usable &= sample_panorama(source_mask, pixels) > 0.999
     lines = [_robust_line(seen[usable, c], wanted[usable, c]) for c in range(seen.shape[-1])]
@@ -82,9 +94,25 @@ def _robust_line(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float,
             return 1.0, 0.0
         gain = float(np.sum(weight * (x - mean_x) * (y - mean_y))) / variance
         offset = float(mean_y - gain * mean_x)
-    if not _GAIN_LIMITS[0] < gain < _GAIN_LIMITS[1]:
+    darkest, brightest = np.quantile(x, [0.05, 0.95])
+    change = max(abs(gain * level + offset - level) for level in (darkest, brightest))
+    if not _GAIN_LIMITS[0] < gain < _GAIN_LIMITS[1] or change < _LEAST_CHANGE:
         return 1.0, 0.0
     return gain, offset
+
+
+def _at_an_end(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return 255 where a colour is so dark or so bright that it may have been cut off, (H, W, 1)."""
+    at_an_end = ((picture <= _ENDS[0]) | (picture >= _ENDS[1])).any(axis=-1, keepdims=True)
+    return np.where(at_an_end, np.uint8(255), np.uint8(0))
+
+
+def _smooth(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return a picture, (H, W, C), in which neither noise nor interpolation makes a difference to speak of."""
+    radius = int(np.ceil(3 * _SMOOTHING_PX))
+    padded = pad_panorama(picture, radius).astype(np.float32)
+    smooth = cv2.GaussianBlur(padded, (2 * radius + 1, 2 * radius + 1), _SMOOTHING_PX)
+    return np.asarray(smooth[radius:-radius, radius:-radius], np.float32).reshape(picture.shape)
 
 
 def shrink(picture: NDArray[np.uint8], rows: int) -> NDArray[np.uint8]:
