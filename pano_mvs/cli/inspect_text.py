@@ -88,8 +88,8 @@ def _verdict(found: Inspection) -> str:
     if np.isfinite(curve.range):
         text += f", between the planes {curve.range:.5g}"
     if curve.runner_up is not None:
-        text += (f", runner-up {curve.ranges[curve.runner_up]:.4g} at {curve.decisive[curve.runner_up]:.3f} "
-                 f"(the winner is {100 * curve.uniqueness:.0f} % cheaper)")  # fmt: skip
+        text += f"; next valley {curve.ranges[curve.runner_up]:.4g} at {curve.decisive[curve.runner_up]:.3f}"
+    text += f"; unique by {100 * curve.uniqueness:.0f} %"
     if np.isfinite(found.true_range) and np.isfinite(curve.range):
         text += f"; off the truth by {100 * (curve.range / found.true_range - 1):+.2f} %"
     return text

@@ -105,7 +105,7 @@ class _Panel:
         if curve.runner_up is not None:
             x, y = self.at(curve.runner_up, float(costs[curve.runner_up]))
             self.board.dot((x, y), _RIVAL, filled=False)
-            self.tag(f"runner-up {curve.ranges[curve.runner_up]:.4g}", x, max(y - 16, self.upper + 52), _RIVAL)
+            self.tag(f"next valley {curve.ranges[curve.runner_up]:.4g}", x, max(y - 16, self.upper + 52), _RIVAL)
         x, y = self.at(curve.winner, float(costs[curve.winner]))
         self.board.dot((x, y), _WINNER, filled=True)
         shown = curve.range if np.isfinite(curve.range) else curve.ranges[curve.winner]
@@ -122,8 +122,8 @@ def _write_title(board: DrawingBoard, found: Inspection) -> None:
     board.write(f"{found.image}, pixel ({found.column}, {found.row})", (24, 34), Letters(0.68, _INK))
     sure = f"confidence {curve.confidence}" if curve.confidence else "no range"
     board.write(f"{found.sweep}: {settings.cost}, window {settings.window}, {settings.combination}, "
-                f"{settings.aggregation}, {settings.planes} planes ({settings.spacing}); {sure}, the winner is "
-                f"{100 * curve.uniqueness:.0f} % cheaper than the runner-up",
+                f"{settings.aggregation}, {settings.planes} planes ({settings.spacing}); {sure}, "
+                f"unique by {100 * curve.uniqueness:.0f} %",
                 (24, 62), Letters(0.46, _FAINT))  # fmt: skip
 
 

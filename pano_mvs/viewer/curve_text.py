@@ -14,8 +14,8 @@ _MARGIN = 6
 _LABEL_STEP = 16
 # Eighths of a character, in terminals that have them, and whole ones in others.
 _EIGHTHS, _WHOLE = " ▁▂▃▄▅▆▇█", " #"
-_SIGNS = {"winner": "▲", "runner-up": "△", "truth": "◆"}
-_PLAIN_SIGNS = {"winner": "^", "runner-up": "o", "truth": "T"}
+_SIGNS = {"winner": "▲", "next valley": "△", "truth": "◆"}
+_PLAIN_SIGNS = {"winner": "^", "next valley": "o", "truth": "T"}
 
 
 def curve_text(curve: CostCurve, *, true_range: float = np.nan, width: int = 100, plain: bool = False) -> list[str]:
@@ -69,7 +69,7 @@ def _bars(heights: NDArray[np.float64], steps: str) -> NDArray[np.str_]:
 def _marks(curve: CostCurve, true_range: float) -> Mapping[str, int]:
     marks = {"winner": curve.winner}
     if curve.runner_up is not None:
-        marks["runner-up"] = curve.runner_up
+        marks["next valley"] = curve.runner_up
     if np.isfinite(true_range):
         marks["truth"] = int(np.abs(np.log(curve.ranges / true_range)).argmin())
     return marks

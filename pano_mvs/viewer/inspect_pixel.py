@@ -194,7 +194,10 @@ def _curve_notes(
     notes = []
     name = unit.entry.name
     if record is None:
-        notes.append(f"{name} of {unit.item} is not stored with these settings: the curve was computed for this alone")
+        notes.append(
+            f"{name} of {unit.item} is not in the cache as it would be computed now (other settings, pictures or "
+            "version): the curve was computed for this alone"
+        )
     if settings.levels > 1:
         notes.append(f"{name} goes from coarse to fine (levels: {settings.levels}) and tries a few ranges around a "
                      "guide; the curve tries all")  # fmt: skip

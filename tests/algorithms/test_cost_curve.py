@@ -93,6 +93,11 @@ def test_a_distinct_surface_has_a_sharp_curve_at_its_true_range():
         assert curve.decisive[curve.winner] == curve.decisive.min()
         assert curve.runner_up is not None
         assert abs(curve.runner_up - curve.winner) > 1
+        around = curve.decisive[max(0, curve.runner_up - 1) : curve.runner_up + 2]
+        assert curve.decisive[curve.runner_up] == around.min()
+        apart = np.abs(np.arange(48) - curve.winner) > 1
+        rival = curve.decisive[apart].min()
+        assert curve.uniqueness == pytest.approx(1 - curve.decisive.min() / rival, rel=1e-5)
     assert np.median(errors) < 0.05
     assert np.median(sharp) > 0.2
 

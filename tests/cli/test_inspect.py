@@ -86,7 +86,7 @@ def test_other_settings_are_tried_without_a_run(run: Path) -> None:
     found = inspected(run / "out", "000.png", 40, 28, "--set", "depth.cost=zncc", "--set", "depth.planes=40")
     assert len(found["curve"]["ranges"]) == 40
     assert [one["stage"] for one in found["stages"]] == ["boxed"]
-    assert "not stored with these settings" in found["notes"][0]
+    assert "not in the cache" in found["notes"][0]
     assert found["curve"]["range"] == pytest.approx(found["true_range"], rel=0.15)
 
 

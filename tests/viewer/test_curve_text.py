@@ -11,9 +11,8 @@ def curve(planes: int, winner: int, *, by_paths: bool = False) -> CostCurve:
     costs = 0.2 + 0.6 * np.minimum(np.abs(np.arange(planes) - winner) / 6, 1)
     costs[planes // 6] = 0.5
     ranges = 1 / np.linspace(1, 0.1, planes)
-    return CostCurve(
-        ranges, costs[None], costs, 3 * costs if by_paths else None, winner, planes // 6, ranges[winner], 99
-    )
+    sums = 3 * costs if by_paths else None
+    return CostCurve(ranges, costs[None], costs, sums, winner, planes // 6, 0.5, ranges[winner], 99)
 
 
 @pytest.mark.parametrize("planes", [24, 64, 128, 500])

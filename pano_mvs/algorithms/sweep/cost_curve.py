@@ -36,7 +36,9 @@ class CostCurve:
         aggregated: (D,) mean cost of the eight paths of semi-global matching, what steps between the planes cost
             included, so it may exceed 1; None if it is not asked for.
         winner: index of the range that wins.
-        runner_up: index of the cheapest range that is not next to the winner; None if there is none.
+        runner_up: index of the bottom of the deepest other valley; None if there is none.
+        uniqueness: how much cheaper the winner is than the best range that is not next to it, as a share of that one's
+            cost: 0 says that both are as good. The confidence "peak_ratio" is made of it.
         range: of the pixel, between the virtual ones as `selection` says; NaN if the sweep leaves it without.
         confidence: 64–127, or 0 where there is no range.
         reason: why it has no range; empty if it has.
@@ -48,6 +50,7 @@ class CostCurve:
     aggregated: FloatArray | None
     winner: int
     runner_up: int | None
+    uniqueness: float
     range: float
     confidence: int
     reason: str = ""
@@ -56,14 +59,6 @@ class CostCurve:
     def decisive(self) -> FloatArray:
         """The costs by which the winner was chosen, (D,)."""
         return self.raw if self.aggregated is None else self.aggregated
-
-    @property
-    def uniqueness(self) -> float:
-        """How much dearer the runner-up is than the winner, as a share of its cost: 0 says that both are as good."""
-        if self.runner_up is None:
-            return 1.0
-        rival = float(self.decisive[self.runner_up])
-        return (rival - float(self.decisive[self.winner])) / rival if rival > 0 else 0.0
 
 
 def cost_curve(work: SweepInput, *, column: int, row: int, masked: bool = False) -> CostCurve:
@@ -97,18 +92,32 @@ def cost_curve(work: SweepInput, *, column: int, row: int, masked: bool = False)
         seen=np.full((1, 1), not reason),
     )  # fmt: skip
     winner = int(winners.plane[0, 0])
-    apart = np.where(np.abs(np.arange(len(decisive)) - winner) <= 1, np.inf, decisive)
     return CostCurve(
         ranges=work.ranges,
         by_source=np.stack([_of_source(work, idx, row, column) for idx in range(len(work.sources))]) / worst,
         raw=raw / worst,
         aggregated=None if sums is None else sums / (_PATHS * _WORST),
         winner=winner,
-        runner_up=int(np.argmin(apart)) if np.isfinite(apart).any() else None,
+        runner_up=_other_valley(decisive, winner),
+        uniqueness=_uniqueness(float(winners.cost[0, 0]), float(winners.rival[0, 0])),
         range=float(found.range[0, 0]),
         confidence=int(found.confidence[0, 0]),
         reason=reason,
     )
+
+
+def _other_valley(costs: FloatArray, winner: int) -> int | None:
+    """Return where the deepest valley of a curve is that is not the winner's, or None if there is no other."""
+    padded = np.pad(costs, 1, constant_values=np.inf)
+    bottom = (costs <= padded[:-2]) & (costs <= padded[2:]) & (np.abs(np.arange(len(costs)) - winner) > 1)
+    valleys = np.flatnonzero(bottom)
+    return int(valleys[np.argmin(costs[valleys])]) if len(valleys) else None
+
+
+def _uniqueness(cost: float, rival: float) -> float:
+    if np.isinf(rival):
+        return 1.0
+    return (rival - cost) / rival if rival > 0 else 0.0
 
 
 def _of_source(work: SweepInput, idx: int, row: int, column: int) -> FloatArray:
