@@ -17,10 +17,10 @@ from pano_mvs.scene import RangeMap
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceRender:
-    """What is seen in a face; nothing of it comes from a masked pixel of the panorama.
+    """What is seen in a face; where its mask is True nothing of it comes from a masked pixel of the panorama.
 
     Attributes:
-        image: (h, w, 3) uint8 RGB, black where masked.
+        image: (h, w, 3) uint8 RGB; where masked, what the picture that was given shows there.
         mask: (h, w) bool, False where masked.
         z_depth: (h, w) float32 in scene units, NaN where unknown or masked.
         normals_in_face: (h, w, 3) float32 unit normals in the face's camera frame, towards the camera; NaN exactly
@@ -40,7 +40,7 @@ class FaceSource:
     """A panorama with its range map, made ready for the rendering of faces.
 
     Attributes:
-        image: (H, W, 3) uint8 RGB.
+        image: (H, W, 3) uint8 RGB, such as `Panorama.load`, which shows nothing masked.
         valid: (H, W) bool, False is masked.
         ranges: (H, W) float32, NaN where unknown, masked or of too little confidence.
         normals_in_cam: (H, W, 3) float32, NaN where unknown.
@@ -110,9 +110,7 @@ def render_face(
     normals[~known] = np.nan
     confidence = face_confidence(source.confidence, depth_view)
     confidence[~known] = 0
-    image = face_image(source.image, view)
-    image[~mask] = 0
-    return FaceRender(image, mask, z_depth, normals, confidence)
+    return FaceRender(face_image(source.image, view), mask, z_depth, normals, confidence)
 
 
 def colmap_depth_view(view: PinholeView) -> PinholeView:
