@@ -88,9 +88,9 @@ def _tour(scene: ShownScene, options: ViewOptions, size_wh: tuple[int, int]) -> 
     if cloud is not None:
         color_cloud(cloud, options.color, up=scene.up, unit=scene.unit)  # refuses what it cannot do
     points = cloud.points if cloud is not None else np.zeros((0, 3), np.float32)
-    if not len(points) and scene.mesh is not None:
-        points = mesh_points(scene.mesh)
-    tour = Tour(scene, cloud, box_of(points, scene.centers), aspect=size_wh[0] / size_wh[1])
+    corners = mesh_points(scene.mesh) if cloud is None and scene.mesh is not None else None
+    box = box_of(points if corners is None else corners, scene.centers)
+    tour = Tour(scene, cloud, box, aspect=size_wh[0] / size_wh[1], corners=corners)
     tour.see(options.view)
     tour.begin(color=options.color, labels=options.labels, blended=options.blended, backs=options.backs)
     return tour

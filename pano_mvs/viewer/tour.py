@@ -69,6 +69,7 @@ class Tour:
         cloud: the points that are drawn, or None.
         box: (2, 3) in which nearly all lies.
         aspect: width of the window as a multiple of its height.
+        corners: (N, 3) of a mesh, to measure between where there is no cloud; None if there is no mesh.
         state: what is shown now.
     """
 
@@ -76,6 +77,7 @@ class Tour:
     cloud: DrawnCloud | None
     box: FloatArray
     aspect: float = 1.5
+    corners: NDArray[np.float32] | None = None
     state: TourState = field(init=False)
 
     def __post_init__(self) -> None:
@@ -223,17 +225,17 @@ class Tour:
         return found if found != self.state.inside else None
 
     def _pick(self, start: FloatArray, direction: FloatArray) -> None:
-        if self.cloud is None:
+        points = self.cloud.points if self.cloud is not None else self.corners
+        if points is None:
             self.state = replace(self.state, message="there is no cloud to measure in")
             return
         height = self.state.viewpoint.height
-        normals = None if self.state.backs else self.cloud.normals
-        found = point_under(start, direction, self.cloud.points, normals=normals,
-                            parallel_reach=_PARALLEL_REACH * height)  # fmt: skip
+        normals = None if self.state.backs or self.cloud is None else self.cloud.normals
+        found = point_under(start, direction, points, normals=normals, parallel_reach=_PARALLEL_REACH * height)
         if found is None:
             self.state = replace(self.state, message="no point there: click on the cloud")
             return
-        point = self.cloud.points[found].astype(np.float64)
+        point = points[found].astype(np.float64)
         picked = (*self.state.picked, point) if len(self.state.picked) < 2 else (point,)
         self.state = replace(self.state, picked=picked)
         distance = self.distance

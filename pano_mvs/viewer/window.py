@@ -52,10 +52,10 @@ class SceneWindow:
         self._spheres: dict[int, Any] = {}
         self._surroundings: Any = None
         self._rims: Any = None
+        self._dots: Any = None
         self._legend = ""
         self._add_mesh()
         self._add_cloud()
-        self._add_dots()
         self._add_bar()
         self.plotter.add_axes(color=_INK, xlabel="x", ylabel="y", zlabel="z", line_width=2)
         self._hands = Hands(tour, seen_from=self.seen_from, update=self.update)
@@ -128,14 +128,6 @@ class SceneWindow:
             self._mesh = self.plotter.add_mesh(mesh, scalars="RGB" if colored else None, rgb=colored,
                                                color=None if colored else "#b8bcc4", name="mesh",
                                                reset_camera=False)  # fmt: skip
-
-    def _add_dots(self) -> None:
-        self._dots: Any = None
-        if len(self.tour.centers):
-            self._dots = self.plotter.add_points(
-                self.tour.centers, color=_DOTS, point_size=self._font * 0.7, render_points_as_spheres=False,
-                name="dots", reset_camera=False, pickable=False,
-            )  # fmt: skip
 
     def _add_bar(self) -> None:
         """Lay a line of known length along the lower front edge of the scene."""
@@ -218,8 +210,9 @@ class SceneWindow:
             self._texture_nearest(state.viewpoint.eye)
         for idx, actor in self._spheres.items():
             actor.SetVisibility(state.cameras and idx != state.inside)
-        self._rims.SetVisibility(state.cameras)
-        self._dots.SetVisibility(state.cameras and len(centers) > len(self._spheres))
+        for marks in (self._rims, self._dots):
+            if marks is not None:
+                marks.SetVisibility(state.cameras)
         self.plotter.remove_actor("names", render=False)
         named = [state.hovered] if state.hovered is not None else []
         if state.labels and state.cameras:
@@ -242,12 +235,23 @@ class SceneWindow:
             actor = sphere_actor(sphere_picture(camera, SMALL_WIDTH), camera.cam_from_world, self.tour.radius)
             self.plotter.add_actor(actor, name=f"camera {idx}", reset_camera=False)
             self._spheres[idx] = actor
-        shown = self.tour.centers[[idx for idx in sorted(wanted) if idx != self.tour.state.inside]]
+        self._mark(wanted)
+
+    def _mark(self, textured: set[int]) -> None:
+        """Give the spheres rims, and all other cameras dots."""
+        tour = self.tour
         self.plotter.remove_actor("rims", render=False)
-        if len(shown):
-            share = _RIM_INSIDE if self.tour.state.inside is not None else _RIM_OUTSIDE
-            self._rims = rims_actor(shown, share * self.tour.radius, _RIM)
+        self.plotter.remove_actor("dots", render=False)
+        share = _RIM_OUTSIDE if tour.state.inside is None else _RIM_INSIDE
+        rimmed = [idx for idx in sorted(textured) if idx != tour.state.inside]
+        self._rims = self._dots = None
+        if rimmed:
+            self._rims = rims_actor(tour.centers[rimmed], share * tour.radius, _RIM)
             self.plotter.add_actor(self._rims, name="rims", reset_camera=False, pickable=False)
+        others = np.delete(tour.centers, sorted(textured), axis=0)
+        if len(others):
+            self._dots = self.plotter.add_points(others, color=_DOTS, point_size=0.7 * self._font, name="dots",
+                                                 reset_camera=False, pickable=False)  # fmt: skip
 
     def _show_picked(self, state: TourState) -> None:
         for name in ("picked", "measured", "distance"):

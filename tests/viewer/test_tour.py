@@ -162,6 +162,11 @@ def test_a_tour_without_cloud_or_without_cameras_goes_on(tmp_path: Path) -> None
     bare.click(450, 300, SIZE)
     assert "no cloud" in bare.state.message
     assert not bare.key("c") or bare.state.coloring == "rgb"
+    bare.corners = np.float32([[0, 0, 0], [0, 0, 1]])
+    bare.see("top")
+    for corner in bare.corners:
+        bare.click(*place_of(corner, bare.state.viewpoint), SIZE)
+    assert bare.distance == pytest.approx(1)
     alone = tour_of(write_output(tmp_path / "alone", {}))
     alone.key("Right")
     alone.click(450, 300, SIZE)

@@ -209,6 +209,7 @@ def test_of_very_many_cameras_the_nearest_have_pictures(tmp_path: Path, windows:
     windows[-1].update()
     distances = np.linalg.norm(tour.centers - tour.centers[4321], axis=1)
     assert set(windows[-1]._spheres) == set(np.argsort(distances)[:TEXTURED].tolist())
+    assert windows[-1]._dots.mapper.dataset.n_points == 5000 - TEXTURED
 
 
 def test_a_lone_mesh_is_shown(tmp_path: Path, windows: list[SceneWindow]) -> None:
