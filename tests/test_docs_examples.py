@@ -6,7 +6,7 @@ import re
 import shlex
 import textwrap
 from contextlib import suppress
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,9 @@ FOLDERS = (
     "out/site/colmap/sparse/0",
     "colmap/sparse/0",
     "truth",
+    "videos",
 )
+FILES = ("walk.mp4", "mask.png")
 
 
 def blocks(language: str) -> list[Any]:
@@ -54,6 +56,9 @@ def commands(script: str) -> list[list[str]]:
 def parse(arguments: list[str]) -> None:
     """Parse a command line as the program does, down to the command that it calls, without calling it."""
     command: Any = typer.main.get_command(app)
+    if arguments[0] in ("--install-completion", "--show-completion"):  # would do so, here and now
+        assert any(arguments[0] in parameter.opts for parameter in command.params)
+        return
     context = command.make_context("pano-mvs", list(arguments))
     while getattr(command, "commands", None):
         name, command, arguments = command.resolve_command(context, [*context._protected_args, *context.args])
@@ -104,6 +109,8 @@ def folder(tmp_path: Path) -> Path:
     """A folder with what the pages' workflows read."""
     for name in FOLDERS:
         (tmp_path / name).mkdir(parents=True)
+    for name in FILES:
+        (tmp_path / name).touch()
     for name in ("my.yaml", "workflow.yaml"):
         (tmp_path / name).write_text("pano_mvs: 1\nextends: quickstart\n")
     for page in PAGES:
@@ -133,6 +140,6 @@ def test_every_setting_of_a_command_exists(
     monkeypatch.chdir(folder)
     for verb, *arguments in commands(script):
         if verb in ("run", "plan", "check") and not arguments[0].startswith("workflows/"):
-            changes = [word for name, value in pairwise(arguments) if name == "--set" for word in (name, value)]
-            result = CliRunner().invoke(app, ["check", arguments[0], *changes])
+            changes = [pair for pair in pairwise(arguments) if pair[0] in ("--set", "--images")]
+            result = CliRunner().invoke(app, ["check", arguments[0], *chain(*changes)])
             assert result.exit_code == 0, result.output
