@@ -84,9 +84,9 @@ def key_fields(params: Params) -> tuple[dict[str, Any], dict[str, list[Path]]]:
     for name, field in type(params).model_fields.items():
         marks = field.metadata
         value = getattr(params, name)
-        if any(isinstance(mark, _NotInKey) for mark in marks):
+        if _is_marked(field.annotation, marks, _NotInKey):
             continue
-        if _is_keyed_by_content(field.annotation, marks) and value is not None:
+        if _is_marked(field.annotation, marks, _KeyedByContent) and value is not None:
             paths[name] = _paths_in(value)
         elif part := next((mark for mark in marks if isinstance(mark, PartOf)), None):
             plain[name] = part.identity(value)
@@ -120,9 +120,9 @@ def _names_files(annotation: Any, marks: list[Any]) -> bool:
     return any(_names_files(part, [part]) for part in inner)
 
 
-def _is_keyed_by_content(annotation: Any, marks: list[Any]) -> bool:
-    """Look for the mark on the field itself and inside `InputPath | None`."""
-    if any(isinstance(mark, _KeyedByContent) for mark in marks):
+def _is_marked(annotation: Any, marks: list[Any], mark_type: type[_NotInKey | _KeyedByContent]) -> bool:
+    """Look for a mark on the field itself and inside of `InputPath | None` and the like."""
+    if any(isinstance(mark, mark_type) for mark in marks):
         return True
     inner = [*getattr(annotation, "__args__", ()), *getattr(annotation, "__metadata__", ())]
-    return any(isinstance(part, _KeyedByContent) or _is_keyed_by_content(part, []) for part in inner)
+    return any(isinstance(part, mark_type) or _is_marked(part, [], mark_type) for part in inner)

@@ -25,7 +25,7 @@ _TIME_IN_NAME = re.compile(r".*_(\d{8,})ms\.png")
 class VideoParams(Params):
     """Settings of source.video."""
 
-    path: Annotated[SourcePath | list[SourcePath], NOT_IN_KEY] = Field(
+    path: SourcePath | list[SourcePath] = Field(
         description="an equirectangular video, a list of them, or a folder of them"
     )
     every_s: float | None = Field(default=None, gt=0, description="seconds from one frame to the next; 1 by default")
@@ -39,9 +39,7 @@ class VideoParams(Params):
     max_frames: Annotated[int | None, NOT_IN_KEY] = Field(
         default=None, ge=2, description="of each video at most so many frames; the steps grow"
     )
-    mask: Annotated[SourcePath | None, NOT_IN_KEY] = Field(
-        default=None, description="one mask for all frames; 0 is ignored"
-    )
+    mask: SourcePath | None = Field(default=None, description="one mask for all frames; 0 is ignored")
     nadir_deg: float = Field(default=0.0, ge=0, le=90, description="ignore so much around straight down (operator)")
     zenith_deg: float = Field(default=0.0, ge=0, le=90, description="ignore so much around straight up")
     max_width: int = Field(default=4096, ge=16, description="wider frames are scaled down to this width")

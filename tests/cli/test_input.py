@@ -67,6 +67,8 @@ def test_a_video_is_read_once_and_only_what_is_new_again(pano_mvs: Command, tmp_
     stages = {stage["name"]: stage for stage in run_json(Path("out"))["stages"]}
     assert (stages["images"]["run"], stages["features"]["run"]) == (6, 6)
     assert "0 units computed" in pano_mvs(*run).text
+    explained = pano_mvs("plan", *run[1:2], "--cache", "cache", "--explain", "images:walk_00001000ms.png")
+    assert "figure   time_s: 1" in explained.text
 
     shorter = pano_mvs(*run, "--set", "images.end_s=1.2")
     assert shorter.code == 0
@@ -89,3 +91,22 @@ def test_a_folder_of_videos_is_pointed_to_the_other_source(pano_mvs: Command, tm
     settings = ("--set", "images.use=source.video", "--set", "pairs.use=pairs.sequential", "--until", "pairs")
     result = pano_mvs("run", "quickstart", "--images", tmp_path / "films", *settings, "--out", "out")
     assert result.code == 0, result.text
+
+
+def test_where_pictures_and_masks_lie_does_not_count(pano_mvs: Command, tmp_path: Path) -> None:
+    """The path of the masks was once part of the key."""
+    for folder in ("photos", "masks"):
+        (tmp_path / folder).mkdir()
+    for name in ("a", "b"):
+        cv2.imwrite(str(tmp_path / "photos" / f"{name}.png"), counted(ord(name)))
+        cv2.imwrite(str(tmp_path / "masks" / f"{name}.png"), np.full((64, 128), 255, np.uint8))
+    workflow = tmp_path / "look.yaml"
+    workflow.write_text(LOOK)
+    run = ("run", workflow, "--out", "out", "--cache", "cache")
+    assert pano_mvs(*run, "--set", f"images.masks={tmp_path / 'masks'}").code == 0
+    (tmp_path / "masks").rename(tmp_path / "elsewhere")
+    (tmp_path / "photos").rename(tmp_path / "pictures")
+    moved = ("--set", f"images.masks={tmp_path / 'elsewhere'}", "--set", f"images.path={tmp_path / 'pictures'}")
+    again = pano_mvs(*run, *moved)
+    assert again.code == 0, again.text
+    assert "0 units computed" in again.text
