@@ -114,7 +114,7 @@ def folder(tmp_path: Path) -> Path:
     for name in ("my.yaml", "workflow.yaml"):
         (tmp_path / name).write_text("pano_mvs: 1\nextends: quickstart\n")
     for page in PAGES:
-        for name, text in re.findall(r"Save this as `([^`/]+)`.*?```\w+\n(.*?)```", page.read_text(), re.DOTALL):
+        for name, text in re.findall(r"Save this\s+as `([^`/]+)`.*?```\w+\n(.*?)```", page.read_text(), re.DOTALL):
             (tmp_path / name).write_text(text)
     return tmp_path
 
