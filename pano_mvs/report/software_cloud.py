@@ -69,13 +69,14 @@ def _projected(
 def _spread(image: NDArray[np.uint8], nearest: NDArray[np.float64], side: int) -> NDArray[np.uint8]:
     """Let each drawn pixel cover a square, nearer ones over farther ones."""
     result, front = image.copy(), nearest.copy()
+    rows, columns = np.nonzero(np.isfinite(nearest))
+    depths, colors = nearest[rows, columns], image[rows, columns]
     for down in range(side):
         for along in range(side):
-            shifted = np.full_like(nearest, np.inf)
-            height, width = nearest.shape
-            shifted[down:, along:] = nearest[: height - down, : width - along]
-            nearer = shifted < front
-            front[nearer] = shifted[nearer]
-            rows, columns = np.nonzero(nearer)
-            result[rows, columns] = image[rows - down, columns - along]
+            inside = (rows + down < nearest.shape[0]) & (columns + along < nearest.shape[1])
+            below, right = rows[inside] + down, columns[inside] + along
+            nearer = depths[inside] < front[below, right]
+            below, right = below[nearer], right[nearer]
+            front[below, right] = depths[inside][nearer]
+            result[below, right] = colors[inside][nearer]
     return result
