@@ -138,7 +138,8 @@ def test_links_lead_to_where_files_are_in_the_site(text: str, shown: str) -> Non
 
 def test_every_page_is_in_the_navigation() -> None:
     settings = YAML(typ="safe").load(ROOT / "mkdocs.yml")
-    listed = set(re.findall(r"[\w/]+\.md", str(settings["nav"])))
+    entries = re.findall(r"[\w/]+\.md", str(settings["nav"]))
+    assert len(entries) == len(listed := set(entries)), "a page is there twice"
     written = {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").glob("**/*.md")}
     assert written <= listed
     made = {f"reference/{name}.md" for name in ("stages", "presets", "commands", "api", "conventions")}
