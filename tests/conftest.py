@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 
+# pycolmap's wheel shows its own zlib to whatever is loaded after it: if that is OpenCV, writing a PNG ends the process.
+import cv2  # noqa: F401
+
 # A worker takes longer to start than most of the small runs in here take; tests of the executors name theirs.
 os.environ.setdefault("PANO_MVS_EXECUTOR", "serial")
 # PyVista takes seconds to start; the tests of its pictures name it.

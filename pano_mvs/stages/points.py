@@ -14,7 +14,7 @@ from pano_mvs.scene.tracked_points import TrackedPoints
 class SurfaceParams(Params):
     """Settings of points.surface."""
 
-    count: int = Field(default=20_000, ge=1, description="directions, evenly spread, that are looked at in each view")
+    count: int = Field(default=80_000, ge=1, description="directions, evenly spread, that are looked at in each view")
     min_confidence: int = Field(default=128, ge=1, le=255, description="ranges below are not used (128: consistent)")
 
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pycolmap
 import pytest
@@ -23,6 +27,17 @@ def cuts(layout="cube", names=NAMES):
     faces = FACES[layout]
     views = [face.view for face in faces]
     return {name: CutPanorama(views, [f"{face.name}/{name}.jpg" for face in faces]) for name in names}
+
+
+def test_opencv_is_loaded_before_pycolmap():
+    """The other way round OpenCV's PNG writer frees with pycolmap's zlib what it got from its own, and dies."""
+    code = (
+        "import sys, pano_mvs.api; assert 'cv2' in sys.modules and 'pycolmap' not in sys.modules;"
+        "import numpy as np, pycolmap; from pathlib import Path; from pano_mvs.api import write_png;"
+        "[write_png(Path(sys.argv[1]), np.random.default_rng(n).integers(0, 255, (300, 300, 3)).astype(np.uint8))"
+        " for n in range(9)]"
+    )
+    subprocess.run([sys.executable, "-c", code, os.devnull], check=True)
 
 
 @pytest.mark.parametrize("shape", [(3, 5), (3, 5, 3)])

@@ -16,7 +16,7 @@ def sample_surface(
     valid: NDArray[np.bool_],
     range_map: RangeMap,
     *,
-    count: int = 20_000,
+    count: int = 80_000,
     min_confidence: int = 128,
 ) -> SurfaceSamples:
     """Return points of the surfaces that a view sees, one for each of `count` evenly spread directions.
