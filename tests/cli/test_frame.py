@@ -7,6 +7,7 @@ import struct
 import zlib
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -17,7 +18,7 @@ from pano_mvs.io.pose_files import read_poses
 from pano_mvs.io.range_files import read_range_tiff
 from tests.algorithms.synthetic_capture import random_rotation
 from tests.cli.conftest import SMALL, Command, run_json
-from tests.io.pictures import exif, full_sphere, xmp
+from tests.io.pictures import app1, exif, full_sphere, xmp
 from tests.test_docs_frames import block
 
 UP = np.array([0.0, -1.0, 0.0])
@@ -169,3 +170,46 @@ def test_settings_that_contradict_each_other_are_found_before_anything_runs(
     result = pano_mvs("check", workflow)
     assert result.code == 2
     assert problem in result.flat
+
+
+@pytest.mark.slow
+def test_cropped_photographs_alone_give_a_level_world_in_metres_and_north(pano_mvs: Command, capture: Path) -> None:
+    """Nothing is known but the pictures: JPEGs without poles, with attributes for metadata; a unit is 60 m."""
+    truth = true_poses(capture)
+    for name, pose in truth.items():
+        path = capture / "images" / name
+        picture = cv2.imread(str(path))
+        height, width = picture.shape[:2]
+        edge = height // 10
+        up = pose.rotation @ UP
+        fields = full_sphere(
+            height, width, CroppedAreaTopPixels=edge, CroppedAreaImageHeightPixels=height - 2 * edge,
+            PosePitchDegrees=np.rad2deg(np.arctan2(up[2], -up[1])), PoseRollDegrees=np.rad2deg(-np.arcsin(up[0])),
+        )  # fmt: skip
+        latitude, longitude, altitude = lla_from_local(60 * pose.center, [-47.5, -8.25, 410.0])
+        angles = [((int(abs(a)), 1), (0, 1), (round((abs(a) % 1) * 3600e6), 10**6)) for a in (latitude, longitude)]
+        position = exif(">", refs=(b"S", b"W", 0), latitude=angles[0], longitude=angles[1],
+                        altitude=(round(altitude * 1000), 1000))  # fmt: skip
+        data = bytes(cv2.imencode(".jpg", picture[edge : height - edge], [cv2.IMWRITE_JPEG_QUALITY, 97])[1])
+        packet = b"http://ns.adobe.com/xap/1.0/\0" + xmp(fields, form="attribute")
+        path.with_suffix(".JPG").write_bytes(data[:2] + app1(b"Exif\0\0" + position) + app1(packet) + data[2:])
+        path.unlink()
+    workflow = capture.parent / "alone.yaml"
+    workflow.write_text(f"""
+pano_mvs: 1
+stages:
+  images:   {{use: source.folder, path: {capture / "images"}}}
+  features: {{use: features.sift_tangent, max_keypoints: 2000}}
+  pairs:    {{use: pairs.exhaustive}}
+  matches:  {{use: matches.brute_force}}
+  poses:    {{use: poses.scaled_translation}}
+  refined:  {{use: poses.refine}}
+  metres:   {{use: poses.scale, gps: true, align: gps, gps_noise_m: 0.5}}
+""")
+    result = pano_mvs("run", workflow, "--out", "out")
+    assert result.code == 0, result.text
+    told = run_json(Path("out"))["poses"]
+    assert told["registered"] == [f"00{number}.JPG" for number in range(4)]
+    assert told["frame"].startswith("x east, y down, z north, by GPS")
+    expected = np.array([60 * pose.center for pose in truth.values()])
+    np.testing.assert_allclose(told["centers"], expected - expected[0] + told["centers"][0], atol=0.5)

@@ -70,8 +70,8 @@ def test_a_jpeg_may_have_them_behind_megabytes_of_other_segments(tmp_path: Path)
 
 def test_an_extended_packet_is_joined_from_its_pieces(tmp_path: Path) -> None:
     """Adobe's XMP specification, part 3, section 1.1.3.1: pieces in any order, each with its offset."""
-    long = PACKET.replace(b"</rdf:RDF>", b"<!--" + b"x" * 150_000 + b"--></rdf:RDF>")
-    offsets = [0, 130_000, 65_000]
+    long = PACKET.replace(b"<rdf:Description", b"<!--" + b"x" * 150_000 + b"--><rdf:Description")
+    offsets = [130_000, 0, 65_000]
     pieces = [b"G" * 32 + struct.pack(">II", len(long), at) + long[at : at + 65_000] for at in offsets]
     extended = b"".join(app1(b"http://ns.adobe.com/xmp/extension/\0" + piece) for piece in pieces)
     main = b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><other/></x:xmpmeta>'
