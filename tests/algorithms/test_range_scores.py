@@ -170,6 +170,16 @@ class TestBestConstant:
                                 method="bounded", options={"xatol": 1e-10})  # fmt: skip
         assert best_constant_errors(true, weight)[name] == pytest.approx(found.fun, rel=1e-6)
 
+    def test_what_lies_just_at_a_limit_is_judged_as_the_scores_do(self):
+        """1 and 1.25² are each 1.25 times from 1.25, which is not below; 1 and 3 are each 50 % from 1.5, not above."""
+        even = np.ones(2)
+        found = best_constant_errors(np.array([1.0, 1.5625]), even)
+        assert (found["delta_125"], found["delta_125_2"]) == (0.5, 1)
+        assert best_constant_errors(np.array([1.0, 3.0]), even, bad=BAD)["bad_50"] == 0
+        assert best_constant_errors(np.array([1.0, 3.001]), even, bad=BAD)["bad_50"] == 0.5
+        length = (BadLimit(0.5, relative=False),)
+        assert best_constant_errors(np.array([1.0, 2.0]), even, bad=length)["bad_abs_0.5"] == 0
+
     @pytest.mark.parametrize("seed", range(5))
     def test_the_median_too(self, seed):
         rng = np.random.default_rng(seed)
