@@ -105,3 +105,9 @@ def test_a_tiff_whose_directory_stands_behind_its_pixels(tmp_path: Path) -> None
     data = bytes(cv2.imencode(".tif", noise)[1])
     assert read_container(data).size_hw == (64, 128)
     assert read_container(data[:-200]).size_hw is None
+
+
+def test_chunks_of_odd_length_are_padded_in_a_webp(tmp_path: Path) -> None:
+    (tmp_path / "a.webp").write_bytes(by_pillow(SIZE, "WEBP", exif=exif() + b"\0", xmp=PACKET, lossless=True))
+    assert len(read_container((tmp_path / "a.webp").read_bytes()).xmp) == 1
+    assert describe_picture(tmp_path / "a.webp").gpano == EXPECTED
