@@ -65,6 +65,11 @@ class CameraMap:
     north: bool = False
 
     @property
+    def radius(self) -> float:
+        """The radius at which a camera is drawn."""
+        return 4.5 if len(self.cameras) <= _MOST_LABELS else 2.5
+
+    @property
     def rejected(self) -> int:
         """The number of rejected pairs that are drawn."""
         return sum(link.rejected for link in self.links)
@@ -174,19 +179,30 @@ def _drawn(
 
 
 def _label_spots(placed: FloatArray, labels: list[str]) -> list[tuple[float, float] | None]:
-    """Return where each label goes, below one another where cameras coincide; none where there are too many."""
+    """Return where each label begins: beside its camera, where no other is; none where there is no such place.
+
+    Where there are too many cameras none has a label.
+    """
     if len(labels) > _MOST_LABELS:
         return [None] * len(labels)
-    taken: list[tuple[float, float]] = []
+    found: list[tuple[float, float] | None] = []
+    taken: list[tuple[float, float, float]] = []
     for (x, y), label in zip(placed, labels, strict=True):
-        spot = (float(x) + 9, float(y) - 7)
-        half = 4.6 * len(label)
-        if spot[0] + 2 * half > _WIDTH:
-            spot = (float(x) - 9 - 1.8 * half, spot[1])
-        while any(abs(spot[0] - other[0]) < 2 * half and abs(spot[1] - other[1]) < 15 for other in taken):
-            spot = (spot[0], spot[1] + 15)
-        taken.append(spot)
-    return list(taken)
+        wide = 8.4 * len(label)
+        spots = [(float(x) + across, float(y) + down) for across in (9, -9 - wide) for down in (-7, 17, 32)]
+        free = (spot for spot in spots if _fits(spot, wide, taken))
+        found.append(next(free, None))
+        if found[-1] is not None:
+            taken.append((*found[-1], wide))
+    return found
+
+
+def _fits(spot: tuple[float, float], wide: float, taken: list[tuple[float, float, float]]) -> bool:
+    """Return whether a label is within the map and covers none that is there."""
+    left, y = spot
+    if left < 2 or left + wide > _WIDTH - 2:
+        return False
+    return all(left + wide < other or other + width < left or abs(y - line) >= 15 for other, line, width in taken)
 
 
 def _round_length(longest: float) -> float:

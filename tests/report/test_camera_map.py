@@ -83,6 +83,20 @@ def test_north_is_shown_where_the_levelled_frame_says_it(tiny):
         assert up_of({"frame": level.frame, "up": [1, 0, 0]}).tolist() == [0, -1, 0]
 
 
+def test_labels_stand_beside_their_cameras_and_cover_no_other():
+    """Of cameras in a row too close for their names some go without one, rather than with one far away."""
+    names = [f"R{number:07d}.jpg" for number in range(10210, 10240)]
+    above, _ = camera_maps({"registered": names, "centers": [[0.3 * idx, 0, 0.02 * idx] for idx in range(30)]})
+    spots = [(spot, (x, y)) for x, y, _, spot in above.cameras if spot is not None]
+    assert 8 <= len(spots) < 30
+    wide = 8.4 * 8
+    for idx, ((left, line), (x, y)) in enumerate(spots):
+        assert abs(line - y) <= 32
+        assert min(abs(left - x), abs(left + wide - x)) <= 9.5
+        for (other, other_line), _ in spots[:idx]:
+            assert abs(left - other) > wide or abs(line - other_line) >= 15
+
+
 @pytest.mark.parametrize(
     "centers", [[[0, 0, 0]] * 3, [[0, 0, 0], [0, 1e-12, 0], [0, 0, 0]], [[0, 0, 0], [1e6, 0, 0], [2e6, 0, 0]]]
 )
