@@ -1,5 +1,7 @@
 """The scores that are kept with a run: names that stay, constants beside them, truth of another size."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -52,3 +54,7 @@ def test_what_cannot_be_judged_has_no_score():
     assert all(np.isfinite(value) for value in found.values())
     missing = score_capture(POSES, POSES, {"a": nothing}, {"a": lambda: None})
     assert (missing.views, missing.notes) == ({}, ("a: no true range map",))
+    flat = np.full((8, 16), 2.0, np.float32)
+    perfect = scored(flat, flat)
+    assert not {"psnr_db", "constant_psnr_db"} & set(perfect.views["a"])
+    json.dumps(perfect.views, allow_nan=False)

@@ -75,7 +75,10 @@ def score_capture(
 def _view_scores(
     estimated: NDArray[np.float32], truth: NDArray[np.float32], scale: float, confidence: NDArray[np.uint8] | None
 ) -> dict[str, float]:
-    """Return the scores that are kept with a run, then what constants score under each of these names."""
+    """Return the scores that are kept with a run, then what constants score under each of these names.
+
+    What is no finite number (the median of nothing, the PSNR of no error) is left out: records hold none.
+    """
     size_hw = truth.shape[0], truth.shape[1]
     if confidence is not None:
         confidence = resized_labels(np.asarray(confidence), size_hw)
@@ -83,7 +86,5 @@ def _view_scores(
     scores = {name: found.scores[name] for name in (*KEPT, *KEPT_OF_CONFIDENCE) if name in found.scores}
     for prefix, constants in (("constant_", found.constants["median"]), ("best_constant_", found.constants["best"])):
         scores |= {f"{prefix}{name}": constants[name] for name in (*KEPT, "ause") if name in constants}
-    left_out = {"constant_completeness", "best_constant_completeness"} | {
-        name for name, value in scores.items() if np.isnan(value)
-    }
-    return {name: value for name, value in scores.items() if name not in left_out}
+    always = {"constant_completeness", "best_constant_completeness"}
+    return {name: value for name, value in scores.items() if np.isfinite(value) and name not in always}
