@@ -92,15 +92,23 @@ def describe_video(path: Path) -> VideoInfo:
     return VideoInfo((height, width), int(count), float(rate), is_turned)
 
 
-def frames_between(path: Path, begin_s: float, end_s: float) -> Iterator[tuple[float, NDArray[np.uint8]]]:
+def frames_between(
+    path: Path, begin_s: float, end_s: float, *, threads: int = 1
+) -> Iterator[tuple[float, NDArray[np.uint8]]]:
     """Yield the frames from one time to another, both included, each with its time in seconds; (H, W, 3) uint8 BGR.
 
     A frame that is damaged so much that nothing can be decoded ends what is yielded.
 
+    Args:
+        path: the video.
+        begin_s: the earliest time, from the start of the video.
+        end_s: the latest.
+        threads: of the decoder; each of them may hold a frame of its own.
+
     Raises:
         InputError: if the video cannot be opened, or its time stamps do not increase.
     """
-    with _opened(path) as capture:
+    with _opened(path, threads) as capture:
         previous = -1.0
         has_frame = _seek(capture, begin_s)
         while has_frame:
@@ -135,10 +143,10 @@ def _seek(capture: cv2.VideoCapture, time_s: float) -> bool:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
+def _opened(path: Path, threads: int = 1) -> Iterator[cv2.VideoCapture]:
     if not path.is_file():
         raise InputError(f"{path}: no such video")
-    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, threads])
     try:
         if not capture.isOpened():
             raise InputError(f"{path}: cannot be opened as a video: it is none, is damaged, or the recording was not "

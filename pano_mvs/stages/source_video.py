@@ -81,7 +81,7 @@ def video(item: SourceItem, params: VideoParams, ctx: Context) -> Panorama:
     info = describe_video(path)
     if info.is_turned:
         ctx.note(f"{path.name} tells players to turn it, which was ignored: frames are taken as they are stored")
-    time_s, quality, frame = _best_frame(path, _time_from_name(item.name), params, info)
+    time_s, quality, frame = _best_frame(path, _time_from_name(item.name), params, info, threads=ctx.threads)
     if is_dual_fisheye(frame):
         raise InputError(_dual_fisheye(path))
     ctx.metric("time_s", time_s)
@@ -136,7 +136,7 @@ def _steps(info: VideoInfo, params: VideoParams) -> list[float]:
 
 
 def _best_frame(
-    path: Path, time_s: float, params: VideoParams, info: VideoInfo
+    path: Path, time_s: float, params: VideoParams, info: VideoInfo, *, threads: int
 ) -> tuple[float, float, NDArray[np.uint8]]:
     """Return the time, the sharpness and the picture (BGR) of the frame to take around a time.
 
@@ -146,7 +146,7 @@ def _best_frame(
     reach_s = max(params.step_s(info) / 4, 0.51 / info.frames_per_s)
     best: tuple[float, float, NDArray[np.uint8]] | None = None
     least = np.inf
-    for found_s, frame in frames_between(path, time_s - reach_s, time_s + reach_s):
+    for found_s, frame in frames_between(path, time_s - reach_s, time_s + reach_s, threads=threads):
         quality = sharpness(frame)
         badness = -quality if params.pick == "sharpest" else abs(found_s - time_s)
         if best is None or badness < least:
