@@ -1,9 +1,8 @@
 """Pictures of the documentation, from a run of the quickstart and the pictures that the program itself makes of it.
 
     pano-mvs run quickstart
-    pano-mvs view out/quickstart --screenshot view.png
     pano-mvs inspect quickstart 000.png 620 330 --plot inspect.png
-    python docs/_pictures/quickstart_pictures.py out/quickstart view.png inspect.png
+    python docs/_pictures/quickstart_pictures.py out/quickstart inspect.png
 
 The picture of the report is one of a browser's window of 1200×1000 pixels.
 """
@@ -77,10 +76,9 @@ def beside(preview: Picture, cloud: Picture) -> Picture:
 
 
 if __name__ == "__main__":
-    out, view, inspect = map(Path, sys.argv[1:])
+    out, inspect = map(Path, sys.argv[1:])
     preview, cloud = cv2.imread(str(out / "preview" / "000.jpg")), cloud_picture(out / "cloud.ply")
     write("quickstart_preview.jpg", scaled(preview))
     write("quickstart_confidence.jpg", confidence_picture(out / "confidence" / "000.png"))
-    write("quickstart_view.jpg", cv2.imread(str(view)))
     write("inspect.jpg", cv2.imread(str(inspect)))
     write("quickstart.jpg", beside(preview, cloud))
