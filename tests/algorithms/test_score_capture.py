@@ -56,5 +56,5 @@ def test_what_cannot_be_judged_has_no_score():
     assert (missing.views, missing.notes) == ({}, ("a: no true range map",))
     flat = np.full((8, 16), 2.0, np.float32)
     perfect = scored(flat, flat)
-    assert not {"psnr_db", "constant_psnr_db"} & set(perfect.views["a"])
+    assert "constant_psnr_db" not in perfect.views["a"]  # it would be infinite
     json.dumps(perfect.views, allow_nan=False)

@@ -54,9 +54,11 @@ class CloudDistances:
 
     def quantiles(self, surface: TrueSurface, shares: Sequence[float] = (0.5, 0.9)) -> dict[str, tuple[float, ...]]:
         """Return the quantiles of both: "accuracy" of all points alike, "completeness" by area; NaN of nothing."""
-        alike = np.ones(len(self.of_points))
+        count = len(self.of_points)
+        at = [max(0, int(np.ceil(share * count - 1e-9)) - 1) for share in shares]
+        ordered = np.partition(self.of_points, at) if count else np.full(1, np.nan)
         return {
-            "accuracy": tuple(weighted_quantile(self.of_points, alike, share) for share in shares),
+            "accuracy": tuple(float(ordered[idx]) for idx in at),
             "completeness": tuple(weighted_quantile(self.of_surface, surface.area, share) for share in shares),
         }
 
