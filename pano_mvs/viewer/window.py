@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -97,10 +97,11 @@ class SceneWindow:
             self._reload_points(state)
         if before is None or before.inside != state.inside:
             self._surround(state.inside)
-        self._show_cloud(state, before)
-        self._show_cameras(state, before)
-        self._show_picked(state)
-        self._show_texts(state)
+        if before is None or before.viewpoint.eye is not state.viewpoint.eye or not _looks_elsewhere(before, state):
+            self._show_cloud(state, before)
+            self._show_cameras(state, before)
+            self._show_picked(state)
+            self._show_texts(state)
         self.plotter.suppress_rendering = False
         self.plotter.renderer.ResetCameraClippingRange()
         self.plotter.render()
@@ -282,3 +283,9 @@ class SceneWindow:
         self._overlay.text([title, news], "upper_left")
         self._overlay.text([self._legend, "   ".join([*counts, "h: keys"])], "lower_right")
         self._overlay.help(wanted=state.help)
+
+
+def _looks_elsewhere(before: TourState, state: TourState) -> bool:
+    """Return whether nothing but the viewpoint is another one."""
+    names = (field.name for field in fields(TourState) if field.name != "viewpoint")
+    return all(getattr(before, name) is getattr(state, name) for name in names)

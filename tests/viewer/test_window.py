@@ -11,7 +11,7 @@ import pytest
 
 from pano_mvs.geometry import Rigid3
 from pano_mvs.viewer.cloud_colors import drawn_cloud
-from pano_mvs.viewer.display import quiet_vtk
+from pano_mvs.viewer.display import quiet_vtk, require_drawing
 from pano_mvs.viewer.shown_scene import open_scene
 from pano_mvs.viewer.tour import Tour, box_of
 from pano_mvs.viewer.viewpoint import Viewpoint
@@ -25,6 +25,7 @@ SIZE = (900, 600)
 
 @pytest.fixture
 def windows() -> Iterator[list[SceneWindow]]:
+    require_drawing()  # else VTK takes the tests down with it
     quiet_vtk()
     opened: list[SceneWindow] = []
     yield opened

@@ -41,10 +41,9 @@ def _compiled_costs(work: SweepInput, rows: NDArray[np.intp], columns: NDArray[n
     shared = shared_arguments(work)
     costs = np.empty((len(work.ranges), len(rows)), np.float32)
     for run in runs_of(tile_means(wanted) > 0, (height, width), shared):
-        here = np.zeros((height, width), np.bool_)
-        here[run.place] = True
-        own = np.flatnonzero(here[rows, columns])
-        place = rows[own] - run.first, columns[own] - run.start + run.margin
+        down, across = rows - run.first, columns - run.start
+        own = np.flatnonzero((down >= 0) & (down < run.rows) & (across >= 0) & (across < run.columns))
+        place = down[own], across[own] + run.margin
         arguments = run_arguments(shared, run)
         for idx in range(len(work.ranges)):
             state, planes = _fresh_state(run.rows, run.columns + 2 * run.margin)
