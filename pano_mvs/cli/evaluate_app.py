@@ -17,7 +17,7 @@ evaluate_app = typer.Typer(
     no_args_is_help=True,
 )
 
-_FILES = "Folder of range maps (.tiff, .exr, .npy, .npz, 16-bit .png, paired by path without extension) or .npz file"
+_FILES = "a folder of range maps (.tiff, .exr, .npy, .npz, 16-bit .png; paired by path), or an .npz file"
 
 
 @evaluate_app.command("run")
@@ -81,8 +81,8 @@ def evaluate_points(
 @evaluate_app.command("depth")
 @guarded
 def evaluate_ranges(
-    source: Annotated[Path, typer.Argument(help=f"The output folder of a run. {_FILES}.")],
-    truth: Annotated[Path, typer.Option("--truth", help=f"Folder with poses.json and depth.npz. {_FILES}.")],
+    source: Annotated[Path, typer.Argument(help=f"The output folder of a run, {_FILES}.")],
+    truth: Annotated[Path, typer.Option("--truth", help="Folder with poses.json and depth.npz, or any of these.")],
     out: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option("--out", help="Folder for a picture of each view's errors, scores.json and scores.csv."),

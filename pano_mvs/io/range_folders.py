@@ -91,18 +91,17 @@ def find_ranges(path: Path, *, unit: float = 1.0) -> dict[str, RangeFile]:
             f"{path}: no such folder or .npz file. Give the output folder of a run, or a folder of range maps"
         )
     folder = path / "range" if (path / "range").is_dir() else path
-    files = sorted(
-        (file for file in folder.rglob("*") if file.suffix.lower() in RANGE_SUFFIXES and not file.name.startswith(".")),
-        key=lambda file: (file.relative_to(folder).as_posix(), RANGE_SUFFIXES.index(file.suffix.lower())),
-    )
+    files = [
+        file for file in folder.rglob("*") if file.suffix.lower() in RANGE_SUFFIXES and not file.name.startswith(".")
+    ]
     if [file.name for file in files if file.suffix == ".npz"] == ["depth.npz"]:
         return _in_archive(next(file for file in files if file.suffix == ".npz"), unit)
     found: dict[str, RangeFile] = {}
-    for file in sorted(files, key=lambda file: RANGE_SUFFIXES.index(file.suffix.lower())):
+    for file in sorted(files, key=lambda file: (RANGE_SUFFIXES.index(file.suffix.lower()), file)):
         name = file.relative_to(folder).with_suffix("").as_posix()
         confidence = path / "confidence" / f"{name}.png"
-        here = confidence if folder != path and confidence.is_file() else None
-        found.setdefault(name, RangeFile(file, unit=unit, confidence_path=here))
+        of_run = folder != path and confidence.is_file()
+        found.setdefault(name, RangeFile(file, unit=unit, confidence_path=confidence if of_run else None))
     if not found:
         raise InputError(f"{folder}: no range maps here. They may be {', '.join(RANGE_SUFFIXES)}")
     return dict(sorted(found.items()))
