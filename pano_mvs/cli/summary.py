@@ -162,13 +162,17 @@ def _up(poses: Poses) -> list[float] | None:
 
 
 def _result_stages(run: Run) -> dict[str, str]:
-    """Return which stage made what the report shows: the last one, of the first chain, that made anything."""
+    """Return which stage made what the report shows: the last one, of the first chain, that made anything.
+
+    Where a run did not get to its end, a stage that had hardly begun does not hide what the one before had made.
+    """
     found: dict[str, str] = {}
     for role, kind in _ROLES.items():
-        chain = reversed(chain_of(run.workflow, run.graph, kind))
-        made = (name for name in chain if name in run.states and run.states[name].items)
-        if (name := next(made, None)) is not None:
-            found[role] = name
+        chain = chain_of(run.workflow, run.graph, kind)
+        made = {name: len(run.states[name].items) for name in chain if name in run.states and run.states[name].items}
+        least = max(made.values(), default=0) / 2 if run.result.stopped else 0
+        if names := [name for name, count in made.items() if count >= least]:
+            found[role] = names[-1]
     return found
 
 
@@ -184,7 +188,8 @@ def _scores(run: Run) -> dict[str, Any]:
 
 
 def _views(run: Run, result: RunResult) -> list[dict[str, Any]]:
-    stage = _last_stage_of(run, result, RangeMap)
+    name = _result_stages(run).get("ranges")
+    stage = next((summary for summary in result.stages if summary.name == name), None)
     if stage is None or run.states[stage.name].axis is not Axis.VIEW:
         return []
     previews: dict[str, str] = {}

@@ -22,13 +22,14 @@ from pano_mvs.report.findings import (
 )
 from pano_mvs.report.residuals import Residuals
 
+_INTERRUPTED = 130
 _OUTCOMES = {
     0: ("good", "Finished"),
     1: ("bad", "Stopped by an internal error"),
     2: ("bad", "Stopped: the workflow or an input cannot be used"),
     3: ("fair", "Finished, with failed items"),
     4: ("bad", "Stopped by a quality gate or a guard"),
-    130: ("fair", "Interrupted"),
+    _INTERRUPTED: ("fair", "Interrupted"),
 }
 _JUDGEMENTS = {
     "good": "The result looks sound.",
@@ -94,7 +95,10 @@ def verdict(
     moods = {mood, *(tile.mood for tile in tiles), *(finding.mood for finding in found)}
     overall = next((name for name in ("bad", "fair", "good") if name in moods), "good")
     judged = any(tile.mood for tile in tiles) or overall == "bad"
-    return Verdict(overall, outcome, _JUDGEMENTS[overall] if judged else "", _sentence(summary), tuple(tiles), found)
+    judgement = _JUDGEMENTS[overall] if judged else ""
+    if code == _INTERRUPTED and overall != "bad":
+        judgement = "Not finished."
+    return Verdict(overall, outcome, judgement, _sentence(summary), tuple(tiles), found)
 
 
 def _sentence(summary: Mapping[str, Any]) -> str:

@@ -117,3 +117,26 @@ def test_a_run_that_does_nothing_leaves_the_report_before(pano_mvs: Command, toy
     assert run(pano_mvs, toy) not in (0, 3)
     assert (toy.folder / "out" / "report.html").read_bytes() == before
     assert json.loads((toy.folder / "out" / "run.json").read_text())["exit_code"] == 0
+
+
+def test_what_an_interrupted_run_had_made_is_shown(
+    pano_mvs: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The filter behind was interrupted before its first view: the views are those of the stage before it."""
+
+    def interrupted(*_args: object, **_options: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pano_mvs.stages.filters.fast_bilateral_solver", interrupted)
+    write_capture(tmp_path / "capture", default_room(), capture_poses(2, spread=0.4), (32, 64))
+    truth = tmp_path / "capture" / "truth"
+    result = pano_mvs("run", "known_poses", "--images", tmp_path / "capture" / "images", "--out", "out", "--cache", "c",
+                      "--set", f"poses.path={truth / 'poses.json'}", "--set", f"scores.truth={truth}",
+                      "--set", "depth.planes=8", "--set", "features.max_keypoints=200")  # fmt: skip
+    assert result.code == 130
+    summary = run_json(Path("out"))
+    assert summary["results"]["ranges"] == "checked"
+    assert [view["name"] for view in summary["views"]] == ["000.png", "001.png"]
+    page = page_in(Path("out"))
+    assert "Not finished." in page.words
+    assert sum(": the panorama" in str(alt) for alt in pictures(page)) == 2
