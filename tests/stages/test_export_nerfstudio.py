@@ -26,6 +26,7 @@ from pano_mvs.stages.export_nerfstudio import (
 )
 from pano_mvs.testing.room import default_room, range_along
 from pano_mvs.testing.tiny_capture import TinyCapture, Variant, tiny_capture
+from tests.oracles.nerfstudio import documented_rays, world_points
 
 HEIGHT, WIDTH = 192, 384
 PLAIN = Variant((HEIGHT, WIDTH))
@@ -64,36 +65,6 @@ def exported(
     files = nerfstudio(frames, poses, cloud, params, Context(np.random.default_rng(0), scratch))
     publisher.publish("nerfstudio", "", store.put_value(files))
     return folder / "out" / "nerfstudio"
-
-
-def documented_rays(document: dict[str, Any], frame: dict[str, Any], size_wh: tuple[int, int]) -> np.ndarray:
-    """Return world rays (h, w, 3) of the pixels of a depth picture, by the camera that the file describes.
-
-    Nerfstudio's cameras: image coordinates of pixel centres are x + 0.5, y + 0.5; OpenGL's axes; a PINHOLE ray is
-    (x, y, −1), whose depth is z; an EQUIRECTANGULAR one has θ from −π to π and φ from 0 at the zenith, length 1.
-    """
-    said = document | frame
-    scale_x, scale_y = said["w"] / size_wh[0], said["h"] / size_wh[1]
-    x = ((np.arange(size_wh[0]) + 0.5) * scale_x - said["cx"]) / said["fl_x"]
-    y = -((np.arange(size_wh[1]) + 0.5) * scale_y - said["cy"]) / said["fl_y"]
-    x, y = np.meshgrid(x, y)
-    if said["camera_model"] == "EQUIRECTANGULAR":
-        theta, phi = -np.pi * x, np.pi * (0.5 - y)
-        rays = np.stack([-np.sin(theta) * np.sin(phi), np.cos(phi), -np.cos(theta) * np.sin(phi)], axis=-1)
-    else:
-        assert said["camera_model"] == "PINHOLE"
-        rays = np.stack([x, y, -np.ones_like(x)], axis=-1)
-    return rays @ np.array(frame["transform_matrix"])[:3, :3].T
-
-
-def world_points(folder: Path, document: dict[str, Any], frame: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points of a frame's known depths, (N, 3), and which pixels they are of, (h, w)."""
-    steps = cv2.imread(str(folder / frame["depth_file_path"]), cv2.IMREAD_ANYDEPTH)
-    assert steps.dtype == np.uint16
-    depths = steps * document["depth_unit_scale_factor"]
-    rays = documented_rays(document, frame, steps.shape[::-1])
-    origin = np.array(frame["transform_matrix"])[:3, 3]
-    return (origin + rays * depths[..., None])[steps > 0], steps > 0
 
 
 @pytest.fixture(scope="module")
