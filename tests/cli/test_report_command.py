@@ -138,5 +138,5 @@ def test_what_an_interrupted_run_had_made_is_shown(
     assert summary["results"]["ranges"] == "checked"
     assert [view["name"] for view in summary["views"]] == ["000.png", "001.png"]
     page = page_in(Path("out"))
-    assert "Not finished." in page.words
+    assert "The run was interrupted" in page.words
     assert sum(": the panorama" in str(alt) for alt in pictures(page)) == 2
