@@ -23,6 +23,7 @@ from pano_mvs.stages.filters import (
 )
 from pano_mvs.stages.frame import level, scale, unit_translations
 from pano_mvs.stages.fusion import vote
+from pano_mvs.stages.masks import color
 from pano_mvs.stages.matches import brute_force
 from pano_mvs.stages.pairs import exhaustive, position, retrieval, sequential, vlad
 from pano_mvs.stages.patchmatch import patchmatch
@@ -43,6 +44,7 @@ __all__ = [
     "colmap_masks",
     "colmap_poses",
     "colmap_sift_poses",
+    "color",
     "confidence",
     "consistency",
     "exhaustive",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from pydantic import Field
 
 from pano_mvs.algorithms.fusion.settings import FusionSettings
@@ -47,4 +49,15 @@ def vote(
         [poses[name].cam_from_world for name in names], load, FusionSettings(**settings), threads=ctx.threads
     )
     ctx.metric("points", len(cloud))
+    if not len(cloud):
+        ctx.note(_why_empty({name: ranges[name] for name in names}, settings["min_views"]))
     return cloud
+
+
+def _why_empty(ranges: Mapping[str, RangeMap], min_views: int) -> str:
+    if not any(range_map.valid.any() for range_map in ranges.values()):
+        return "the cloud is empty: no view has any range. Look at the masks, and at what the depth stage says"
+    return (
+        f"the cloud is empty: at no pixel did {min_views} views agree. Look at the poses, or lower min_confidence or "
+        "min_views"
+    )

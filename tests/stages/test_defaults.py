@@ -19,6 +19,7 @@ from pano_mvs.algorithms.filters.median import median_range
 from pano_mvs.algorithms.filters.planes import lay_planes
 from pano_mvs.algorithms.filters.speckle import remove_speckles
 from pano_mvs.algorithms.fusion.settings import FusionSettings
+from pano_mvs.algorithms.masks.one_color import areas_of_color
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.matching.neighbours import loop_closing_pairs, position_pairs, retrieval_pairs
 from pano_mvs.algorithms.matching.preemptive import hopeless_reason
@@ -41,6 +42,7 @@ FUNCTIONS = {
     "features.sift_tangent": extract_sift,
     "features.orb_tangent": extract_orb,
     "features.sphorb": extract_sphorb,
+    "masks.color": areas_of_color,
     "pairs.sequential": loop_closing_pairs,
     "pairs.position": position_pairs,
     "pairs.retrieval": retrieval_pairs,

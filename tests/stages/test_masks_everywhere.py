@@ -82,3 +82,18 @@ def test_no_key_point_of_colmap_is_masked(tmp_path):
     for name, found in features.items():
         columns, rows = np.floor(pixel_from_ray(found.bearings, (96, 192))).astype(int).T
         assert capture.images[name].load_mask()[rows, columns].all()
+
+
+@pytest.mark.parametrize(("blank", "why"), [(True, "no view has any range"), (False, "at no pixel did 4 views agree")])
+def test_an_empty_cloud_is_told(tmp_path, blank, why):
+    capture = tiny_capture(Variant(blank=blank))
+    poses = {name: Pose(pose) for name, pose in zip(capture.names, capture.poses, strict=True)}
+    ranges = {name: capture.items[RangeMap][name] for name in capture.names}
+    if not blank:  # ranges that nobody else confirms
+        ranges = {
+            name: RangeMap(ranges[name].range * (3.0**idx), ranges[name].confidence)
+            for idx, name in enumerate(capture.names)
+        }
+    context = Context(np.random.default_rng(0), tmp_path, 1)
+    assert not len(vote(ranges, poses, capture.images, VoteParams(min_views=4, min_support=None), context))
+    assert why in context.notes[0]

@@ -1,0 +1,58 @@
+"""Areas of one colour: what a stitcher, a crop or a logo put where there was no picture."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import pad_panorama, pixel_solid_angle
+
+Mask = NDArray[np.bool_]
+
+
+def areas_of_color(
+    picture: NDArray[np.uint8],
+    color_rgb: tuple[int, int, int],
+    *,
+    tolerance: int = 8,
+    min_area_deg2: float = 4.0,
+    margin_px: int = 2,
+) -> Mask:
+    """Return the pixels, (H, W), of large connected areas of a colour, over the seam and over the poles.
+
+    Args:
+        picture: (H, W, 3) uint8 RGB, the full sphere.
+        color_rgb: the colour.
+        tolerance: grey levels by which each channel may differ from it: what compression does to an even area.
+        min_area_deg2: smaller areas are none, in square degrees: dark corners and lamps.
+        margin_px: areas are widened by so much, to take their blurred edges along.
+
+    Raises:
+        UsageError: if the picture is no (H, W, 3) uint8 array, or a number is negative.
+    """
+    if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
+        raise UsageError(f"a picture must be (H, W, 3) uint8, got {picture.shape} {picture.dtype}")
+    if min(tolerance, min_area_deg2, margin_px) < 0:
+        raise UsageError(f"numbers must not be negative, got {tolerance}, {min_area_deg2}, {margin_px}")
+    from pano_mvs.algorithms.filters.kernels_components import label_surfaces  # compiles on import
+
+    alike = np.asarray((np.abs(picture.astype(np.int16) - np.array(color_rgb, np.int16)) <= tolerance).all(axis=-1))
+    if not alike.any():
+        return alike
+    labels = label_surfaces(np.where(alike, np.float32(1), np.float32(np.nan)), 1.0).reshape(alike.shape)
+    area_deg2 = np.broadcast_to(pixel_solid_angle(alike.shape)[:, None], alike.shape) * np.degrees(1) ** 2
+    sizes = np.bincount(labels[alike], area_deg2[alike], labels.size)
+    large = np.zeros_like(alike)
+    large[alike] = sizes[labels[alike]] >= min_area_deg2
+    return _widened(large, min(margin_px, len(alike)))
+
+
+def _widened(mask: Mask, margin: int) -> Mask:
+    if margin == 0:
+        return mask
+    window = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
+    return np.asarray(
+        cv2.dilate(pad_panorama(mask.astype(np.uint8), margin), window)[margin:-margin, margin:-margin] > 0
+    )

@@ -1,0 +1,32 @@
+"""Masks: panorama in, panorama out, with more of it to be ignored by every later stage."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from pano_mvs.algorithms.masks.one_color import areas_of_color
+from pano_mvs.api import Context, Each, Panorama, Params, stage
+
+
+class ColorParams(Params):
+    """Settings of masks.color."""
+
+    color: str = Field(default="#000000", pattern="^#[0-9a-fA-F]{6}$", description="what is ignored, as #rrggbb")
+    tolerance: int = Field(default=8, ge=0, le=255, description="grey levels by which a channel may differ from it")
+    min_area_deg2: float = Field(default=4.0, ge=0, description="smaller areas are left, in square degrees")
+    margin_px: int = Field(default=2, ge=0, le=64, description="areas are widened by so much")
+
+
+@stage("masks.color")
+def color(image: Each[Panorama], params: ColorParams, ctx: Context) -> Panorama:
+    """Ignore large areas of one colour: black where a stitcher had nothing, a white disc over the tripod."""
+    red, green, blue = bytes.fromhex(params.color[1:])
+    found = areas_of_color(
+        image.load(),
+        (red, green, blue),
+        tolerance=params.tolerance,
+        min_area_deg2=params.min_area_deg2,
+        margin_px=params.margin_px,
+    )
+    ctx.metric("masked", float(found.mean()))
+    return image.with_mask(~found, ctx.scratch)
