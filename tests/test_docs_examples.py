@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import textwrap
+from collections import defaultdict
 from contextlib import suppress
 from itertools import chain, pairwise
 from pathlib import Path
@@ -12,9 +13,13 @@ from typing import Any
 
 import pytest
 import typer
+from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
+from pano_mvs.engine.policy import RESERVED_KEYS
+from pano_mvs.engine.registry import Registry
+from pano_mvs.engine.stage import StageSpec
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("docs/**/*.md"), ROOT / "README.md"])
@@ -143,3 +148,40 @@ def test_every_setting_of_a_command_exists(
             changes = [pair for pair in pairwise(arguments) if pair[0] in ("--set", "--images")]
             result = CliRunner().invoke(app, ["check", arguments[0], *chain(*changes)])
             assert result.exit_code == 0, result.output
+
+
+def settings_in_text() -> list[Any]:
+    """Return each `stage.setting=value` that stands in running text, with the page."""
+    found = []
+    for page in PAGES:
+        prose = FENCED.sub("", page.read_text(encoding="utf-8"))
+        spans = sorted(set(re.findall(r"`(?:--set )?([a-z]\w*)\.([a-z]\w*)=([^`\s]+)`", prose)))
+        found += [pytest.param(*span, id=f"{page.relative_to(ROOT)}: {'.'.join(span[:2])}={span[2]}") for span in spans]
+    return found
+
+
+@pytest.fixture(scope="module")
+def specs_by_stage() -> dict[str, list[StageSpec]]:
+    """What each name of a stage in the shipped workflows stands for."""
+    registry = Registry.installed()
+    specs: dict[str, list[StageSpec]] = defaultdict(list)
+    for path in (ROOT / "workflows").glob("*.yaml"):
+        for name, entry in YAML(typ="safe").load(path)["stages"].items():
+            if "use" in entry:
+                specs[name].append(registry.stages[entry["use"]])
+    return specs
+
+
+@pytest.mark.parametrize(("stage", "setting", "value"), settings_in_text())
+def test_every_setting_in_running_text_exists(
+    specs_by_stage: dict[str, list[StageSpec]], stage: str, setting: str, value: str
+) -> None:
+    if setting in RESERVED_KEYS:
+        return
+    known = [spec for spec in specs_by_stage[stage] if setting in spec.params_type.model_fields]
+    assert known
+    if not value.isupper():  # DIR and FILE stand for any
+        for spec in known:
+            spec.params_type.__pydantic_validator__.validate_assignment(
+                spec.params_type.model_construct(), setting, YAML(typ="safe").load(value)
+            )
