@@ -40,7 +40,7 @@ def transforms_document(
     """Return the contents of a transforms.json.
 
     Intrinsics are said once if all frames share them, else for each. Where some frames are masked the others get the
-    mask of `open_mask`.
+    mask of `open_mask`. `panorama` is the name of the picture in the capture, by which our own reader knows it.
 
     Args:
         variant: which camera model; one file has one.
@@ -97,7 +97,7 @@ def _listed(
         entry["mask_path"] = frame.mask.replace("{name}", name) or open_mask(frame.size_wh)
     if with_depth:
         entry["depth_file_path"] = frame.depth.replace("{name}", name)
-    return entry | {"transform_matrix": matrix.tolist()}
+    return entry | {"panorama": name, "transform_matrix": matrix.tolist()}
 
 
 def _intrinsics(frame: NerfstudioFrame) -> dict[str, Any]:

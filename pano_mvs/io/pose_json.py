@@ -93,7 +93,7 @@ def read_posed_views(path: Path) -> tuple[list[PosedView], bool]:
 
 
 def read_transforms(path: Path) -> dict[str, Rigid3]:
-    """Return the poses of a nerfstudio transforms.json by image name (its file_path).
+    """Return the poses of a nerfstudio transforms.json by image name (its file_path, or `panorama`, as we write it).
 
     `transform_matrix` is world_from_cam for OpenGL's camera (x right, y up, z backwards). The world is the file's.
 
@@ -107,7 +107,7 @@ def read_transforms(path: Path) -> dict[str, Rigid3]:
     poses: list[tuple[str, Rigid3]] = []
     for idx, frame in enumerate(frames):
         where = f"{path}: frames[{idx}]"
-        name = _name(frame, "file_path", where)
+        name = _name(frame, "panorama" if isinstance(frame, dict) and "panorama" in frame else "file_path", where)
         model = frame.get("camera_model", data.get("camera_model"))
         if model != "EQUIRECTANGULAR":
             raise InputError(f"{where} ({name}): camera_model is {model}, expected EQUIRECTANGULAR. Only panoramas "

@@ -26,12 +26,12 @@ class MeshParams(Params):
     smallest_part: float = Field(
         default=0.001, ge=0, le=1, description="loose parts with less than this share of the triangles are left out"
     )
-    max_points: int = Field(default=1_000_000, ge=0, description="the cloud is thinned evenly to so many; 0: never")
+    max_points: int = Field(default=500_000, ge=0, description="the cloud is thinned evenly to so many; 0: never")
     min_views: int = Field(default=2, ge=0, le=255, description="points on which fewer views agree are left out")
     min_confidence: int = Field(default=64, ge=0, le=255, description="points below are left out")
 
 
-@stage("export.mesh", memory="4GB")
+@stage("export.mesh", memory="2GB")
 def mesh(cloud: One[PointCloud], params: MeshParams, ctx: Context) -> Files:
     """The surface through the fused cloud as mesh.ply: coloured triangles, by screened Poisson reconstruction.
 

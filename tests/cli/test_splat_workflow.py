@@ -31,6 +31,7 @@ def test_splat_writes_panoramas_faces_and_seeds_that_agree(pano_mvs: Command, re
     document = json.loads((out / "nerfstudio/equirectangular/transforms.json").read_text())
     assert [frame["file_path"] for frame in document["frames"]] == [f"images/{name}.jpg" for name in solved.names]
     read = read_poses(out / "nerfstudio/equirectangular")
+    assert read.names == solved.names  # though the pictures are written anew, under other names
     np.testing.assert_allclose(read.translations, solved.translations, atol=1e-9)
     for name, frame in zip(solved.names, document["frames"], strict=True):
         stem = Path(name).stem
