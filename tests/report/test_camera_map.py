@@ -50,6 +50,16 @@ def test_of_very_many_links_the_strongest_are_drawn():
     assert strengths[-1] == 1
 
 
+def test_of_very_many_rejected_pairs_those_that_came_nearest_are_drawn():
+    names = [str(number) for number in range(60)]
+    pairs = [(a, b) for a in names for b in names if a < b]
+    links = [[*pair, 0, idx, None] for idx, pair in enumerate(pairs)]
+    above, _ = camera_maps({"registered": names, "centers": [[i, 0, i % 7] for i in range(60)], "links": links})
+    assert above.rejected == 600
+    assert f"none of {len(pairs) - 1} candidates" in above.links[0].text
+    assert not any("none of 9 candidates" in link.text for link in above.links)
+
+
 def test_of_very_many_cameras_only_dots_are_drawn():
     above, _ = camera_maps({"registered": [str(i) for i in range(5000)], "centers": [[i, 0, i] for i in range(5000)]})
     assert not above.cameras
