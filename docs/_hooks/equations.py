@@ -13,8 +13,12 @@ _BLOCK = re.compile(r'<div class="arithmatex">\s*\\\[(.*?)\\\]\s*</div>', re.DOT
 
 def with_mathml(page: str) -> str:
     """Return a page with its TeX, as pymdownx.arithmatex marks it, in MathML."""
-    page = _BLOCK.sub(lambda found: convert(html.unescape(found[1]).strip(), display="block"), page)
-    page = _INLINE.sub(lambda found: convert(html.unescape(found[1]).strip()), page)
+    page = _BLOCK.sub(lambda found: f'<div class="equation">{_mathml(found[1], display="block")}</div>', page)
+    page = _INLINE.sub(lambda found: _mathml(found[1], display="inline"), page)
     if "arithmatex" in page:
         raise ValueError(f"an equation is not shown: … {page[page.index('arithmatex') :][:120]} …")
     return page
+
+
+def _mathml(tex: str, *, display: str) -> str:
+    return str(convert(html.unescape(tex).strip(), display=display))
