@@ -21,8 +21,7 @@ from pano_mvs.engine.stage import StageSpec
 
 KINDS = {
     "source": "which pictures there are, and how one is read",
-    "video": "pictures out of a video",
-    "mask": "what is to be ignored in a picture",
+    "masks": "what is to be ignored in a picture",
     "features": "key points of one panorama, as bearings on the sphere",
     "global": "one vector that sums up a picture",
     "pairs": "which pictures are matched",
@@ -33,7 +32,6 @@ KINDS = {
     "filters": "range map in, range map out",
     "fusion": "from all range maps to one cloud",
     "points": "points to start from, for programs that want few and good ones",
-    "mesh": "from the cloud to a surface",
     "export": "files in the output folder",
     "evaluate": "comparison with the truth",
 }
