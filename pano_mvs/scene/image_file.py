@@ -13,7 +13,11 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.scene.jpeg import JPEG_START, is_cut_short
 
 # What OpenCV prints of pictures that it cannot decode is said better by our own error.
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+_SILENT = 0
+if hasattr(cv2, "setLogLevel"):  # OpenCV 4
+    cv2.setLogLevel(_SILENT)
+else:
+    cv2.utils.logging.setLogLevel(_SILENT)
 
 _HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
 
@@ -38,6 +42,9 @@ def decode_image(path: Path) -> NDArray[np.uint8]:
         return _decode_heic(data, path)
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    if image is None and data[4:12] in (b"ftypavif", b"ftypavis"):
+        raise InputError(f"{path}: this OpenCV ({cv2.__version__}) reads no AVIF pictures, or it is damaged. Install a "
+                         "newer opencv-python-headless, or convert it to JPEG")  # fmt: skip
     if image is None:
         raise InputError(f"{path}: not a picture that can be decoded ({len(data)} bytes). Remove it or convert it to "
                          f"JPEG, or to PNG or TIFF of 8 or 16 bits")  # fmt: skip
@@ -60,7 +67,7 @@ def _decode_heic(data: bytes, path: Path) -> NDArray[np.uint8]:
             from error  # fmt: skip
     try:
         picture = pillow_heif.open_heif(data, convert_hdr_to_8bit=True)
-        image = np.asarray(picture)
+        image = np.array(picture, copy=True)  # what is merely looked at may go with the picture
     except (ValueError, EOFError, OSError, RuntimeError, SyntaxError) as error:
         raise InputError(f"{path}: not a HEIC picture that can be decoded ({error}). Copy it again, or convert it to "
                          "JPEG")  from error  # fmt: skip

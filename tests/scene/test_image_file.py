@@ -98,6 +98,12 @@ def test_what_cameras_append_to_a_jpeg_is_not_taken_for_its_end(tmp_path: Path) 
         decode_image(tmp_path / "short.jpg")
 
 
+def test_avif_that_opencv_does_not_read_says_so(tmp_path: Path) -> None:
+    (tmp_path / "a.avif").write_bytes(saved("AVIF")[:200])
+    with pytest.raises(InputError, match=r"a\.avif: this OpenCV .* reads no AVIF pictures, or it is damaged"):
+        decode_image(tmp_path / "a.avif")
+
+
 @pytest.mark.parametrize("kind", ["PNG", "TIFF", "WEBP", "HEIC"])
 def test_what_is_cut_short_is_refused(tmp_path: Path, kind: str) -> None:
     data = heic(SMOOTH) if kind == "HEIC" else saved(kind)
