@@ -108,6 +108,6 @@ def _residuals_deg(poses: Poses, step: int) -> FloatArray:
 
 
 def _round_up(value: float) -> float:
-    """Return the smallest of 1, 1.5, 2, 3, 5, 7.5, 10 × 10ⁿ that is not smaller."""
+    """Return the smallest of 1, 2, 4, 6, 8, 10 × 10ⁿ that is not smaller: their quarters are short numbers."""
     power = 10.0 ** np.floor(np.log10(value))
-    return float(next(step * power for step in (1, 1.5, 2, 3, 5, 7.5, 10) if step * power >= value * (1 - 1e-9)))
+    return float(next(step * power for step in (1, 2, 4, 6, 8, 10) if step * power >= value * (1 - 1e-9)))
