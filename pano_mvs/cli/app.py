@@ -187,6 +187,8 @@ def view_results(
                                                        "of opening a window; needs no display.")] = None,
     view: Annotated[str, typer.Option("--view", help="overview, top, front or inside:NAME of an image.")] = "overview",
     color: Annotated[str, typer.Option("--color", help="rgb, confidence, views, normals or height.")] = "rgb",
+    surface: Annotated[str, typer.Option("--show", metavar="cloud|mesh|both", help="By default the cloud, if there is "
+                                         "one.", show_default=False)] = "",
     points: Annotated[int, typer.Option("--points", min=0, help="Draw at most so many points; 0: all.")] = 2_000_000,
     size: Annotated[str, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Of the window in pixels.")] = "1280x860",
     images: Annotated[Optional[Path], typer.Option("--images", help="Folder of the panoramas, if they "  # noqa: UP045
@@ -198,7 +200,7 @@ def view_results(
     """Look at cloud, mesh and cameras, and step inside the panoramas."""
     from pano_mvs.cli.view_command import ViewOptions, view_scene
 
-    options = ViewOptions(images, screenshot, view, color, points, size, labels, blended, backs)
+    options = ViewOptions(images, screenshot, view, color, surface, points, size, labels, blended, backs)
     view_scene(out, options, Console())
 
 

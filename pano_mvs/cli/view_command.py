@@ -16,7 +16,8 @@ from pano_mvs.core.errors import InputError, StoreError, UsageError
 from pano_mvs.viewer.cloud_colors import POINT_BUDGET, color_cloud, drawn_cloud
 from pano_mvs.viewer.display import quiet_vtk, require_display, require_drawing, require_window
 from pano_mvs.viewer.shown_scene import ShownScene, open_scene
-from pano_mvs.viewer.tour import Tour, box_of
+from pano_mvs.viewer.sizes import box_of
+from pano_mvs.viewer.tour import Tour
 
 _SIZE = re.compile(r"([1-9][0-9]{1,4})[x×]([1-9][0-9]{1,4})")
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
@@ -32,17 +33,19 @@ class ViewOptions:
         screenshot: a picture to write instead of opening a window.
         view: "overview", "top", "front" or "inside:NAME".
         color: of the cloud, see `COLORINGS`.
+        surface: "cloud", "mesh" or "both"; empty for the cloud where there is one.
         points: at most so many are drawn; 0: all.
         size: WIDTHxHEIGHT of the window in pixels.
         labels: whether cameras are named.
         blended: whether the cloud is shown within a panorama.
-        backs: whether points are shown that turn their back to the eye.
+        backs: whether points and triangles are shown that turn their back to the eye.
     """
 
     images: Path | None = None
     screenshot: Path | None = None
     view: str = "overview"
     color: str = "rgb"
+    surface: str = ""
     points: int = POINT_BUDGET
     size: str = "1280x860"
     labels: bool = False
@@ -92,8 +95,22 @@ def _tour(scene: ShownScene, options: ViewOptions, size_wh: tuple[int, int]) -> 
     box = box_of(points if corners is None else corners, scene.centers)
     tour = Tour(scene, cloud, box, aspect=size_wh[0] / size_wh[1], corners=corners)
     tour.see(options.view)
-    tour.begin(color=options.color, labels=options.labels, blended=options.blended, backs=options.backs)
+    # Ours face the side that was seen; how anybody's lone mesh is wound is not known.
+    backs = options.backs or (cloud is None and not scene.cameras)
+    tour.begin(coloring=options.color, labels=options.labels, blended=options.blended, backs=backs)
+    if options.surface:
+        tour.begin(surface=_surface(options.surface, scene))
     return tour
+
+
+def _surface(wanted: str, scene: ShownScene) -> str:
+    if wanted not in ("cloud", "mesh", "both"):
+        raise UsageError(f"--show {wanted}: there are cloud, mesh and both")
+    missing = {"cloud": scene.cloud is None, "mesh": scene.mesh is None}
+    absent = [name for name in ("cloud", "mesh") if wanted in (name, "both") and missing[name]]
+    if absent:
+        raise UsageError(f"--show {wanted}: there is no {absent[0]}.ply in {scene.name}")
+    return wanted
 
 
 def mesh_points(path: Path) -> NDArray[np.float32]:

@@ -16,13 +16,20 @@ _KEYS = (
     ("o, t, y", "overview, top, front"),
     ("m", "measure: click two points"),
     ("c", "colours of the cloud"),
-    ("x", "points that turn their back"),
+    ("s", "cloud, mesh, or both"),
+    ("x", "what turns its back to you"),
     ("b", "cloud within the panorama"),
     ("d", "all points"),
     ("l, k", "names, cameras"),
     ("h, q", "this help, quit"),
 )
 _HELP = "\n".join(f" {keys:<18} {what} " for keys, what in _KEYS)
+# In shares of the window, from the lower left corner, and which edges of the text lie there.
+_PLACES = {
+    "upper_left": (0.008, 0.988, "left", "top"),
+    "lower_right": (0.992, 0.012, "right", "bottom"),
+    "help": (0.012, 0.9, "left", "top"),
+}
 
 
 class Overlay:
@@ -32,12 +39,9 @@ class Overlay:
         self._plotter, self._font, self._ink, self._paper = plotter, font, ink, paper
 
     def text(self, lines: list[str], corner: str) -> None:
-        """Write lines, but for empty ones, into a corner such as "upper_left"."""
-        self._plotter.remove_actor(corner, render=False)
-        shown = "\n".join(line for line in lines if line)
-        if shown:
-            self._plotter.add_text(shown, position=corner, font_size=0.8 * self._font, color=self._ink, font="arial",
-                                   shadow=True, name=corner, render=False)  # fmt: skip
+        """Write lines, but for empty ones, into the corner "upper_left" or "lower_right"."""
+        shown = "\n".join(f" {line} " for line in lines if line)
+        self._panel(shown, corner, font="arial", size=0.8)
 
     def label(self, points: NDArray[np.float64], texts: list[str], name: str, *, color: str = "") -> None:
         """Write a text at each point (N, 3) of the scene."""
@@ -49,10 +53,14 @@ class Overlay:
 
     def help(self, *, wanted: bool) -> None:
         """Show the keys, or take them away."""
-        self._plotter.remove_actor("help", render=False)
-        if wanted:
-            place = 1.5 * self._font, self._plotter.window_size[1] - 5.5 * self._font
-            actor = self._plotter.add_text(_HELP, position=place, name="help", font="courier", color=self._ink,
-                                           font_size=0.7 * self._font, render=False)  # fmt: skip
-            actor.prop.justification_vertical = "top"
-            actor.prop.background_color, actor.prop.background_opacity = self._paper, 0.85
+        self._panel(_HELP if wanted else "", "help", font="courier", size=0.7)
+
+    def _panel(self, text: str, name: str, *, font: str, size: float) -> None:
+        self._plotter.remove_actor(name, render=False)
+        if not text:
+            return
+        x, y, across, upright = _PLACES[name]
+        actor = self._plotter.add_text(text, position=(x, y), viewport=True, name=name, font=font, color=self._ink,
+                                       font_size=size * self._font, render=False)  # fmt: skip
+        actor.prop.justification_horizontal, actor.prop.justification_vertical = across, upright
+        actor.prop.background_color, actor.prop.background_opacity = self._paper, 0.75

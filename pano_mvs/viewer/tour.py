@@ -13,13 +13,11 @@ from pano_mvs.io.names import match_image_names
 from pano_mvs.viewer.cloud_colors import DrawnCloud
 from pano_mvs.viewer.picking import camera_under, point_under
 from pano_mvs.viewer.shown_scene import ShownScene
+from pano_mvs.viewer.sizes import length_text, sphere_radius
 from pano_mvs.viewer.viewpoint import Viewpoint, looking_along, outside_view
 
 FloatArray = NDArray[np.float64]
 
-# A sphere is this share of the way to the next camera, within these shares of the scene.
-_RADIUS_SHARE, _RADIUS_LIMITS = 0.18, (0.005, 0.025)
-_BOX_SHARES = 0.01, 0.99
 _PARALLEL_REACH = 0.006
 
 
@@ -29,6 +27,7 @@ class TourState:
 
     Attributes:
         viewpoint: from where.
+        surface: "cloud", "mesh" or "both".
         coloring: of the cloud.
         inside: index of the camera whose panorama is all around, or None.
         outside: where to come back to from inside.
@@ -38,13 +37,15 @@ class TourState:
         labels: whether all cameras are named.
         cameras: whether cameras are shown.
         blended: whether the cloud is shown inside a panorama.
-        backs: whether points that turn their back to the eye are shown; not showing them opens rooms to the eye.
+        backs: whether points, and triangles, that turn their back to the eye are shown; not showing them opens rooms
+            to the eye.
         all_points: whether all points of the file are drawn.
         help: whether the keys are listed.
         message: the latest news.
     """
 
     viewpoint: Viewpoint
+    surface: str = "cloud"
     coloring: str = "rgb"
     inside: int | None = None
     outside: Viewpoint | None = None
@@ -84,7 +85,7 @@ class Tour:
         """Begin with the overview."""
         self.centers = self.scene.centers
         self.radius = sphere_radius(self.centers, self.box)
-        self.state = TourState(self.from_outside("overview"), help=False)
+        self.state = TourState(self.from_outside("overview"), "cloud" if self.cloud is not None else "mesh")
 
     def from_outside(self, name: str) -> Viewpoint:
         """Return the view called "overview", "top" or "front"."""
@@ -107,9 +108,9 @@ class Tour:
         else:
             raise UsageError(f"there is no view {view!r}; there are overview, top, front and inside:NAME")
 
-    def begin(self, *, color: str, labels: bool, blended: bool, backs: bool) -> None:
-        """Begin with other than the usual settings."""
-        self.state = replace(self.state, coloring=color, labels=labels, blended=blended, backs=backs)
+    def begin(self, **settings: str | bool) -> None:
+        """Begin with other than the usual settings: fields of `TourState` by name."""
+        self.state = replace(self.state, **settings)  # type: ignore[arg-type]
 
     def step_into(self, camera_idx: int) -> None:
         """Go to a camera, looking on in the same direction: its panorama is all around."""
@@ -183,6 +184,7 @@ class Tour:
         return {
             "Escape": self.step_out,
             "c": self._next_coloring,
+            "s": self._next_surface,
             "m": lambda: self._toggle("measuring"),
             "l": lambda: self._toggle("labels"),
             "k": lambda: self._toggle("cameras"),
@@ -212,6 +214,11 @@ class Tour:
         if names:
             place = names.index(self.state.coloring) if self.state.coloring in names else -1
             self.state = replace(self.state, coloring=names[(place + 1) % len(names)])
+
+    def _next_surface(self) -> None:
+        if self.cloud is not None and self.scene.mesh is not None:
+            following = {"cloud": "mesh", "mesh": "both", "both": "cloud"}
+            self.state = replace(self.state, surface=following[self.state.surface])
 
     def _next_camera(self, step: int) -> None:
         if self.scene.cameras:
@@ -249,47 +256,3 @@ class Tour:
             shown = ", ".join(names[:6]) + (" …" if len(names) > 6 else "")
             raise UsageError(f"there is no camera {name!r}; there are: {shown or 'none'}")
         return names.index(matched[name])
-
-
-def sphere_radius(centers: FloatArray, box: FloatArray) -> float:
-    """Return how large the spheres of cameras are, so that they neither touch nor vanish; scene units."""
-    size = float(np.linalg.norm(box[1] - box[0])) or 1.0
-    least, most = (share * size for share in _RADIUS_LIMITS)
-    if len(centers) < 2:
-        return most
-    from scipy.spatial import cKDTree
-
-    gaps = np.asarray(cKDTree(centers).query(centers, k=2)[0])[:, 1]
-    return float(np.clip(_RADIUS_SHARE * float(np.median(gaps)), least, most))
-
-
-def box_of(points: NDArray[np.floating], centers: FloatArray) -> FloatArray:
-    """Return the box, (2, 3), in which nearly all points (N, 3) and all cameras (M, 3) lie; never empty."""
-    corners = [centers] if len(centers) else []
-    if len(points):
-        corners.append(np.asarray(np.quantile(np.asarray(points, np.float64), _BOX_SHARES, axis=0)))
-    if not corners:
-        return np.array([[-1.0, -1, -1], [1, 1, 1]])
-    together = np.concatenate(corners)
-    box = np.stack([together.min(axis=0), together.max(axis=0)])
-    if np.ptp(box, axis=0).max() < 1e-9:
-        box = box + np.array([[-1.0], [1.0]])
-    return box
-
-
-def length_text(length: float, unit: str) -> str:
-    """Return a length as people read it, with its unit."""
-    if unit != "m":
-        return f"{length:.4g} {unit}"
-    return f"{length:.3f} m" if length >= 1 else f"{100 * length:.1f} cm"
-
-
-def bar_text(length: float, unit: str) -> str:
-    """Return a round length with its unit."""
-    return f"{length:g} {unit.removesuffix('s') if length == 1 else unit}"
-
-
-def bar_length(extent: float) -> float:
-    """Return the longest of 1, 2, 5 × 10ⁿ that is no longer than a quarter of an extent."""
-    power = 10.0 ** np.floor(np.log10(extent / 4))
-    return float(next(step * power for step in (5, 2, 1) if step * power <= extent / 4 * (1 + 1e-9)))

@@ -13,8 +13,9 @@ from pano_mvs.viewer.cloud_colors import POINT_BUDGET, color_cloud, drawn_cloud
 from pano_mvs.viewer.hands import Hands
 from pano_mvs.viewer.overlay import Overlay
 from pano_mvs.viewer.panorama_pictures import LARGE_WIDTH, SMALL_WIDTH, sphere_picture
+from pano_mvs.viewer.sizes import bar_length, bar_text, length_text
 from pano_mvs.viewer.sphere_actors import rims_actor, sphere_actor
-from pano_mvs.viewer.tour import Tour, TourState, bar_length, bar_text, length_text
+from pano_mvs.viewer.tour import Tour, TourState
 from pano_mvs.viewer.viewpoint import Viewpoint
 
 TEXTURED = 64
@@ -169,10 +170,11 @@ class SceneWindow:
         if before is None or before.coloring != state.coloring:
             self._recolor(state)
         visible = state.inside is None or state.blended
-        for actor in (self._cloud.actor if self._cloud is not None else None, self._mesh):
-            if actor is not None:
-                actor.SetVisibility(visible)
+        if self._mesh is not None:
+            self._mesh.SetVisibility(visible and state.surface != "cloud")
+            self._mesh.prop.culling = "none" if state.backs else "back"
         if self._cloud is not None:
+            self._cloud.actor.SetVisibility(visible and state.surface != "mesh")
             if before is None or before.backs != state.backs or before.all_points != state.all_points:
                 self._cloud.show_backs(wanted=state.backs)
             self._cloud.size(self._point_size(state))
@@ -278,6 +280,8 @@ class SceneWindow:
         if cloud is not None:
             of = f" of {cloud.total:,}" if len(cloud.points) < cloud.total else ""
             counts.append(f"{len(cloud.points):,}{of} points")
+        if scene.mesh is not None:
+            counts.append("mesh" if cloud is None else f"s: {state.surface} shown")
         if scene.cameras:
             counts.append(f"{len(scene.cameras):,} cameras")
         self._overlay.text([title, news], "upper_left")

@@ -53,6 +53,8 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
         (("--screenshot", "a.png", "--view", "inside:roof"), "no camera 'roof'; there are: lobby/000.png"),
         (("--screenshot", "a.png", "--view", "below"), "there are overview, top, front and inside:NAME"),
         (("--screenshot", "a.png", "--color", "views"), "quality: true"),
+        (("--screenshot", "a.png", "--show", "both"), "there is no mesh.ply"),
+        (("--screenshot", "a.png", "--show", "all"), "there are cloud, mesh and both"),
     ],
 )
 def test_mistakes_are_told_with_a_remedy(out: Path, arguments: tuple[str, ...], message: str) -> None:

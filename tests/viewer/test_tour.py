@@ -11,7 +11,8 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.viewer.cloud_colors import drawn_cloud
 from pano_mvs.viewer.picking import camera_under, point_under
 from pano_mvs.viewer.shown_scene import open_scene
-from pano_mvs.viewer.tour import Tour, bar_length, bar_text, box_of, length_text, sphere_radius
+from pano_mvs.viewer.sizes import bar_length, bar_text, box_of, length_text, sphere_radius
+from pano_mvs.viewer.tour import Tour
 from pano_mvs.viewer.viewpoint import Viewpoint
 from tests.viewer.scenes import HALF, turned_poses, write_output
 
@@ -192,7 +193,8 @@ def test_sizes_suit_the_scene() -> None:
     box = np.array([[0.0, 0, 0], [10, 3, 8]])
     apart = np.array([[1.0, 1, 1], [2, 1, 1], [3, 1, 1]])
     assert sphere_radius(apart, box) == pytest.approx(0.18)
-    assert sphere_radius(apart * 1e-3, box) == pytest.approx(0.005 * np.linalg.norm([10, 3, 8]))
+    assert sphere_radius(apart * 0.4, box) == pytest.approx(0.008 * np.linalg.norm([10, 3, 8]))
+    assert sphere_radius(apart * 0.1, box) == pytest.approx(0.04)
     assert sphere_radius(apart[:1], box) == sphere_radius(apart * 1e3, box)
     assert [bar_length(extent) for extent in (4.0, 8.1, 19.9, 20, 0.3)] == [1, 2, 2, 5, 0.05]
     assert length_text(0.4321, "m") == "43.2 cm"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -10,10 +11,12 @@ import numpy as np
 import pytest
 
 from pano_mvs.geometry import Rigid3
+from pano_mvs.io.ply_mesh import write_ply_mesh
 from pano_mvs.viewer.cloud_colors import drawn_cloud
 from pano_mvs.viewer.display import quiet_vtk, require_drawing
 from pano_mvs.viewer.shown_scene import open_scene
-from pano_mvs.viewer.tour import Tour, box_of
+from pano_mvs.viewer.sizes import box_of
+from pano_mvs.viewer.tour import Tour
 from pano_mvs.viewer.viewpoint import Viewpoint
 from pano_mvs.viewer.window import TEXTURED, SceneWindow
 from tests.viewer.scenes import HALF, turned_poses, world_color, write_output
@@ -218,8 +221,36 @@ def test_a_lone_mesh_is_shown(tmp_path: Path, windows: list[SceneWindow]) -> Non
     scene = open_scene(tmp_path / "mesh.ply")
     tour = Tour(scene, None, np.array([[0.0, 0, -0.5], [1, 1, 0.5]]))
     tour.see("front")
+    tour.key("x")
     windows.append(SceneWindow(tour, size_wh=SIZE, off_screen=True))
     picture = windows[-1].picture()
     inside = place_of(np.array([0.2, 0.3, 0]), tour.state.viewpoint)
     outside = place_of(np.array([0.8, 0.8, 0]), tour.state.viewpoint)
     assert seen_at(picture, *inside).mean() > 150 > seen_at(picture, *outside).mean()
+
+
+def test_a_mesh_faces_the_side_that_was_seen_and_can_be_chosen(tmp_path: Path, windows: list[SceneWindow]) -> None:
+    """A floor that faces up: red from above, not there from below, behind the cloud's choice of surface."""
+    out = write_output(tmp_path, {}, points=5000)
+    corners = np.array([[-3, 1.5, -4], [3, 1.5, -4], [3, 1.5, 4], [-3, 1.5, 4]], np.float32)
+    red = np.tile(np.uint8([250, 10, 10]), (4, 1))
+    write_ply_mesh(out / "mesh.ply", (corners, red, np.array([[0, 1, 2], [0, 2, 3]], np.int32)))
+    window = window_on(out, windows, view="top")
+
+    def share_of_red() -> float:
+        window.update()
+        picture = window.picture().astype(int)
+        return float(((picture[..., 0] > 200) & (picture[..., 1:].max(axis=-1) < 60)).mean())
+
+    assert share_of_red() == 0  # the cloud
+    window.tour.key("s")
+    assert share_of_red() > 0.3  # the mesh
+    window.tour.key("s")
+    assert share_of_red() > 0.1  # both
+    above = window.tour.state.viewpoint
+    window.tour.moved_to(replace(above, eye=2 * above.target - above.eye, up=above.up))
+    window.tour.key("s")
+    window.tour.key("s")
+    assert share_of_red() == 0  # from below
+    window.tour.key("x")
+    assert share_of_red() > 0.3

@@ -1,0 +1,59 @@
+"""How large things are in the scene, and how lengths are written."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+# A sphere is this share of the way to the next camera, within these shares of the scene.
+_RADIUS_SHARE, _RADIUS_LIMITS = 0.18, (0.008, 0.025)
+_CROWDED_SHARE = 0.4
+_BOX_SHARES = 0.01, 0.99
+
+
+def sphere_radius(centers: FloatArray, box: FloatArray) -> float:
+    """Return how large the spheres of cameras are, so that they neither touch nor vanish; scene units."""
+    size = float(np.linalg.norm(box[1] - box[0])) or 1.0
+    least, most = (share * size for share in _RADIUS_LIMITS)
+    if len(centers) < 2:
+        return most
+    from scipy.spatial import cKDTree
+
+    gaps = np.asarray(cKDTree(centers).query(centers, k=2)[0])[:, 1]
+    gap = float(np.median(gaps))
+    wanted = min(max(_RADIUS_SHARE * gap, least), most)
+    return min(wanted, _CROWDED_SHARE * gap) if gap > 0 else wanted
+
+
+def box_of(points: NDArray[np.floating], centers: FloatArray) -> FloatArray:
+    """Return the box, (2, 3), in which nearly all points (N, 3) and all cameras (M, 3) lie; never empty."""
+    corners = [centers] if len(centers) else []
+    if len(points):
+        corners.append(np.asarray(np.quantile(np.asarray(points, np.float64), _BOX_SHARES, axis=0)))
+    if not corners:
+        return np.array([[-1.0, -1, -1], [1, 1, 1]])
+    together = np.concatenate(corners)
+    box = np.stack([together.min(axis=0), together.max(axis=0)])
+    if np.ptp(box, axis=0).max() < 1e-9:
+        box = box + np.array([[-1.0], [1.0]])
+    return box
+
+
+def length_text(length: float, unit: str) -> str:
+    """Return a length as people read it, with its unit."""
+    if unit != "m":
+        return f"{length:.4g} {unit}"
+    return f"{length:.3f} m" if length >= 1 else f"{100 * length:.1f} cm"
+
+
+def bar_text(length: float, unit: str) -> str:
+    """Return a round length with its unit."""
+    return f"{length:g} {unit.removesuffix('s') if length == 1 else unit}"
+
+
+def bar_length(extent: float) -> float:
+    """Return the longest of 1, 2, 5 × 10ⁿ that is no longer than a quarter of an extent."""
+    power = 10.0 ** np.floor(np.log10(extent / 4))
+    return float(next(step * power for step in (5, 2, 1) if step * power <= extent / 4 * (1 + 1e-9)))
