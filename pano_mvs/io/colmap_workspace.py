@@ -1,9 +1,9 @@
 """The files of a COLMAP dense workspace, beside its sparse model.
 
-images/FACE/IMAGE.jpg
-masks/FACE/IMAGE.jpg.png                            255 valid, 0 ignored
-stereo/depth_maps/FACE/IMAGE.jpg.geometric.bin      z-depth, 0 unknown
-stereo/normal_maps/FACE/IMAGE.jpg.geometric.bin     in the face's camera frame
+images/IMAGE_FACE.jpg
+masks/IMAGE_FACE.jpg.png                            255 valid, 0 ignored
+stereo/depth_maps/IMAGE_FACE.jpg.geometric.bin      z-depth, 0 unknown
+stereo/normal_maps/IMAGE_FACE.jpg.geometric.bin     in the face's camera frame
 stereo/patch-match.cfg, stereo/fusion.cfg           which pictures there are
 """
 
@@ -25,8 +25,12 @@ _SOURCES = 20  # what COLMAP's own undistorter writes
 
 
 def face_image_name(face: str, item: str, suffix: str) -> str:
-    """Return the name of a face's picture in the model: `front/a/b.jpg` of the image `a/b`."""
-    return f"{face}/{item}{suffix}"
+    """Return the name of a face's picture in the model: `a/b_front.jpg` of the image `a/b`.
+
+    Splat trainers look at the last part of the name alone, so it is not the folder that tells the faces apart. Names of
+    faces hold no `_`, so that no two pictures share a name.
+    """
+    return f"{item}_{face}{suffix}"
 
 
 def write_face_picture(path: Path, picture: NDArray[np.uint8]) -> None:
@@ -71,6 +75,14 @@ def write_face(
     write_depth_map(depth_file, z_depth)
     write_normal_map(normal_file, normals_in_face)
     return targets
+
+
+def sparse_targets(files: Iterable[Path]) -> dict[str, Path]:
+    """Return where in the output folder the files of the model belong: in sparse/ and again in sparse/0.
+
+    COLMAP's dense tools and OpenMVS look in the one, splat trainers in the other.
+    """
+    return {f"{WORKSPACE}/{folder}/{path.name}": path for folder in ("sparse", "sparse/0") for path in files}
 
 
 def write_stereo_configs(scratch: Path, image_names: Iterable[str]) -> dict[str, Path]:

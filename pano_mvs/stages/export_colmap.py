@@ -16,7 +16,7 @@ from pano_mvs.geometry import PinholeView
 from pano_mvs.io.colmap_model import write_colmap_model
 from pano_mvs.io.colmap_points import ModelForm
 from pano_mvs.io.colmap_rig import CutPanorama, write_rig_model
-from pano_mvs.io.colmap_workspace import WORKSPACE, face_image_name, write_face, write_stereo_configs
+from pano_mvs.io.colmap_workspace import face_image_name, sparse_targets, write_face, write_stereo_configs
 from pano_mvs.scene.face_files import FaceFiles, FaceLayout
 from pano_mvs.scene.files import item_stems
 from pano_mvs.scene.image_file import write_png
@@ -106,8 +106,8 @@ def colmap_dense(
 ) -> Files:
     """The model of export.colmap_faces' pictures: a dense workspace for COLMAP's fusion, OpenMVS and splat trainers.
 
-    colmap_dense/sparse: a rig of PINHOLE cameras, a frame for each panorama, points with tracks; stereo/*.cfg. With
-    points.tracked its points are added to the sparse ones, so that no face is without.
+    A rig of PINHOLE cameras, a frame for each panorama, points with tracks: in colmap_dense/sparse and, for trainers,
+    in sparse/0; stereo/*.cfg. With points.tracked its points join the sparse ones, so that no face is without.
     """
     joined = poses if points is None else points.joined_to(poses, keep_points=True)
     cuts = _cuts(poses.names, faces, item_stems(images))
@@ -120,8 +120,7 @@ def colmap_dense(
     if blind:
         ctx.note(f"{blind} of {len(seen)} faces see no point of the model: COLMAP fuses none of their depths. Add a "
                  "stage points.tracked, or raise its count")  # fmt: skip
-    files = {f"{WORKSPACE}/sparse/{path.name}": path for path in sorted(folder.iterdir())}
-    return Files(files | write_stereo_configs(ctx.scratch, seen))
+    return Files(sparse_targets(sorted(folder.iterdir())) | write_stereo_configs(ctx.scratch, seen))
 
 
 class DenseInitParams(ModelParams):

@@ -62,8 +62,8 @@ def test_faces_look_where_their_names_say():
     assert axes["right"] == pytest.approx((1, 0, 0))
     assert axes["up"] == pytest.approx((0, -1, 0))
     around = {face.name: face.view.view_from_cam for face in panorama_faces(SIZE, layout="octagon")}
-    assert around["front_right"][2] == pytest.approx(np.array([1, 0, 1]) / np.sqrt(2))
-    assert all(around[name][1] == pytest.approx((0, 1, 0)) for name in ("front", "right", "back_left"))
+    assert around["front-right"][2] == pytest.approx(np.array([1, 0, 1]) / np.sqrt(2))
+    assert all(around[name][1] == pytest.approx((0, 1, 0)) for name in ("front", "right", "back-left"))
 
 
 def test_the_camera_is_colmaps_pinhole_camera():

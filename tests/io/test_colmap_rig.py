@@ -26,7 +26,7 @@ FACES = {
 def cuts(layout="cube", names=NAMES):
     faces = FACES[layout]
     views = [face.view for face in faces]
-    return {name: CutPanorama(views, [f"{face.name}/{name}.jpg" for face in faces]) for name in names}
+    return {name: CutPanorama(views, [f"{name}_{face.name}.jpg" for face in faces]) for name in names}
 
 
 def test_opencv_is_loaded_before_pycolmap():
@@ -83,7 +83,7 @@ def test_pycolmap_reads_rigs_frames_and_poses(tmp_path, layout, form):
     model = pycolmap.Reconstruction(str(tmp_path))
     assert (model.num_rigs(), model.num_cameras(), model.num_frames()) == (1, len(faces), 4)
     assert model.num_reg_images() == 4 * len(faces)
-    by_name = {f"{face.name}/{name}.jpg": (face.view, idx) for face in faces for idx, name in enumerate(NAMES)}
+    by_name = {f"{name}_{face.name}.jpg": (face.view, idx) for face in faces for idx, name in enumerate(NAMES)}
     assert {image.name for image in model.images.values()} == set(by_name)
     for image in model.images.values():
         view, idx = by_name[image.name]

@@ -35,7 +35,7 @@ CUBE_ROTATIONS: FloatArray = np.array(
     dtype=np.float64,
 )
 CUBE_NAMES = ("front", "right", "back", "left", "up", "down")
-_OCTAGON_NAMES = ("front", "front_right", "right", "back_right", "back", "back_left", "left", "front_left")
+_OCTAGON_NAMES = ("front", "front-right", "right", "back-right", "back", "back-left", "left", "front-left")
 _LEAST_FOV_DEG, _LARGEST_FOV_DEG, _LEAST_SIZE_PX = 30.0, 150.0, 4
 
 
@@ -44,7 +44,7 @@ class Face:
     """One face of a layout.
 
     Attributes:
-        name: a plain word, unique in its layout; names files and folders.
+        name: a plain word without `_`, unique in its layout; part of the names of files.
         view: the face as a pinhole view; `view.view_from_cam` is face_from_cam, `view.calibration` is K.
     """
 
