@@ -24,7 +24,7 @@ from pano_mvs.scene import PointCloud
 RENDERER_VARIABLE = "PANO_MVS_RENDERER"
 """`software` draws without PyVista; anything else, or nothing, tries PyVista first."""
 
-VERSION = 1
+VERSION = 2
 """Raise it when the pictures change: earlier pages' are then drawn again."""
 
 _SIZE_HW = (600, 960)

@@ -63,6 +63,8 @@ class Results:
         if entry is None:
             return Results(notes=[f"the cache {store.root} knows no run into {out}, so pictures are missing"])
         stages = {role: str(stage) for role, stage in (summary.get("results") or {}).items() if role in ROLES}
+        if not stages:
+            return Results(notes=["run.json is of an earlier version and names no results: run again to see pictures"])
         records = {
             role: {item: store.read_record(key) for item, key in entry.keys.get(stage, {}).items()}
             for role, stage in stages.items()

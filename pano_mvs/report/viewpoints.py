@@ -72,7 +72,7 @@ def horizontal_axes(up: FloatArray) -> tuple[FloatArray, FloatArray]:
     axis = np.array([0.0, 0.0, 1.0]) if abs(up[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
     forward = axis - (axis @ up) * up
     forward /= np.linalg.norm(forward)
-    return np.cross(up, forward), forward
+    return np.cross(forward, up), forward
 
 
 def facing(points: NDArray[np.float32], normals: NDArray[np.float32], viewpoint: Viewpoint) -> NDArray[np.bool_]:

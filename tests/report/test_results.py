@@ -106,6 +106,7 @@ def test_a_folder_and_its_cache_give_the_page_of_the_run(out_dir, results, tiny)
     assert again.notes == []
     elsewhere = Results.of_folder(out_dir / "other", summary, store)
     assert "knows no run" in elsewhere.notes[0]
+    assert "earlier version" in Results.of_folder(out_dir, {}, store).notes[0]
 
 
 def drawing(folder: Path, body: str) -> tuple[str, ...]:

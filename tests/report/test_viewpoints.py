@@ -86,9 +86,9 @@ def test_the_nearer_point_hides_the_farther_one():
 
 
 @pytest.mark.parametrize("up", [[0, -1, 0], [0, 0, 1], [0.6, 0, 0.8], [0, 0, -1]])
-def test_horizontal_axes_are_across_up_and_right_handed(up):
+def test_horizontal_axes_are_across_up_with_right_on_the_right(up):
     up = np.array(up, float)
     right, forward = horizontal_axes(up)
     frame = np.stack([right, up, forward])
     assert frame @ frame.T == pytest.approx(np.eye(3), abs=1e-12)
-    assert np.linalg.det(frame) == pytest.approx(1)
+    assert np.linalg.det(frame) == pytest.approx(-1), "seen from above, forward up the page, right is to the right"
