@@ -12,15 +12,14 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.io.colmap_maps import write_depth_map, write_normal_map
+from pano_mvs.io.colmap_pictures import write_picture
 from pano_mvs.scene.image_file import write_png
 
 WORKSPACE = "colmap_dense"
-_JPEG = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 _SOURCES = 20  # what COLMAP's own undistorter writes
 
 
@@ -31,14 +30,6 @@ def face_image_name(face: str, item: str, suffix: str) -> str:
     faces hold no `_`, so that no two pictures share a name.
     """
     return f"{item}_{face}{suffix}"
-
-
-def write_face_picture(path: Path, picture: NDArray[np.uint8]) -> None:
-    """Write a picture (H, W, 3) uint8 RGB as JPEG (quality 95, full colour resolution) or PNG, by the path's suffix."""
-    if path.suffix == ".png":
-        write_png(path, picture)
-    else:
-        path.write_bytes(cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), _JPEG)[1].tobytes())
 
 
 def write_face(
@@ -70,7 +61,7 @@ def write_face(
         f"{WORKSPACE}/stereo/normal_maps/{name}.geometric.bin": scratch / f"{face}.normal.bin",
     }
     picture, mask_file, depth_file, normal_file = targets.values()
-    write_face_picture(picture, image)
+    write_picture(picture, image)
     write_png(mask_file, mask.astype(np.uint8) * 255)
     write_depth_map(depth_file, z_depth)
     write_normal_map(normal_file, normals_in_face)

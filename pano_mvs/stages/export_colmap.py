@@ -14,6 +14,7 @@ from pano_mvs.algorithms.faces.render import colmap_depth_view, face_source, ren
 from pano_mvs.api import All, Context, Each, Files, Names, One, Panorama, Params, Poses, RangeMap, UsageError, stage
 from pano_mvs.geometry import PinholeView
 from pano_mvs.io.colmap_model import write_colmap_model
+from pano_mvs.io.colmap_pictures import resized_mask, write_picture
 from pano_mvs.io.colmap_points import ModelForm
 from pano_mvs.io.colmap_rig import CutPanorama, write_rig_model
 from pano_mvs.io.colmap_workspace import face_image_name, sparse_targets, write_face, write_stereo_configs
@@ -35,22 +36,28 @@ def colmap(poses: One[Poses], images: All[Panorama], params: ModelParams, ctx: C
     return _sparse_model(poses, images, params.format, ctx, "colmap/sparse/0")
 
 
+class MasksParams(Params):
+    """Settings of export.colmap_masks."""
+
+    pictures: bool = Field(default=False, description="also the pictures, as whole spheres, for files that are cropped")
+
+
 @stage("export.colmap_masks")
-def colmap_masks(image: Each[Panorama], ctx: Context) -> Files:
+def colmap_masks(image: Each[Panorama], params: MasksParams, ctx: Context) -> Files:
     """A mask for each picture where COLMAP looks for it, colmap/masks/<image>.png: 0 is ignored, 255 is used.
 
     In the size of the model's cameras, and also of pictures of which nothing is masked: COLMAP leaves out a picture
-    whose mask it does not find.
+    whose mask it does not find. With `pictures` the pictures themselves are colmap/images/<image>, in that size, whole
+    spheres, and where masked they show what is around.
     """
-    path = ctx.scratch / "mask.png"
-    mask = image.load_mask().astype(np.uint8) * 255
-    rows, columns = (
-        np.minimum(np.arange(source) * size // source, size - 1)
-        for source, size in zip(image.source_size_hw, mask.shape, strict=True)
-    )
-    write_png(path, mask[rows[:, None], columns])
-    ctx.metric("masked_share", float((mask == 0).mean()))
-    return Files({"colmap/masks/{name}.png": path})
+    mask = image.load_mask()
+    files = {"colmap/masks/{name}.png": ctx.scratch / "mask.png"}
+    write_png(files["colmap/masks/{name}.png"], resized_mask(mask, image.source_size_hw).astype(np.uint8) * 255)
+    if params.pictures:
+        files["colmap/images/{name}"] = ctx.scratch / f"picture{image.image.path.suffix.lower()}"
+        write_picture(files["colmap/images/{name}"], image.load(), image.source_size_hw)
+    ctx.metric("masked_share", float((~mask).mean()))
+    return Files(files)
 
 
 class FacesParams(Params):

@@ -13,8 +13,9 @@ import pytest
 from pano_mvs.algorithms.faces.layout import panorama_faces
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.io.colmap_maps import read_colmap_map, write_depth_map, write_normal_map
+from pano_mvs.io.colmap_pictures import write_picture
 from pano_mvs.io.colmap_rig import CutPanorama, write_rig_model
-from pano_mvs.io.colmap_workspace import write_face_picture, write_stereo_configs
+from pano_mvs.io.colmap_workspace import write_stereo_configs
 from pano_mvs.scene.image_file import decode_image
 from tests.io.test_colmap_model import NAMES, noisy_poses
 
@@ -170,9 +171,11 @@ def test_configurations_name_every_picture(tmp_path):
     assert fusion.splitlines() == names
 
 
-@pytest.mark.parametrize(("suffix", "largest"), [(".png", 0), (".jpg", 12)])
-def test_face_pictures_keep_their_colors(tmp_path, suffix, largest):
+@pytest.mark.parametrize(
+    ("suffix", "largest"), [(".png", 0), (".jpg", 12), (".JPEG", 12), (".webp", 20), (".heic", 12)]
+)
+def test_pictures_keep_their_colors(tmp_path, suffix, largest):
     smooth = np.indices((40, 40)).sum(axis=0).astype(np.uint8) * 3
     picture = np.stack([smooth, smooth[::-1], 255 - smooth], axis=-1)
-    write_face_picture(tmp_path / f"a{suffix}", picture)
+    write_picture(tmp_path / f"a{suffix}", picture)
     assert np.abs(decode_image(tmp_path / f"a{suffix}").astype(int) - picture).max() <= largest

@@ -15,11 +15,12 @@ from pano_mvs.geometry import angle_between, ray_grid
 from pano_mvs.io.colmap_maps import read_colmap_map
 from pano_mvs.scene import FilePart, Files, Panorama, Poses, RangeMap
 from pano_mvs.scene.face_files import FaceFiles
-from pano_mvs.scene.image_file import write_png
+from pano_mvs.scene.image_file import decode_image, write_png
 from pano_mvs.stages.export_colmap import (
     DenseInitParams,
     DenseParams,
     FacesParams,
+    MasksParams,
     ModelParams,
     colmap,
     colmap_dense,
@@ -242,7 +243,7 @@ def test_too_few_points_are_told(capture: Capture, tmp_path: Path) -> None:
 def test_masks_are_called_and_sized_as_colmap_wants_them(capture: Capture, tmp_path: Path, source_hw) -> None:
     image = dataclasses.replace(capture.images[NAMES[1]], source_size_hw=source_hw)
     ctx = context(tmp_path / "scratch")
-    files = colmap_masks(image=image, ctx=ctx)
+    files = colmap_masks(image=image, params=MasksParams(), ctx=ctx)
     assert list(files.files) == ["colmap/masks/{name}.png"]
     mask = cv2.imread(str(next(iter(files.files.values()))), cv2.IMREAD_UNCHANGED)
     assert mask.shape == source_hw
@@ -250,6 +251,20 @@ def test_masks_are_called_and_sized_as_colmap_wants_them(capture: Capture, tmp_p
     assert (mask[down] == 0).all()
     assert (mask == 0).mean() == pytest.approx(1 / 6, abs=0.01)
     assert ctx.metrics["masked_share"] == pytest.approx(1 / 6, abs=0.01)
+
+
+def test_cropped_pictures_are_written_as_the_spheres_that_the_cameras_are(capture: Capture, tmp_path: Path) -> None:
+    whole = capture.images[NAMES[0]]
+    write_png(tmp_path / "crop.png", whole.load()[40:200, 100:400])
+    image = Panorama(FilePart(tmp_path / "crop.png"), SIZE, SIZE, crop_ltwh=(100, 40, 300, 160))
+    ctx = context(tmp_path / "scratch")
+    files = colmap_masks(image=image, params=MasksParams(pictures=True), ctx=ctx)
+    assert set(files.files) == {"colmap/masks/{name}.png", "colmap/images/{name}"}
+    picture = decode_image(files.files["colmap/images/{name}"])
+    mask = cv2.imread(str(files.files["colmap/masks/{name}.png"]), cv2.IMREAD_UNCHANGED)
+    assert picture.shape == (*SIZE, 3)
+    assert (mask > 0).sum() == 300 * 160
+    np.testing.assert_array_equal(picture[40:200, 100:400], whole.load()[40:200, 100:400])
 
 
 @pytest.mark.parametrize("form", ["bin", "txt", "both"])
