@@ -119,6 +119,8 @@ def folder(tmp_path: Path) -> Path:
     for name in ("my.yaml", "workflow.yaml"):
         (tmp_path / name).write_text("pano_mvs: 1\nextends: quickstart\n")
     for page in PAGES:
+        for name, text in re.findall(r"<!-- plugin: (\w+) -->\n```python\n(.*?)```", page.read_text(), re.DOTALL):
+            (tmp_path / f"{name}.py").write_text(text)
         for name, text in re.findall(r"Save this\s+as `([^`/]+)`.*?```\w+\n(.*?)```", page.read_text(), re.DOTALL):
             (tmp_path / name).write_text(text)
     return tmp_path
@@ -128,6 +130,8 @@ def as_workflow(text: str) -> str:
     """Return a block as a workflow: a piece of one is laid over quickstart."""
     if re.search(r"^(pano_mvs|extends):", text, re.MULTILINE):
         return text
+    if text.startswith("stages:"):
+        return f"pano_mvs: 1\nextends: quickstart\n{text}"
     return f"pano_mvs: 1\nextends: quickstart\nstages:\n{textwrap.indent(textwrap.dedent(text), '  ')}"
 
 

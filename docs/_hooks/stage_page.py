@@ -21,7 +21,7 @@ from pano_mvs.engine.stage import StageSpec
 
 KINDS = {
     "source": "which pictures there are, and how one is read",
-    "masks": "what is to be ignored in a picture",
+    "mask": "what is to be ignored in a picture",
     "features": "key points of one panorama, as bearings on the sphere",
     "global": "one vector that sums up a picture",
     "pairs": "which pictures are matched",
