@@ -9,7 +9,7 @@ from pano_mvs.api import Context, Each, Panorama, Params, stage
 
 
 class ColorParams(Params):
-    """Settings of masks.color."""
+    """Settings of mask.color."""
 
     color: str = Field(default="#000000", pattern="^#[0-9a-fA-F]{6}$", description="what is ignored, as #rrggbb")
     tolerance: int = Field(default=8, ge=0, le=255, description="grey levels by which a channel may differ from it")
@@ -17,7 +17,7 @@ class ColorParams(Params):
     margin_px: int = Field(default=2, ge=0, le=64, description="areas are widened by so much")
 
 
-@stage("masks.color")
+@stage("mask.color")
 def color(image: Each[Panorama], params: ColorParams, ctx: Context) -> Panorama:
     """Ignore large areas of one colour: black where a stitcher had nothing, a white disc over the tripod."""
     red, green, blue = bytes.fromhex(params.color[1:])

@@ -42,7 +42,7 @@ FUNCTIONS = {
     "features.sift_tangent": extract_sift,
     "features.orb_tangent": extract_orb,
     "features.sphorb": extract_sphorb,
-    "masks.color": areas_of_color,
+    "mask.color": areas_of_color,
     "pairs.sequential": loop_closing_pairs,
     "pairs.position": position_pairs,
     "pairs.retrieval": retrieval_pairs,

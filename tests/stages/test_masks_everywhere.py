@@ -19,12 +19,14 @@ from pano_mvs.testing.tiny_capture import TinyCapture, Variant, tiny_capture
 
 FEW = {"planes": 12, "near": 0.5, "far": 6.0}
 BOX = FEW | {"aggregation": "box"}
-VARIANTS: list[tuple[str, dict[str, Any]]] = [
+SWEEPS: list[tuple[str, dict[str, Any]]] = [
     *(("depth.sweep", BOX | {"backend": b, "exposure": False}) for b in ("numpy", "opencv")),
     *(("depth.sweep", BOX | {"cost": cost}) for cost in ("sad", "census_gradient", "zncc", "sad_gradient")),
     *(("depth.sweep", BOX | {"combination": c}) for c in ("sum", "best_k", "parallax_weighted")),
-    ("depth.sweep", FEW | {"cost": "sad", "prefilter_diameter": 5, "derotate": True}),
     ("depth.sweep", FEW | {"levels": 2}),
+]
+VARIANTS: list[tuple[str, dict[str, Any]]] = [
+    ("depth.sweep", FEW | {"cost": "sad", "prefilter_diameter": 5, "derotate": True}),
     ("depth.sweep", FEW | {"window": 15, "support": 15, "no_match": "keep"}),
     ("features.orb_tangent", {"max_keypoints": 50}),
     ("features.sift_tangent", {"max_keypoints": 50}),
@@ -37,7 +39,9 @@ VARIANTS: list[tuple[str, dict[str, Any]]] = [
 ]
 
 
-@pytest.mark.parametrize(("name", "settings"), VARIANTS, ids=lambda value: str(value))
+@pytest.mark.parametrize(
+    ("name", "settings"), [*VARIANTS, *(pytest.param(*sweep, marks=pytest.mark.slow) for sweep in SWEEPS)], ids=str
+)
 def test_no_setting_lets_a_stage_see_what_is_masked(name, settings):
     size_hw = (128, 256) if settings.get("levels", 1) > 1 else (32, 64)
     laws = [law for law in stage_laws(name, settings=settings, size_hw=size_hw) if "masked" in str(law)]

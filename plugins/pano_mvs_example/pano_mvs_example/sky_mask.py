@@ -1,11 +1,9 @@
 """A mask of the sky, by its colour, its smoothness and its place."""
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pano_mvs.api import Context, Each, FilePart, Panorama, Params, stage, write_png
+from pano_mvs.api import Context, Each, Panorama, Params, stage
 from pano_mvs.geometry import pad_panorama
 from pydantic import Field
 
@@ -25,12 +23,9 @@ def sky(image: Each[Panorama], params: SkyParams, ctx: Context) -> Panorama:
 
     Indoors a white ceiling looks the same; leave the stage out there.
     """
-    valid = image.load_mask()
-    found = find_sky(image.load(), valid, params)
+    found = find_sky(image.load(), image.load_mask(), params)
     ctx.metric("sky", float(found.mean()))
-    path = ctx.scratch / "mask.png"
-    write_png(path, np.where(valid & ~found, np.uint8(255), np.uint8(0)))
-    return replace(image, mask_file=FilePart(path))
+    return image.with_mask(~found, ctx.scratch)
 
 
 def find_sky(picture: NDArray[np.uint8], valid: NDArray[np.bool_], params: SkyParams) -> NDArray[np.bool_]:
