@@ -67,6 +67,8 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
     mask = item.files.get("mask")
     if mask is None and params.masks is not None:
         ctx.note(f"{item.name} has no mask in {params.masks.name}; all of it is used")
+    if params.masks is None and (unused := params.path / "masks").is_dir():
+        ctx.note(f"{unused} is there, but not used; give it as `masks` to ignore what its files mask")
     panorama = Panorama(
         image=FilePart(path, external=True),
         size_hw=working_size(info.size_hw, min(params.max_width, info.full_width_px)),

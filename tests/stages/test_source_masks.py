@@ -69,6 +69,15 @@ def test_masks_among_the_pictures_are_no_pictures(capture):
     assert sorted(found) == sorted(NAMES)
 
 
+def test_a_folder_of_masks_that_was_not_given_is_noted(capture):
+    write_mask(capture / "photos" / "masks" / "3.png")
+    found, notes = read(capture / "photos")
+    assert sorted(found) == sorted(NAMES)
+    assert any("masks is there, but not used" in note for note in notes)
+    _, notes = read(capture / "photos", masks=capture / "photos" / "masks")
+    assert not any("not used" in note for note in notes)
+
+
 def test_masks_that_fit_no_picture_are_named(capture):
     (capture / "masks").mkdir()
     with pytest.raises(InputError, match=r"masks: no mask in it belongs .* \(it is empty\)"):

@@ -29,7 +29,7 @@ _NEAREST_BASELINES = 0.15
 _NEAR_QUANTILE, _FAR_QUANTILE = 0.005, 0.995
 _NEAR_MARGIN, _FAR_MARGIN = 0.7, 1.3
 _LEAST_SHARE = 0.01
-# Outdoors this share of the sphere is sky. What ends there, at a third of the farthest range that the pictures can
+# Outdoors this share of what is not masked is sky. What ends there, at a third of the farthest range that pictures can
 # tell or beyond, sets no quantile, and with planes even in 1/range it costs next to none to go all the way.
 _OPEN_SHARE, _OPEN_RANGE = 0.1, 1 / 3
 # Grey levels between the darkest and the brightest pixel of a 5×5 window; plain walls agree with each other anywhere.
@@ -59,7 +59,8 @@ def limits_by_sweeping(
         device: where it computes, if it can choose.
 
     Returns:
-        (near, far); from the baselines and the angular resolution alone where less than 1 % of the sphere agrees.
+        (near, far); from the baselines and the angular resolution alone where no more than 1 % of what is not masked
+        agrees.
 
     Raises:
         UsageError: if there is no source, or no source at another place.
@@ -80,13 +81,14 @@ def limits_by_sweeping(
     )  # fmt: skip
     agreed = (checked.confidence >= CONSISTENT_CONFIDENCE[0]) & _textured(small[0])
     solid_angle = np.broadcast_to(pixel_solid_angle(agreed.shape)[:, None], agreed.shape)
-    if solid_angle[agreed].sum() < _LEAST_SHARE * solid_angle.sum():
+    seen_angle = solid_angle[small_masks[0]].sum()
+    if solid_angle[agreed].sum() <= _LEAST_SHARE * seen_angle:
         return range_limits(_baselines(0, poses), width=width)
     near, far = _quantiles(checked.range[agreed], solid_angle[agreed])
     near, far = _outward(_NEAR_MARGIN * near, _FAR_MARGIN * far)
     farthest = range_limits(_baselines(0, poses), width=width)[1]
     open_angle = solid_angle[maps[0].range > _OPEN_RANGE * farthest].sum()
-    return near, max(far, farthest) if open_angle > _OPEN_SHARE * solid_angle.sum() else far
+    return near, max(far, farthest) if open_angle > _OPEN_SHARE * seen_angle else far
 
 
 def _coarse(
