@@ -10,7 +10,7 @@ from typing import Any
 from pano_mvs.report.camera_map import CameraMap, camera_maps, up_of
 from pano_mvs.report.cloud_pictures import CloudPictures, cloud_pictures
 from pano_mvs.report.completeness import Shares
-from pano_mvs.report.figures import score_tables
+from pano_mvs.report.figures import score_tables, side_by_side
 from pano_mvs.report.findings import scores_by_stage
 from pano_mvs.report.kept import Kept
 from pano_mvs.report.panoramas import Row, panorama_rows
@@ -45,6 +45,7 @@ class Content:
         residuals: of the points.
         pair_residuals: medians of the pairs' residuals.
         scores: (stage, tables) of each branch that has some.
+        comparison: the medians of several branches side by side.
         notes: what could not be shown.
     """
 
@@ -62,6 +63,7 @@ class Content:
     residuals: Residuals | None
     pair_residuals: Histogram | None
     scores: tuple[tuple[str, Mapping[str, Any]], ...]
+    comparison: Mapping[str, Any]
     notes: tuple[str, ...]
 
 
@@ -85,6 +87,7 @@ def gather(out_dir: Path, summary: Mapping[str, Any], results: Results, kept: Ke
     shares = measured_shares(views, results, kept) | {card.name: card.shares for card in cards if card.shares}
     rows = panorama_rows(summary, shares=shares, residuals=residuals,
                          thumbnails=thumbnails(out_dir, views, results, kept))  # fmt: skip
+    scores = tuple((stage, score_tables(scored)) for stage, scored in scores_by_stage(summary).items())
     judged = dict(summary) | {"views": [_judged(view, shares) for view in views]}
     return Content(
         verdict=verdict(judged, residuals=residuals, image_width=_image_width(results)),
@@ -101,7 +104,8 @@ def gather(out_dir: Path, summary: Mapping[str, Any], results: Results, kept: Ke
         mean_shares=_mean(list(shares.values())),
         residuals=residuals,
         pair_residuals=histogram([link[4] for link in links if len(link) > 4 and link[4] is not None]),
-        scores=tuple((stage, score_tables(scores)) for stage, scores in scores_by_stage(summary).items()),
+        scores=scores,
+        comparison=side_by_side(scores),
         notes=tuple(sorted(set(results.notes))),
     )  # fmt: skip
 

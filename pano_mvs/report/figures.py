@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 # What a person looks at first; other scores follow as they come.
@@ -101,6 +101,23 @@ def score_tables(scores: Mapping[str, Any]) -> dict[str, Any]:
         "median": [_beside_constant(middle, metric) for metric in columns] if len(views) > 1 else [],
         "notes": [*([_BRACKETS] if len(_metrics(views)) > len(columns) else []), *(scores.get("notes") or [])],
     }
+
+
+def side_by_side(tables: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[str, Any]:
+    """Return the medians of several branches as one table with a row for each; none where there is but one.
+
+    Args:
+        tables: (name of a branch, what `score_tables` gave for it).
+    """
+    scored = [(name, table) for name, table in tables if table["views"]]
+    if len(scored) < 2:
+        return {"columns": [], "rows": []}
+    columns = list(dict.fromkeys(column for _, table in scored for column in table["columns"]))
+    rows = []
+    for name, table in scored:
+        values = dict(zip(table["columns"], table["median"] or table["views"][0][1], strict=True))
+        rows.append((name, [values.get(column) for column in columns]))
+    return {"columns": columns, "rows": rows}
 
 
 def _metrics(views: Mapping[str, Mapping[str, Any]]) -> list[str]:

@@ -180,7 +180,10 @@ def test_what_is_no_preview_within_the_folder_is_not_shown(out_dir, preview):
 def test_scores_of_all_branches_are_told_apart(out_dir):
     both = {"ours": SUMMARY["scores"], "papers": {"poses": {}, "views": {"a/1.png": {"psnr_db": 11.25}}, "notes": []}}
     words = reported(out_dir, SUMMARY | {"all_scores": both}).words
-    assert words.index("ours") < words.index("papers") < words.index("11.25")
+    beside = words[words.index("Median over views") :]
+    assert beside.index("ours") < beside.index("30") < beside.index("papers") < beside.index("11.25")
+    assert words.count("11.25") == 2, "and in the table of its branch"
+    assert "Median over views" not in reported(out_dir, SUMMARY).words
 
 
 def test_where_nothing_failed_nothing_is_said_of_failures(out_dir):
