@@ -25,13 +25,17 @@ from pano_mvs.algorithms.metrics.surface import TrueSurface, TrueView, surface_o
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.geometry import Rigid3, Similarity3
 from pano_mvs.io.names import match_image_names
-from pano_mvs.io.ply_points import PlyPoints, open_ply_points, read_ply_points
+from pano_mvs.io.ply_points import PlyPoints, open_ply_points
 from pano_mvs.io.pose_files import read_poses
 from pano_mvs.io.truth import read_truth
 
 _CLOUD, _MODEL = "cloud.ply", "colmap/sparse/0"
 # Distances are told apart up to this many times the largest tolerance; for quantiles and files, not for scores.
 _FARTHEST = 20.0
+# Of a reference cloud, as many points as may have to be found; all of them count for the cloud's own accuracy.
+_MOST_SAMPLES = 4_000_000
+# Length of the mean of the cameras' own vertical axes from which they are held to agree on where up is.
+_AGREED = 0.5
 
 
 @dataclass(frozen=True)
@@ -66,6 +70,7 @@ class CloudTruth:
         views: number of views with truth.
         unit: of lengths.
         cameras: (M, 3) where the cameras that were used stood, in the truth's world.
+        up: (3,) unit vector away from the ground, as far as the cameras tell.
     """
 
     pieces: Callable[[], Iterable[NDArray[np.float32]]]
@@ -74,6 +79,7 @@ class CloudTruth:
     views: int
     unit: str
     cameras: NDArray[np.float64]
+    up: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,10 +195,12 @@ def _alignment(model: Path, known: dict[str, Rigid3]) -> tuple[Similarity3, list
 
 def _cloud_truth(truth: Path, used: list[str], voxel_size: float, known: dict[str, Rigid3]) -> CloudTruth:
     cameras = np.array([known[name].center for name in used if name in known]).reshape(-1, 3)
+    up = _up([known[name] for name in used if name in known])
     if not truth.is_dir():
-        reference = read_ply_points(truth)
-        surface = surface_of_cloud(reference, voxel_size=voxel_size)
-        return CloudTruth(lambda: PointChunks.of(reference).read(), surface, {}, 0, "units of the truth", cameras)
+        reference = open_ply_points(truth)
+        some, _ = reference.some(max(1, -(-reference.count // _MOST_SAMPLES)))
+        surface = surface_of_cloud(some, voxel_size=voxel_size)
+        return CloudTruth(reference.chunks, surface, {}, 0, "units of the truth", cameras, up)
     true = read_truth(truth)
     views = {
         name: TrueView(view.cam_from_world, ranges)
@@ -204,7 +212,14 @@ def _cloud_truth(truth: Path, used: list[str], voxel_size: float, known: dict[st
         raise InputError(f"{truth}: holds no range map of a camera that was used ({', '.join(used[:3]) or 'none'})")
     unit = "m" if true.metric else "units of the truth"
     surface = surface_of_views(list(chosen.values()))
-    return CloudTruth(lambda: map(view_points, views.values()), surface, chosen, len(views), unit, cameras)
+    return CloudTruth(lambda: map(view_points, views.values()), surface, chosen, len(views), unit, cameras, up)
+
+
+def _up(cameras: Sequence[Rigid3]) -> NDArray[np.float64]:
+    """Return the unit vector (3,) that is up for most cameras, for pictures; that of the world where they disagree."""
+    down = np.mean([camera.rotation[1] for camera in cameras], axis=0) if cameras else np.zeros(3)
+    length = float(np.linalg.norm(down))
+    return -down / length if length > _AGREED else np.array([0.0, -1.0, 0.0])
 
 
 def _as_json(request: CloudRequest, judged: JudgedCloud, scores: Sequence[CloudScore]) -> dict[str, object]:

@@ -48,12 +48,12 @@ def write_error_clouds(folder: Path, judged: JudgedCloud) -> None:
                       farthest=judged.farthest)  # fmt: skip
     write_error_cloud(folder / "completeness.ply", PointChunks.of(surface.points_in_world).read(),
                       judged.distances.of_surface, limits=limits, farthest=judged.farthest)  # fmt: skip
-    cameras = judged.compared.cameras
-    write_cloud_views(folder / "accuracy.png", *_some_points(judged), limits=limits, cameras=cameras,
+    cameras, up = judged.compared.cameras, judged.compared.up
+    write_cloud_views(folder / "accuracy.png", *_some_points(judged), limits=limits, cameras=cameras, up=up,
                       title="cloud by its distance from the true surface")  # fmt: skip
     step = -(-len(surface.points_in_world) // _MOST_POINTS) or 1
     write_cloud_views(folder / "completeness.png", surface.points_in_world[::step], _towards_cameras(judged, step),
-                      judged.distances.of_surface[::step], limits=limits, cameras=cameras,
+                      judged.distances.of_surface[::step], limits=limits, cameras=cameras, up=up,
                       title="true surface by its distance from the cloud")  # fmt: skip
     write_overview(folder / "errors.png", judged)
 

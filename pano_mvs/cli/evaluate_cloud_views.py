@@ -14,7 +14,6 @@ from pano_mvs.report.viewpoints import viewpoints
 from pano_mvs.scene.image_file import write_png
 
 _SIZE_HW = (640, 1024)
-_UP = np.array([0.0, -1.0, 0.0])  # y is down
 
 
 def write_cloud_views(
@@ -25,23 +24,25 @@ def write_cloud_views(
     *,
     limits: Sequence[float],
     cameras: NDArray[np.float64],
+    up: NDArray[np.float64],
     title: str,
 ) -> None:
     """Write a PNG of points coloured by their distances, with a legend.
 
     Args:
         path: the file to write; its folder is made.
-        points: (N, 3) in a world whose y is down.
+        points: (N, 3) in the world.
         normals: (N, 3) towards the side that is seen, or 0: what shows its back is left out.
         distances: (N,) of each.
         limits: tolerances in rising order, by which points are coloured as of `distance_colors`.
         cameras: (M, 3) where cameras stood; from one of them the inside is seen.
+        up: (3,) unit vector away from the ground.
         title: what is shown.
     """
     parts = [distance_legend(limits)]
     if len(points):
         colors = distance_colors(distances, limits)
-        for view in viewpoints(points, cameras, _UP, aspect=_SIZE_HW[1] / _SIZE_HW[0]):
+        for view in viewpoints(points, cameras, up, aspect=_SIZE_HW[1] / _SIZE_HW[0]):
             parts += [caption(f"{title}, {view.title.lower()}"),
                       draw_cloud(points, normals, colors, view, size_hw=_SIZE_HW)]  # fmt: skip
     path.parent.mkdir(parents=True, exist_ok=True)

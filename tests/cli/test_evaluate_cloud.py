@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.metrics.surface import TrueView, view_points
+from pano_mvs.cli.evaluate_cloud import CloudRequest, judge_cloud
 from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec
 from pano_mvs.io.ply import write_ply
 from pano_mvs.io.ply_points import open_ply_points
@@ -110,6 +111,25 @@ def test_a_cloud_against_itself_is_perfect_and_no_distance_from_it(
     away = save(tmp_path / "b.ply", surface + 100)
     text = pano_mvs("evaluate", "cloud", away, "--truth", own, "--threshold", "0.5").flat
     assert "points from the surface: median over 10, 90 % within over 10" in text
+
+
+def test_up_is_where_the_cameras_have_it(tmp_path: Path, folder: Path, surface: np.ndarray) -> None:
+    reference = save(tmp_path / "a.ply", surface)
+    turned = Similarity3(1.0, rotation_from_rotvec([0.9, 0.4, -0.2]), np.zeros(3))
+    poses = read_truth(folder).poses
+    for place, expected in (
+        (Similarity3(1.0, np.eye(3), np.zeros(3)), (0, -1, 0)),
+        (turned, turned.rotation @ (0, -1, 0)),
+    ):
+        known = write_json(tmp_path / "m.json", {name: place.move_camera(pose) for name, pose in poses.items()})
+        found = judge_cloud(CloudRequest(reference, reference, true_poses=known, poses=known)).compared.up
+        angle_deg = np.rad2deg(np.arccos(found @ expected))
+        assert angle_deg < 10  # the cameras of the room are held nearly level
+    flips = (np.eye(3), np.diag([1.0, -1, -1])) * 2
+    upside = {name: Rigid3(flip, pose.translation) for flip, (name, pose) in zip(flips, poses.items(), strict=True)}
+    known = write_json(tmp_path / "m.json", upside)
+    found = judge_cloud(CloudRequest(reference, reference, true_poses=known, poses=known)).compared.up
+    np.testing.assert_array_equal(found, [0, -1, 0])
 
 
 def test_errors_are_written_as_clouds_and_drawn(
