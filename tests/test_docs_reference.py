@@ -126,7 +126,8 @@ def test_columns_that_say_nothing_are_left_out() -> None:
     [
         ("[guide](docs/plugins.md#masks)", "[guide](plugins.md#masks)"),
         ("[example](plugins/pano_mvs_example/README.md)", "[example](example_plugin.md)"),
-        ("[`plugins/`](plugins/README.md)", "`plugins/` (`plugins/README.md`)"),
+        ("[`plugins/`](plugins/README.md)", "[`plugins/`](installable_plugins.md)"),
+        ("[a licence](LICENSE)", "a licence (`LICENSE`)"),
         ("| `a \\| b` | c |", "| `a | b` | c |"),
         ("[site](https://example.org)", "[site](https://example.org)"),
         ("```\n[x](y.md)\n```", "```\n[x](y.md)\n```"),

@@ -11,7 +11,10 @@ ROOT = Path(__file__).parents[2]
 PAGES = {
     "changelog.md": "CHANGELOG.md",
     "contributing.md": "CONTRIBUTING.md",
+    "installable_plugins.md": "plugins/README.md",
     "example_plugin.md": "plugins/pano_mvs_example/README.md",
+    "las_plugin.md": "plugins/pano_mvs_las/README.md",
+    "torch_plugin.md": "plugins/pano_mvs_torch/README.md",
 }
 """Page of the site to the file of the repository that it is."""
 
