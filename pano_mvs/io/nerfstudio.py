@@ -15,9 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.nerfstudio_frames import NerfstudioFrame, Variant
@@ -74,14 +72,6 @@ def is_common_picture(path: Path) -> bool:
     with path.open("rb") as stream:
         start = stream.read(26)
     return start[:2] == b"\xff\xd8" or (start[:8] == _PNG_START and start[24:26] == _PNG_RGB_8_BIT)
-
-
-def write_picture(path: Path, picture: NDArray[np.uint8]) -> None:
-    """Write a picture (H, W, 3) RGB as JPEG (quality 95) or PNG, by the file's suffix."""
-    options = [cv2.IMWRITE_JPEG_QUALITY, 95] if path.suffix == ".jpg" else []
-    encoded, data = cv2.imencode(path.suffix, cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), options)
-    assert encoded
-    path.write_bytes(bytes(data))
 
 
 def _listed(

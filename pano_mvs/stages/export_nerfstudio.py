@@ -30,7 +30,8 @@ from pano_mvs.api import (
     stage,
     write_png,
 )
-from pano_mvs.io.nerfstudio import is_common_picture, open_mask, transforms_document, write_picture
+from pano_mvs.io.colmap_pictures import write_picture
+from pano_mvs.io.nerfstudio import is_common_picture, open_mask, transforms_document
 from pano_mvs.io.nerfstudio_frames import NerfstudioFrame, NerfstudioFrames, Variant
 from pano_mvs.io.ply import write_ply
 from pano_mvs.io.range_files import write_range_png
