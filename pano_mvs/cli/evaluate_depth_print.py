@@ -27,6 +27,7 @@ _LABELS = {"psnr_db": "PSNR dB", "mse": "MSE ×10⁻²", "rmse": "RMSE", "mae": 
 )
 _FACTORS = {"psnr_db": 1.0, "rmse": 1.0, "mae": 1.0}  # all others are shown in hundredths
 _OF_A_VIEW = "psnr_db", "w_mae", "w_delta_105", "completeness", "valid_w_delta_105", "median_relative_error", "ause"
+_MOST_VIEWS = 40
 _BASELINE_WORDS = {
     "best": "the constant that is best for the very score, chosen by the truth",
     "median": "the median of the view's true ranges everywhere",
@@ -125,6 +126,9 @@ def print_report(report: DepthReport, console: Console, *, baseline: str) -> Non
     console.print(_mean_table(report, baseline))
     if len(report.views) > 1:
         console.print(_view_table(report, baseline))
+    if len(report.views) > _MOST_VIEWS:
+        console.print(f"these are the {_MOST_VIEWS} of {len(report.views)} views with the worst δ<1.05; --json and "
+                      "--csv have all", highlight=False, markup=False, soft_wrap=True)  # fmt: skip
     for what, names in (("no truth for", report.without_truth), ("no estimate of", report.without_estimate)):
         if names:
             shown = ", ".join(names[:5]) + (f" … ({len(names)} in all)" if len(names) > 5 else "")
@@ -172,7 +176,10 @@ def _mean_table(report: DepthReport, baseline: str) -> Table:
 def _view_table(report: DepthReport, baseline: str) -> Table:
     names = [name for name in _OF_A_VIEW if any(name in view.scores for view in report.views.values())]
     table = Table("view", *(_view_heading(name) for name in names), box=SIMPLE, collapse_padding=True)
+    worst = sorted(report.views, key=lambda name: report.views[name].scores["w_delta_105"])[:_MOST_VIEWS]
     for label, view in report.views.items():
+        if label not in worst:
+            continue
         constant = view.constants[baseline]
         table.add_row(escape(label), *(_shown(name, view.scores) for name in names))
         table.add_row("constant", *(_shown(name, constant) for name in names), style="dim", end_section=True)

@@ -150,6 +150,17 @@ def test_foreign_folders_are_compared_in_their_units(pano_mvs: Command, truth: P
     assert scaled["mean"]["mae"] == pytest.approx(report["mean"]["mae"], rel=1e-4)
 
 
+def test_of_many_views_the_worst_are_listed(pano_mvs: Command, tmp_path: Path) -> None:
+    true = {f"v{idx:02d}": np.full((4, 8), 2, np.float32) for idx in range(43)}
+    wrong = {name: np.where(np.arange(8) < idx % 5, 9, ranges) for idx, (name, ranges) in enumerate(true.items())}
+    np.savez(tmp_path / "true.npz", **true)
+    np.savez(tmp_path / "found.npz", **wrong)
+    text = pano_mvs("evaluate", "depth", tmp_path / "found.npz", "--truth", tmp_path / "true.npz").text
+    assert "the 40 of 43 views with the worst δ<1.05" in text
+    assert "v42" in text
+    assert "v40" not in text  # one of nine without an error
+
+
 def test_masks_and_confidence_leave_out_what_they_say(
     pano_mvs: Command, output: Path, truth: Path, tmp_path: Path
 ) -> None:
