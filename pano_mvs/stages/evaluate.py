@@ -23,7 +23,7 @@ def truth(images: All[Panorama], poses: One[Poses], ranges: All[RangeMap], param
     """Compare poses and range maps with the truth.
 
     A picture counts if the truth knows its name and, where the truth states the picture's SHA-256, its bytes: another
-    picture of the same name is not scored against it.
+    picture of the same name is not scored against it. What a picture's mask ignores is left out.
     """
     known = read_truth(params.truth)
     notes: list[str] = []
@@ -40,5 +40,6 @@ def truth(images: All[Panorama], poses: One[Poses], ranges: All[RangeMap], param
         {name: ranges[name].range for name in matched if name in ranges},
         {name: partial(known.range_map, view) for name, view in matched.items()},
         confidences={name: ranges[name].confidence for name in matched if name in ranges},
+        masks={name: images[name].load_mask() for name in matched if name in ranges},
     )
     return Scores(scores.poses, scores.views, (*scores.notes, *notes))

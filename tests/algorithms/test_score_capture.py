@@ -46,6 +46,15 @@ def test_ranges_are_scaled_by_the_cameras_and_read_at_the_true_pixels():
     assert not found.notes
 
 
+def test_what_is_masked_is_not_judged():
+    truth, _ = box_range((32, 64))
+    estimated, mask = truth.copy(), np.ones((16, 32), bool)
+    estimated[16:], mask[8:] = np.nan, False
+    views = {"a": estimated}, {"a": lambda: truth}
+    assert score_capture(POSES, POSES, *views, masks={"a": mask}).views["a"]["completeness"] == 1
+    assert score_capture(POSES, POSES, *views).views["a"]["completeness"] == 0.5
+
+
 def test_what_cannot_be_judged_has_no_score():
     nothing = np.full((8, 16), np.nan, np.float32)
     found = scored(nothing, box_range((8, 16))[0], np.zeros((8, 16), np.uint8)).views["a"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from pano_mvs.scene import Scores
 
 KEPT = "psnr_db", "w_mae", "w_delta_105", "bad_5", "completeness", "median_relative_error"
 KEPT_OF_CONFIDENCE = "sparsification_area", "sparsification_oracle_area", "ause"
+Scalar = TypeVar("Scalar", bound=np.generic)
 RangeReader = Callable[[], "NDArray[np.float32] | None"]
 
 
@@ -26,6 +28,7 @@ def score_capture(
     true_ranges: Mapping[str, RangeReader],
     *,
     confidences: Mapping[str, NDArray[np.uint8]] | None = None,
+    masks: Mapping[str, NDArray[np.bool_]] | None = None,
 ) -> Scores:
     """Return pose and depth scores.
 
@@ -40,6 +43,7 @@ def score_capture(
         estimated_ranges: (H, W) by image, NaN invalid; of another size than the truth they are read at its pixels.
         true_ranges: image to a function that returns its (H, W) true range, or None where it is not known.
         confidences: (H, W) by image: how well they rank the errors is scored too where they are given.
+        masks: (H, W) by image, False is left out of the scores: nothing was to be estimated there.
     """
     if len(true_poses) < 2:
         return Scores({}, {}, ("no ground truth is known for these pictures",))
@@ -68,21 +72,34 @@ def score_capture(
         if truth is None:
             notes.append(f"{name}: no true range map")
             continue
-        views[name] = _view_scores(np.asarray(estimated), truth, scale, (confidences or {}).get(name))
+        size_hw = truth.shape[0], truth.shape[1]
+        views[name] = _view_scores(
+            resized_range(np.asarray(estimated), size_hw),
+            truth,
+            scale,
+            confidence=_of_size((confidences or {}).get(name), size_hw),
+            mask=_of_size((masks or {}).get(name), size_hw),
+        )
     return Scores(poses, views, tuple(notes))
 
 
+def _of_size(labels: NDArray[Scalar] | None, size_hw: tuple[int, int]) -> NDArray[Scalar] | None:
+    return None if labels is None else resized_labels(np.asarray(labels), size_hw)
+
+
 def _view_scores(
-    estimated: NDArray[np.float32], truth: NDArray[np.float32], scale: float, confidence: NDArray[np.uint8] | None
+    estimated: NDArray[np.float32],
+    truth: NDArray[np.float32],
+    scale: float,
+    *,
+    confidence: NDArray[np.uint8] | None,
+    mask: NDArray[np.bool_] | None,
 ) -> dict[str, float]:
     """Return the scores that are kept with a run, then what constants score under each of these names.
 
     What is no finite number (the median of nothing, the PSNR of no error) is left out: records hold none.
     """
-    size_hw = truth.shape[0], truth.shape[1]
-    if confidence is not None:
-        confidence = resized_labels(np.asarray(confidence), size_hw)
-    found = score_view(resized_range(estimated, size_hw), truth, scale=scale, confidence=confidence)
+    found = score_view(estimated, truth, scale=scale, confidence=confidence, mask=mask)
     scores = {name: found.scores[name] for name in (*KEPT, *KEPT_OF_CONFIDENCE) if name in found.scores}
     for prefix, constants in (("constant_", found.constants["median"]), ("best_constant_", found.constants["best"])):
         scores |= {f"{prefix}{name}": constants[name] for name in (*KEPT, "ause") if name in constants}
