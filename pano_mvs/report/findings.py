@@ -55,7 +55,7 @@ def findings(summary: Mapping[str, Any], *, residual_px: float | None = None) ->
         *_registration(summary),
         *_graph(summary),
         *_residual(residual_px),
-        *_views(summary.get("views") or []),
+        *_views(summary),
         *_cloud(summary),
         *_baseline(summary),
     ]
@@ -131,13 +131,23 @@ def _residual(residual_px: float | None) -> list[Finding]:
                     "put poses.refine behind the solver if it is not there.")]  # fmt: skip
 
 
-def _views(views: Sequence[Mapping[str, Any]]) -> list[Finding]:
+def compares_views(summary: Mapping[str, Any]) -> bool:
+    """Return whether any stage compared the views: where none did, no pixel is confirmed, and that says nothing."""
+    compared = any("consistency" in str(stage.get("use")) for stage in summary.get("stages") or [])
+    return compared or any(view.get("consistent") for view in summary.get("views") or [])
+
+
+def _views(summary: Mapping[str, Any]) -> list[Finding]:
     found = []
+    views = summary.get("views") or []
     complete, consistent = (median([view.get(key) for view in views]) for key in ("completeness", "consistent"))
     if complete is not None and (mood := mood_of(complete, GOOD_COMPLETE, FAIR_COMPLETE)) != "good":
         found.append(Finding(mood, f"Half of the views have a range for less than {share(complete)} of their pixels.",
                              "Sky and masks have none; elsewhere look at the views below."))  # fmt: skip
-    if consistent is not None and (mood := mood_of(consistent, GOOD_CONSISTENT, FAIR_CONSISTENT)) != "good":
+    if consistent is not None and not compares_views(summary):
+        found.append(Finding("", "No stage compared the views with each other, so nothing is known of their agreement.",
+                             "filters.consistency does it."))  # fmt: skip
+    elif consistent is not None and (mood := mood_of(consistent, GOOD_CONSISTENT, FAIR_CONSISTENT)) != "good":
         found.append(Finding(mood, f"Other views confirm only {share(consistent)} of the pixels in the median view.",
                              "Plain walls cannot be confirmed; if textured ones are not either, the cameras are too "
                              "far apart or the poses are wrong."))  # fmt: skip

@@ -17,6 +17,7 @@ from pano_mvs.report.findings import (
     GOOD_REGISTERED,
     GOOD_RESIDUAL_PX,
     Finding,
+    compares_views,
     findings,
     mood_of,
 )
@@ -140,7 +141,7 @@ def _coverage(summary: Mapping[str, Any]) -> list[Tile]:
         ("consistent", "of pixels agree with other views", (GOOD_CONSISTENT, FAIR_CONSISTENT)),
     ):
         value = median([view.get(key) for view in views])
-        if value is not None:
+        if value is not None and (key != "consistent" or compares_views(summary)):
             tiles.append(Tile(share(value), label, mood_of(value, *limits)))
     return tiles
 

@@ -65,6 +65,17 @@ def test_residuals_are_judged_by_the_pixels_of_the_pictures(median_deg, mood):
     assert verdict(GOOD, residuals=residuals(median_deg)).mood == "good", "not judged where that is not known"
 
 
+def test_where_no_stage_compares_the_views_nothing_is_held_against_them():
+    """The paper's workflow has no such stage: all its pixels are weak, however right they are."""
+    views = [{"name": name, "completeness": 0.99, "consistent": 0.0} for name in NAMES]
+    found = verdict(GOOD | {"views": views})
+    assert found.mood == "good"
+    assert "nothing is known of their agreement" in found.findings[0].text
+    assert not any("agree" in tile.label for tile in found.tiles)
+    checked = [{"name": "checked", "use": "filters.consistency", "run": 10}]
+    assert verdict(GOOD | {"views": views, "stages": checked}).mood == "bad", "it compared, and nothing agrees"
+
+
 def test_the_worst_comes_first():
     found = verdict(GOOD | {"exit_code": 3, "failures": [{"stage": "depth"}], "cloud": {"points": 0}})
     assert [finding.mood for finding in found.findings] == ["bad", "fair"]
