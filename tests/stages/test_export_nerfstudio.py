@@ -21,6 +21,7 @@ from pano_mvs.io.pose_files import read_poses
 from pano_mvs.stages.export_nerfstudio import (
     NerfstudioFramesParams,
     NerfstudioParams,
+    frames_memory_bytes,
     nerfstudio,
     nerfstudio_frames,
 )
@@ -295,3 +296,9 @@ def test_grey_and_16_bit_pictures_are_written_anew(tmp_path: Path) -> None:
         params = NerfstudioFramesParams(variants=("equirectangular",))
         made = nerfstudio_frames(given, None, params, Context(np.random.default_rng(0), scratch))
         assert list(made.files) == ["nerfstudio/equirectangular/images/{name}.jpg"]
+
+
+def test_what_a_panorama_takes_goes_with_its_pixels() -> None:
+    image = replace(tiny_capture(PLAIN).images["000.png"], size_hw=(4096, 8192), source_size_hw=(4096, 8192))
+    assert 1.2e9 < frames_memory_bytes(NerfstudioFramesParams(), {"image": image}) < 1.5e9
+    assert frames_memory_bytes(NerfstudioFramesParams(size_px=8192), {"image": image}) > 3e9
