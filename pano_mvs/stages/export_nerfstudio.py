@@ -60,7 +60,7 @@ class NerfstudioFramesParams(Params):
 def frames_memory_bytes(params: NerfstudioFramesParams, inputs: Mapping[str, Any]) -> int:
     """Return what one panorama takes: 40 bytes a pixel, measured at 4096 and 8192 columns, and those of a face."""
     height, width = inputs["image"].size_hw
-    return 40 * (height * width + (params.size_px or 0) ** 2)
+    return int(40 * (height * width + (params.size_px or 0) ** 2))
 
 
 @stage("export.nerfstudio_frames", memory=frames_memory_bytes)
