@@ -22,6 +22,7 @@ _PLACE_BITS = 21
 _MOST_PLACES = 1 << _PLACE_BITS
 _CANDIDATE = np.dtype([("place", "<u8"), ("rank", "<u2"), ("off_center", "<f4"), ("idx", "<i8")])
 _COUNTED_VOXELS = 1 << 14
+_CUBE_SURFACE = 24.0  # of a cube from −1 to 1: what rooms have more or less
 _FEWEST_ROUNDS = 8
 _FULL_ENOUGH = 0.93
 
@@ -110,7 +111,7 @@ def voxel_for_count(cloud: PointCloud, good: Kept, selection: Selection) -> floa
         return selection.voxel
     reach = _reach(cloud, good)
     smallest = max(selection.voxel, 2 * reach / (_MOST_PLACES - 2))
-    edge, slope = max(smallest, reach / np.sqrt(wanted)), -2.0
+    edge, slope = max(smallest, reach * np.sqrt(_CUBE_SURFACE / wanted)), -2.0
     tried: list[tuple[float, float]] = []
     fitting: list[float] = []
     while len(tried) < _FEWEST_ROUNDS or (not fitting and edge < 4 * reach):
