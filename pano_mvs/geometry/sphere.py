@@ -50,8 +50,14 @@ def pixel_from_ray(rays: ArrayLike, size_hw: tuple[int, int]) -> FloatArray:
 def ray_grid(size_hw: tuple[int, int]) -> FloatArray:
     """Return the unit rays through all pixel centres, (height, width, 3), in the camera frame."""
     height, width = _checked_size(size_hw)
-    y, x = np.mgrid[0:height, 0:width] + 0.5
-    return ray_from_pixel(np.stack([x, y], axis=-1), size_hw)
+    # One row and one column are enough: nothing as large as the result is made beside it.
+    azimuth = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
+    elevation = np.pi * (0.5 - (np.arange(height) + 0.5) / height)[:, None]
+    rays = np.empty((height, width, 3))
+    rays[..., 0] = np.cos(elevation) * np.sin(azimuth)
+    rays[..., 1] = -np.sin(elevation)
+    rays[..., 2] = np.cos(elevation) * np.cos(azimuth)
+    return rays
 
 
 def spiral_rays(count: int) -> FloatArray:

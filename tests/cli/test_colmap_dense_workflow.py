@@ -17,7 +17,8 @@ def test_colmap_dense_writes_models_masks_and_a_workspace_that_fuses(pano_mvs: C
     out = Path("out")
     arguments = (
         "run", "colmap_dense", "--images", rendered / "images", "--out", out, *SMALL, "--set", "scores=null",
-        "--set", "previews=null", "--set", "cloud=null", "--set", "ply=null", "--set", "tracked.count=2000",
+        "--set", "previews=null", "--set", "cloud=null", "--set", "ply=null", "--set", "smooth=null", "--set",
+        "views.sources=2", "--set", "tracked.count=2000",
     )  # fmt: skip
     result = pano_mvs(*arguments)
     assert result.code == 0, result.text

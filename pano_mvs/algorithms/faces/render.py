@@ -11,7 +11,7 @@ from pano_mvs.algorithms.faces.pictures import face_image, face_mask
 from pano_mvs.algorithms.faces.ranges import face_confidence, face_normals, face_z_depth
 from pano_mvs.algorithms.fusion.normals import normals_from_range
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import PinholeView, ray_grid
+from pano_mvs.geometry import PinholeView, ray_from_pixel
 from pano_mvs.scene import RangeMap
 
 
@@ -84,8 +84,9 @@ def face_source(
     given = None if range_map.normals_in_cam is None else range_map.normals_in_cam.astype(np.float32)
     seen = np.where(kept, ranges, np.float32(np.nan))
     normals = normals_from_range(seen, given=given, threads=threads)
-    unknown = ~np.isfinite(normals[..., 0])
-    normals[unknown] = -ray_grid((ranges.shape[0], ranges.shape[1]))[unknown]
+    row, column = np.nonzero(kept & ~np.isfinite(normals[..., 0]))
+    size_hw = (ranges.shape[0], ranges.shape[1])
+    normals[row, column] = -ray_from_pixel(np.stack([column + 0.5, row + 0.5], axis=-1), size_hw)
     return FaceSource(image, valid, seen, normals, np.where(kept, range_map.confidence, np.uint8(0)))
 
 
