@@ -24,6 +24,7 @@ from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.matching.neighbours import loop_closing_pairs, position_pairs, retrieval_pairs
 from pano_mvs.algorithms.matching.preemptive import hopeless_reason
 from pano_mvs.algorithms.matching.vlad import vlad_descriptor
+from pano_mvs.algorithms.mesh.poisson import solve_poisson
 from pano_mvs.algorithms.patchmatch.refine import refine_range
 from pano_mvs.algorithms.poses.colmap import solve_colmap
 from pano_mvs.algorithms.poses.colmap_sift import colmap_sift
@@ -37,6 +38,7 @@ from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.two_view.verification import verify_pair
 from pano_mvs.algorithms.views import select_views
 from pano_mvs.engine.registry import Registry
+from pano_mvs.io.thinning import Selection
 
 FUNCTIONS = {
     "features.sift_tangent": extract_sift,
@@ -66,6 +68,8 @@ FUNCTIONS = {
     "filters.fast_bilateral_solver": fast_bilateral_solver,
     "filters.fill": fill_from_neighbours,
     "fusion.vote": FusionSettings,
+    "export.mesh": solve_poisson,
+    "export.ply": Selection,
 }
 
 
