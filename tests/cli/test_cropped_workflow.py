@@ -58,7 +58,8 @@ def test_cropped_and_masked_panoramas_from_files_to_cloud(pano_mvs: Command, cap
     assert {(camera.model.name, camera.width, camera.height) for camera in cameras} == {("EQUIRECTANGULAR", 320, 160)}
     inside = np.zeros(SIZE_HW, np.bool_)
     inside[TOP : TOP + HEIGHT, LEFT : LEFT + WIDTH] = True
-    truth = np.load(capture / "truth" / "depth.npz")
+    with np.load(capture / "truth" / "depth.npz") as file:
+        truth = {path.stem: file[path.stem] for path in pictures}
     for idx, path in enumerate(pictures[:3]):
         ranges = read_range_tiff(Path(f"out/range/{path.stem}.tiff"))
         seen = inside & ((of_sphere > 0) if idx < 2 else True)
