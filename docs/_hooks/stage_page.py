@@ -130,10 +130,17 @@ def _settings(spec: StageSpec) -> str:
     rows = []
     for name, info in spec.params_type.model_fields.items():
         field = schema["properties"][info.alias or name]
-        free = " *Does not count towards the cache.*" if NOT_IN_KEY in info.metadata else ""
-        about = cell(info.description or "") + free
-        rows.append((f"`{info.alias or name}`", type_of(field, schema), _default(info), limits_of(field), about))
+        kind = type_of(field, schema)
+        about = cell(info.description or "") + _part_in_key(info, kind)
+        rows.append((f"`{info.alias or name}`", kind, _default(info), limits_of(field), about))
     return f'<div class="settings" markdown>\n\n{table(("setting", "type", "default", "limits", ""), rows)}\n\n</div>'
+
+
+def _part_in_key(info: FieldInfo, kind: str) -> str:
+    """Return what is special about how a setting counts towards the cache."""
+    if kind.startswith("path"):
+        return " (counts by content, whatever its name)"
+    return " (does not count towards the cache)" if NOT_IN_KEY in info.metadata else ""
 
 
 def _default(info: FieldInfo) -> str:
