@@ -72,7 +72,7 @@ def inspect_pixel(
         column=column,
         row=row,
         size_hw=(height, width),
-        color_rgb=_color(pictures[0], row, column),
+        color_rgb=_color(pictures[0] if masks[0][row, column] else read.reference.load_unmasked(), row, column),
         ray_in_cam=ray,
         ray_in_world=pose.rotation.T @ ray,
         center_in_world=pose.center,
@@ -162,7 +162,9 @@ def _sights(
             baseline=float(np.linalg.norm(pose.translation)),
             parallax_deg=float(np.rad2deg(np.arcsin(min(1.0, float(np.linalg.norm(between)))))),
             pixel_px=(float(x), float(y)),
-            color_rgb=_color(pictures[idx], row, column),
+            color_rgb=_color(
+                pictures[idx] if masks[idx][row, column] else read.sources[idx].load_unmasked(), row, column
+            ),
             masked=not masks[idx][row, column],
             cost=float(curve.by_source[idx, curve.winner]),
         ))  # fmt: skip

@@ -11,6 +11,7 @@ _KEYS = (
     ("left drag", "turn"),
     ("wheel, right drag", "nearer, farther"),
     ("click a camera", "step inside"),
+    ("click elsewhere", "inside: pixel and range"),
     ("Esc, right click", "step out"),
     ("left, right", "next camera"),
     ("o, t, y", "overview, top, front"),

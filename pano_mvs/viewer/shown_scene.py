@@ -34,12 +34,16 @@ class ShownCamera:
         cam_from_world: its pose.
         picture: its panorama, or None where no file is there.
         preview: a small picture whose upper half is the panorama, or None.
+        range_file: its ranges as float32 TIFF, or None.
+        confidence_file: its confidences as PNG, or None.
     """
 
     name: str
     cam_from_world: Rigid3
     picture: Path | None
     preview: Path | None
+    range_file: Path | None = None
+    confidence_file: Path | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,11 +154,19 @@ def _cameras(folder: Path, run: Mapping[str, Any], images: Path | None, notes: l
             cam_from_world=poses.cam_from_world(idx),
             picture=picture if picture is not None and picture.is_file() else None,
             preview=preview if preview.is_file() else None,
+            range_file=_map_of(folder, "range", name, ".tiff"),
+            confidence_file=_map_of(folder, "confidence", name, ".png"),
         ))  # fmt: skip
     if any(camera.picture is None for camera in cameras):
         where = source if source is not None else "the place from which the run read them"
         notes.append(f"panoramas are not in {where}: shown by their previews; give --images DIR for the pictures")
     return tuple(cameras)
+
+
+def _map_of(folder: Path, kind: str, name: str, suffix: str) -> Path | None:
+    """Return the file of an image in range/ or confidence/, called with its extension where need be, else without."""
+    candidates = (folder / kind / f"{name}{suffix}", folder / kind / PurePosixPath(name).with_suffix(suffix))
+    return next((path for path in candidates if path.is_file()), None)
 
 
 def _source_folder(run: Mapping[str, Any]) -> Path | None:

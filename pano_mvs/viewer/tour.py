@@ -12,6 +12,7 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.io.names import match_image_names
 from pano_mvs.viewer.cloud_colors import DrawnCloud
 from pano_mvs.viewer.picking import camera_under, point_under
+from pano_mvs.viewer.pixel_readout import pixel_readout
 from pano_mvs.viewer.shown_scene import ShownScene
 from pano_mvs.viewer.sizes import length_text, sphere_radius
 from pano_mvs.viewer.viewpoint import Viewpoint, looking_along, outside_view
@@ -125,7 +126,7 @@ class Tour:
             outside=state.viewpoint if state.inside is None else state.outside,
             viewpoint=looking_along(center, forward, self.scene.up),
             hovered=None,
-            message=self.scene.cameras[camera_idx].name,
+            message="",
         )
 
     def step_out(self) -> None:
@@ -137,7 +138,7 @@ class Tour:
         self.state = replace(state, inside=None, outside=None, viewpoint=state.outside, message="")
 
     def click(self, x: float, y: float, size_wh: tuple[int, int]) -> None:
-        """Do what a click at a place in the window asks for: pick a point, or step into a camera."""
+        """Do what a click at a place in the window asks for: pick a point, step into a camera, or read a pixel."""
         start, direction = self.state.viewpoint.ray(x, y, size_wh)
         if self.state.measuring:
             self._pick(start, direction)
@@ -145,6 +146,9 @@ class Tour:
         found = self._camera_at(start, direction)
         if found is not None:
             self.step_into(found)
+        elif self.state.inside is not None:
+            said = pixel_readout(self.scene.cameras[self.state.inside], direction, self.scene.unit)
+            self.state = replace(self.state, message=said)
 
     def hover(self, x: float, y: float, size_wh: tuple[int, int]) -> bool:
         """Note which camera is under the pointer, and return whether that is another one than before."""

@@ -275,7 +275,6 @@ class SceneWindow:
         title = scene.name
         if state.inside is not None:
             title = f"inside {scene.cameras[state.inside].name}   (Esc or right click: out)"
-        news = state.message if state.inside is None or state.measuring else ""
         counts = []
         if cloud is not None:
             of = f" of {cloud.total:,}" if len(cloud.points) < cloud.total else ""
@@ -284,7 +283,7 @@ class SceneWindow:
             counts.append("mesh" if cloud is None else f"s: {state.surface} shown")
         if scene.cameras:
             counts.append(f"{len(scene.cameras):,} cameras")
-        self._overlay.text([title, news], "upper_left")
+        self._overlay.text([title, *state.message.split("\n")], "upper_left")
         self._overlay.text([self._legend, "   ".join([*counts, "h: keys"])], "lower_right")
         self._overlay.help(wanted=state.help)
 

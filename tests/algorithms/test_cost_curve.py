@@ -23,7 +23,7 @@ def work_of(case: SweepCase) -> SweepInput:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("number", range(0, CASES, 3))
+@pytest.mark.parametrize("number", range(0, CASES, 5))
 def test_the_winner_of_the_curve_is_that_of_the_sweep(number):
     case = sweep_case(number)
     swept, work = case.swept("numba"), work_of(case)

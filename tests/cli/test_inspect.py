@@ -94,6 +94,12 @@ def test_a_masked_pixel_has_a_curve_and_no_range(run: Path) -> None:
     found = inspected(run / "out", "000.png", 40, 63)
     assert found["curve"]["range"] is None
     assert "masked" in found["notes"][0]
+    assert found["color_rgb"] == decode_image(run / "capture" / "images" / "000.png")[63, 40].tolist()
+
+
+def test_a_sweep_from_coarse_to_fine_says_that_it_tried_less(run: Path) -> None:
+    found = inspected(run / "out", "000.png", 40, 28, "--set", "depth.levels=2")
+    assert any("tries a few ranges around a guide" in note for note in found["notes"])
 
 
 def test_people_see_tables_a_plot_and_a_picture(run: Path, tmp_path: Path) -> None:

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import ray_from_pixel
+from pano_mvs.io.range_files import write_confidence_png, write_range_tiff
 from pano_mvs.viewer.cloud_colors import drawn_cloud
 from pano_mvs.viewer.picking import camera_under, point_under
 from pano_mvs.viewer.shown_scene import open_scene
 from pano_mvs.viewer.sizes import bar_length, bar_text, box_of, length_text, sphere_radius
 from pano_mvs.viewer.tour import Tour
-from pano_mvs.viewer.viewpoint import Viewpoint
+from pano_mvs.viewer.viewpoint import Viewpoint, looking_along
 from tests.viewer.scenes import HALF, turned_poses, write_output
 
 SIZE = (900, 600)
@@ -74,6 +76,31 @@ def test_one_goes_on_from_camera_to_camera_and_comes_back_to_the_start(tour: Tou
     assert tour.state.viewpoint is start
     tour.key("Left")
     assert tour.state.inside == 5
+
+
+def test_a_click_inside_reads_the_pixel_for_inspect(tour: Tour, tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    ranges = np.full((64, 128), 2.5, np.float32)
+    ranges[:, 96:] = np.nan
+    for kind in ("range", "confidence"):
+        (folder / kind / "lobby").mkdir(parents=True)
+    write_range_tiff(folder / "range" / "lobby" / "003.tiff", ranges)
+    write_confidence_png(folder / "confidence" / "lobby" / "003.png", np.full((64, 128), 201, np.uint8))
+    tour = tour_of(folder)
+    tour.key("k")  # no camera in the way
+    tour.see("inside:002")
+    tour.click(450, 300, SIZE)
+    assert tour.state.message == "azimuth 0.0°, elevation 0.0°"
+    tour.see("inside:003")
+    rotation = tour.scene.cameras[3].cam_from_world.rotation
+    for column, row, said in ((70, 20, "range 2.500 m, confidence 201"), (110, 40, "no range")):
+        along = rotation.T @ ray_from_pixel([column + 0.5, row + 0.5], (64, 128))
+        tour.moved_to(looking_along(tour.centers[3], along, tour.scene.up))
+        tour.click(450, 300, SIZE)
+        assert tour.state.message.startswith(f"pixel {column} {row}: {said}")
+    (folder / "range" / "lobby" / "003.tiff").write_bytes(b"broken")
+    tour.click(450, 300, SIZE)
+    assert "a range map is a one-channel float32 TIFF" in tour.state.message
 
 
 def test_inside_by_name_looks_where_the_camera_looked(tour: Tour) -> None:
