@@ -38,6 +38,7 @@ class Panorama(Record):
     """
 
     axis: ClassVar[Axis | None] = Axis.IMAGE
+    kind_version: ClassVar[int] = 2  # what is masked is not shown
 
     image: FilePart
     size_hw: tuple[int, int]
