@@ -11,12 +11,14 @@ import cv2
 import numpy as np
 import pytest
 
+from pano_mvs.algorithms.metrics.surface import TrueView, view_points
 from pano_mvs.algorithms.metrics.view_scores import score_view
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.colmap_model import write_colmap_model
+from pano_mvs.io.ply import write_ply
 from pano_mvs.io.range_files import write_confidence_png, write_range_tiff
 from pano_mvs.io.truth import read_truth
-from pano_mvs.scene import Poses
+from pano_mvs.scene import PointCloud, Poses
 from tests.cli.conftest import SIZE_HW, Command
 
 SCALE = 2.5
@@ -227,6 +229,20 @@ class TestRun:
         assert "4 of 4 registered" in result.flat
         assert "3 views of" in result.flat
         assert "cloud: not compared, there is no cloud.ply" in result.flat
+
+    def test_a_cloud_too(self, pano_mvs: Command, output: Path, truth: Path) -> None:
+        known = read_truth(truth)
+        views = [(view.cam_from_world, known.range_map(view)) for view in known.views.values()]
+        points = np.concatenate([view_points(TrueView(pose, ranges)) for pose, ranges in views if ranges is not None])
+        points /= SCALE  # the frame and the unit of the model
+        up = np.tile(np.float32([0, -1, 0]), (len(points), 1))
+        grey = np.full((len(points), 3), 99, np.uint8)
+        write_ply(output / "cloud.ply", PointCloud(points, up, grey, np.ones(len(points), np.uint8)))
+        result = pano_mvs("evaluate", output, "--truth", truth)
+        assert result.code == 0, result.text
+        assert "not compared" not in result.flat
+        assert f"{len(points)} points against the surface that 4 views see" in result.flat
+        assert "100.00" in result.text
 
     def test_ranges_alone(self, pano_mvs: Command, output: Path, truth: Path) -> None:
         shutil.rmtree(output / "colmap")
