@@ -57,6 +57,7 @@ def main() -> None:
     parser.add_argument("--workflow", default="quality", help="preset or file")
     parser.add_argument("--set", action="append", default=[], metavar="STAGE.PARAM=VALUE", help="as in run")
     parser.add_argument("--widths", type=int, nargs=2, default=[1024, 2048], help="of the panoramas")
+    parser.add_argument("--views", type=int, default=4, help="one of them the reference, the others its sources")
     options = parser.parse_args()
     found = []
     for width in (64, *options.widths):  # the first loads and compiles
