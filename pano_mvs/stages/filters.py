@@ -21,6 +21,7 @@ from pano_mvs.algorithms.filters.speckle import remove_speckles
 from pano_mvs.api import Context, Each, Near, Panorama, Params, Pose, RangeMap, stage
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 from pano_mvs.stages.fields import Odd
+from pano_mvs.stages.memory import bytes_per_pixel
 
 
 class MedianParams(Params):
@@ -108,7 +109,7 @@ class ConsistencyParams(Params):
     min_contradictions: int = Field(default=2, ge=1, description="sources that must contradict for that")
 
 
-@stage("filters.consistency")
+@stage("filters.consistency", memory=bytes_per_pixel(110, each_source=8))
 def consistency(
     range_map: Each[RangeMap],
     pose: Each[Pose],
@@ -147,7 +148,7 @@ class BilateralSolverParams(Params):
     )
 
 
-@stage("filters.fast_bilateral_solver")
+@stage("filters.fast_bilateral_solver", memory=bytes_per_pixel(190))
 def bilateral_solver(
     range_map: Each[RangeMap], image: Each[Panorama], params: BilateralSolverParams, ctx: Context
 ) -> RangeMap:
@@ -169,7 +170,7 @@ class FillParams(Params):
     )
 
 
-@stage("filters.fill")
+@stage("filters.fill", memory=bytes_per_pixel(96))
 def fill(range_map: Each[RangeMap], image: Each[Panorama], params: FillParams, ctx: Context) -> RangeMap:
     """Give holes the range of the surface behind them, from trusted pixels only (confidence 1–63).
 
@@ -192,7 +193,7 @@ class PlanesParams(Params):
     )
 
 
-@stage("filters.planes")
+@stage("filters.planes", memory=bytes_per_pixel(170))
 def planes(range_map: Each[RangeMap], image: Each[Panorama], params: PlanesParams, ctx: Context) -> RangeMap:
     """Lay planes through plain walls and ceilings, on which nothing can be matched; best after the bilateral solver.
 

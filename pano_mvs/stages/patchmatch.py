@@ -7,6 +7,7 @@ from pydantic import Field
 from pano_mvs.algorithms.patchmatch.refine import refine_range
 from pano_mvs.api import Context, Each, Near, Panorama, Params, Pose, RangeMap, stage
 from pano_mvs.stages.fields import Odd
+from pano_mvs.stages.memory import bytes_per_pixel
 
 
 class PatchMatchParams(Params):
@@ -28,7 +29,7 @@ class PatchMatchParams(Params):
     )
 
 
-@stage("depth.patchmatch")
+@stage("depth.patchmatch", memory=bytes_per_pixel(140, each_source=16))
 def patchmatch(
     range_map: Each[RangeMap],
     ref: Each[Panorama],

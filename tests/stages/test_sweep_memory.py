@@ -1,10 +1,15 @@
-"""What depth.sweep says that it takes in memory."""
+"""What dense stages say that they take in memory."""
 
 from pathlib import Path
 
+import numpy as np
+import pytest
+
 from pano_mvs.engine.stage import spec_of
-from pano_mvs.scene import FilePart, Panorama
+from pano_mvs.scene import FilePart, Panorama, RangeMap
 from pano_mvs.stages.depth import SweepParams, sweep, sweep_memory_bytes
+from pano_mvs.stages.filters import bilateral_solver, consistency, fill, planes
+from pano_mvs.stages.patchmatch import patchmatch
 
 PIXELS = 512 * 1024
 
@@ -33,3 +38,19 @@ def test_the_engine_is_told():
     spec = spec_of(sweep)
     assert spec is not None
     assert spec.memory_needed is sweep_memory_bytes
+
+
+def test_volumes_end_at_their_limit():
+    assert needed(planes=4096, volume_limit_gb=1.0) == needed(planes=1024, volume_limit_gb=1.0)
+    assert needed(planes=512, volume_limit_gb=0.5) - needed(aggregation="box") == 500_000_000
+
+
+@pytest.mark.parametrize(("function", "least"), [(patchmatch, 163), (consistency, 115), (bilateral_solver, 166),
+                                                 (fill, 83), (planes, 149)])  # fmt: skip
+def test_other_dense_stages_say_more_than_was_measured_with_three_sources(function, least):
+    spec = spec_of(function)
+    assert spec is not None
+    assert spec.memory_needed is not None
+    ranges = RangeMap(np.ones((64, 128), np.float32), np.full((64, 128), 255, np.uint8))
+    inputs = {"range_map": ranges} | ({"sources": [ranges] * 3} if function in (patchmatch, consistency) else {})
+    assert 1.1 * least < spec.memory_needed(spec.params_type(), inputs) / (64 * 128) < 1.3 * least
