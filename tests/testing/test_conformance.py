@@ -186,6 +186,13 @@ def sees_masked(image: Each[Panorama]) -> Features:
 
 
 @bad
+def looks_behind_the_mask(x: Each[RangeMap], image: Each[Panorama]) -> RangeMap:
+    """Ranges by the brightness of the file, tripod and all."""
+    brightness = image.load_unmasked().mean() / 128
+    return replace(x, range=(x.range * brightness).astype(np.float32))
+
+
+@bad
 def stops_at_the_seam(x: Each[RangeMap]) -> RangeMap:
     """A border where there is none."""
     keep = np.ones(x.range.shape, np.bool_)
@@ -213,6 +220,7 @@ LAWS = {
     fills_masked: "respects masks",
     unmasks: "respects masks",
     sees_masked: "respects masks",
+    looks_behind_the_mask: "does not see what is masked",
     stops_at_the_seam: "rolls with",
 }
 
