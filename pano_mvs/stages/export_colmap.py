@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
 
-from pano_mvs.algorithms.faces.layout import Face, covers_sphere, panorama_faces
+from pano_mvs.algorithms.faces.layout import Face, covers_sphere, default_face_size, panorama_faces
 from pano_mvs.algorithms.faces.render import colmap_depth_view, face_source, render_face
 from pano_mvs.api import All, Context, Each, Files, Names, One, Panorama, Params, Poses, RangeMap, UsageError, stage
 from pano_mvs.geometry import PinholeView
@@ -70,7 +70,14 @@ class FacesParams(Params):
     image_format: Literal["jpg", "png"] = Field(default="jpg", description="of the faces' pictures (JPEG: quality 95)")
 
 
-@stage("export.colmap_faces")
+def faces_memory_bytes(params: FacesParams, inputs: Mapping[str, Any]) -> int:
+    """Return what one panorama's faces take: normals are fitted to the whole panorama, one face is held at a time."""
+    height, width = inputs["image"].size_hw
+    size = params.size_px or default_face_size((height, width), fov_deg=params.fov_deg)
+    return 200_000_000 + 70 * height * width + 60 * size**2
+
+
+@stage("export.colmap_faces", memory=faces_memory_bytes)
 def colmap_faces(image: Each[Panorama], range_map: Each[RangeMap], params: FacesParams, ctx: Context) -> FaceFiles:
     """The pinhole faces of each panorama for COLMAP's dense tools: pictures, masks, z-depth and normal maps.
 
