@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -158,10 +158,11 @@ def picture_reader(images: Path | None, truth: Path, inputs: DepthInputs) -> Cal
 
 
 def _mask_of(masks: Path, name: str) -> Path | None:
-    plain = PurePosixPath(without_extension(name))
-    endings = [f"{suffix}.png" for suffix in sorted(PICTURE_SUFFIXES)]
-    tried = [masks / f"{name}.png", *(masks / f"{plain}{ending}" for ending in endings), masks / f"{plain}.png"]
-    return next((path for path in tried if path.is_file()), None)
+    """Return the mask of a picture: COLMAP's name of it, the picture's with .png behind, before the bare one."""
+    plain = without_extension(name)
+    own = [f"{name}.png"] if name != plain else []
+    tried = [*own, *(f"{plain}{suffix}.png" for suffix in sorted(PICTURE_SUFFIXES)), f"{plain}.png"]
+    return next((masks / path for path in tried if (masks / path).is_file()), None)
 
 
 def _poses(path: Path) -> dict[str, Rigid3]:

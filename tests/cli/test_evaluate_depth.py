@@ -169,6 +169,7 @@ def test_masks_and_confidence_leave_out_what_they_say(
     counted = np.zeros(SIZE_HW, np.uint8)
     counted[60:100, 40:80] = 255
     (tmp_path / "masks").mkdir()
+    cv2.imwrite(str(tmp_path / "masks" / "000.png"), 255 - counted)  # of 000.png.png, which is looked for first
     cv2.imwrite(str(tmp_path / "masks" / "000.png.png"), counted)
     cv2.imwrite(str(tmp_path / "masks" / "001.png"), counted)
     report = told(pano_mvs("evaluate", "depth", output, "--truth", truth, "--masks", tmp_path / "masks", "--json"))
