@@ -74,7 +74,7 @@ def faces_memory_bytes(params: FacesParams, inputs: Mapping[str, Any]) -> int:
     """Return what one panorama's faces take: normals are fitted to the whole panorama, one face is held at a time."""
     height, width = inputs["image"].size_hw
     size = params.size_px or default_face_size((height, width), fov_deg=params.fov_deg)
-    return 200_000_000 + 70 * height * width + 60 * size**2
+    return int(200_000_000 + 70 * height * width + 60 * size**2)
 
 
 @stage("export.colmap_faces", memory=faces_memory_bytes)
