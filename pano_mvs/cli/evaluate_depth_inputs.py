@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.metrics.poses import align_centers
-from pano_mvs.algorithms.metrics.resize import resized_labels
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.captures import PICTURE_SUFFIXES, describe_picture, list_pictures
@@ -18,7 +17,7 @@ from pano_mvs.io.pose_files import read_poses
 from pano_mvs.io.range_folders import RangeFile, find_ranges, match_pictures, without_extension
 from pano_mvs.io.truth import find_true_ranges
 from pano_mvs.scene import FilePart, Panorama
-from pano_mvs.scene.image_file import decode_image
+from pano_mvs.scene.masking import decode_mask, placed_mask
 
 
 @dataclass(frozen=True)
@@ -124,7 +123,8 @@ def mask_reader(masks: Path | None, mask: Path | None) -> Callable[[str, tuple[i
         paths = [mask] if mask is not None else []
         if masks is not None and (own := _mask_of(masks, name)) is not None:
             paths.append(own)
-        counted = [resized_labels(decode_image(path).max(axis=-1) > 0, size_hw) for path in paths]
+        sphere = (0, 0, size_hw[1], size_hw[0])
+        counted = [placed_mask(decode_mask(path), size_hw, of=sphere, whole_hw=size_hw) for path in paths]
         return np.asarray(np.logical_and.reduce(counted)) if counted else None
 
     return read
