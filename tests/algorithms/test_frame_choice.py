@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import cv2
 import numpy as np
 import pytest
@@ -16,6 +18,11 @@ from pano_mvs.testing.scenes import SCENES
 SIZE = (128, 256)
 
 
+@functools.cache
+def scene_picture(name: str) -> NDArray[np.uint8]:
+    return SCENES[name]().view(0, SIZE, supersample=1)[0]
+
+
 @pytest.fixture(scope="module")
 def room() -> NDArray[np.uint8]:
     return render(default_room(), Rigid3.identity(), SIZE)[0]
@@ -23,7 +30,7 @@ def room() -> NDArray[np.uint8]:
 
 @pytest.mark.parametrize("name", sorted(SCENES))
 def test_any_scene_is_less_sharp_the_more_it_is_blurred(name: str) -> None:
-    picture, _ = SCENES[name]().view(0, SIZE, supersample=1)
+    picture = scene_picture(name)
     shaken = [sharpness(cv2.blur(picture, (width, 1))) for width in (1, 2, 3, 5, 9)]
     assert shaken == sorted(shaken, reverse=True)
     assert shaken[-1] < shaken[0] / 2
@@ -57,7 +64,7 @@ def test_two_fisheyes_are_told_from_any_panorama(room: NDArray[np.uint8]) -> Non
     assert is_dual_fisheye(unstitched(room))
     assert not is_dual_fisheye(room)
     for name in sorted(SCENES):
-        assert not is_dual_fisheye(SCENES[name]().view(0, SIZE, supersample=1)[0]), name
+        assert not is_dual_fisheye(scene_picture(name)), name
 
 
 def test_black_patches_and_nights_are_no_fisheyes(room: NDArray[np.uint8]) -> None:
