@@ -80,13 +80,13 @@ def test_paths_end_in_the_pixel_with_the_sums_of_the_volume():
 def test_a_distinct_surface_has_a_sharp_curve_at_its_true_range():
     poses = capture_poses(3, spread=0.4)
     room = default_room()
-    views = [render(room, pose, (128, 256)) for pose in poses]
+    views = [render(room, pose, (96, 192)) for pose in poses]
     work = sweep_input(
         views[0][0], [view[0] for view in views[1:]], [pose @ poses[0].inverse() for pose in poses[1:]],
         near=NEAR, far=FAR, settings=SweepSettings(planes=48),
     )  # fmt: skip
     errors, sharp = [], []
-    for row, column in [(64, 40), (60, 128), (68, 200), (40, 80), (88, 160)]:
+    for row, column in [(48, 30), (45, 96), (51, 150), (30, 60), (66, 120)]:
         curve = cost_curve(work, column=column, row=row)
         errors.append(abs(curve.range / views[0][1][row, column] - 1))
         sharp.append(curve.uniqueness)

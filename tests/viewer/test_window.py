@@ -63,7 +63,7 @@ def test_inside_a_camera_every_direction_is_where_it_was(tmp_path: Path, windows
     """The panoramas are coloured by direction in the world, so a mirrored or turned sphere has other colours."""
     window = window_on(write_output(tmp_path, turned_poses(3), points=0), windows, view="inside:001")
     window.tour.key("k")
-    for dx, dy in ((0, 0), (300, 0), (500, 120), (-900, -200)):
+    for dx, dy in ((300, 0), (-900, -200)):
         window.tour.drag(dx, dy, window_height=SIZE[1])
         window.update()
         picture = window.picture()
@@ -92,7 +92,7 @@ def test_from_outside_a_camera_is_a_window_to_what_lies_behind(tmp_path: Path, w
 
 
 def test_points_are_drawn_where_they_are_and_walls_open_to_the_eye(tmp_path: Path, windows: list[SceneWindow]) -> None:
-    window = window_on(write_output(tmp_path, {}, points=200_000), windows, view="top")
+    window = window_on(write_output(tmp_path, {}, points=100_000), windows, view="top")
     floor, ceiling = np.array([0.3, 1, 0.2]) * HALF, np.array([0.3, -1, 0.2]) * HALF
     for key, point in (("h", floor), ("x", ceiling)):  # the first changes nothing here
         window.tour.key(key)
@@ -151,7 +151,7 @@ def test_keys_reach_the_tour_and_the_picture(tmp_path: Path, windows: list[Scene
     window = window_on(write_output(tmp_path, turned_poses(4), quality=True), windows)
     interactor = window.plotter.iren.interactor
     pictures = [window.picture()]
-    for key in ("c", "h", "l", "k", "t", "m"):
+    for key in ("c", "h", "l", "t"):
         interactor.SetKeySym(key)
         interactor.InvokeEvent("KeyPressEvent")
         interactor.InvokeEvent("CharEvent")
@@ -163,7 +163,7 @@ def test_keys_reach_the_tour_and_the_picture(tmp_path: Path, windows: list[Scene
 
 
 def test_a_measured_distance_is_drawn(tmp_path: Path, windows: list[SceneWindow]) -> None:
-    window = window_on(write_output(tmp_path, {}, points=200_000), windows, view="top")
+    window = window_on(write_output(tmp_path, {}, points=60_000), windows, view="top")
     window.tour.key("m")
     for x in (300, 600):
         window.tour.click(x, 300, SIZE)
@@ -176,7 +176,7 @@ def test_a_measured_distance_is_drawn(tmp_path: Path, windows: list[SceneWindow]
 
 
 def test_the_cloud_is_blended_into_a_panorama_on_demand(tmp_path: Path, windows: list[SceneWindow]) -> None:
-    window = window_on(write_output(tmp_path, turned_poses(2), points=100_000), windows, view="inside:000")
+    window = window_on(write_output(tmp_path, turned_poses(2), points=60_000), windows, view="inside:000")
     alone = window.picture()
     window.tour.key("b")
     window.update()
