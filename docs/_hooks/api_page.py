@@ -87,7 +87,7 @@ def _own_methods(value: type) -> list[Any]:
 
 
 def _method(member: Any) -> str:
-    function = member.fget if isinstance(member, property) else member
+    function: Any = member.fget if isinstance(member, property) else member
     shown = "" if isinstance(member, property) else _signature(function)
     body = docstring(function.__doc__ or "").replace("\n", "\n    ")
     return f"`{function.__name__}{shown}`\n\n:   {body}"
