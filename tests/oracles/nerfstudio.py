@@ -3,7 +3,7 @@
     python -m tests.oracles.nerfstudio OUT/nerfstudio/faces
 
 needs nerfstudio (which is no dependency) and prints how far its points lie from those of the documented reading, and
-the seed points from those of the file. Nerfstudio 1.1.5, on the CPU: 4e-6 scene units, both variants.
+the seed points from those of the file. Nerfstudio 1.1.5, on the CPU: 4e-6 scene units in a room, both variants.
 """
 
 from __future__ import annotations
