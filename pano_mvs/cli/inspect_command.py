@@ -117,7 +117,7 @@ def _inspection(session: Session, wanted: PixelWanted) -> Inspection:
     image = _image(wanted.image, found.images)
     unit = found.units.get(sweep, {}).get(image)
     if unit is None:
-        raise InputError(_why_not(plans, sweep, image))
+        raise InputError(_why_not(plans, sweep, image, session))
     stages = [units[image] for units in found.units.values() if image in units]
     truth = wanted.truth or _truth_of(session)
     return inspect_pixel(unit, stages, store, column=math.floor(wanted.x), row=math.floor(wanted.y), truth=truth)
@@ -145,13 +145,15 @@ def _image(wanted: str, names: Sequence[str]) -> str:
                      f"{' …' if len(shown) > _SHOWN else ''}")  # fmt: skip
 
 
-def _why_not(plans: Sequence[StagePlan], sweep: str, image: str) -> str:
+def _why_not(plans: Sequence[StagePlan], sweep: str, image: str, session: Session) -> str:
     plan = next(plan for plan in plans if plan.name == sweep)
     if image in plan.blocked:
         return f"{sweep}:{image} cannot be swept: {plan.blocked[image]}"
     if plan.open or plan.may_run:
-        return (f"{sweep}:{image} reads what is not computed yet: run the workflow first with these settings and this "
-                f"cache (--cache), or just that: pano-mvs run WORKFLOW --only {sweep}:{image}")  # fmt: skip
+        command = f"pano-mvs run {session.workflow.path} --cache {session.store_root} --only {sweep}:{image}"
+        return (f"{sweep}:{image} reads what the cache {session.store_root} does not hold, with these settings, "
+                f"pictures and version: run the workflow first, with the same --set and --images, or just that: "
+                f"{command}")  # fmt: skip
     return f"{sweep} has no view of {image}: it was not registered, or has no neighbours; see report.html"
 
 

@@ -129,7 +129,7 @@ def test_people_see_tables_a_plot_and_a_picture(run: Path, tmp_path: Path) -> No
         (("lobby.jpg", 5, 3), "no images are called 'lobby.jpg'; there are: 000.png"),
         (("000.png", 5, 3, "--stage", "checked"), "its sweeps: depth, boxed"),
         (("000.png", 5, 3, "--plot", "curve.pdf"), "the plot is a PNG"),
-        (("000.png", 5, 3, "--set", "images.nadir_deg=30"), "Run the workflow first"),
+        (("000.png", 5, 3, "--set", "images.nadir_deg=30"), "run the workflow first, with the same --set"),
     ],
 )
 def test_mistakes_are_told_with_a_remedy(run: Path, arguments: tuple[object, ...], message: str) -> None:
