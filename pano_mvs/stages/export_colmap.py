@@ -129,6 +129,7 @@ def colmap_dense(
         raise UsageError("no panorama has both a pose and faces, so there is no workspace to describe")
     folder = ctx.scratch / "sparse"
     seen = write_rig_model(folder, joined, cuts, form=params.format)
+    _tell_blanks(seen, params.format, ctx)
     blind = sum(not count for count in seen.values())
     ctx.metric("faces_without_points", blind)
     if blind:
@@ -156,10 +157,18 @@ def colmap_dense_init(
     return _sparse_model(joined, images, params.format, ctx, "colmap_dense_init/sparse/0")
 
 
+def _tell_blanks(names: Iterable[str], form: ModelForm, ctx: Context) -> None:
+    found = next((name for name in names if " " in name), "") if form != "bin" else ""
+    if found:
+        ctx.note(f"{found!r} holds a blank: in the text model COLMAP and OpenMVS read such a name as far as that. Use "
+                 "the binary one, or rename the picture")  # fmt: skip
+
+
 def _sparse_model(poses: Poses, images: Mapping[str, Panorama], form: ModelForm, ctx: Context, target: str) -> Files:
     folder = ctx.scratch / "model"
     sizes_hw = {name: images[name].source_size_hw for name in poses.names if name in images}
     write_colmap_model(folder, poses, sizes_hw, form=form)
+    _tell_blanks(poses.names, form, ctx)
     return Files({f"{target}/{path.name}": path for path in sorted(folder.iterdir())})
 
 

@@ -286,6 +286,20 @@ def test_the_sparse_model_has_the_form_that_is_asked_for(capture: Capture, tmp_p
     assert sorted(image.name for image in model.images.values()) == sorted(NAMES)
 
 
+@pytest.mark.parametrize(("form", "told"), [("bin", False), ("both", True)])
+def test_names_with_blanks_are_told_where_the_text_cannot_hold_them(
+    capture: Capture, tmp_path: Path, form, told
+) -> None:
+    """COLMAP itself writes such names into images.txt and reads them back as far as the blank."""
+    poses = Poses.without_points({"a/1 b.png": capture.poses.cam_from_world(0)}, frame="", scale="", metric=False)
+    images, ctx = {"a/1 b.png": capture.images[NAMES[0]]}, context(tmp_path / "scratch")
+    files = colmap(poses=poses, images=images, params=ModelParams(format=form), ctx=ctx)
+    assert bool(ctx.notes) == told
+    deliver(files, tmp_path, "")
+    model = pycolmap.Reconstruction(tmp_path / "colmap/sparse/0")
+    assert [image.name for image in model.images.values()] == ["a/1 b.png"]
+
+
 @pytest.mark.slow
 def test_true_ranges_fuse_to_the_walls_at_full_size(tmp_path: Path) -> None:
     """The bar: 1024×512, six faces of 96° and 300 px; median ≤ 2 mm, 95 % ≤ 10 mm at 3 m."""
