@@ -62,7 +62,7 @@ def list_pictures(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder. Give the folder that holds the panoramas")
-    files = list(_files_below(folder))
+    files = list(files_below(folder))
     pictures = [path for path in files if path.suffix.lower() in PICTURE_SUFFIXES]
     if not pictures and (film := next((path for path in files if path.suffix.lower() in VIDEO_SUFFIXES), None)):
         raise InputError(f"{folder}: no pictures here, but the video {film.name}. Use source.video: "
@@ -114,8 +114,12 @@ def describe_picture(path: Path) -> PictureInfo:
     return PictureInfo(sphere, (height, width), crop, gpano, warnings, traits, position_from_exif(exif))
 
 
-def _files_below(folder: Path) -> Iterator[Path]:
-    """Walk a capture, through links too; a folder that cannot be read is an error, not an empty one."""
+def files_below(folder: Path) -> Iterator[Path]:
+    """Yield the files of a capture, through links too, without hidden ones, masks and the outputs of earlier runs.
+
+    Raises:
+        InputError: if a folder cannot be read: it is not taken for an empty one.
+    """
 
     def fail(error: OSError) -> None:
         raise InputError(f"{error.filename}: cannot be listed ({error.strerror}). Mend its permissions or move it away")

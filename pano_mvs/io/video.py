@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.io.captures import VIDEO_SUFFIXES, natural_key
+from pano_mvs.io.captures import VIDEO_SUFFIXES, files_below, natural_key
 
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # what FFmpeg prints of a damaged video is said better below
 
@@ -60,7 +60,7 @@ def list_videos(path: Path) -> list[Path]:
         return [path]
     if not path.is_dir():
         raise InputError(f"{path}: no such video or folder. Give a video, several, or the folder that holds them")
-    files = [file for file in path.rglob("*") if file.is_file() and not file.name.startswith(".")]
+    files = list(files_below(path))
     videos = [file for file in files if file.suffix.lower() in VIDEO_SUFFIXES]
     if not videos:
         raw = [file.name for file in files if file.suffix.lower() in _UNSTITCHED_SUFFIXES]

@@ -119,7 +119,9 @@ def test_several_videos_and_folders_of_them(tmp_path: Path) -> None:
     for name in ("walks/b.avi", "walks/a10.avi", "walks/a2.AVI", "walks/day 2/b.avi"):
         write_video((tmp_path / name).with_suffix(".avi"), 12)
     (tmp_path / "walks/a2.avi").rename(tmp_path / "walks/a2.AVI")
-    (tmp_path / "walks/notes.txt").write_text("x")
+    for ignored in ("notes.txt", ".trash/b.avi", "masks/b.avi", "out/b.avi", "out/.pano-mvs-output"):
+        (tmp_path / "walks" / ignored).parent.mkdir(exist_ok=True)
+        (tmp_path / "walks" / ignored).write_text("x")
     names = [item.name for item in list_frames(params(tmp_path / "walks", every_s=0.5))]
     assert [name.rpartition("_")[0] for name in names[::2]] == ["a2", "a10", "b", "day 2/b"]
     both = params([tmp_path / "walks/b.avi", tmp_path / "walks/a10.avi"], every_s=0.5)
