@@ -47,8 +47,7 @@ def best_constant_errors(
     names = [*mse_scores(1.0, peak), "mae", "abs_rel", *DELTAS, *(limit.name for limit in bad)]
     if not len(true):
         return dict.fromkeys(names, float("nan"))
-    order = np.argsort(true, kind="stable")
-    ranges, weight = true[order], weight[order]
+    ranges, weight = _in_order(true, weight)
     line = _Sorted(ranges, np.concatenate([[0.0], np.cumsum(weight)]))
     best = mse_scores(weighted_mean(((ranges - weighted_mean(ranges, weight)) / peak) ** 2, weight), peak)
     best["mae"] = weighted_mean(np.abs(ranges - weighted_median(ranges, weight)), weight)
@@ -66,13 +65,23 @@ def best_constant_median(true: NDArray[np.float64], weight: NDArray[np.float64])
     """
     if not len(true):
         return float("nan")
-    order = np.argsort(true, kind="stable")
-    ranges, reached = true[order], np.cumsum(weight[order])
+    ranges, weight = _in_order(true, weight)
+    reached = np.cumsum(weight)
     before = np.concatenate([[0.0], reached[:-1]])
     last = np.searchsorted(reached, before + reached[-1] / 2 * (1 - 1e-12))
     full = last < len(ranges)
     ratio = float((ranges[last[full]] / ranges[full]).min())
     return (ratio - 1) / (ratio + 1)
+
+
+def _in_order(
+    true: NDArray[np.float64], weight: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return true ranges in rising order and the weight of each: the very arrays if they are so."""
+    if np.all(true[1:] >= true[:-1]):
+        return true, weight
+    order = np.argsort(true, kind="stable")
+    return true[order], weight[order]
 
 
 def _bad_ends(ranges: NDArray[np.float64], limit: BadLimit) -> NDArray[np.intp]:

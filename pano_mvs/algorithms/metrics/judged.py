@@ -36,11 +36,13 @@ class JudgedPixels:
     def only_valid(self) -> JudgedPixels:
         """Return the pixels that have an estimate."""
         valid = self.valid
+        if valid.all():
+            return self
         return JudgedPixels(self.found[valid], self.true[valid], self.weight[valid])
 
     def scaled(self, scale: float) -> JudgedPixels:
         """Return the same pixels with all estimates multiplied by a factor."""
-        return JudgedPixels(scale * self.found, self.true, self.weight)
+        return self if scale == 1 else JudgedPixels(scale * self.found, self.true, self.weight)
 
     def by_truth(self) -> JudgedPixels:
         """Return the same pixels from the nearest to the farthest."""
@@ -81,7 +83,9 @@ def judged_pixels(
         counted &= mask
     found = estimated[counted].astype(np.float64)
     weight = np.broadcast_to(pixel_solid_angle((truth.shape[0], truth.shape[1]))[:, None], truth.shape)[counted]
-    return JudgedPixels(np.where(has_range(found), scale * found, np.nan), truth[counted].astype(np.float64), weight)
+    found[~has_range(found)] = np.nan
+    found *= scale
+    return JudgedPixels(found, truth[counted].astype(np.float64), weight)
 
 
 def aligning_scale(pixels: JudgedPixels, align: Align) -> float:

@@ -88,21 +88,24 @@ def score_view(
     """
     judging = judging or Judging()
     kept = _confident(estimated, confidence, judging.min_confidence)
-    pixels = judged_pixels(kept, truth, scale=scale, mask=mask)
+    found = _without_confidence(judged_pixels(kept, truth, scale=scale, mask=mask), scale, judging)
+    if confidence is None:
+        return found
+    known = truth if mask is None else np.where(mask, truth, np.nan)
+    ranked, unranked = _sparsification(estimated, confidence, known, found.scale)
+    constants = {name: {**values, **unranked} for name, values in found.constants.items()}
+    return ViewScores(found.pixels, found.scale, {**found.scores, **ranked}, constants)
+
+
+def _without_confidence(pixels: JudgedPixels, scale: float, judging: Judging) -> ViewScores:
     fitted = aligning_scale(pixels, judging.align)
     # In the order of the truth: each of the constants sorts by it, which takes no time once it is so.
     groups = _groups(pixels.scaled(fitted).by_truth())
-    scores = _scores(groups, judging)
     constants = {"best": _best(groups, judging)} | {
         name: _scores(_constant(groups, value), judging)
         for name, value in (("median", np.median), ("mean", np.mean))
     }  # fmt: skip
-    if confidence is not None:
-        known = truth if mask is None else np.where(mask, truth, np.nan)
-        ranked, unranked = _sparsification(estimated, confidence, known, scale * fitted)
-        scores |= ranked
-        constants = {name: values | unranked for name, values in constants.items()}
-    return ViewScores(len(pixels.true), scale * fitted, scores, constants)
+    return ViewScores(len(pixels.true), scale * fitted, _scores(groups, judging), constants)
 
 
 def pixel_scores(pixels: JudgedPixels, judging: Judging) -> dict[str, float]:
@@ -133,7 +136,7 @@ def _groups(pixels: JudgedPixels) -> dict[str, JudgedPixels]:
     """Return the pixels of each protocol with what they count there, by its prefix."""
     weighted = {"w_": pixels, "valid_w_": pixels.only_valid()}
     equal = {
-        prefix.removesuffix("w_"): JudgedPixels(group.found, group.true, np.ones_like(group.true))
+        prefix.removesuffix("w_"): JudgedPixels(group.found, group.true, np.broadcast_to(1.0, group.true.shape))
         for prefix, group in weighted.items()
     }
     return {prefix: (equal | weighted)[prefix] for prefix in PROTOCOLS}
@@ -146,7 +149,7 @@ def _constant(
     true = groups[""].true
     constant = float(value(true)) if len(true) else float("nan")
     return {
-        prefix: JudgedPixels(np.full_like(group.true, constant), group.true, group.weight)
+        prefix: JudgedPixels(np.broadcast_to(constant, group.true.shape), group.true, group.weight)
         for prefix, group in groups.items()
     }
 
