@@ -33,7 +33,8 @@ window.addEventListener("load", function () {
     });
     const tabs = stack.nextElementSibling;
     tabs.lastElementChild.click();
-    found.slider = {tabs: tabs.children.length, clips: clips, label: slider.getAttribute("aria-label"), text: slider.getAttribute("aria-valuetext"),
+    found.slider = {tabs: tabs.children.length, clips: clips, label: slider.getAttribute("aria-label"),
+      text: slider.getAttribute("aria-valuetext"),
       hidden: getComputedStyle(shown).display, focusable: slider.tabIndex,
       covers: slider.getBoundingClientRect().width - stack.getBoundingClientRect().width};
   }
