@@ -18,6 +18,8 @@ _INK, _FAINT, _GRID = (45, 45, 50), (120, 120, 128), (232, 232, 236)
 _DECISIVE, _RAW = (22, 96, 167), (90, 100, 115)
 _SOURCES: tuple[Color, ...] = ((226, 160, 90), (120, 180, 120), (190, 140, 190), (120, 190, 200), (214, 140, 140))
 _WINNER, _RIVAL, _TRUTH = (200, 50, 50), (210, 130, 30), (20, 130, 80)
+# How wide the text at a mark may be.
+_TAG = 170
 _STEPS = (0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10)
 
 
@@ -96,25 +98,29 @@ class _Panel:
             self.board.line([self.at(plane, float(costs[plane])) for plane in range(start, stop)], color, weight)
 
     def marks(self, costs: NDArray[np.float64]) -> None:
-        """Draw the winner, the runner-up and the true range."""
+        """Draw the winner, the next valley and the true range."""
         curve, truth = self.inspection.curve, self.inspection.true_range
-        if np.isfinite(truth):
-            x = self.at(self.plane_of(truth), 0)[0]
-            self.board.dashes((x, self.upper), (x, self.lower), _TRUTH)
-            self.tag(f"truth {truth:.4g}", x, self.upper + 16, _TRUTH)
-        if curve.runner_up is not None:
-            x, y = self.at(curve.runner_up, float(costs[curve.runner_up]))
-            self.board.dot((x, y), _RIVAL, filled=False)
-            self.tag(f"next valley {curve.ranges[curve.runner_up]:.4g}", x, max(y - 16, self.upper + 52), _RIVAL)
         x, y = self.at(curve.winner, float(costs[curve.winner]))
+        if np.isfinite(truth):
+            true_x = self.at(self.plane_of(truth), 0)[0]
+            self.board.dashes((true_x, self.upper), (true_x, self.lower), _TRUTH)
+            self.tag(f"truth {truth:.4g}", (true_x, self.upper - 6), _TRUTH, true_x)
+        other_x = x
+        if curve.runner_up is not None:
+            other_x, other_y = self.at(curve.runner_up, float(costs[curve.runner_up]))
+            self.board.dot((other_x, other_y), _RIVAL, filled=False)
+            self.tag(f"next valley {curve.ranges[curve.runner_up]:.4g}", (other_x, other_y), _RIVAL, x)
         self.board.dot((x, y), _WINNER, filled=True)
         shown = curve.range if np.isfinite(curve.range) else curve.ranges[curve.winner]
-        self.tag(f"winner {shown:.4g}", x, max(y - 10, self.upper + 34) if y > self.lower - 24 else y + 22, _WINNER)
+        self.tag(f"winner {shown:.4g}", (x, y), _WINNER, other_x)
 
-    def tag(self, text: str, x: float, y: float, color: Color) -> None:
-        """Write beside a mark, on the side where there is room."""
-        right = x > 0.75 * _WIDTH
-        self.board.write(text, (x + (-12 if right else 12), y), Letters(color=color, align=float(right)), halo=True)
+    def tag(self, text: str, spot: tuple[float, float], color: Color, other_x: float) -> None:
+        """Write below a mark, where there is room, on the side away from another mark that is near."""
+        x, y = spot
+        leftwards = x > 0.75 * _WIDTH or (x < other_x < x + 2 * _TAG and x > _LEFT + _TAG)
+        below = y + 22 if y < self.lower - 24 else y - 10
+        place = x + (-12 if leftwards else 12), below
+        self.board.write(text, place, Letters(color=color, align=float(leftwards)), on_paper=True)
 
 
 def _write_title(board: DrawingBoard, found: Inspection) -> None:

@@ -59,24 +59,25 @@ class DrawingBoard:
         cv2.circle(self._canvas, center, 6 * _FINE, _PAPER, cv2.FILLED, cv2.LINE_AA)
         cv2.circle(self._canvas, center, 5 * _FINE, color, cv2.FILLED if filled else 2 * _FINE, cv2.LINE_AA)
 
-    def write(self, text: str, spot: Spot, letters: Letters, *, halo: bool = False) -> float:
+    def write(self, text: str, spot: Spot, letters: Letters, *, on_paper: bool = False) -> float:
         """Write text, its base line at the spot, and return its width in pixels; OpenCV's letters are ASCII alone.
 
         Args:
             text: what to write; other letters become question marks.
             spot: where.
             letters: how.
-            halo: whether to lay paper around the letters, over what is drawn there.
+            on_paper: whether to lay paper below the letters, over what is drawn there.
         """
         scale = letters.scale * _FINE
         weight = max(1, round(1.4 * scale))
         shown = text.encode("ascii", "replace").decode()
-        size = cv2.getTextSize(shown, cv2.FONT_HERSHEY_SIMPLEX, scale, weight)[0][0]
-        at = round(spot[0] * _FINE - letters.align * size), round(spot[1] * _FINE)
-        for color, strokes in ((_PAPER, weight + 4 * _FINE), (letters.color, weight)):
-            if halo or color is letters.color:
-                cv2.putText(self._canvas, shown, at, cv2.FONT_HERSHEY_SIMPLEX, scale, color, strokes, cv2.LINE_AA)
-        return float(size / _FINE)
+        (width, height), below = cv2.getTextSize(shown, cv2.FONT_HERSHEY_SIMPLEX, scale, weight)
+        x, y = round(spot[0] * _FINE - letters.align * width), round(spot[1] * _FINE)
+        if on_paper:
+            corners = (x - 2 * _FINE, y - height - _FINE), (x + width + 2 * _FINE, y + below // 2)
+            cv2.rectangle(self._canvas, *corners, _PAPER, cv2.FILLED)
+        cv2.putText(self._canvas, shown, (x, y), cv2.FONT_HERSHEY_SIMPLEX, scale, letters.color, weight, cv2.LINE_AA)
+        return float(width / _FINE)
 
     def picture(self) -> NDArray[np.uint8]:
         """Return what is drawn, (H, W, 3) RGB."""
