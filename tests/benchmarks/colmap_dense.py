@@ -131,6 +131,7 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=1024)
     parser.add_argument("--size", type=int, default=300, help="pixels of a face")
     parser.add_argument("--workflow", default="known_poses")
+    parser.add_argument("--min-confidence", type=int, nargs="*", default=[64])
     parser.add_argument("--min-num-pixels", type=int, default=3)
     given = parser.parse_args()
     print("| scene, ranges | fused points | % of pixels | median mm at 3 m | p95 mm at 3 m |\n|---|---|---|---|---|")
@@ -138,9 +139,13 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             capture = scene_capture(scene, Path(folder) / "capture", width=given.width)
             estimated = list(DenseChain(given.workflow).run(capture).range_maps.values())[-1]
-            for what, maps in (("true", true_maps(capture)), (given.workflow, estimated)):
+            cases = [("true", true_maps(capture), 64)]
+            cases += [(f"{given.workflow} {least}", estimated, least) for least in given.min_confidence]
+            for what, maps, least in cases:
                 poses = Poses.without_points(capture.poses, frame="the truth's", scale="the truth's", metric=True)
-                workspace = write_workspace(Path(folder) / what, capture.panoramas, poses, maps, size_px=given.size)
+                workspace = write_workspace(
+                    Path(folder) / what, capture.panoramas, poses, maps, size_px=given.size, min_confidence=least
+                )
                 points = fused_points(workspace, min_num_pixels=given.min_num_pixels)
                 errors = wall_distances(points, scene.room, scene.poses)
                 print(line(f"{scene.name}, {what}", errors, len(maps) * 6 * given.size**2), flush=True)
