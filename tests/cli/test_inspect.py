@@ -21,9 +21,9 @@ pano_mvs: 1
 name: tuned
 stages:
   images:  {use: source.folder, path: capture/images, nadir_deg: 20}
-  poses:   {use: poses.from_model, path: capture/truth/poses.json}
+  poses:   {use: poses.from_model, path: halved.json}
   views:   {use: views.nearest, sources: 2}
-  depth:   {use: depth.sweep, planes: 24, near: 0.6, far: 8}
+  depth:   {use: depth.sweep, planes: 24, near: 0.3, far: 4}
   boxed:   {use: depth.sweep, planes: 24, aggregation: box}
   checked: {use: filters.consistency, in: {range_map: depth, sources: depth}}
   scores:  {use: evaluate.truth, truth: capture/truth, in: {ranges: checked}}
@@ -47,6 +47,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("inspected")
     write_capture(folder / "capture", default_room(), capture_poses(3, spread=0.4), SIZE_HW)
     (folder / "wf.yaml").write_text(WORKFLOW)
+    poses = json.loads((folder / "capture" / "truth" / "poses.json").read_text())
+    for view in poses["views"]:  # scene units of two metres
+        view["t"] = [0.5 * length for length in view["t"]]
+    (folder / "halved.json").write_text(json.dumps(poses))
     outcome = call("run", folder / "wf.yaml", "--out", folder / "out", "--cache", folder / "cache")
     assert outcome.code == 0, outcome.text
     return folder
@@ -68,14 +72,14 @@ def test_rays_colours_neighbours_and_the_truth_are_those_of_the_capture(run: Pat
     ray = ray_from_pixel([40.5, 28.5], SIZE_HW)
     np.testing.assert_allclose(found["ray_in_cam"], ray, atol=1e-12)
     with np.load(run / "capture" / "truth" / "depth.npz") as truth:
-        assert found["true_range"] == pytest.approx(float(truth["000"][28, 40]), rel=1e-5)
+        assert found["true_range"] == pytest.approx(0.5 * float(truth["000"][28, 40]), rel=1e-5)
     picture = decode_image(run / "capture" / "images" / "000.png")
     assert found["color_rgb"] == picture[28, 40].tolist()
     assert {one["name"] for one in found["sources"]} == {"001.png", "002.png"}
     point = np.array(found["center_in_world"]) + np.array(found["ray_in_world"]) * found["curve"]["range"]
     poses = {f"{idx:03}.png": pose for idx, pose in enumerate(capture_poses(3, spread=0.4))}
     for one in found["sources"]:
-        seen = poses[one["name"]].apply(point)
+        seen = poses[one["name"]].apply(2 * point)
         expected = ray_from_pixel(one["pixel_px"], SIZE_HW) * np.linalg.norm(seen)
         np.testing.assert_allclose(expected, seen, atol=1e-6)
         here = decode_image(run / "capture" / "images" / one["name"])[int(one["pixel_px"][1]), int(one["pixel_px"][0])]
@@ -165,6 +169,6 @@ def test_the_pictures_of_the_run_are_found_from_anywhere(
 
 
 def test_a_workflow_without_a_sweep_is_told(tmp_path: Path, run: Path) -> None:
-    text = WORKFLOW.replace("capture/", f"{run}/capture/").split("  depth:")[0]
+    text = WORKFLOW.replace("capture/", f"{run}/capture/").replace("halved", f"{run}/halved").split("  depth:")[0]
     (tmp_path / "none.yaml").write_text(text)
     assert "no depth.sweep" in call("inspect", tmp_path / "none.yaml", "000.png", 1, 1).flat
