@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import ctypes.util
+import ctypes
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from pano_mvs.core.errors import UsageError
 
+_DRAWING_LIBRARIES = ("libEGL.so.1", "libOSMesa.so.8", "libOSMesa.so")
 _REMEDY = "Give --screenshot FILE to draw a picture without a window"
 
 
@@ -30,17 +31,32 @@ def require_window(window_class: str) -> None:
         raise UsageError(f"the display {os.environ.get('DISPLAY', '')} does not answer. {_REMEDY}")
 
 
-def require_drawing(platform: str = sys.platform, find: object = ctypes.util.find_library) -> None:
+def require_drawing(
+    environment: Mapping[str, str] = os.environ,
+    platform: str = sys.platform,
+    *,
+    loads: Callable[[str], bool] | None = None,
+) -> None:
     """Raise UsageError if there is neither a display nor a library that draws without one; VTK would crash.
 
     Args:
+        environment: the process's.
         platform: of Python.
-        find: finds a library by its name.
+        loads: tells whether a library can be loaded; None: try it.
     """
-    assert callable(find)
-    if platform.startswith("linux") and not any(find(name) for name in ("EGL", "OSMesa")):
+    if not platform.startswith("linux") or environment.get("DISPLAY"):
+        return
+    if not any((loads or _loads)(name) for name in _DRAWING_LIBRARIES):
         raise UsageError("pictures cannot be drawn here: neither EGL nor OSMesa is installed. Install one: for Debian "
                          "and Ubuntu `apt install libegl1 libgl1-mesa-dri`")  # fmt: skip
+
+
+def _loads(name: str) -> bool:
+    try:
+        ctypes.CDLL(name)
+    except OSError:
+        return False
+    return True
 
 
 def quiet_vtk() -> None:

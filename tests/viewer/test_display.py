@@ -22,6 +22,7 @@ def test_a_display_that_does_not_answer_is_told_from_one_that_does() -> None:
 
 def test_without_any_way_to_draw_the_packages_are_named() -> None:
     with pytest.raises(UsageError, match="apt install libegl1"):
-        require_drawing("linux", lambda name: None)
-    require_drawing("linux", lambda name: "libOSMesa.so.8" if name == "OSMesa" else None)
-    require_drawing("darwin", lambda name: None)
+        require_drawing({}, "linux", loads=lambda name: False)
+    require_drawing({}, "linux", loads=lambda name: "OSMesa" in name)
+    require_drawing({"DISPLAY": ":0"}, "linux", loads=lambda name: False)
+    require_drawing({}, "darwin", loads=lambda name: False)
