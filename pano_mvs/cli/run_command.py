@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import signal
 import sys
 import threading
@@ -204,7 +205,7 @@ def print_summary(summary: Mapping[str, Any], out: Path, console: Console, *, wr
             f"{count} files of an earlier run, which this one did not write, are still there", highlight=False
         )
     console.print(f"results in {escape(str(out))} ({len(summary['files'])} files, {written} written now): "
-                  "open report.html", highlight=False, soft_wrap=True)  # fmt: skip
+                  f"open report.html, or look around with pano-mvs view {escape(shlex.quote(str(out)))}", highlight=False, soft_wrap=True)  # fmt: skip
 
 
 def _print_failures(summary: Mapping[str, Any], console: Console) -> None:
