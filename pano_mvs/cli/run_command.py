@@ -204,8 +204,12 @@ def print_summary(summary: Mapping[str, Any], out: Path, console: Console, *, wr
         console.print(
             f"{count} files of an earlier run, which this one did not write, are still there", highlight=False
         )
-    console.print(f"results in {escape(str(out))} ({len(summary['files'])} files, {written} written now): "
-                  f"open report.html, or look around with pano-mvs view {escape(shlex.quote(str(out)))}", highlight=False, soft_wrap=True)  # fmt: skip
+    console.print(
+        f"results in {escape(str(out))} ({len(summary['files'])} files, {written} written now): open report.html, "
+        f"or look around with pano-mvs view {escape(shlex.quote(str(out)))}",
+        highlight=False,
+        soft_wrap=True,
+    )
 
 
 def _print_failures(summary: Mapping[str, Any], console: Console) -> None:
