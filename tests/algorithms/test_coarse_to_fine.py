@@ -174,6 +174,7 @@ def test_it_finds_what_the_plain_sweep_finds(settings):
     assert _good(guided.range, truth).mean() > _good(plain.range, truth).mean() - 0.01
 
 
+@pytest.mark.slow
 def test_three_levels_are_not_much_worse_than_two():
     pictures, poses, truth = _capture(256)
     two, three = (_sweep(pictures, poses, PLAIN.replace(levels=levels)) for levels in (2, 3))

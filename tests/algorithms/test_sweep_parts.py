@@ -136,6 +136,7 @@ def test_no_cost_minds_another_exposure(capture, cost, exposure):
     assert good_share(changed, usual.range) > 0.93
 
 
+@pytest.mark.slow
 def test_all_names_go_together(capture):
     tiny = [picture[::4, ::4] for picture in capture[0]], capture[1], None
     for names in itertools.product(*NAMES.values()):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from tests.cli.conftest import Command, run_json
 from tests.cli.test_workflows import known
 
@@ -21,6 +23,7 @@ stages:
 """
 
 
+@pytest.mark.slow
 def test_two_sweeps_side_by_side(pano_mvs: Command, rendered: Path) -> None:
     truth = str(rendered / "truth")
     Path("fixed.yaml").write_text(FIXED.replace("TRUTH", truth), encoding="utf-8")

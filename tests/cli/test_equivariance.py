@@ -33,6 +33,7 @@ def rolled_capture(capture: Path, folder: Path, columns: int) -> Path:
         name = Path(view["image"]).name
         image, new_from_old = roll_panorama(cv2.imread(str(capture / "images" / name)), columns)
         cv2.imwrite(str(folder / "images" / name), image)
+        view.pop("sha256", None)  # the rolled picture is another one
         view["R"] = (new_from_old @ np.array(view["R"])).tolist()
         view["t"] = (new_from_old @ np.array(view["t"])).tolist()
     (folder / "poses.json").write_text(json.dumps(truth))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from tests.cli.conftest import Command, Outcome, run_json
 
 WORKFLOW = """\
@@ -30,6 +32,7 @@ def run(
     return pano_mvs("run", "pairs.yaml", "--out", "out")
 
 
+@pytest.mark.slow
 def test_every_picture_is_registered_and_looks_are_kept(pano_mvs: Command, capture: Path) -> None:
     """One more picture leaves the global descriptors of the others as they are."""
     last = sorted((capture / "images").iterdir())[-1]

@@ -47,6 +47,7 @@ def test_the_papers_way_from_pictures_to_ranges(run) -> None:  # type: ignore[no
         assert np.nanmax(ranges) <= 10
 
 
+@pytest.mark.slow
 def test_each_ablation_is_one_switch(run) -> None:  # type: ignore[no-untyped-def]
     full = run()
     unscaled = run("unscaled.enabled=true", out="unscaled")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from pano_mvs.io.ply import read_ply
 from pano_mvs.io.range_files import read_range_tiff
 from tests.cli.conftest import SMALL, run_json
 
 
+@pytest.mark.slow
 def test_quality_is_more_precise_than_the_quickstart_on_the_same_pictures(pano_mvs, rendered, tmp_path):
     errors = {}
     for preset in ("quickstart", "quality"):

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pycolmap
+import pytest
 
 from pano_mvs.io.ply import read_ply
 from pano_mvs.io.pose_files import read_poses
@@ -21,6 +22,7 @@ PLAIN_RANGES = (
 )
 
 
+@pytest.mark.slow
 def test_splat_writes_panoramas_faces_and_seeds_that_agree(pano_mvs: Command, rendered: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     arguments = ("splat", "--images", rendered / "images", "--out", out, "--executor", "serial", *SMALL, *PLAIN_RANGES,
