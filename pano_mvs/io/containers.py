@@ -13,12 +13,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from pano_mvs.io.tiff_directory import open_tiff
-from pano_mvs.scene.jpeg import JPEG_START, jpeg_segments
+from pano_mvs.scene.jpeg import JPEG_FRAMES, JPEG_START, jpeg_segments
 
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 _EXIF, _XMP, _MORE_XMP = b"Exif\0\0", b"http://ns.adobe.com/xap/1.0/\0", b"http://ns.adobe.com/xmp/extension/\0"
-# Start-of-frame markers of JPEG: C0–CF without the tables DHT (C4), JPG (C8) and DAC (CC).
-_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _APP1 = 0xE1
 _WIDTH, _HEIGHT, _TIFF_XMP = 256, 257, 700
 _MOST_XMP_BYTES = 64 << 20
@@ -62,7 +60,7 @@ def _read_jpeg(data: bytes) -> Container:
     packets: list[bytes] = []
     extended: dict[bytes, dict[int, bytes]] = {}
     for marker, start, end in jpeg_segments(data):
-        if marker in _FRAMES and size is None:
+        if marker in JPEG_FRAMES and size is None:
             size = _sound(*struct.unpack_from(">HH", data, start + 1))
         if marker != _APP1:
             continue

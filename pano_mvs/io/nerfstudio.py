@@ -19,6 +19,7 @@ import numpy as np
 
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.nerfstudio_frames import NerfstudioFrame, Variant
+from pano_mvs.scene.jpeg import JPEG_FRAMES, JPEG_START, jpeg_segments
 
 _MODELS = {"equirectangular": "EQUIRECTANGULAR", "faces": "PINHOLE"}
 _DEPTHS = {"equirectangular": "distance along the ray", "faces": "z, along the camera's axis"}
@@ -68,10 +69,23 @@ def open_mask(size_wh: tuple[int, int]) -> str:
 
 
 def is_common_picture(path: Path) -> bool:
-    """Return whether a file is a JPEG or an 8-bit RGB PNG, which every trainer reads as it is."""
+    """Return whether a file is a JPEG or an 8-bit PNG, either of three channels, which every trainer reads as it is.
+
+    A JPEG of four channels is CMYK, which trainers take for red, green, blue and alpha.
+    """
     with path.open("rb") as stream:
         start = stream.read(26)
-    return start[:2] == b"\xff\xd8" or (start[:8] == _PNG_START and start[24:26] == _PNG_RGB_8_BIT)
+        if start[:2] == JPEG_START:
+            return _jpeg_channels(start + stream.read()) == 3
+    return start[:8] == _PNG_START and start[24:26] == _PNG_RGB_8_BIT
+
+
+def _jpeg_channels(data: bytes) -> int:
+    """Return how many channels a JPEG has, as its first start of frame says (ITU-T T.81, B.2.2); 0 if it has none."""
+    for marker, start, _ in jpeg_segments(data):
+        if marker in JPEG_FRAMES:
+            return data[start + 5]
+    return 0
 
 
 def _listed(

@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 JPEG_START = b"\xff\xd8"
+JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+"""Start-of-frame markers: C0–CF without the tables DHT (C4), JPG (C8) and DAC (CC)."""
 _SCAN, _END = 0xDA, b"\xff\xd9"
 _ALONE = frozenset({0x01, *range(0xD0, 0xD9)})  # markers that have no length: TEM, RST0 to RST7, SOI
 

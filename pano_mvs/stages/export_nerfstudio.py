@@ -63,14 +63,15 @@ def frames_memory_bytes(params: NerfstudioFramesParams, inputs: Mapping[str, Any
     return int(40 * (height * width + (params.size_px or 0) ** 2))
 
 
-@stage("export.nerfstudio_frames", memory=frames_memory_bytes)
+@stage("export.nerfstudio_frames", version=2, memory=frames_memory_bytes)
 def nerfstudio_frames(
     image: Each[Panorama], range_map: Each[RangeMap] | None, params: NerfstudioFramesParams, ctx: Context
 ) -> NerfstudioFrames:
     """Pictures, masks and depths of each panorama under nerfstudio/; export.nerfstudio lists them in transforms.json.
 
     A masked pixel has no depth, and shows the colours around it, for programs that do not look at masks. A panorama
-    of which nothing is masked, and that is a JPEG or an 8-bit PNG of the working resolution, is delivered as it is.
+    of which nothing is masked, and that is a colour JPEG (no CMYK) or an 8-bit PNG of the working resolution, is
+    delivered as it is.
     """
     valid = image.load_mask()
     ranges = None

@@ -9,6 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import PIL.Image
 import pytest
 from scipy.spatial import cKDTree
 
@@ -283,13 +284,18 @@ def test_panoramas_without_frames_are_told_and_none_at_all_is_refused(tmp_path: 
         nerfstudio({}, poses, None, NerfstudioParams(), ctx)
 
 
-def test_grey_and_16_bit_pictures_are_written_anew(tmp_path: Path) -> None:
-    """Trainers read 8 bits a channel; what is no such file is decoded once, here."""
+def test_grey_16_bit_and_cmyk_pictures_are_written_anew(tmp_path: Path) -> None:
+    """Trainers read 8 bits a channel; what is no such file is decoded once, here.
+
+    CMYK JPEGs were delivered as they are, and trainers took the four channels for colours with transparency.
+    """
     image = tiny_capture(PLAIN).images["000.png"]
     deep = cv2.imread(str(image.image.path)).astype(np.uint16) * 257
     cv2.imwrite(str(tmp_path / "deep.png"), deep)
     cv2.imwrite(str(tmp_path / "grey.png"), (deep[..., 0] >> 8).astype(np.uint8))
-    for idx, name in enumerate(("deep.png", "grey.png")):
+    PIL.Image.open(image.image.path).convert("CMYK").save(tmp_path / "cmyk.jpg")
+    PIL.Image.open(image.image.path).convert("L").save(tmp_path / "grey.jpg")
+    for idx, name in enumerate(("deep.png", "grey.png", "cmyk.jpg", "grey.jpg")):
         scratch = tmp_path / str(idx)
         scratch.mkdir()
         given = replace(image, image=FilePart(tmp_path / name, external=True))
