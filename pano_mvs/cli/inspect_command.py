@@ -110,6 +110,8 @@ class _Found:
 
 
 def _inspection(session: Session, wanted: PixelWanted) -> Inspection:
+    if not (math.isfinite(wanted.x) and math.isfinite(wanted.y)):
+        raise UsageError(f"({wanted.x}, {wanted.y}) is no pixel: give its column and its row as numbers")
     sweep = _sweep_stage(session, wanted.stage)
     store = Store(session.store_root)
     found = _Found()

@@ -129,6 +129,8 @@ def test_people_see_tables_a_plot_and_a_picture(run: Path, tmp_path: Path) -> No
     ("arguments", "message"),
     [
         (("000.png", 500, 3), "there is no pixel (500, 3); x is 0 to 127"),
+        (("000.png", "nan", 3), "(nan, 3.0) is no pixel"),
+        (("000.png", 5, "inf"), "(5.0, inf) is no pixel"),
         (("0", 5, 3), "3 images are called '0'"),
         (("lobby.jpg", 5, 3), "no images are called 'lobby.jpg'; there are: 000.png"),
         (("000.png", 5, 3, "--stage", "checked"), "its sweeps: depth, boxed"),
