@@ -116,6 +116,9 @@ def judge_depth(request: DepthRequest, *, pictures: Path | None = None) -> Depth
             path = pictures / f"{view.name}.jpg"
             write_error_picture(path, view.estimated, view.truth, image=image, counted=view.counted,
                                 limit=request.error_limit)  # fmt: skip
+    if not any(view.pixels for view in views.values()):
+        raise InputError(f"{request.truth}: no pixel of any view has a true range that counts. Look at its files and "
+                         "at the masks: zero, negative, infinite and NaN are no range")  # fmt: skip
     return DepthReport(str(request.source), str(request.truth), request.judging, scale, views, inputs.without_truth,
                        inputs.without_estimate, sizes)  # fmt: skip
 
@@ -134,7 +137,7 @@ class _View:
 
 def _views(request: DepthRequest, inputs: DepthInputs, scale: FoundScale) -> Iterator[_View]:
     """Judge one view after the other."""
-    mask_of = mask_reader(request.masks, request.mask)
+    mask_of = mask_reader(request.masks, request.mask, inputs.truths)
     least = request.judging.min_confidence
     for name, true_file in inputs.truths.items():
         file, truth = inputs.estimates[name], true_file.read()

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import glob
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,18 +107,25 @@ def find_scale(source: Path, truth: Path, given: str, poses: Path | None, true_p
     return FoundScale(aligned.scale, f"from the centres of {len(names)} cameras, never from the ranges")
 
 
-def mask_reader(masks: Path | None, mask: Path | None) -> Callable[[str, tuple[int, int]], NDArray[np.bool_] | None]:
+def mask_reader(
+    masks: Path | None, mask: Path | None, names: Iterable[str]
+) -> Callable[[str, tuple[int, int]], NDArray[np.bool_] | None]:
     """Return what gives, for a name and (height, width), the pixels that count, or None for all.
 
     Args:
         masks: a folder of masks by picture, `<image name>.png` or `<name without extension>.png`; 0 is left out.
         mask: one more for all pictures.
+        names: of the views that are judged.
 
     Raises:
-        InputError: if the folder is none.
+        InputError: if the folder is none, or holds no mask of any view.
     """
     if masks is not None and not masks.is_dir():
         raise InputError(f"{masks}: masks must be a folder. Give one mask for all pictures as --mask")
+    names = list(names)
+    if masks is not None and not any(_mask_of(masks, name) for name in names):
+        raise InputError(f"{masks}: no mask in it belongs to a view. That of {names[0]} must be called like the "
+                         f"picture with .png behind, or {without_extension(names[0])}.png")  # fmt: skip
 
     def read(name: str, size_hw: tuple[int, int]) -> NDArray[np.bool_] | None:
         paths = [mask] if mask is not None else []
@@ -161,8 +169,11 @@ def _mask_of(masks: Path, name: str) -> Path | None:
     """Return the mask of a picture: COLMAP's name of it, the picture's with .png behind, before the bare one."""
     plain = without_extension(name)
     own = [f"{name}.png"] if name != plain else []
-    tried = [*own, *(f"{plain}{suffix}.png" for suffix in sorted(PICTURE_SUFFIXES)), f"{plain}.png"]
-    return next((masks / path for path in tried if (masks / path).is_file()), None)
+    place, stem = (masks / plain).parent, PurePosixPath(plain).name
+    beside = (path for path in sorted(place.glob(f"{glob.escape(stem)}.*.png"))
+              if without_extension(path.stem) == stem)  # fmt: skip
+    tried = [*(masks / path for path in own), *beside, masks / f"{plain}.png"]
+    return next((path for path in tried if path.is_file()), None)
 
 
 def _poses(path: Path) -> dict[str, Rigid3]:

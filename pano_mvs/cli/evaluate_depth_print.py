@@ -129,7 +129,9 @@ def print_report(report: DepthReport, console: Console, *, baseline: str) -> Non
     if len(report.views) > _MOST_VIEWS:
         console.print(f"these are the {_MOST_VIEWS} of {len(report.views)} views with the worst δ<1.05; --json and "
                       "--csv have all", highlight=False, markup=False, soft_wrap=True)  # fmt: skip
-    for what, names in (("no truth for", report.without_truth), ("no estimate of", report.without_estimate)):
+    nothing_true = [name for name, view in report.views.items() if not view.pixels]
+    for what, names in (("no truth for", report.without_truth), ("no estimate of", report.without_estimate),
+                        ("no true range that counts in", nothing_true)):  # fmt: skip
         if names:
             shown = ", ".join(names[:5]) + (f" … ({len(names)} in all)" if len(names) > 5 else "")
             console.print(f"{what} {shown}: not in the scores", highlight=False, markup=False, soft_wrap=True)
@@ -161,7 +163,8 @@ def _conditions(report: DepthReport, baseline: str) -> list[str]:
 
 def _mean_table(report: DepthReport, baseline: str) -> Table:
     scores, constant = report.mean(), report.mean_constant(baseline)
-    table = Table(f"mean of {len(report.views)}" if len(report.views) > 1 else "one view", *_PROTOCOL_HEADINGS)
+    judged = sum(view.pixels > 0 for view in report.views.values())
+    table = Table(f"mean of {judged}" if judged > 1 else "one view", *_PROTOCOL_HEADINGS)
     for name, label in (_LABELS | {limit.name: _bad_label(limit.name) for limit in report.judging.bad}).items():
         table.add_row(label, *(_cell(f"{prefix}{name}", scores, constant) for prefix in PROTOCOLS))
     complete = (_cell(name, scores, constant) for name in ("completeness", "w_completeness"))
@@ -176,7 +179,8 @@ def _mean_table(report: DepthReport, baseline: str) -> Table:
 def _view_table(report: DepthReport, baseline: str) -> Table:
     names = [name for name in _OF_A_VIEW if any(name in view.scores for view in report.views.values())]
     table = Table("view", *(_view_heading(name) for name in names), box=SIMPLE, collapse_padding=True)
-    worst = sorted(report.views, key=lambda name: report.views[name].scores["w_delta_105"])[:_MOST_VIEWS]
+    worst = sorted(report.views, key=lambda name: np.nan_to_num(report.views[name].scores["w_delta_105"], nan=np.inf))
+    worst = worst[:_MOST_VIEWS]
     for label, view in report.views.items():
         if label not in worst:
             continue

@@ -163,6 +163,20 @@ def test_of_many_views_the_worst_are_listed(pano_mvs: Command, tmp_path: Path) -
     assert "v40" not in text  # one of nine without an error
 
 
+def test_views_without_a_true_range_are_told_and_none_at_all_is_refused(pano_mvs: Command, tmp_path: Path) -> None:
+    """They counted as views of the mean, and a truth of nothing but NaN gave a table of dashes and exit code 0."""
+    known, nothing = np.full((8, 16), 2, np.float32), np.full((8, 16), np.nan, np.float32)
+    np.savez(tmp_path / "found.npz", a=known, b=known, c=known)
+    np.savez(tmp_path / "true.npz", a=known, b=nothing, c=known)
+    outcome = pano_mvs("evaluate", "depth", tmp_path / "found.npz", "--truth", tmp_path / "true.npz")
+    assert outcome.code == 0
+    assert "mean of 2" in outcome.flat
+    assert "no true range that counts in b: not in the scores" in outcome.flat
+    np.savez(tmp_path / "true.npz", a=nothing, b=nothing, c=0 * known)
+    outcome = pano_mvs("evaluate", "depth", tmp_path / "found.npz", "--truth", tmp_path / "true.npz")
+    assert (outcome.code, "no pixel of any view has a true range that counts" in outcome.flat) == (2, True)
+
+
 def test_masks_and_confidence_leave_out_what_they_say(
     pano_mvs: Command, output: Path, truth: Path, tmp_path: Path
 ) -> None:
@@ -175,6 +189,9 @@ def test_masks_and_confidence_leave_out_what_they_say(
     report = told(pano_mvs("evaluate", "depth", output, "--truth", truth, "--masks", tmp_path / "masks", "--json"))
     assert [view["pixels"] for view in report["views"].values()][:2] == [1600, 1600]
     assert report["views"]["002"]["pixels"] > 40_000
+    cv2.imwrite(str(tmp_path / "masks" / "002.JPG.png"), counted)
+    named = told(pano_mvs("evaluate", "depth", output, "--truth", truth, "--masks", tmp_path / "masks", "--json"))
+    assert named["views"]["002"]["pixels"] == 1600  # as cameras write names: it was not found
     half = cv2.resize(counted, (SIZE_HW[1] // 2, SIZE_HW[0] // 2), interpolation=cv2.INTER_NEAREST)
     cv2.imwrite(str(tmp_path / "one.png"), half)
     alone = told(pano_mvs("evaluate", "depth", output, "--truth", truth, "--mask", tmp_path / "one.png", "--json"))
@@ -193,6 +210,7 @@ def test_masks_and_confidence_leave_out_what_they_say(
         (("--unit", "0"), "--unit must be a positive number"),
         (("--peak", "0"), "peak must be a positive length"),
         (("--masks", "none"), "masks must be a folder"),
+        (("--masks", "."), "no mask in it belongs to a view"),
         (("--poses", "none.json"), "none.json: no such file"),
         (("--images", "none"), None),
     ],
