@@ -16,6 +16,7 @@ from pano_mvs.algorithms.sharpness import sharpness
 from pano_mvs.api import NOT_IN_KEY, Context, FilePart, InputError, Panorama, Params, SourceItem, SourcePath, source
 from pano_mvs.io.names import printable_name
 from pano_mvs.io.video import VideoInfo, describe_video, frames_between, list_videos
+from pano_mvs.scene.files import item_stems
 from pano_mvs.scene.image_file import write_png
 from pano_mvs.stages.source import working_size
 
@@ -102,11 +103,23 @@ def video(item: SourceItem, params: VideoParams, ctx: Context) -> Panorama:
 
 
 def _named_videos(params: VideoParams) -> Iterator[tuple[Path, str]]:
-    """Yield the videos, each with its name relative to the capture, without its suffix."""
+    """Yield the videos, each with its name relative to the capture, without its suffix where one alone is called so.
+
+    Raises:
+        InputError: if two videos of a list have one name.
+    """
+    named: dict[str, Path] = {}
     for path in params.path if isinstance(params.path, list) else [params.path]:
         base = path if path.is_dir() else path.parent
         for found in list_videos(path):
-            yield found, found.relative_to(base).with_suffix("").as_posix()
+            name = found.relative_to(base).as_posix()
+            if name in named:
+                raise InputError(f"{named[name]} and {found}: frames of both would be called after {name}. Give the "
+                                 "folder that holds both as path, or rename one")  # fmt: skip
+            named[name] = found
+    stems = item_stems(named)
+    for name, path in named.items():
+        yield path, stems[name]
 
 
 def _items_of(path: Path, name: str, params: VideoParams) -> Iterator[SourceItem]:

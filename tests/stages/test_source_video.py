@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -126,6 +127,19 @@ def test_several_videos_and_folders_of_them(tmp_path: Path) -> None:
     assert [name.rpartition("_")[0] for name in names[::2]] == ["a2", "a10", "b", "day 2/b"]
     both = params([tmp_path / "walks/b.avi", tmp_path / "walks/a10.avi"], every_s=0.5)
     assert [item.name for item in list_frames(both)][::2] == ["b_00000000ms.png", "a10_00000000ms.png"]
+
+
+def test_videos_of_one_name_are_told_apart_or_refused(tmp_path: Path) -> None:
+    """They ended in "listed twice", without a word of which videos, and what to do."""
+    for name in ("walk.avi", "a/way.avi", "b/way.avi"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        write_video(tmp_path / name, 30)
+    shutil.copy(tmp_path / "walk.avi", tmp_path / "walk.mp4")  # FFmpeg looks at the contents
+    names = [item.name for item in list_frames(params(tmp_path, start_s=0.0, end_s=0.5))]
+    assert names == [f"{name}_00000000ms.png" for name in ("a/way", "b/way", "walk.avi", "walk.mp4")]
+    listed = [tmp_path / "a/way.avi", tmp_path / "b/way.avi"]
+    with pytest.raises(InputError, match=r"way\.avi and .*way\.avi: frames of both would be called after way\.avi"):
+        list(list_frames(params(listed)))
 
 
 def test_mask_and_cuts_are_as_for_pictures(tmp_path: Path) -> None:
