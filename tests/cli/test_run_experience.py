@@ -105,16 +105,20 @@ def test_interrupt_lets_units_finish_and_says_how_to_go_on(toy: Toy, number: sig
 
 def _read_until(process: subprocess.Popen[str], *words: str) -> None:
     assert process.stdout is not None
+    said = []
     for line in process.stdout:
+        said.append(line)
         if all(word in line for word in words):
             return
-    pytest.fail(f"it never said {words}")
+    code, _, err = finish(process)
+    pytest.fail(f"it ended with {code} and never said {words}, but {said} and {err}")
 
 
 @ON_POSIX
 def test_second_interrupt_ends_at_once(toy: Toy) -> None:  # noqa: F811
     process = start(toy, "--json", "--executor", "processes", "--workers", "2", sleep_s=300.0)
-    _read_until(process, '"unit_started"', '"mean"')
+    for _ in range(2):  # when the second is told of, the first is at work
+        _read_until(process, '"unit_started"', '"mean"')
     process.send_signal(signal.SIGINT)
     _read_until(process, "may finish")
     started = time.monotonic()
