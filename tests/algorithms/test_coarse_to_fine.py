@@ -233,6 +233,7 @@ def test_only_the_compiled_backend_has_levels():
         SweepSettings(levels=0)
 
 
+@pytest.mark.slow
 def test_thin_rods_are_seen_where_the_plain_sweep_sees_them():
     scene, size_hw = poles(seed=2), (192, 384)
     views = [scene.view(idx, size_hw) for idx in range(3)]

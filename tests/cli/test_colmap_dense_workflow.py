@@ -6,6 +6,7 @@ from pathlib import Path
 
 import cv2
 import pycolmap
+import pytest
 
 from tests.benchmarks.colmap_dense import fused_points
 from tests.cli.conftest import SIZE_HW, SMALL, Command, run_json
@@ -13,6 +14,7 @@ from tests.cli.conftest import SIZE_HW, SMALL, Command, run_json
 NAMES = ["000", "001", "002", "003"]
 
 
+@pytest.mark.slow
 def test_colmap_dense_writes_models_masks_and_a_workspace_that_fuses(pano_mvs: Command, rendered: Path) -> None:
     out = Path("out")
     arguments = (

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from pano_mvs.io.ply import read_ply
 from pano_mvs.io.range_files import read_range_tiff
 from tests.cli.conftest import run_json
 
 
+@pytest.mark.slow
 def test_fast_runs_from_pictures_to_cloud(pano_mvs, rendered, tmp_path):
     out = tmp_path / "out"
     result = pano_mvs(

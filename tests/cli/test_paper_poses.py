@@ -30,6 +30,7 @@ def faithful(capture: Path, tmp_path: Path) -> Path:
     return workflow
 
 
+@pytest.mark.slow
 def test_a_workflow_can_say_what_the_paper_does(faithful: Path, tmp_path: Path, pano_mvs: Command) -> None:
     outcome = pano_mvs("run", faithful, "--out", tmp_path / "out")
     assert outcome.code == 0, outcome.text

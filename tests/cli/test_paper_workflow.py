@@ -31,6 +31,7 @@ def run(rendered: Path, pano_mvs: Command):  # type: ignore[no-untyped-def]
     return call
 
 
+@pytest.mark.slow
 def test_the_papers_way_from_pictures_to_ranges(run) -> None:  # type: ignore[no-untyped-def]
     summary = run()
     params = {stage["name"]: stage["params"] for stage in summary["stages"]}
