@@ -88,6 +88,8 @@ def open_scene(path: Path, *, images: Path | None = None) -> ShownScene:
     """
     if path.is_file():
         cloud, mesh = (None, path) if has_faces(path) else (open_ply_points(path), None)
+        if cloud is not None and not cloud.count:
+            raise InputError(f"{path}: holds no points, so there is nothing to show. Look at what wrote it")
         return ShownScene(path.name, cloud, mesh, (), "scene units", *_frame(()))
     if not path.is_dir():
         raise InputError(f"{path}: no such file or folder. Give the output folder of a run, or a .ply file")
@@ -95,14 +97,19 @@ def open_scene(path: Path, *, images: Path | None = None) -> ShownScene:
     notes: list[str] = []
     cloud_file, mesh_file = _written(path, run, _CLOUD), _written(path, run, _MESH)
     cameras = _cameras(path, run, images, notes)
-    if cloud_file is None:
+    cloud = None if cloud_file is None else open_ply_points(cloud_file)
+    if cloud is None:
         notes.append(f"no {_CLOUD}: the workflow has no export.ply, or the run did not get there")
-    if cloud_file is None and mesh_file is None and not cameras:
-        raise InputError(f"{path}: holds no {_CLOUD}, no {_MESH} and no {_MODEL}. Give the output folder of a run")
+    elif not cloud.count:
+        cloud = None
+        notes.append(f"{_CLOUD} holds no points: report.html tells why")
+    if cloud is None and mesh_file is None and not cameras:
+        raise InputError(f"{path}: holds no {_CLOUD} with points, no {_MESH} and no {_MODEL}. Give the output folder "
+                         "of a run; its report.html tells what became of it")  # fmt: skip
     metric = bool((run.get("poses") or {}).get("metric"))
     return ShownScene(
         name=path.resolve().name,
-        cloud=open_ply_points(cloud_file) if cloud_file is not None else None,
+        cloud=cloud,
         mesh=mesh_file,
         cameras=cameras,
         unit="m" if metric else "scene units",

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +9,10 @@ import pytest
 from numpy.lib.recfunctions import drop_fields
 
 from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.io.ply import write_ply
 from pano_mvs.io.ply_points import open_ply_points
 from pano_mvs.io.preview import write_preview
+from pano_mvs.scene import PointCloud
 from pano_mvs.scene.image_file import decode_image
 from pano_mvs.viewer.cloud_colors import DrawnCloud, color_cloud, drawn_cloud
 from pano_mvs.viewer.panorama_pictures import LARGE_WIDTH, SMALL_WIDTH, sphere_picture
@@ -68,6 +71,21 @@ def test_nothing_to_show_is_an_error_with_a_remedy(tmp_path: Path) -> None:
     (tmp_path / "bad.ply").write_text("nothing")
     with pytest.raises(InputError, match="not a PLY file"):
         open_scene(tmp_path / "bad.ply")
+
+
+def test_a_cloud_without_points_is_as_none(tmp_path: Path) -> None:
+    """The window took it for a cloud, and ended as an internal error: masks that cover all make one."""
+    out = write_output(tmp_path, turned_poses(2))
+    write_ply(out / "cloud.ply", PointCloud(*(np.zeros((0, 3), kind) for kind in (np.float32, np.float32, np.uint8)),
+                                            np.zeros(0, np.uint8)))  # fmt: skip
+    scene = open_scene(out)
+    assert (scene.cloud, len(scene.cameras)) == (None, 2)
+    assert "cloud.ply holds no points" in scene.notes[-1]
+    with pytest.raises(InputError, match="holds no points"):
+        open_scene(out / "cloud.ply")
+    shutil.rmtree(out / "colmap")
+    with pytest.raises(InputError, match=r"holds no cloud\.ply with points"):
+        open_scene(out)
 
 
 def test_lone_files_are_clouds_or_meshes(tmp_path: Path) -> None:
