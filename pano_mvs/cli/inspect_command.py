@@ -20,6 +20,7 @@ from pano_mvs.engine.run import workflow_id
 from pano_mvs.engine.store import Store, UnitRecord
 from pano_mvs.engine.units import Unit
 from pano_mvs.io.names import match_image_names
+from pano_mvs.io.truth import read_truth
 from pano_mvs.scene import RangeMap
 from pano_mvs.stages.depth import SweepParams
 from pano_mvs.viewer.inspect_pixel import UnitFound, inspect_pixel
@@ -121,7 +122,7 @@ def _inspection(session: Session, wanted: PixelWanted) -> Inspection:
     if unit is None:
         raise InputError(_why_not(plans, sweep, image, session))
     stages = [units[image] for units in found.units.values() if image in units]
-    truth = wanted.truth or _truth_of(session)
+    truth = wanted.truth or _truth_of(session, image)
     return inspect_pixel(unit, stages, store, column=math.floor(wanted.x), row=math.floor(wanted.y), truth=truth)
 
 
@@ -159,12 +160,15 @@ def _why_not(plans: Sequence[StagePlan], sweep: str, image: str, session: Sessio
     return f"{sweep} has no view of {image}: it was not registered, or has no neighbours; see report.html"
 
 
-def _truth_of(session: Session) -> Path | None:
-    """Return the truth that the workflow itself compares with, if it does."""
+def _truth_of(session: Session, image: str) -> Path | None:
+    """Return the truth that the workflow itself compares with, if it does and knows the image.
+
+    A preset's truth is of its sample: of other pictures it says nothing.
+    """
     for entry in session.workflow.stages.values():
         folder = getattr(entry.params, "truth", None)
         if isinstance(folder, Path) and (folder / "poses.json").is_file():
-            return folder
+            return folder if read_truth(folder).match([image]) else None
     return None
 
 

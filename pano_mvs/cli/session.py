@@ -57,6 +57,8 @@ def open_session(
     """
     path, is_preset = find_workflow(name, presets_folder())
     if images is not None and not images.is_dir():
+        if images.exists():
+            raise InputError(f"--images {images}: this is a file; give the folder with the pictures")
         raise InputError(f"--images {images}: there is no such folder")
     registry = Registry.installed()
     try:

@@ -89,7 +89,7 @@ def camera_maps(
     if not names or len(centers) != len(names) or not np.isfinite(centers).all():
         return ()
     centers = centers @ rotation_from_two_vectors(up_of(poses), (0, -1, 0)).T
-    unit = "m" if poses.get("metric") else "units"
+    unit = "m" if poses.get("metric") else "scene units"
     labels = short_names(names)
     links = _chosen(poses.get("links") or [], names, labels, reasons or {})
     north = bool(_ALONG_NORTH.search(str(poses.get("frame") or "")))
@@ -150,6 +150,10 @@ def _chosen(
     return found[:split][:_MOST_REJECTED] + found[split:][-_MOST_LINKS:]
 
 
+def _measured(length: float, unit: str) -> str:
+    return f"{length:g} {unit.removesuffix('s') if length == 1 else unit}"
+
+
 def _drawn(
     title: str, flat: FloatArray, labels: list[str], links: list[_Joined], *, unit: str, tallest: int, north: bool
 ) -> CameraMap:
@@ -171,7 +175,7 @@ def _drawn(
     spots = _label_spots(placed, labels)
     cameras = [(float(x), float(y), label, spot) for (x, y), label, spot in zip(placed, labels, spots, strict=True)]
     length = _round_length(110 / scale)
-    bar = (14.0, height - 14.0, round(length * scale, 1), f"{length:g} {unit}")
+    bar = (14.0, height - 14.0, round(length * scale, 1), _measured(length, unit))
     wide, deep = (f"{float(size):.3g} {unit}" for size in high - low)
     text = f"{len(labels)} cameras {title.lower()}, {wide} across and {deep} {'deep' if tallest == _HEIGHT else 'high'}"
     dots = "" if named else "".join(f"M{x:g} {y:g}h0" for x, y in placed)

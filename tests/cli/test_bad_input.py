@@ -43,6 +43,13 @@ def test_folder_that_is_not_there(pano_mvs: Command) -> None:
     assert "there is no such folder" in result.flat
 
 
+def test_file_instead_of_a_folder(pano_mvs: Command, tmp_path: Path) -> None:
+    (tmp_path / "hall.jpg").touch()
+    result = pano_mvs("run", "quickstart", "--images", tmp_path / "hall.jpg")
+    assert result.code == 2
+    assert "this is a file; give the folder with the pictures" in result.flat
+
+
 def test_one_image(pano_mvs: Command, capture: Path) -> None:
     for path in sorted((capture / "images").iterdir())[1:]:
         path.unlink()

@@ -67,6 +67,18 @@ def test_the_curves_winner_is_what_the_stage_stored(run: Path, stage: str, x: fl
     assert found["notes"] == []
 
 
+def test_a_truth_of_other_pictures_is_not_mentioned_unless_it_was_asked_for(run: Path) -> None:
+    truth = run / "elsewhere"
+    truth.mkdir()
+    poses = (run / "capture" / "truth" / "poses.json").read_text()
+    (truth / "poses.json").write_text(poses.replace("images/00", "images/other"))
+    (run / "other.yaml").write_text(WORKFLOW.replace("capture/truth", "elsewhere"))
+    found = inspected(run / "other.yaml", "000", 40, 28, "--cache", run / "cache")
+    assert (found["true_range"], found["notes"]) == (None, [])
+    found = inspected(run / "other.yaml", "000", 40, 28, "--cache", run / "cache", "--truth", truth)
+    assert "has no range map of 000.png" in found["notes"][0]
+
+
 def test_rays_colours_neighbours_and_the_truth_are_those_of_the_capture(run: Path) -> None:
     found = inspected(run / "wf.yaml", "000", 40, 28, "--cache", run / "cache")
     ray = ray_from_pixel([40.5, 28.5], SIZE_HW)
