@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -171,6 +172,10 @@ def _sights(
     return tuple(sights)
 
 
+def _sha256(picture: Panorama) -> str:
+    return hashlib.sha256(picture.image.path.read_bytes()).hexdigest()
+
+
 def _true_range(
     folder: Path | None, image: str, read: _SweepRead, row: int, column: int
 ) -> tuple[float, tuple[str, ...]]:
@@ -179,7 +184,11 @@ def _true_range(
         return np.nan, ()
     truth = read_truth(folder)
     estimated = dict(zip((image, *read.names), read.poses, strict=True))
-    views = truth.match(list(estimated))
+    pictures = dict(zip((image, *read.names), (read.reference, *read.sources), strict=True))
+    matched = truth.match(list(estimated))
+    views = {name: view for name, view in matched.items() if view.sha256 in (None, _sha256(pictures[name]))}
+    if image in matched and image not in views:
+        return np.nan, (f"{image} is not the picture that the truth in {folder.name} belongs to",)
     ranges = truth.range_map(views[image]) if image in views else None
     if ranges is None or ranges.shape != read.reference.size_hw:
         return np.nan, (f"the truth in {folder.name} has no range map of {image} at the size that was swept",)

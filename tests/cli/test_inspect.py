@@ -79,6 +79,18 @@ def test_a_truth_of_other_pictures_is_not_mentioned_unless_it_was_asked_for(run:
     assert "has no range map of 000.png" in found["notes"][0]
 
 
+def test_a_picture_of_the_same_name_is_not_compared_with_the_truth_of_another(run: Path) -> None:
+    truth = run / "of_others"
+    shutil.copytree(run / "capture" / "truth", truth)
+    poses = json.loads((truth / "poses.json").read_text())
+    for view in poses["views"]:
+        view["sha256"] = "0" * 64
+    (truth / "poses.json").write_text(json.dumps(poses))
+    found = inspected(run / "wf.yaml", "000", 40, 28, "--cache", run / "cache", "--truth", truth)
+    assert found["true_range"] is None
+    assert found["notes"] == ["000.png is not the picture that the truth in of_others belongs to"]
+
+
 def test_rays_colours_neighbours_and_the_truth_are_those_of_the_capture(run: Path) -> None:
     found = inspected(run / "wf.yaml", "000", 40, 28, "--cache", run / "cache")
     ray = ray_from_pixel([40.5, 28.5], SIZE_HW)
