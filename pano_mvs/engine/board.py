@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol, TypeAlias
 
@@ -28,8 +28,8 @@ Token: TypeAlias = "tuple[str, str | None]"  # noqa: S105 (no password)
 class Listener(Protocol):
     """Hears how a run's stages come along."""
 
-    def source_listed(self, names: Iterable[str]) -> None:
-        """A source's images are known."""
+    def source_listed(self, entry: StageEntry, notes: Mapping[str, tuple[str, ...]]) -> None:
+        """A source's images are known, with what there is to say of each."""
 
     def stage_opened(self, entry: StageEntry) -> None:
         """A stage's units are known."""
@@ -172,7 +172,8 @@ class Board:
         resolution = resolve_source(stage.entry, self._store, self._only.get(stage.entry.name))
         stage.found = {unit.item: unit for unit in resolution.units}
         state.members.update(resolution.members)
-        self._listener.source_listed(resolution.members)
+        said = {unit.item: unit.source.notes for unit in resolution.units if unit.source}
+        self._listener.source_listed(stage.entry, {item: said.get(item, ()) for item in resolution.members})
         return resolution.blocked
 
     def _wait(self, stage: _Stage, item: str) -> None:

@@ -28,11 +28,14 @@ class SourceItem:
         name: path relative to the capture, with forward slashes.
         files: role to file; their content is what the item is known by.
         problem: why the item cannot be used, if that is known already.
+        notes: what a user should know in each run, whether the item is read or its result cached: what hangs on where
+            files lie, which is no part of what the item is known by.
     """
 
     name: str
     files: Mapping[str, Path]
     problem: str = ""
+    notes: tuple[str, ...] = ()
 
 
 ListItems = Callable[[Any], Iterable[SourceItem]]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from pano_mvs.core.errors import GateError, InputError
@@ -42,10 +42,12 @@ class Tally:
         self._states = states
         self._name_items = name_items
         self._counts: dict[str, _Count] = {}
+        self._listed: dict[str, Mapping[str, tuple[str, ...]]] = {}
 
-    def source_listed(self, names: Iterable[str]) -> None:
-        """Pass on the names of the images."""
-        self._name_items(names)
+    def source_listed(self, entry: StageEntry, notes: Mapping[str, tuple[str, ...]]) -> None:
+        """Pass on the names of the images, and keep what there is to say of each."""
+        self._name_items(notes)
+        self._listed[entry.name] = notes
 
     def stage_opened(self, entry: StageEntry) -> None:
         """Begin to count."""
@@ -116,7 +118,8 @@ class Tally:
         for name in sorted({name for metrics in summary.unit_metrics.values() for name in metrics}):
             values = [metrics[name] for metrics in summary.unit_metrics.values() if name in metrics]
             summary.metrics[name] = sum(values) / len(values)
-        notes = (note for item in state.items for note in count.notes.get(item, ()))
+        listed = self._listed.get(entry.name, {})
+        notes = (note for item in state.items for note in (*listed.get(item, ()), *count.notes.get(item, ())))
         summary.notes = list(dict.fromkeys(notes))
         self._observer.stage_finished(summary)
         if entry.spec.list_items is not None and not state.items:

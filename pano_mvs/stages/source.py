@@ -46,7 +46,7 @@ def list_folder(params: FolderParams) -> Iterator[SourceItem]:
         mask = None if problem else _mask_of(name, params)
         if mask is not None:
             files["mask"] = mask
-        yield SourceItem(name, files, problem)
+        yield SourceItem(name, files, problem, tuple(_notes_on_masks(name, mask, params)))
 
 
 @source("source.folder", list_items=list_folder)
@@ -65,10 +65,6 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
         ctx.note(f"some pictures have {trait}")
     _check_pixels(path, info)
     mask = item.files.get("mask")
-    if mask is None and params.masks is not None:
-        ctx.note(f"{item.name} has no mask in {params.masks.name}; all of it is used")
-    if params.masks is None and (unused := params.path / "masks").is_dir():
-        ctx.note(f"{unused} is there, but not used; give it as `masks` to ignore what its files mask")
     panorama = Panorama(
         image=FilePart(path, external=True),
         size_hw=working_size(info.size_hw, min(params.max_width, info.full_width_px)),
@@ -111,6 +107,13 @@ def working_size(source_hw: tuple[int, int], max_width: int) -> tuple[int, int]:
 def _mask_of(name: str, params: FolderParams) -> Path | None:
     own = None if params.masks is None else find_mask(name, params.masks)
     return own or params.mask
+
+
+def _notes_on_masks(name: str, mask: Path | None, params: FolderParams) -> Iterator[str]:
+    if mask is None and params.masks is not None:
+        yield f"{name} has no mask in {params.masks.name}; all of it is used"
+    if params.masks is None and (unused := params.path / "masks").is_dir():
+        yield f"{unused} is there, but not used; give it as `masks` to ignore what its files mask"
 
 
 def _is_mask(path: Path, params: FolderParams) -> bool:

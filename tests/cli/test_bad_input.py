@@ -213,3 +213,18 @@ def test_status_of_a_strange_run_json(pano_mvs: Command, short: Path) -> None:
         result = pano_mvs("status", short, "--out", "out")
         assert result.code == 0, result.text
         assert "run again to write it anew" in result.flat
+
+
+def test_pictures_without_a_mask_are_told_in_each_run_and_only_there(
+    pano_mvs: Command, capture: Path, tmp_path: Path
+) -> None:
+    masks = tmp_path / "blinds"
+    masks.mkdir()
+    cv2.imwrite(str(masks / "000.png"), np.full((160, 320), 255, np.uint8))
+    arguments = ["run", "quickstart", "--images", capture / "images", "--out", tmp_path / "out", "--until", "images"]
+    assert "has no mask" not in pano_mvs(*arguments).text
+    for _ in range(2):
+        text = pano_mvs(*arguments, "--set", f"images.masks={masks}").text
+        assert "001.png has no mask in blinds" in text
+        assert "000.png has no mask" not in text
+    assert "has no mask" not in pano_mvs(*arguments).text

@@ -38,8 +38,9 @@ def write_mask(path: Path, size_hw: tuple[int, int] = (16, 32), *, masked: slice
 def read(photos: Path, **settings: object) -> tuple[dict[str, Panorama], list[str]]:
     params = FolderParams.model_validate({"path": photos, **settings})
     context = Context(np.random.default_rng(0), photos, 1)
-    found = {item.name: folder(item, params, context) for item in list_folder(params)}
-    return found, context.notes
+    items = list(list_folder(params))
+    found = {item.name: folder(item, params, context) for item in items}
+    return found, [note for item in items for note in item.notes] + context.notes
 
 
 def masked_rows(panorama: Panorama) -> int:
