@@ -29,6 +29,7 @@ from pano_mvs.cli.session import Session
 from pano_mvs.cli.streams import apart
 from pano_mvs.cli.telling import INTERRUPTED, tell, tell_of_end
 from pano_mvs.core.errors import PanoMvsError, UsageError
+from pano_mvs.core.files import OUTPUT_MARK, set_aside
 from pano_mvs.engine.blobs import DamagedBlobError
 from pano_mvs.engine.events import Observer, RunResult
 from pano_mvs.engine.executors.choose import make_executor
@@ -69,6 +70,7 @@ class Execution:
 def run_workflow(session: Session, execution: Execution = Execution()) -> int:
     """Run a workflow, write run.json and report.html, print what came out, and return the exit code."""
     _check_output(session)
+    _keep_what_is_not_ours(session.out)
     store = Store(session.store_root, durable=execution.durable, least_free_bytes=least_free_bytes(execution.min_free))
     executor = make_executor(store, execution.executor, workers=execution.workers, threads=execution.threads,
                              scheduler=execution.scheduler)  # fmt: skip
@@ -164,6 +166,14 @@ def interrupted_by_termination() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+def _keep_what_is_not_ours(out: Path) -> None:
+    """Rename files that we are about to write where no run of ours has written before."""
+    if not (out / OUTPUT_MARK).exists():
+        for path in (out / "run.json", out / "report.html"):
+            if path.is_file():
+                set_aside(path)
 
 
 def _check_output(session: Session) -> None:

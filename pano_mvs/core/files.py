@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
+from itertools import count
 from pathlib import Path
 
 from pano_mvs.core.errors import StoreError
@@ -29,6 +30,20 @@ def _umask() -> int:
 _UMASK = _umask()  # once: to ask is to set it for a moment, for all threads
 _TEMPORARY = re.compile(r"\.tmp-([0-9a-f]{8})-(\d{1,10})-.*")
 _ABANDONED_AFTER_S = 7 * 24 * 3600.0
+
+
+def set_aside(path: Path) -> Path:
+    """Rename a file to `<name>.bak`, or `<name>.1.bak` and so on where that is taken; return its new place.
+
+    Raises:
+        StoreError: if it cannot be renamed.
+    """
+    names = (f"{path.name}{f'.{number}' if number else ''}.bak" for number in count())
+    free = next(path.with_name(name) for name in names if not path.with_name(name).exists())
+    try:
+        return path.rename(free)
+    except OSError as error:
+        raise StoreError(f"{path} is in the way and cannot be renamed ({error.strerror}). Move it away") from error
 
 
 def temporary_prefix() -> str:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
 
 from pano_mvs.core.errors import StoreError, UsageError
-from pano_mvs.core.files import OUTPUT_MARK, clear_abandoned, copy_file
+from pano_mvs.core.files import OUTPUT_MARK, clear_abandoned, copy_file, set_aside
 from pano_mvs.engine.blobs import BlobRef, DamagedBlobError
 from pano_mvs.engine.room import is_full_disk
 from pano_mvs.engine.store import ItemRef, Store
@@ -19,7 +19,17 @@ _PLACEHOLDER = re.compile(r"\{(?:item|name)\}")
 
 
 class Publisher:
-    """Writes the files of one run into one folder."""
+    """Writes the files of one run into one folder.
+
+    Attributes:
+        out: the folder.
+        store: where their bytes are.
+        written: the files that were written.
+        published: every file of the run, and its digest.
+        earlier: file to digest, as an earlier run wrote them.
+        set_aside: file to what it is called now, of those that stood where one was to be written and are nobody's but
+            the user's: edited since, or never a run's.
+    """
 
     def __init__(self, out: Path, store: Store) -> None:
         """Check that the folder can be written.
@@ -32,6 +42,8 @@ class Publisher:
         self.store = store
         self.written: list[str] = []
         self.published: dict[str, str] = {}
+        self.earlier: Mapping[str, str] = {}
+        self.set_aside: dict[str, str] = {}
         self._owners: dict[str, str] = {}
         self._stems: dict[str, str] = {}
         try:
@@ -111,9 +123,14 @@ class Publisher:
         if not _is_inside(target, self.out):
             raise StoreError(_cannot_write(target, "it would leave the output folder (a link leads outside)"))
         self._clear(target.parent)
-        if target.is_file() and not target.is_symlink() and self.store.stat_cache.digest(target) == blob.digest:
+        there = ""
+        if target.is_file() and not target.is_symlink():
+            there = self.store.stat_cache.digest(target)
+        if there == blob.digest:
             return
         source = self.store.blobs.verified_path(blob)
+        if there and there != self.earlier.get(name) and not self._is_stored(target, there, blob.suffix):
+            self.set_aside[name] = set_aside(target).relative_to(self.out).as_posix()
         try:
             copy_file(source, target)
         except StoreError:
@@ -121,6 +138,9 @@ class Publisher:
                 raise self.store.blobs.discard(blob, "is gone") from None
             raise
         self.written.append(name)
+
+    def _is_stored(self, path: Path, digest: str, suffix: str) -> bool:
+        return self.store.blobs.exists(BlobRef(digest, path.stat().st_size, suffix))
 
 
 def _is_inside(path: Path, folder: Path) -> bool:

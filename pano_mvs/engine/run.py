@@ -88,6 +88,7 @@ class Run:
             KeyboardInterrupt: if the user interrupts; units in flight were given some time to finish.
         """
         earlier = dict(earlier_files or {})
+        self._publisher.earlier = earlier
         self._warn_of_timeouts()
         try:
             self._execute_healing()
@@ -103,6 +104,8 @@ class Run:
         finally:
             self._desk.cancel()
             self._remember()
+            for name, aside in self._publisher.set_aside.items():
+                self._warn(f"{name} was not as a run had written it: what was there is kept as {aside}")
             self.result.written = sorted(self._publisher.written)
             self.result.published = self._publisher.published
             self.result.left_over = {
