@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -83,15 +83,21 @@ class Truth:
 def read_truth(folder: Path) -> Truth:
     """Return the ground truth in a folder: poses.json, and depth.npz if it is there.
 
-    A view's range map is looked up in depth.npz by its picture's stem, then by its id with three digits. Views
-    without a range map, and range maps without a view, do no harm.
+    A view's range map is looked up in depth.npz by its picture's path, with and without extension, then by the end of
+    that path down to its stem, then by its id with three digits. Views without a range map, and range maps without a
+    view, do no harm.
 
     Raises:
-        InputError: if poses.json is missing or malformed, or depth.npz is damaged.
+        InputError: if poses.json is missing or malformed, or depth.npz is damaged, or one of its arrays might be that
+            of several pictures.
     """
     posed, metric = read_posed_views(folder / "poses.json")
     keys = _range_keys(folder / "depth.npz")
-    return Truth(folder, {view.name: _truth_view(view, keys) for view in posed}, metric)
+    claimed = _claimed_keys(folder / "depth.npz", posed, keys)
+    views = {
+        view.name: TruthView(view.name, view.cam_from_world, claimed.get(view.name), view.sha256) for view in posed
+    }
+    return Truth(folder, views, metric)
 
 
 def find_true_ranges(path: Path, *, unit: float = 1.0) -> dict[str, RangeFile]:
@@ -125,8 +131,34 @@ def _range_keys(path: Path) -> frozenset[str]:
         raise InputError(f"{path}: not a readable .npz file ({error}). Fetch it again") from error
 
 
-def _truth_view(view: PosedView, keys: frozenset[str]) -> TruthView:
-    stem = view.name.rsplit("/", 1)[-1].rsplit(".", 1)[0]
-    numbered = f"{view.number:03d}" if view.number is not None else ""
-    key = next((name for name in (stem, numbered) if name in keys), None)
-    return TruthView(view.name, view.cam_from_world, key, view.sha256)
+def _claimed_keys(path: Path, views: Sequence[PosedView], keys: frozenset[str]) -> dict[str, str]:
+    """Return the array of each view that has one, by the view's name.
+
+    Raises:
+        InputError: if one array might be that of several views.
+    """
+    whole = {view.name: (view.name.rsplit(".", 1)[0], view.name) for view in views}
+    claimed = {name: key for name, tried in whole.items() if (key := _first(tried, keys)) is not None}
+    owners = {key: name for name, key in claimed.items()}
+    free = keys - owners.keys()
+    for view in views:
+        key = None if view.name in claimed else _first(_short_keys(view), free)
+        if key is None:
+            continue
+        if key in owners:
+            raise InputError(f"{path}: the array {key} might be that of {owners[key]} or of {view.name}. Call the "
+                             f"arrays like the pictures with their folders, such as {whole[view.name][0]}")  # fmt: skip
+        owners[key], claimed[view.name] = view.name, key
+    return claimed
+
+
+def _first(tried: Sequence[str], keys: frozenset[str]) -> str | None:
+    return next((key for key in tried if key in keys), None)
+
+
+def _short_keys(view: PosedView) -> list[str]:
+    """Return what the array of a view may be called besides its whole name, the longest first, at last its number."""
+    parts = view.name.split("/")
+    ends = ["/".join(parts[start:]) for start in range(1, len(parts))]
+    numbered = [] if view.number is None else [f"{view.number:03d}"]
+    return [key for end in ends for key in (end.rsplit(".", 1)[0], end)] + numbered

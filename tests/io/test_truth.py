@@ -124,3 +124,26 @@ def test_the_same_file_gives_known_poses(capture):
 def test_a_malformed_entry_is_named_with_its_key(capture, tmp_path, change, what):
     with pytest.raises(InputError, match=rf"poses\.json: .*{what}"):
         read_truth(edited(capture, tmp_path, change))
+
+
+class TestPicturesOfOneNameInTwoFolders:
+    @staticmethod
+    def written(folder, names, keys):
+        pose = {"R": np.eye(3).tolist(), "t": [0, 0, 0]}
+        data = {"views": [{"image": name, **pose} for name in names]}
+        (folder / "poses.json").write_text(json.dumps(data))
+        np.savez(folder / "depth.npz", **{key: np.full((2, 4), idx + 1.0) for idx, key in enumerate(keys)})
+        return folder
+
+    @pytest.mark.parametrize("keys", [("a/1", "b/1"), ("a/1.png", "b/1.png"), ("images/a/1", "images/b/1")])
+    def test_each_has_its_own_range_map(self, tmp_path, keys):
+        truth = read_truth(self.written(tmp_path, ["images/a/1.png", "images/b/1.png"], keys))
+        assert [float(truth.range_map(view)[0, 0]) for view in truth.views.values()] == [1, 2]
+
+    def test_one_map_for_both_is_refused(self, tmp_path):
+        with pytest.raises(InputError, match=r"array 1 might be that of a/1\.png or of b/1\.png.*such as b/1"):
+            read_truth(self.written(tmp_path, ["a/1.png", "b/1.png"], ["1"]))
+
+    def test_a_whole_name_goes_before_a_stem(self, tmp_path):
+        views = read_truth(self.written(tmp_path, ["b/1.png", "1.png"], ["1"])).views
+        assert {name: view.range_key for name, view in views.items()} == {"b/1.png": None, "1.png": "1"}
