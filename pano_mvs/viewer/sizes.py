@@ -10,7 +10,7 @@ FloatArray = NDArray[np.float64]
 # A sphere is this share of the way to the next camera, within these shares of the scene.
 _RADIUS_SHARE, _RADIUS_LIMITS = 0.18, (0.008, 0.025)
 _CROWDED_SHARE = 0.4
-_BOX_SHARES = 0.01, 0.99
+_BOX_SHARES, _OUTER_SHARES = (0.01, 0.99), (0.0005, 0.9995)
 
 
 def sphere_radius(centers: FloatArray, box: FloatArray) -> float:
@@ -39,6 +39,19 @@ def box_of(points: NDArray[np.floating], centers: FloatArray) -> FloatArray:
     if np.ptp(box, axis=0).max() < 1e-9:
         box = box + np.array([[-1.0], [1.0]])
     return box
+
+
+def outer_box(points: NDArray[np.floating], box: FloatArray) -> FloatArray:
+    """Return a box, (2, 3), in which the thinly sampled ends of a cloud (N, 3) lie too.
+
+    Points grow sparse with the distance from the cameras, so that a small share of them may be half a corridor. What
+    is farther off than half the longest side of the scene's box is taken for stray all the same.
+    """
+    if not len(points):
+        return box
+    margin = np.ptp(box, axis=0).max() / 2
+    low, high = np.quantile(np.asarray(points, np.float64), _OUTER_SHARES, axis=0)
+    return np.stack([np.clip(low, box[0] - margin, box[0]), np.clip(high, box[1], box[1] + margin)])
 
 
 def length_text(length: float, unit: str) -> str:

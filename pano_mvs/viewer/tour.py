@@ -14,7 +14,7 @@ from pano_mvs.viewer.cloud_colors import DrawnCloud
 from pano_mvs.viewer.picking import camera_under, point_under
 from pano_mvs.viewer.pixel_readout import pixel_readout
 from pano_mvs.viewer.shown_scene import ShownScene
-from pano_mvs.viewer.sizes import length_text, sphere_radius
+from pano_mvs.viewer.sizes import length_text, outer_box, sphere_radius
 from pano_mvs.viewer.viewpoint import Viewpoint, looking_along, outside_view
 
 FloatArray = NDArray[np.float64]
@@ -86,11 +86,15 @@ class Tour:
         """Begin with the overview."""
         self.centers = self.scene.centers
         self.radius = sphere_radius(self.centers, self.box)
+        points = self.corners if self.cloud is None else self.cloud.points
+        self._outer_box = self.box if points is None else outer_box(points, self.box)
         self.state = TourState(self.from_outside("overview"), "cloud" if self.cloud is not None else "mesh")
 
     def from_outside(self, name: str) -> Viewpoint:
         """Return the view called "overview", "top" or "front"."""
-        return outside_view(name, self.box, self.scene.up, self.scene.ahead, aspect=self.aspect)
+        # Perspective leaves room around what it fits; a plan or an elevation has to fit the ends of the cloud itself.
+        box = self.box if name == "overview" else self._outer_box
+        return outside_view(name, box, self.scene.up, self.scene.ahead, aspect=self.aspect)
 
     def see(self, view: str) -> None:
         """Go to a view by name: "overview", "top", "front" or "inside:NAME".

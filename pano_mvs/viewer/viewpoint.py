@@ -15,6 +15,8 @@ _LEAST_ANGLE_DEG, _LARGEST_ANGLE_DEG = 15.0, 110.0
 _STEEPEST_DEG = 89.0
 # The scene fills the window up to this share.
 _FILLED = 0.94
+# Height of a plan or an elevation in halves of the scene: below it there is room for the bar of known length.
+_PARALLEL_ROOM = 2.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +118,7 @@ def outside_view(name: str, box: FloatArray, up: FloatArray, ahead: FloatArray, 
         return Viewpoint(middle + _distance(corners @ seen.axes.T, aspect) * direction, middle, up)
     away, upright = (up, ahead) if name == "top" else (-ahead, up)
     across, high = np.abs(corners @ right).max(), np.abs(corners @ upright).max()
-    height = 2.15 * max(float(high), float(across) / aspect)
+    height = _PARALLEL_ROOM * max(float(high), float(across) / aspect)
     return Viewpoint(middle + 2 * radius * away, middle, upright, height=height)
 
 

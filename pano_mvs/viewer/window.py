@@ -27,6 +27,8 @@ _RIM_OUTSIDE, _RIM_INSIDE = 1.1, 1.03
 _MOST_LABELS = 300
 _SURROUND_SHARE = 2.0
 _FONT_SHARE = 1 / 72
+# Upper right, as least and greatest x and y: the bar lies at the lower edge, texts in other corners.
+_TRIAD = (0.8, 0.8, 1.0, 1.0)
 
 
 class SceneWindow:
@@ -58,7 +60,7 @@ class SceneWindow:
         self._add_mesh()
         self._add_cloud()
         self._add_bar()
-        self.plotter.add_axes(color=_INK, xlabel="x", ylabel="y", zlabel="z", line_width=2)
+        self.plotter.add_axes(color=_INK, xlabel="x", ylabel="y", zlabel="z", line_width=2, viewport=_TRIAD)
         self._hands = Hands(tour, seen_from=self.seen_from, update=self.update)
         self.plotter.clear_events_for_key("b")
         self.plotter.iren.style = self._hands.attach(self.plotter.iren.interactor)

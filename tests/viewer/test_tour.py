@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from pano_mvs.io.range_files import write_confidence_png, write_range_tiff
 from pano_mvs.viewer.cloud_colors import drawn_cloud
 from pano_mvs.viewer.picking import camera_under, point_under
 from pano_mvs.viewer.shown_scene import open_scene
-from pano_mvs.viewer.sizes import bar_length, bar_text, box_of, length_text, sphere_radius
+from pano_mvs.viewer.sizes import bar_length, bar_text, box_of, length_text, outer_box, sphere_radius
 from pano_mvs.viewer.tour import Tour
 from pano_mvs.viewer.viewpoint import Viewpoint, looking_along
 from tests.viewer.scenes import HALF, turned_poses, write_output
@@ -53,6 +54,26 @@ def test_clicking_a_camera_steps_inside_and_out_again(tour: Tour, view: str) -> 
     tour.step_out()
     assert tour.state.inside is None
     assert tour.state.viewpoint is before
+
+
+@pytest.mark.parametrize("view", ["top", "front"])
+def test_the_sparse_ends_of_a_corridor_are_in_the_window(tour: Tour, view: str) -> None:
+    """All but the hundredth part of the points lies about the cameras; that part is the rest of the corridor."""
+    assert tour.cloud is not None
+    points = tour.cloud.points.copy()
+    points[::120, ::2] *= np.linspace(1, 1.7, len(points[::120]), dtype=np.float32)[:, None]
+    corridor = Tour(tour.scene, replace(tour.cloud, points=points), box_of(points, tour.scene.centers))
+    corridor.see(view)
+    seen = np.array([place_of(point, corridor.state.viewpoint) for point in points[::120]])
+    assert np.mean((seen >= 0) & (seen <= SIZE)) > 0.99
+
+
+def test_a_stray_point_does_not_shrink_the_plan(tour: Tour) -> None:
+    assert tour.cloud is not None
+    stray = np.concatenate([tour.cloud.points, np.full((500, 3), 1e4, np.float32)])
+    box = box_of(stray, tour.scene.centers)
+    assert np.ptp(outer_box(stray, box), axis=0).max() <= 1.5001 * np.ptp(box, axis=0).max()
+    assert outer_box(stray[:0], box) is box
 
 
 def test_a_click_beside_all_cameras_does_nothing(tour: Tour) -> None:

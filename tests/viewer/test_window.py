@@ -72,6 +72,16 @@ def test_inside_a_camera_every_direction_is_where_it_was(tmp_path: Path, windows
             assert np.abs(seen_at(picture, x, y) - world_color(along)).max() <= 8
 
 
+def test_the_directions_are_shown_where_the_bar_is_not(tmp_path: Path, windows: list[SceneWindow]) -> None:
+    window = window_on(write_output(tmp_path, {}, points=500), windows, view="top")
+    _, lowest, _, _ = window.plotter.renderer.axes_widget.GetViewport()
+    ends = np.asarray(window.plotter.actors["bar"].mapper.dataset.points, np.float64)
+    upper = SIZE[1] * (1 - lowest)
+    for x, y in (place_of(point, window.tour.state.viewpoint) for point in ends):
+        assert 0 < x < SIZE[0]
+        assert upper < y < SIZE[1]
+
+
 def test_from_outside_a_camera_is_a_window_to_what_lies_behind(tmp_path: Path, windows: list[SceneWindow]) -> None:
     """A sphere shows its far side from within: as one would see it from inside, not mirrored, the right way up."""
     poses = {"a.png": Rigid3.from_center(turned_poses(1, seed=4)["lobby/000.png"].rotation, np.array([0.5, 0.1, 0.3]))}
