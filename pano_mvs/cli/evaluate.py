@@ -80,8 +80,11 @@ def _cloud(out: Path, truth: Path, console: Console) -> str:
         return f"there is no {CLOUD}"
     if not is_colmap_model(out / MODEL):
         return f"there is no {MODEL} that tells in which frame it is"
-    if not ((truth / "poses.json").is_file() and (truth / "depth.npz").is_file()):
-        return "the truth has no poses.json with a depth.npz"
+    try:
+        if not match_pictures(_cameras(truth), find_true_ranges(truth)):
+            return "the truth has no ranges of a picture whose pose it knows"
+    except InputError as error:
+        return f"the truth has no ranges with poses ({error})"
     try:
         evaluate_cloud(CloudRequest(out, truth), console, as_json=False)
     except UsageError as error:

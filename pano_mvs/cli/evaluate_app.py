@@ -49,7 +49,7 @@ def evaluate_model(
 @guarded
 def evaluate_points(
     cloud: Annotated[Path, typer.Argument(help="A PLY file, or the output folder of a run.")],
-    truth: Annotated[Path, typer.Option("--truth", help="Folder with poses.json and depth.npz, or a reference PLY.")],
+    truth: Annotated[Path, typer.Option("--truth", help="Folder with poses and range maps, or a reference PLY.")],
     poses: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option("--poses", help="The poses it was made with; without, a PLY lies in the truth's frame."),

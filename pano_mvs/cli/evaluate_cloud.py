@@ -27,7 +27,8 @@ from pano_mvs.geometry import Rigid3, Similarity3
 from pano_mvs.io.names import match_image_names
 from pano_mvs.io.ply_points import PlyPoints, open_ply_points
 from pano_mvs.io.pose_files import read_poses
-from pano_mvs.io.truth import read_truth
+from pano_mvs.io.range_folders import match_pictures
+from pano_mvs.io.truth import find_true_ranges
 
 _CLOUD, _MODEL = "cloud.ply", "colmap/sparse/0"
 # Distances are told apart up to this many times the largest tolerance; for quantiles and files, not for scores.
@@ -44,7 +45,8 @@ class CloudRequest:
 
     Attributes:
         cloud: a PLY file, or the output folder of a run.
-        truth: a folder with poses.json and depth.npz, or a reference cloud as a PLY file.
+        truth: a folder with poses in any form that `read_poses` reads and range maps in any that `find_true_ranges`
+            finds, or a reference cloud as a PLY file.
         poses: the poses with which the cloud was made, of the cameras that were used, in any form that `read_poses`
             reads; None: those in the output folder, or, beside a PLY file, a cloud in the truth's own frame from all
             of the truth's cameras.
@@ -155,14 +157,14 @@ def judge_cloud(request: CloudRequest) -> JudgedCloud:
     cloud, truth = request.cloud, request.truth
     file = open_ply_points(cloud / _CLOUD if cloud.is_dir() else cloud)
     model = cloud / _MODEL if cloud.is_dir() and request.poses is None else request.poses
-    known = _true_poses(truth, request.true_poses)
+    known, is_metric = _true_poses(truth, request.true_poses)
     used, truth_from_cloud = list(known), None
     if model is not None:
         if not known:
             raise InputError(f"{truth}: a reference cloud knows no cameras: give --true-poses to bring the cloud of "
                              f"{model} into its frame")  # fmt: skip
         truth_from_cloud, used = _alignment(model, known)
-    compared = _cloud_truth(truth, used, thresholds[0], known)
+    compared = _cloud_truth(truth, used, thresholds[0], known, is_metric=is_metric)
     farthest = _FARTHEST * thresholds[-1]
     points = PointChunks(file.count, lambda: _in_truth(file, truth_from_cloud))
     distances = cloud_distances(points, compared.pieces(), compared.surface, limit=farthest)
@@ -174,11 +176,13 @@ def _in_truth(file: PlyPoints, truth_from_cloud: Similarity3 | None) -> Iterator
         yield chunk if truth_from_cloud is None else truth_from_cloud.apply(chunk).astype(np.float32)
 
 
-def _true_poses(truth: Path, true_poses: Path | None) -> dict[str, Rigid3]:
-    if true_poses is not None:
-        poses = read_poses(true_poses)
-        return {name: poses.cam_from_world(idx) for idx, name in enumerate(poses.names)}
-    return read_truth(truth).poses if truth.is_dir() else {}
+def _true_poses(truth: Path, true_poses: Path | None) -> tuple[dict[str, Rigid3], bool]:
+    """Return the true cameras, none of a reference cloud alone, and whether lengths are metres."""
+    if true_poses is None and not truth.is_dir():
+        return {}, False
+    beside = truth / "poses.json"  # of the ranges, whatever other poses lie there
+    poses = read_poses(true_poses or (beside if beside.is_file() else truth))
+    return {name: poses.cam_from_world(idx) for idx, name in enumerate(poses.names)}, poses.metric
 
 
 def _alignment(model: Path, known: dict[str, Rigid3]) -> tuple[Similarity3, list[str]]:
@@ -193,7 +197,9 @@ def _alignment(model: Path, known: dict[str, Rigid3]) -> tuple[Similarity3, list
     return aligned, list(ours)
 
 
-def _cloud_truth(truth: Path, used: list[str], voxel_size: float, known: dict[str, Rigid3]) -> CloudTruth:
+def _cloud_truth(
+    truth: Path, used: list[str], voxel_size: float, known: dict[str, Rigid3], *, is_metric: bool
+) -> CloudTruth:
     cameras = np.array([known[name].center for name in used if name in known]).reshape(-1, 3)
     up = _up([known[name] for name in used if name in known])
     if not truth.is_dir():
@@ -201,16 +207,13 @@ def _cloud_truth(truth: Path, used: list[str], voxel_size: float, known: dict[st
         some, _ = reference.some(max(1, -(-reference.count // _MOST_SAMPLES)))
         surface = surface_of_cloud(some, voxel_size=voxel_size)
         return CloudTruth(reference.chunks, surface, {}, 0, "units of the truth", cameras, up)
-    true = read_truth(truth)
-    views = {
-        name: TrueView(view.cam_from_world, ranges)
-        for name, view in true.views.items()
-        if (ranges := true.range_map(view)) is not None
-    }
+    files = find_true_ranges(truth)
+    names = match_pictures(known, files)
+    views = {name: TrueView(pose, files[names[name]].read()) for name, pose in known.items() if name in names}
     chosen = {name: views[name] for name in used if name in views}
     if not chosen:
         raise InputError(f"{truth}: holds no range map of a camera that was used ({', '.join(used[:3]) or 'none'})")
-    unit = "m" if true.metric else "units of the truth"
+    unit = "m" if is_metric else "units of the truth"
     surface = surface_of_views(list(chosen.values()))
     return CloudTruth(lambda: map(view_points, views.values()), surface, chosen, len(views), unit, cameras, up)
 

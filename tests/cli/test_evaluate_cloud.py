@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -69,6 +70,23 @@ def test_the_truth_is_perfect_in_its_own_frame_and_in_any_other(
     failed = pano_mvs("evaluate", "cloud", *arguments, "--truth", tmp_path / "a.ply")
     assert failed.code == 2
     assert "give --true-poses" in failed.flat
+
+
+def test_truth_may_be_range_maps_in_files_beside_the_poses(
+    pano_mvs: Command, tmp_path: Path, folder: Path, surface: np.ndarray
+) -> None:
+    truth = tmp_path / "truth"
+    (truth / "range").mkdir(parents=True)
+    shutil.copy(folder / "poses.json", truth)
+    with np.load(folder / "depth.npz") as arrays:
+        for key in arrays:
+            np.save(truth / "range" / f"{key}.npy", arrays[key])
+    cloud = save(tmp_path / "a.ply", surface[::7])
+    found, wanted = (
+        json.loads(pano_mvs("evaluate", "cloud", cloud, "--truth", path, "--json").text) for path in (truth, folder)
+    )
+    assert found.pop("truth") != wanted.pop("truth")
+    assert found == wanted
 
 
 def test_only_what_the_cameras_used_see_must_be_found(
