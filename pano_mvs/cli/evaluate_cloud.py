@@ -50,7 +50,8 @@ class CloudRequest:
         poses: the poses with which the cloud was made, of the cameras that were used, in any form that `read_poses`
             reads; None: those in the output folder, or, beside a PLY file, a cloud in the truth's own frame from all
             of the truth's cameras.
-        true_poses: those of a reference cloud's frame; None: the truth folder's.
+        true_poses: those of a reference cloud's frame; None: the truth folder's, or, without `poses`, a cloud in the
+            reference cloud's own frame.
         thresholds: tolerances in the truth's unit.
     """
 
@@ -159,7 +160,7 @@ def judge_cloud(request: CloudRequest) -> JudgedCloud:
     model = cloud / _MODEL if cloud.is_dir() and request.poses is None else request.poses
     known, is_metric = _true_poses(truth, request.true_poses)
     used, truth_from_cloud = list(known), None
-    if model is not None:
+    if model is not None and (known or request.poses is not None):
         if not known:
             raise InputError(f"{truth}: a reference cloud knows no cameras: give --true-poses to bring the cloud of "
                              f"{model} into its frame")  # fmt: skip
@@ -252,6 +253,9 @@ def _print(judged: JudgedCloud, scores: Sequence[CloudScore], console: Console) 
     against = (f"the surface that {compared.views} views see; of it to be found is what at least 2 of "
                f"{len(compared.used)} cameras see") if compared.used else "a reference cloud"  # fmt: skip
     console.print(f"{judged.file.count} points against {against}", highlight=False, markup=False)
+    if not compared.used and judged.truth_from_cloud is None:
+        console.print("both clouds are taken to lie in one frame; if they do not, give --true-poses, those in the "
+                      "frame of the reference cloud", highlight=False, markup=False, soft_wrap=True)  # fmt: skip
     table = Table(f"within, {compared.unit}", "accuracy %", "completeness %", "F-score %")
     for score in scores:
         shares = (score.accuracy, score.completeness, score.f_score)

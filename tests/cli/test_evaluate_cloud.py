@@ -131,6 +131,20 @@ def test_a_cloud_against_itself_is_perfect_and_no_distance_from_it(
     assert "points from the surface: median over 10, 90 % within over 10" in text
 
 
+def test_the_cloud_of_a_run_lies_in_the_frame_of_a_reference_without_poses(
+    pano_mvs: Command, tmp_path: Path, surface: np.ndarray
+) -> None:
+    own = save(tmp_path / "cloud.ply", surface[::50])
+    model = tmp_path / "colmap/sparse/0"
+    model.mkdir(parents=True)
+    plain = pano_mvs("evaluate", "cloud", tmp_path, "--truth", own)
+    assert plain.code == 0, plain.text
+    assert "both clouds are taken to lie in one frame" in plain.flat
+    assert "100.00" in plain.text
+    named = pano_mvs("evaluate", "cloud", tmp_path, "--truth", own, "--poses", model)
+    assert (named.code, "give --true-poses" in named.flat) == (2, True)
+
+
 def test_up_is_where_the_cameras_have_it(tmp_path: Path, folder: Path, surface: np.ndarray) -> None:
     reference = save(tmp_path / "a.ply", surface)
     turned = Similarity3(1.0, rotation_from_rotvec([0.9, 0.4, -0.2]), np.zeros(3))
