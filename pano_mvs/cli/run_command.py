@@ -38,6 +38,7 @@ from pano_mvs.engine.memory import bytes_from_size
 from pano_mvs.engine.params import files_of
 from pano_mvs.engine.run import Run
 from pano_mvs.engine.store import LEAST_FREE_BYTES, Store
+from pano_mvs.viewer.shown_scene import is_to_see
 
 MIN_FREE_VARIABLE = "PANO_MVS_MIN_FREE"
 _SHOWN_FAILURES = 20
@@ -214,9 +215,9 @@ def print_summary(summary: Mapping[str, Any], out: Path, console: Console, *, wr
         console.print(
             f"{count} files of an earlier run, which this one did not write, are still there", highlight=False
         )
+    look = f", or look around with pano-mvs view {escape(shlex.quote(str(out)))}" if is_to_see(summary["files"]) else ""
     console.print(
-        f"results in {escape(str(out))} ({len(summary['files'])} files, {written} written now): open report.html, "
-        f"or look around with pano-mvs view {escape(shlex.quote(str(out)))}",
+        f"results in {escape(str(out))} ({len(summary['files'])} files, {written} written now): open report.html{look}",
         highlight=False,
         soft_wrap=True,
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -116,6 +116,11 @@ def open_scene(path: Path, *, images: Path | None = None) -> ShownScene:
         **dict(zip(("up", "ahead"), _frame(cameras), strict=True)),
         notes=tuple(notes),
     )
+
+
+def is_to_see(files: Iterable[str]) -> bool:
+    """Return whether among a run's files, by their paths in its folder, is one that `open_scene` shows."""
+    return any(PurePosixPath(name).name in (_CLOUD, _MESH) or name.startswith(f"{_MODEL}/") for name in files)
 
 
 def has_faces(path: Path) -> bool:

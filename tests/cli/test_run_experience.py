@@ -180,6 +180,14 @@ def test_serial_and_processes_leave_the_same_files(toy: Toy) -> None:  # noqa: F
     assert deliverables(toy) == first
 
 
+def test_view_is_named_only_where_there_is_something_to_view(toy: Toy) -> None:  # noqa: F811
+    out = finish(start(toy, "--executor", "serial"))[1]
+    assert "open report.html" in out
+    assert "pano-mvs view" not in out
+    toy.edit("plug.py", lambda text: text.replace('"all.txt"', '"cloud.ply"'))
+    assert "open report.html, or look around with pano-mvs view" in finish(start(toy, "--executor", "serial"))[1]
+
+
 def test_time_left_is_a_bound_until_all_is_known() -> None:
     estimate = Estimate(workers=2)
     estimate.start("a", 10)

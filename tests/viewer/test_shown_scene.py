@@ -16,7 +16,7 @@ from pano_mvs.scene import PointCloud
 from pano_mvs.scene.image_file import decode_image
 from pano_mvs.viewer.cloud_colors import DrawnCloud, color_cloud, drawn_cloud
 from pano_mvs.viewer.panorama_pictures import LARGE_WIDTH, SMALL_WIDTH, sphere_picture
-from pano_mvs.viewer.shown_scene import has_faces, open_scene
+from pano_mvs.viewer.shown_scene import has_faces, is_to_see, open_scene
 from tests.viewer.scenes import turned_poses, write_output
 
 UP = np.array([0.0, -1, 0])
@@ -176,3 +176,9 @@ def test_pictures_are_found_small_and_large_and_missing_ones_are_plain(tmp_path:
     (tmp_path / "images" / "lobby" / "001.png").write_bytes(b"broken")
     plain = sphere_picture(open_scene(out).cameras[1], SMALL_WIDTH)
     assert plain[0].mean() > plain[-1].mean()
+
+
+@pytest.mark.parametrize("name", ["cloud.ply", "sad/cloud.ply", "mesh.ply", "colmap/sparse/0/cameras.bin"])
+def test_what_can_be_seen_is_known_from_the_names_of_files(name: str) -> None:
+    assert is_to_see(["range/1.tiff", name])
+    assert not is_to_see(["range/1.tiff", "report.html", "colmap/images/1.jpg", "points.laz"])
