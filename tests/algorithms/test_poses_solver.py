@@ -172,6 +172,7 @@ def test_an_image_that_fits_a_third_of_the_known_points_is_rejected(capture):
     poses = solve(features, kept)
     assert poses.names == ("0.jpg", "1.jpg", "2.jpg", "4.jpg")
     assert "seen where they should be" in poses.rejected["3.jpg"]
+    assert "or a picture that is no panorama" in poses.rejected["3.jpg"]
 
 
 def test_only_the_largest_group_is_kept():

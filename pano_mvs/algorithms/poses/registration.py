@@ -190,7 +190,7 @@ class GrowingModel:
                 pose, support, len(points),
                 f"only {support} of {len(points)} points known from other pictures are seen where they should be, "
                 f"{max(_MIN_POINTS, int(np.ceil(_MIN_SHARE * len(points))))} needed: repeated structure, something "
-                "that moved, or stitching errors",
+                "that moved, stitching errors, or a picture that is no panorama",
             )  # fmt: skip
         return Attachment(pose, support, len(points))
 
