@@ -103,6 +103,9 @@ def test_libraries_that_work_are_ok() -> None:
         ["numba", "pycolmap", "OpenCV", "PyVista", "torch"], "ok"
     )
     assert "Card 7" in found["torch"].detail
+    assert "AVIF: yes, video: yes" in found["OpenCV"].detail
+    without = by_what(library_findings(fake(cv2={**GOOD["cv2"], "avif": False}), has_torch_plugin=False))
+    assert "AVIF: no, video: yes" in without["OpenCV"].detail
 
 
 @pytest.mark.parametrize(

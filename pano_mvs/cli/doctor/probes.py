@@ -167,7 +167,8 @@ def _read_opencv(outcome: Outcome) -> Iterator[Finding]:
         yield _finding("OpenCV", "failed", f"{said['version']} lacks {', '.join(said['missing'])}",
                        f"{_PIP} opencv-python-headless")  # fmt: skip
     else:
-        yield _finding("OpenCV", "ok", f"{said['version']}: JPEG, PNG, TIFF, WebP")
+        video, avif = ("yes" if said[what] else "no" for what in ("video", "avif"))
+        yield _finding("OpenCV", "ok", f"{said['version']}: JPEG, PNG, TIFF, WebP; AVIF: {avif}, video: {video}")
     if not said["video"]:
         yield _finding("OpenCV video", "warning", "reads no videos (no FFmpeg)", f"{_PIP} opencv-python-headless")
     if not said["avif"]:
