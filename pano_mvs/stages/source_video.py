@@ -62,13 +62,22 @@ def list_frames(params: VideoParams) -> Iterator[SourceItem]:
     """List the frames to take, by the headers of the videos alone.
 
     Raises:
-        InputError: if a video cannot be used, or all of them give fewer than two frames.
+        InputError: if the only video cannot be used, or all of them give fewer than two frames.
     """
-    items = [item for path, name in _named_videos(params) for item in _items_of(path, name, params)]
+    items, failed, first_error = list[SourceItem](), list[SourceItem](), None
+    for path, name in _named_videos(params):
+        try:
+            items += _items_of(path, name, params)
+        except InputError as error:
+            first_error = first_error or error
+            failed.append(SourceItem(printable_name(name)[0], {"video": path}, str(error)))
     if len(items) < 2:
+        if first_error is not None:
+            raise first_error
         raise InputError(f"{items[0].files['video'] if items else params.path}: gives {len(items)} frames; depth needs "
                          "two or more. Set a smaller every_s, or another start_s and end_s")  # fmt: skip
     yield from items
+    yield from failed
 
 
 @source("source.video", list_items=list_frames)

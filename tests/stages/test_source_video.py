@@ -194,6 +194,18 @@ def test_what_cannot_be_opened_is_named(tmp_path: Path, damage: str, capfd: pyte
     assert capfd.readouterr() == ("", ""), "FFmpeg's own messages are not for people"
 
 
+def test_a_video_that_cannot_be_used_does_not_stop_the_others(tmp_path: Path) -> None:
+    write_video(tmp_path / "good.avi", 30)
+    (tmp_path / "bad.avi").write_bytes(b"hello")
+    *frames, bad = list_frames(params(tmp_path, every_s=0.5))
+    assert len(frames) >= 2
+    assert {item.problem for item in frames} == {""}
+    assert bad.name == "bad"
+    assert "bad.avi: cannot be opened as a video" in bad.problem
+    with pytest.raises(InputError, match=r"bad\.avi: cannot be opened"):
+        list(list_frames(params(tmp_path, every_s=50)))
+
+
 def test_a_video_that_ends_early_gives_what_it_has(tmp_path: Path) -> None:
     path = write_video(tmp_path / "walk.avi", 60)
     data = path.read_bytes()
