@@ -107,6 +107,7 @@ def run(
 def plan(
     workflow: WorkflowArgument,
     images: ImagesOption = None,
+    out: OutOption = None,
     overrides: SetOption = None,
     cache: CacheOption = None,
     until: UntilOption = None,
@@ -115,14 +116,15 @@ def plan(
     explain: Annotated[str, typer.Option("--explain", metavar="STAGE:ITEM", help="All about one unit: what it reads, "
                                          "what it is made of, where its result is.", show_default=False)] = "",
 ) -> None:  # fmt: skip
-    """Show what a run would do, what is cached, and why the rest is not."""
+    """Show what a run would do, what is cached, and why the rest is not; nothing is written into --out."""
     from pano_mvs.cli.explain import explain_unit
     from pano_mvs.cli.plan_command import show_plan
-    from pano_mvs.cli.session import open_session
+    from pano_mvs.cli.session import check_output, open_session
     from pano_mvs.engine.demands import Demands
 
     demands = Demands(tuple(until or ()), tuple(only or ()), tuple(refresh or ()))
-    session = open_session(workflow, overrides=overrides or [], images=images, cache=cache, demands=demands)
+    session = open_session(workflow, overrides=overrides or [], images=images, cache=cache, out=out, demands=demands)
+    check_output(session)
     if explain:
         explain_unit(session, explain, Console())
     else:

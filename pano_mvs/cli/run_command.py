@@ -25,7 +25,7 @@ from rich.table import Table
 
 from pano_mvs.cli.json_events import SCHEMA, JsonEvents
 from pano_mvs.cli.progress import ProgressBars
-from pano_mvs.cli.session import Session
+from pano_mvs.cli.session import Session, check_output
 from pano_mvs.cli.streams import apart
 from pano_mvs.cli.telling import INTERRUPTED, tell, tell_of_end
 from pano_mvs.core.errors import PanoMvsError, UsageError
@@ -35,7 +35,6 @@ from pano_mvs.engine.events import Observer, RunResult
 from pano_mvs.engine.executors.choose import make_executor
 from pano_mvs.engine.executors.protocol import Executor
 from pano_mvs.engine.memory import bytes_from_size
-from pano_mvs.engine.params import files_of
 from pano_mvs.engine.run import Run
 from pano_mvs.engine.store import LEAST_FREE_BYTES, Store
 from pano_mvs.viewer.shown_scene import is_to_see
@@ -70,7 +69,7 @@ class Execution:
 
 def run_workflow(session: Session, execution: Execution = Execution()) -> int:
     """Run a workflow, write run.json and report.html, print what came out, and return the exit code."""
-    _check_output(session)
+    check_output(session)
     _keep_what_is_not_ours(session.out)
     store = Store(session.store_root, durable=execution.durable, least_free_bytes=least_free_bytes(execution.min_free))
     executor = make_executor(store, execution.executor, workers=execution.workers, threads=execution.threads,
@@ -175,14 +174,6 @@ def _keep_what_is_not_ours(out: Path) -> None:
         for path in (out / "run.json", out / "report.html"):
             if path.is_file():
                 set_aside(path)
-
-
-def _check_output(session: Session) -> None:
-    """Refuse an output folder that is itself read from."""
-    out = session.out.resolve()
-    for name, entry in session.workflow.stages.items():
-        if any(path.resolve() == out for paths in files_of(entry.params).values() for path in paths):
-            raise UsageError(f"--out {session.out}: stage {name!r} reads this very folder. Choose another folder")
 
 
 def earlier_files(out: Path) -> dict[str, str]:

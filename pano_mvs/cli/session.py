@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pano_mvs
-from pano_mvs.core.errors import InputError, WorkflowError
+from pano_mvs.core.errors import InputError, UsageError, WorkflowError
 from pano_mvs.engine.demands import NO_DEMANDS, Demands
+from pano_mvs.engine.params import files_of
 from pano_mvs.engine.registry import Registry
 from pano_mvs.engine.wiring import Graph, wire, wiring_problems
 from pano_mvs.engine.workflow import PartialWorkflowError, Workflow, find_workflow, load_workflow
@@ -71,6 +72,18 @@ def open_session(
     beside = Path.cwd() if is_preset else path.parent
     root = cache or (Path(variable) if variable else beside / ".pano-mvs")
     return Session(workflow, graph, registry, root, out or Path("out") / workflow.name, demands)
+
+
+def check_output(session: Session) -> None:
+    """Refuse an output folder that is itself read from.
+
+    Raises:
+        UsageError: if a stage reads it.
+    """
+    out = session.out.resolve()
+    for name, entry in session.workflow.stages.items():
+        if any(path.resolve() == out for paths in files_of(entry.params).values() for path in paths):
+            raise UsageError(f"--out {session.out}: stage {name!r} reads this very folder. Choose another folder")
 
 
 def _all_plugins(workflow: Workflow, registry: Registry) -> dict[Path, str]:

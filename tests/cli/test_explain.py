@@ -36,3 +36,15 @@ def test_explain_says_why_a_unit_would_run(toy: Toy) -> None:
 def test_explain_of_nothing_names_what_there_is(toy: Toy, unit: str, message: str) -> None:
     toy.run()
     assert message in explain(toy, unit)
+
+
+def test_plan_takes_the_out_of_a_run_and_writes_nothing_there(toy: Toy) -> None:
+    """One can put `plan` in the place of `run` in one's own command."""
+    command = ["plan", str(toy.folder / "wf.yaml"), "--cache", str(toy.folder / "cache"), "--out"]
+    planned = CliRunner().invoke(app, [*command, str(toy.folder / "new")])
+    assert planned.exit_code == 0
+    assert "units would run" in planned.output
+    assert not (toy.folder / "new").exists()
+    refused = CliRunner().invoke(app, [*command, str(toy.folder / "capture")])
+    assert refused.exit_code == 2, "as a run would be"
+    assert "reads this very folder" in " ".join(refused.output.split())
