@@ -19,6 +19,7 @@ from pano_mvs.cli.evaluate_depth_inputs import (
     find_scale,
     mask_reader,
     picture_reader,
+    views_without_mask,
 )
 from pano_mvs.cli.evaluate_depth_print import DepthReport, print_report, report_json, write_csv
 from pano_mvs.core.errors import InputError, UsageError
@@ -120,7 +121,7 @@ def judge_depth(request: DepthRequest, *, pictures: Path | None = None) -> Depth
         raise InputError(f"{request.truth}: no pixel of any view has a true range that counts. Look at its files and "
                          "at the masks: zero, negative, infinite and NaN are no range")  # fmt: skip
     return DepthReport(str(request.source), str(request.truth), request.judging, scale, views, inputs.without_truth,
-                       inputs.without_estimate, sizes)  # fmt: skip
+                       inputs.without_estimate, sizes, views_without_mask(request.masks, views))  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

@@ -138,6 +138,11 @@ def mask_reader(
     return read
 
 
+def views_without_mask(masks: Path | None, names: Iterable[str]) -> tuple[str, ...]:
+    """Return the views that have no mask in a folder of masks, none if there is no such folder."""
+    return () if masks is None else tuple(name for name in names if _mask_of(masks, name) is None)
+
+
 def picture_reader(images: Path | None, truth: Path, inputs: DepthInputs) -> Callable[[str], NDArray[np.uint8] | None]:
     """Return what gives a name's panorama, (H, W, 3) RGB, or None where it is not known.
 

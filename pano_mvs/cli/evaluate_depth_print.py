@@ -48,6 +48,7 @@ class DepthReport:
         without_truth: names of estimates that have no truth.
         without_estimate: names that the truth knows and nobody estimated.
         sizes: ((height, width) of the estimate, that of the truth) to the number of such views.
+        without_mask: names of views that have no mask where there is a folder of masks.
     """
 
     source: str
@@ -58,6 +59,7 @@ class DepthReport:
     without_truth: Sequence[str] = ()
     without_estimate: Sequence[str] = ()
     sizes: Mapping[tuple[tuple[int, int], tuple[int, int]], int] = field(default_factory=dict)
+    without_mask: Sequence[str] = ()
 
     def mean(self) -> dict[str, float]:
         """Return the mean of each score over the views."""
@@ -92,6 +94,7 @@ def report_json(report: DepthReport) -> str:
         },
         "without_truth": list(report.without_truth),
         "without_estimate": list(report.without_estimate),
+        "without_mask": list(report.without_mask),
     }
     return json.dumps(values, indent=1, ensure_ascii=False, allow_nan=False)
 
@@ -152,6 +155,9 @@ def _conditions(report: DepthReport, baseline: str) -> list[str]:
                      f"{min(fitted):.5g} to {max(fitted):.5g}")  # fmt: skip
     if judging.min_confidence:
         lines.append(f"ranges of a confidence below {judging.min_confidence} count as missing")
+    if report.without_mask:
+        lines.append(f"no mask in --masks for {len(report.without_mask)} of {count} views, {report.without_mask[0]} "
+                     "first: all of their pixels count that --mask does not leave out")  # fmt: skip
     for (size, true_size), views in report.sizes.items():
         if size != true_size:
             lines.append(f"{views} of the views are {size[1]}×{size[0]}, their truth {true_size[1]}×{true_size[0]}: "

@@ -189,8 +189,12 @@ def test_masks_and_confidence_leave_out_what_they_say(
     report = told(pano_mvs("evaluate", "depth", output, "--truth", truth, "--masks", tmp_path / "masks", "--json"))
     assert [view["pixels"] for view in report["views"].values()][:2] == [1600, 1600]
     assert report["views"]["002"]["pixels"] > 40_000
+    assert report["without_mask"] == ["002"]
+    noted = pano_mvs("evaluate", "depth", output, "--truth", truth, "--masks", tmp_path / "masks")
+    assert "no mask in --masks for 1 of 3 views, 002 first" in noted.flat
     cv2.imwrite(str(tmp_path / "masks" / "002.JPG.png"), counted)
     named = told(pano_mvs("evaluate", "depth", output, "--truth", truth, "--masks", tmp_path / "masks", "--json"))
+    assert named["without_mask"] == []
     assert named["views"]["002"]["pixels"] == 1600  # as cameras write names: it was not found
     half = cv2.resize(counted, (SIZE_HW[1] // 2, SIZE_HW[0] // 2), interpolation=cv2.INTER_NEAREST)
     cv2.imwrite(str(tmp_path / "one.png"), half)
