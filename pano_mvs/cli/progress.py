@@ -79,9 +79,8 @@ class ProgressBars:
         elif time.monotonic() > self._next_line_s:
             self._next_line_s = time.monotonic() + _LINE_EVERY_S
             clock = self._estimate.stages[name]
-            left = ", ".join(
-                text for text in (self._estimate.of_stage(name), self._estimate.of_run(self._stages)) if text
-            )
+            times = {"stage": self._estimate.of_stage(name), "run": self._estimate.of_run(self._stages)}
+            left = ", ".join(f"{whose}: {text}" for whose, text in times.items() if text)
             self.console.print(f"{name:<14} {clock.done} of {clock.units}  {left}", highlight=False)
 
     def stage_finished(self, summary: StageSummary) -> None:

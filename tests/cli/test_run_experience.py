@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import signal
@@ -13,8 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from pano_mvs.cli.estimate import Estimate, duration
+from pano_mvs.cli.progress import ProgressBars
 from tests.engine.conftest import Toy, toy  # noqa: F401 (a fixture)
 from tests.engine.test_resume import deliverables, finished_records
 
@@ -186,6 +189,17 @@ def test_view_is_named_only_where_there_is_something_to_view(toy: Toy) -> None: 
     assert "pano-mvs view" not in out
     toy.edit("plug.py", lambda text: text.replace('"all.txt"', '"cloud.ply"'))
     assert "open report.html, or look around with pano-mvs view" in finish(start(toy, "--executor", "serial"))[1]
+
+
+def test_a_line_says_which_time_is_the_stages_and_which_the_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pano_mvs.cli.progress._LINE_EVERY_S", -1.0)
+    stream = io.StringIO()
+    bars = ProgressBars(Console(file=stream, width=100), stages=2)
+    bars.stage_started("depth", 4)
+    bars.unit_finished("depth", "1.jpg", "run", 17.0)
+    assert stream.getvalue().split("  ")[-1] == "stage: 51 s left, run: more than 51 s left\n"
+    bars.unit_finished("depth", "2.jpg", "cached", 0.0)
+    assert stream.getvalue().endswith("2 of 4  stage: 34 s left, run: more than 34 s left\n")
 
 
 def test_time_left_is_a_bound_until_all_is_known() -> None:
