@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path, PurePosixPath
 
 from pano_mvs.core.errors import StoreError, UsageError
@@ -85,7 +86,10 @@ class Publisher:
             self.published[name] = blob.digest
 
     def remove_stale(self, earlier: dict[str, str]) -> list[str]:
-        """Delete files that an earlier run wrote and this one did not, if nobody has changed them since."""
+        """Delete files that an earlier run wrote and this one did not, if nobody has changed them since.
+
+        Folders of these files that are empty then go with them; the output folder itself, and links, stay.
+        """
         removed: list[str] = []
         for name, digest in earlier.items():
             path = self.out / name
@@ -94,7 +98,17 @@ class Publisher:
             if self.store.stat_cache.digest(path) == digest:
                 path.unlink()
                 removed.append(name)
+        self._remove_emptied(removed)
         return removed
+
+    def _remove_emptied(self, removed: Iterable[str]) -> None:
+        """Remove the folders in which the removed files lay, where nothing is left in them."""
+        emptied = {folder for name in removed for folder in PurePosixPath(name).parents if folder.parts}
+        for folder in sorted(emptied, key=lambda folder: len(folder.parts), reverse=True):
+            path = self.out / folder
+            if _is_inside(path, self.out) and not path.is_symlink():
+                with suppress(OSError):  # it is not empty, or somebody else has removed it
+                    path.rmdir()
 
     def _placed(self, target: str, item: str) -> str:
         texts = {"{item}": self._stems.get(item, item), "{name}": item}
