@@ -19,7 +19,7 @@ def pixel_readout(camera: ShownCamera, direction_in_world: NDArray[np.float64], 
     """
     ray = camera.cam_from_world.rotation @ direction_in_world
     azimuth, elevation = np.rad2deg([np.arctan2(ray[0], ray[2]), np.arcsin(np.clip(-ray[1], -1, 1))])
-    angles = f"azimuth {azimuth:.1f}°, elevation {elevation:.1f}°"
+    angles = f"azimuth {azimuth:z.1f}°, elevation {elevation:z.1f}°"
     if camera.range_file is None:
         return angles
     try:

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import ray_from_pixel
+from pano_mvs.geometry import Rigid3, ray_from_pixel
 from pano_mvs.io.range_files import write_confidence_png, write_range_tiff
 from pano_mvs.viewer.cloud_colors import drawn_cloud
 from pano_mvs.viewer.picking import camera_under, point_under
-from pano_mvs.viewer.shown_scene import open_scene
+from pano_mvs.viewer.pixel_readout import pixel_readout
+from pano_mvs.viewer.shown_scene import ShownCamera, open_scene
 from pano_mvs.viewer.sizes import bar_length, bar_text, box_of, length_text, outer_box, sphere_radius
 from pano_mvs.viewer.tour import Tour
 from pano_mvs.viewer.viewpoint import Viewpoint, looking_along
@@ -97,6 +98,13 @@ def test_one_goes_on_from_camera_to_camera_and_comes_back_to_the_start(tour: Tou
     assert tour.state.viewpoint is start
     tour.key("Left")
     assert tour.state.inside == 5
+
+
+@pytest.mark.parametrize("offset", [-1e-9, -0.0, 1e-9])
+def test_an_angle_that_rounds_to_zero_has_no_sign(offset: float) -> None:
+    """Regression: the last bit of a machine's arithmetic showed as "azimuth -0.0°"."""
+    camera = ShownCamera("a.png", Rigid3.identity(), None, None)
+    assert pixel_readout(camera, np.array([offset, -offset, 1.0]), "m") == "azimuth 0.0°, elevation 0.0°"
 
 
 def test_a_click_inside_reads_the_pixel_for_inspect(tour: Tour, tmp_path: Path) -> None:
