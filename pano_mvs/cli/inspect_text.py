@@ -63,8 +63,9 @@ def print_inspection(found: Inspection, console: Console) -> None:
     def say(text: str) -> None:
         console.print(escape(text), highlight=False, soft_wrap=True)
 
-    say(f"{found.image}, pixel ({found.column}, {found.row}) of {found.size_hw[1]}×{found.size_hw[0]}: azimuth "
-        f"{found.azimuth_deg:z.2f}°, elevation {found.elevation_deg:z.2f}°, colour {_hex(found.color_rgb)}")  # fmt: skip
+    say(f"{found.image}, pixel ({found.column}, {found.row}) of {found.size_hw[1]}×{found.size_hw[0]}: "
+        f"azimuth {found.azimuth_deg:z.2f}°, elevation {found.elevation_deg:z.2f}°, "
+        f"colour {_hex(found.color_rgb)}")  # fmt: skip
     say(f"ray in the camera {_vector(found.ray_in_cam)}, in the world {_vector(found.ray_in_world)} from "
         f"{_vector(found.center_in_world)}")  # fmt: skip
     console.print(_stage_table(found))

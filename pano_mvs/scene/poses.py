@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, Self
 
 import numpy as np
@@ -66,10 +66,16 @@ class Poses(Record):
         center_stds: (N,) float64 standard deviation of each camera's centre, scene units, relative to the first camera
             and the first baseline, from noise in the rays alone; NaN where nothing is known; None if not computed.
         rotation_stds_rad: (N,) float64 likewise of each camera's rotation.
+        group_idx: (N,) int32 the group of each camera: 0 is the largest. Cameras of different groups are not connected
+            by any reliable pair; each group has a world frame and a unit of length of its own. None: one group.
+        confirmed_shares: (N,) float64 share of each image's textured pixels, by solid angle, whose ranges other images
+            confirm in a small sweep with these poses; NaN where too little can be judged; None if not computed.
+        expected_shares: (N,) float64 what that share should be, judged from the neighbouring cameras.
+        doubts: name of every registered image whose pose is doubtful, with the reason.
     """
 
     axis: ClassVar[Axis | None] = Axis.ONE
-    kind_version: ClassVar[int] = 2
+    kind_version: ClassVar[int] = 3
     explodes_into: ClassVar[type[Record] | None] = Pose
 
     names: tuple[str, ...]
@@ -87,6 +93,10 @@ class Poses(Record):
     metric: bool = False
     center_stds: NDArray[np.float64] | None = None
     rotation_stds_rad: NDArray[np.float64] | None = None
+    group_idx: NDArray[np.int32] | None = None
+    confirmed_shares: NDArray[np.float64] | None = None
+    expected_shares: NDArray[np.float64] | None = None
+    doubts: dict[str, str] = field(default_factory=dict)
 
     @staticmethod
     def without_points(
@@ -141,9 +151,12 @@ class Poses(Record):
         require_array(self, "track_point_idx", dtype=np.int32, shape=(tracks,))
         require_array(self, "track_image_idx", dtype=np.int32, shape=(tracks,))
         require_array(self, "track_bearings", dtype=np.float64, shape=(tracks, 3))
-        for name in ("center_stds", "rotation_stds_rad"):
+        for name in ("center_stds", "rotation_stds_rad", "confirmed_shares", "expected_shares"):
             if getattr(self, name) is not None:
                 require_array(self, name, dtype=np.float64, shape=(images,), finite=False)
+        if self.group_idx is not None:
+            require_array(self, "group_idx", dtype=np.int32, shape=(images,))
+        require(self.doubts.keys() <= set(self.names), self, "an image that is not registered is doubted")
         if tracks:
             require(
                 0 <= self.track_point_idx.min() <= self.track_point_idx.max() < points, self, "a track has no point"

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -26,10 +27,17 @@ class TwoView(Record):
         parallax_deg: median angle between the two rays of a verified match after de-rotation.
         rotation_std_deg: standard deviation of the rotation about its least certain axis, as far as the matches tell.
         direction_std_deg: the same of the direction; both are 0 unless the geometry is general.
+        alternative_rotations: (K, 3, 3) float64 of second_from_first of the runner-up geometries, best supported first;
+            None, as are the next four, if there are none. Repeated structure often makes a false geometry the best.
+        alternative_directions: (K, 3) float64 their unit translations.
+        alternative_sizes: (K,) int32 number of matches that support each.
+        alternative_matches_idx: (S, 2) int32 these matches, one geometry after the other, S = Σ sizes. A match may
+            support several geometries.
+        alternative_residuals_rad: (S,) float32 their angular Sampson errors.
     """
 
     axis: ClassVar[Axis | None] = Axis.PAIR
-    kind_version: ClassVar[int] = 2
+    kind_version: ClassVar[int] = 3
 
     matches_idx: NDArray[np.int32]
     rotation: NDArray[np.float64]
@@ -41,6 +49,11 @@ class TwoView(Record):
     parallax_deg: float = 0.0
     rotation_std_deg: float = 0.0
     direction_std_deg: float = 0.0
+    alternative_rotations: NDArray[np.float64] | None = None
+    alternative_directions: NDArray[np.float64] | None = None
+    alternative_sizes: NDArray[np.int32] | None = None
+    alternative_matches_idx: NDArray[np.int32] | None = None
+    alternative_residuals_rad: NDArray[np.float32] | None = None
 
     @staticmethod
     def failed(reason: str, *, candidates: int = 0) -> TwoView:
@@ -61,9 +74,57 @@ class TwoView(Record):
         """Median residual of the verified matches; 0 if there are none."""
         return float(np.rad2deg(np.median(self.residuals_rad))) if len(self) else 0.0
 
+    @property
+    def alternatives(self) -> tuple[TwoView, ...]:
+        """The runner-up geometries, best supported first, each as a two-view geometry of its own."""
+        if (
+            self.alternative_sizes is None
+            or self.alternative_rotations is None
+            or self.alternative_directions is None
+            or self.alternative_matches_idx is None
+            or self.alternative_residuals_rad is None
+        ):
+            return ()
+        ends = np.cumsum(self.alternative_sizes)
+        return tuple(
+            TwoView(
+                matches_idx=self.alternative_matches_idx[end - size : end],
+                rotation=rotation,
+                direction=direction,
+                residuals_rad=self.alternative_residuals_rad[end - size : end],
+                geometry="general",
+                candidates=self.candidates,
+            )
+            for rotation, direction, size, end in zip(
+                self.alternative_rotations, self.alternative_directions, self.alternative_sizes, ends, strict=True
+            )
+        )
+
+    def with_alternatives(self, alternatives: Sequence[TwoView]) -> TwoView:
+        """Return the same geometry with these runner-ups in place of its own."""
+        if not alternatives:
+            return replace(
+                self, alternative_rotations=None, alternative_directions=None, alternative_sizes=None,
+                alternative_matches_idx=None, alternative_residuals_rad=None,
+            )  # fmt: skip
+        return replace(
+            self,
+            alternative_rotations=np.stack([view.rotation for view in alternatives]),
+            alternative_directions=np.stack([view.direction for view in alternatives]),
+            alternative_sizes=np.array([len(view) for view in alternatives], np.int32),
+            alternative_matches_idx=np.concatenate([view.matches_idx for view in alternatives]),
+            alternative_residuals_rad=np.concatenate([view.residuals_rad for view in alternatives]),
+        )
+
     def check(self) -> None:
         """Raise ContractError unless the arrays agree."""
         require_array(self, "matches_idx", dtype=np.int32, shape=(None, 2))
         require_array(self, "rotation", dtype=np.float64, shape=(3, 3))
         require_array(self, "direction", dtype=np.float64, shape=(3,))
         require_array(self, "residuals_rad", dtype=np.float32, shape=(len(self.matches_idx),))
+        if self.alternative_sizes is not None:
+            sizes = require_array(self, "alternative_sizes", dtype=np.int32, shape=(None,))
+            require_array(self, "alternative_rotations", dtype=np.float64, shape=(len(sizes), 3, 3))
+            require_array(self, "alternative_directions", dtype=np.float64, shape=(len(sizes), 3))
+            require_array(self, "alternative_matches_idx", dtype=np.int32, shape=(int(sizes.sum()), 2))
+            require_array(self, "alternative_residuals_rad", dtype=np.float32, shape=(int(sizes.sum()),))
