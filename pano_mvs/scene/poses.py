@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar, Self
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,20 @@ class Pose(Record):
         return cls(Rigid3(np.array(meta["rotation"], np.float64), np.array(meta["translation"], np.float64)))
 
 
+class World(NamedTuple):
+    """The world of one group of cameras.
+
+    Attributes:
+        frame: what the world frame is, in words.
+        scale: where the unit of length comes from, in words.
+        metric: whether the unit of length is the metre.
+    """
+
+    frame: str
+    scale: str
+    metric: bool
+
+
 @dataclass(frozen=True, eq=False)
 class Poses(Record):
     """The poses of all registered images of a capture, with the sparse points and tracks behind them.
@@ -60,14 +74,16 @@ class Poses(Record):
         track_image_idx: (T,) int32: … in this image (a position in `names`) …
         track_bearings: (T, 3) float64: … along this unit ray in the camera frame.
         rejected: name of every image that could not be registered, with the reason.
-        frame: what the world frame is, in words.
+        frame: what the world frame is, in words; with several groups, that of group 0, as are the next two.
         scale: where the unit of length comes from, in words.
         metric: whether the unit of length is the metre.
         center_stds: (N,) float64 standard deviation of each camera's centre, scene units, relative to the first camera
             and the first baseline, from noise in the rays alone; NaN where nothing is known; None if not computed.
         rotation_stds_rad: (N,) float64 likewise of each camera's rotation.
         group_idx: (N,) int32 the group of each camera: 0 is the largest. Cameras of different groups are not connected
-            by any reliable pair; each group has a world frame and a unit of length of its own. None: one group.
+            by any reliable pair; each group has a world frame and a unit of length of its own, and no point is seen
+            from two groups. None: one group. `pano_mvs.scene.pose_groups` splits and joins groups.
+        other_worlds: the worlds of groups 1, 2, …; empty with one group.
         confirmed_shares: (N,) float64 share of each image's textured pixels, by solid angle, whose ranges other images
             confirm in a small sweep with these poses; NaN where too little can be judged; None if not computed.
         expected_shares: (N,) float64 what that share should be, judged from the neighbouring cameras.
@@ -97,6 +113,11 @@ class Poses(Record):
     confirmed_shares: NDArray[np.float64] | None = None
     expected_shares: NDArray[np.float64] | None = None
     doubts: dict[str, str] = field(default_factory=dict)
+    other_worlds: tuple[World, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Turn the worlds, which are stored as plain lists, back into what they were."""
+        object.__setattr__(self, "other_worlds", tuple(World(*world) for world in self.other_worlds))
 
     @staticmethod
     def without_points(
@@ -135,6 +156,16 @@ class Poses(Record):
         centers: NDArray[np.float64] = -np.einsum("nji,nj->ni", self.rotations, self.translations)
         return centers
 
+    @property
+    def groups(self) -> NDArray[np.int32]:
+        """The group of each camera, (N,); zeros with one group."""
+        return np.zeros(len(self.names), np.int32) if self.group_idx is None else self.group_idx
+
+    @property
+    def worlds(self) -> tuple[World, ...]:
+        """The world of each group, that of the largest first."""
+        return (World(self.frame, self.scale, self.metric), *self.other_worlds)
+
     def explode(self) -> Mapping[str, Pose]:
         """Return the pose of each registered image."""
         return {name: Pose(self.cam_from_world(idx)) for idx, name in enumerate(self.names)}
@@ -154,8 +185,6 @@ class Poses(Record):
         for name in ("center_stds", "rotation_stds_rad", "confirmed_shares", "expected_shares"):
             if getattr(self, name) is not None:
                 require_array(self, name, dtype=np.float64, shape=(images,), finite=False)
-        if self.group_idx is not None:
-            require_array(self, "group_idx", dtype=np.int32, shape=(images,))
         require(self.doubts.keys() <= set(self.names), self, "an image that is not registered is doubted")
         if tracks:
             require(
@@ -164,3 +193,18 @@ class Poses(Record):
             require(
                 0 <= self.track_image_idx.min() <= self.track_image_idx.max() < images, self, "a track has no image"
             )
+        self._check_groups()
+
+    def _check_groups(self) -> None:
+        if self.group_idx is None:
+            require(not self.other_worlds, self, "worlds of other groups are given, but no groups")
+            return
+        groups = require_array(self, "group_idx", dtype=np.int32, shape=(len(self.names),))
+        require(bool((groups >= 0).all()), self, "a group has a negative number")
+        sizes = np.bincount(groups)
+        require(len(sizes) == len(self.worlds), self, f"{len(sizes)} groups, but {len(self.worlds)} worlds")
+        require(bool((sizes > 0).all()) and sizes.argmax() == 0, self, "group 0 must be the largest, and none empty")
+        seen_from = groups[self.track_image_idx]
+        first = np.full(len(self.points_in_world), -1, np.int32)
+        first[self.track_point_idx] = seen_from
+        require(bool((first[self.track_point_idx] == seen_from).all()), self, "a point is seen from two groups")

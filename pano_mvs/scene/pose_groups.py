@@ -1,0 +1,170 @@
+"""Groups of cameras that no reliable pair connects: taken apart, put together, treated one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import UsageError
+from pano_mvs.scene.poses import Poses
+
+_PER_CAMERA = ("center_stds", "rotation_stds_rad", "confirmed_shares", "expected_shares")
+ALONE = "no other picture shares its frame, so that its place tells nothing"
+
+
+def split_groups(poses: Poses) -> list[Poses]:
+    """Return the groups of poses, the largest first, each as poses of one group.
+
+    A group has its own cameras, in the capture's order, the points that they see, their tracks and doubts, and its own
+    frame and scale. Points that no camera sees go to group 0. Poses of one group are returned as they are; with several
+    groups, `rejected` of each is empty.
+    """
+    if not poses.other_worlds:
+        return [poses if poses.group_idx is None else replace(poses, group_idx=None)]
+    groups = poses.groups
+    group_of_point = np.zeros(len(poses.points_in_world), np.int32)
+    group_of_point[poses.track_point_idx] = groups[poses.track_image_idx]
+    return [_part(poses, groups == number, group_of_point == number, number) for number in range(len(poses.worlds))]
+
+
+def join_groups(
+    groups: Sequence[Poses], *, order: Sequence[str] | None = None, rejected: Mapping[str, str] | None = None
+) -> Poses:
+    """Return several poses, each of one group, as poses with groups.
+
+    Groups are numbered by their number of cameras, the largest first; of two of one size the one with the earliest
+    image comes first. A camera that is alone in its group is rejected, unless there is no other group.
+
+    Args:
+        groups: poses of one group each; no image may be in two of them. At least one.
+        order: names of images in the capture's order, all registered ones at least; the names of all groups one after
+            the other if not given.
+        rejected: reasons to state besides those of the groups. Images that some group registers are left out.
+
+    Returns:
+        Cameras in the capture's order; points and tracks group by group. A single group is returned without groups.
+
+    Raises:
+        UsageError: if there is no group, one has groups itself, an image is in two groups, or `order` lacks one.
+    """
+    order = tuple(name for group in groups for name in group.names) if order is None else tuple(order)
+    position = {name: idx for idx, name in enumerate(order)}
+    _require_joinable(groups, position)
+    reasons = {**(rejected or {})}
+    for group in groups:
+        reasons |= group.rejected
+    ranked = sorted(
+        (group for group in groups if group.names),
+        key=lambda group: (-len(group.names), min(position[name] for name in group.names)),
+    )
+    kept = [group for number, group in enumerate(ranked) if number == 0 or len(group.names) > 1]
+    reasons |= {name: ALONE for group in ranked if len(group.names) == 1 for name in group.names}
+    kept = kept or list(groups[:1])
+    registered = {name for group in kept for name in group.names}
+    joined = _concatenated(kept, position)
+    return replace(joined, rejected={name: why for name, why in reasons.items() if name not in registered})
+
+
+def per_group(poses: Poses, function: Callable[[Poses], Poses]) -> Poses:
+    """Return poses with a function applied to each group, which gets and returns poses of one group.
+
+    Poses of one group are simply passed to the function. Otherwise each group comes without `rejected`; what the
+    function rejects is added to the reasons of all. Groups are numbered anew if their sizes change.
+    """
+    if not poses.other_worlds:
+        return function(poses)
+    return join_groups([function(group) for group in split_groups(poses)], order=poses.names, rejected=poses.rejected)
+
+
+def _part(poses: Poses, cameras: NDArray[np.bool_], points: NDArray[np.bool_], number: int) -> Poses:
+    names = tuple(np.array(poses.names, object)[cameras])
+    tracks = cameras[poses.track_image_idx]
+    world = poses.worlds[number]
+    values = {name: getattr(poses, name) for name in _PER_CAMERA}
+    return replace(
+        poses,
+        names=names,
+        rotations=poses.rotations[cameras],
+        translations=poses.translations[cameras],
+        points_in_world=poses.points_in_world[points],
+        point_colors_rgb=poses.point_colors_rgb[points],
+        point_errors_rad=poses.point_errors_rad[points],
+        track_point_idx=_renumbered(points)[poses.track_point_idx[tracks]],
+        track_image_idx=_renumbered(cameras)[poses.track_image_idx[tracks]],
+        track_bearings=poses.track_bearings[tracks],
+        rejected={},
+        frame=world.frame,
+        scale=world.scale,
+        metric=world.metric,
+        group_idx=None,
+        other_worlds=(),
+        doubts={name: poses.doubts[name] for name in names if name in poses.doubts},
+        **{name: None if value is None else value[cameras] for name, value in values.items()},
+    )
+
+
+def _renumbered(kept: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Return the new position of each kept item, (N,)."""
+    positions: NDArray[np.int32] = (np.cumsum(kept) - 1).astype(np.int32)
+    return positions
+
+
+def _require_joinable(groups: Sequence[Poses], position: Mapping[str, int]) -> None:
+    if not groups:
+        raise UsageError("there is no group to join")
+    if any(group.other_worlds for group in groups):
+        raise UsageError("a group that is joined must not have groups itself; split it first")
+    names = [name for group in groups for name in group.names]
+    if len(set(names)) < len(names):
+        raise UsageError("an image is in two groups")
+    missing = [name for name in names if name not in position]
+    if missing:
+        raise UsageError(f"the order of the images does not have {missing[0]!r}")
+
+
+def _concatenated(groups: Sequence[Poses], position: Mapping[str, int]) -> Poses:
+    """Return groups, numbered as they come, with their cameras in the capture's order."""
+    names = [name for group in groups for name in group.names]
+    order = np.array(sorted(range(len(names)), key=lambda idx: position[names[idx]]), np.intp)
+    place = np.argsort(order).astype(np.int32)
+    first_camera = np.cumsum([0, *(len(group.names) for group in groups)])
+    first_point = np.cumsum([0, *(len(group.points_in_world) for group in groups)])
+
+    def joined(field: str) -> NDArray[Any]:
+        return np.concatenate([getattr(group, field) for group in groups])
+
+    values: dict[str, Any] = {field: _joined_values(groups, field) for field in _PER_CAMERA}
+    points = [group.track_point_idx + np.int32(first) for group, first in zip(groups, first_point, strict=False)]
+    images = [group.track_image_idx + np.int32(first) for group, first in zip(groups, first_camera, strict=False)]
+    numbers = np.repeat(np.arange(len(groups), dtype=np.int32), np.diff(first_camera))
+    return replace(
+        groups[0],
+        names=tuple(names[idx] for idx in order),
+        rotations=joined("rotations")[order],
+        translations=joined("translations")[order],
+        points_in_world=joined("points_in_world"),
+        point_colors_rgb=joined("point_colors_rgb"),
+        point_errors_rad=joined("point_errors_rad"),
+        track_point_idx=np.concatenate(points),
+        track_image_idx=place[np.concatenate(images)],
+        track_bearings=joined("track_bearings"),
+        group_idx=numbers[order] if len(groups) > 1 else None,
+        other_worlds=tuple(group.worlds[0] for group in groups[1:]),
+        doubts={name: why for group in groups for name, why in group.doubts.items()},
+        **{field: None if value is None else value[order] for field, value in values.items()},
+    )
+
+
+def _joined_values(groups: Sequence[Poses], field: str) -> NDArray[np.float64] | None:
+    """Return what the groups know of each camera, NaN where a group knows nothing; None if no group does."""
+    known = [getattr(group, field) for group in groups]
+    if all(values is None for values in known):
+        return None
+    return np.concatenate(
+        [np.full(len(group.names), np.nan) if values is None else values
+         for group, values in zip(groups, known, strict=True)]
+    )  # fmt: skip

@@ -1,0 +1,133 @@
+"""Groups of cameras: split, join, and one function for each."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from pano_mvs.core.errors import ContractError, UsageError
+from pano_mvs.geometry import angle_between
+from pano_mvs.scene import Poses
+from pano_mvs.scene.pose_groups import join_groups, per_group, split_groups
+from tests.scene.pose_groups import drawn_group
+
+_LARGE = drawn_group(("b.jpg", "d.jpg", "e.jpg"), seed=1)
+_SMALL = drawn_group(("a.jpg", "c.jpg"), seed=2)
+_ORDER = ("a.jpg", "b.jpg", "c.jpg", "d.jpg", "e.jpg", "f.jpg")
+
+
+def _joined() -> Poses:
+    return join_groups([_SMALL, _LARGE], order=_ORDER, rejected={"f.jpg": "blurred", "a.jpg": "not any more"})
+
+
+def _assert_same(first: Poses, second: Poses) -> None:
+    for field in fields(Poses):
+        a, b = getattr(first, field.name), getattr(second, field.name)
+        if isinstance(a, np.ndarray):
+            assert a.dtype == b.dtype, field.name
+            np.testing.assert_array_equal(a, b, err_msg=field.name)
+        else:
+            assert a == b, field.name
+
+
+def test_joined_cameras_are_in_the_order_of_the_capture_and_the_largest_group_is_first():
+    joined = _joined()
+    joined.check()
+    assert joined.names == _ORDER[:5]
+    assert joined.groups.tolist() == [1, 0, 1, 0, 0]
+    assert [world.frame for world in joined.worlds] == ["frame 1", "frame 2"]
+    assert [world.metric for world in joined.worlds] == [True, False]
+    assert joined.rejected == {"f.jpg": "blurred"}
+    assert joined.doubts == {"c.jpg": "doubt 2", "e.jpg": "doubt 1"}
+
+
+def test_of_two_groups_of_one_size_the_one_with_the_earliest_image_is_first():
+    other = drawn_group(("b.jpg", "e.jpg"), seed=3)
+    assert join_groups([other, _SMALL], order=_ORDER).frame == _SMALL.frame
+
+
+def test_every_observation_still_points_at_its_point():
+    joined = _joined()
+    rays = joined.points_in_world[joined.track_point_idx] - joined.centers[joined.track_image_idx]
+    seen = np.einsum("nij,nj->ni", joined.rotations[joined.track_image_idx], rays)
+    assert angle_between(seen, joined.track_bearings).max() < 1e-6
+
+
+def test_split_gives_back_what_was_joined():
+    large, small = split_groups(_joined())
+    _assert_same(large, _LARGE)
+    _assert_same(small, _SMALL)
+
+
+def test_groups_survive_the_form_in_which_they_are_stored():
+    joined = _joined()
+    _assert_same(Poses.from_parts(joined.to_parts()), joined)
+    meta = dict(joined.to_parts()["meta"])  # type: ignore[arg-type]  # the part is a JSON object
+    meta["other_worlds"] = [list(world) for world in joined.other_worlds]
+    _assert_same(Poses.from_parts({**joined.to_parts(), "meta": meta}), joined)
+
+
+def test_what_only_one_group_knows_is_unknown_of_the_other():
+    joined = join_groups([_LARGE, replace(_SMALL, center_stds=None)], order=_ORDER)
+    assert joined.center_stds is not None
+    assert _LARGE.center_stds is not None
+    assert np.isnan(joined.center_stds[[0, 2]]).all()
+    np.testing.assert_array_equal(joined.center_stds[[1, 3, 4]], _LARGE.center_stds)
+    assert joined.confirmed_shares is None
+
+
+def test_one_group_is_passed_on_as_it_is():
+    assert split_groups(_LARGE) == [_LARGE]
+    assert per_group(_LARGE, lambda poses: poses) is _LARGE
+    _assert_same(join_groups([_LARGE]), _LARGE)
+
+
+def test_per_group_treats_each_group_alone_and_joins_what_comes_out():
+    seen = []
+
+    def moved(group: Poses) -> Poses:
+        seen.append(group.names)
+        return replace(group, frame=f"moved {group.frame}", rejected={"x.jpg": group.frame})
+
+    treated = per_group(_joined(), moved)
+    assert seen == [_LARGE.names, _SMALL.names]
+    assert [world.frame for world in treated.worlds] == ["moved frame 1", "moved frame 2"]
+    assert treated.rejected == {"f.jpg": "blurred", "x.jpg": "frame 2"}
+
+
+def test_a_camera_that_is_left_alone_is_rejected_and_an_empty_group_is_forgotten():
+    alone = drawn_group(("c.jpg",), seed=4)
+    empty = Poses.without_points({}, frame="", scale="", metric=False, rejected={"a.jpg": "too few points"})
+    joined = join_groups([_LARGE, alone, empty], order=_ORDER)
+    assert joined.names == _LARGE.names
+    assert joined.group_idx is None
+    assert joined.rejected.keys() == {"a.jpg", "c.jpg"}
+    joined.check()
+
+
+def test_groups_that_cannot_be_joined_are_refused():
+    with pytest.raises(UsageError, match="no group"):
+        join_groups([])
+    with pytest.raises(UsageError, match="split it first"):
+        join_groups([_joined()])
+    with pytest.raises(UsageError, match="in two groups"):
+        join_groups([_LARGE, _LARGE])
+    with pytest.raises(UsageError, match=r"does not have 'a\.jpg'"):
+        join_groups([_SMALL], order=("b.jpg",))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"group_idx": np.array([0, 1, 0, 1, 1], np.int32)}, "largest"),
+        ({"group_idx": np.array([2, 0, 2, 0, 0], np.int32)}, "worlds"),
+        ({"group_idx": np.array([-1, 0, -1, 0, 0], np.int32)}, "negative"),
+        ({"group_idx": None}, "no groups"),
+        ({"group_idx": np.array([1, 0, 0, 0, 1], np.int32)}, "seen from two groups"),
+    ],
+)
+def test_groups_that_do_not_fit_break_the_contract(changes: dict[str, object], message: str):
+    with pytest.raises(ContractError, match=message):
+        replace(_joined(), **changes).check()  # type: ignore[arg-type]  # one field of each kind
