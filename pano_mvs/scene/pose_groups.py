@@ -84,7 +84,7 @@ def _part(poses: Poses, cameras: NDArray[np.bool_], points: NDArray[np.bool_], n
     names = tuple(np.array(poses.names, object)[cameras])
     tracks = cameras[poses.track_image_idx]
     world = poses.worlds[number]
-    values = {name: getattr(poses, name) for name in _PER_CAMERA}
+    values: dict[str, Any] = {name: getattr(poses, name) for name in _PER_CAMERA}
     return replace(
         poses,
         names=names,
@@ -137,7 +137,6 @@ def _concatenated(groups: Sequence[Poses], position: Mapping[str, int]) -> Poses
     def joined(field: str) -> NDArray[Any]:
         return np.concatenate([getattr(group, field) for group in groups])
 
-    values: dict[str, Any] = {field: _joined_values(groups, field) for field in _PER_CAMERA}
     points = [group.track_point_idx + np.int32(first) for group, first in zip(groups, first_point, strict=False)]
     images = [group.track_image_idx + np.int32(first) for group, first in zip(groups, first_camera, strict=False)]
     numbers = np.repeat(np.arange(len(groups), dtype=np.int32), np.diff(first_camera))
@@ -155,16 +154,18 @@ def _concatenated(groups: Sequence[Poses], position: Mapping[str, int]) -> Poses
         group_idx=numbers[order] if len(groups) > 1 else None,
         other_worlds=tuple(group.worlds[0] for group in groups[1:]),
         doubts={name: why for group in groups for name, why in group.doubts.items()},
-        **{field: None if value is None else value[order] for field, value in values.items()},
+        **_joined_values(groups, order),
     )
 
 
-def _joined_values(groups: Sequence[Poses], field: str) -> NDArray[np.float64] | None:
+def _joined_values(groups: Sequence[Poses], order: NDArray[np.intp]) -> dict[str, Any]:
     """Return what the groups know of each camera, NaN where a group knows nothing; None if no group does."""
-    known = [getattr(group, field) for group in groups]
-    if all(values is None for values in known):
-        return None
-    return np.concatenate(
-        [np.full(len(group.names), np.nan) if values is None else values
-         for group, values in zip(groups, known, strict=True)]
-    )  # fmt: skip
+    joined = {}
+    for field in _PER_CAMERA:
+        known = [getattr(group, field) for group in groups]
+        filled = [
+            np.full(len(group.names), np.nan) if values is None else values
+            for group, values in zip(groups, known, strict=True)
+        ]
+        joined[field] = None if all(values is None for values in known) else np.concatenate(filled)[order]
+    return joined
