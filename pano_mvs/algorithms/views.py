@@ -9,6 +9,7 @@ from scipy.spatial.distance import cdist
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import angle_between
 from pano_mvs.scene import Poses, Views
+from pano_mvs.scene.pose_groups import split_groups
 
 FloatArray = NDArray[np.float64]
 
@@ -27,7 +28,8 @@ def select_views(poses: Poses, *, count: int = 4, min_angle_deg: float = 1.0, ma
     With tracks, a pair's score is the sum over the points that both see of a weight for the triangulation angle: 0
     outside [min, max], rising to 1 at 12° and falling again slowly. Where a reference shares too few points with
     anybody, and without tracks, near images come first, by the distance of the centres; those that stand much closer
-    together than is usual in the capture come after the others, since they see no parallax.
+    together than is usual in the capture come after the others, since they see no parallax. Sources are of the
+    reference's own group.
 
     Args:
         poses: of all registered images, with or without points.
@@ -45,6 +47,14 @@ def select_views(poses: Poses, *, count: int = 4, min_angle_deg: float = 1.0, ma
     if count < 1 or not 0 <= min_angle_deg < max_angle_deg <= 180:
         raise UsageError(f"views need count ≥ 1 and 0 ≤ min_angle_deg < max_angle_deg ≤ 180, got {count}, "
                          f"{min_angle_deg} and {max_angle_deg}")  # fmt: skip
+    found: dict[str, tuple[str, ...]] = {}
+    for group in split_groups(poses):
+        found |= _neighbours(group, count=count, min_angle_deg=min_angle_deg, max_angle_deg=max_angle_deg)
+    return Views({name: found[name] for name in poses.names if name in found})
+
+
+def _neighbours(poses: Poses, *, count: int, min_angle_deg: float, max_angle_deg: float) -> dict[str, tuple[str, ...]]:
+    """Return the sources of the images of one group."""
     distances = _center_distances(poses.centers)
     scores = _shared_point_scores(poses, min_angle_deg=min_angle_deg, max_angle_deg=max_angle_deg)
     preference = _distance_ranks(distances)
@@ -56,7 +66,7 @@ def select_views(poses: Poses, *, count: int = 4, min_angle_deg: float = 1.0, ma
         order = usable[np.lexsort((usable, preference[idx, usable], -scores[idx, usable]))]
         if len(order):
             neighbours[name] = tuple(poses.names[source] for source in order[:count])
-    return Views(neighbours)
+    return neighbours
 
 
 def _center_distances(centers: FloatArray) -> FloatArray:

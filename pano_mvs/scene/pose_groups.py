@@ -80,9 +80,22 @@ def per_group(poses: Poses, function: Callable[[Poses], Poses]) -> Poses:
     return join_groups([function(group) for group in split_groups(poses)], order=poses.names, rejected=poses.rejected)
 
 
+def with_cameras(poses: Poses, kept: NDArray[np.bool_]) -> Poses:
+    """Return poses of one group with some of its cameras alone; points that fewer than two of them see are left out.
+
+    Args:
+        poses: of one group.
+        kept: (N,) which cameras to keep.
+    """
+    if kept.all():
+        return poses
+    seen = np.bincount(poses.track_point_idx[kept[poses.track_image_idx]], minlength=len(poses.points_in_world)) >= 2
+    return replace(_part(poses, kept, seen, 0), rejected=poses.rejected)
+
+
 def _part(poses: Poses, cameras: NDArray[np.bool_], points: NDArray[np.bool_], number: int) -> Poses:
     names = tuple(np.array(poses.names, object)[cameras])
-    tracks = cameras[poses.track_image_idx]
+    tracks = cameras[poses.track_image_idx] & points[poses.track_point_idx]
     world = poses.worlds[number]
     values: dict[str, Any] = {name: getattr(poses, name) for name in _PER_CAMERA}
     return replace(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -15,6 +16,7 @@ from pano_mvs.algorithms.poses.unit_translations import unit_translations as wit
 from pano_mvs.algorithms.poses.vertical import find_vertical
 from pano_mvs.api import All, Context, InputError, One, Panorama, Params, Poses, stage
 from pano_mvs.io.names import match_image_names
+from pano_mvs.scene.pose_groups import join_groups, split_groups
 
 _UP_OF_WORLD = np.array([0.0, -1.0, 0.0])
 
@@ -34,17 +36,21 @@ def level(poses: One[Poses], images: All[Panorama], params: LevelParams, ctx: Co
     """Turn the world so that y points down along gravity, and z north where compass headings agree.
 
     The origin goes to the first registered camera; the unit of length stays. Where nothing tells the vertical, the
-    poses stay as they are and the report says why.
+    poses stay as they are and the report says why. Each group of poses is levelled on its own.
     """
     headings = {name: image.heading_deg for name, image in images.items() if image.heading_deg is not None}
-    levelled, vertical = level_poses(poses, _up_in_cam(images), headings, evidence=params.evidence)
-    if not vertical:
-        ctx.note(f"the world was not levelled: {vertical.reason}")
-    else:
-        ctx.note(f"levelled by {vertical.evidence}")
-        if np.isfinite(vertical.disagreement_deg):
-            ctx.metric("disagreement_deg", vertical.disagreement_deg)
-    return levelled
+    groups, levelled = split_groups(poses), []
+    for number, group in enumerate(groups):
+        level_group, vertical = level_poses(group, _up_in_cam(images), headings, evidence=params.evidence)
+        levelled.append(level_group)
+        which = f"group {number}: " if len(groups) > 1 else ""
+        if not vertical:
+            ctx.note(f"{which}the world was not levelled: {vertical.reason}")
+        else:
+            ctx.note(f"{which}levelled by {vertical.evidence}")
+            if np.isfinite(vertical.disagreement_deg) and not number:
+                ctx.metric("disagreement_deg", vertical.disagreement_deg)
+    return join_groups(levelled, order=poses.names, rejected=poses.rejected)
 
 
 class BaselineParams(Params):
@@ -92,26 +98,27 @@ def scale(poses: One[Poses], images: All[Panorama], params: ScaleParams, ctx: Co
     """Make the metre the unit of length, by one length that is known.
 
     Known may be the distance between two images, the cameras' height above the floor, GPS positions, or the factor
-    itself. Everything behind it comes out in metres: ranges, cloud, COLMAP model.
+    itself. Everything behind it comes out in metres: ranges, cloud, COLMAP model. With several groups of poses, the
+    distance between two images tells of the group that holds both, the factor of the largest group; height and GPS
+    tell of every group in which they can be used. Other groups keep their unit, and the report says so.
 
     Raises:
-        InputError: if the length cannot be had from the poses: an image that is not registered, no floor, GPS
-            positions too close together for their noise.
+        InputError: if the length cannot be had from the poses of any group: an image that is not registered, no floor,
+            GPS positions too close together for their noise.
     """
+    groups = split_groups(poses)
     if params.baseline is not None:
-        metric = _by_baseline(poses, images, params.baseline)
-    elif params.factor is not None:
-        metric = scaled_poses(poses, params.factor, origin=f"the given factor {params.factor:g}")
-    elif params.camera_height_m is not None:
-        metric, floor = scaled_by_camera_height(
-            poses, _up(poses, images, params.vertical), metres=params.camera_height_m
-        )
-        if not floor:
-            raise InputError(f"camera_height_m gives no scale: {floor.reason}. Give a baseline instead")
-    else:
-        metric = _by_gps(poses, images, params, ctx)
-    ctx.note(f"unit of length: {metric.scale}")
-    return metric
+        ends, metres = _ends(images, params.baseline), params.baseline.metres
+        chosen = _holding(ends, groups)
+        whole = poses if chosen is None else groups[chosen]
+        return _scaled(poses, groups, [chosen or 0], lambda _: scaled_by_baseline(whole, *ends, metres=metres), ctx)
+    if params.factor is not None:
+        origin, factor = f"the given factor {params.factor:g}", params.factor
+        return _scaled(poses, groups, [0], lambda group: scaled_poses(group, factor, origin=origin), ctx)
+    every = list(range(len(groups)))
+    if params.camera_height_m is not None:
+        return _scaled(poses, groups, every, lambda group: _by_camera_height(group, images, params), ctx)
+    return _scaled(poses, groups, every, lambda group: _by_gps(group, images, params, ctx), ctx)
 
 
 class UnitTranslationsParams(Params):
@@ -126,7 +133,60 @@ def unit_translations(poses: One[Poses], params: UnitTranslationsParams) -> Pose
     return without_scale_factors(poses) if params.enabled else poses
 
 
-def _by_baseline(poses: Poses, images: All[Panorama], baseline: BaselineParams) -> Poses:
+def _scaled(
+    poses: Poses, groups: list[Poses], chosen: list[int], scaled: Callable[[Poses], Poses], ctx: Context
+) -> Poses:
+    """Return all groups, those of the chosen numbers scaled as far as that can be.
+
+    Raises:
+        InputError: of the first chosen group, if none can be scaled.
+    """
+    found, refused = list(groups), {}
+    for number in chosen:
+        try:
+            found[number] = scaled(groups[number])
+        except InputError as error:
+            refused[number] = error
+    if len(refused) == len(chosen):
+        raise refused[chosen[0]]
+    for number, group in enumerate(found):
+        which = f"group {number}: " if len(groups) > 1 else ""
+        if number in chosen and number not in refused:
+            ctx.note(f"{which}unit of length: {group.scale}")
+        else:
+            why = str(refused.get(number, "the length that is known is of another group"))
+            ctx.note(f"{which}keeps its own unit of length ({group.scale}): {why}")
+    return join_groups(found, order=poses.names, rejected=poses.rejected)
+
+
+def _holding(ends: tuple[str, str], groups: list[Poses]) -> int | None:
+    """Return the number of the group that holds both images; None where one of them is in no group.
+
+    Raises:
+        InputError: if they are in different groups.
+    """
+    homes = [number for name in ends for number, group in enumerate(groups) if name in group.names]
+    if len(homes) < 2:
+        return None
+    if homes[0] != homes[1]:
+        raise InputError(
+            f"baseline: {ends[0]} and {ends[1]} are in groups {homes[0]} and {homes[1]} of the poses, which no "
+            "reliable pair connects, so the distance between them gives no scale. Name two images of one group"
+        )
+    return homes[0]
+
+
+def _by_camera_height(poses: Poses, images: All[Panorama], params: ScaleParams) -> Poses:
+    assert params.camera_height_m is not None
+    up = _up(poses, images, params.vertical)
+    metric, floor = scaled_by_camera_height(poses, up, metres=params.camera_height_m)
+    if not floor:
+        raise InputError(f"camera_height_m gives no scale: {floor.reason}. Give a baseline instead")
+    return metric
+
+
+def _ends(images: All[Panorama], baseline: BaselineParams) -> tuple[str, str]:
+    """Return the names in the capture of the two images of a baseline."""
     wanted = (baseline.from_image, baseline.to_image)
     known = match_image_names(wanted, images)
     for name in wanted:
@@ -134,8 +194,7 @@ def _by_baseline(poses: Poses, images: All[Panorama], baseline: BaselineParams) 
             raise InputError(
                 f"baseline: {name} is not one image of the capture, which has {', '.join(list(images)[:5])} …"
             )
-    first, second = (known[name] for name in wanted)
-    return scaled_by_baseline(poses, first, second, metres=baseline.metres)
+    return known[wanted[0]], known[wanted[1]]
 
 
 def _by_gps(poses: Poses, images: All[Panorama], params: ScaleParams, ctx: Context) -> Poses:
@@ -145,8 +204,9 @@ def _by_gps(poses: Poses, images: All[Panorama], params: ScaleParams, ctx: Conte
     if not fit:
         raise InputError(f"GPS gives no scale: {fit.reason}. Give a baseline or camera_height_m instead, or "
                          "gps_noise_m if the receiver was better")  # fmt: skip
-    ctx.metric("gps_residual_m", fit.residual_m)
-    ctx.metric("gps_scale_error", fit.scale_error)
+    if "gps_residual_m" not in ctx.metrics:  # the largest group's
+        ctx.metric("gps_residual_m", fit.residual_m)
+        ctx.metric("gps_scale_error", fit.scale_error)
     return georeferenced_poses(poses, fit) if params.align == "gps" else scaled_by_gps(poses, fit)
 
 

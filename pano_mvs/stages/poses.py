@@ -30,6 +30,7 @@ from pano_mvs.api import (
 )
 from pano_mvs.io.names import match_image_names
 from pano_mvs.io.pose_files import read_poses, recorded_pictures
+from pano_mvs.scene.pose_groups import split_groups
 
 
 class ScaledTranslationParams(Params):
@@ -72,7 +73,10 @@ class RefineParams(Params):
 
 @stage("poses.refine")
 def refine(poses: One[Poses], params: RefineParams, ctx: Context) -> Poses:
-    """Angular bundle adjustment: all poses and points together, in degrees on the sphere rather than in pixels."""
+    """Angular bundle adjustment: all poses and points together, in degrees on the sphere rather than in pixels.
+
+    Groups of poses are adjusted one by one.
+    """
     refined = refine_poses(
         poses,
         loss=params.loss,
@@ -80,9 +84,10 @@ def refine(poses: One[Poses], params: RefineParams, ctx: Context) -> Poses:
         max_error_deg=params.max_error_deg,
         max_iterations=params.max_iterations,
     )
-    if refined.center_stds is not None and refined.rotation_stds_rad is not None:
-        ctx.metric("center_std_median", np.nanmedian(refined.center_stds))
-        ctx.metric("rotation_std_median_deg", np.rad2deg(np.nanmedian(refined.rotation_stds_rad)))
+    largest = split_groups(refined)[0]
+    if largest.center_stds is not None and largest.rotation_stds_rad is not None:
+        ctx.metric("center_std_median", np.nanmedian(largest.center_stds))
+        ctx.metric("rotation_std_median_deg", np.rad2deg(np.nanmedian(largest.rotation_stds_rad)))
     return checked_poses(refined, ctx)
 
 
@@ -159,6 +164,8 @@ def checked_poses(poses: Poses, ctx: Context, *, remedy: str = _CLOSER) -> Poses
     registered = len(poses.names)
     ctx.metric("registered", registered / max(1, registered + len(poses.rejected)))
     ctx.metric("points", len(poses.points_in_world))
+    if len(poses.worlds) > 1:
+        ctx.metric("groups", len(poses.worlds))
     if registered < 2:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(poses.rejected.items())[:8])
         raise GateError(f"no two panoramas could be registered, so there is no model. {remedy}. {reasons}")

@@ -21,6 +21,7 @@ from pano_mvs.algorithms.poses.colmap_sift import colmap_sift
 from pano_mvs.algorithms.poses.refine import refine_poses
 from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle
 from pano_mvs.scene import Features, Poses, TwoView
+from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.testing.room import capture_poses, default_room, render
 from tests.algorithms.synthetic_capture import random_poses, synthetic_features, synthetic_two_views
 
@@ -109,18 +110,25 @@ def test_world_is_the_first_camera_and_its_first_baseline(capture: Capture, tmp_
     assert np.linalg.norm(poses.centers[1]) == pytest.approx(1)
 
 
-def test_two_places_make_two_models_and_the_smaller_is_named(tmp_path: Path) -> None:
-    _, features, two_views = made(4, count=5)
-    _, others, other_views = made(5, count=3)
+def test_two_places_make_two_groups_each_in_its_own_world(tmp_path: Path) -> None:
+    truth, features, two_views = made(4, count=5)
+    other_truth, others, other_views = made(5, count=3)
     features |= {f"other {name}": found for name, found in others.items()}
     two_views |= {(f"other {a}", f"other {b}"): view for (a, b), view in other_views.items()}
     poses = solve_colmap(features, two_views, rng=np.random.default_rng(0), scratch=tmp_path)
-    assert poses.names == tuple(f"{n}.jpg" for n in range(5))
-    assert list(poses.rejected) == [f"other {n}.jpg" for n in range(3)]
-    assert set(poses.rejected.values()) == {
-        "COLMAP put it into its sub-model 2 of 2, of 3 pictures; only the largest, of 5, is kept: "
-        "take pictures in between"
-    }
+    poses.check()
+    assert poses.rejected == {}
+    assert poses.names == tuple(features)
+    assert poses.groups.tolist() == [0] * 5 + [1] * 3
+    large, small = split_groups(poses)
+    assert relative_pose_errors(by_name(large), truth).pair_deg.max() < 0.5
+    assert (
+        relative_pose_errors({name[6:]: pose for name, pose in by_name(small).items()}, other_truth).pair_deg.max()
+        < 0.5
+    )
+    for group in (large, small):
+        np.testing.assert_array_equal(group.rotations[0], np.eye(3))
+        assert np.linalg.norm(group.centers[1]) == pytest.approx(1)
 
 
 @pytest.mark.parametrize("mapper", ["incremental", "global"])

@@ -10,7 +10,7 @@ import pytest
 from pano_mvs.core.errors import ContractError, UsageError
 from pano_mvs.geometry import angle_between
 from pano_mvs.scene import Poses
-from pano_mvs.scene.pose_groups import join_groups, per_group, split_groups
+from pano_mvs.scene.pose_groups import join_groups, per_group, split_groups, with_cameras
 from tests.scene.pose_groups import drawn_group
 
 _LARGE = drawn_group(("b.jpg", "d.jpg", "e.jpg"), seed=1)
@@ -131,3 +131,14 @@ def test_groups_that_cannot_be_joined_are_refused():
 def test_groups_that_do_not_fit_break_the_contract(changes: dict[str, object], message: str):
     with pytest.raises(ContractError, match=message):
         replace(_joined(), **changes).check()  # type: ignore[arg-type]  # one field of each kind
+
+
+def test_points_that_a_single_camera_is_left_of_go_with_the_others():
+    large = replace(_LARGE, track_point_idx=_LARGE.track_point_idx[10:], track_image_idx=_LARGE.track_image_idx[10:],
+                    track_bearings=_LARGE.track_bearings[10:])  # fmt: skip
+    kept = with_cameras(large, np.array([True, True, False]))
+    kept.check()
+    assert kept.names == _LARGE.names[:2]
+    np.testing.assert_array_equal(kept.points_in_world, _LARGE.points_in_world[10:])
+    assert len(kept.track_point_idx) == 2 * 20
+    assert with_cameras(large, np.ones(3, np.bool_)) is large

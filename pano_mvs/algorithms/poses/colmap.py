@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from pano_mvs.algorithms.poses.gauge import moved_poses, normalised_poses
 from pano_mvs.algorithms.poses.reasons import best_pair, why_no_pair
 from pano_mvs.geometry import Similarity3
 from pano_mvs.scene import Features, Poses
+from pano_mvs.scene.pose_groups import join_groups, with_cameras
 
 _SEED_LIMIT = 2**31 - 1
 
@@ -47,8 +48,9 @@ def solve_colmap(
         scratch: an empty folder for COLMAP's files.
 
     Returns:
-        Poses in the frame of the first registered camera, the first baseline being 1. Of several models the one with
-        most panoramas is kept; what it does not hold is in `rejected`, with the reason.
+        Poses in the frame of the first registered camera, the first baseline being 1. Several models become as many
+        groups, each in such a frame of its own; a panorama that is in two models is taken from the larger one. What no
+        model of two panoramas or more holds is in `rejected`, with the reason.
     """
     seed = int(rng.integers(1, _SEED_LIMIT))
     (scratch / "models").mkdir()
@@ -64,11 +66,17 @@ def solve_colmap(
         )
     except (RuntimeError, ValueError, IndexError) as error:
         return _nothing(features, f"COLMAP's {mapper} mapper stopped: {error}")
-    members = [registered_panoramas(model, images).keys() for model in models]
-    if not models or len(members[0]) < 2:
+    groups: list[Poses] = []
+    registered: set[str] = set()
+    for model in models:
+        poses = poses_from_model(model, features, images, rejected={})
+        group = with_cameras(poses, np.array([name not in registered for name in poses.names], np.bool_))
+        if len(group.names) > 1:
+            groups.append(normalised_poses(group))
+            registered.update(group.names)
+    if not groups:
         return _nothing(features, f"COLMAP's {mapper} mapper found no model of two panoramas or more")
-    rejected = _rejected(features, two_views, members)
-    return normalised_poses(poses_from_model(models[0], features, images, rejected=rejected))
+    return join_groups(groups, order=tuple(features), rejected=_rejected(features, two_views, registered))
 
 
 def extend_with_colmap(
@@ -121,7 +129,9 @@ def extend_with_colmap(
             },
             frame=known.frame, scale=known.scale, metric=known.metric,
         )  # fmt: skip
-    rejected = _rejected(features, two_views, [registered_panoramas(model, images).keys()])
+    names = tuple(features)
+    registered = {names[idx] for idx in registered_panoramas(model, images)}
+    rejected = _rejected(features, two_views, registered)
     poses = _in_world_of(known, poses_from_model(model, features, images, rejected=rejected))
     return replace(poses, frame=known.frame, scale=known.scale, metric=known.metric)
 
@@ -151,23 +161,9 @@ def _nothing(features: Mapping[str, Features], reason: str) -> Poses:
     )  # fmt: skip
 
 
-def _rejected(
-    features: Mapping[str, Features], two_views: TwoViews, members: Sequence[Collection[int]]
-) -> dict[str, str]:
-    """Return the reason for every panorama that is not in the first of COLMAP's models, given who is in each."""
-    reasons: dict[str, str] = {}
-    for idx, name in enumerate(features):
-        if idx in members[0]:
-            continue
-        other = next((number for number, model in enumerate(members) if idx in model), 0)
-        if other:
-            reasons[name] = (
-                f"COLMAP put it into its sub-model {other + 1} of {len(members)}, of {len(members[other])} pictures; "
-                f"only the largest, of {len(members[0])}, is kept: take pictures in between"
-            )
-        else:
-            reasons[name] = _why_unregistered(name, two_views)
-    return reasons
+def _rejected(features: Mapping[str, Features], two_views: TwoViews, registered: Collection[str]) -> dict[str, str]:
+    """Return the reason for every panorama that is not registered."""
+    return {name: _why_unregistered(name, two_views) for name in features if name not in registered}
 
 
 def _why_unregistered(name: str, two_views: TwoViews) -> str:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.geometry import Similarity3, similarity_from_points
 from pano_mvs.scene import Poses
+from pano_mvs.scene.pose_groups import per_group
 
 FloatArray = NDArray[np.float64]
 
@@ -20,7 +21,12 @@ def normalised_poses(poses: Poses) -> Poses:
     """Return the same scene with the first camera as the world and its first baseline as the unit of length.
 
     The baseline is that to the first other camera, in the capture's order, that does not all but coincide with it.
+    Each group has its own first camera and first baseline.
     """
+    return per_group(poses, _normalised)
+
+
+def _normalised(poses: Poses) -> Poses:
     if not poses.names:
         return poses
     first = poses.cam_from_world(0)
@@ -36,6 +42,7 @@ def in_gauge_of(poses: Poses, centers: FloatArray) -> Poses:
     """Return refined poses in the world frame and unit of length of the (N, 3) centres from before the refinement.
 
     Metric poses keep the frame by the similarity of all centres; others keep the first camera and first baseline.
+    The poses are of one group.
     """
     if poses.metric and len(centers) >= 3:
         return moved_poses(poses, similarity_from_points(poses.centers, centers))
@@ -55,7 +62,7 @@ def first_neighbour(centers: FloatArray) -> int:
 
 
 def moved_poses(poses: Poses, new_from_old: Similarity3) -> Poses:
-    """Return poses and points in another world frame."""
+    """Return poses and points, which are of one group, in another world frame."""
     cameras = [new_from_old.move_camera(poses.cam_from_world(idx)) for idx in range(len(poses.names))]
     return replace(
         poses,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from pano_mvs.algorithms.poses.points import triangulate_observations
 from pano_mvs.algorithms.poses.uncertainty import camera_deviations
 from pano_mvs.core.errors import UsageError
 from pano_mvs.scene import Poses
+from pano_mvs.scene.pose_groups import per_group
 
 FloatArray = NDArray[np.float64]
 
@@ -35,7 +37,7 @@ def refine_poses(
     do not fit are dropped. The world frame is kept: the first camera does not move and neither does the length of its
     first baseline; where lengths are metres, the cameras as a whole stay where they were.
     How sure each camera is, relative to the first camera and first baseline, is in `center_stds` and
-    `rotation_stds_rad`; see `camera_deviations`.
+    `rotation_stds_rad`; see `camera_deviations`. Groups are adjusted one by one, each in its own world.
 
     Args:
         poses: poses with tracks; without tracks they are returned as they are.
@@ -50,6 +52,18 @@ def refine_poses(
     if min(loss_scale_deg, max_iterations, max_error_deg) <= 0:
         raise UsageError("loss_scale_deg, max_iterations and max_error_deg must be positive, got "
                          f"{loss_scale_deg}, {max_iterations} and {max_error_deg}")  # fmt: skip
+    refined = partial(
+        _refined,
+        loss=loss,
+        loss_scale_deg=loss_scale_deg,
+        max_iterations=max_iterations,
+        max_error_deg=max_error_deg,
+    )
+    return per_group(poses, refined)
+
+
+def _refined(poses: Poses, *, loss: Loss, loss_scale_deg: float, max_iterations: int, max_error_deg: float) -> Poses:
+    """Return one group, refined."""
     bundle, colors = _bundle(poses)
     for round_idx in range(_ROUNDS):
         # Wide at first: observations that were far off by wrong poses alone shall pull, not go.

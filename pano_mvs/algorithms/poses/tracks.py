@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from pano_mvs.algorithms.poses.points import triangulate_observations
 from pano_mvs.scene import Features, Poses, TwoView
+from pano_mvs.scene.pose_groups import per_group
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int32]
@@ -92,6 +93,8 @@ def triangulate_tracks(
 ) -> Poses:
     """Return the same poses, not moved by a digit, with the points that the verified matches give.
 
+    Matches between images of different groups are left out: the groups' worlds have nothing in common.
+
     Args:
         poses: known poses; its points, if any, are replaced.
         features: key points by image name.
@@ -99,15 +102,28 @@ def triangulate_tracks(
         max_error_deg: largest angle between an observed ray and the one to its point.
         min_angle_deg: smallest angle between the rays of a point seen twice.
     """
-    known = {name: features[name] for name in poses.names if name in features}
-    inside = {pair: view for pair, view in two_views.items() if pair[0] in known and pair[1] in known}
-    return poses_with_points(
-        poses, build_tracks(known, inside), max_error_deg=max_error_deg, min_angle_deg=min_angle_deg
-    )
+
+    def triangulated(group: Poses) -> Poses:
+        known = {name: features[name] for name in group.names if name in features}
+        inside = {pair: view for pair, view in two_views.items() if pair[0] in known and pair[1] in known}
+        return poses_with_points(
+            group, build_tracks(known, inside), max_error_deg=max_error_deg, min_angle_deg=min_angle_deg
+        )
+
+    return per_group(poses, triangulated)
 
 
 def poses_with_points(poses: Poses, tracks: Tracks, *, max_error_deg: float, min_angle_deg: float) -> Poses:
-    """Return the same poses with the points of tracks, whose names are all registered or are left out."""
+    """Return the same poses with the points of tracks, whose names are all registered or are left out.
+
+    A track that is seen from several groups gives each of them a point of its own.
+    """
+    return per_group(
+        poses, lambda group: _with_points(group, tracks, max_error_deg=max_error_deg, min_angle_deg=min_angle_deg)
+    )
+
+
+def _with_points(poses: Poses, tracks: Tracks, *, max_error_deg: float, min_angle_deg: float) -> Poses:
     position = {name: idx for idx, name in enumerate(poses.names)}
     pose_of_image = np.array([position.get(name, -1) for name in tracks.names], np.int32)
     seen = pose_of_image[tracks.image_idx] >= 0
@@ -126,20 +142,14 @@ def poses_with_points(poses: Poses, tracks: Tracks, *, max_error_deg: float, min
     count = int(found.valid.sum())
     sizes = np.maximum(np.bincount(point_idx, minlength=count), 1)
     colors = np.stack([np.bincount(point_idx, c, count) / sizes for c in tracks.colors_rgb[seen][used].T], axis=1)
-    return Poses(
-        names=poses.names,
-        rotations=poses.rotations,
-        translations=poses.translations,
+    return replace(
+        poses,
         points_in_world=found.points_in_world[found.valid],
         point_colors_rgb=np.rint(colors).astype(np.uint8),
         point_errors_rad=(np.bincount(point_idx, found.errors_rad[used], count) / sizes).astype(np.float32),
         track_point_idx=point_idx,
         track_image_idx=image_idx[used].astype(np.int32),
         track_bearings=bearings[used],
-        rejected=poses.rejected,
-        frame=poses.frame,
-        scale=poses.scale,
-        metric=poses.metric,
     )
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Poses
+from pano_mvs.scene.pose_groups import per_group
 
 
 def unit_translations(poses: Poses) -> Poses:
@@ -14,7 +15,12 @@ def unit_translations(poses: Poses) -> Poses:
     That is all that the essential matrices of the pairs with the first picture say (Yang, Kim & Lee, "Dense Depth
     Estimation from Multiple 360-degree Images Using Virtual Depth", section 3.2: the scale factors of all views are
     taken as 1). Sparse points do not fit such cameras and are left out; a camera at the first one's place stays there.
+    Each group has a first camera of its own.
     """
+    return per_group(poses, _unit_translations)
+
+
+def _unit_translations(poses: Poses) -> Poses:
     centers = poses.centers
     moved: dict[str, Rigid3] = {}
     for idx, name in enumerate(poses.names):

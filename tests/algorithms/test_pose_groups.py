@@ -1,0 +1,84 @@
+"""Every step on poses treats each group as if it were alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from pano_mvs.algorithms.poses.gauge import normalised_poses
+from pano_mvs.algorithms.poses.refine import refine_poses
+from pano_mvs.algorithms.poses.tracks import triangulate_tracks
+from pano_mvs.algorithms.poses.unit_translations import unit_translations
+from pano_mvs.algorithms.views import select_views
+from pano_mvs.geometry import Rigid3
+from pano_mvs.scene import Features, Poses, TwoView
+from pano_mvs.scene.pose_groups import join_groups, split_groups
+from tests.algorithms.synthetic_capture import random_poses, synthetic_features, synthetic_two_views
+
+Views = dict[tuple[str, str], TwoView]
+
+
+def _room(seed: int, count: int, prefix: str) -> tuple[Poses, dict[str, Features], Views]:
+    rng = np.random.default_rng(seed)
+    truth = random_poses(rng, count)
+    features = synthetic_features(rng, truth, points=200)
+    pairs = synthetic_two_views(rng, features)
+    known = {f"{prefix}{name}": Rigid3(pose.rotation, 2 * pose.translation + 0.01) for name, pose in truth.items()}
+    return (
+        Poses.without_points(known, frame=f"the room {prefix}", scale=f"unit of {prefix}", metric=False),
+        {f"{prefix}{name}": found for name, found in features.items()},
+        {(f"{prefix}{a}", f"{prefix}{b}"): view for (a, b), view in pairs.items()},
+    )
+
+
+_SMALL, _SMALL_FEATURES, _SMALL_PAIRS = _room(1, 2, "a")
+_LARGE, _LARGE_FEATURES, _LARGE_PAIRS = _room(2, 3, "b")
+_ORDER = ("b0.jpg", "a0.jpg", "b1.jpg", "a1.jpg", "b2.jpg")
+_FEATURES = {name: (_SMALL_FEATURES | _LARGE_FEATURES)[name] for name in _ORDER}
+# A false pair between the rooms: a repeated door, say.
+_PAIRS = _SMALL_PAIRS | _LARGE_PAIRS | {("b0.jpg", "a0.jpg"): next(iter(_LARGE_PAIRS.values()))}
+
+
+def _triangulated(poses: Poses) -> Poses:
+    return triangulate_tracks(poses, _FEATURES, _PAIRS)
+
+
+def _joined() -> Poses:
+    return join_groups([_LARGE, _SMALL], order=_ORDER, rejected={"x.jpg": "blurred"})
+
+
+@pytest.mark.parametrize(
+    "step",
+    [_triangulated, normalised_poses, unit_translations, lambda poses: refine_poses(_triangulated(poses))],
+    ids=["triangulate", "normalise", "unit_translations", "refine"],
+)
+def test_a_step_on_groups_is_the_step_on_each(step: Callable[[Poses], Poses]):
+    together = step(_joined())
+    together.check()
+    assert together.names == _ORDER
+    assert together.rejected == {"x.jpg": "blurred"}
+    for number, (group, alone) in enumerate(zip(split_groups(together), (_LARGE, _SMALL), strict=True)):
+        expected = step(alone)
+        for field in fields(Poses):
+            found, wanted = getattr(group, field.name), getattr(expected, field.name)
+            if isinstance(wanted, np.ndarray):
+                np.testing.assert_array_equal(found, wanted, err_msg=f"{field.name} of group {number}")
+            else:
+                assert found == wanted, field.name
+
+
+def test_sources_are_of_the_references_own_group():
+    views = select_views(_joined(), count=4)
+    assert list(views.neighbours) == list(_ORDER)
+    for reference, sources in views.neighbours.items():
+        assert sorted(sources) == sorted(name for name in _ORDER if name[0] == reference[0] and name != reference)
+
+
+def test_a_group_in_one_place_does_not_disturb_the_others():
+    together = replace(_SMALL, translations=np.array(_SMALL.translations))
+    together.translations[:] = 0.0
+    views = select_views(join_groups([_LARGE, together], order=_ORDER))
+    assert list(views.neighbours) == ["b0.jpg", "b1.jpg", "b2.jpg"]
