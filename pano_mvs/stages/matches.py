@@ -28,6 +28,11 @@ class BruteForceParams(Params):
         default="five_point", description="how hypotheses are made; eight_point is the paper's, and weak on one plane"
     )
     refine: bool = Field(default=True, description="false keeps the best hypothesis as it comes, as the paper does")
+    max_alternatives: int = Field(
+        default=4,
+        ge=0,
+        description="runner-up geometries that a pair keeps, for places with repeated structure; none without refine",
+    )
 
 
 @stage("matches.brute_force")
@@ -46,10 +51,12 @@ def brute_force(features: Near[Features], params: BruteForceParams, ctx: Context
         min_inliers=params.min_inliers,
         solver=params.solver,
         refine=params.refine,
+        max_alternatives=params.max_alternatives,
     )
     ctx.metric("candidates", len(candidates))
     ctx.metric("inliers", len(two_view) if two_view else 0)
     if two_view:
+        ctx.metric("alternatives", len(two_view.alternatives))
         ctx.metric("residual_deg", two_view.residual_deg)
         ctx.metric("direction_std_deg", two_view.direction_std_deg)
         ctx.metric("parallax_deg", two_view.parallax_deg)

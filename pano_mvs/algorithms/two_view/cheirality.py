@@ -34,6 +34,15 @@ def plausible(first: FloatArray, second: FloatArray, pose: Rigid3, threshold_rad
     return accepted
 
 
+def agreement(
+    pose: Rigid3, first: FloatArray, second: FloatArray, threshold_rad: float
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Return the Sampson errors, (M,), and which matches agree: a small error, and in front of both cameras."""
+    residuals = sampson_angles(skew(pose.translation) @ pose.rotation, first, second)
+    agreeing: NDArray[np.bool_] = (residuals < threshold_rad) & plausible(first, second, pose, threshold_rad)
+    return residuals, agreeing
+
+
 def facing_costs(
     poses: Sequence[Rigid3], first: FloatArray, second: FloatArray, threshold_rad: float
 ) -> NDArray[np.float64]:

@@ -8,7 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
+from pano_mvs.algorithms.two_view.essential import in_front, sampson_angles
+from pano_mvs.geometry import Rigid3, skew
+
 FloatArray = NDArray[np.float64]
+
+MAX_LOG10_FALSE_ALARMS = -6.0
 
 
 def log10_false_alarms(
@@ -57,6 +62,20 @@ def chance_of_agreement(
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
     agreeing = int(agrees(first[pairs[:, 0]], second[pairs[:, 1]]).sum())
     return (agreeing + 1) / (len(pairs) + 1)
+
+
+def chance_of_pose(
+    pose: Rigid3, first: FloatArray, second: FloatArray, *, rng: np.random.Generator, threshold_rad: float
+) -> float:
+    """Return the probability that a wrong match agrees with a relative pose (see `chance_of_agreement`)."""
+    essential = skew(pose.translation) @ pose.rotation
+
+    def agrees(first: FloatArray, second: FloatArray) -> NDArray[np.bool_]:
+        near = sampson_angles(essential, first, second) < threshold_rad
+        near[near] = in_front(first[near], second[near], pose)
+        return near
+
+    return chance_of_agreement(agrees, first, second, rng=rng)
 
 
 def independent_count(first: FloatArray, second: FloatArray, *, cell_rad: float = 0.025) -> int:

@@ -5,22 +5,23 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.two_view.essential import in_front, sampson_angles
+from pano_mvs.algorithms.two_view.alternatives import runner_ups
+from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs
 from pano_mvs.algorithms.two_view.hypotheses import SOLVERS, Solver
 from pano_mvs.algorithms.two_view.ransac import RelativePose, estimate_two_view
 from pano_mvs.algorithms.two_view.refinement import pose_uncertainty
 from pano_mvs.algorithms.two_view.rotation_only import estimate_rotation
 from pano_mvs.algorithms.two_view.significance import (
-    chance_of_agreement,
+    MAX_LOG10_FALSE_ALARMS,
+    chance_of_pose,
     independent_count,
     log10_false_alarms,
 )
-from pano_mvs.geometry import Rigid3, angle_between, skew
+from pano_mvs.geometry import Rigid3, angle_between
 from pano_mvs.scene import Features, TwoView
 
 FloatArray = NDArray[np.float64]
 
-_MAX_LOG10_FALSE_ALARMS = -6.0
 _MAX_DIRECTION_STD_DEG = 3.0
 _ROTATION_SHARE = 0.9
 _MIN_PARALLAX = 4.0  # in units of the threshold
@@ -38,6 +39,7 @@ def verify_pair(
     solver: Solver = "five_point",
     refine: bool = True,
     max_iterations: int = 15_000,
+    max_alternatives: int = 4,
 ) -> TwoView:
     """Return what two pictures agree on: their relative pose and the matches that bear it out.
 
@@ -54,6 +56,8 @@ def verify_pair(
         solver: see `estimate_two_view`.
         refine: False gives the best minimal hypothesis as it comes, as the paper does.
         max_iterations: at most so many hypotheses.
+        max_alternatives: keep at most so many runner-up geometries (see `runner_ups`); 0: none. Without `refine`
+            there are none.
 
     Returns:
         geometry "general"; or "rotation", where the pictures were taken from one place; or "none". The last two are
@@ -75,22 +79,51 @@ def verify_pair(
     if not pose or witnesses < min_inliers:
         few = f"{witnesses} independent matches of {count} agree on a relative pose, {min_inliers} needed"
         return TwoView.failed(pose.reason or few, candidates=count)
-    rotation_std_deg, direction_std_deg = _uncertainty_deg(pose, p, q, witnesses, threshold_rad)
-    reason = (
-        _why_chance(pose, p, q, witnesses, rng=rng, threshold_rad=threshold_rad, solver=solver)
-        or _why_no_parallax(pose, p, q, threshold_rad)
-        or _why_open(direction_std_deg)
-    )
+    reason = _why_chance(pose, p, q, witnesses, rng=rng, threshold_rad=threshold_rad, solver=solver)
     if reason:
         return TwoView.failed(reason, candidates=count)
+    best = _judged(pose.second_from_first, pose.residuals_rad, kept, matches_idx, p, q, threshold_rad)
+    if not (best and refine and max_alternatives):
+        return best
+    others = runner_ups(
+        pose.second_from_first, p, q,
+        rng=rng, threshold_rad=threshold_rad, min_inliers=min_inliers, most=max_alternatives,
+    )  # fmt: skip
+    views = [best]
+    for other in others:
+        residuals, agreeing = agreement(other, p, q, threshold_rad)
+        view = _judged(other, residuals, agreeing, matches_idx, p, q, threshold_rad)
+        if view:
+            views.append(view)
+    costs = facing_costs([Rigid3(view.rotation, view.direction) for view in views], p, q, threshold_rad)
+    ranked = [views[k] for k in np.argsort(costs, kind="stable")]
+    return ranked[0].with_alternatives(ranked[1:])
+
+
+def _judged(
+    pose: Rigid3,
+    residuals: FloatArray,
+    kept: NDArray[np.bool_],
+    matches_idx: NDArray[np.int32],
+    p: FloatArray,
+    q: FloatArray,
+    threshold_rad: float,
+) -> TwoView:
+    """Return the geometry of a pose, or why its matches do not determine it."""
+    witnesses = independent_count(p[kept], q[kept])
+    rotation_std_deg, direction_std_deg = _uncertainty_deg(pose, residuals, kept, p, q, witnesses, threshold_rad)
+    parallax = _parallax(p[kept], q[kept], pose)
+    reason = _why_no_parallax(parallax, threshold_rad) or _why_open(direction_std_deg)
+    if reason:
+        return TwoView.failed(reason, candidates=len(p))
     return TwoView(
         matches_idx=matches_idx[kept],
-        rotation=pose.second_from_first.rotation,
-        direction=pose.second_from_first.translation,
-        residuals_rad=pose.residuals_rad[kept].astype(np.float32),
+        rotation=pose.rotation,
+        direction=pose.translation,
+        residuals_rad=residuals[kept].astype(np.float32),
         geometry="general",
-        candidates=count,
-        parallax_deg=float(np.rad2deg(np.median(_parallax(p[kept], q[kept], pose.second_from_first)))),
+        candidates=len(p),
+        parallax_deg=float(np.rad2deg(np.median(parallax))),
         rotation_std_deg=rotation_std_deg,
         direction_std_deg=direction_std_deg,
     )
@@ -124,7 +157,7 @@ def _why_chance(
     """Say so if as many matches might agree on some relative pose by chance."""
     # Among the agreeing matches alone as well: where they crowd along one epipolar circle any match would agree.
     chance = max(
-        _chance(pose.second_from_first, first, second, rng=rng, threshold_rad=threshold_rad)
+        chance_of_pose(pose.second_from_first, first, second, rng=rng, threshold_rad=threshold_rad)
         for first, second in ((p, q), (p[pose.inliers], q[pose.inliers]))
     )
     false_alarms = log10_false_alarms(
@@ -134,19 +167,18 @@ def _why_chance(
         sample=SOLVERS[solver].sample,
         models_per_sample=SOLVERS[solver].models,
     )
-    if false_alarms <= _MAX_LOG10_FALSE_ALARMS:
+    if false_alarms <= MAX_LOG10_FALSE_ALARMS:
         return ""
     return (f"{witnesses} independent matches of {len(p)} agree on a relative pose, which may be chance: the "
             "pictures may not overlap")  # fmt: skip
 
 
-def _why_no_parallax(pose: RelativePose, p: FloatArray, q: FloatArray, threshold_rad: float) -> str:
+def _why_no_parallax(parallax: FloatArray, threshold_rad: float) -> str:
     """Say so if hardly any of the agreeing matches moved by more than the noise."""
-    kept = pose.inliers
-    moved = int((_parallax(p[kept], q[kept], pose.second_from_first) > _MIN_PARALLAX * threshold_rad).sum())
+    moved = int((parallax > _MIN_PARALLAX * threshold_rad).sum())
     if moved >= _MIN_WITH_PARALLAX:
         return ""
-    return (f"only {moved} of {kept.sum()} agreeing matches show parallax, {_MIN_WITH_PARALLAX} needed: the "
+    return (f"only {moved} of {len(parallax)} agreeing matches show parallax, {_MIN_WITH_PARALLAX} needed: the "
             "pictures were taken too close together for what they see")  # fmt: skip
 
 
@@ -159,25 +191,19 @@ def _why_open(direction_std_deg: float) -> str:
 
 
 def _uncertainty_deg(
-    pose: RelativePose, p: FloatArray, q: FloatArray, witnesses: int, threshold_rad: float
+    pose: Rigid3,
+    residuals: FloatArray,
+    kept: NDArray[np.bool_],
+    p: FloatArray,
+    q: FloatArray,
+    witnesses: int,
+    threshold_rad: float,
 ) -> tuple[float, float]:
     """Return the standard deviations of rotation and direction, a crowd of matches counting as one witness."""
-    kept = pose.inliers
-    noise_rad = max(float(np.sqrt(np.mean(pose.residuals_rad[kept] ** 2))), 0.1 * threshold_rad)
+    noise_rad = max(float(np.sqrt(np.mean(residuals[kept] ** 2))), 0.1 * threshold_rad)
     noise_rad *= np.sqrt(kept.sum() / witnesses)
-    rotation_rad, direction_rad = pose_uncertainty(pose.second_from_first, p[kept], q[kept], noise_rad=noise_rad)
+    rotation_rad, direction_rad = pose_uncertainty(pose, p[kept], q[kept], noise_rad=noise_rad)
     return float(np.rad2deg(rotation_rad)), float(np.rad2deg(direction_rad))
-
-
-def _chance(pose: Rigid3, p: FloatArray, q: FloatArray, *, rng: np.random.Generator, threshold_rad: float) -> float:
-    essential = skew(pose.translation) @ pose.rotation
-
-    def agrees(first: FloatArray, second: FloatArray) -> NDArray[np.bool_]:
-        near = sampson_angles(essential, first, second) < threshold_rad
-        near[near] = in_front(first[near], second[near], pose)
-        return near
-
-    return chance_of_agreement(agrees, p, q, rng=rng)
 
 
 def _parallax(p: FloatArray, q: FloatArray, pose: Rigid3) -> FloatArray:
