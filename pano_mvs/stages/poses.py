@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
+from pano_mvs.algorithms.poses.confirmation import Picture
 from pano_mvs.algorithms.poses.refine import refine_poses
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.poses.tracks import triangulate_tracks
+from pano_mvs.algorithms.poses.verification import verify_poses
 from pano_mvs.api import (
     All,
     Context,
@@ -41,15 +43,24 @@ class ScaledTranslationParams(Params):
     )
     kappa: float = Field(default=0.01, gt=0, description="width of the paper's clusters of scale factors")
     adjust: bool = Field(default=True, description="adjust all cameras and points together as the model grows")
+    ask_images: bool = Field(
+        default=True, description="let the images decide between places that the matches support about equally"
+    )
 
 
-@stage("poses.scaled_translation")
+@stage("poses.scaled_translation", version=2)
 def scaled_translation(
-    features: All[Features], matches: All[TwoView], params: ScaledTranslationParams, ctx: Context
+    features: All[Features],
+    matches: All[TwoView],
+    images: All[Panorama],
+    params: ScaledTranslationParams,
+    ctx: Context,
 ) -> Poses:
-    """The paper's solver, chained over the pairs that agree best: two-view poses joined by translation scale factors.
+    """The paper's solver for any capture: relative poses joined by translation scale factors, placed by all pairs.
 
-    Pictures that cannot be joined soundly are left out, each with its reason.
+    Every image is placed by all of its pairs together; where several places agree with the pairs about as well, the
+    images decide. Images that cannot be placed reliably are left out, each with its reason. Groups of images that no
+    reliable pair connects are solved separately.
     """
     poses = solve_scaled_translation(
         features,
@@ -57,9 +68,55 @@ def scaled_translation(
         scale_estimator=params.scale_estimator,
         kappa=params.kappa,
         adjust=params.adjust,
+        load=panorama_loader(images) if params.ask_images else None,
         rng=ctx.rng,
     )
     return checked_poses(poses, ctx)
+
+
+class VerifyParams(Params):
+    """Settings of poses.verify."""
+
+    correct: bool = Field(
+        default=True, description="move or leave out cameras that the images contradict; false only reports"
+    )
+
+
+@stage("poses.verify")
+def verify(
+    poses: One[Poses],
+    images: All[Panorama],
+    features: All[Features] | None,
+    matches: All[TwoView] | None,
+    params: VerifyParams,
+    ctx: Context,
+) -> Poses:
+    """Check poses of any origin against the images, and correct what repeated structure has put in the wrong place.
+
+    Every camera is swept with its neighbours at 256 columns, and gets the share of its textured pixels that they
+    confirm beside the share that is to be expected. A camera far below it is tried in the other places that its
+    matches suggest, moved to one that the images confirm clearly better, left out if nothing supports it, or reported
+    as doubtful. Without features and matches it only reports.
+    """
+    verified = verify_poses(
+        poses, panorama_loader(images), features=features, two_views=matches, correct=params.correct
+    )
+    for name in poses.names:
+        if name in verified.names and not np.array_equal(
+            poses.cam_from_world(poses.names.index(name)).center,
+            verified.cam_from_world(verified.names.index(name)).center,
+        ):
+            ctx.note(f"{name} was moved to another place, which the images confirm better")
+    return checked_poses(verified, ctx)
+
+
+def panorama_loader(images: Mapping[str, Panorama]) -> Callable[[str], Picture]:
+    """Return a function that loads the panorama and the mask of an image by its name."""
+
+    def load(name: str) -> Picture:
+        return images[name].load(), images[name].load_mask()
+
+    return load
 
 
 class RefineParams(Params):
@@ -164,6 +221,10 @@ def checked_poses(poses: Poses, ctx: Context, *, remedy: str = _CLOSER) -> Poses
     registered = len(poses.names)
     ctx.metric("registered", registered / max(1, registered + len(poses.rejected)))
     ctx.metric("points", len(poses.points_in_world))
+    for name, reason in poses.doubts.items():
+        ctx.note(f"the pose of {name} is doubtful: {reason}")
+    if poses.confirmed_shares is not None and np.isfinite(poses.confirmed_shares).any():
+        ctx.metric("confirmed_share_median", np.nanmedian(poses.confirmed_shares))
     if len(poses.worlds) > 1:
         ctx.metric("groups", len(poses.worlds))
     if registered < 2:

@@ -18,6 +18,7 @@ from pano_mvs.algorithms.two_view.refinement import tangent_basis
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, Similarity3, geodesic_angle, rotation_from_rotvec
 from pano_mvs.scene import Poses, TwoView
+from pano_mvs.scene.pose_groups import split_groups
 from tests.algorithms.synthetic_capture import (
     noisy_bearings,
     points_in_box,
@@ -172,10 +173,10 @@ def test_an_image_that_fits_a_third_of_the_known_points_is_rejected(capture):
     poses = solve(features, kept)
     assert poses.names == ("0.jpg", "1.jpg", "2.jpg", "4.jpg")
     assert "seen where they should be" in poses.rejected["3.jpg"]
-    assert "or a picture that is no panorama" in poses.rejected["3.jpg"]
+    assert "or an image that is no panorama" in poses.rejected["3.jpg"]
 
 
-def test_only_the_largest_group_is_kept():
+def test_every_group_is_solved_in_its_own_frame():
     rng = np.random.default_rng(14)
     truth = random_poses(rng, 5)
     features = synthetic_features(rng, truth)
@@ -183,9 +184,14 @@ def test_only_the_largest_group_is_kept():
     first = {"0.jpg", "1.jpg"}
     apart = {pair: view for pair, view in views.items() if (pair[0] in first) == (pair[1] in first)}
     poses = solve(features, apart)
-    assert poses.names == ("2.jpg", "3.jpg", "4.jpg")
-    assert set(poses.rejected) == first
-    np.testing.assert_array_equal(poses.rotations[0], np.eye(3))
+    assert poses.names == tuple(truth)
+    assert poses.rejected == {}
+    np.testing.assert_array_equal(poses.group_idx, [1, 1, 0, 0, 0])
+    for group in split_groups(poses):
+        np.testing.assert_array_equal(group.rotations[0], np.eye(3))
+        assert np.linalg.norm(group.centers[1]) == pytest.approx(1.0)
+        known = {name: truth[name] for name in group.names}
+        assert relative_pose_errors(cameras(group), known).median_pair_deg < 0.15
 
 
 def test_two_images_are_a_capture(capture):

@@ -81,6 +81,11 @@ class GrowingModel:
         for pairs in self._pairs:
             pairs.sort()
 
+    @property
+    def points_in_world(self) -> FloatArray:
+        """The point of every track, (count, 3), NaN where it is not triangulated."""
+        return self._points
+
     def add(self, image: int, cam_from_world: Rigid3) -> None:
         """Register an image and triangulate the tracks that it sees."""
         self.cameras[image] = cam_from_world

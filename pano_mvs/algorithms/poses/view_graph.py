@@ -87,7 +87,8 @@ def _edges_by_position(names: tuple[str, ...], two_views: Mapping[tuple[str, str
 def _reversed(view: TwoView) -> TwoView:
     inverse = Rigid3(view.rotation, view.direction).inverse()
     matches: NDArray[np.int32] = view.matches_idx[:, ::-1]
-    return replace(view, matches_idx=matches, rotation=inverse.rotation, direction=inverse.translation)
+    best = replace(view, matches_idx=matches, rotation=inverse.rotation, direction=inverse.translation)
+    return best.with_alternatives([_reversed(other) for other in view.alternatives])
 
 
 def _triangles(keys: list[Edge]) -> NDArray[np.intp]:

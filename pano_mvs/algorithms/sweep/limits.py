@@ -69,8 +69,8 @@ def limits_by_sweeping(
         raise UsageError("limits need a reference and at least one source, each with its pose and mask")
     poses = list(cams_from_world[:_MOST_PICTURES])
     width = pictures[0].shape[1]
-    small = [_small(picture) for picture in pictures[:_MOST_PICTURES]]
-    small_masks = [_small_mask(mask) for mask in masks[:_MOST_PICTURES]]
+    small = [reduced_panorama(picture, _WIDTH) for picture in pictures[:_MOST_PICTURES]]
+    small_masks = [reduced_mask(mask, _WIDTH) for mask in masks[:_MOST_PICTURES]]
     maps = [
         _coarse(idx, small, small_masks, poses, width=width, backend=helper_backend(backend), device=device)
         for idx in range(len(poses))
@@ -79,7 +79,7 @@ def limits_by_sweeping(
         maps[0], poses[0], maps[1:], poses[1:],
         max_relative_error=0.1, max_reprojection_px=1.5, min_support=0, min_motion_px=0,
     )  # fmt: skip
-    agreed = (checked.confidence >= CONSISTENT_CONFIDENCE[0]) & _textured(small[0])
+    agreed = (checked.confidence >= CONSISTENT_CONFIDENCE[0]) & textured_pixels(small[0])
     solid_angle = np.broadcast_to(pixel_solid_angle(agreed.shape)[:, None], agreed.shape)
     seen_angle = solid_angle[small_masks[0]].sum()
     if solid_angle[agreed].sum() <= _LEAST_SHARE * seen_angle:
@@ -125,22 +125,23 @@ def _baselines(idx: int, poses: Sequence[Rigid3]) -> list[float]:
     return [float(np.linalg.norm(pose.center - poses[idx].center)) for pose in poses]
 
 
-def _small(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    if picture.shape[1] <= _WIDTH:
+def reduced_panorama(picture: NDArray[np.uint8], width_px: int) -> NDArray[np.uint8]:
+    """Return a panorama (H, W, 3) at `width_px` columns; one that is no larger is returned as it is."""
+    if picture.shape[1] <= width_px:
         return picture
-    small: NDArray[np.uint8] = cv2.resize(picture, (_WIDTH, _WIDTH // 2), interpolation=cv2.INTER_AREA)
+    small: NDArray[np.uint8] = cv2.resize(picture, (width_px, width_px // 2), interpolation=cv2.INTER_AREA)
     return small
 
 
-def _small_mask(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return where a small pixel has no ignored pixel in it."""
-    if mask.shape[1] <= _WIDTH:
+def reduced_mask(mask: NDArray[np.bool_], width_px: int) -> NDArray[np.bool_]:
+    """Return a mask (H, W) at `width_px` columns: True where a small pixel has no ignored pixel in it."""
+    if mask.shape[1] <= width_px:
         return mask
     height, width = mask.shape
-    return placed_mask(mask, (_WIDTH // 2, _WIDTH), of=(0, 0, width, height), whole_hw=(height, width))
+    return placed_mask(mask, (width_px // 2, width_px), of=(0, 0, width, height), whole_hw=(height, width))
 
 
-def _textured(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def textured_pixels(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Return the pixels, (H, W), in whose surroundings there is something to match."""
     grey = pad_panorama(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), 2)
     window = np.ones((5, 5), np.uint8)

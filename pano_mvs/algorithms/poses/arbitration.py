@@ -1,0 +1,176 @@
+"""Let the images decide between places that the matches support: move cameras, leave them out, or doubt them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pano_mvs.algorithms.poses.confirmation import Confirmation, nearest_cameras
+from pano_mvs.algorithms.poses.placed_model import PlacedModel, enough_points
+from pano_mvs.geometry import Rigid3
+
+# A camera whose images confirm less than this share of what its neighbours lead to expect is looked at again …
+_SUSPICIOUS = 0.75
+# … and is doubtful if no other place does better and it stays below this share …
+_DOUBTFUL = 0.6
+# … or is left out, if its pairs do not support it either.
+_HOPELESS, _MIN_EXPLAINED = 0.3, 0.5
+# Another place must be better by this factor, and by this much, to be taken; within the factor it is a rival.
+_BETTER, _MARGIN = 1.15, 0.03
+# Where nothing more than this can be expected to be confirmed, nothing can be said.
+_MIN_EXPECTED = 0.1
+_NEIGHBOURS = 6
+_ALTERNATIVES = 4
+_MIN_SCORE = 0.2  # of the best placement's score by matches, for a place to be tried at all
+_ROUNDS = 3
+
+
+@dataclass(eq=False)
+class Arbitration:
+    """What the images say about the cameras of a model.
+
+    Attributes:
+        shares: image position to the confirmed share of its textured pixels; NaN where too little can be judged.
+        expected: image position to the share that its neighbours lead to expect; NaN likewise.
+        moved: images that were put in another place.
+        doubts: images whose pose is doubtful, with the reason.
+        removed: images that were taken out of the model, with the reason.
+    """
+
+    shares: dict[int, float] = field(default_factory=dict)
+    expected: dict[int, float] = field(default_factory=dict)
+    moved: set[int] = field(default_factory=set)
+    doubts: dict[int, str] = field(default_factory=dict)
+    removed: dict[int, str] = field(default_factory=dict)
+
+    def mean_share(self) -> float:
+        """Return the mean confirmed share of the images that can be judged; NaN if there is none."""
+        known = [share for share in self.shares.values() if np.isfinite(share)]
+        return float(np.mean(known)) if known else float("nan")
+
+
+def arbitrate(
+    model: PlacedModel, confirmation: Confirmation, *, fixed: Collection[int] = (), remove: bool = True
+) -> Arbitration:
+    """Judge all cameras of a model by the images, and put right what another place explains better.
+
+    Cameras that confirm much less than their neighbours are tried in the other places that their pairs suggest,
+    against cameras that are beyond suspicion. The model is changed in place.
+
+    Args:
+        model: at least two cameras.
+        confirmation: of the same capture.
+        fixed: images that are never moved or removed, only doubted.
+        remove: whether a camera that nothing explains is taken out of the model.
+    """
+    found = Arbitration()
+    for _ in range(_ROUNDS):
+        _judge(model, confirmation, found)
+        suspects = _suspects(found)
+        trusted = {idx: camera for idx, camera in model.cameras.items() if idx not in suspects}
+        if len(trusted) < 2:
+            trusted = dict(model.cameras)
+        moved = False
+        for image in suspects:
+            if image in fixed:
+                continue
+            pose = _better_place(model, image, trusted, confirmation)
+            if pose is not None:
+                model.add(image, pose)
+                trusted[image] = pose
+                found.moved.add(image)
+                moved = True
+        if not moved:
+            break
+    _judge(model, confirmation, found)
+    _conclude(model, found, fixed=fixed, remove=remove)
+    return found
+
+
+def expected_shares(cameras: Mapping[int, Rigid3], shares: Mapping[int, float]) -> dict[int, float]:
+    """Return the median confirmed share of each camera's nearest neighbours; NaN where none can be judged."""
+    expected = {}
+    for image, pose in cameras.items():
+        others = {idx: camera for idx, camera in cameras.items() if idx != image}
+        around = [shares[idx] for idx in nearest_cameras(pose, others, count=_NEIGHBOURS) if np.isfinite(shares[idx])]
+        expected[image] = float(np.median(around)) if around else float("nan")
+    return expected
+
+
+def _judge(model: PlacedModel, confirmation: Confirmation, found: Arbitration) -> None:
+    found.shares = {
+        image: confirmation.share(image, pose, model.cameras) for image, pose in sorted(model.cameras.items())
+    }
+    found.expected = expected_shares(model.cameras, found.shares)
+
+
+def _suspects(found: Arbitration) -> list[int]:
+    """Return the images that confirm much less than expected, the worst first."""
+    ratios = {image: share / max(found.expected[image], 1e-9) for image, share in found.shares.items()}
+    return sorted(
+        (image for image, ratio in ratios.items() if ratio < _SUSPICIOUS and found.expected[image] > _MIN_EXPECTED),
+        key=lambda image: (ratios[image], image),
+    )
+
+
+def _better_place(
+    model: PlacedModel, image: int, trusted: Mapping[int, Rigid3], confirmation: Confirmation
+) -> Rigid3 | None:
+    """Return another pose of an image that the images confirm clearly better than its own, or None."""
+    cameras = {idx: camera for idx, camera in trusted.items() if idx != image}
+    if len(cameras) < 2:
+        return None
+    here = confirmation.share(image, model.cameras[image], cameras)
+    best, best_share = None, max(_BETTER * here, here + _MARGIN)
+    for pose in _alternatives(model, image, cameras):
+        share = confirmation.share(image, pose, cameras)
+        if share > best_share:
+            best, best_share = pose, share
+    return best
+
+
+def _alternatives(model: PlacedModel, image: int, cameras: Mapping[int, Rigid3]) -> list[Rigid3]:
+    """Return the poses that an image's pairs with some cameras suggest, polished on known points."""
+    without = model.copy()
+    without.cameras = dict(cameras)
+    witnesses, places = without.place(image)
+    poses = []
+    for place in places[:_ALTERNATIVES]:
+        if place.score < _MIN_SCORE * places[0].score:
+            continue
+        pose, support, known = without.polished(image, witnesses, place)
+        if enough_points(support, known):
+            poses.append(pose)
+    return poses
+
+
+def _conclude(model: PlacedModel, found: Arbitration, *, fixed: Collection[int], remove: bool) -> None:
+    """Doubt or take out what is still confirmed much less than expected."""
+    for image in _suspects(found):
+        share, expected = found.shares[image], found.expected[image]
+        if not share < _DOUBTFUL * expected:
+            continue
+        said = (f"other images confirm {100 * share:.0f} % of its texture, where its neighbours lead to expect "
+                f"{100 * expected:.0f} %")  # fmt: skip
+        removable = remove and image not in fixed and len(model.cameras) - len(found.removed) > 2
+        if removable and share < _HOPELESS * expected and _explained(model, image) < _MIN_EXPLAINED:
+            found.removed[image] = f"{said}, and its pairs do not agree on another place"
+        else:
+            found.doubts[image] = said
+    for image in found.removed:
+        model.remove(image)
+        del found.shares[image], found.expected[image]
+
+
+def _explained(model: PlacedModel, image: int) -> float:
+    """Return the share of an image's pairs, by weight, that its camera explains."""
+    total = kept = 0.0
+    for partner in model.pairs.partners[image]:
+        if partner in model.cameras:
+            edge = min(image, partner), max(image, partner)
+            total += model.pairs.geometries[edge][0].weight
+            if edge in model.chosen:
+                kept += model.pairs.geometries[edge][model.chosen[edge]].weight
+    return kept / total if total else 0.0

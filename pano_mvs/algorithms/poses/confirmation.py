@@ -1,0 +1,136 @@
+"""Ask the images about their poses: how much of what one sees do the others see where its pose puts it?"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.filters.consistency import check_consistency
+from pano_mvs.algorithms.sweep.hypotheses import range_limits
+from pano_mvs.algorithms.sweep.limits import reduced_mask, reduced_panorama, textured_pixels
+from pano_mvs.algorithms.sweep.settings import SweepSettings
+from pano_mvs.algorithms.sweep.sweep import sweep_range
+from pano_mvs.geometry import Rigid3, pixel_solid_angle
+from pano_mvs.scene import RangeMap
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
+
+Picture = tuple[NDArray[np.uint8], NDArray[np.bool_]]
+"""A panorama (H, W, 3) uint8 RGB with its mask (H, W), False is ignored."""
+
+WIDTH_PX = 256
+_SETTINGS = SweepSettings(planes=64, cost="census", no_match="keep")
+_SOURCES = 4
+# In units of the median baseline. A near limit by the longest would lose the foreground where one source is far away.
+_NEAREST_BASELINES = 0.15
+_MAX_RELATIVE_ERROR, _MAX_REPROJECTION_PX, _MIN_SUPPORT, _MIN_MOTION_PX = 0.05, 1.0, 0.5, 0.05
+# Less texture than this share of the sphere says nothing about a pose.
+MIN_TEXTURED = 0.05
+_CACHED_MAPS = 256
+
+
+@dataclass(frozen=True, eq=False)
+class _Small:
+    """A panorama at 256 columns.
+
+    Attributes:
+        image: (128, 256, 3) uint8.
+        mask: (128, 256) bool, False is ignored.
+        textured: (128, 256) bool, where there is something to match.
+    """
+
+    image: NDArray[np.uint8]
+    mask: NDArray[np.bool_]
+    textured: NDArray[np.bool_]
+
+
+class Confirmation:
+    """Small sweeps of panoramas with given poses, and how far they confirm one another.
+
+    Each panorama is swept against its nearest neighbours at 256×128 (about 0.05 s), and the ranges are compared with
+    the neighbours' own. Wrong poses, even those that repeated structure suggests, confirm much less: whatever does not
+    repeat is then in the wrong place.
+
+    Args:
+        load: returns a panorama and its mask by its position in the capture. It is called once for each panorama;
+            only a small copy is kept.
+    """
+
+    def __init__(self, load: Callable[[int], Picture]) -> None:
+        self._load = load
+        self._small: dict[int, _Small] = {}
+        self._maps: OrderedDict[tuple[object, ...], RangeMap] = OrderedDict()
+
+    def share(self, image: int, pose: Rigid3, cameras: Mapping[int, Rigid3]) -> float:
+        """Return the share of an image's textured pixels, by solid angle, that other images confirm; NaN if none can.
+
+        Args:
+            image: position of the image.
+            pose: the cam_from_world to judge.
+            cameras: cam_from_world of other images, which are taken as they are; `image` itself is left out.
+        """
+        others = {idx: camera for idx, camera in cameras.items() if idx != image}
+        sources = nearest_cameras(pose, others)
+        small = self.small(image)
+        solid_angle = np.broadcast_to(pixel_solid_angle(small.mask.shape)[:, None], small.mask.shape)
+        textured = small.textured & small.mask
+        if not sources or solid_angle[textured].sum() < MIN_TEXTURED * solid_angle.sum():
+            return float("nan")
+        own = self._swept(image, pose, sources, others)
+        maps, poses = [], []
+        for source in sources:
+            around = {idx: camera for idx, camera in others.items() if idx != source}
+            # Of two images each can only be checked against the other.
+            seen_by = nearest_cameras(others[source], around) or [image]
+            maps.append(self._swept(source, others[source], seen_by, {**around, image: pose}))
+            poses.append(others[source])
+        checked = check_consistency(
+            own, pose, maps, poses,
+            max_relative_error=_MAX_RELATIVE_ERROR, max_reprojection_px=_MAX_REPROJECTION_PX,
+            min_support=_MIN_SUPPORT, min_motion_px=_MIN_MOTION_PX,
+        )  # fmt: skip
+        confirmed = (checked.confidence >= CONSISTENT_CONFIDENCE[0]) & textured
+        return float(solid_angle[confirmed].sum() / solid_angle[textured].sum())
+
+    def small(self, image: int) -> _Small:
+        """Return a panorama at 256 columns."""
+        if image not in self._small:
+            picture, mask = self._load(image)
+            reduced = reduced_panorama(picture, WIDTH_PX)
+            self._small[image] = _Small(reduced, reduced_mask(mask, WIDTH_PX), textured_pixels(reduced))
+        return self._small[image]
+
+    def _swept(self, image: int, pose: Rigid3, sources: Sequence[int], cameras: Mapping[int, Rigid3]) -> RangeMap:
+        """Return the small range map of an image against its sources; the latest are kept."""
+        relative = [cameras[idx] @ pose.inverse() for idx in sources]
+        key = (image, *sources, *(part.tobytes() for to in relative for part in (to.rotation, to.translation)),
+               pose.translation.tobytes())  # fmt: skip
+        if key in self._maps:
+            self._maps.move_to_end(key)
+            return self._maps[key]
+        small = self.small(image)
+        baselines = [float(np.linalg.norm(to.translation)) for to in relative]
+        self._maps[key] = sweep_range(
+            small.image,
+            [self.small(idx).image for idx in sources],
+            relative,
+            near=_NEAREST_BASELINES * float(np.median(baselines)),
+            far=range_limits(baselines, width=4 * WIDTH_PX)[1],
+            settings=_SETTINGS,
+            reference_mask=small.mask,
+            source_masks=[self.small(idx).mask for idx in sources],
+        )
+        if len(self._maps) > _CACHED_MAPS:
+            self._maps.popitem(last=False)
+        return self._maps[key]
+
+
+def nearest_cameras(pose: Rigid3, cameras: Mapping[int, Rigid3], *, count: int = _SOURCES) -> list[int]:
+    """Return the cameras nearest to a pose, nearest first; those in the very same place are left out."""
+    distances = {idx: float(np.linalg.norm(camera.center - pose.center)) for idx, camera in cameras.items()}
+    farthest = max(distances.values(), default=0.0)
+    apart = [idx for idx, distance in distances.items() if distance > 1e-6 * farthest]
+    return sorted(apart, key=lambda idx: (distances[idx], idx))[:count]

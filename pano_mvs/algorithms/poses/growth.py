@@ -1,0 +1,282 @@
+"""Grow a model from a seed pair: the image that its pairs place most clearly comes first."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+
+from pano_mvs.algorithms.poses.arbitration import Arbitration, arbitrate
+from pano_mvs.algorithms.poses.confirmation import Confirmation
+from pano_mvs.algorithms.poses.placed_model import MIN_POINTS, MIN_SHARE, Pairs, PlacedModel, enough_points
+from pano_mvs.algorithms.poses.placement import Placement, agreement
+from pano_mvs.algorithms.poses.view_graph import Edge
+from pano_mvs.algorithms.poses.witnesses import Witnesses
+from pano_mvs.geometry import Rigid3
+
+_FULL_PARALLAX_DEG = 10.0
+_SEEDS = 12  # seeds of which the support by third images is computed
+_THIRDS = 8
+_MAX_GROWN = 3  # seeds from which models are grown
+_ADJUST_GROWTH = 1.25  # all cameras are adjusted whenever there are a quarter more than at the last time
+_LOOKED_AT = 4  # images that are placed before the clearest of them is added
+_CLEAR = 0.8  # a runner-up with more than this share of the best score leaves a placement in doubt …
+_CLEAR_TO_REFEREE = 0.4  # … and with more than this where there is somebody to ask
+_SATISFYING = 0.85  # share of the pairs explained with which the first model is good enough
+_CERTAIN = 0.97  # share of the pairs explained from which the images are not asked
+_RIVALS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class GrownModel:
+    """A model with what could not be added to it.
+
+    Attributes:
+        model: the cameras.
+        refused: images that could not be added, with the reason.
+        arbitration: what the images say about the cameras; None if they were not asked.
+    """
+
+    model: PlacedModel
+    refused: dict[int, str]
+    arbitration: Arbitration | None
+
+    def satisfies(self) -> bool:
+        """Return whether no other model need be tried."""
+        if self.refused:
+            return False
+        if self.arbitration is None:
+            return self.model.explained_share() > _SATISFYING
+        return not self.arbitration.doubts and not self.arbitration.removed
+
+    def rank(self) -> tuple[float, float, float]:
+        """Return what models are sorted by: cameras without doubts, then what images and pairs confirm."""
+        arbitration = self.arbitration
+        share = arbitration.mean_share() if arbitration is not None else float("nan")
+        doubts = len(arbitration.doubts) if arbitration is not None else 0
+        return doubts - len(self.model.cameras), -np.nan_to_num(share), -self.model.explained_share()
+
+
+def grown_models(
+    pairs: Pairs, images: Collection[int], *, adjust: bool, confirmation: Confirmation | None
+) -> list[GrownModel]:
+    """Return models of a connected group of images, the one that explains the pairs best first.
+
+    Args:
+        pairs: of the capture.
+        images: of the group.
+        adjust: whether all cameras are adjusted as the model grows.
+        confirmation: decides between placements, and between models, that the pairs do not decide; asked only then.
+    """
+    models: list[GrownModel] = []
+    for edge, rank in ranked_seeds(pairs, images):
+        if any(grown.model.chosen.get(edge) == rank for grown in models):
+            continue
+        models.append(_grown(pairs, images, edge, rank, adjust=adjust, confirmation=confirmation))
+        if models[-1].satisfies() or len(models) == _MAX_GROWN:
+            break
+    return sorted(models, key=GrownModel.rank)
+
+
+def ranked_seeds(pairs: Pairs, images: Collection[int]) -> list[tuple[Edge, int]]:
+    """Return pairs with the geometry to begin with, the best first.
+
+    Many matches and enough parallax make a good seed, and third images that both of its cameras place alike. A seed
+    with a false geometry has few of those.
+    """
+    members = set(images)
+
+    def quality(edge: Edge, rank: int) -> float:
+        geometry = pairs.geometries[edge][rank]
+        return len(geometry.view) * min(geometry.parallax_deg / _FULL_PARALLAX_DEG, 1.0)
+
+    seeds = [
+        (edge, rank) for edge, found in pairs.geometries.items() if edge[0] in members for rank in range(len(found))
+    ]
+    seeds.sort(key=lambda seed: (-quality(*seed), seed))
+    seeds = seeds[:_SEEDS]
+    support = {seed: _support(pairs, *seed) for seed in seeds}
+    most = max((quality(*seed) for seed in seeds), default=1.0)
+    return sorted(seeds, key=lambda seed: (-support[seed] * np.sqrt(quality(*seed) / most), -quality(*seed), seed))
+
+
+def _support(pairs: Pairs, edge: Edge, rank: int) -> float:
+    """Return how much third images speak for a seed: the weight of what both of its cameras agree on."""
+    model = PlacedModel(pairs)
+    model.seed(edge, rank)
+    thirds = [idx for idx in pairs.partners[edge[0]] if idx in pairs.partners[edge[1]]][:_THIRDS]
+    total = 0.25
+    for image in thirds:
+        _, found = model.place(image)
+        witnesses_of_both = [place for place in found if place.explained.sum() >= 2]
+        if witnesses_of_both:
+            total += witnesses_of_both[0].score
+    return total
+
+
+def _grown(
+    pairs: Pairs, images: Collection[int], edge: Edge, rank: int, *, adjust: bool, confirmation: Confirmation | None
+) -> GrownModel:
+    """Return the model that grows from a seed, and why images were refused."""
+    model = PlacedModel(pairs)
+    model.seed(edge, rank)
+    left = set(images) - set(edge)
+    adjusted = 2
+    reasons: dict[int, str] = {}
+    while left:
+        step = _next(model, left, confirmation=confirmation, reasons=reasons)
+        if step is None:
+            break
+        image, pose = step
+        model.add(image, pose)
+        left.discard(image)
+        if adjust and len(model.cameras) > _ADJUST_GROWTH * adjusted:
+            model.adjust()
+            adjusted = len(model.cameras)
+    for image in edge:
+        if reason := _unsupported(model, image):
+            model.remove(image)
+            left.add(image)
+            reasons[image] = reason
+    settle(model, adjust=adjust, confirmation=confirmation)
+    refused = {image: reasons.get(image, _why_nothing(model, image)) for image in sorted(left)}
+    arbitration = None
+    if confirmation is not None and model.explained_share() < _CERTAIN:
+        arbitration = arbitrate(model, confirmation)
+        refused |= arbitration.removed
+        if arbitration.moved:
+            settle(model, adjust=adjust, confirmation=confirmation)
+    return GrownModel(model, refused, arbitration)
+
+
+def _unsupported(model: PlacedModel, image: int) -> str:
+    """Return why a camera of the seed, which nothing has checked yet, does not fit the others; "" if it does."""
+    if len(model.cameras) < 4:
+        return ""
+    without = model.copy()
+    without.remove(image)
+    without.learn_ranges()
+    witnesses = without.witnesses(image)
+    pose = model.cameras[image]
+    agrees = agreement(witnesses, pose.rotation[None], pose.center[None])[0]
+    _, support, known = without.polished(image, witnesses, Placement(pose, agrees, 0.0))
+    return "" if enough_points(support, known) else _why_refused(model.pairs, image, support, known)
+
+
+def _next(
+    model: PlacedModel, left: Collection[int], *, confirmation: Confirmation | None, reasons: dict[int, str]
+) -> tuple[int, Rigid3] | None:
+    """Return the image to add next and its pose; None if none can be added."""
+    partners = {image: [idx for idx in model.pairs.partners[image] if idx in model.cameras] for image in left}
+    weights = {
+        image: sum(model.pairs.geometries[min(image, idx), max(image, idx)][0].weight for idx in found)
+        for image, found in partners.items()
+        if found
+    }
+    doubtful: list[tuple[float, int, Witnesses, list[Placement]]] = []
+    looked_at = 0
+    for image in sorted(weights, key=lambda idx: (-weights[idx], idx)):
+        witnesses, found = model.place(image)
+        if not found:
+            reasons[image] = _why_nothing(model, image)
+            continue
+        looked_at += 1
+        rival = found[1].score / found[0].score if len(found) > 1 else 0.0
+        share = found[0].score / witnesses.total
+        if (
+            rival < (_CLEAR if confirmation is None else _CLEAR_TO_REFEREE)
+            and share > 0.5
+            and (pose := _accepted(model, image, witnesses, found[0], reasons))
+        ):
+            return image, pose
+        doubtful.append((share * (1 - 0.5 * rival), image, witnesses, found))
+        if looked_at >= max(_LOOKED_AT, len(model.cameras)):
+            break
+    for _, image, witnesses, found in sorted(doubtful, key=lambda item: (-item[0], item[1])):
+        for placement in _by_pictures(model, image, found, confirmation):
+            if pose := _accepted(model, image, witnesses, placement, reasons):
+                return image, pose
+    return None
+
+
+def _by_pictures(
+    model: PlacedModel, image: int, found: list[Placement], confirmation: Confirmation | None
+) -> list[Placement]:
+    """Return the placements in the order in which they are to be tried: where they are rivals the pictures decide."""
+    rivals = [placement for placement in found[:_RIVALS] if placement.score > _CLEAR_TO_REFEREE * found[0].score]
+    if confirmation is None or len(rivals) < 2:
+        return found[:_RIVALS]
+    shares = [confirmation.share(image, placement.cam_from_world, model.cameras) for placement in rivals]
+    return [rivals[idx] for idx in np.argsort(-np.nan_to_num(shares), kind="stable")]
+
+
+def _accepted(
+    model: PlacedModel, image: int, witnesses: Witnesses, placement: Placement, reasons: dict[int, str]
+) -> Rigid3 | None:
+    """Return the pose of a placement polished on known points, or None if it sees too few of them; notes the reason."""
+    pose, support, known = model.polished(image, witnesses, placement)
+    if enough_points(support, known):
+        return pose
+    reasons[image] = _why_refused(model.pairs, image, support, known)
+    return None
+
+
+def settle(model: PlacedModel, *, adjust: bool, confirmation: Confirmation | None) -> None:
+    """Adjust a grown model, choose geometries again, and move cameras that their pairs place elsewhere by now."""
+    for _ in range(3):
+        if adjust:
+            model.adjust()
+        model.choose_again()
+        if not _moved_cameras(model, confirmation):
+            break
+    if adjust:
+        model.adjust()
+        model.choose_again()
+
+
+def _moved_cameras(model: PlacedModel, confirmation: Confirmation | None) -> bool:
+    """Move every camera of which another place explains clearly more; return whether any was moved."""
+    moved = False
+    if len(model.cameras) < 3:
+        return False
+    for image in sorted(model.cameras):
+        witnesses = model.witnesses(image)
+        mine = [rank for edge, rank in model.chosen.items() if image in edge]
+        score = sum(model.pairs.geometries[edge][rank].weight for edge, rank in model.chosen.items() if image in edge)
+        if not mine or score > 0.8 * witnesses.total:
+            continue
+        _, found = model.place(image)
+        if found and found[0].score > 1.2 * score:
+            pose, support, known = model.polished(image, witnesses, found[0])
+            if enough_points(support, known) and _better_by_pictures(model, image, pose, confirmation):
+                model.add(image, pose)
+                moved = True
+    return moved
+
+
+def _better_by_pictures(model: PlacedModel, image: int, pose: Rigid3, confirmation: Confirmation | None) -> bool:
+    """Return whether the images do not speak against moving a camera."""
+    if confirmation is None:
+        return True
+    here = confirmation.share(image, model.cameras[image], model.cameras)
+    return not confirmation.share(image, pose, model.cameras) < here
+
+
+def _why_nothing(model: PlacedModel, image: int) -> str:
+    if any(idx in model.cameras for idx in model.pairs.partners[image]):
+        return "no pair with a registered image shares enough points with a third to tell how far apart they are"
+    return "its pairs are with images that could not be registered either"
+
+
+def _why_refused(pairs: Pairs, image: int, support: int, known: int) -> str:
+    if known >= MIN_POINTS:
+        needed = max(MIN_POINTS, int(np.ceil(MIN_SHARE * known)))
+        return (
+            f"only {support} of {known} points known from other images are seen where they should be, {needed} needed: "
+            "repeated structure, something that moved, stitching errors, or an image that is no panorama"
+        )
+    partner = pairs.partners[image][0]
+    count = max(len(found.view) for found in pairs.geometries[min(image, partner), max(image, partner)])
+    return (f"{known} of its points are known from two other images, {MIN_POINTS} needed; its best partner is "
+            f"{pairs.names[partner]!r} with {count} matches: take panoramas in between")  # fmt: skip
