@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.scene.record import Axis, Record, require_array
+from pano_mvs.scene.record import Axis, Record, require, require_array
 
 
 @dataclass(frozen=True, eq=False)
 class PointCloud(Record):
     """A coloured point cloud with normals, in the world frame.
+
+    Where the cameras are in several groups, the points of each group are in that group's own world; `groups` tells them
+    apart.
 
     Attributes:
         points_in_world: (N, 3) float32, scene units.
@@ -21,6 +26,7 @@ class PointCloud(Record):
         colors_rgb: (N, 3) uint8.
         view_counts: (N,) uint8 number of views that agree on the point.
         confidence: (N,) uint8, as of the range maps: the largest of the views that agree; None if not known.
+        group_sizes: number of points of each group, which follow one after the other; empty with one group.
     """
 
     axis: ClassVar[Axis | None] = Axis.ONE
@@ -31,6 +37,7 @@ class PointCloud(Record):
     colors_rgb: NDArray[np.uint8]
     view_counts: NDArray[np.uint8]
     confidence: NDArray[np.uint8] | None = None
+    group_sizes: tuple[int, ...] = ()
 
     def __len__(self) -> int:
         """Return the number of points."""
@@ -45,3 +52,36 @@ class PointCloud(Record):
         require_array(self, "view_counts", dtype=np.uint8, shape=(count,))
         if self.confidence is not None:
             require_array(self, "confidence", dtype=np.uint8, shape=(count,))
+        if self.group_sizes:
+            fits = min(self.group_sizes) >= 0 and sum(self.group_sizes) == count
+            require(fits, self, f"groups of {self.group_sizes} points do not make up {count}")
+
+    def groups(self) -> list[PointCloud]:
+        """Return the cloud of each group, the largest group of cameras first; arrays are views of this cloud's."""
+        if not self.group_sizes:
+            return [self]
+        return [
+            PointCloud(
+                self.points_in_world[end - size : end],
+                self.normals_in_world[end - size : end],
+                self.colors_rgb[end - size : end],
+                self.view_counts[end - size : end],
+                None if self.confidence is None else self.confidence[end - size : end],
+            )
+            for size, end in zip(self.group_sizes, accumulate(self.group_sizes), strict=True)
+        ]
+
+    @staticmethod
+    def of_groups(clouds: Sequence[PointCloud]) -> PointCloud:
+        """Return the clouds of all groups, the first being group 0, as one; confidence is kept if all have it."""
+        confidences = [cloud.confidence for cloud in clouds if cloud.confidence is not None]
+        if len(clouds) == 1:
+            return clouds[0]
+        return PointCloud(
+            np.concatenate([cloud.points_in_world for cloud in clouds]),
+            np.concatenate([cloud.normals_in_world for cloud in clouds]),
+            np.concatenate([cloud.colors_rgb for cloud in clouds]),
+            np.concatenate([cloud.view_counts for cloud in clouds]),
+            np.concatenate(confidences) if len(confidences) == len(clouds) else None,
+            tuple(len(cloud) for cloud in clouds),
+        )

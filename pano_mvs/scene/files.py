@@ -54,6 +54,12 @@ class Files(Record):
         return cls(files)
 
 
+def group_file(name: str, group: int) -> str:
+    """Return the name of a group's file: cloud.ply of group 0, cloud_1.ply of group 1."""
+    path = PurePosixPath(name)
+    return str(path.with_stem(f"{path.stem}_{group}")) if group else name
+
+
 def item_stems(names: Iterable[str]) -> dict[str, str]:
     """Return the `{item}` of each image: its path without the extension, kept where two would collide."""
     found = list(names)

@@ -19,14 +19,18 @@ class Pose(Record):
 
     Attributes:
         cam_from_world: the rigid transform into the camera frame.
+        group: number of the group whose world this is (see `Poses.group_idx`): poses of different groups have nothing
+            to do with one another.
     """
 
     axis: ClassVar[Axis | None] = Axis.IMAGE
 
     cam_from_world: Rigid3
+    group: int = 0
 
     def check(self) -> None:
         """Raise ContractError unless the rotation is one."""
+        require(self.group >= 0, self, "the number of the group is negative")
         rotation = self.cam_from_world.rotation
         require(bool(np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)), self, "the rotation is not orthonormal")
         require(bool(np.linalg.det(rotation) > 0), self, "the rotation mirrors (its determinant is negative)")
@@ -35,14 +39,16 @@ class Pose(Record):
     def to_parts(self) -> Parts:
         """Return the pose as one JSON object (floats keep all their digits)."""
         pose = self.cam_from_world
-        return {"meta": {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}}
+        meta = {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
+        return {"meta": meta | ({"group": self.group} if self.group else {})}
 
     @classmethod
     def from_parts(cls, parts: Parts) -> Self:
         """Return the pose that `to_parts` gave."""
         meta = parts["meta"]
         assert isinstance(meta, dict)
-        return cls(Rigid3(np.array(meta["rotation"], np.float64), np.array(meta["translation"], np.float64)))
+        pose = Rigid3(np.array(meta["rotation"], np.float64), np.array(meta["translation"], np.float64))
+        return cls(pose, meta.get("group", 0))
 
 
 class World(NamedTuple):
@@ -168,7 +174,8 @@ class Poses(Record):
 
     def explode(self) -> Mapping[str, Pose]:
         """Return the pose of each registered image."""
-        return {name: Pose(self.cam_from_world(idx)) for idx, name in enumerate(self.names)}
+        groups = self.groups.tolist()
+        return {name: Pose(self.cam_from_world(idx), groups[idx]) for idx, name in enumerate(self.names)}
 
     def check(self) -> None:
         """Raise ContractError unless all arrays agree."""

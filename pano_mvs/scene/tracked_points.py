@@ -60,19 +60,24 @@ class TrackedPoints(Record):
     def joined_to(self, poses: Poses, *, keep_points: bool) -> Poses:
         """Return poses with these points, behind their own or in their place.
 
-        Tracks in images that the poses do not have are left out.
+        Tracks in images that the poses do not have are left out. With several groups of poses, so are points of which
+        no track is left: nothing tells in which world they are.
         """
         position = {name: idx for idx, name in enumerate(poses.names)}
         image_idx = np.array([position.get(name, -1) for name in self.names], np.int32)[self.track_image_idx]
         known = image_idx >= 0
+        placed = np.ones(len(self), np.bool_)
+        if len(poses.worlds) > 1:
+            placed = np.bincount(self.track_point_idx[known], minlength=len(self)) > 0
+        point_idx = (np.cumsum(placed) - 1).astype(np.int32)[self.track_point_idx[known]]
         own = slice(None) if keep_points else slice(0)
         first = len(poses.points_in_world[own])
         return replace(
             poses,
-            points_in_world=np.concatenate([poses.points_in_world[own], self.points_in_world]),
-            point_colors_rgb=np.concatenate([poses.point_colors_rgb[own], self.colors_rgb]),
-            point_errors_rad=np.concatenate([poses.point_errors_rad[own], self.errors_rad]),
-            track_point_idx=np.concatenate([poses.track_point_idx[own], self.track_point_idx[known] + np.int32(first)]),
+            points_in_world=np.concatenate([poses.points_in_world[own], self.points_in_world[placed]]),
+            point_colors_rgb=np.concatenate([poses.point_colors_rgb[own], self.colors_rgb[placed]]),
+            point_errors_rad=np.concatenate([poses.point_errors_rad[own], self.errors_rad[placed]]),
+            track_point_idx=np.concatenate([poses.track_point_idx[own], point_idx + np.int32(first)]),
             track_image_idx=np.concatenate([poses.track_image_idx[own], image_idx[known]]),
             track_bearings=np.concatenate([poses.track_bearings[own], self.track_bearings[known]]),
         )

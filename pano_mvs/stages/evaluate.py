@@ -23,7 +23,8 @@ def truth(images: All[Panorama], poses: One[Poses], ranges: All[RangeMap], param
     """Compare poses and range maps with the truth.
 
     A picture counts if the truth knows its name and, where the truth states the picture's SHA-256, its bytes: another
-    picture of the same name is not scored against it. What a picture's mask ignores is left out.
+    picture of the same name is not scored against it. What a picture's mask ignores is left out. Each group of poses is
+    aligned with the truth on its own; pairs across groups count as not registered.
     """
     known = read_truth(params.truth)
     notes: list[str] = []
@@ -41,5 +42,6 @@ def truth(images: All[Panorama], poses: One[Poses], ranges: All[RangeMap], param
         {name: partial(known.range_map, view) for name, view in matched.items()},
         confidences={name: ranges[name].confidence for name in matched if name in ranges},
         masks={name: images[name].load_mask() for name in matched if name in ranges},
+        groups=dict(zip(poses.names, poses.groups.tolist(), strict=True)),
     )
     return Scores(scores.poses, scores.views, (*scores.notes, *notes))

@@ -23,6 +23,7 @@ from pano_mvs.io.range_files import (
     write_range_tiff,
 )
 from pano_mvs.io.thinning import Selection, select_points
+from pano_mvs.scene.files import group_file
 
 
 class PlyParams(Params):
@@ -43,16 +44,21 @@ class PlyParams(Params):
 def ply(cloud: One[PointCloud], params: PlyParams, ctx: Context) -> Files:
     """The fused cloud as cloud.ply: binary little endian, x y z nx ny nz red green blue.
 
-    Written, and thinned, in chunks: memory does not grow with the cloud.
+    Written, and thinned, in chunks: memory does not grow with the cloud. Further groups of poses, each in a frame of
+    its own, are cloud_1.ply, cloud_2.ply …; each file is thinned on its own.
     """
-    path = ctx.scratch / "cloud.ply"
     selection = Selection(params.min_confidence, params.min_views, params.voxel, params.max_points)
-    kept = select_points(cloud, selection, ctx.scratch)
-    write_ply(path, cloud, quality=params.quality, kept=kept)
-    ctx.metric("points", len(cloud) if kept is None else kept.count)
-    if kept is not None and kept.voxel:
-        ctx.metric("voxel", kept.voxel)
-    return Files({"cloud.ply": path})
+    files, points = {}, 0
+    for number, group in enumerate(cloud.groups()):
+        name = group_file("cloud.ply", number)
+        kept = select_points(group, selection, ctx.scratch)
+        files[name] = ctx.scratch / name
+        write_ply(files[name], group, quality=params.quality, kept=kept)
+        points += len(group) if kept is None else kept.count
+        if kept is not None and kept.voxel and not number:
+            ctx.metric("voxel", kept.voxel)
+    ctx.metric("points", points)
+    return Files(files)
 
 
 class RangesParams(Params):

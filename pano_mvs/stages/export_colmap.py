@@ -17,10 +17,11 @@ from pano_mvs.io.colmap_model import write_colmap_model
 from pano_mvs.io.colmap_pictures import resized_mask, write_picture
 from pano_mvs.io.colmap_points import ModelForm
 from pano_mvs.io.colmap_rig import CutPanorama, write_rig_model
-from pano_mvs.io.colmap_workspace import face_image_name, sparse_targets, write_face, write_stereo_configs
+from pano_mvs.io.colmap_workspace import WORKSPACE, face_image_name, sparse_targets, write_face, write_stereo_configs
 from pano_mvs.scene.face_files import FaceFiles, FaceLayout
 from pano_mvs.scene.files import item_stems
 from pano_mvs.scene.image_file import write_png
+from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.tracked_points import TrackedPoints
 
 
@@ -32,8 +33,11 @@ class ModelParams(Params):
 
 @stage("export.colmap", version=2)
 def colmap(poses: One[Poses], images: All[Panorama], params: ModelParams, ctx: Context) -> Files:
-    """COLMAP model of EQUIRECTANGULAR cameras, with points and tracks, in colmap/sparse/0."""
-    return _sparse_model(poses, images, params.format, ctx, "colmap/sparse/0")
+    """COLMAP model of EQUIRECTANGULAR cameras, with points and tracks, in colmap/sparse/0.
+
+    Further groups of poses, each in a frame of its own, are the models sparse/1, sparse/2 …
+    """
+    return _sparse_models(poses, images, params.format, ctx, "colmap/sparse")
 
 
 class MasksParams(Params):
@@ -122,20 +126,25 @@ def colmap_dense(
 
     A rig of PINHOLE cameras, a frame for each panorama, points with tracks: in colmap_dense/sparse and, for trainers,
     in sparse/0; stereo/*.cfg. With points.tracked its points join the sparse ones, so that no face is without.
+    A workspace has one frame, that of the largest group of poses; models of the others are in sparse/1, sparse/2 …
     """
     joined = poses if points is None else points.joined_to(poses, keep_points=True)
-    cuts = _cuts(poses.names, faces, item_stems(images))
+    largest, *others = split_groups(joined)
+    cuts = _cuts(largest.names, faces, item_stems(images))
     if not cuts:
         raise UsageError("no panorama has both a pose and faces, so there is no workspace to describe")
     folder = ctx.scratch / "sparse"
-    seen = write_rig_model(folder, joined, cuts, form=params.format)
+    seen = write_rig_model(folder, largest, cuts, form=params.format)
+    files = sparse_targets(sorted(folder.iterdir())) | write_stereo_configs(ctx.scratch, seen)
+    for number, group in enumerate(others, start=1):
+        files |= _other_model(group, number, _cuts(group.names, faces, item_stems(images)), params.format, ctx)
     _tell_blanks(seen, params.format, ctx)
     blind = sum(not count for count in seen.values())
     ctx.metric("faces_without_points", blind)
     if blind:
         ctx.note(f"{blind} of {len(seen)} faces see no point of the model: COLMAP fuses none of their depths. Add a "
                  "stage points.tracked, or raise its count")  # fmt: skip
-    return Files(sparse_targets(sorted(folder.iterdir())) | write_stereo_configs(ctx.scratch, seen))
+    return Files(files)
 
 
 class DenseInitParams(ModelParams):
@@ -150,11 +159,11 @@ def colmap_dense_init(
 ) -> Files:
     """COLMAP model with the many points of points.tracked, in colmap_dense_init/sparse/0: what splats begin with.
 
-    The cameras are those of export.colmap, EQUIRECTANGULAR.
+    The cameras are those of export.colmap, EQUIRECTANGULAR. Further groups of poses are in sparse/1, sparse/2 …
     """
     joined = points.joined_to(poses, keep_points=params.keep_sfm)
     ctx.metric("points", len(joined.points_in_world))
-    return _sparse_model(joined, images, params.format, ctx, "colmap_dense_init/sparse/0")
+    return _sparse_models(joined, images, params.format, ctx, "colmap_dense_init/sparse")
 
 
 def _tell_blanks(names: Iterable[str], form: ModelForm, ctx: Context) -> None:
@@ -164,12 +173,32 @@ def _tell_blanks(names: Iterable[str], form: ModelForm, ctx: Context) -> None:
                  "the binary one, or rename the picture")  # fmt: skip
 
 
-def _sparse_model(poses: Poses, images: Mapping[str, Panorama], form: ModelForm, ctx: Context, target: str) -> Files:
-    folder = ctx.scratch / "model"
-    sizes_hw = {name: images[name].source_size_hw for name in poses.names if name in images}
-    write_colmap_model(folder, poses, sizes_hw, form=form)
+def _sparse_models(poses: Poses, images: Mapping[str, Panorama], form: ModelForm, ctx: Context, target: str) -> Files:
+    """Write a model for each group of poses into the folders 0, 1 … of the target."""
+    files: dict[str, Path] = {}
+    for number, group in enumerate(split_groups(poses)):
+        folder = ctx.scratch / f"model_{number}"
+        sizes_hw = {name: images[name].source_size_hw for name in group.names if name in images}
+        write_colmap_model(folder, group, sizes_hw, form=form)
+        files |= {f"{target}/{number}/{path.name}": path for path in sorted(folder.iterdir())}
     _tell_blanks(poses.names, form, ctx)
-    return Files({f"{target}/{path.name}": path for path in sorted(folder.iterdir())})
+    return Files(files)
+
+
+def _other_model(
+    group: Poses, number: int, cuts: Mapping[str, CutPanorama], form: ModelForm, ctx: Context
+) -> dict[str, Path]:
+    """Write the model of a group that is not the workspace's, and return where its files belong."""
+    shown = ", ".join(group.names[:3]) + (f" … ({len(group.names)} images)" if len(group.names) > 3 else "")
+    if not cuts:
+        ctx.note(f"group {number} of the poses ({shown}) has no faces and so no model in {WORKSPACE}")
+        return {}
+    folder = ctx.scratch / f"sparse_{number}"
+    write_rig_model(folder, group, cuts, form=form)
+    target = f"{WORKSPACE}/sparse/{number}"
+    ctx.note(f"{WORKSPACE}/sparse is the model of the largest group of poses; group {number} ({shown}) has a frame of "
+             f"its own and is in {target}. To fuse it, put that model in the place of sparse")  # fmt: skip
+    return {f"{target}/{path.name}": path for path in sorted(folder.iterdir())}
 
 
 def _cuts(names: Iterable[str], faces: Mapping[str, FaceFiles], stems: Mapping[str, str]) -> dict[str, CutPanorama]:

@@ -36,6 +36,8 @@ from pano_mvs.io.nerfstudio_frames import NerfstudioFrame, NerfstudioFrames, Var
 from pano_mvs.io.ply import write_ply
 from pano_mvs.io.range_files import write_range_png
 from pano_mvs.io.thinning import Selection, select_points
+from pano_mvs.scene.files import group_file
+from pano_mvs.scene.pose_groups import split_groups
 
 _NO_TURN = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 _MUCH = 0.01
@@ -110,17 +112,45 @@ def nerfstudio(
 ) -> Files:
     """The frames of export.nerfstudio_frames as nerfstudio/<variant>/transforms.json, with points to start from.
 
-    Where there is no cloud, the sparse points of the poses are taken.
+    Where there is no cloud, the sparse points of the poses are taken. One file has one frame: further groups of poses
+    are transforms_1.json with seed_1.ply, transforms_2.json …
     """
-    registered = {name: poses.cam_from_world(idx) for idx, name in enumerate(poses.names) if name in frames}
-    if not registered:
+    loaded = {name: frames[name] for name in poses.names if name in frames}
+    if not loaded:
         raise InputError("no panorama has both a pose and frames: nothing can be listed in transforms.json")
-    if len(registered) < len(poses.names):
-        ctx.note(f"{len(poses.names) - len(registered)} of {len(poses.names)} registered panoramas have no ranges and "
+    if len(loaded) < len(poses.names):
+        ctx.note(f"{len(poses.names) - len(loaded)} of {len(poses.names)} registered panoramas have no ranges and "
                  "are not in transforms.json")  # fmt: skip
-    loaded = {name: frames[name] for name in registered}
     files: dict[str, Path] = {}
-    seed = _write_seed(poses, cloud, params, ctx)
+    groups = split_groups(poses)
+    clouds = [] if cloud is None else cloud.groups()
+    for number, group in enumerate(groups):
+        own = clouds[number] if number < len(clouds) else None
+        files |= _write_group(number, group, loaded, own, params, ctx)
+    if len(groups) > 1:
+        ctx.note(f"the poses are in {len(groups)} groups, each with a frame of its own: transforms.json lists the "
+                 f"largest, transforms_1.json … the others")  # fmt: skip
+    return Files(files)
+
+
+def _write_group(
+    number: int,
+    poses: Poses,
+    frames: Mapping[str, NerfstudioFrames],
+    cloud: PointCloud | None,
+    params: NerfstudioParams,
+    ctx: Context,
+) -> dict[str, Path]:
+    """Write the transforms and the seed of one group of poses, and return where they belong."""
+    registered = {name: poses.cam_from_world(idx) for idx, name in enumerate(poses.names) if name in frames}
+    loaded = {name: frames[name] for name in registered}
+    if not loaded:
+        return {}
+    files: dict[str, Path] = {}
+    scratch = ctx.scratch / str(number)
+    scratch.mkdir()
+    seed = _write_seed(poses, cloud, params, ctx, scratch)
+    seed_name, transforms = group_file("seed.ply", number), group_file("transforms.json", number)
     for variant in sorted({frame.variant for each in loaded.values() for frame in each.frames}):
         listed = [
             (name, registered[name], frame)
@@ -133,16 +163,16 @@ def nerfstudio(
             listed,
             depth_unit=next(iter(loaded.values())).depth_unit,
             about={"scene_unit": "metre" if poses.metric else poses.scale, "world_frame": poses.frame},
-            seed="" if seed is None else "seed.ply",
+            seed="" if seed is None else seed_name,
         )
         folder = f"nerfstudio/{variant}"
-        path = files[f"{folder}/transforms.json"] = ctx.scratch / f"{variant}.json"
+        path = files[f"{folder}/{transforms}"] = scratch / f"{variant}.json"
         path.write_text(json.dumps(document, indent=1), encoding="utf-8")
         if seed is not None:
-            files[f"{folder}/seed.ply"] = seed
-        files |= _open_masks(listed, folder, ctx.scratch)
-        ctx.metric(variant, len(listed))
-    return Files(files)
+            files[f"{folder}/{seed_name}"] = seed
+        files |= _open_masks(listed, folder, scratch)
+        ctx.metric(variant, ctx.metrics.get(variant, 0) + len(listed))
+    return files
 
 
 class _Made:
@@ -213,7 +243,9 @@ def _add_faces(made: _Made, image: Panorama, valid: NDArray[np.bool_], ranges: N
         made.frames.append(NerfstudioFrame("faces", picture, mask, depth, size, focal, turn))
 
 
-def _write_seed(poses: Poses, cloud: PointCloud | None, params: NerfstudioParams, ctx: Context) -> Path | None:
+def _write_seed(
+    poses: Poses, cloud: PointCloud | None, params: NerfstudioParams, ctx: Context, scratch: Path
+) -> Path | None:
     """Write the points to start from; None if there are none."""
     if cloud is None or not len(cloud):
         count = len(poses.points_in_world)
@@ -224,9 +256,9 @@ def _write_seed(poses: Poses, cloud: PointCloud | None, params: NerfstudioParams
     if not params.seed_points or not len(cloud):
         return None
     selection = Selection(min_views=params.min_views, max_points=params.seed_points)
-    kept = select_points(cloud, selection, ctx.scratch)
-    ctx.metric("seed_points", len(cloud) if kept is None else kept.count)
-    path = ctx.scratch / "seed.ply"
+    kept = select_points(cloud, selection, scratch)
+    ctx.metric("seed_points", ctx.metrics.get("seed_points", 0) + (len(cloud) if kept is None else kept.count))
+    path = scratch / "seed.ply"
     write_ply(path, cloud, kept=kept)
     return path
 

@@ -37,21 +37,45 @@ class VoteParams(Params):
 def vote(
     ranges: All[RangeMap], poses: All[Pose], images: All[Panorama], params: VoteParams, ctx: Context
 ) -> PointCloud:
-    """One coloured cloud with normals of all points on which several views agree."""
-    names = [name for name in ranges if name in poses and name in images]
-    settings = params.model_dump() | {"min_views": min(params.min_views, max(1, len(names)))}
+    """One coloured cloud with normals of all points on which several views agree.
+
+    Groups of poses are fused one by one, since nothing is known of where they are to each other.
+    """
+    groups = {name: pose.group for name, pose in poses.items()}
+    clouds = []
+    for number in range(max(groups.values(), default=0) + 1):
+        names = [name for name in ranges if groups.get(name) == number and name in images]
+        clouds.append(_fused(names, ranges, poses, images, params, ctx.threads))
+        if not len(clouds[-1]):
+            which = f"group {number}: " if len(set(groups.values())) > 1 else ""
+            ctx.note(which + _why_empty({name: ranges[name] for name in names}, _min_views(params, len(names))))
+    cloud = PointCloud.of_groups(clouds)
+    ctx.metric("points", len(cloud))
+    return cloud
+
+
+def _fused(
+    names: list[str],
+    ranges: All[RangeMap],
+    poses: All[Pose],
+    images: All[Panorama],
+    params: VoteParams,
+    threads: int,
+) -> PointCloud:
+    """Return the cloud of the views of one group."""
+    settings = params.model_dump() | {"min_views": _min_views(params, len(names))}
 
     def load(idx: int) -> FusionView:
         name, image = names[idx], images[names[idx]]
         return FusionView(ranges[name], poses[name].cam_from_world, image.load(), image.load_mask())
 
-    cloud = fuse_stream(
-        [poses[name].cam_from_world for name in names], load, FusionSettings(**settings), threads=ctx.threads
-    )
-    ctx.metric("points", len(cloud))
-    if not len(cloud):
-        ctx.note(_why_empty({name: ranges[name] for name in names}, settings["min_views"]))
-    return cloud
+    cams = [poses[name].cam_from_world for name in names]
+    return fuse_stream(cams, load, FusionSettings(**settings), threads=threads)
+
+
+def _min_views(params: VoteParams, views: int) -> int:
+    """Return how many views must agree on a point: no more than there are."""
+    return min(params.min_views, max(1, views))
 
 
 def _why_empty(ranges: Mapping[str, RangeMap], min_views: int) -> str:

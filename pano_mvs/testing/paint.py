@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 
@@ -12,6 +12,14 @@ from pano_mvs.testing.texture import noise
 Texture = Literal["strong", "weak", "isotropic", "outdoor", "none"]
 
 Colors = tuple[Vector, Vector]
+
+
+class Pattern(Protocol):
+    """A texture that brings its own colours."""
+
+    def albedo(self, points: FloatArray, normals: FloatArray, *, footprint: FloatArray) -> FloatArray:
+        """Return the unlit colours (N, 3) of points (N, 3) with normals (N, 3), where pixels are `footprint` wide."""
+
 
 WHITE: Colors = ((0.86, 0.86, 0.84), (0.86, 0.86, 0.84))
 OAK: Colors = ((0.62, 0.44, 0.27), (0.42, 0.28, 0.17))

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.geometry import Rigid3, ray_from_pixel, rotation_from_rotvec
-from pano_mvs.testing.paint import Texture, albedo_at, sky_color
-from pano_mvs.testing.surfaces import Ball, Cuboid, FloatArray, Quad, Surface, Vector
+from pano_mvs.testing.paint import Pattern, Texture, albedo_at, sky_color
+from pano_mvs.testing.surfaces import Ball, Bounded, Cuboid, FloatArray, Quad, Surface, Vector
 
 _RAYS_AT_ONCE = 1 << 17
 
@@ -38,7 +38,7 @@ class Room:
     texture: Texture = "strong"
     seed: int = 0
     lamp: Vector = (0.4, -1.2, 0.3)
-    textures: tuple[Texture, ...] = ()
+    textures: tuple[Texture | Pattern, ...] = ()
     sky: tuple[Vector, Vector] | None = None
 
 
@@ -163,9 +163,15 @@ def _first_hit(room: Room, origin: FloatArray, rays: FloatArray) -> tuple[FloatA
     """Return distance, index of the surface (−1: none) and normal where each ray first meets a surface."""
     best, which, normals = np.full(len(rays), np.inf), np.full(len(rays), -1), np.zeros_like(rays)
     for idx, surface in enumerate(room.surfaces):
-        distance, normal = surface.hit(origin, rays)
-        nearer = distance < best
-        best[nearer], which[nearer], normals[nearer] = distance[nearer], idx, normal[nearer]
+        if isinstance(surface, Bounded):
+            rows = surface.towards(origin, rays)
+            distance, normal = surface.surface.hit(origin, rays[rows])
+            nearer = distance < best[rows]
+        else:
+            rows, (distance, normal) = np.arange(len(rays)), surface.hit(origin, rays)
+            nearer = distance < best
+        on = rows[nearer]
+        best[on], which[on], normals[on] = distance[nearer], idx, normal[nearer]
     return best, which, normals
 
 
@@ -181,10 +187,18 @@ def _shaded(
     colors = np.zeros_like(rays)
     for idx, surface in enumerate(room.surfaces):
         on = surface_idx == idx
+        if not on.any():
+            continue
         points = origin + distances[on, None] * rays[on]
         texture = room.textures[idx] if room.textures else room.texture
-        seed = 1000 * room.seed + 2 * idx
-        albedo = albedo_at(points, surface.colors_rgb, texture, seed=seed, footprint=pixel_rad * distances[on])
+        footprint = pixel_rad * distances[on]
+        if isinstance(texture, str):
+            seed = 1000 * room.seed + 2 * idx
+            albedo = albedo_at(points, surface.colors_rgb, texture, seed=seed, footprint=footprint)
+        else:
+            # A pixel on a slanted surface is longer than wide; between the two it neither flickers nor blurs much.
+            slant = np.abs(np.sum(rays[on] * normals[on], axis=1))
+            albedo = texture.albedo(points, normals[on], footprint=footprint / np.sqrt(np.maximum(slant, 0.02)))
         to_lamp = np.array(room.lamp) - points
         facing = np.abs(np.sum(to_lamp * normals[on], axis=1)) / np.maximum(np.linalg.norm(to_lamp, axis=1), 1e-9)
         colors[on] = albedo * (0.55 + 0.45 * facing[:, None])

@@ -155,3 +155,38 @@ class Rod:
                 distance[met] = to_wall[met]
                 normals[met] = -sign * (start + to_wall[met, None] * across[met]) / self.radius
         return distance, normals
+
+
+@dataclass(frozen=True)
+class Bounded:
+    """A surface that lies within a sphere, so that only the rays towards that sphere are tried on it.
+
+    Attributes:
+        surface: any.
+        center: of the sphere.
+        radius: of the sphere.
+    """
+
+    surface: Surface
+    center: Vector
+    radius: float
+
+    @property
+    def colors_rgb(self) -> tuple[Vector, Vector]:
+        """The two colours between which the surface's texture varies."""
+        return self.surface.colors_rgb
+
+    def hit(self, origin: FloatArray, rays: FloatArray) -> Hit:
+        """Return the distance along each unit ray (N, 3) from one origin (3,), and the normal there."""
+        distance, normals, towards = np.full(len(rays), np.inf), np.zeros_like(rays), self.towards(origin, rays)
+        distance[towards], normals[towards] = self.surface.hit(origin, rays[towards])
+        return distance, normals
+
+    def towards(self, origin: FloatArray, rays: FloatArray) -> NDArray[np.int64]:
+        """Return the positions, ascending, of the unit rays (N, 3) from one origin (3,) that meet the sphere."""
+        to_center = np.array(self.center) - origin
+        apart = float(np.linalg.norm(to_center))
+        if apart <= self.radius:
+            return np.arange(len(rays))
+        least = np.sqrt(1 - (self.radius / apart) ** 2) - 1e-9
+        return np.flatnonzero(rays @ (to_center / apart) >= least)

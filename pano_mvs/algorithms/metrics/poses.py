@@ -34,6 +34,7 @@ class PoseErrors:
         median_pair_deg: median of `pair_deg`.
         auc: limit in degrees to the area under the recall curve of `pair_deg` up to it, in [0, 1].
         registered: number of images that have an estimate.
+        in_one_frame: number of those in the largest group, which share a world frame.
         expected: number of images that have truth.
         scale_ratio_median: median of |baseline ratio − 1| after division by the median ratio; NaN below 3 images.
         scale_ratio_max: largest of them.
@@ -46,6 +47,7 @@ class PoseErrors:
     median_pair_deg: float
     auc: dict[float, float]
     registered: int
+    in_one_frame: int
     expected: int
     scale_ratio_median: float
     scale_ratio_max: float
@@ -68,12 +70,16 @@ class CenterErrors:
     scale: float
 
 
-def relative_pose_errors(estimated: Mapping[str, Rigid3], truth: Mapping[str, Rigid3]) -> PoseErrors:
+def relative_pose_errors(
+    estimated: Mapping[str, Rigid3], truth: Mapping[str, Rigid3], *, groups: Mapping[str, int] | None = None
+) -> PoseErrors:
     """Return the errors of all pairs of the truth's images; they depend on no choice of world frame or scale.
 
     Args:
         estimated: cam_from_world by image name; names without truth are left out.
         truth: true cam_from_world by image name, two at least.
+        groups: number of each estimate's group, where they have different worlds: a pair across groups cannot be
+            measured and counts as one with an image that is not registered. None: all have one world.
 
     Raises:
         UsageError: if the truth holds fewer than two images.
@@ -82,11 +88,22 @@ def relative_pose_errors(estimated: Mapping[str, Rigid3], truth: Mapping[str, Ri
         raise UsageError(f"relative poses need the truth of at least two images, got {len(truth)}")
     pairs = tuple(combinations(truth, 2))
     known = {name: estimated[name] for name in truth if name in estimated}
-    limits = (_COINCIDENT_SHARE * _extent(known), _COINCIDENT_SHARE * _extent(truth))
-    errors = np.array([_pair_error_deg(first, second, known, truth, limits) for first, second in pairs])
+    group_of = {name: 0 if groups is None else groups[name] for name in known}
+    worlds = {
+        number: {name: known[name] for name in known if group_of[name] == number} for number in set(group_of.values())
+    }
+    true_limit = _COINCIDENT_SHARE * _extent(truth)
+    limits = {number: (_COINCIDENT_SHARE * _extent(world), true_limit) for number, world in worlds.items()}
+    errors = np.array([
+        _pair_error_deg(first, second, known, truth, limits[group_of[first]])
+        if first in known and second in known and group_of[first] == group_of[second]
+        else (180.0, 180.0)
+        for first, second in pairs
+    ])  # fmt: skip
     pair_deg = errors.max(axis=1)
-    ratios = _baseline_ratios(known, truth, limits)
-    deviations = np.abs(ratios / np.median(ratios) - 1) if len(ratios) > 1 else np.array([np.nan])
+    ratios = [_baseline_ratios(world, truth, limits[number]) for number, world in sorted(worlds.items())]
+    found = [np.abs(own / np.median(own) - 1) for own in ratios if len(own) > 1]
+    deviations = np.concatenate(found) if found else np.array([np.nan])
     return PoseErrors(
         pairs=pairs,
         rotation_deg=errors[:, 0],
@@ -95,6 +112,7 @@ def relative_pose_errors(estimated: Mapping[str, Rigid3], truth: Mapping[str, Ri
         median_pair_deg=float(np.median(pair_deg)),
         auc={limit: float(np.clip(1 - pair_deg / limit, 0, 1).mean()) for limit in AUC_LIMITS_DEG},
         registered=len(known),
+        in_one_frame=max(map(len, worlds.values()), default=0),
         expected=len(truth),
         scale_ratio_median=float(np.median(deviations)),
         scale_ratio_max=float(deviations.max()),
@@ -162,8 +180,6 @@ def _pair_error_deg(
     limits: tuple[float, float],
 ) -> tuple[float, float]:
     """Return the errors of rotation and of direction; a pair truly taken from one place has no direction."""
-    if first not in estimated or second not in estimated:
-        return 180.0, 180.0
     guess = estimated[second] @ estimated[first].inverse()
     true = truth[second] @ truth[first].inverse()
     rotation_deg = float(np.rad2deg(geodesic_angle(guess.rotation, true.rotation)))

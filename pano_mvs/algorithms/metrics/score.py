@@ -29,13 +29,15 @@ def score_capture(
     *,
     confidences: Mapping[str, NDArray[np.uint8]] | None = None,
     masks: Mapping[str, NDArray[np.bool_]] | None = None,
+    groups: Mapping[str, int] | None = None,
 ) -> Scores:
     """Return pose and depth scores.
 
-    Ranges are multiplied by the scale of the similarity that aligns the estimated camera centres with the true ones;
-    they are never fitted to the true ranges. Pixels without true surface are left out; a pixel without an estimate
-    counts as an error equal to the truth. Names of scores are those of `score_view`; `constant_` before one is what the
-    median of the view's true ranges scores in its place, `best_constant_` what the constant that is best for it does.
+    Ranges are multiplied by the scale of the similarity that aligns the estimated camera centres, of the view's group,
+    with the true ones; they are never fitted to the true ranges. Pixels without true surface are left out; a pixel
+    without an estimate counts as an error equal to the truth. Names of scores are those of `score_view`; `constant_`
+    before one is what the median of the view's true ranges scores in its place, `best_constant_` what the constant that
+    is best for it does.
 
     Args:
         estimated_poses: cam_from_world by image.
@@ -44,11 +46,12 @@ def score_capture(
         true_ranges: image to a function that returns its (H, W) true range, or None where it is not known.
         confidences: (H, W) by image: how well they rank the errors is scored too where they are given.
         masks: (H, W) by image, False is left out of the scores: nothing was to be estimated there.
+        groups: number of each estimated pose's group, where they have different worlds; None: all have one.
     """
     if len(true_poses) < 2:
         return Scores({}, {}, ("no ground truth is known for these pictures",))
     notes: list[str] = []
-    errors = relative_pose_errors(estimated_poses, true_poses)
+    errors = relative_pose_errors(estimated_poses, true_poses, groups=groups)
     poses: dict[str, float] = {
         "registered": errors.registered,
         "of": errors.expected,
@@ -62,12 +65,20 @@ def score_capture(
             "scale_ratio_error_median": errors.scale_ratio_median,
             "scale_ratio_error_max": errors.scale_ratio_max,
         }
-    try:
-        scale = align_centers(estimated_poses, true_poses).scale
-    except UsageError as error:
-        return Scores(poses, {}, (f"ranges are not scored: {error}",))
+    if groups is not None and len(set(groups.values())) > 1:
+        poses["registered_in_one_frame"] = errors.in_one_frame
+        notes.append(f"the poses are in {len(set(groups.values()))} groups, each with a frame and a scale of its own: "
+                     "pairs across groups cannot be measured and count as not registered; each group is aligned with "
+                     "the truth on its own")  # fmt: skip
+    scales, refused = _scales(estimated_poses, true_poses, groups or {})
+    if not scales:
+        return Scores(poses, {}, (*notes, *(f"ranges are not scored: {why}" for why in refused.values())))
+    notes += [f"the ranges of group {number} are not scored: {why}" for number, why in refused.items()]
     views: dict[str, dict[str, float]] = {}
     for name, estimated in estimated_ranges.items():
+        scale = scales.get((groups or {}).get(name, 0))
+        if scale is None:
+            continue
         truth = true_ranges[name]() if name in true_ranges else None
         if truth is None:
             notes.append(f"{name}: no true range map")
@@ -81,6 +92,20 @@ def score_capture(
             mask=_of_size((masks or {}).get(name), size_hw),
         )
     return Scores(poses, views, tuple(notes))
+
+
+def _scales(
+    estimated: Mapping[str, Rigid3], truth: Mapping[str, Rigid3], groups: Mapping[str, int]
+) -> tuple[dict[int, float], dict[int, str]]:
+    """Return the truth's units per unit of each group, or why that cannot be known."""
+    scales, refused = {}, {}
+    for number in sorted({groups.get(name, 0) for name in estimated}) or [0]:
+        own = {name: pose for name, pose in estimated.items() if groups.get(name, 0) == number}
+        try:
+            scales[number] = align_centers(own, truth).scale
+        except UsageError as error:
+            refused[number] = str(error)
+    return scales, refused
 
 
 def _of_size(labels: NDArray[Scalar] | None, size_hw: tuple[int, int]) -> NDArray[Scalar] | None:

@@ -14,6 +14,7 @@ from pano_mvs.algorithms.points.selection import spread_points
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Poses, RangeMap
+from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.surface_samples import SurfaceSamples
 from pano_mvs.scene.tracked_points import TrackedPoints
 
@@ -67,7 +68,8 @@ def track_points(
 
     Points are spread (`spread_points`) so that the distance between neighbours goes with the square root of that from
     the nearest camera. A view sees a point if its own range there agrees, forward and backward, by the test of
-    `check_consistency`, with a range of at least `min_confidence`; what is hidden or masked does not agree.
+    `check_consistency`, with a range of at least `min_confidence`; what is hidden or masked does not agree. Groups of
+    poses get points by the number of their views, each in its own world; no point is seen from two of them.
 
     Args:
         samples: image name to points of its surfaces.
@@ -75,7 +77,7 @@ def track_points(
         load_range: image name to its range map; called once for each.
         rng: what excess points are drawn with.
         count: how many points are wanted; there may be fewer.
-        min_views: points that fewer views see are left out.
+        min_views: points that fewer views see are left out; in a group of fewer views, those that not all of them see.
         neighbours: so many views, the nearest to a point, are asked.
         max_relative_error: largest relative difference between a view's range and the point's distance.
         min_confidence: a view's range of a lower confidence does not see.
@@ -85,6 +87,60 @@ def track_points(
     """
     if count < 1 or min_views < 1 or neighbours < 1 or not max_relative_error > 0:
         raise UsageError("count, min_views, neighbours and max_relative_error must be positive")
+    groups = split_groups(poses)
+    views = [sum(name in samples for name in group.names) for group in groups]
+    found = []
+    for group, own in zip(groups, views, strict=True):
+        fewest = min(min_views, max(own, 1)) if len(groups) > 1 else min_views
+        wanted = max(1, round(count * own / max(sum(views), 1)))
+        points = _track_group(
+            samples,
+            group,
+            load_range,
+            rng=rng,
+            count=wanted,
+            min_views=fewest,
+            neighbours=neighbours,
+            max_relative_error=max_relative_error,
+            min_confidence=min_confidence,
+        )
+        found.append(points)
+    return _of_groups(found)
+
+
+def _of_groups(parts: list[TrackedPoints]) -> TrackedPoints:
+    """Return the points of all groups, one group after the other."""
+    if len(parts) == 1:
+        return parts[0]
+    names = tuple(name for part in parts for name in part.names)
+    first_point = np.cumsum([0, *(len(part) for part in parts)])
+    first_image = np.cumsum([0, *(len(part.names) for part in parts)])
+    points = [part.track_point_idx + np.int32(first) for part, first in zip(parts, first_point, strict=False)]
+    images = [part.track_image_idx + np.int32(first) for part, first in zip(parts, first_image, strict=False)]
+    return TrackedPoints(
+        names=names,
+        points_in_world=np.concatenate([part.points_in_world for part in parts]),
+        colors_rgb=np.concatenate([part.colors_rgb for part in parts]),
+        errors_rad=np.concatenate([part.errors_rad for part in parts]),
+        track_point_idx=np.concatenate(points),
+        track_image_idx=np.concatenate(images),
+        track_bearings=np.concatenate([part.track_bearings for part in parts]),
+    )
+
+
+def _track_group(
+    samples: Mapping[str, SurfaceSamples],
+    poses: Poses,
+    load_range: Callable[[str], RangeMap],
+    *,
+    rng: np.random.Generator,
+    count: int,
+    min_views: int,
+    neighbours: int,
+    max_relative_error: float,
+    min_confidence: int,
+) -> TrackedPoints:
+    """Return the points of one group of poses."""
     names = [name for name in poses.names if name in samples]
     position = {name: idx for idx, name in enumerate(poses.names)}
     pose_idx = np.array([position[name] for name in names], np.intp)

@@ -14,10 +14,17 @@ class XyzParams(Params):
 
 @stage("export.xyz")
 def xyz(cloud: One[PointCloud], params: XyzParams, ctx: Context) -> Files:
-    """The cloud as cloud.xyz: a line for each point, x y z red green blue."""
-    kept = cloud.view_counts >= params.min_views
-    ctx.metric("points", int(kept.sum()))
-    rows = np.concatenate([cloud.points_in_world[kept], cloud.colors_rgb[kept]], axis=1)
-    path = ctx.scratch / "cloud.xyz"
-    np.savetxt(path, rows, fmt=[f"%.{params.digits}f"] * 3 + ["%d"] * 3)
-    return Files({"cloud.xyz": path})
+    """The cloud as cloud.xyz: a line for each point, x y z red green blue.
+
+    Points of panoramas that nothing connects with the others have a frame of their own, and so a file: cloud_1.xyz …
+    """
+    files, points = {}, 0
+    for number, group in enumerate(cloud.groups()):
+        kept = group.view_counts >= params.min_views
+        points += int(kept.sum())
+        rows = np.concatenate([group.points_in_world[kept], group.colors_rgb[kept]], axis=1)
+        name = f"cloud_{number}.xyz" if number else "cloud.xyz"
+        files[name] = ctx.scratch / name
+        np.savetxt(files[name], rows, fmt=[f"%.{params.digits}f"] * 3 + ["%d"] * 3)
+    ctx.metric("points", points)
+    return Files(files)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Literal
 
-from pano_mvs.api import Context, Files, InputError, One, Params, PointCloud, Poses, stage
+from pano_mvs.api import Context, Files, InputError, One, Params, PointCloud, Poses, UsageError, stage
 from pano_mvs.io.thinning import Kept, Selection, select_points
+from pano_mvs.scene.files import group_file
+from pano_mvs.scene.pose_groups import split_groups
 from pydantic import Field
 
 from pano_mvs_las.e57_file import write_e57
@@ -38,31 +41,65 @@ class LasParams(CloudParams):
 
 @stage("export.las")
 def las(cloud: One[PointCloud], poses: One[Poses], params: LasParams, ctx: Context) -> Files:
-    """The fused cloud as cloud.laz (or .las): LAS 1.4 with 16-bit colours, z up; normals, views and confidence too."""
-    kept, placement = _prepared(cloud, poses, params, ctx)
-    path = ctx.scratch / f"cloud.{params.format}"
-    write_las(path, cloud, placement, step=params.step, kept=kept)
-    return Files({path.name: path})
+    """The fused cloud as cloud.laz (or .las): LAS 1.4 with 16-bit colours, z up; normals, views and confidence too.
+
+    Further groups of poses, each in a frame of its own, are cloud_1.laz …
+    """
+    files = {}
+    for number, group, kept, placement in _prepared(cloud, poses, params, ctx):
+        path = ctx.scratch / group_file(f"cloud.{params.format}", number)
+        write_las(path, group, placement, step=params.step, kept=kept)
+        files[path.name] = path
+    return Files(files)
 
 
 @stage("export.e57")
 def e57(cloud: One[PointCloud], poses: One[Poses], params: CloudParams, ctx: Context) -> Files:
-    """The fused cloud as cloud.e57: one scan with colours and normals, z up."""
-    kept, placement = _prepared(cloud, poses, params, ctx)
-    path = ctx.scratch / "cloud.e57"
-    write_e57(path, cloud, placement, kept=kept)
-    return Files({path.name: path})
+    """The fused cloud as cloud.e57: one scan with colours and normals, z up.
+
+    Further groups of poses, each in a frame of its own, are cloud_1.e57 …
+    """
+    files = {}
+    for number, group, kept, placement in _prepared(cloud, poses, params, ctx):
+        path = ctx.scratch / group_file("cloud.e57", number)
+        write_e57(path, group, placement, kept=kept)
+        files[path.name] = path
+    return Files(files)
 
 
-def _prepared(cloud: PointCloud, poses: Poses, params: CloudParams, ctx: Context) -> tuple[Kept | None, Placement]:
-    """Return which points are written and where, and report both."""
-    placement = placement_of(poses, params.epsg)
+def _prepared(
+    cloud: PointCloud, poses: Poses, params: CloudParams, ctx: Context
+) -> Iterator[tuple[int, PointCloud, Kept | None, Placement]]:
+    """Yield the number and the cloud of each group that has points, which of them are written, and where."""
     selection = Selection(params.min_confidence, params.min_views, params.voxel, params.max_points)
-    kept = select_points(cloud, selection, ctx.scratch)
-    count = len(cloud) if kept is None else kept.count
-    if not count:
-        raise InputError("the cloud has no points that could be written")
-    ctx.metric("points", count)
+    total = 0
+    for number, (group, own) in enumerate(zip(cloud.groups(), split_groups(poses), strict=False)):
+        kept = select_points(group, selection, ctx.scratch)
+        count = len(group) if kept is None else kept.count
+        if not count:
+            if not number:
+                raise InputError("the cloud has no points that could be written")
+            continue
+        placement = _placement(own, params.epsg, number, ctx)
+        total += count
+        yield number, group, kept, placement
+    ctx.metric("points", total)
+
+
+def _placement(poses: Poses, epsg: int | None, number: int, ctx: Context) -> Placement:
+    """Return where the points of a group are written; where GPS placed the largest group alone, the others on no map.
+
+    Raises:
+        UsageError: of the largest group.
+    """
+    try:
+        placement = placement_of(poses, epsg)
+    except UsageError as error:
+        if not number:
+            raise
+        ctx.note(f"group {number} is on no map: {error}")
+        return placement_of(poses, 0)
     if placement.crs is not None:
-        ctx.note(f"the cloud is on the map {placement.crs.name} (EPSG:{placement.crs.to_epsg()})")
-    return kept, placement
+        which = f"the cloud of group {number}" if number else "the cloud"
+        ctx.note(f"{which} is on the map {placement.crs.name} (EPSG:{placement.crs.to_epsg()})")
+    return placement

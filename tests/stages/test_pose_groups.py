@@ -1,0 +1,340 @@
+"""Two rooms that nothing connects, through every stage that reads poses: each room is treated as if it were alone."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from pano_mvs.algorithms.poses.gauge import moved_poses
+from pano_mvs.core.errors import InputError
+from pano_mvs.engine.context import Context
+from pano_mvs.engine.ports import Names
+from pano_mvs.geometry import Similarity3, rotation_from_rotvec
+from pano_mvs.io.nerfstudio_frames import NerfstudioFrame, NerfstudioFrames
+from pano_mvs.io.ply import read_ply
+from pano_mvs.scene import Files, Panorama, PointCloud, Pose, Poses, RangeMap
+from pano_mvs.scene.face_files import FaceFiles
+from pano_mvs.scene.pose_groups import join_groups, split_groups
+from pano_mvs.scene.surface_samples import SurfaceSamples
+from pano_mvs.stages.evaluate import TruthParams, truth
+from pano_mvs.stages.export import PlyParams, ply
+from pano_mvs.stages.export_colmap import (
+    DenseInitParams,
+    DenseParams,
+    ModelParams,
+    colmap,
+    colmap_dense,
+    colmap_dense_init,
+)
+from pano_mvs.stages.export_mesh import MeshParams, mesh
+from pano_mvs.stages.export_nerfstudio import NerfstudioParams, nerfstudio
+from pano_mvs.stages.frame import BaselineParams, LevelParams, ScaleParams, level, scale
+from pano_mvs.stages.fusion import VoteParams, vote
+from pano_mvs.stages.points import TrackedParams, tracked
+from pano_mvs.testing.tiny_capture import TinyCapture, tiny_capture
+
+_LARGE = ("000.png", "001.png", "003.png")
+# The smaller room is the same capture's, under other names, in a world that is turned, moved and half as large.
+_SMALL = {"b0.png": "000.png", "b1.png": "002.png"}
+_ORDER = ("b0.png", "000.png", "001.png", "b1.png", "003.png")
+_MOVED = Similarity3(0.5, rotation_from_rotvec([0.1, 1.0, -0.2]), np.array([3.0, 1.0, -2.0]))
+
+
+class Rooms:
+    """The values that stages take, of both rooms."""
+
+    def __init__(self, tiny: TinyCapture) -> None:
+        whole = tiny.wholes[Poses]
+        assert isinstance(whole, Poses)
+        large, small = (_with(whole, names) for names in (_LARGE, tuple(_SMALL.values())))
+        small = replace(moved_poses(small, _MOVED), names=tuple(_SMALL), frame="the small room's", scale="its own")
+        self.poses = join_groups([small, large], order=_ORDER)
+        self.images = self._of(tiny.items[Panorama])
+        self.ranges = self._of(tiny.items[RangeMap])
+        self.samples = self._of(tiny.items[SurfaceSamples])
+        for name in _SMALL:
+            own = self.ranges[name]
+            self.ranges[name] = replace(own, range=(0.5 * own.range).astype(np.float32))
+            self.samples[name] = replace(
+                self.samples[name], ranges=(0.5 * self.samples[name].ranges).astype(np.float32)
+            )
+        self.pose_items: Mapping[str, Pose] = self.poses.explode()
+
+    @staticmethod
+    def _of(items: Mapping[str, object]) -> dict:
+        return {name: items[_SMALL.get(name, name)] for name in _ORDER}
+
+
+def _with(poses: Poses, names: tuple[str, ...]) -> Poses:
+    from pano_mvs.scene.pose_groups import with_cameras
+
+    return with_cameras(poses, np.array([name in names for name in poses.names]))
+
+
+@pytest.fixture(scope="module")
+def rooms() -> Rooms:
+    return Rooms(tiny_capture())
+
+
+@pytest.fixture
+def ctx(tmp_path: Path) -> Context:
+    return _context(tmp_path / "stage")
+
+
+def _context(folder: Path) -> Context:
+    folder.mkdir()
+    return Context(np.random.default_rng(0), folder)
+
+
+def _fused(rooms: Rooms, names: tuple[str, ...] = _ORDER, **settings: object) -> PointCloud:
+    chosen = {name: rooms.ranges[name] for name in names}
+    poses = {name: Pose(rooms.pose_items[name].cam_from_world, rooms.pose_items[name].group) for name in names}
+    if set(names) == set(_SMALL):
+        poses = {name: Pose(pose.cam_from_world) for name, pose in poses.items()}
+    ctx = Context(np.random.default_rng(0), Path())
+    return vote(ranges=chosen, poses=poses, images=rooms.images, params=VoteParams(**settings), ctx=ctx)
+
+
+def test_each_image_knows_its_group(rooms: Rooms):
+    assert {name: pose.group for name, pose in rooms.pose_items.items()} == {
+        name: int(name in _SMALL) for name in _ORDER
+    }
+    pose = rooms.pose_items["b1.png"]
+    assert Pose.from_parts(pose.to_parts()).group == 1
+    assert "group" not in rooms.pose_items["000.png"].to_parts()["meta"]  # as it is stored where there is one group
+
+
+def test_nothing_of_one_room_enters_the_cloud_of_the_other(rooms: Rooms):
+    cloud = _fused(rooms, min_views=3)
+    cloud.check()
+    assert PointCloud.from_parts(cloud.to_parts()).group_sizes == cloud.group_sizes
+    for group, names in zip(cloud.groups(), (_LARGE, tuple(_SMALL)), strict=True):
+        alone = _fused(rooms, names, min_views=3)
+        assert len(alone) > 100
+        assert alone.group_sizes == ()
+        np.testing.assert_array_equal(group.points_in_world, alone.points_in_world)
+        np.testing.assert_array_equal(group.colors_rgb, alone.colors_rgb)
+        np.testing.assert_array_equal(group.view_counts, alone.view_counts)
+
+
+def test_a_room_without_ranges_keeps_its_number(rooms: Rooms, ctx: Context):
+    ranges = {name: rooms.ranges[name] for name in _LARGE}
+    cloud = vote(ranges=ranges, poses=rooms.pose_items, images=rooms.images, params=VoteParams(), ctx=ctx)
+    assert [len(group) > 0 for group in cloud.groups()] == [True, False]
+    assert any(note.startswith("group 1: the cloud is empty") for note in ctx.notes)
+
+
+def test_each_cloud_has_a_file(rooms: Rooms, ctx: Context):
+    cloud = _fused(rooms)
+    files = ply(cloud=cloud, params=PlyParams(), ctx=ctx).files
+    assert list(files) == ["cloud.ply", "cloud_1.ply"]
+    for path, group in zip(files.values(), cloud.groups(), strict=True):
+        np.testing.assert_array_equal(read_ply(path).points_in_world, group.points_in_world)
+    assert ctx.metrics["points"] == len(cloud)
+
+
+@pytest.mark.slow
+def test_each_mesh_has_a_file(rooms: Rooms, ctx: Context):
+    files = mesh(cloud=_fused(rooms), params=MeshParams(min_confidence=0, depth=5, trim=0), ctx=ctx).files
+    assert list(files) == ["mesh.ply", "mesh_1.ply"]
+
+
+def test_a_room_with_too_few_points_has_no_mesh_and_says_so(rooms: Rooms, ctx: Context):
+    large = _fused(rooms).groups()[0]
+    few = replace(large, **{name: getattr(large, name)[:5] for name in vars(large) if name != "group_sizes"})
+    files = mesh(cloud=PointCloud.of_groups([large, few]), params=MeshParams(depth=4, trim=0), ctx=ctx).files
+    assert list(files) == ["mesh.ply"]
+    assert ctx.notes[0].startswith("no mesh_1.ply: 5 of 5 points are left")
+
+
+def _placed(files: Files, folder: Path) -> Path:
+    for target, path in files.files.items():
+        (folder / target).parent.mkdir(parents=True, exist_ok=True)
+        (folder / target).write_bytes(path.read_bytes())
+    return folder
+
+
+def _model_images(folder: Path) -> dict[str, np.ndarray]:
+    model = pycolmap.Reconstruction(folder)
+    return {image.name: image.projection_center() for image in model.images.values()}
+
+
+def test_each_room_is_a_sparse_model(rooms: Rooms, ctx: Context, tmp_path: Path):
+    out = _placed(colmap(poses=rooms.poses, images=rooms.images, params=ModelParams(), ctx=ctx), tmp_path)
+    assert sorted(path.name for path in (out / "colmap" / "sparse").iterdir()) == ["0", "1"]
+    for number, group in enumerate(split_groups(rooms.poses)):
+        centers = _model_images(out / "colmap" / "sparse" / str(number))
+        assert centers.keys() == set(group.names)
+        for name, center in zip(group.names, group.centers, strict=True):
+            np.testing.assert_allclose(centers[name], center, atol=1e-9)
+
+
+def _tracked(rooms: Rooms, ctx: Context, count: int = 100):
+    params = TrackedParams(count=count, min_confidence=1)
+    return tracked(poses=rooms.poses, samples=rooms.samples, ranges=rooms.ranges, params=params, ctx=ctx)
+
+
+def test_tracked_points_are_seen_from_one_room_each(rooms: Rooms, ctx: Context):
+    points = _tracked(rooms, ctx)
+    points.check()
+    in_small = np.array([name in _SMALL for name in points.names])[points.track_image_idx]
+    share = np.bincount(points.track_point_idx, in_small) / np.bincount(points.track_point_idx)
+    assert set(share) == {0.0, 1.0}
+    assert 10 < share.sum() < len(points) - 10
+    joined = points.joined_to(rooms.poses, keep_points=True)
+    joined.check()
+    towards = joined.points_in_world[joined.track_point_idx] - joined.centers[joined.track_image_idx]
+    in_cam = np.einsum("nij,nj->ni", joined.rotations[joined.track_image_idx], towards)
+    in_cam /= np.linalg.norm(in_cam, axis=1, keepdims=True)
+    assert np.median(np.linalg.norm(in_cam - joined.track_bearings, axis=1)) < 0.02
+
+
+def test_points_that_lose_their_room_are_left_out(rooms: Rooms, ctx: Context):
+    points = _tracked(rooms, ctx)
+    third = drawn_room(rooms)
+    joined = points.joined_to(third, keep_points=False)
+    joined.check()
+    assert np.bincount(joined.track_point_idx, minlength=len(joined.points_in_world)).min() > 0
+
+
+def drawn_room(rooms: Rooms) -> Poses:
+    """Return the large room beside another one of which no point is known."""
+    large, small = split_groups(rooms.poses)
+    return join_groups([large, replace(small, names=("c0.png", "c1.png"))])
+
+
+def test_splats_begin_with_a_model_of_each_room(rooms: Rooms, tmp_path: Path):
+    points = _tracked(rooms, _context(tmp_path / "points"))
+    ctx = _context(tmp_path / "init")
+    files = colmap_dense_init(
+        poses=rooms.poses, points=points, images=rooms.images, params=DenseInitParams(keep_sfm=False), ctx=ctx
+    )
+    out = _placed(files, tmp_path)
+    sizes = [pycolmap.Reconstruction(out / f"colmap_dense_init/sparse/{number}").num_points3D() for number in range(2)]
+    assert sum(sizes) == len(points)
+    assert min(sizes) > 10
+
+
+def test_a_dense_workspace_is_of_the_largest_room(rooms: Rooms, ctx: Context, tmp_path: Path):
+    faces = {name: FaceFiles({}, size_px=12) for name in _ORDER}
+    files = colmap_dense(
+        poses=rooms.poses, faces=faces, images=Names(_ORDER), points=None, params=DenseParams(format="bin"), ctx=ctx
+    )
+    out = _placed(files, tmp_path) / "colmap_dense"
+    for folder, names in (("sparse", _LARGE), ("sparse/0", _LARGE), ("sparse/1", _SMALL)):
+        assert {name.rpartition("_")[0] for name in _model_images(out / folder)} == {Path(name).stem for name in names}
+    assert "b0" not in (out / "stereo" / "fusion.cfg").read_text()
+    assert any("group 1 (b0.png, b1.png) has a frame of its own" in note for note in ctx.notes)
+
+
+def test_each_room_has_transforms_and_a_seed(rooms: Rooms, ctx: Context, tmp_path: Path):
+    frame = NerfstudioFrame("equirectangular", "images/{name}", "", "", (64, 32), (32.0, 32.0),
+                            ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))  # fmt: skip
+    frames = {name: NerfstudioFrames({}, {}, (frame,), 0.001) for name in _ORDER}
+    cloud = _fused(rooms)
+    files = nerfstudio(frames=frames, poses=rooms.poses, cloud=cloud, params=NerfstudioParams(), ctx=ctx)
+    out = _placed(files, tmp_path) / "nerfstudio" / "equirectangular"
+    for number, (names, suffix) in enumerate(((_LARGE, ""), (tuple(_SMALL), "_1"))):
+        document = json.loads((out / f"transforms{suffix}.json").read_text())
+        assert {entry["panorama"] for entry in document["frames"]} == set(names)
+        assert document["ply_file_path"] == f"seed{suffix}.ply"
+        assert document["world_frame"] == rooms.poses.worlds[number].frame
+        assert len(read_ply(out / f"seed{suffix}.ply")) == sum(cloud.groups()[number].view_counts >= 2)
+
+
+def test_each_room_is_aligned_with_the_truth_on_its_own(rooms: Rooms, tmp_path: Path):
+    tiny = tiny_capture()
+    folder = _truth_of_rooms(tiny, tmp_path / "truth")
+    scores = truth(images=rooms.images, poses=rooms.poses, ranges=rooms.ranges, params=TruthParams(truth=folder))
+    assert scores.poses["registered"] == 5
+    assert scores.poses["registered_in_one_frame"] == 3
+    assert scores.poses["scale_ratio_error_max"] < 1e-6
+    assert 0 < scores.poses["auc_1_deg"] == pytest.approx(4 / 10)  # three pairs of the large room, one of the small one
+    assert all(view["median_relative_error"] < 0.01 for view in scores.views.values())
+    assert len(scores.views) == 5
+    assert "in 2 groups" in scores.notes[0]
+
+
+def _truth_of_rooms(tiny: TinyCapture, folder: Path) -> Path:
+    folder.mkdir()
+    of_image = {name: tiny.names.index(_SMALL.get(name, name)) for name in _ORDER}
+    views = [
+        {"image": name, "R": tiny.poses[idx].rotation.tolist(), "t": tiny.poses[idx].translation.tolist()}
+        for name, idx in of_image.items()
+    ]
+    (folder / "poses.json").write_text(json.dumps({"width": 64, "height": 32, "metric": True, "views": views}))
+    np.savez(folder / "depth.npz", **{Path(name).stem: tiny.ranges[idx] for name, idx in of_image.items()})
+    return folder
+
+
+def test_each_room_is_levelled_on_its_own(rooms: Rooms, ctx: Context):
+    levelled = level(poses=rooms.poses, images=rooms.images, params=LevelParams(evidence="sensors"), ctx=ctx)
+    levelled.check()
+    for number, group in enumerate(split_groups(levelled)):
+        np.testing.assert_array_equal(group.translations[0], 0)
+        ups = np.array([group.rotations[idx].T @ rooms.images[name].up_in_cam for idx, name in enumerate(group.names)])
+        np.testing.assert_allclose(ups, np.tile([0, -1, 0], (len(ups), 1)), atol=1e-6)
+        assert ctx.notes[number].startswith(f"group {number}: levelled by")
+
+
+def _metres(poses: Poses, first: str, second: str) -> float:
+    positions = dict(zip(poses.names, poses.centers, strict=True))
+    return float(np.linalg.norm(positions[first] - positions[second]))
+
+
+def _scaled(rooms: Rooms, ctx: Context, **settings: object) -> Poses:
+    poses = scale(poses=rooms.poses, images=rooms.images, params=ScaleParams(**settings), ctx=ctx)
+    poses.check()
+    return poses
+
+
+def test_a_baseline_scales_the_room_that_holds_both_images(rooms: Rooms, ctx: Context):
+    baseline = BaselineParams(from_image="b0.png", to_image="b1.png", metres=7)
+    poses = _scaled(rooms, ctx, baseline=baseline)
+    assert [world.metric for world in poses.worlds] == [False, True]
+    assert _metres(poses, "b0.png", "b1.png") == pytest.approx(7)
+    assert _metres(poses, "000.png", "001.png") == pytest.approx(_metres(rooms.poses, "000.png", "001.png"))
+    assert (
+        "group 0: keeps its own unit of length (the first reference–neighbour baseline is 1): the length that"
+        in ctx.notes[0]
+    )
+    assert ctx.notes[1].startswith("group 1: unit of length: metres, by the baseline of 7 m")
+
+
+def test_a_baseline_across_rooms_is_refused(rooms: Rooms, ctx: Context):
+    baseline = BaselineParams(from_image="000.png", to_image="b1.png", metres=7)
+    with pytest.raises(InputError, match=r"000\.png and b1\.png are in groups 0 and 1 .* Name two images of one group"):
+        _scaled(rooms, ctx, baseline=baseline)
+
+
+def test_a_factor_is_of_the_largest_room(rooms: Rooms, ctx: Context):
+    poses = _scaled(rooms, ctx, factor=3)
+    assert [world.metric for world in poses.worlds] == [True, False]
+    assert _metres(poses, "000.png", "001.png") == pytest.approx(3 * _metres(rooms.poses, "000.png", "001.png"))
+
+
+def test_gps_scales_every_room_with_positions_enough(rooms: Rooms, ctx: Context):
+    """The small room has two positions, which are too few."""
+    poses = _scaled(rooms, ctx, gps=True, gps_noise_m=0.001, vertical="sensors")
+    assert [world.metric for world in poses.worlds] == [True, False]
+    assert "group 1: keeps its own unit of length (its own): GPS gives no scale: 2 of 2 registered" in ctx.notes[1]
+
+
+def test_where_no_room_can_be_scaled_the_largest_says_why(rooms: Rooms, ctx: Context):
+    with pytest.raises(InputError, match="GPS gives no scale: the GPS positions lie within"):
+        _scaled(rooms, ctx, gps=True, vertical="sensors")
+
+
+def test_a_camera_height_scales_every_room_with_a_floor(rooms: Rooms, ctx: Context):
+    poses = _scaled(rooms, ctx, camera_height_m=1.5, vertical="sensors")
+    assert [world.metric for world in poses.worlds] == [True, True]
+    assert _metres(poses, "b0.png", "b1.png") == pytest.approx(
+        _metres(rooms.poses, "b0.png", "b1.png") * 2 * _metres(poses, "000.png", "001.png")
+        / _metres(rooms.poses, "000.png", "001.png"), rel=0.1,
+    )  # fmt: skip
