@@ -28,7 +28,7 @@ from pano_mvs.stages.matches import brute_force
 from pano_mvs.stages.pairs import exhaustive, position, retrieval, sequential, vlad
 from pano_mvs.stages.patchmatch import patchmatch
 from pano_mvs.stages.points import surface, tracked
-from pano_mvs.stages.poses import from_model, refine, scaled_translation, triangulate
+from pano_mvs.stages.poses import from_model, refine, scaled_translation, triangulate, verify
 from pano_mvs.stages.poses_colmap import colmap_poses, colmap_sift_poses, extend
 from pano_mvs.stages.source import folder
 from pano_mvs.stages.source_video import video
@@ -81,6 +81,7 @@ __all__ = [
     "triangulate",
     "truth",
     "unit_translations",
+    "verify",
     "video",
     "vlad",
     "vote",

@@ -14,7 +14,7 @@ from pano_mvs.geometry import Rigid3
 # A camera whose images confirm less than this share of what its neighbours lead to expect is looked at again …
 _SUSPICIOUS = 0.75
 # … and is doubtful if no other place does better and it stays below this share …
-_DOUBTFUL = 0.6
+_DOUBTFUL = 0.55
 # … or is left out, if its pairs do not support it either.
 _HOPELESS, _MIN_EXPLAINED = 0.3, 0.5
 # Another place must be better by this factor, and by this much, to be taken; within the factor it is a rival.
@@ -89,21 +89,17 @@ def arbitrate(
     return found
 
 
-def expected_shares(cameras: Mapping[int, Rigid3], shares: Mapping[int, float]) -> dict[int, float]:
-    """Return the median confirmed share of each camera's nearest neighbours; NaN where none can be judged."""
-    expected = {}
-    for image, pose in cameras.items():
-        others = {idx: camera for idx, camera in cameras.items() if idx != image}
-        around = [shares[idx] for idx in nearest_cameras(pose, others, count=_NEIGHBOURS) if np.isfinite(shares[idx])]
-        expected[image] = float(np.median(around)) if around else float("nan")
-    return expected
-
-
 def _judge(model: PlacedModel, confirmation: Confirmation, found: Arbitration) -> None:
-    found.shares = {
-        image: confirmation.share(image, pose, model.cameras) for image, pose in sorted(model.cameras.items())
+    """Compare what each image confirms with what its nearest neighbours' experience leads to expect."""
+    evidence = {
+        image: confirmation.evidence(image, pose, model.cameras) for image, pose in sorted(model.cameras.items())
     }
-    found.expected = expected_shares(model.cameras, found.shares)
+    found.shares = {image: own.share for image, own in evidence.items()}
+    found.expected = {}
+    for image, pose in model.cameras.items():
+        others = {idx: camera for idx, camera in model.cameras.items() if idx != image}
+        around = nearest_cameras(pose, others, count=_NEIGHBOURS)
+        found.expected[image] = evidence[image].expected_share([evidence[idx] for idx in around])
 
 
 def _suspects(found: Arbitration) -> list[int]:

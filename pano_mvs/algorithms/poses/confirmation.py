@@ -14,7 +14,7 @@ from pano_mvs.algorithms.sweep.hypotheses import range_limits
 from pano_mvs.algorithms.sweep.limits import reduced_mask, reduced_panorama, textured_pixels
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.sweep import sweep_range
-from pano_mvs.geometry import Rigid3, pixel_solid_angle
+from pano_mvs.geometry import Rigid3, angle_between, pixel_solid_angle, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
@@ -30,6 +30,10 @@ _MAX_RELATIVE_ERROR, _MAX_REPROJECTION_PX, _MIN_SUPPORT, _MIN_MOTION_PX = 0.05, 
 # Less texture than this share of the sphere says nothing about a pose.
 MIN_TEXTURED = 0.05
 _CACHED_MAPS = 256
+_PARALLAX_EDGES_DEG = np.array([2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 50.0, 65.0, 180.0])
+_CLASSES = len(_PARALLAX_EDGES_DEG)
+# Solid angle with which the overall share counts in each class.
+_PRIOR = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +49,41 @@ class _Small:
     image: NDArray[np.uint8]
     mask: NDArray[np.bool_]
     textured: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """How much of what an image sees other images confirm, by the parallax under which they see it.
+
+    Attributes:
+        textured: (B,) solid angle of the textured pixels in each class of parallax.
+        confirmed: (B,) solid angle of those that other images confirm.
+    """
+
+    textured: NDArray[np.float64]
+    confirmed: NDArray[np.float64]
+
+    @property
+    def share(self) -> float:
+        """The confirmed share of the textured pixels; NaN if too little of the sphere has any texture."""
+        if self.textured.sum() < MIN_TEXTURED * 4 * np.pi:
+            return float("nan")
+        return float(self.confirmed.sum() / self.textured.sum())
+
+    def expected_share(self, others: Sequence[Evidence]) -> float:
+        """Return the share that other cameras' experience leads to expect, class by class; NaN without any.
+
+        A camera far from its neighbours sees everything under a large parallax, of which little is confirmed wherever
+        it stands: what counts is how much of the same classes others have confirmed.
+        """
+        known = [other for other in others if np.isfinite(other.share)]
+        if not known or not np.isfinite(self.share):
+            return float("nan")
+        textured = np.sum([other.textured for other in known], axis=0)
+        confirmed = np.sum([other.confirmed for other in known], axis=0)
+        overall = confirmed.sum() / textured.sum()
+        rates = (confirmed + _PRIOR * overall) / (textured + _PRIOR)
+        return float(self.textured @ rates / self.textured.sum())
 
 
 class Confirmation:
@@ -65,7 +104,11 @@ class Confirmation:
         self._maps: OrderedDict[tuple[object, ...], RangeMap] = OrderedDict()
 
     def share(self, image: int, pose: Rigid3, cameras: Mapping[int, Rigid3]) -> float:
-        """Return the share of an image's textured pixels, by solid angle, that other images confirm; NaN if none can.
+        """Return the share of an image's textured pixels, by solid angle, that other images confirm; see `evidence`."""
+        return self.evidence(image, pose, cameras).share
+
+    def evidence(self, image: int, pose: Rigid3, cameras: Mapping[int, Rigid3]) -> Evidence:
+        """Return how much of what an image sees its nearest neighbours confirm.
 
         Args:
             image: position of the image.
@@ -77,8 +120,8 @@ class Confirmation:
         small = self.small(image)
         solid_angle = np.broadcast_to(pixel_solid_angle(small.mask.shape)[:, None], small.mask.shape)
         textured = small.textured & small.mask
-        if not sources or solid_angle[textured].sum() < MIN_TEXTURED * solid_angle.sum():
-            return float("nan")
+        if not sources:
+            return Evidence(np.zeros(_CLASSES), np.zeros(_CLASSES))
         own = self._swept(image, pose, sources, others)
         maps, poses = [], []
         for source in sources:
@@ -93,7 +136,13 @@ class Confirmation:
             min_support=_MIN_SUPPORT, min_motion_px=_MIN_MOTION_PX,
         )  # fmt: skip
         confirmed = (checked.confidence >= CONSISTENT_CONFIDENCE[0]) & textured
-        return float(solid_angle[confirmed].sum() / solid_angle[textured].sum())
+        classes = _parallax_classes(own.range, pose, poses)
+        return Evidence(
+            *(
+                np.histogram(classes[which], _CLASSES, (-0.5, _CLASSES - 0.5), weights=solid_angle[which])[0]
+                for which in (textured, confirmed)
+            )
+        )
 
     def small(self, image: int) -> _Small:
         """Return a panorama at 256 columns."""
@@ -126,6 +175,22 @@ class Confirmation:
         if len(self._maps) > _CACHED_MAPS:
             self._maps.popitem(last=False)
         return self._maps[key]
+
+
+def _parallax_classes(ranges: NDArray[np.float32], pose: Rigid3, sources: Sequence[Rigid3]) -> NDArray[np.intp]:
+    """Return the class of each pixel, (H, W): the smallest angle under which a source and the image see its point.
+
+    Angles under 2° do not count, since they tell little. Pixels without such a source are in the last class.
+    """
+    points = ray_grid(ranges.shape) * np.nan_to_num(ranges)[..., None]
+    smallest = np.full(ranges.shape, np.inf)
+    for source in sources:
+        offset = (source @ pose.inverse()).center
+        angles = np.rad2deg(angle_between(points, points - offset))
+        smallest = np.where((angles > _PARALLAX_EDGES_DEG[0]) & (angles < smallest), angles, smallest)
+    smallest[np.isnan(ranges)] = np.inf
+    classes: NDArray[np.intp] = np.searchsorted(_PARALLAX_EDGES_DEG[1:], smallest)
+    return classes
 
 
 def nearest_cameras(pose: Rigid3, cameras: Mapping[int, Rigid3], *, count: int = _SOURCES) -> list[int]:
