@@ -1,4 +1,4 @@
-"""The essential matrices through five pairs of bearings."""
+"""The five-point problem by the action matrix: all samples at once, in numpy."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ FloatArray = NDArray[np.float64]
 _SAMPLE = 5
 # Exponents of x, y, z in the twenty monomials up to degree three. The last ten are a basis of what is left of all
 # polynomials once the ten cubic ones before them are expressed by them.
-_MONOMIALS = (
+MONOMIALS = (
     (3, 0, 0), (2, 1, 0), (1, 2, 0), (0, 3, 0), (2, 0, 1), (1, 1, 1), (0, 2, 1), (1, 0, 2), (0, 1, 2), (0, 0, 3),
     (2, 0, 0), (1, 1, 0), (0, 2, 0), (1, 0, 1), (0, 1, 1), (0, 0, 2), (1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0),
 )  # fmt: skip
@@ -20,7 +20,7 @@ _BASIS_ROWS = ((6, 0), (7, 1), (8, 3), (9, 6))
 _REAL = 1e-7  # imaginary part of a root, relative to its size, that rounding explains
 
 
-def essentials_from_five(first: FloatArray, second: FloatArray) -> tuple[FloatArray, NDArray[np.intp]]:
+def essentials_by_eigenvectors(first: FloatArray, second: FloatArray) -> tuple[FloatArray, NDArray[np.intp]]:
     """Return all essential matrices for which five pairs of bearings meet: qᵀ E p = 0.
 
     E = x X + y Y + z Z + W over the null space of the five equations; det E = 0 and 2 E Eᵀ E − tr(E Eᵀ) E = 0 are ten
@@ -39,7 +39,7 @@ def essentials_from_five(first: FloatArray, second: FloatArray) -> tuple[FloatAr
     products = (second[..., :, None] * first[..., None, :]).reshape(-1, _SAMPLE, 9)
     null_space = np.linalg.qr(np.swapaxes(products, 1, 2), mode="complete")[0][:, :, _SAMPLE:]
     basis = np.swapaxes(null_space, 1, 2).reshape(-1, 4, 3, 3)
-    actions, sample_idx = _multiplications_by_x(_cubic_equations(basis))
+    actions, sample_idx = _multiplications_by_x(cubic_equations(basis))
     roots, vectors = np.linalg.eig(actions)
     scale = vectors[:, 9]
     real = (np.abs(roots.imag) < _REAL * (1 + np.abs(roots.real))) & (np.abs(scale) > 1e-12 * np.abs(vectors).max(1))
@@ -50,7 +50,7 @@ def essentials_from_five(first: FloatArray, second: FloatArray) -> tuple[FloatAr
     return essentials, sample_idx[row]
 
 
-def _cubic_equations(basis: FloatArray) -> FloatArray:
+def cubic_equations(basis: FloatArray) -> FloatArray:
     """Return the ten equations' coefficients of the twenty monomials, (N, 10, 20), for bases (N, 4, 3, 3).
 
     Each is Σ_abc c_a c_b c_c T_abc with c = (x, y, z, 1): T is computed first, equal products of c added up next.
@@ -79,10 +79,10 @@ def _multiplications_by_x(equations: FloatArray) -> tuple[FloatArray, NDArray[np
 
 def _monomial_of_products() -> FloatArray:
     """Return which monomial each product c_a c_b c_c of c = (x, y, z, 1) is, (64, 20)."""
-    table = np.zeros((4, 4, 4, len(_MONOMIALS)))
+    table = np.zeros((4, 4, 4, len(MONOMIALS)))
     powers = np.eye(4, 3, dtype=np.int64)
     for a, b, c in np.ndindex(4, 4, 4):
-        table[a, b, c, _MONOMIALS.index(tuple(int(n) for n in powers[a] + powers[b] + powers[c]))] = 1.0
+        table[a, b, c, MONOMIALS.index(tuple(int(n) for n in powers[a] + powers[b] + powers[c]))] = 1.0
     return table.reshape(64, -1)
 
 

@@ -29,9 +29,9 @@ from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-_DIRECTIONS = 300  # pairs of matches that vote for a direction, for each rotation
+_DIRECTIONS = 200  # pairs of matches that vote for a direction, for each rotation
 _TWINS = 16  # samples among the matches of a known geometry
-_FRESH = 192  # samples among the matches that the best geometry does not explain
+_FRESH = 96  # samples among the matches that the best geometry does not explain
 _PEAKS = 6  # candidates of each kind that are settled
 _FINALISTS = 4  # candidates that are judged
 _MIN_REFINED = 8  # fewer matches are not refined on
@@ -134,7 +134,11 @@ class _Search:
         if len(rest) < needed:
             return None
         p, q = self.first[rest], self.second[rest]
-        rough = [self._settled(pose, p, q, (3.0, 2.0)) for pose in self._candidates(known, pool, p, q)]
+        rough = [
+            self._settled(pose, p, q, (3.0, 2.0))
+            for pose in self._candidates(known, pool, p, q)
+            if agreement(pose, p, q, 3 * self.threshold_rad)[1].sum() >= needed
+        ]
         support = [int(agreement(pose, p, q, 1.5 * self.threshold_rad)[1].sum()) for pose in rough]
         chosen: list[Rigid3] = []
         for idx in np.argsort(support, kind="stable")[::-1]:

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numba import njit
 
-_CHECKS = (48, 128)  # matches after which a hypothesis is given up if it lags behind
+_CHECKS = (16, 32, 64, 128)  # matches after which a hypothesis is given up if it lags behind
 _SIGMAS = 3.0
 
 
@@ -42,8 +42,8 @@ def _essential_cost(essential, first, second, squared_threshold, limit):  # type
         total += squared / allowed if squared < allowed else 1.0
         if total >= limit:
             return np.inf
-        if mean < 1.0 and (idx + 1 == _CHECKS[0] or idx + 1 == _CHECKS[1]):
-            seen = idx + 1
+        seen = idx + 1
+        if mean < 1.0 and seen in _CHECKS:
             if total > seen * mean + _SIGMAS * math.sqrt(seen * mean * (1.0 - mean)):
                 return np.inf
     return total

@@ -36,7 +36,8 @@ def best_redirected(
     candidates = list(poses)
     for pose in poses:
         moved = pose
-        for _ in range(_ROUNDS):
+        # A single pose is that of a search which was sure of it.
+        for _ in range(_ROUNDS if len(poses) > 1 else 1):
             moved = _redirected(moved, first, second, rng=rng, threshold_rad=threshold_rad)
             candidates.append(moved)
     costs = facing_costs(candidates, first, second, threshold_rad)

@@ -83,5 +83,6 @@ def _linearised(pose: Rigid3, first: FloatArray, second: FloatArray) -> tuple[Fl
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return a × b, (..., 3), without the general case of numpy's, which costs more than the product itself."""
-    (a0, a1, a2), (b0, b1, b2) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
+    a0, a1, a2 = a[..., 0], a[..., 1], a[..., 2]
+    b0, b1, b2 = b[..., 0], b[..., 1], b[..., 2]
     return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-1)
