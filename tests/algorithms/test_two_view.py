@@ -6,14 +6,9 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.two_view import estimate_two_view, verify_pair
-from pano_mvs.algorithms.two_view.essential import (
-    essential_from_bearings,
-    in_front,
-    poses_from_essential,
-    sampson_angles,
-)
+from pano_mvs.algorithms.two_view.essential import essential_from_bearings, sampson_angles
 from pano_mvs.algorithms.two_view.redirection import best_redirected
-from pano_mvs.algorithms.two_view.refinement import _linearised, _moved, pose_uncertainty, tangent_basis
+from pano_mvs.algorithms.two_view.refinement import _linearised, pose_uncertainty, tangent_basis
 from pano_mvs.algorithms.two_view.rotation_only import estimate_rotation
 from pano_mvs.algorithms.two_view.significance import independent_count, log10_false_alarms
 from pano_mvs.core.errors import UsageError
@@ -25,6 +20,7 @@ from tests.algorithms.synthetic_capture import (
     random_rotation,
     synthetic_matches,
 )
+from tests.oracles.two_view import in_front, moved_pose, poses_from_essential
 
 HARD = {
     "along x": ((0.5, 0, 0), (0, 0, 0)),
@@ -234,7 +230,7 @@ def test_derivatives_of_the_sampson_error():
     pose = Rigid3(pose.rotation, pose.translation / np.linalg.norm(pose.translation))
     jacobian = _linearised(pose, p, q)[1]
     for column, step in enumerate(1e-6 * np.eye(5)):
-        numeric = (_linearised(_moved(pose, step), p, q)[0] - _linearised(_moved(pose, -step), p, q)[0]) / 2e-6
+        numeric = (_linearised(moved_pose(pose, step), p, q)[0] - _linearised(moved_pose(pose, -step), p, q)[0]) / 2e-6
         np.testing.assert_allclose(jacobian[:, column], numeric, atol=1e-7)
 
 

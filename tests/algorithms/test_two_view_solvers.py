@@ -7,8 +7,8 @@ import pytest
 
 from pano_mvs.algorithms.two_view import estimate_two_view, verify_pair
 from pano_mvs.algorithms.two_view.cheirality import facing_costs, facing_pose
-from pano_mvs.algorithms.two_view.essential import in_front, sampson_angles
-from pano_mvs.algorithms.two_view.five_point import _MONOMIALS, _cubic_equations, essentials_from_five
+from pano_mvs.algorithms.two_view.essential import sampson_angles
+from pano_mvs.algorithms.two_view.five_point import essentials_from_five
 from pano_mvs.algorithms.two_view.hypotheses import SOLVERS, draw_samples, samples_needed
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, ranges_from_bearings, skew
@@ -19,6 +19,8 @@ from tests.algorithms.synthetic_capture import (
     synthetic_matches,
 )
 from tests.algorithms.test_two_view import HARD, draw, errors_deg, rng_of
+from tests.oracles.five_point import MONOMIALS, cubic_equations
+from tests.oracles.two_view import in_front
 
 
 def samples_of_five(rng, *, count, flat):
@@ -75,16 +77,16 @@ def test_turning_the_cameras_turns_the_solutions():
         assert min(np.linalg.norm(turned - s * matrix, axis=(1, 2)).min() for s in (1, -1)) < 1e-6
 
 
-def test_cubic_equations_are_the_constraints_of_an_essential_matrix():
+def testcubic_equations_are_the_constraints_of_an_essential_matrix():
     rng = rng_of("cubic")
     basis = rng.normal(size=(3, 4, 3, 3))
     x, y, z = unknowns = rng.normal(size=3)
     matrices = np.einsum("a,naij->nij", [*unknowns, 1.0], basis)
-    monomials = np.array([x**i * y**j * z**k for i, j, k in _MONOMIALS])
+    monomials = np.array([x**i * y**j * z**k for i, j, k in MONOMIALS])
     squares = matrices @ np.swapaxes(matrices, 1, 2)
     trace = 2 * squares @ matrices - np.trace(squares, axis1=1, axis2=2)[:, None, None] * matrices
     expected = np.concatenate([trace.reshape(3, 9), np.linalg.det(matrices)[:, None]], axis=1)
-    np.testing.assert_allclose(_cubic_equations(basis) @ monomials, expected, atol=1e-9)
+    np.testing.assert_allclose(cubic_equations(basis) @ monomials, expected, atol=1e-9)
 
 
 def test_samples_without_a_solution_give_none():

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs, facing_pose
-from pano_mvs.algorithms.two_view.essential import msac_costs
+from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs, facing_pose, least_essentials
 from pano_mvs.algorithms.two_view.five_point import essentials_from_five
 from pano_mvs.algorithms.two_view.hypotheses import draw_samples
+from pano_mvs.algorithms.two_view.redirection import voted_directions
 from pano_mvs.algorithms.two_view.refinement import refine_relative_pose
 from pano_mvs.algorithms.two_view.significance import (
     MAX_LOG10_FALSE_ALARMS,
@@ -24,15 +24,17 @@ from pano_mvs.algorithms.two_view.significance import (
     independent_count,
     log10_false_alarms,
 )
-from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle, skew
+from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-_DIRECTIONS = 300  # pairs of matches that vote for a direction, for each rotation
+_DIRECTIONS = 200  # pairs of matches that vote for a direction, for each rotation
 _TWINS = 16  # samples among the matches of a known geometry
-_FRESH = 192  # samples among the matches that no geometry explains
-_PEAKS = 6  # candidates of each kind that are refined
+_FRESH = 96  # samples among the matches that the best geometry does not explain
+_PEAKS = 6  # candidates of each kind that are settled
+_FINALISTS = 4  # candidates that are judged
+_MIN_REFINED = 8  # fewer matches are not refined on
 _MIN_OWN_RATIO = 0.6  # own independent matches, of the number that a best geometry needs
 _MIN_OWN_SHARE = 0.08  # own matches, of the number that the best geometry has
 _MIN_TURN_RAD = float(np.deg2rad(1.5))
@@ -50,7 +52,7 @@ class _Geometry:
     agreeing: BoolArray
 
 
-def runner_ups(
+def distinct_geometries(
     best: Rigid3,
     first: FloatArray,
     second: FloatArray,
@@ -60,11 +62,12 @@ def runner_ups(
     min_inliers: int,
     most: int,
 ) -> list[Rigid3]:
-    """Return relative poses beside the best one that enough other matches agree on.
+    """Return the best relative pose, and others that enough other matches agree on.
 
-    They are looked for one after the other, each among the matches that none before explains. A pose counts only if
-    the matches of its own are more than chance among those, by the same test that the best one passes; it must differ
-    from all others by 1.5° of rotation or 2.5° of direction.
+    The others are looked for one after the other, each among the matches that none before explains. A pose counts only
+    if the matches of its own are more than chance among those, by the test that the best one passes; it must differ
+    from all before by 1.5° of rotation or 2.5° of direction. The best is replaced if most of its matches lie on one
+    plane, and fit the plane's other pose together with more of the rest.
 
     Args:
         best: second_from_first of the best geometry, |t| = 1.
@@ -72,143 +75,164 @@ def runner_ups(
         second: (M, 3) unit bearings.
         rng: draws the samples.
         threshold_rad: Sampson error below which a match agrees.
-        min_inliers: independent matches that the best geometry needed; a runner-up needs 0.6 times as many of its own.
-        most: at most so many poses.
+        min_inliers: independent matches that the best geometry needed; another needs 0.6 times as many of its own, and
+            a twelfth of what the best one has.
+        most: at most so many others.
     """
-    known = [_Geometry(best, agreement(best, first, second, threshold_rad)[1])]
+    search = _Search(first, second, rng, threshold_rad, min_inliers)
+    best, twins = search.better_twin(best)
+    known = [search.geometry(best)]
+    pool = np.concatenate([twins, search.solutions(np.flatnonzero(~known[0].agreeing), _FRESH)])
     while len(known) <= most:
+        geometry = search.next_geometry(known, pool)
+        if geometry is None:
+            break
+        known.append(geometry)
+        pool = np.concatenate([pool, search.solutions(np.flatnonzero(geometry.agreeing), _TWINS)])
+    return [geometry.pose for geometry in known]
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """The search for further geometries of one pair."""
+
+    first: FloatArray
+    second: FloatArray
+    rng: np.random.Generator
+    threshold_rad: float
+    min_inliers: int
+
+    def geometry(self, pose: Rigid3) -> _Geometry:
+        """Return a pose with the matches that agree with it."""
+        return _Geometry(pose, agreement(pose, self.first, self.second, self.threshold_rad)[1])
+
+    def solutions(self, among: NDArray[np.intp], count: int) -> FloatArray:
+        """Return the essential matrices of samples of five of these matches, (N, 3, 3)."""
+        if len(among) < 5:
+            return np.zeros((0, 3, 3))
+        drawn = among[draw_samples(self.rng, len(among), batch=count, sample=5)]
+        return essentials_from_five(self.first[drawn], self.second[drawn])[0]
+
+    def better_twin(self, best: Rigid3) -> tuple[Rigid3, FloatArray]:
+        """Return the best pose or, if it costs less, another that its matches allow, and all that they allow."""
+        twins = self.solutions(np.flatnonzero(self.geometry(best).agreeing), _TWINS)
+        order = self.rng.permutation(len(self.first))
+        p, q = self.first[order], self.second[order]
+        poses = [best]
+        for essential in least_essentials(twins, p, q, 2 * self.threshold_rad, count=_PEAKS):
+            rough = facing_pose(essential, p, q, 2 * self.threshold_rad)
+            if _differ(rough, best):
+                poses.append(self._settled(rough, p, q, (2.0, 1.0)))
+        costs = facing_costs(poses, self.first, self.second, self.threshold_rad)
+        return poses[int(np.argmin(costs))], twins
+
+    def next_geometry(self, known: Sequence[_Geometry], pool: FloatArray) -> _Geometry | None:
+        """Return the geometry with most matches of its own, if there is one for which they are more than chance."""
         searched = ~np.any([geometry.agreeing for geometry in known], axis=0)
-        needed = max(_MIN_OWN_RATIO * min_inliers, _MIN_OWN_SHARE * float(known[0].agreeing.sum()))
-        found = [
-            _Geometry(pose, agreement(pose, first, second, threshold_rad)[1])
-            for pose in _candidates([geometry.pose for geometry in known], searched, first, second, rng, threshold_rad)
+        needed = max(_MIN_OWN_RATIO * self.min_inliers, _MIN_OWN_SHARE * float(known[0].agreeing.sum()))
+        rest = self.rng.permutation(np.flatnonzero(searched))
+        if len(rest) < needed:
+            return None
+        p, q = self.first[rest], self.second[rest]
+        rough = [
+            self._settled(pose, p, q, (3.0, 2.0))
+            for pose in self._candidates(known, pool, p, q)
+            if agreement(pose, p, q, 3 * self.threshold_rad)[1].sum() >= needed
         ]
-        found = [geometry for geometry in found if _is_other(geometry, known, searched)]
-        if not found:
-            break
-        chosen = max(found, key=lambda geometry: int((geometry.agreeing & searched).sum()))
-        if not _significant(chosen, known, searched, first, second, needed, rng, threshold_rad):
-            break
-        known.append(chosen)
-    return [geometry.pose for geometry in known[1:]]
+        support = [int(agreement(pose, p, q, 1.5 * self.threshold_rad)[1].sum()) for pose in rough]
+        chosen: list[Rigid3] = []
+        for idx in np.argsort(support, kind="stable")[::-1]:
+            if support[idx] < needed or len(chosen) == _FINALISTS:
+                break
+            if all(_differ(rough[idx], other) for other in chosen):
+                chosen.append(rough[idx])
+        found = [self.geometry(self._settled(pose, self.first, self.second, (1.5, 1.0))) for pose in chosen]
+        found.sort(key=lambda geometry: -int((geometry.agreeing & searched).sum()))
+        for geometry in found:
+            if _is_other(geometry, known, searched) and self._significant(geometry, known, searched, needed):
+                return geometry
+        return None
+
+    def _candidates(self, known: Sequence[_Geometry], pool: FloatArray, p: FloatArray, q: FloatArray) -> list[Rigid3]:
+        """Return poses that some of the unexplained matches, p and q, agree on.
+
+        Of two kinds: the known rotations, with the directions that pairs of these matches vote for; and the essential
+        matrices of the pool.
+        """
+        found: list[Rigid3] = []
+        wide_rad = 2 * self.threshold_rad  # the rotation is not quite right for these matches yet
+        for rotation in _distinct_rotations(known):
+            directions, costs = voted_directions(rotation, p, q, rng=self.rng, threshold_rad=wide_rad, count=_DIRECTIONS)
+            found += [Rigid3(rotation, direction) for direction in _peaks(directions, costs)]
+        finalists = least_essentials(pool, p, q, wide_rad, count=_PEAKS)
+        return found + [facing_pose(essential, p, q, wide_rad) for essential in finalists]
+
+    def _settled(self, pose: Rigid3, p: FloatArray, q: FloatArray, widths: Sequence[float]) -> Rigid3:
+        """Refine on the matches of ever narrower bands, in units of the threshold."""
+        for widen in widths:
+            near = agreement(pose, p, q, widen * self.threshold_rad)[1]
+            if near.sum() < _MIN_REFINED:
+                break
+            scale_rad = 0.5 * widen * self.threshold_rad
+            pose = refine_relative_pose(pose, p[near], q[near], scale_rad=scale_rad, max_iterations=6)
+        return pose
+
+    def _significant(
+        self, geometry: _Geometry, known: Sequence[_Geometry], searched: BoolArray, needed: float
+    ) -> bool:
+        own = geometry.agreeing & searched
+        own_p, own_q = self.first[own], self.second[own]
+        witnesses = independent_count(own_p, own_q) if own.any() else 0
+        if witnesses < needed:
+            return False
+        p, q = self.first[searched], self.second[searched]
+        turn = min(float(geodesic_angle(geometry.pose.rotation, other.pose.rotation)) for other in known)
+        # Two matches determine the direction where the rotation is known already.
+        sample, models = (2, 1) if turn < _SAME_ROTATION_RAD else (5, 10)
+        false_alarms = log10_false_alarms(
+            witnesses,
+            max(independent_count(p, q), witnesses),
+            chance=max(
+                chance_of_pose(geometry.pose, *rays, rng=self.rng, threshold_rad=self.threshold_rad)
+                for rays in ((p, q), (own_p, own_q))
+            ),
+            sample=sample,
+            models_per_sample=models,
+        )
+        return false_alarms <= MAX_LOG10_FALSE_ALARMS
 
 
 def _is_other(geometry: _Geometry, known: Sequence[_Geometry], searched: BoolArray) -> bool:
     """Return whether a geometry is none of the known ones, nor one of them bent towards some more matches."""
     mostly_own = 2 * (geometry.agreeing & searched).sum() > geometry.agreeing.sum()
     for other in known:
+        if not _differ(geometry.pose, other.pose):
+            return False
         turn = float(geodesic_angle(geometry.pose.rotation, other.pose.rotation))
         between = float(angle_between(geometry.pose.translation, other.pose.translation))
-        if turn < _MIN_TURN_RAD and between < _MIN_DIRECTION_RAD:
-            return False
         if turn < _VARIANT_TURN_RAD and between < _VARIANT_DIRECTION_RAD and not mostly_own:
             return False
     return True
 
 
-def _significant(
-    geometry: _Geometry,
-    known: Sequence[_Geometry],
-    searched: BoolArray,
-    first: FloatArray,
-    second: FloatArray,
-    needed: float,
-    rng: np.random.Generator,
-    threshold_rad: float,
-) -> bool:
-    own = geometry.agreeing & searched
-    witnesses = independent_count(first[own], second[own]) if own.any() else 0
-    if witnesses < needed:
-        return False
-    turns = [float(geodesic_angle(geometry.pose.rotation, other.pose.rotation)) for other in known]
-    # Two matches determine the direction where the rotation is known already.
-    sample, models = (2, 1) if min(turns) < _SAME_ROTATION_RAD else (5, 10)
-    false_alarms = log10_false_alarms(
-        witnesses,
-        max(independent_count(first[searched], second[searched]), witnesses),
-        chance=max(
-            chance_of_pose(geometry.pose, first[among], second[among], rng=rng, threshold_rad=threshold_rad)
-            for among in (searched, own)
-        ),
-        sample=sample,
-        models_per_sample=models,
-    )
-    return false_alarms <= MAX_LOG10_FALSE_ALARMS
+def _differ(pose: Rigid3, other: Rigid3) -> bool:
+    turn = float(geodesic_angle(pose.rotation, other.rotation))
+    return turn > _MIN_TURN_RAD or float(angle_between(pose.translation, other.translation)) > _MIN_DIRECTION_RAD
 
 
-def _candidates(
-    known: Sequence[Rigid3],
-    searched: BoolArray,
-    first: FloatArray,
-    second: FloatArray,
-    rng: np.random.Generator,
-    threshold_rad: float,
-) -> list[Rigid3]:
-    """Return poses that some of the unexplained matches agree on.
-
-    Of three kinds: the known rotations, with the directions that pairs of unexplained matches vote for; the solutions
-    of five explained matches, since the matches of one plane fit two geometries; those of five unexplained ones.
-    """
-    rest = np.flatnonzero(searched)
-    if len(rest) < 5:
-        return []
-    p, q = first[rest], second[rest]
-    rough: list[Rigid3] = []
-    for rotation in _distinct_rotations(known):
-        rough += _redirections(rotation, p, q, rng, threshold_rad)
-    for among, count in ((np.flatnonzero(~searched), _TWINS), (rest, _FRESH)):
-        drawn = among[draw_samples(rng, len(among), batch=count, sample=5)]
-        essentials = essentials_from_five(first[drawn], second[drawn])[0]
-        costs = msac_costs(essentials, p, q, 2 * threshold_rad)
-        best = essentials[np.argsort(costs, kind="stable")[:_PEAKS]]
-        rough += [facing_pose(essential, p, q, 2 * threshold_rad) for essential in best]
-    return [_settled(pose, first, second, rest, threshold_rad) for pose in rough]
-
-
-def _distinct_rotations(poses: Sequence[Rigid3]) -> list[FloatArray]:
+def _distinct_rotations(known: Sequence[_Geometry]) -> list[FloatArray]:
     kept: list[FloatArray] = []
-    for pose in poses:
-        if all(geodesic_angle(pose.rotation, other) > _MIN_TURN_RAD for other in kept):
-            kept.append(pose.rotation)
+    for geometry in known:
+        if all(geodesic_angle(geometry.pose.rotation, other) > _MIN_TURN_RAD for other in kept):
+            kept.append(geometry.pose.rotation)
     return kept
 
 
-def _redirections(
-    rotation: FloatArray, p: FloatArray, q: FloatArray, rng: np.random.Generator, threshold_rad: float
-) -> list[Rigid3]:
-    """Return poses of this rotation with the directions that most matches vote for.
-
-    A match allows the directions of a great circle, t · (R p × q) = 0; two matches meet in t ∝ n₁ × n₂.
-    """
-    normals = np.cross(p @ rotation.T, q)
-    pairs = rng.integers(len(p), size=(_DIRECTIONS, 2))
-    directions = np.cross(normals[pairs[:, 0]], normals[pairs[:, 1]])
-    lengths = np.linalg.norm(directions, axis=1)
-    directions = directions[lengths > 1e-12] / lengths[lengths > 1e-12, None]
-    # The rotation is not quite right for these matches yet, so the band is wider.
-    costs = msac_costs(skew(directions) @ rotation, p, q, 2 * threshold_rad)
+def _peaks(directions: FloatArray, costs: FloatArray) -> list[FloatArray]:
+    """Return the directions of least cost of which none is near another."""
+    left = directions[np.argsort(costs, kind="stable")]
     kept: list[FloatArray] = []
-    for direction in directions[np.argsort(costs, kind="stable")]:
-        if all(abs(direction @ other) < np.cos(_MIN_DIRECTION_RAD) for other in kept):
-            kept.append(direction)
-            if len(kept) == _PEAKS:
-                break
-    found = []
-    for direction in kept:
-        two = [Rigid3(rotation, direction), Rigid3(rotation, -direction)]
-        found.append(two[int(np.argmin(facing_costs(two, p, q, 2 * threshold_rad)))])
-    return found
-
-
-def _settled(
-    pose: Rigid3, first: FloatArray, second: FloatArray, rest: NDArray[np.intp], threshold_rad: float
-) -> Rigid3:
-    """Refine on the unexplained matches, then on all that agree."""
-    everything = np.arange(len(first))
-    for among, widen in ((rest, 3.0), (rest, 2.0), (everything, 1.5), (everything, 1.0)):
-        p, q = first[among], second[among]
-        near = agreement(pose, p, q, widen * threshold_rad)[1]
-        if near.sum() < 8:
-            break
-        pose = refine_relative_pose(pose, p[near], q[near], scale_rad=0.5 * widen * threshold_rad, max_iterations=6)
-    return pose
+    while len(left) and len(kept) < _PEAKS:
+        kept.append(left[0])
+        left = left[left @ left[0] < np.cos(_MIN_DIRECTION_RAD)]
+    return kept

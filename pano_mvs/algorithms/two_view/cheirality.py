@@ -1,4 +1,4 @@
-"""Which side of the cameras matches lie on, and what that says of a hypothesis."""
+"""Which matches agree with a relative pose: small errors, and in front of both cameras."""
 
 from __future__ import annotations
 
@@ -7,53 +7,90 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.two_view.essential import in_front, poses_from_essential, sampson_angles
-from pano_mvs.geometry import Rigid3, angle_between, skew
+from pano_mvs.geometry import Rigid3
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 
 def facing_pose(essential: FloatArray, first: FloatArray, second: FloatArray, threshold_rad: float) -> Rigid3:
     """Return the decomposition of an essential matrix with most inliers in front of both cameras.
 
     Args:
-        essential: (3, 3).
+        essential: (3, 3), of any scale.
         first: (M, 3) unit bearings.
         second: (M, 3) unit bearings.
         threshold_rad: Sampson error below which a match is an inlier.
     """
-    inliers = sampson_angles(essential, first, second) < threshold_rad
-    poses = poses_from_essential(essential)
-    return max(poses, key=lambda pose: int(in_front(first[inliers], second[inliers], pose).sum()))
+    from pano_mvs.algorithms.two_view.kernels_agreement import decompose_facing
 
-
-def plausible(first: FloatArray, second: FloatArray, pose: Rigid3, threshold_rad: float) -> NDArray[np.bool_]:
-    """Return which matches lie in front of both cameras, or so far away that noise decides their sign, (M,)."""
-    far = angle_between(first @ pose.rotation.T, second) < 2 * threshold_rad
-    accepted: NDArray[np.bool_] = far | in_front(first, second, pose)
-    return accepted
+    rotation, translation = np.empty((3, 3)), np.empty(3)
+    scaled = np.ascontiguousarray(essential * (np.sqrt(2) / np.linalg.norm(essential)))
+    decompose_facing(scaled, _rows(first), _rows(second), threshold_rad, rotation, translation)
+    return Rigid3(rotation, translation)
 
 
 def agreement(
     pose: Rigid3, first: FloatArray, second: FloatArray, threshold_rad: float
-) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Return the Sampson errors, (M,), and which matches agree: a small error, and in front of both cameras."""
-    residuals = sampson_angles(skew(pose.translation) @ pose.rotation, first, second)
-    agreeing: NDArray[np.bool_] = (residuals < threshold_rad) & plausible(first, second, pose, threshold_rad)
+) -> tuple[FloatArray, BoolArray]:
+    """Return the Sampson errors, (M,), and which matches agree with a pose, |t| = 1.
+
+    A match agrees if its error is small and it lies in front of both cameras, or so far away (the angle between its
+    rays is below twice the threshold) that noise decides on which side.
+    """
+    from pano_mvs.algorithms.two_view.kernels_agreement import pose_residuals
+
+    residuals, agreeing = np.empty(len(first)), np.empty(len(first), np.bool_)
+    pose_residuals(*_parts(pose), _rows(first), _rows(second), threshold_rad, residuals, agreeing)
     return residuals, agreeing
 
 
-def facing_costs(
-    poses: Sequence[Rigid3], first: FloatArray, second: FloatArray, threshold_rad: float
-) -> NDArray[np.float64]:
+def facing_costs(poses: Sequence[Rigid3], first: FloatArray, second: FloatArray, threshold_rad: float) -> FloatArray:
     """Return Σ min(r² / threshold², 1) for each pose, where a match behind a camera costs 1.
 
     The matches of one plane fit two essential matrices exactly; what lies behind the cameras tells them apart.
     """
-    essentials = np.array([skew(pose.translation) @ pose.rotation for pose in poses])
-    costs = np.minimum((sampson_angles(essentials, first, second) / threshold_rad) ** 2, 1.0)
-    for cost, pose in zip(costs, poses, strict=True):
-        near = np.flatnonzero(cost < 1)
-        cost[near[~plausible(first[near], second[near], pose, threshold_rad)]] = 1.0
-    total: FloatArray = costs.sum(axis=1)
-    return total
+    from pano_mvs.algorithms.two_view.kernels_agreement import pose_cost
+
+    p, q = _rows(first), _rows(second)
+    return np.array([pose_cost(*_parts(pose), p, q, threshold_rad) for pose in poses])
+
+
+def least_essentials(
+    essentials: FloatArray,
+    first: FloatArray,
+    second: FloatArray,
+    threshold_rad: float,
+    *,
+    limit: float = np.inf,
+    count: int,
+) -> FloatArray:
+    """Return the essential matrices of least Σ min(r² / threshold², 1), wherever the matches lie.
+
+    A matrix that lags behind after a few matches is given up; one in a thousand that would have led goes with them.
+
+    Args:
+        essentials: (N, 3, 3).
+        first: (M, 3) unit bearings in random order.
+        second: (M, 3) unit bearings.
+        threshold_rad: Sampson error from which a match costs 1.
+        limit: only those that cost less.
+        count: at most so many.
+
+    Returns:
+        (K, 3, 3), K ≤ count, best first.
+    """
+    from pano_mvs.algorithms.two_view.kernels_agreement import rank_essentials
+
+    best, costs = np.empty(count, np.int64), np.empty(count)
+    rank_essentials(_rows(essentials), _rows(first), _rows(second), threshold_rad, limit, best, costs)
+    return essentials[best[best >= 0]]
+
+
+def _parts(pose: Rigid3) -> tuple[FloatArray, FloatArray]:
+    return _rows(pose.rotation), _rows(pose.translation)
+
+
+def _rows(array: FloatArray) -> FloatArray:
+    """Return an array as the kernels take it: float64 in C order."""
+    return np.ascontiguousarray(array, np.float64)

@@ -1,16 +1,13 @@
-"""The essential matrix on the sphere: residual, linear solution, decomposition."""
+"""The essential matrix on the sphere: residual and linear solution."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.geometry import Rigid3
-
 FloatArray = NDArray[np.float64]
 
 _DIAGONAL = np.array([1.0, 1.0, 0.0])
-_QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def sampson_angles(essentials: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
@@ -37,13 +34,6 @@ def sampson_angles(essentials: FloatArray, first: FloatArray, second: FloatArray
     return residuals.reshape(*essentials.shape[:-2], len(first))
 
 
-def msac_costs(essentials: FloatArray, first: FloatArray, second: FloatArray, threshold_rad: float) -> FloatArray:
-    """Return Σ min(r² / threshold², 1) over all matches, for each of the essential matrices (..., 3, 3)."""
-    residuals = sampson_angles(essentials, first, second)
-    costs: FloatArray = np.sum(np.minimum((residuals / threshold_rad) ** 2, 1.0), axis=-1)
-    return costs
-
-
 def essential_from_bearings(first: FloatArray, second: FloatArray) -> FloatArray:
     """Return the essential matrices that solve qᵀ E p = 0 in the least-squares sense (8-point method).
 
@@ -61,27 +51,6 @@ def essential_from_bearings(first: FloatArray, second: FloatArray) -> FloatArray
     u, _, vt = np.linalg.svd(vectors[..., 0].reshape(*products.shape[:-2], 3, 3))
     essential: FloatArray = (u * _DIAGONAL) @ vt
     return essential
-
-
-def poses_from_essential(essential: FloatArray) -> list[Rigid3]:
-    """Return the four second_from_first poses, |t| = 1, that share an essential matrix (3, 3)."""
-    u, _, vt = np.linalg.svd(essential)
-    u, vt = u * np.sign(np.linalg.det(u)), vt * np.sign(np.linalg.det(vt))
-    rotations = (u @ _QUARTER_TURN @ vt, u @ _QUARTER_TURN.T @ vt)
-    return [Rigid3(rotation, sign * u[:, 2]) for rotation in rotations for sign in (1.0, -1.0)]
-
-
-def in_front(first: FloatArray, second: FloatArray, second_from_first: Rigid3) -> NDArray[np.bool_]:
-    """Return whether each pair of rays, (M, 3) and (M, 3), meets at positive range from both centres, (M,).
-
-    The signs of `ranges_from_bearings`' numerators, with C the second centre in the first frame and q de-rotated:
-    (C × q)·(p × q) = C·p − (C·q)(p·q) and (C × p)·(p × q) = (C·p)(p·q) − C·q. Parallel rays do not meet.
-    """
-    q = second @ second_from_first.rotation
-    center = second_from_first.center
-    along_p, along_q, cosine = first @ center, q @ center, np.einsum("ni,ni->n", first, q)
-    front: NDArray[np.bool_] = (along_p > along_q * cosine) & (along_p * cosine > along_q)
-    return front
 
 
 def _products(second: FloatArray, first: FloatArray) -> FloatArray:

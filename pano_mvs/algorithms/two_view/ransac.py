@@ -7,20 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.two_view.cheirality import facing_costs, facing_pose, plausible
-from pano_mvs.algorithms.two_view.essential import essential_from_bearings, msac_costs, sampson_angles
+from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs, facing_pose, least_essentials
+from pano_mvs.algorithms.two_view.essential import essential_from_bearings
 from pano_mvs.algorithms.two_view.hypotheses import SOLVERS, MinimalSolver, Solver, draw_samples, samples_needed
 from pano_mvs.algorithms.two_view.redirection import best_redirected
 from pano_mvs.algorithms.two_view.refinement import refine_relative_pose
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import Rigid3, skew
+from pano_mvs.geometry import Rigid3
 
 FloatArray = NDArray[np.float64]
 
 _MIN_MATCHES = 16
 _MIN_INLIERS = 8
-_SCREEN = 400  # matches on which all hypotheses of a batch are compared
-_FINALISTS = 4  # hypotheses of a batch that are compared on all matches
+_FINALISTS = 4  # hypotheses of a batch whose sides are looked at
 _LEADERS = 6  # hypotheses that are given new directions
 _POLISH = 1000  # inliers on which a leader is polished
 
@@ -88,7 +87,9 @@ def estimate_two_view(
         raise UsageError(f"there is no solver {solver!r}; choose one of {', '.join(SOLVERS)}")
     if len(first) < _MIN_MATCHES:
         return _none(len(first), f"only {len(first)} matches, {_MIN_MATCHES} needed for a hypothesis")
-    search = _Search(first, second, rng, threshold_rad, SOLVERS[solver], optimise=refine)
+    # Hypotheses are given up after a few matches, which must be any.
+    order = rng.permutation(len(first))
+    search = _Search(first[order], second[order], rng, threshold_rad, SOLVERS[solver], optimise=refine)
     leaders, iterations = search.run(confidence=confidence, max_iterations=max_iterations)
     if not leaders:
         return _none(len(first), "no sample of matches determines a relative pose")
@@ -98,8 +99,7 @@ def estimate_two_view(
         pose = _refined(pose, first, second, threshold_rad)
     if pose is None:
         return _none(len(first), "no relative pose is shared by eight matches")
-    residuals = sampson_angles(skew(pose.translation) @ pose.rotation, first, second)
-    inliers = (residuals < threshold_rad) & plausible(first, second, pose, threshold_rad)
+    residuals, inliers = agreement(pose, first, second, threshold_rad)
     return RelativePose(pose, inliers, residuals, iterations)
 
 
@@ -110,8 +110,7 @@ def _none(count: int, reason: str) -> RelativePose:
 def _refined(pose: Rigid3, first: FloatArray, second: FloatArray, threshold_rad: float) -> Rigid3 | None:
     """Minimise the angular error over the matches around the inliers; None if fewer than eight are left."""
     for _ in range(3):
-        residuals = sampson_angles(skew(pose.translation) @ pose.rotation, first, second)
-        near = (residuals < 2 * threshold_rad) & plausible(first, second, pose, threshold_rad)
+        residuals, near = agreement(pose, first, second, 2 * threshold_rad)
         if near.sum() < _MIN_INLIERS:
             return None
         core = residuals[near & (residuals < threshold_rad)]
@@ -159,15 +158,13 @@ class _Search:
         hypotheses = self.solver.solve(self.first[drawn], self.second[drawn])
         if not len(hypotheses):
             return None, np.inf, 0
-        screen = self.rng.choice(size, min(_SCREEN, size), replace=False)
-        p, q = self.first[screen], self.second[screen]
-        screened = msac_costs(hypotheses, p, q, self.threshold_rad)
-        finalists = hypotheses[np.argsort(screened, kind="stable")[:_FINALISTS]]
         # What a hypothesis costs without a look at the sides is the least that it can cost.
-        finalists = finalists[msac_costs(finalists, self.first, self.second, self.threshold_rad) < worst]
+        finalists = least_essentials(
+            hypotheses, self.first, self.second, self.threshold_rad, limit=worst, count=_FINALISTS
+        )
         if not len(finalists):
             return None, np.inf, len(hypotheses)
-        poses = [facing_pose(essential, p, q, self.threshold_rad) for essential in finalists]
+        poses = [facing_pose(essential, self.first, self.second, self.threshold_rad) for essential in finalists]
         costs = facing_costs(poses, self.first, self.second, self.threshold_rad)
         return poses[int(np.argmin(costs))], float(costs.min()), len(hypotheses)
 
@@ -209,4 +206,4 @@ class _Search:
         return found
 
     def _residuals(self, pose: Rigid3) -> FloatArray:
-        return sampson_angles(skew(pose.translation) @ pose.rotation, self.first, self.second)
+        return agreement(pose, self.first, self.second, self.threshold_rad)[0]

@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view.cheirality import facing_costs
-from pano_mvs.algorithms.two_view.essential import in_front, msac_costs, sampson_angles
-from pano_mvs.algorithms.two_view.refinement import refine_relative_pose
-from pano_mvs.geometry import Rigid3, skew
+from pano_mvs.algorithms.two_view.refinement import cross, refine_relative_pose
+from pano_mvs.geometry import Rigid3
 
 FloatArray = NDArray[np.float64]
 
@@ -37,7 +36,8 @@ def best_redirected(
     candidates = list(poses)
     for pose in poses:
         moved = pose
-        for _ in range(_ROUNDS):
+        # A single pose is that of a search which was sure of it.
+        for _ in range(_ROUNDS if len(poses) > 1 else 1):
             moved = _redirected(moved, first, second, rng=rng, threshold_rad=threshold_rad)
             candidates.append(moved)
     costs = facing_costs(candidates, first, second, threshold_rad)
@@ -49,27 +49,48 @@ def _redirected(
 ) -> Rigid3:
     chosen = rng.choice(len(first), min(_MATCHES, len(first)), replace=False)
     p, q = first[chosen], second[chosen]
-    normals = np.cross(p @ pose.rotation.T, q)
-    pairs = rng.integers(len(p), size=(_DIRECTIONS, 2))
-    directions = np.cross(normals[pairs[:, 0]], normals[pairs[:, 1]])
-    lengths = np.linalg.norm(directions, axis=1)
-    directions = np.concatenate([pose.translation[None], directions[lengths > 1e-12] / lengths[lengths > 1e-12, None]])
-    essentials = skew(directions) @ pose.rotation
-    # The rotation is not quite right yet, so the band is wider.
-    direction = directions[int(np.argmin(msac_costs(essentials, p, q, 2 * threshold_rad)))]
-    found = Rigid3(pose.rotation, direction)
+    directions, costs = voted_directions(pose.rotation, p, q, rng=rng, threshold_rad=2 * threshold_rad)
+    directions = np.concatenate([pose.translation[None], directions])
+    costs = np.concatenate([facing_costs([pose], p, q, 2 * threshold_rad), costs])
+    found = Rigid3(pose.rotation, directions[int(np.argmin(costs))])
     for widen in (2.0, 0.5):
         found = refine_relative_pose(found, p, q, scale_rad=widen * threshold_rad, max_iterations=_STEPS)
-    near = sampson_angles(_essential(found), p, q) < threshold_rad
-    return _facing(found, p[near], q[near])
+    opposite = Rigid3(found.rotation, -found.translation)
+    costs = facing_costs([found, opposite], p, q, threshold_rad)
+    return found if costs[0] <= costs[1] else opposite
 
 
-def _facing(pose: Rigid3, p: FloatArray, q: FloatArray) -> Rigid3:
-    """Return the pose with the sign of the translation for which most points lie in front (the error has none)."""
-    opposite = Rigid3(pose.rotation, -pose.translation)
-    return pose if in_front(p, q, pose).sum() >= in_front(p, q, opposite).sum() else opposite
+def voted_directions(
+    rotation: FloatArray,
+    p: FloatArray,
+    q: FloatArray,
+    *,
+    rng: np.random.Generator,
+    threshold_rad: float,
+    count: int = _DIRECTIONS,
+) -> tuple[FloatArray, FloatArray]:
+    """Return directions of translation that pairs of matches vote for, (N, 3), and what each costs, (N,).
 
+    With the rotation known a match allows the directions of a great circle, t · (R p × q) = 0, and two matches meet
+    in t ∝ n₁ × n₂; of t and −t the one is taken for which more matches lie in front of the cameras.
 
-def _essential(pose: Rigid3) -> FloatArray:
-    matrix: FloatArray = skew(pose.translation) @ pose.rotation
-    return matrix
+    Args:
+        rotation: (3, 3) of second_from_first.
+        p: (M, 3) unit bearings in the first image.
+        q: (M, 3) unit bearings in the second.
+        rng: draws the pairs.
+        threshold_rad: Sampson error from which a match costs 1; wide enough for what the rotation is wrong by.
+        count: number of pairs.
+    """
+    from pano_mvs.algorithms.two_view.kernels_agreement import direction_costs
+
+    rotated = p @ rotation.T
+    normals = cross(rotated, q)
+    pairs = rng.integers(len(p), size=(count, 2))
+    directions = cross(normals[pairs[:, 0]], normals[pairs[:, 1]])
+    lengths = np.linalg.norm(directions, axis=1)
+    directions = directions[lengths > 1e-12] / lengths[lengths > 1e-12, None]
+    costs = np.empty((len(directions), 2))
+    direction_costs(rotated, np.ascontiguousarray(q), directions, threshold_rad, costs)
+    signs = np.where(costs[:, 0] <= costs[:, 1], 1.0, -1.0)
+    return directions * signs[:, None], costs.min(axis=1)

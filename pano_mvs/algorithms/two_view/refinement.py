@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.geometry import Rigid3, rotation_from_rotvec, skew
+from pano_mvs.geometry import Rigid3, skew
 
 FloatArray = NDArray[np.float64]
 
@@ -26,26 +24,12 @@ def refine_relative_pose(
         scale_rad: residual at which the weight has fallen to a half.
         max_iterations: at most so many steps.
     """
-    residuals, jacobian = _linearised(pose, first, second)
-    cost = _cost(residuals, scale_rad)
-    for _ in range(max_iterations):
-        weights = 1 / (1 + (residuals / scale_rad) ** 2)
-        hessian = (jacobian * weights[:, None]).T @ jacobian
-        hessian += 1e-9 * np.trace(hessian) * np.eye(5)
-        step = -np.linalg.solve(hessian, jacobian.T @ (weights * residuals))
-        for shrink in (1.0, 0.3, 0.1, 0.01):
-            moved = _moved(pose, shrink * step)
-            moved_residuals, moved_jacobian = _linearised(moved, first, second)
-            moved_cost = _cost(moved_residuals, scale_rad)
-            if moved_cost < cost:
-                break
-        else:
-            break
-        gain = cost - moved_cost
-        pose, residuals, jacobian, cost = moved, moved_residuals, moved_jacobian, moved_cost
-        if gain < 1e-10 * cost:
-            break
-    return pose
+    from pano_mvs.algorithms.two_view.kernels_refinement import refine_pose
+
+    rotation, translation = pose.rotation.astype(np.float64), pose.translation.astype(np.float64)
+    p, q = np.ascontiguousarray(first, np.float64), np.ascontiguousarray(second, np.float64)
+    refine_pose(rotation, translation, p, q, scale_rad, max_iterations)
+    return Rigid3(rotation, translation)
 
 
 def pose_uncertainty(pose: Rigid3, first: FloatArray, second: FloatArray, *, noise_rad: float) -> tuple[float, float]:
@@ -69,9 +53,9 @@ def pose_uncertainty(pose: Rigid3, first: FloatArray, second: FloatArray, *, noi
 def tangent_basis(directions: FloatArray) -> FloatArray:
     """Return two unit vectors that are normal to each direction and to one another; (..., 3) to (..., 3, 2)."""
     axis = np.eye(3)[np.argmin(np.abs(directions), axis=-1)]
-    u = _cross(directions, axis)
+    u = cross(directions, axis)
     u /= np.linalg.norm(u, axis=-1, keepdims=True)
-    basis: FloatArray = np.stack([u, _cross(directions, u)], axis=-1)
+    basis: FloatArray = np.stack([u, cross(directions, u)], axis=-1)
     return basis
 
 
@@ -87,7 +71,7 @@ def _linearised(pose: Rigid3, first: FloatArray, second: FloatArray) -> tuple[Fl
     e = np.sum(q * t_cross_a, axis=1)
     squared = np.maximum(2 - t_dot_a**2 - t_dot_q**2 - 2 * e**2, 1e-12)
     e_by_omega = t_dot_a[:, None] * q - np.sum(q * a, axis=1)[:, None] * t
-    e_by_t = _cross(a, q)
+    e_by_t = cross(a, q)
     d_by_omega = 2 * t_dot_a[:, None] * t_cross_a - 4 * e[:, None] * e_by_omega
     d_by_t = -2 * (t_dot_a[:, None] * a + t_dot_q[:, None] * q) - 4 * e[:, None] * e_by_t
     root = np.sqrt(squared)[:, None]
@@ -97,16 +81,8 @@ def _linearised(pose: Rigid3, first: FloatArray, second: FloatArray) -> tuple[Fl
     return e / root[:, 0], e_by / root - 0.5 * e[:, None] * d_by / root**3
 
 
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return a × b, (..., 3), without the general case of numpy's, which costs more than the product itself."""
-    (a0, a1, a2), (b0, b1, b2) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
+    a0, a1, a2 = a[..., 0], a[..., 1], a[..., 2]
+    b0, b1, b2 = b[..., 0], b[..., 1], b[..., 2]
     return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-1)
-
-
-def _moved(pose: Rigid3, step: NDArray[np.floating[Any]]) -> Rigid3:
-    translation = pose.translation + tangent_basis(pose.translation) @ step[3:]
-    return Rigid3(rotation_from_rotvec(step[:3]) @ pose.rotation, translation / np.linalg.norm(translation))
-
-
-def _cost(residuals: FloatArray, scale_rad: float) -> float:
-    return float(np.sum(np.log1p((residuals / scale_rad) ** 2)))

@@ -25,13 +25,12 @@ def estimate_rotation(
         rng: draws the samples.
         threshold_rad: angle between the turned and the seen ray below which a match agrees.
     """
+    from pano_mvs.algorithms.two_view.kernels_agreement import best_turn
+
     samples = rng.integers(len(first), size=(_SAMPLES, 2))
-    rotations = nearest_rotation(np.swapaxes(second[samples], 1, 2) @ first[samples])
+    rotation = np.eye(3)
     squared_chord = (2 * np.sin(threshold_rad / 2)) ** 2
-    # |q − R p|² = 2 − 2 q·R p, and q·R p is one matrix product for all samples.
-    products = (second[:, :, None] * first[:, None, :]).reshape(-1, 9)
-    agreeing = (2 - 2 * rotations.reshape(-1, 9) @ products.T < squared_chord).sum(axis=1)
-    rotation = rotations[np.argmax(agreeing)]
+    best_turn(np.ascontiguousarray(first), np.ascontiguousarray(second), samples, squared_chord, rotation)
     for _ in range(4):
         inliers = angle_between(first @ rotation.T, second) < threshold_rad
         if inliers.sum() < 2:

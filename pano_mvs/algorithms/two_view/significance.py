@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-from pano_mvs.algorithms.two_view.essential import in_front, sampson_angles
-from pano_mvs.geometry import Rigid3, skew
+from pano_mvs.geometry import Rigid3
 
 FloatArray = NDArray[np.float64]
 
@@ -38,44 +35,35 @@ def log10_false_alarms(
     return float((trials + (inliers - sample) * np.log(max(chance, 1e-12))) / np.log(10))
 
 
-def chance_of_agreement(
-    agrees: Callable[[FloatArray, FloatArray], NDArray[np.bool_]],
+def chance_of_pose(
+    pose: Rigid3,
     first: FloatArray,
     second: FloatArray,
     *,
     rng: np.random.Generator,
+    threshold_rad: float,
     draws: int = 20_000,
 ) -> float:
-    """Return the probability that a wrong match agrees with a model, measured on shuffled matches.
+    """Return the probability that a wrong match agrees with a relative pose, measured on shuffled matches.
 
     Key points crowd (near the horizon, say), and so do epipolar circles; the share of shuffled matches that agree
     takes both into account where a formula for even spread would not.
 
     Args:
-        agrees: tells which of paired rays, (N, 3) and (N, 3), agree with the model.
+        pose: second_from_first, |t| = 1.
         first: (M, 3) bearings of the matches in the first image.
         second: (M, 3) in the second.
         rng: draws the pairs.
-        draws: how many.
+        threshold_rad: Sampson error below which a match agrees, if it lies in front of both cameras.
+        draws: how many pairs.
     """
+    from pano_mvs.algorithms.two_view.kernels_agreement import count_chance
+
     pairs = rng.integers(len(first), size=(draws, 2))
-    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
-    agreeing = int(agrees(first[pairs[:, 0]], second[pairs[:, 1]]).sum())
-    return (agreeing + 1) / (len(pairs) + 1)
-
-
-def chance_of_pose(
-    pose: Rigid3, first: FloatArray, second: FloatArray, *, rng: np.random.Generator, threshold_rad: float
-) -> float:
-    """Return the probability that a wrong match agrees with a relative pose (see `chance_of_agreement`)."""
-    essential = skew(pose.translation) @ pose.rotation
-
-    def agrees(first: FloatArray, second: FloatArray) -> NDArray[np.bool_]:
-        near = sampson_angles(essential, first, second) < threshold_rad
-        near[near] = in_front(first[near], second[near], pose)
-        return near
-
-    return chance_of_agreement(agrees, first, second, rng=rng)
+    p, q = np.ascontiguousarray(first), np.ascontiguousarray(second)
+    rotation, translation = np.ascontiguousarray(pose.rotation), np.ascontiguousarray(pose.translation)
+    agreeing, drawn = count_chance(rotation, translation, p, q, pairs, threshold_rad)
+    return float((agreeing + 1) / (drawn + 1))
 
 
 def independent_count(first: FloatArray, second: FloatArray, *, cell_rad: float = 0.025) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.two_view.alternatives import runner_ups
+from pano_mvs.algorithms.two_view.alternatives import distinct_geometries
 from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs
 from pano_mvs.algorithms.two_view.hypotheses import SOLVERS, Solver
 from pano_mvs.algorithms.two_view.ransac import RelativePose, estimate_two_view
@@ -56,7 +56,7 @@ def verify_pair(
         solver: see `estimate_two_view`.
         refine: False gives the best minimal hypothesis as it comes, as the paper does.
         max_iterations: at most so many hypotheses.
-        max_alternatives: keep at most so many runner-up geometries (see `runner_ups`); 0: none. Without `refine`
+        max_alternatives: keep at most so many runner-up geometries (see `distinct_geometries`); 0: none. Without `refine`
             there are none.
 
     Returns:
@@ -85,19 +85,17 @@ def verify_pair(
     best = _judged(pose.second_from_first, pose.residuals_rad, kept, matches_idx, p, q, threshold_rad)
     if not (best and refine and max_alternatives):
         return best
-    others = runner_ups(
+    poses = distinct_geometries(
         pose.second_from_first, p, q,
         rng=rng, threshold_rad=threshold_rad, min_inliers=min_inliers, most=max_alternatives,
     )  # fmt: skip
-    views = [best]
-    for other in others:
-        residuals, agreeing = agreement(other, p, q, threshold_rad)
-        view = _judged(other, residuals, agreeing, matches_idx, p, q, threshold_rad)
+    views: list[TwoView] = []
+    for idx in np.argsort(facing_costs(poses, p, q, threshold_rad), kind="stable"):
+        residuals, agreeing = agreement(poses[idx], p, q, threshold_rad)
+        view = _judged(poses[idx], residuals, agreeing, matches_idx, p, q, threshold_rad)
         if view:
             views.append(view)
-    costs = facing_costs([Rigid3(view.rotation, view.direction) for view in views], p, q, threshold_rad)
-    ranked = [views[k] for k in np.argsort(costs, kind="stable")]
-    return ranked[0].with_alternatives(ranked[1:])
+    return views[0].with_alternatives(views[1:]) if views else best
 
 
 def _judged(
