@@ -249,10 +249,10 @@ def print_scores(scores: Mapping[str, Any], console: Console) -> None:
     """Print pose scores in a line and range scores in a table."""
     poses = scores.get("poses")
     if poses:
-        text = (f"{poses['registered']} of {poses['of']} registered, median pair error "
+        together = poses.get("registered_in_one_frame")
+        in_one_frame = "" if together is None else f" ({together} in one frame)"
+        text = (f"{poses['registered']} of {poses['of']} registered{in_one_frame}, median pair error "
                 f"{poses['median_pair_error_deg']:.3f}°")  # fmt: skip
-        if "registered_in_one_frame" in poses:
-            text += f" ({poses['registered_in_one_frame']:.0f} registered in one frame)"
         if "scale_ratio_error_max" in poses:
             text += f", translation scale ratios within {100 * poses['scale_ratio_error_max']:.2f} %"
         console.print(f"against the ground truth: {text}", highlight=False)

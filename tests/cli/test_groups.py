@@ -165,7 +165,7 @@ def _check_evaluation(pano_mvs: Command, out: Path, rooms: Path) -> None:
     assert all(view["median_relative_error"] < 0.05 for view in scores["views"].values())
     told = pano_mvs("evaluate", "run", out, "--truth", rooms / "capture" / "truth")
     assert told.code == 0, told.text
-    assert "5 of 5 registered (3 registered in one frame)" in told.flat
+    assert "5 of 5 registered (3 in one frame), median pair error" in told.flat
     assert "the poses are in 2 groups, each with a frame and a scale of its own" in told.flat
     depth = pano_mvs("evaluate", "depth", out, "--truth", rooms / "capture" / "truth", "--json")
     views = json.loads(depth.text)["views"]
