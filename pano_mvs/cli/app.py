@@ -198,11 +198,13 @@ def view_results(
     labels: Annotated[bool, typer.Option("--labels", help="Name the cameras.")] = False,
     blended: Annotated[bool, typer.Option("--blend", help="Show the cloud within a panorama.")] = False,
     backs: Annotated[bool, typer.Option("--backs", help="Show points that turn their back to the eye too.")] = False,
+    group: Annotated[int, typer.Option("--group", min=0, help="Which group of panoramas, where no reliable pair "
+                                       "connects all of them; 0 is the largest.")] = 0,
 ) -> None:  # fmt: skip
     """Look at cloud, mesh and cameras, and step inside the panoramas."""
     from pano_mvs.cli.view_command import ViewOptions, view_scene
 
-    options = ViewOptions(images, screenshot, view, color, surface, points, size, labels, blended, backs)
+    options = ViewOptions(images, screenshot, view, color, surface, points, size, labels, blended, backs, group)
     view_scene(out, options, Console())
 
 

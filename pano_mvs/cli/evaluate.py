@@ -14,11 +14,11 @@ from pano_mvs.cli.run_command import print_scores
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.colmap_model import is_colmap_model
-from pano_mvs.io.pose_files import read_poses
+from pano_mvs.io.pose_files import read_groups, read_poses
 from pano_mvs.io.range_folders import find_ranges, match_pictures
 from pano_mvs.io.truth import find_true_ranges
 
-MODEL, CLOUD, RANGES = "colmap/sparse/0", "cloud.ply", "range"
+MODEL_ABOVE, MODEL, CLOUD, RANGES = "colmap", "colmap/sparse/0", "cloud.ply", "range"
 
 
 def evaluate_folder(out: Path, truth: Path, console: Console) -> None:
@@ -48,13 +48,20 @@ def _poses(out: Path, truth: Path, console: Console) -> str:
         true = _cameras(truth)
     except InputError as error:
         return f"the truth has no poses ({error})"
-    estimated = _cameras(out / MODEL)
+    estimated: dict[str, Rigid3] = {}
+    groups: dict[str, int] = {}
+    for number, group in enumerate(read_groups(out / MODEL_ABOVE)):
+        estimated |= {name: group.cam_from_world(idx) for idx, name in enumerate(group.names)}
+        groups |= dict.fromkeys(group.names, number)
     ours = {known: name for name, known in match_pictures(estimated, true).items()}
     if not ours:
         return f"the truth knows none of its images ({', '.join(list(estimated)[:3])})"
     # An image that the truth knows and the run did not register keeps the truth's name, and counts as a failure.
-    scores = score_capture(estimated, {ours.get(known, known): pose for known, pose in true.items()}, {}, {})
+    scores = score_capture(estimated, {ours.get(known, known): pose for known, pose in true.items()}, {}, {},
+                           groups=groups)  # fmt: skip
     print_scores({"poses": scores.poses, "views": {}}, console)
+    if "registered_in_one_frame" in scores.poses:
+        console.print(scores.notes[0], highlight=False, markup=False, soft_wrap=True)
     return "" if scores.poses else "; ".join(scores.notes)
 
 

@@ -140,7 +140,10 @@ def _views(request: DepthRequest, inputs: DepthInputs, scale: FoundScale) -> Ite
     """Judge one view after the other."""
     mask_of = mask_reader(request.masks, request.mask, inputs.truths)
     least = request.judging.min_confidence
+    scales = scale.of_views(inputs.truths)
     for name, true_file in inputs.truths.items():
+        if name not in scales:
+            continue
         file, truth = inputs.estimates[name], true_file.read()
         found, confidence = file.read(), file.read_confidence()
         if least and confidence is None:
@@ -154,7 +157,7 @@ def _views(request: DepthRequest, inputs: DepthInputs, scale: FoundScale) -> Ite
         except UsageError as error:
             error.add_note(f"view {name}: {file.path} against {true_file.path}")
             raise InputError(f"{file.path} against {true_file.path}: {error}") from error
-        scores = score_view(estimated, truth, confidence=confidence, scale=scale.value, mask=counted,
+        scores = score_view(estimated, truth, confidence=confidence, scale=scales[name], mask=counted,
                             judging=request.judging)  # fmt: skip
         if least and confidence is not None:
             estimated = np.where(confidence >= least, estimated, np.float32(np.nan))

@@ -14,7 +14,7 @@ from pano_mvs.algorithms.metrics.poses import align_centers
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.captures import PICTURE_SUFFIXES, describe_picture, list_pictures
-from pano_mvs.io.pose_files import read_poses
+from pano_mvs.io.pose_files import read_groups, read_poses
 from pano_mvs.io.range_folders import RangeFile, find_ranges, match_pictures, without_extension
 from pano_mvs.io.truth import find_true_ranges
 from pano_mvs.scene import FilePart, Panorama
@@ -45,12 +45,21 @@ class FoundScale:
     """What the estimates are multiplied by to have the truth's unit.
 
     Attributes:
-        value: the factor.
+        value: the factor; with several groups of poses, that of the largest one.
         reason: where it comes from.
+        others: image of another group to that group's factor; NaN where it cannot be known.
     """
 
     value: float
     reason: str
+    others: Mapping[str, float] = field(default_factory=dict)
+
+    def of_views(self, names: Iterable[str]) -> dict[str, float]:
+        """Return the factor of each view; views without one are left out."""
+        listed = list(names)
+        groups = match_pictures(listed, self.others)
+        factors = {name: self.others[groups[name]] if name in groups else self.value for name in listed}
+        return {name: factor for name, factor in factors.items() if np.isfinite(factor)}
 
 
 def find_inputs(source: Path, truth: Path, *, unit: float, truth_unit: float) -> DepthInputs:
@@ -104,7 +113,19 @@ def find_scale(source: Path, truth: Path, given: str, poses: Path | None, true_p
         if named:
             raise
         return FoundScale(1.0, f"the poses determine no scale, so both are taken to have one unit ({error})")
-    return FoundScale(aligned.scale, f"from the centres of {len(names)} cameras, never from the ranges")
+    reason = f"from the centres of {len(names)} cameras, never from the ranges"
+    others: dict[str, float] = {}
+    for number, group in enumerate(read_groups(source)[1:] if poses is None else [], start=1):
+        cameras = {name: group.cam_from_world(idx) for idx, name in enumerate(group.names)}
+        ours = match_pictures(cameras, true)
+        try:
+            factor = align_centers(cameras, {name: true[other] for name, other in ours.items()}).scale
+            reason += f"; those of group {number}, which has a unit of its own, × {factor:.6g}"
+        except UsageError as error:
+            factor = float("nan")
+            reason += f"; the {len(cameras)} of group {number} are not judged: {error}"
+        others |= dict.fromkeys(cameras, factor)
+    return FoundScale(aligned.scale, reason, others)
 
 
 def mask_reader(

@@ -150,7 +150,8 @@ def _conditions(report: DepthReport, baseline: str) -> list[str]:
     if judging.align == "none":
         lines.append("ranges are not fitted to the truth (--align none)")
     else:
-        fitted = [view.scale / report.scale.value for view in report.views.values()]
+        scales = report.scale.of_views(report.views)
+        fitted = [view.scale / scales[name] for name, view in report.views.items()]
         lines.append(f"RANGES ARE FITTED TO THE TRUTH, each view by a factor of its own (--align {judging.align}): "
                      f"{min(fitted):.5g} to {max(fitted):.5g}")  # fmt: skip
     if judging.min_confidence:

@@ -12,7 +12,7 @@ from rich.table import Table
 from pano_mvs.algorithms.metrics.pose_report import PoseReport, report_poses, summary
 from pano_mvs.core.errors import InputError
 from pano_mvs.io.names import match_image_names
-from pano_mvs.io.pose_files import read_poses
+from pano_mvs.io.pose_files import read_groups, read_poses
 from pano_mvs.scene import Poses
 
 
@@ -28,7 +28,8 @@ def evaluate_poses(model: Path, truth_path: Path, console: Console, *, as_json: 
     Raises:
         InputError: if the two have fewer than two images in common.
     """
-    estimated, truth = read_poses(model), read_poses(truth_path)
+    groups, truth = read_groups(model), read_poses(truth_path)
+    estimated = groups[0]
     ours = _truth_to_model(estimated, truth)
     if len(ours) < 2:
         raise InputError(f"{model} and {truth_path} have {len(ours) or 'no'} images in common, two are needed to "
@@ -46,6 +47,10 @@ def evaluate_poses(model: Path, truth_path: Path, console: Console, *, as_json: 
         print(json.dumps(values | {"without_truth": without_truth}, indent=1, ensure_ascii=False))
         return
     _print(report, unit, console)
+    if len(groups) > 1:
+        count = sum(len(group.names) for group in groups[1:])
+        console.print(f"{len(groups) - 1} further groups of {count} images in {model}, each with a frame of its own, "
+                      "count as not registered", highlight=False, markup=False, soft_wrap=True)  # fmt: skip
     if without_truth:
         console.print(f"no truth for {_shown(without_truth)}", highlight=False, markup=False)
 

@@ -37,6 +37,7 @@ from pano_mvs.engine.executors.protocol import Executor
 from pano_mvs.engine.memory import bytes_from_size
 from pano_mvs.engine.run import Run
 from pano_mvs.engine.store import LEAST_FREE_BYTES, Store
+from pano_mvs.report.findings import pictures_between
 from pano_mvs.viewer.shown_scene import is_to_see
 
 MIN_FREE_VARIABLE = "PANO_MVS_MIN_FREE"
@@ -237,13 +238,20 @@ def _print_poses(summary: Mapping[str, Any], console: Console) -> None:
         total = len(poses["registered"]) + len(poses["rejected"])
         console.print(f"poses: {len(poses['registered'])} of {total} registered, {poses['points']} points; "
                       f"scale: {escape(poses['scale'])}", highlight=False)  # fmt: skip
+        if len(poses["groups"]) > 1:
+            sizes = " + ".join(str(len(group["images"])) for group in poses["groups"])
+            console.print(f"[yellow]{len(poses['groups'])} groups[/] ({sizes} panoramas) share no reliable connection: "
+                          f"each has its own frame and scale. {escape(pictures_between(poses))}",
+                          highlight=False, soft_wrap=True)  # fmt: skip
 
 
 def print_scores(scores: Mapping[str, Any], console: Console) -> None:
     """Print pose scores in a line and range scores in a table."""
     poses = scores.get("poses")
     if poses:
-        text = (f"{poses['registered']} of {poses['of']} registered, median pair error "
+        together = poses.get("registered_in_one_frame")
+        in_one_frame = "" if together is None else f" ({together} in one frame)"
+        text = (f"{poses['registered']} of {poses['of']} registered{in_one_frame}, median pair error "
                 f"{poses['median_pair_error_deg']:.3f}°")  # fmt: skip
         if "scale_ratio_error_max" in poses:
             text += f", translation scale ratios within {100 * poses['scale_ratio_error_max']:.2f} %"

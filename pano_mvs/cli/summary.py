@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -21,6 +21,7 @@ from pano_mvs.engine.wiring import Graph
 from pano_mvs.engine.workflow import Workflow
 from pano_mvs.scene import Axis, Panorama, PointCloud, Poses, RangeMap, Record, Scores, TwoView
 from pano_mvs.scene.index import pair_from_name
+from pano_mvs.scene.pose_groups import split_groups
 
 _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "pycolmap", "pyvista", "scipy")
 _ROLES: Mapping[str, type[Record]] = {"images": Panorama, "pairs": TwoView, "poses": Poses, "ranges": RangeMap,
@@ -133,6 +134,7 @@ def _poses(run: Run, result: RunResult) -> dict[str, Any]:
     for stage in result.stages:
         if issubclass(run.workflow.stages[stage.name].spec.output, TwoView):
             links = [_link(pair, metrics) for pair, metrics in stage.unit_metrics.items()]
+    groups = split_groups(poses)
     return {
         "registered": list(poses.names),
         "blocked": [{"stage": f.stage, "item": f.item, "cause": f.cause} for f in result.failures if f.blocked],
@@ -142,9 +144,45 @@ def _poses(run: Run, result: RunResult) -> dict[str, Any]:
         "frame": poses.frame,
         "scale": poses.scale,
         "metric": poses.metric,
-        "up": _up(poses),
+        "up": _up(groups[0]),
+        "groups": [
+            {
+                "images": list(group.names),
+                "frame": group.frame,
+                "scale": group.scale,
+                "metric": group.metric,
+                "points": len(group.points_in_world),
+                "up": _up(group),
+                "nearest_pair": nearest_pair(groups[0].names, group.names, links) if number else None,
+            }
+            for number, group in enumerate(groups)
+        ],
         "links": links,
     }
+
+
+def nearest_pair(largest: Sequence[str], other: Sequence[str], links: Sequence[Sequence[Any]]) -> list[Any] | None:
+    """Return the pair that comes closest to joining two groups: that with most matches, or else most candidates.
+
+    Args:
+        largest: images of the largest group.
+        other: images of another one.
+        links: of run.json: both images, the inliers, and the candidates where they are known.
+
+    Returns:
+        The image of the largest group, that of the other one, the matches and the candidates; None where no pair of
+        them was compared.
+    """
+    inside, outside = set(largest), set(other)
+    found = []
+    for first, second, inliers, *more in links:
+        for a, b in ((first, second), (second, first)):
+            if a in inside and b in outside:
+                found.append((-int(inliers), -int((more[0] if more else None) or 0), str(a), str(b)))
+    if not found:
+        return None
+    matches, candidates, a, b = min(found)
+    return [a, b, -matches, -candidates]
 
 
 def _link(pair: str, metrics: Mapping[str, float]) -> list[Any]:

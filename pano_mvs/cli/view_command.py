@@ -39,6 +39,7 @@ class ViewOptions:
         labels: whether cameras are named.
         blended: whether the cloud is shown within a panorama.
         backs: whether points and triangles are shown that turn their back to the eye.
+        group: which group of poses to show; 0 is the largest.
     """
 
     images: Path | None = None
@@ -51,6 +52,7 @@ class ViewOptions:
     labels: bool = False
     blended: bool = False
     backs: bool = False
+    group: int = 0
 
 
 def view_scene(path: Path, options: ViewOptions, console: Console) -> None:
@@ -67,7 +69,7 @@ def view_scene(path: Path, options: ViewOptions, console: Console) -> None:
     else:
         _check_screenshot(options.screenshot)
         require_drawing()
-    scene = open_scene(path, images=options.images)
+    scene = open_scene(path, images=options.images, group=options.group)
     tour = _tour(scene, options, size_wh)
     from pano_mvs.viewer.window import SceneWindow  # on use: pyvista is slow to import
 

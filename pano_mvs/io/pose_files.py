@@ -20,6 +20,7 @@ from pano_mvs.io.pose_json import (
     rigid_from_arrays,
 )
 from pano_mvs.scene import Poses
+from pano_mvs.scene.pose_groups import with_cameras
 
 CSV_HEADER = ("name", "tx", "ty", "tz", "qw", "qx", "qy", "qz")
 _IN_A_FOLDER = ("transforms.json", "poses.json", "truth/poses.json", "poses.csv", "reconstruction.json")
@@ -61,6 +62,26 @@ def read_poses(path: Path) -> Poses:
         return _from_file({view.name: view.cam_from_world for view in views}, path, metric=metric)
     raise InputError(f"{path}: neither key 'frames' (nerfstudio) nor key 'views' (pano-mvs), nor a list with 'shots' "
                      "(OpenSfM): no poses here")  # fmt: skip
+
+
+def read_groups(path: Path) -> list[Poses]:
+    """Return the poses in a file or folder, and those of the further groups beside them.
+
+    Further groups are the models sparse/1, sparse/2 … beside sparse/0, where a folder above these is given. Each is in
+    a world of its own. Images that an earlier group has are left out.
+
+    Raises:
+        InputError: as `read_poses`.
+    """
+    groups = [read_poses(path)]
+    model = _file_or_model(path)
+    number = 1
+    while model != path and model.name == "0" and is_colmap_model(model.with_name(str(number))):
+        group = read_poses(model.with_name(str(number)))
+        known = {name for earlier in groups for name in earlier.names}
+        groups.append(with_cameras(group, np.array([name not in known for name in group.names], np.bool_)))
+        number += 1
+    return groups
 
 
 def recorded_pictures(path: Path) -> dict[str, str]:

@@ -20,6 +20,7 @@ from pano_mvs.report.results import Results
 from pano_mvs.report.software_cloud import draw_cloud
 from pano_mvs.report.viewpoints import Viewpoint, inside_camera, viewpoints
 from pano_mvs.scene import PointCloud
+from pano_mvs.scene.pose_groups import split_groups
 
 RENDERER_VARIABLE = "PANO_MVS_RENDERER"
 """`software` draws without PyVista; anything else, or nothing, tries PyVista first."""
@@ -54,6 +55,8 @@ def cloud_pictures(
 ) -> CloudPictures:
     """Return pictures of the cloud: those of an earlier page, if they are of the same cloud, else new ones.
 
+    Of several groups of poses the largest is shown.
+
     Args:
         results: with the cloud and the poses.
         kept: the earlier page's.
@@ -71,14 +74,18 @@ def cloud_pictures(
         titles = [str(title) for title in known["titles"]]
         pairs = tuple((title, found) for title, found in zip(titles, earlier, strict=True) if found is not None)
         return CloudPictures(pairs, str(known.get("note", "")))
-    cloud, poses = results.cloud, results.poses
-    if cloud is None or not len(cloud):
+    whole, all_poses = results.cloud, results.poses
+    if whole is None or not len(whole.groups()[0]):
         return CloudPictures()
+    cloud, poses = whole.groups()[0], None if all_poses is None else split_groups(all_poses)[0]
     centers = poses.centers if poses is not None else np.zeros((0, 3))
     place = poses.names[inside_camera(centers)] if poses is not None and len(centers) else ""
     arrays = _thinned(cloud)
     seen_from = viewpoints(arrays[0], centers, up, aspect=_SIZE_HW[1] / _SIZE_HW[0], place=place)
     images, note = _drawn(arrays, seen_from, software=software, command=command)
+    if whole.group_sizes:
+        note = "; ".join([*filter(None, [note]), "shown is group 0 of the poses, the largest; the clouds of the others "
+                          "are cloud_1.ply … (pano-mvs view OUT --group 1)"])  # fmt: skip
     titles = [view.title for view in seen_from]
     kept.keep(stem, {"titles": titles, "note": note})
     return CloudPictures(

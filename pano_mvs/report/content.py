@@ -33,7 +33,9 @@ class Content:
     Attributes:
         verdict: the head of the page.
         poses: as in run.json, without gaps.
-        maps: the cameras from above and from the side.
+        groups: of poses, as in run.json; one where it is silent of them.
+        maps: the cameras of each group, from above and from the side.
+        metric: images whose ranges are in metres.
         rejected_pairs: (first, second, candidates or None, reason) of pairs without a common geometry.
         pairs: number of pairs that were looked at.
         cloud: pictures of the cloud.
@@ -51,7 +53,9 @@ class Content:
 
     verdict: Verdict
     poses: Mapping[str, Any]
-    maps: tuple[CameraMap, ...]
+    groups: tuple[Mapping[str, Any], ...]
+    maps: tuple[tuple[CameraMap, ...], ...]
+    metric: frozenset[str]
     rejected_pairs: tuple[tuple[str, str, int | None, str], ...]
     pairs: int
     cloud: CloudPictures
@@ -80,6 +84,7 @@ def gather(out_dir: Path, summary: Mapping[str, Any], results: Results, kept: Ke
     poses = {name: known.get(name) or empty for name, empty in _NO_POSES.items()} | {"up": known.get("up")}
     views = summary.get("views") or []
     links = poses["links"]
+    groups = pose_groups(poses | {"groups": known.get("groups")})
     rejected_pairs = _rejected_pairs(links, results)
     record = results.poses
     residuals = reprojection_residuals(record) if record is not None else None
@@ -92,7 +97,11 @@ def gather(out_dir: Path, summary: Mapping[str, Any], results: Results, kept: Ke
     return Content(
         verdict=verdict(judged, residuals=residuals, image_width=_image_width(results)),
         poses=poses,
-        maps=camera_maps(poses, {(first, second): why for first, second, _, why in rejected_pairs}),
+        groups=groups,
+        maps=tuple(
+            camera_maps(group, {(first, second): why for first, second, _, why in rejected_pairs}) for group in groups
+        ),
+        metric=frozenset(str(name) for group in groups if group["metric"] for name in group["registered"]),
         rejected_pairs=rejected_pairs,
         pairs=len(links),
         cloud=cloud_pictures(results, kept, up=up_of(poses)),
@@ -108,6 +117,29 @@ def gather(out_dir: Path, summary: Mapping[str, Any], results: Results, kept: Ke
         comparison=side_by_side(scores),
         notes=tuple(sorted(set(results.notes))),
     )  # fmt: skip
+
+
+def pose_groups(poses: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:
+    """Return the groups of poses, each as the poses of a run that has one group alone.
+
+    Args:
+        poses: as in run.json, without gaps; where it names no groups, or one, it is returned as it is.
+    """
+    groups = poses.get("groups") or []
+    if len(groups) < 2:
+        return (poses,)
+    centers = dict(zip(map(str, poses["registered"]), poses["centers"], strict=False))
+    found = []
+    for group in groups:
+        names = [str(name) for name in group.get("images") or []]
+        found.append({
+            "registered": names,
+            "centers": [centers[name] for name in names if name in centers],
+            "links": [link for link in poses["links"] if link[0] in names and link[1] in names],
+            "frame": group.get("frame", ""), "scale": group.get("scale", ""), "metric": group.get("metric", False),
+            "up": group.get("up"), "points": group.get("points"), "nearest_pair": group.get("nearest_pair"),
+        })  # fmt: skip
+    return tuple(found)
 
 
 def _rejected_pairs(links: Any, results: Results) -> tuple[tuple[str, str, int | None, str], ...]:

@@ -18,6 +18,7 @@ GOOD_COMPLETE, FAIR_COMPLETE = 0.8, 0.35
 # Plain walls are confirmed by nobody: a third of a furnished room is as much as can be had.
 GOOD_CONSISTENT, FAIR_CONSISTENT = 0.3, 0.12
 _FEW_LINKS = 2
+_SHOWN_GROUPS = 5
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,7 @@ def findings(summary: Mapping[str, Any], *, residual_px: float | None = None) ->
         *_stopped(summary),
         *_failures(summary),
         *_registration(summary),
+        *_groups(summary),
         *_graph(summary),
         *_residual(residual_px),
         *_views(summary),
@@ -96,6 +98,43 @@ def _registration(summary: Mapping[str, Any]) -> list[Finding]:
         return [Finding("", text)]
     return [Finding(mood, text, "Take more pictures between those, 0.5–1 m apart indoors, each seeing much of what the "
                     "next one sees.")]  # fmt: skip
+
+
+def _groups(summary: Mapping[str, Any]) -> list[Finding]:
+    poses = summary.get("poses") or {}
+    groups = poses.get("groups") or []
+    if len(groups) < 2:
+        return []
+    sizes = [f"group {number} has {_named(group)}" for number, group in enumerate(groups[1:], start=1)]
+    more = f"; and {len(sizes) - _SHOWN_GROUPS} more" if len(sizes) > _SHOWN_GROUPS else ""
+    text = (f"{len(groups)} groups of panoramas share no reliable connection: each has its own frame and scale. The "
+            f"largest has {len(groups[0].get('images') or [])} panoramas; "
+            f"{'; '.join(sizes[:_SHOWN_GROUPS])}{more}.")  # fmt: skip
+    return [Finding("fair", text, pictures_between(poses))]
+
+
+def _named(group: Mapping[str, Any]) -> str:
+    names = [str(name) for name in group.get("images") or []]
+    return f"{len(names)} ({', '.join(names[:3])}{' …' if len(names) > 3 else ''})"
+
+
+def pictures_between(poses: Mapping[str, Any]) -> str:
+    """Return which pictures to take so that the smaller groups join the largest one.
+
+    Args:
+        poses: as in run.json; `groups` holds two or more.
+    """
+    found = []
+    for group in (poses.get("groups") or [])[1:]:
+        pair = group.get("nearest_pair")
+        if pair:
+            first, second, matches, candidates = pair
+            known = f"{matches} matches" if matches else f"{candidates} candidates"
+            found.append(f"{first} and {second} ({known})")
+    if not found:
+        return "Take pictures between the groups, 0.5–1 m apart, and compare them with both."
+    more = " …" if len(found) > _SHOWN_GROUPS else ""
+    return f"To join them take pictures between {'; between '.join(found[:_SHOWN_GROUPS])}{more}."
 
 
 def _commonest(reasons: Sequence[str]) -> str:

@@ -122,7 +122,9 @@ def _registered(summary: Mapping[str, Any]) -> list[Tile]:
     if not registered + rejected:
         return []
     mood = mood_of(registered / (registered + rejected), GOOD_REGISTERED, FAIR_REGISTERED)
-    return [Tile(f"{registered} of {registered + rejected}", "panoramas registered", mood)]
+    groups = len(poses.get("groups") or [])
+    label = "panoramas registered" + (f", in {groups} groups" if groups > 1 else "")
+    return [Tile(f"{registered} of {registered + rejected}", label, mood)]
 
 
 def _residual(residual_deg: float | None, residual_px: float | None) -> list[Tile]:

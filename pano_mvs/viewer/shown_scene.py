@@ -12,14 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.core.errors import InputError
+from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.ply_points import PlyPoints, open_ply_points
 from pano_mvs.io.pose_files import read_poses
+from pano_mvs.scene.files import group_file
 
 FloatArray = NDArray[np.float64]
 
-_CLOUD, _MESH, _MODEL = "cloud.ply", "mesh.ply", "colmap/sparse/0"
+_CLOUD, _MESH, _MODELS = "cloud.ply", "mesh.ply", "colmap/sparse"
 _HEAD_BYTES = 1 << 14
 # The cameras' own directions up must agree this well to count as the scene's.
 _LEAST_AGREEMENT = 0.5
@@ -76,15 +77,17 @@ class ShownScene:
         return np.array([camera.cam_from_world.center for camera in self.cameras]).reshape(-1, 3)
 
 
-def open_scene(path: Path, *, images: Path | None = None) -> ShownScene:
+def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> ShownScene:
     """Return what there is to look at.
 
     Args:
         path: the output folder of a run, or a PLY file, a cloud or a mesh.
         images: folder of the panoramas; None: where the run read them, else the previews that it wrote.
+        group: which group of poses to show, since each has a frame of its own; 0 is the largest.
 
     Raises:
         InputError: if there is nothing to show, or a file is damaged.
+        UsageError: if there is no such group.
     """
     if path.is_file():
         cloud, mesh = (None, path) if has_faces(path) else (open_ply_points(path), None)
@@ -95,18 +98,28 @@ def open_scene(path: Path, *, images: Path | None = None) -> ShownScene:
         raise InputError(f"{path}: no such file or folder. Give the output folder of a run, or a .ply file")
     run = _run_json(path)
     notes: list[str] = []
-    cloud_file, mesh_file = _written(path, run, _CLOUD), _written(path, run, _MESH)
-    cameras = _cameras(path, run, images, notes)
+    groups = (run.get("poses") or {}).get("groups") or [run.get("poses") or {}]
+    if group >= len(groups):
+        raise UsageError(f"--group {group}: {path} has {len(groups)} {'groups' if len(groups) > 1 else 'group'}, "
+                         f"numbered from 0")  # fmt: skip
+    if len(groups) > 1:
+        others = ", ".join(f"{number} ({len(groups[number].get('images') or ())} images)"
+                           for number in range(len(groups)) if number != group)  # fmt: skip
+        notes.append(f"shown is group {group} of {len(groups)}, each with a frame and a scale of its own; --group N "
+                     f"shows another: {others}")  # fmt: skip
+    cloud_name, mesh_name, model = group_file(_CLOUD, group), group_file(_MESH, group), f"{_MODELS}/{group}"
+    cloud_file, mesh_file = _written(path, run, cloud_name), _written(path, run, mesh_name)
+    cameras = _cameras(path, model, run, images, notes)
     cloud = None if cloud_file is None else open_ply_points(cloud_file)
     if cloud is None:
-        notes.append(f"no {_CLOUD}: the workflow has no export.ply, or the run did not get there")
+        notes.append(f"no {cloud_name}: the workflow has no export.ply, or the run did not get there")
     elif not cloud.count:
         cloud = None
-        notes.append(f"{_CLOUD} holds no points: report.html tells why")
+        notes.append(f"{cloud_name} holds no points: report.html tells why")
     if cloud is None and mesh_file is None and not cameras:
-        raise InputError(f"{path}: holds no {_CLOUD} with points, no {_MESH} and no {_MODEL}. Give the output folder "
-                         "of a run; its report.html tells what became of it")  # fmt: skip
-    metric = bool((run.get("poses") or {}).get("metric"))
+        raise InputError(f"{path}: holds no {cloud_name} with points, no {mesh_name} and no {model}. Give the output "
+                         "folder of a run; its report.html tells what became of it")  # fmt: skip
+    metric = bool(groups[group].get("metric"))
     return ShownScene(
         name=path.resolve().name,
         cloud=cloud,
@@ -120,7 +133,7 @@ def open_scene(path: Path, *, images: Path | None = None) -> ShownScene:
 
 def is_to_see(files: Iterable[str]) -> bool:
     """Return whether among a run's files, by their paths in its folder, is one that `open_scene` shows."""
-    return any(PurePosixPath(name).name in (_CLOUD, _MESH) or name.startswith(f"{_MODEL}/") for name in files)
+    return any(PurePosixPath(name).name in (_CLOUD, _MESH) or name.startswith(f"{_MODELS}/0/") for name in files)
 
 
 def has_faces(path: Path) -> bool:
@@ -149,10 +162,12 @@ def _written(folder: Path, run: Mapping[str, Any], name: str) -> Path | None:
     return next((folder / found for found in names if (folder / found).is_file()), None)
 
 
-def _cameras(folder: Path, run: Mapping[str, Any], images: Path | None, notes: list[str]) -> tuple[ShownCamera, ...]:
-    model = folder / _MODEL
+def _cameras(
+    folder: Path, model_name: str, run: Mapping[str, Any], images: Path | None, notes: list[str]
+) -> tuple[ShownCamera, ...]:
+    model = folder / model_name
     if not model.is_dir():
-        notes.append(f"no {_MODEL}: the workflow has no export.colmap, or the run did not get there; no cameras")
+        notes.append(f"no {model_name}: the workflow has no export.colmap, or the run did not get there; no cameras")
         return ()
     poses = read_poses(model)
     source = images or _source_folder(run)

@@ -121,3 +121,22 @@ def test_a_picture_that_is_there_twice_has_no_direction_in_any_unit(unit):
     estimated = {**poses, "again": Rigid3.from_center(poses["0.jpg"].rotation, poses["0.jpg"].center + aside)}
     scaled = moved(truth, Similarity3(unit, np.eye(3), np.zeros(3)))
     assert relative_pose_errors(estimated, scaled).direction_deg.max() < 0.1
+
+
+def test_pairs_across_groups_cannot_be_measured_and_count_as_not_registered() -> None:
+    true = random_poses(np.random.default_rng(8), 5)
+    groups = {"0.jpg": 0, "1.jpg": 1, "2.jpg": 0, "3.jpg": 1, "4.jpg": 0}
+    # The second group in another unit: nothing tells what its lengths are to the first one's.
+    found = {
+        name: Rigid3.from_center(pose.rotation, pose.center * (7.0 if groups[name] else 1.0))
+        for name, pose in true.items()
+    }
+    errors = relative_pose_errors(found, true, groups=groups)
+    across = np.array([groups[a] != groups[b] for a, b in errors.pairs])
+    assert (errors.pair_deg[across] == 180).all()
+    assert errors.pair_deg[~across].max() < 1e-4
+    assert (errors.registered, errors.in_one_frame, errors.expected) == (5, 3, 5)
+    assert errors.scale_ratio_max < 1e-9
+    unmoved = relative_pose_errors(true, true, groups=groups)
+    assert (unmoved.pair_deg[across] == 180).all()
+    assert relative_pose_errors(true, true).in_one_frame == 5

@@ -182,3 +182,27 @@ def test_pictures_are_found_small_and_large_and_missing_ones_are_plain(tmp_path:
 def test_what_can_be_seen_is_known_from_the_names_of_files(name: str) -> None:
     assert is_to_see(["range/1.tiff", name])
     assert not is_to_see(["range/1.tiff", "report.html", "colmap/images/1.jpg", "points.laz"])
+
+
+def test_one_group_is_shown_at_a_time_and_the_others_are_named(tmp_path: Path) -> None:
+    poses = turned_poses(3)
+    out = write_output(tmp_path, poses, metric=False)
+    other = write_output(tmp_path / "other", turned_poses(2, seed=5), points=50)
+    shutil.copy(other / "cloud.ply", out / "cloud_1.ply")
+    shutil.copytree(other / "colmap" / "sparse" / "0", out / "colmap" / "sparse" / "1")
+    run = json.loads((out / "run.json").read_text())
+    run["poses"]["groups"] = [{"images": list(poses), "metric": False}, {"images": ["x", "y"], "metric": True}]
+    (out / "run.json").write_text(json.dumps(run))
+    for group, cameras, points, unit, told in (
+        (0, 3, 20_000, "scene units", "1 (2 images)"),
+        (1, 2, 50, "m", "0 (3 images)"),
+    ):
+        scene = open_scene(out, group=group)
+        assert scene.cloud is not None
+        assert (len(scene.cameras), scene.cloud.count, scene.unit) == (cameras, points, unit)
+        assert f"shown is group {group} of 2" in scene.notes[0]
+        assert told in scene.notes[0]
+    with pytest.raises(UsageError, match=r"--group 2: .* has 2 groups, numbered from 0"):
+        open_scene(out, group=2)
+    with pytest.raises(UsageError, match="has 1 group,"):
+        open_scene(other, group=1)
