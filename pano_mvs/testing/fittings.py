@@ -17,7 +17,7 @@ Painted: TypeAlias = tuple[Surface, Texture | Pattern]
 
 _PAINTS: tuple[Colors, ...] = (OAK, BRICK, STONE, STEEL, BLUE, RED, LEAVES)
 # Length of wall for one picture and one piece of furniture.
-_SLOT = 1.5
+_SLOT = 1.35
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class Site:
             self._furniture(slots[idx][0], slots[idx][1], rng)
 
     def _picture(self, wall: Wall, along: float, rng: np.random.Generator) -> None:
-        wide, high = (float(side) for side in rng.uniform(0.45, 1.2, 2))
+        wide, high = (float(side) for side in rng.uniform(0.45, 1.1, 2))
         along, up = along + rng.uniform(-0.12, 0.12), min(rng.uniform(1.0, 1.5), wall.height - high - 0.1)
         corner = wall.at(along - wide / 2, up + high, 0.02)
         pattern = _own_print("poster", (wide, high), corner, rng)

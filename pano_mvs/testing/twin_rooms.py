@@ -15,7 +15,7 @@ from pano_mvs.testing.visits import STONES, TILES, Visit, captured, printed, uni
 from pano_mvs.testing.walks import Ground, Rect
 
 _HALF = 0.1  # of the partition's thickness
-_OPENING, _LINTEL, _HEIGHT = 1.5, 2.1, 2.7
+_OPENING, _LINTEL, _HEIGHT = 1.4, 2.1, 2.7
 _RIM = 0.5
 
 
@@ -49,7 +49,7 @@ def twin_rooms(
     _doorways(site, wide)
     site.unique_things(visit.get("unique", 0.5), unique_rng(visit))
     inner: Rect = (home[0] + _RIM, home[1] + _RIM, home[2] - _RIM, home[3] - _RIM)
-    between: Rect = (-1.0, 0.3 - _OPENING / 2, 1.0, _OPENING / 2 - 0.3)
+    between: Rect = (-1.0, 0.28 - _OPENING / 2, 1.0, _OPENING / 2 - 0.28)
     ground = Ground((inner, move.rect(inner), between), tuple(site.obstacles), (0.0, 0.0), np.pi / 2)
     return captured("twin_rooms", site, ground, visit)
 

@@ -18,6 +18,8 @@ LAYOUTS: tuple[Layout, ...] = ("unordered", "path", "loop")
 _NEAREST, _FARTHEST = 0.6, 1.5
 _CLEARANCE = 0.4
 _TRIES = 1500
+# A walk is begun anew after so many places in a row where the next camera cannot stand.
+_STUCK = 60
 
 
 def _level(along: FloatArray) -> FloatArray:
@@ -76,12 +78,14 @@ def stands(ground: Ground, layout: Layout, views: int, rng: np.random.Generator)
 
 
 def _scattered(ground: Ground, views: int, rng: np.random.Generator) -> FloatArray | None:
-    chosen = [_start(ground, rng)]
-    for _ in range(60 * views):
+    chosen, failed = [_start(ground, rng)], 0
+    while len(chosen) < views and failed < _STUCK:
         near, turn = chosen[rng.integers(len(chosen))], rng.uniform(0, 2 * np.pi)
         candidate = near + rng.uniform(_NEAREST, _FARTHEST) * np.array([np.sin(turn), np.cos(turn)])
-        if len(chosen) < views and _clear(ground, near, candidate) and _apart(candidate, chosen, _NEAREST):
+        failed += 1
+        if _clear(ground, near, candidate) and _apart(candidate, chosen, _NEAREST):
             chosen.append(candidate)
+            failed = 0
     return rng.permutation(np.array(chosen)) if len(chosen) == views else None
 
 
@@ -92,15 +96,15 @@ def _path(ground: Ground, views: int, rng: np.random.Generator) -> FloatArray | 
     first_half = int(rng.integers(views // 3, views - views // 3 + 1))
     for goal, turn in ((first_half, heading), (views, heading + np.pi)):
         chosen.reverse()
-        for _ in range(20 * views):
-            if len(chosen) == goal:
-                break
+        failed = 0
+        while len(chosen) < goal and failed < _STUCK:
             new_turn = turn + rng.normal(0, 0.35)
             candidate = chosen[-1] + rng.uniform(_NEAREST, _FARTHEST) * np.array([np.sin(new_turn), np.cos(new_turn)])
             if _clear(ground, chosen[-1], candidate) and _apart(candidate, chosen, _NEAREST):
                 chosen.append(candidate)
-                turn = new_turn
+                turn, failed = new_turn, 0
             else:
+                failed += 1
                 turn += rng.normal(0, 0.3)
     return np.array(chosen) if len(chosen) == views else None
 

@@ -1,0 +1,137 @@
+"""Which cameras of a capture stand where they truly stood, each judged on its own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.metrics.poses import align_centers
+from pano_mvs.geometry import Rigid3, Similarity3, geodesic_angle, nearest_rotation
+from pano_mvs.scene import Poses
+
+FloatArray = NDArray[np.float64]
+
+_ROUNDS = 10
+
+
+@dataclass(frozen=True, eq=False)
+class Placements:
+    """Errors of single cameras, after the alignment to the truth that makes most of their group right.
+
+    Attributes:
+        names: (N) registered images that have truth, except those that are alone in their group.
+        right: (N,) whether rotation and centre are within the limits.
+        rotation_deg: (N,) error of each rotation.
+        center_shares: (N,) distance of each centre from the true one, as a share of the extent of the true centres.
+        doubted: (N,) whether the poses themselves say that the pose is doubtful.
+        alone: registered images that have truth but share their group with no other such image: nothing can be said of
+            where they stand.
+        expected: number of images that have truth.
+    """
+
+    names: tuple[str, ...]
+    right: NDArray[np.bool_]
+    rotation_deg: FloatArray
+    center_shares: FloatArray
+    doubted: NDArray[np.bool_]
+    alone: tuple[str, ...]
+    expected: int
+
+    @property
+    def unreported(self) -> tuple[str, ...]:
+        """Names of the images whose pose is wrong and not doubted."""
+        return tuple(np.array(self.names, object)[~self.right & ~self.doubted])
+
+
+def judge_placements(
+    poses: Poses, truth: Mapping[str, Rigid3], *, rotation_limit_deg: float = 1.0, center_limit: float = 0.02
+) -> Placements:
+    """Return for each camera whether it stands where it truly stood.
+
+    Each group of cameras is aligned to the truth by the similarity that makes most of its cameras right, among those
+    that any two of its cameras propose; then by the fit to the cameras that are right, until these stay the same.
+    Unlike in a fit to all cameras, one that is far off does not make the others look wrong. If a capture has come apart
+    into pieces that contradict one another, the largest is right and the others are wrong.
+
+    Args:
+        poses: with `group_idx` and `doubts` where they are known.
+        truth: true cam_from_world by image name.
+        rotation_limit_deg: largest error of the rotation of a camera that is right.
+        center_limit: largest distance of its centre from the true one, as a share of the largest distance between any
+            two true centres of the capture.
+    """
+    extent = _extent(truth)
+    groups: dict[int, list[str]] = {}
+    for idx, name in enumerate(poses.names):
+        if name in truth:
+            groups.setdefault(0 if poses.group_idx is None else int(poses.group_idx[idx]), []).append(name)
+    estimated = {name: poses.cam_from_world(idx) for idx, name in enumerate(poses.names)}
+    limits = np.array([rotation_limit_deg, center_limit])
+    judged: dict[str, FloatArray] = {}
+    for group in groups.values():
+        if len(group) > 1:
+            errors = _least_errors({name: estimated[name] for name in group}, truth, extent, limits)
+            judged.update(zip(group, errors, strict=True))
+    names = tuple(name for name in poses.names if name in judged)
+    errors = np.array([judged[name] for name in names]).reshape(-1, 2)
+    return Placements(
+        names=names,
+        right=np.asarray((errors <= limits).all(axis=1)),
+        rotation_deg=errors[:, 0],
+        center_shares=errors[:, 1],
+        doubted=np.array([name in poses.doubts for name in names], np.bool_),
+        alone=tuple(group[0] for group in groups.values() if len(group) == 1),
+        expected=len(truth),
+    )
+
+
+def _least_errors(
+    estimated: Mapping[str, Rigid3], truth: Mapping[str, Rigid3], extent: float, limits: FloatArray
+) -> FloatArray:
+    """Return rotation error in degrees and centre error in extents (N, 2) after the best alignment of one group."""
+    names = list(estimated)
+    centers, true_centers = (np.array([poses[name].center for name in names]) for poses in (estimated, truth))
+    turns = np.array([truth[name].rotation.T @ estimated[name].rotation for name in names])
+
+    def errors_of(truth_from_estimated: Similarity3) -> FloatArray:
+        rotation_deg = np.rad2deg(geodesic_angle(turns, truth_from_estimated.rotation))
+        distances = np.linalg.norm(truth_from_estimated.apply(centers) - true_centers, axis=1)
+        return np.stack([rotation_deg, distances / extent], axis=1)
+
+    best = np.full((len(names), 2), np.inf)
+    for pair in combinations(range(len(names)), 2):
+        aligned = _pair_alignment(turns[list(pair)], centers[list(pair)], true_centers[list(pair)])
+        if aligned is not None:
+            best = min(best, errors_of(aligned), key=lambda errors: _badness(errors, limits))
+    fitted: list[str] = []
+    for _ in range(_ROUNDS):
+        right = [name for name, error in zip(names, best, strict=True) if np.all(error <= limits)]
+        if len(right) < 2 or right == fitted:
+            break
+        best, fitted = errors_of(align_centers({name: estimated[name] for name in right}, truth)), right
+    return best
+
+
+def _pair_alignment(turns: FloatArray, centers: FloatArray, true_centers: FloatArray) -> Similarity3 | None:
+    """Return the similarity that two cameras propose, its rotation from theirs; None if their centres coincide."""
+    length, true_length = (float(np.linalg.norm(ends[1] - ends[0])) for ends in (centers, true_centers))
+    if min(length, true_length) <= 1e-9 * max(float(np.abs(centers).max()), float(np.abs(true_centers).max()), 1e-300):
+        return None
+    rotation, scale = nearest_rotation(turns.mean(axis=0)), true_length / length
+    return Similarity3(scale, rotation, true_centers.mean(axis=0) - scale * rotation @ centers.mean(axis=0))
+
+
+def _badness(errors: FloatArray, limits: FloatArray) -> tuple[int, float]:
+    """Return how bad errors are: the number of wrong cameras, then how close the right ones come to the limits."""
+    shares = (errors / limits).max(axis=1)
+    right = shares <= 1
+    return int((~right).sum()), float(shares[right].mean()) if right.any() else np.inf
+
+
+def _extent(truth: Mapping[str, Rigid3]) -> float:
+    centers = np.array([pose.center for pose in truth.values()]).reshape(-1, 3)
+    return max((float(np.linalg.norm(centers - center, axis=1).max()) for center in centers), default=0.0)
