@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from pano_mvs.algorithms.poses.aliases import Alias, find_aliases, labellings, moved_cameras
 from pano_mvs.algorithms.poses.confirmation import Confirmation, nearest_cameras
 from pano_mvs.algorithms.poses.placed_model import PlacedModel, enough_points
 from pano_mvs.geometry import Rigid3
@@ -25,6 +26,10 @@ _NEIGHBOURS = 6
 _ALTERNATIVES = 4
 _MIN_SCORE = 0.2  # of the best placement's score by matches, for a place to be tried at all
 _ROUNDS = 3
+_BLOCK_ROUNDS = 3
+# A block is moved if the images around the cut confirm this much more of themselves.
+_MIN_BLOCK_GAIN = 0.05
+_FLIPPED = 3
 
 
 @dataclass(eq=False)
@@ -66,6 +71,8 @@ def arbitrate(
         remove: whether a camera that nothing explains is taken out of the model.
     """
     found = Arbitration()
+    if not fixed:
+        found.moved |= _unshift_blocks(model, confirmation)
     for _ in range(_ROUNDS):
         _judge(model, confirmation, found)
         suspects = _suspects(found)
@@ -87,6 +94,62 @@ def arbitrate(
     _judge(model, confirmation, found)
     _conclude(model, found, fixed=fixed, remove=remove)
     return found
+
+
+def _unshift_blocks(model: PlacedModel, confirmation: Confirmation) -> set[int]:
+    """Move blocks of cameras that the images confirm clearly better elsewhere; return the images that were moved."""
+    moved: set[int] = set()
+    for _ in range(_BLOCK_ROUNDS):
+        best: tuple[float, Alias, dict[int, int]] | None = None
+        for alias in find_aliases(model):
+            for labels in labellings(model, alias):
+                gain = _gain_of(model, alias, labels, confirmation)
+                if gain > _MIN_BLOCK_GAIN and (best is None or gain > best[0]):
+                    best = (gain, alias, labels)
+        if best is None:
+            break
+        gain, alias, labels = best
+        labels = _with_better_labels(model, alias, labels, gain, confirmation)
+        model.cameras = moved_cameras(model, alias, labels)
+        moved |= {image for image, label in labels.items() if label}
+        model.choose_again()
+        model.learn_ranges()
+        model.choose_again()
+    return moved
+
+
+def _with_better_labels(
+    model: PlacedModel, alias: Alias, labels: dict[int, int], gain: float, confirmation: Confirmation
+) -> dict[int, int]:
+    """Change the labels of the images that confirm least, one after the other, where the images confirm more then."""
+    cameras = moved_cameras(model, alias, labels)
+    shares = {image: confirmation.share(image, pose, cameras) for image, pose in cameras.items()}
+    for image in sorted(shares, key=lambda idx: (np.nan_to_num(shares[idx]), idx))[:_FLIPPED]:
+        flipped = {**labels, image: 1 - labels[image]}
+        if 0 < sum(flipped.values()) < len(flipped):
+            flipped_gain = _gain_of(model, alias, flipped, confirmation)
+            if flipped_gain > gain:
+                labels, gain = flipped, flipped_gain
+    return labels
+
+
+def _gain_of(model: PlacedModel, alias: Alias, labels: dict[int, int], confirmation: Confirmation) -> float:
+    """Return by how much more the images confirm of themselves when a block is moved, as a factor less one.
+
+    Images whose neighbours all move with them, or all stay with them, are not asked: nothing changes for them.
+    """
+    cameras = moved_cameras(model, alias, labels)
+    before = after = 0.0
+    for image in model.cameras:
+        around = {
+            idx
+            for poses in (model.cameras, cameras)
+            for idx in nearest_cameras(poses[image], {k: pose for k, pose in poses.items() if k != image})
+        }
+        if any(labels[idx] != labels[image] for idx in around):
+            before += float(np.nan_to_num(confirmation.share(image, model.cameras[image], model.cameras)))
+            after += float(np.nan_to_num(confirmation.share(image, cameras[image], cameras)))
+    return after / before - 1 if before > 0 else 0.0
 
 
 def _judge(model: PlacedModel, confirmation: Confirmation, found: Arbitration) -> None:

@@ -116,12 +116,13 @@ class PlacedModel:
         model._parallax = [parallax.copy() for parallax in self._parallax]
         return model
 
-    def witnesses(self, image: int) -> Witnesses:
-        """Return what the pairs of an image with registered images say about its pose."""
-        partners = [idx for idx in self.pairs.partners[image] if idx in self.cameras and idx != image]
+    def witnesses(self, image: int, partners: Sequence[int] | None = None) -> Witnesses:
+        """Return what the pairs of an image with registered images, or with some of them, say about its pose."""
+        if partners is None:
+            partners = [idx for idx in self.pairs.partners[image] if idx in self.cameras][:_MAX_PARTNERS]
         return gather_witnesses(
             image,
-            partners[:_MAX_PARTNERS],
+            partners,
             geometries=self.pairs.geometries,
             cameras=self.cameras,
             bearings=self.pairs.bearings,

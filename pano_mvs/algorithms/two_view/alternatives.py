@@ -162,7 +162,9 @@ class _Search:
         found: list[Rigid3] = []
         wide_rad = 2 * self.threshold_rad  # the rotation is not quite right for these matches yet
         for rotation in _distinct_rotations(known):
-            directions, costs = voted_directions(rotation, p, q, rng=self.rng, threshold_rad=wide_rad, count=_DIRECTIONS)
+            directions, costs = voted_directions(
+                rotation, p, q, rng=self.rng, threshold_rad=wide_rad, count=_DIRECTIONS
+            )
             found += [Rigid3(rotation, direction) for direction in _peaks(directions, costs)]
         finalists = least_essentials(pool, p, q, wide_rad, count=_PEAKS)
         return found + [facing_pose(essential, p, q, wide_rad) for essential in finalists]
@@ -177,9 +179,7 @@ class _Search:
             pose = refine_relative_pose(pose, p[near], q[near], scale_rad=scale_rad, max_iterations=6)
         return pose
 
-    def _significant(
-        self, geometry: _Geometry, known: Sequence[_Geometry], searched: BoolArray, needed: float
-    ) -> bool:
+    def _significant(self, geometry: _Geometry, known: Sequence[_Geometry], searched: BoolArray, needed: float) -> bool:
         own = geometry.agreeing & searched
         own_p, own_q = self.first[own], self.second[own]
         witnesses = independent_count(own_p, own_q) if own.any() else 0

@@ -166,7 +166,8 @@ def direction_costs(rotated, second, directions, threshold, costs):  # type: ign
 @njit(cache=True, error_model="numpy", nogil=True)
 def _rotation_of(essential, t, rotation):  # type: ignore[no-untyped-def]
     """Write the rotation of E = [t]× R: with |t| = 1 it is cof(E) − [t]× E (Horn 1990, "Recovering baseline and
-    orientation from essential matrix"), made orthonormal row by row."""
+    orientation from essential matrix"), made orthonormal row by row.
+    """
     e = essential
     for row in range(3):
         i, j = (row + 1) % 3, (row + 2) % 3
