@@ -114,6 +114,7 @@ class Site:
 
     def _picture(self, wall: Wall, along: float, rng: np.random.Generator) -> None:
         wide, high = (float(side) for side in rng.uniform(0.45, 1.1, 2))
+        wide = min(wide, wall.length - 0.4)
         along, up = along + rng.uniform(-0.12, 0.12), min(rng.uniform(1.0, 1.5), wall.height - high - 0.1)
         corner = wall.at(along - wide / 2, up + high, 0.02)
         pattern = _own_print("poster", (wide, high), corner, rng)

@@ -94,7 +94,8 @@ def colonnade(
     else:
         site.floor((-60.0, -60.0, 60.0, 60.0), 0.05, printed("gravel", SAND, (1.7, 1.7)))
         _beams(site, sorted({x for x, _ in middles}), height, half_z - 0.6, spacing, rng)
-        site.walls += [Wall((x - 0.75, 0.0, z - 0.3), (1.0, 0.0, 0.0), 1.5, 3.0) for x, z in middles]
+        site.walls += [Wall((x - 0.68, 0.0, z - 0.3), (1.0, 0.0, 0.0), 1.36, 3.0) for x, z in middles]
+        site.obstacles = [(x - 0.5, z - 0.35, x + 0.5, z + 0.35) for x, z in middles]  # the signs are wider
     site.unique_things(visit.get("unique", 0.5), unique_rng(visit), furniture=walled)
     return captured("colonnade", site, Ground((shrunk(rect),), tuple(site.obstacles)), visit, sky=not walled)
 

@@ -39,7 +39,7 @@ OURS = "ours"
 
 @dataclass(frozen=True)
 class Row:
-    """What one method made of one capture; what is counted are cameras."""
+    """What one method made of one capture: numbers of cameras, and the errors of each, as of `judge_placements`."""
 
     method: str
     registered: int
@@ -47,6 +47,8 @@ class Row:
     wrong: int
     unreported: int
     cpu_s: float
+    rotation_deg: list[float]
+    center_shares: list[float]
 
 
 def place_cameras(
@@ -103,7 +105,8 @@ def judged(method: str, result: tuple[Poses, float], truth: Cameras) -> Row:
     poses, cpu_s = result
     placed = judge_placements(poses, truth)
     right = int(placed.right.sum())
-    return Row(method, len(poses.names), right, len(placed.names) - right, len(placed.unreported), cpu_s)
+    wrong, errors = len(placed.names) - right, (placed.rotation_deg.tolist(), placed.center_shares.tolist())
+    return Row(method, len(poses.names), right, wrong, len(placed.unreported), cpu_s, *errors)
 
 
 def show(methods: Sequence[str], captures: Sequence[dict[str, Any]], title: str) -> None:

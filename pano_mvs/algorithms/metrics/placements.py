@@ -9,7 +9,6 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.metrics.poses import align_centers
 from pano_mvs.geometry import Rigid3, Similarity3, geodesic_angle, nearest_rotation
 from pano_mvs.scene import Poses
 
@@ -102,34 +101,54 @@ def _least_errors(
         distances = np.linalg.norm(truth_from_estimated.apply(centers) - true_centers, axis=1)
         return np.stack([rotation_deg, distances / extent], axis=1)
 
-    best = np.full((len(names), 2), np.inf)
+    def fitted_to(chosen: NDArray[np.int64]) -> FloatArray | None:
+        unit = np.deg2rad(limits[0]), limits[1] * extent
+        aligned = _alignment(turns[chosen], centers[chosen], true_centers[chosen], unit)
+        return None if aligned is None else errors_of(aligned)
+
+    best, fitted = np.full((len(names), 2), np.inf), np.zeros(0, np.int64)
     for pair in combinations(range(len(names)), 2):
-        aligned = _pair_alignment(turns[list(pair)], centers[list(pair)], true_centers[list(pair)])
-        if aligned is not None:
-            best = min(best, errors_of(aligned), key=lambda errors: _badness(errors, limits))
-    fitted: list[str] = []
+        proposed = fitted_to(np.array(pair))
+        if proposed is not None:
+            best = min(best, proposed, key=lambda errors: _badness(errors, limits))
     for _ in range(_ROUNDS):
-        right = [name for name, error in zip(names, best, strict=True) if np.all(error <= limits)]
-        if len(right) < 2 or right == fitted:
+        right = np.flatnonzero((best <= limits).all(axis=1))
+        again = fitted_to(right) if len(right) > 1 and not np.array_equal(right, fitted) else None
+        if again is None:
             break
-        best, fitted = errors_of(align_centers({name: estimated[name] for name in right}, truth)), right
+        best, fitted = again, right
     return best
 
 
-def _pair_alignment(turns: FloatArray, centers: FloatArray, true_centers: FloatArray) -> Similarity3 | None:
-    """Return the similarity that two cameras propose, its rotation from theirs; None if their centres coincide."""
-    length, true_length = (float(np.linalg.norm(ends[1] - ends[0])) for ends in (centers, true_centers))
-    if min(length, true_length) <= 1e-9 * max(float(np.abs(centers).max()), float(np.abs(true_centers).max()), 1e-300):
+def _alignment(
+    turns: FloatArray, centers: FloatArray, true_centers: FloatArray, unit: tuple[float, float]
+) -> Similarity3 | None:
+    """Return the similarity with the least squared errors of rotations and centres; None if the centres coincide.
+
+    Args:
+        turns: (N, 3, 3) world_truth from world_estimated as each camera's orientation has it.
+        centers: (N, 3) of the estimated cameras.
+        true_centers: (N, 3) of the true ones.
+        unit: the angle in radians and the length that count for the same.
+    """
+    middle, aim = centers.mean(axis=0), true_centers.mean(axis=0)
+    spread, true_spread = float(np.linalg.norm(centers - middle)), float(np.linalg.norm(true_centers - aim))
+    if spread <= 1e-9 * max(1.0, float(np.abs(centers).max())) or true_spread == 0:
         return None
-    rotation, scale = nearest_rotation(turns.mean(axis=0)), true_length / length
-    return Similarity3(scale, rotation, true_centers.mean(axis=0) - scale * rotation @ centers.mean(axis=0))
+    covariance = (true_centers - aim).T @ (centers - middle)
+    scale = true_spread / spread
+    for _ in range(_ROUNDS):
+        # An angle θ between rotations R and T is θ² ≈ 3 − tr(Rᵀ T).
+        rotation = nearest_rotation(2 * scale * covariance / unit[1] ** 2 + turns.sum(axis=0) / unit[0] ** 2)
+        scale = max(float(np.trace(rotation.T @ covariance)) / spread**2, 1e-3 * true_spread / spread)
+    return Similarity3(scale, rotation, aim - scale * rotation @ middle)
 
 
 def _badness(errors: FloatArray, limits: FloatArray) -> tuple[int, float]:
-    """Return how bad errors are: the number of wrong cameras, then how close the right ones come to the limits."""
+    """Return how bad errors are: the number of wrong cameras, then the mean share of the limits (of right ones)."""
     shares = (errors / limits).max(axis=1)
     right = shares <= 1
-    return int((~right).sum()), float(shares[right].mean()) if right.any() else np.inf
+    return int((~right).sum()), float(shares[right].mean() if right.any() else shares.mean())
 
 
 def _extent(truth: Mapping[str, Rigid3]) -> float:
