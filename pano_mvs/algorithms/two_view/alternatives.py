@@ -29,7 +29,6 @@ from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-_DIRECTIONS = 200  # pairs of matches that vote for a direction, for each rotation
 _TWINS = 16  # samples among the matches of a known geometry
 _FRESH = 96  # samples among the matches that the best geometry does not explain
 _PEAKS = 6  # candidates of each kind that are settled
@@ -162,9 +161,7 @@ class _Search:
         found: list[Rigid3] = []
         wide_rad = 2 * self.threshold_rad  # the rotation is not quite right for these matches yet
         for rotation in _distinct_rotations(known):
-            directions, costs = voted_directions(
-                rotation, p, q, rng=self.rng, threshold_rad=wide_rad, count=_DIRECTIONS
-            )
+            directions, costs = voted_directions(rotation, p, q, rng=self.rng, threshold_rad=wide_rad)
             found += [Rigid3(rotation, direction) for direction in _peaks(directions, costs)]
         finalists = least_essentials(pool, p, q, wide_rad, count=_PEAKS)
         return found + [facing_pose(essential, p, q, wide_rad) for essential in finalists]

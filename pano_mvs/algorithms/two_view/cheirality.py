@@ -63,11 +63,13 @@ def least_essentials(
     threshold_rad: float,
     *,
     limit: float = np.inf,
+    sigmas: float = 3.0,
     count: int,
 ) -> FloatArray:
     """Return the essential matrices of least Σ min(r² / threshold², 1), wherever the matches lie.
 
-    A matrix that lags behind after a few matches is given up; one in a thousand that would have led goes with them.
+    A matrix that lags behind the best after a few matches is given up (after Capel 2005, "An effective bail-out test
+    for RANSAC consensus scoring"), and with them about one in a thousand that would have led.
 
     Args:
         essentials: (N, 3, 3).
@@ -75,6 +77,7 @@ def least_essentials(
         second: (M, 3) unit bearings.
         threshold_rad: Sampson error from which a match costs 1.
         limit: only those that cost less.
+        sigmas: how far it may lag behind, in standard deviations; infinity gives up none that would have led.
         count: at most so many.
 
     Returns:
@@ -83,7 +86,7 @@ def least_essentials(
     from pano_mvs.algorithms.two_view.kernels_agreement import rank_essentials
 
     best, costs = np.empty(count, np.int64), np.empty(count)
-    rank_essentials(_rows(essentials), _rows(first), _rows(second), threshold_rad, limit, best, costs)
+    rank_essentials(_rows(essentials), _rows(first), _rows(second), threshold_rad, limit, sigmas, best, costs)
     return essentials[best[best >= 0]]
 
 

@@ -12,8 +12,7 @@ import math
 import numpy as np
 from numba import njit
 
-_CHECKS = (16, 32, 64, 128)  # matches after which a hypothesis is given up if it lags behind
-_SIGMAS = 3.0
+_CHECKS = (16, 32, 64, 128)  # matches after which a hypothesis is given up if it lags too far behind
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -31,7 +30,7 @@ def _squared_error(e, p, q):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _essential_cost(essential, first, second, squared_threshold, limit):  # type: ignore[no-untyped-def]
+def _essential_cost(essential, first, second, squared_threshold, limit, sigmas):  # type: ignore[no-untyped-def]
     """Return the cost of all matches, or infinity once it is at least, or in all likelihood, above the limit."""
     count = len(first)
     mean = limit / count
@@ -44,13 +43,13 @@ def _essential_cost(essential, first, second, squared_threshold, limit):  # type
             return np.inf
         seen = idx + 1
         if mean < 1.0 and seen in _CHECKS:
-            if total > seen * mean + _SIGMAS * math.sqrt(seen * mean * (1.0 - mean)):
+            if total > seen * mean + sigmas * math.sqrt(seen * mean * (1.0 - mean)):
                 return np.inf
     return total
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def rank_essentials(essentials, first, second, threshold, limit, best, costs):  # type: ignore[no-untyped-def]
+def rank_essentials(essentials, first, second, threshold, limit, sigmas, best, costs):  # type: ignore[no-untyped-def]
     """Write the essential matrices of least cost, in ascending order.
 
     Args:
@@ -59,6 +58,7 @@ def rank_essentials(essentials, first, second, threshold, limit, best, costs):  
         second: (M, 3) unit bearings.
         threshold: in radians.
         limit: only costs below this.
+        sigmas: how far, in standard deviations, the cost of a hypothesis may lag behind the best after some matches.
         best: (K,) int64, written: positions in `essentials`, -1 where there are fewer.
         costs: (K,) float64, written, infinity where there are fewer.
     """
@@ -67,7 +67,7 @@ def rank_essentials(essentials, first, second, threshold, limit, best, costs):  
     last = len(best) - 1
     for n in range(len(essentials)):
         bound = min(limit, costs[last])
-        cost = _essential_cost(essentials[n], first, second, threshold * threshold, bound)
+        cost = _essential_cost(essentials[n], first, second, threshold * threshold, bound, sigmas)
         if cost >= bound:
             continue
         row = last
@@ -165,15 +165,16 @@ def direction_costs(rotated, second, directions, threshold, costs):  # type: ign
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _rotation_of(essential, t, rotation):  # type: ignore[no-untyped-def]
-    """Write the rotation of E = [t]× R: with |t| = 1 it is cof(E) − [t]× E (Horn 1990, "Recovering baseline and
-    orientation from essential matrix"), made orthonormal row by row.
+    """Write the rotation of E = [t]× R, made orthonormal row by row.
+
+    With |t| = 1 it is cof(E) − [t]× E (Horn 1990, "Recovering baseline and orientation from essential matrix").
     """
     e = essential
     for row in range(3):
         i, j = (row + 1) % 3, (row + 2) % 3
         for column in range(3):
-            k, l = (column + 1) % 3, (column + 2) % 3
-            cofactor = e[i, k] * e[j, l] - e[i, l] * e[j, k]
+            k, m = (column + 1) % 3, (column + 2) % 3
+            cofactor = e[i, k] * e[j, m] - e[i, m] * e[j, k]
             rotation[row, column] = cofactor - (t[i] * e[j, column] - t[j] * e[i, column])
     x, y, z = rotation[0], rotation[1], rotation[2]
     x /= math.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])

@@ -1,9 +1,9 @@
 """Compiled: the essential matrices through five pairs of bearings (Nistér 2004).
 
 E = x X + y Y + z Z + W over the null space of the five equations qᵀ E p = 0. The ten cubic constraints are reduced to
-three equations that are linear in x, y and 1 with polynomials in z as coefficients; their determinant is a polynomial of
-degree ten in z. Sturm's theorem separates its real roots in [-1, 1]; those of the reversed polynomial in (-1, 1) are the
-inverses of the others.
+three equations that are linear in x, y and 1 with polynomials in z as coefficients. Their determinant is a polynomial
+of degree ten in z. Sturm's theorem separates its real roots in [-1, 1]; those of the reversed polynomial in (-1, 1)
+are the inverses of the others.
 """
 
 from __future__ import annotations

@@ -19,7 +19,9 @@ FloatArray = NDArray[np.float64]
 
 _MIN_MATCHES = 16
 _MIN_INLIERS = 8
-_FINALISTS = 4  # hypotheses of a batch whose sides are looked at
+_SCREEN = 500  # matches on which all hypotheses of a batch are compared
+_FINALISTS = 4  # hypotheses of a batch that are compared on all matches
+_LAG_SIGMAS = 3.0  # hypotheses that lag so far behind are given up
 _LEADERS = 6  # hypotheses that are given new directions
 _POLISH = 1000  # inliers on which a leader is polished
 
@@ -158,10 +160,14 @@ class _Search:
         hypotheses = self.solver.solve(self.first[drawn], self.second[drawn])
         if not len(hypotheses):
             return None, np.inf, 0
-        # What a hypothesis costs without a look at the sides is the least that it can cost.
+        screened = slice(None, _SCREEN)
         finalists = least_essentials(
-            hypotheses, self.first, self.second, self.threshold_rad, limit=worst, count=_FINALISTS
-        )
+            hypotheses, self.first[screened], self.second[screened], self.threshold_rad,
+            # What a hypothesis costs without a look at the sides is the least that it can cost.
+            limit=worst if len(self.first) <= _SCREEN else np.inf,
+            sigmas=_LAG_SIGMAS if self.optimise else np.inf,
+            count=_FINALISTS,
+        )  # fmt: skip
         if not len(finalists):
             return None, np.inf, len(hypotheses)
         poses = [facing_pose(essential, self.first, self.second, self.threshold_rad) for essential in finalists]

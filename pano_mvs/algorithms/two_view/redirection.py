@@ -11,7 +11,6 @@ from pano_mvs.geometry import Rigid3
 
 FloatArray = NDArray[np.float64]
 
-_DIRECTIONS = 200
 _MATCHES = 1000  # on which directions are compared
 _ROUNDS = 2
 _STEPS = 8
@@ -67,7 +66,7 @@ def voted_directions(
     *,
     rng: np.random.Generator,
     threshold_rad: float,
-    count: int = _DIRECTIONS,
+    count: int = 200,
 ) -> tuple[FloatArray, FloatArray]:
     """Return directions of translation that pairs of matches vote for, (N, 3), and what each costs, (N,).
 
