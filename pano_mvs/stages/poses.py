@@ -164,8 +164,7 @@ def checked_poses(poses: Poses, ctx: Context, *, remedy: str = _CLOSER) -> Poses
     registered = len(poses.names)
     ctx.metric("registered", registered / max(1, registered + len(poses.rejected)))
     ctx.metric("points", len(poses.points_in_world))
-    if len(poses.worlds) > 1:
-        ctx.metric("groups", len(poses.worlds))
+    ctx.metric("groups", len(poses.worlds))
     if registered < 2:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(poses.rejected.items())[:8])
         raise GateError(f"no two panoramas could be registered, so there is no model. {remedy}. {reasons}")
