@@ -40,6 +40,7 @@ from pano_mvs.stages.frame import BaselineParams, LevelParams, ScaleParams, leve
 from pano_mvs.stages.fusion import VoteParams, vote
 from pano_mvs.stages.patchmatch import PatchMatchParams, patchmatch
 from pano_mvs.stages.points import TrackedParams, tracked
+from pano_mvs.stages.poses import known_poses
 from pano_mvs.testing.tiny_capture import TinyCapture, tiny_capture
 
 _LARGE = ("000.png", "001.png", "003.png")
@@ -174,6 +175,17 @@ def test_each_room_is_a_sparse_model(rooms: Rooms, ctx: Context, tmp_path: Path)
         assert centers.keys() == set(group.names)
         for name, center in zip(group.names, group.centers, strict=True):
             np.testing.assert_allclose(centers[name], center, atol=1e-9)
+
+
+def test_known_poses_are_those_of_the_largest_room_and_say_where_the_others_are(
+    rooms: Rooms, ctx: Context, tmp_path: Path
+):
+    out = _placed(colmap(poses=rooms.poses, images=rooms.images, params=ModelParams(), ctx=ctx), tmp_path / "out")
+    known = known_poses(out, (*_ORDER, "new.png"))
+    assert set(known.names) == set(_LARGE)
+    assert known.rejected["b0.png"].startswith("out has it in group 1, whose frame is another: give the model sparse/1")
+    assert known.rejected["new.png"] == "out has no pose for it"
+    assert known_poses(out / "colmap" / "sparse" / "1", _ORDER).names == tuple(_SMALL)
 
 
 def _tracked(rooms: Rooms, ctx: Context, count: int = 100):
