@@ -39,6 +39,7 @@ from pano_mvs.scene import (
     Views,
 )
 from pano_mvs.scene.image_file import decode_image, write_png
+from pano_mvs.scene.pose_groups import join_groups, per_group, split_groups
 
 __all__ = [
     "NOT_IN_KEY",
@@ -79,9 +80,12 @@ __all__ = [
     "Views",
     "Winners",
     "decode_image",
+    "join_groups",
+    "per_group",
     "register_sweep_backend",
     "register_sweep_cost",
     "source",
+    "split_groups",
     "stage",
     "write_png",
 ]

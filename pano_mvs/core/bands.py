@@ -20,6 +20,10 @@ def for_bands(work: Callable[[int, int], object], height: int, *, threads: int) 
         threads: how many bands to work on at a time.
     """
     firsts = range(0, height, _BAND_ROWS)
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
+    if threads <= 1:
+        for first in firsts:
+            work(first, min(_BAND_ROWS, height - first))
+        return
+    with ThreadPoolExecutor(threads) as pool:
         for _ in pool.map(lambda first: work(first, min(_BAND_ROWS, height - first)), firsts):
             pass

@@ -131,9 +131,9 @@ def pose_groups(poses: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:
     centers = dict(zip(map(str, poses["registered"]), poses["centers"], strict=False))
     found = []
     for group in groups:
-        names = [str(name) for name in group.get("images") or []]
+        names = dict.fromkeys(str(name) for name in group.get("images") or [])
         found.append({
-            "registered": names,
+            "registered": list(names),
             "centers": [centers[name] for name in names if name in centers],
             "links": [link for link in poses["links"] if link[0] in names and link[1] in names],
             "frame": group.get("frame", ""), "scale": group.get("scale", ""), "metric": group.get("metric", False),

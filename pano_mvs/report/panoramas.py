@@ -29,6 +29,7 @@ class Row:
         residual_deg: median reprojection residual, or None.
         p95_deg: 95 % of its residuals are smaller, or None.
         thumbnail: its preview, if there is one.
+        group: number of its group, None where there is one group alone.
     """
 
     name: str
@@ -41,6 +42,7 @@ class Row:
     residual_deg: float | None
     p95_deg: float | None
     thumbnail: Picture | None
+    group: int | None = None
 
     @property
     def doubt(self) -> float:
@@ -75,6 +77,10 @@ def panorama_rows(
     links = Counter(
         name for first, second, inliers, *_ in poses.get("links") or [] if inliers for name in (first, second)
     )
+    groups = poses.get("groups") or []
+    group_of = {
+        str(name): number for number, group in enumerate(groups) for name in group.get("images") or () if groups[1:]
+    }
     names = dict.fromkeys([*map(str, poses.get("registered") or []), *figures, *rejected])
     rows = []
     for name in list(names)[:MOST_ROWS]:
@@ -83,7 +89,7 @@ def panorama_rows(
         rows.append(
             Row(name, name in registered if poses else None, rejected.get(name, ""), shares.get(name),
                 _number(view.get("completeness")), _number(view.get("consistent")), links[name], median, p95,
-                thumbnails.get(name))
+                thumbnails.get(name), group_of.get(name))
         )  # fmt: skip
     return tuple(rows)
 

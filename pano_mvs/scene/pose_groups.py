@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.scene.poses import Poses
+from pano_mvs.scene.poses import Pose, Poses
 
 _PER_CAMERA = ("center_stds", "rotation_stds_rad", "confirmed_shares", "expected_shares")
 ALONE = "no other picture shares its frame, so that its place tells nothing"
@@ -78,6 +78,15 @@ def per_group(poses: Poses, function: Callable[[Poses], Poses]) -> Poses:
     if not poses.other_worlds:
         return function(poses)
     return join_groups([function(group) for group in split_groups(poses)], order=poses.names, rejected=poses.rejected)
+
+
+def require_one_group(pose: Pose, others: Iterable[Pose]) -> None:
+    """Raise UsageError unless poses that are to be compared are of one group, and so in one world."""
+    groups = {pose.group, *(other.group for other in others)}
+    if len(groups) > 1:
+        named = ", ".join(map(str, sorted(groups)))
+        raise UsageError(f"a view and its sources are in groups {named} of the poses, which have different worlds. The "
+                         "view selector must choose sources of one group")  # fmt: skip
 
 
 def with_cameras(poses: Poses, kept: NDArray[np.bool_]) -> Poses:

@@ -14,6 +14,7 @@ from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.sweep import sweep_range
 from pano_mvs.api import NOT_IN_KEY, Context, Each, Near, Panorama, Params, PartOf, Pose, RangeMap, stage
 from pano_mvs.core.errors import UsageError
+from pano_mvs.scene.pose_groups import require_one_group
 from pano_mvs.stages.fields import Odd
 
 _NOT_SETTINGS = {"backend", "device", "near", "far"}
@@ -144,6 +145,7 @@ def sweep(
     Without `near` and `far` the limits come from small sweeps of the reference and its first sources, from what they
     agree on.
     """
+    require_one_group(pose, source_poses)
     pictures = [ref.load(), *(source.load() for source in sources)]
     masks = [ref.load_mask(), *(source.load_mask() for source in sources)]
     poses = [pose.cam_from_world, *(other.cam_from_world for other in source_poses)]

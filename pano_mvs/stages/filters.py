@@ -19,6 +19,7 @@ from pano_mvs.algorithms.filters.planes import lay_planes
 from pano_mvs.algorithms.filters.replacement import with_ranges
 from pano_mvs.algorithms.filters.speckle import remove_speckles
 from pano_mvs.api import Context, Each, Near, Panorama, Params, Pose, RangeMap, stage
+from pano_mvs.scene.pose_groups import require_one_group
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 from pano_mvs.stages.fields import Odd
 from pano_mvs.stages.memory import bytes_per_pixel
@@ -119,6 +120,7 @@ def consistency(
     ctx: Context,
 ) -> RangeMap:
     """Compare each range with those of the neighbours, forward and back: confidence 128–255 where they confirm it."""
+    require_one_group(pose, source_poses)
     checked = check_consistency(
         range_map,
         pose.cam_from_world,

@@ -6,6 +6,7 @@ from pydantic import Field
 
 from pano_mvs.algorithms.patchmatch.refine import refine_range
 from pano_mvs.api import Context, Each, Near, Panorama, Params, Pose, RangeMap, stage
+from pano_mvs.scene.pose_groups import require_one_group
 from pano_mvs.stages.fields import Odd
 from pano_mvs.stages.memory import bytes_per_pixel
 
@@ -40,6 +41,7 @@ def patchmatch(
     ctx: Context,
 ) -> RangeMap:
     """Lay slanted planes through the ranges and move them to where the pictures match; gives normals."""
+    require_one_group(pose, source_poses)
     refined = refine_range(
         range_map,
         ref.load(),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
@@ -31,7 +31,7 @@ from pano_mvs.api import (
     stage,
 )
 from pano_mvs.io.names import match_image_names
-from pano_mvs.io.pose_files import read_poses, recorded_pictures
+from pano_mvs.io.pose_files import read_groups, recorded_pictures
 from pano_mvs.scene.pose_groups import split_groups
 
 
@@ -225,8 +225,7 @@ def checked_poses(poses: Poses, ctx: Context, *, remedy: str = _CLOSER) -> Poses
         ctx.note(f"the pose of {name} is doubtful: {reason}")
     if poses.confirmed_shares is not None and np.isfinite(poses.confirmed_shares).any():
         ctx.metric("confirmed_share_median", np.nanmedian(poses.confirmed_shares))
-    if len(poses.worlds) > 1:
-        ctx.metric("groups", len(poses.worlds))
+    ctx.metric("groups", len(poses.worlds))
     if registered < 2:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(poses.rejected.items())[:8])
         raise GateError(f"no two panoramas could be registered, so there is no model. {remedy}. {reasons}")
@@ -236,12 +235,13 @@ def checked_poses(poses: Poses, ctx: Context, *, remedy: str = _CLOSER) -> Poses
 def known_poses(path: Path, images: tuple[str, ...]) -> Poses:
     """Return the poses that a file has for the images of a capture, in the capture's order, without points.
 
-    Images without a pose, and images that share one name of the file, are rejected with the reason.
+    Images without a pose, and images that share one name of the file, are rejected with the reason. Of an output folder
+    with several groups of poses the largest is read.
 
     Raises:
         InputError: if the file cannot be used, knows none of the images, or has all of them in one place.
     """
-    model = read_poses(path)
+    model, *others = read_groups(path)
     known = match_image_names(images, model.names)
     if not known:
         raise InputError(f"{path}: none of its {len(model.names)} images is one of this capture (it has "
@@ -259,7 +259,7 @@ def known_poses(path: Path, images: tuple[str, ...]) -> Poses:
     rejected = {
         name: f"{path.name} has one pose, {known[name]!r}, that several pictures could mean"
         if name in known
-        else f"{path.name} has no pose for it"
+        else _why_unknown(name, path, others)
         for name in images
         if name not in poses
     }
@@ -270,3 +270,11 @@ def known_poses(path: Path, images: tuple[str, ...]) -> Poses:
         scale=model.scale,
         metric=model.metric,
     )
+
+
+def _why_unknown(name: str, path: Path, others: Sequence[Poses]) -> str:
+    for number, group in enumerate(others, start=1):
+        if match_image_names((name,), group.names):
+            return (f"{path.name} has it in group {number}, whose frame is another: give the model sparse/{number} to "
+                    "have that group")  # fmt: skip
+    return f"{path.name} has no pose for it"

@@ -13,6 +13,7 @@ import pytest
 
 from pano_mvs.algorithms.faces.layout import CUBE_ROTATIONS
 from pano_mvs.algorithms.metrics.poses import relative_pose_errors
+from pano_mvs.algorithms.poses import colmap
 from pano_mvs.algorithms.poses.colmap import solve_colmap
 from pano_mvs.algorithms.poses.colmap_database import Cameras, write_database
 from pano_mvs.algorithms.poses.colmap_faces import face_of_bearing, face_pixels, face_size
@@ -24,6 +25,7 @@ from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.testing.room import capture_poses, default_room, render
 from tests.algorithms.synthetic_capture import random_poses, synthetic_features, synthetic_two_views
+from tests.scene.pose_groups import drawn_group
 
 Capture = tuple[dict[str, Rigid3], dict[str, Features], dict[tuple[str, str], TwoView]]
 MAPPERS: list[tuple[Mapper, Cameras]] = [
@@ -129,6 +131,25 @@ def test_two_places_make_two_groups_each_in_its_own_world(tmp_path: Path) -> Non
     for group in (large, small):
         np.testing.assert_array_equal(group.rotations[0], np.eye(3))
         assert np.linalg.norm(group.centers[1]) == pytest.approx(1)
+
+
+def test_a_panorama_in_two_models_is_taken_from_the_larger_one(
+    capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """COLMAP's sub-models may overlap; what is left of the third one here is a single panorama."""
+    models = [
+        drawn_group(("0.jpg", "1.jpg", "2.jpg"), seed=1),
+        drawn_group(("2.jpg", "3.jpg", "4.jpg"), seed=2),
+        drawn_group(("4.jpg", "5.jpg"), seed=3),
+    ]
+    monkeypatch.setattr(colmap, "run_mapper", lambda *_, **__: models)
+    monkeypatch.setattr(colmap, "poses_from_model", lambda model, *_, **__: model)
+    poses = solved(capture, tmp_path)
+    assert poses.names == ("0.jpg", "1.jpg", "2.jpg", "3.jpg", "4.jpg")
+    assert poses.groups.tolist() == [0, 0, 0, 1, 1]
+    assert len(poses.points_in_world) == sum(len(model.points_in_world) for model in models[:2])
+    assert list(poses.rejected) == ["5.jpg"]
+    assert "COLMAP did not register it" in poses.rejected["5.jpg"]
 
 
 @pytest.mark.parametrize("mapper", ["incremental", "global"])

@@ -109,6 +109,7 @@ def test_the_page_draws_each_group_apart_and_says_its_frame(rooms, out_dir):
     assert "Group 0: 2 panoramas" in text
     assert "Group 1: 2 panoramas" in text
     assert "the annexe's" in text
+    assert [text.count(f"{name} group {number}") for name, number in (("001.png", 0), ("002.png", 1))] == [1, 1]
     assert "metres, by GPS" in text
     assert "each has its own frame and unit of length" in text
     assert sum(tag == "svg" and "cameras from" in str(values.get("aria-label")) for tag, values in page.elements) == 4

@@ -12,7 +12,7 @@ import pycolmap
 import pytest
 
 from pano_mvs.algorithms.poses.gauge import moved_poses
-from pano_mvs.core.errors import InputError
+from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.engine.context import Context
 from pano_mvs.engine.ports import Names
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec
@@ -20,8 +20,9 @@ from pano_mvs.io.nerfstudio_frames import NerfstudioFrame, NerfstudioFrames
 from pano_mvs.io.ply import read_ply
 from pano_mvs.scene import Files, Panorama, PointCloud, Pose, Poses, RangeMap
 from pano_mvs.scene.face_files import FaceFiles
-from pano_mvs.scene.pose_groups import join_groups, split_groups
+from pano_mvs.scene.pose_groups import join_groups, split_groups, with_cameras
 from pano_mvs.scene.surface_samples import SurfaceSamples
+from pano_mvs.stages.depth import SweepParams, sweep
 from pano_mvs.stages.evaluate import TruthParams, truth
 from pano_mvs.stages.export import PlyParams, ply
 from pano_mvs.stages.export_colmap import (
@@ -34,9 +35,12 @@ from pano_mvs.stages.export_colmap import (
 )
 from pano_mvs.stages.export_mesh import MeshParams, mesh
 from pano_mvs.stages.export_nerfstudio import NerfstudioParams, nerfstudio
+from pano_mvs.stages.filters import ConsistencyParams, consistency
 from pano_mvs.stages.frame import BaselineParams, LevelParams, ScaleParams, level, scale
 from pano_mvs.stages.fusion import VoteParams, vote
+from pano_mvs.stages.patchmatch import PatchMatchParams, patchmatch
 from pano_mvs.stages.points import TrackedParams, tracked
+from pano_mvs.stages.poses import known_poses
 from pano_mvs.testing.tiny_capture import TinyCapture, tiny_capture
 
 _LARGE = ("000.png", "001.png", "003.png")
@@ -72,8 +76,6 @@ class Rooms:
 
 
 def _with(poses: Poses, names: tuple[str, ...]) -> Poses:
-    from pano_mvs.scene.pose_groups import with_cameras
-
     return with_cameras(poses, np.array([name in names for name in poses.names]))
 
 
@@ -173,6 +175,17 @@ def test_each_room_is_a_sparse_model(rooms: Rooms, ctx: Context, tmp_path: Path)
         assert centers.keys() == set(group.names)
         for name, center in zip(group.names, group.centers, strict=True):
             np.testing.assert_allclose(centers[name], center, atol=1e-9)
+
+
+def test_known_poses_are_those_of_the_largest_room_and_say_where_the_others_are(
+    rooms: Rooms, ctx: Context, tmp_path: Path
+):
+    out = _placed(colmap(poses=rooms.poses, images=rooms.images, params=ModelParams(), ctx=ctx), tmp_path / "out")
+    known = known_poses(out, (*_ORDER, "new.png"))
+    assert set(known.names) == set(_LARGE)
+    assert known.rejected["b0.png"].startswith("out has it in group 1, whose frame is another: give the model sparse/1")
+    assert known.rejected["new.png"] == "out has no pose for it"
+    assert known_poses(out / "colmap" / "sparse" / "1", _ORDER).names == tuple(_SMALL)
 
 
 def _tracked(rooms: Rooms, ctx: Context, count: int = 100):
@@ -338,3 +351,18 @@ def test_a_camera_height_scales_every_room_with_a_floor(rooms: Rooms, ctx: Conte
         _metres(rooms.poses, "b0.png", "b1.png") * 2 * _metres(poses, "000.png", "001.png")
         / _metres(rooms.poses, "000.png", "001.png"), rel=0.1,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("function", "extras"),
+    [
+        (sweep, {"ref": None, "params": SweepParams()}),
+        (patchmatch, {"ref": None, "range_map": None, "params": PatchMatchParams()}),
+        (consistency, {"range_map": None, "params": ConsistencyParams()}),
+    ],
+)
+def test_sources_of_another_room_are_refused(function, extras: dict, rooms: Rooms, ctx: Context):
+    """A view selector of somebody's own may not know of groups."""
+    poses = {"pose": rooms.pose_items["000.png"], "source_poses": [rooms.pose_items["b0.png"]]}
+    with pytest.raises(UsageError, match=r"in groups 0, 1 of the poses, .* view selector must choose"):
+        function(sources=[None], ctx=ctx, **poses, **extras)

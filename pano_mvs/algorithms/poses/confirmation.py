@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,7 @@ from pano_mvs.algorithms.sweep.hypotheses import range_limits
 from pano_mvs.algorithms.sweep.limits import reduced_mask, reduced_panorama, textured_pixels
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.sweep import sweep_range
-from pano_mvs.geometry import Rigid3, angle_between, pixel_solid_angle, ray_grid
+from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle, pixel_solid_angle, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
@@ -29,7 +29,9 @@ _NEAREST_BASELINES = 0.15
 _MAX_RELATIVE_ERROR, _MAX_REPROJECTION_PX, _MIN_SUPPORT, _MIN_MOTION_PX = 0.05, 1.0, 0.5, 0.05
 # Less texture than this share of the sphere says nothing about a pose.
 MIN_TEXTURED = 0.05
-_CACHED_MAPS = 256
+# Maps that are kept for an image with the same sources; relative poses that differ by less than this give the same map.
+_MAPS_PER_IMAGE = 3
+_SAME_PLACE, _SAME_TURN_RAD = 0.005, float(np.deg2rad(0.1))
 _PARALLAX_EDGES_DEG = np.array([2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 50.0, 65.0, 180.0])
 _CLASSES = len(_PARALLAX_EDGES_DEG)
 # Solid angle with which the overall share counts in each class.
@@ -101,7 +103,7 @@ class Confirmation:
     def __init__(self, load: Callable[[int], Picture]) -> None:
         self._load = load
         self._small: dict[int, _Small] = {}
-        self._maps: OrderedDict[tuple[object, ...], RangeMap] = OrderedDict()
+        self._maps: dict[tuple[int, ...], list[tuple[list[Rigid3], float, RangeMap]]] = {}
 
     def share(self, image: int, pose: Rigid3, cameras: Mapping[int, Rigid3]) -> float:
         """Return the share of an image's textured pixels, by solid angle, that other images confirm; see `evidence`."""
@@ -115,6 +117,10 @@ class Confirmation:
             pose: the cam_from_world to judge.
             cameras: cam_from_world of other images, which are taken as they are; `image` itself is left out.
         """
+        with _one_thread():
+            return self._evidence(image, pose, cameras)
+
+    def _evidence(self, image: int, pose: Rigid3, cameras: Mapping[int, Rigid3]) -> Evidence:
         others = {idx: camera for idx, camera in cameras.items() if idx != image}
         sources = nearest_cameras(pose, others)
         small = self.small(image)
@@ -153,16 +159,25 @@ class Confirmation:
         return self._small[image]
 
     def _swept(self, image: int, pose: Rigid3, sources: Sequence[int], cameras: Mapping[int, Rigid3]) -> RangeMap:
-        """Return the small range map of an image against its sources; the latest are kept."""
+        """Return the small range map of an image against its sources.
+
+        A map that was swept with nearly the same relative poses is used again: an adjustment moves all cameras a little.
+        """
         relative = [cameras[idx] @ pose.inverse() for idx in sources]
-        key = (image, *sources, *(part.tobytes() for to in relative for part in (to.rotation, to.translation)),
-               pose.translation.tobytes())  # fmt: skip
-        if key in self._maps:
-            self._maps.move_to_end(key)
-            return self._maps[key]
+        scale = float(np.median([np.linalg.norm(to.translation) for to in relative]))
+        known = self._maps.setdefault((image, *sources), [])
+        for before, before_scale, ranges in known:
+            if all(_nearly(a, scale, b, before_scale) for a, b in zip(relative, before, strict=True)):
+                return RangeMap(ranges.range * np.float32(scale / before_scale), ranges.confidence)
+        ranges = self._sweep(image, sources, relative)
+        known.append((relative, scale, ranges))
+        del known[:-_MAPS_PER_IMAGE]
+        return ranges
+
+    def _sweep(self, image: int, sources: Sequence[int], relative: Sequence[Rigid3]) -> RangeMap:
         small = self.small(image)
         baselines = [float(np.linalg.norm(to.translation)) for to in relative]
-        self._maps[key] = sweep_range(
+        return sweep_range(
             small.image,
             [self.small(idx).image for idx in sources],
             relative,
@@ -172,9 +187,25 @@ class Confirmation:
             reference_mask=small.mask,
             source_masks=[self.small(idx).mask for idx in sources],
         )
-        if len(self._maps) > _CACHED_MAPS:
-            self._maps.popitem(last=False)
-        return self._maps[key]
+
+
+def _nearly(pose: Rigid3, scale: float, other: Rigid3, other_scale: float) -> bool:
+    """Return whether two relative poses, each in its unit, are one for a sweep at 256 columns."""
+    moved = float(np.linalg.norm(pose.translation / scale - other.translation / other_scale))
+    return moved < _SAME_PLACE and float(geodesic_angle(pose.rotation, other.rotation)) < _SAME_TURN_RAD
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Let sweeps work in the calling thread: maps as small as these cost less than handing them to others."""
+    import numba
+
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        yield
+    finally:
+        numba.set_num_threads(threads)
 
 
 def _parallax_classes(ranges: NDArray[np.float32], pose: Rigid3, sources: Sequence[Rigid3]) -> NDArray[np.intp]:

@@ -25,7 +25,7 @@ _CLEAR = 0.8  # a runner-up with more than this share of the best score leaves a
 _CLEAR_TO_REFEREE = 0.4  # … and with more than this where there is somebody to ask
 _SATISFYING = 0.85  # share of the pairs explained with which the first model is good enough
 _CERTAIN = 0.97  # share of the pairs explained from which the images are not asked
-_RIVALS = 3
+_RIVALS = 2
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,12 +12,13 @@ take several times longer to compile, and their portable threading layer aborts 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from math import ceil
-from typing import TypeVar
+from typing import TypeAlias, TypeVar
 
 import numba
 import numpy as np
@@ -46,6 +47,7 @@ _STRIP_LINES = 128
 _NO_SUM = 65535
 
 Job = TypeVar("Job")
+_Pool: TypeAlias = ThreadPoolExecutor | None
 
 
 def find_winners(work: SweepInput) -> Winners:
@@ -120,7 +122,7 @@ def _box_winners(work: SweepInput, prepared: tuple[object, ...]) -> Winners:
         sweep_band(first, *prepared, _NO_VOLUME, state, planes)
         _keep(found, first, state, planes)
 
-    with ThreadPoolExecutor(numba.get_num_threads()) as pool:
+    with _workers() as pool:
         _run(pool, sweep, range(0, height, _BAND_ROWS))
     return found
 
@@ -135,7 +137,7 @@ def _volume_of(work: SweepInput, prepared: tuple[object, ...], around: slice) ->
         here = first - around.start
         sweep_band(first, *prepared, volume[here : here + rows], state, planes)
 
-    with ThreadPoolExecutor(numba.get_num_threads()) as pool:
+    with _workers() as pool:
         _run(pool, sweep, range(around.start, around.stop, _BAND_ROWS))
     return volume
 
@@ -159,7 +161,7 @@ def winners_by_paths(work: SweepInput, volume: NDArray[np.uint8], *, top: int = 
         rival = found.rival[first : first + rows]
         rival[rival == _NO_SUM] = np.inf
 
-    with ThreadPoolExecutor(numba.get_num_threads()) as pool:
+    with _workers() as pool:
         total = _aggregate(pool, work, volume, top)
         _run(pool, decide, range(0, height, _BAND_ROWS))
     return found
@@ -194,7 +196,7 @@ def _band_arguments(work: SweepInput) -> tuple[object, ...]:
     )  # fmt: skip
 
 
-def _aggregate(pool: ThreadPoolExecutor, work: SweepInput, volume: NDArray[np.uint8], top: int) -> NDArray[np.uint16]:
+def _aggregate(pool: _Pool, work: SweepInput, volume: NDArray[np.uint8], top: int) -> NDArray[np.uint16]:
     """Return the sum of the eight paths' costs, (rows, D, W) uint16."""
     height, width = work.reference.shape[:2]
     settings, rows = work.settings, slice(top, top + len(volume))
@@ -227,9 +229,19 @@ def _follow_lines(
     sweep_strip(volume, total, penalties[1], p1, last, lines, -drift, True, warm[1])
 
 
-def _run(pool: ThreadPoolExecutor, work: Callable[[Job], object], jobs: Iterable[Job]) -> None:
+@contextmanager
+def _workers() -> Iterator[_Pool]:
+    """Give threads as many as numba may use; None for one, which needs no pool."""
+    if numba.get_num_threads() == 1:
+        yield None
+        return
+    with ThreadPoolExecutor(numba.get_num_threads()) as pool:
+        yield pool
+
+
+def _run(pool: _Pool, work: Callable[[Job], object], jobs: Iterable[Job]) -> None:
     """Do all jobs and raise what the first of them raised."""
-    for _ in pool.map(work, jobs):
+    for _ in map(work, jobs) if pool is None else pool.map(work, jobs):
         pass
 
 
