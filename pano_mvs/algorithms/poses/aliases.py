@@ -1,7 +1,7 @@
 """Blocks of cameras that repeated structure has shifted together, and the moves that would put them back.
 
-Where a row of equal doors or columns repeats, all pairs between two blocks of cameras may agree on a relative place that
-is one period off: each camera is then well supported, and no camera can be moved alone. But some pairs also have a
+Where a row of equal doors or columns repeats, all pairs between two blocks of cameras may agree on a relative place
+that is one period off: each camera is then well supported, and no camera can be moved alone. But some pairs also have a
 runner-up geometry, supported by what does not repeat, and all of these suggest the same move of one block.
 """
 
@@ -27,7 +27,7 @@ _MIN_PAIRS = 3
 _MAX_ALIASES = 3
 # How much a pair that agrees as things are counts against separating its images.
 _HELD = 0.1
-_LABELLINGS = 3
+_LABELLINGS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +77,8 @@ def find_aliases(model: PlacedModel) -> list[Alias]:
 def labellings(model: PlacedModel, alias: Alias) -> list[dict[int, int]]:
     """Return which cameras an alias may have shifted, image position to 0 or 1 (to be moved); the likeliest first.
 
-    A labelling is good if many pairs that suggest the move join images with different labels, the right way round, and few
-    pairs join such images that do not suggest it. Each is the best that is found by single changes from one vote.
+    A labelling is good if many pairs that suggest the move join images with different labels, the right way round, and
+    few pairs join such images that do not suggest it. Each is the best that single changes lead to from one vote.
     """
     images = sorted(model.cameras)
     place = {image: idx for idx, image in enumerate(images)}

@@ -161,7 +161,8 @@ class Confirmation:
     def _swept(self, image: int, pose: Rigid3, sources: Sequence[int], cameras: Mapping[int, Rigid3]) -> RangeMap:
         """Return the small range map of an image against its sources.
 
-        A map that was swept with nearly the same relative poses is used again: an adjustment moves all cameras a little.
+        A map that was swept with nearly the same relative poses is used again: an adjustment moves all cameras a
+        little.
         """
         relative = [cameras[idx] @ pose.inverse() for idx in sources]
         scale = float(np.median([np.linalg.norm(to.translation) for to in relative]))

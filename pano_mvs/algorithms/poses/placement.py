@@ -64,7 +64,8 @@ def placements(witnesses: Witnesses) -> list[Placement]:
             pose = _refined(witnesses, tight, pose.center)
             tight = agreement(witnesses, pose.rotation[None], pose.center[None])[0]
         score = float(best_by_partner(witnesses.partner, (tight * witnesses.weight)[None])[0])
-        found.append(Placement(pose, tight, score))
+        if score > 0:
+            found.append(Placement(pose, tight, score))
     found.sort(key=lambda placement: -placement.score)
     distinct: list[Placement] = []
     for placement in found:
