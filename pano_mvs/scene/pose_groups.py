@@ -65,7 +65,10 @@ def join_groups(
     reasons |= {name: ALONE for group in ranked if len(group.names) == 1 for name in group.names}
     kept = kept or list(groups[:1])
     registered = {name for group in kept for name in group.names}
-    joined = _concatenated(kept, position)
+    places = [position[name] for name in kept[0].names]
+    # A capture in one piece, the usual case, is not copied.
+    alone = len(kept) == 1 and places == sorted(places)
+    joined = replace(kept[0], group_idx=None) if alone else _concatenated(kept, position)
     return replace(joined, rejected={name: why for name, why in reasons.items() if name not in registered})
 
 

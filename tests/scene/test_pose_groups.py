@@ -82,6 +82,10 @@ def test_one_group_is_passed_on_as_it_is():
     assert split_groups(_LARGE) == [_LARGE]
     assert per_group(_LARGE, lambda poses: poses) is _LARGE
     _assert_same(join_groups([_LARGE]), _LARGE)
+    assert join_groups([_LARGE], order=_ORDER).track_bearings is _LARGE.track_bearings
+    backwards = join_groups([_LARGE], order=tuple(reversed(_ORDER)))
+    assert backwards.names == tuple(reversed(_LARGE.names))
+    np.testing.assert_array_equal(backwards.rotations, _LARGE.rotations[::-1])
 
 
 def test_per_group_treats_each_group_alone_and_joins_what_comes_out():
