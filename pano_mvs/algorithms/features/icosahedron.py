@@ -34,6 +34,17 @@ def face_corners() -> FloatArray:
     return np.array(_faces())
 
 
+def beyond_face_rad(bearings: FloatArray, face_idx: int) -> FloatArray:
+    """Return by how many radians bearings (..., 3) lie beyond the nearest edge of a face, (...,); negative inside."""
+    centers = face_centers()
+    across = centers - centers[face_idx]
+    lengths = np.linalg.norm(across, axis=1)
+    lengths[face_idx] = 1.0
+    # The face's own centre gives 0, which would hide how far inside the others' edges a bearing lies.
+    beyond: FloatArray = np.delete(bearings @ (across / lengths[:, None]).T, face_idx, axis=-1).max(axis=-1)
+    return beyond
+
+
 def tangent_tiles(size_hw: tuple[int, int]) -> list[PinholeView]:
     """Return the twenty tiles for a panorama, at its own resolution at the equator (W / 2π px per radian)."""
     focal_px = size_hw[1] / (2 * np.pi)

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.sampling import sample_view
-from pano_mvs.algorithms.features.icosahedron import face_centers, tangent_tiles
+from pano_mvs.algorithms.features.icosahedron import beyond_face_rad, tangent_tiles
 from pano_mvs.algorithms.features.selection import distinct_keypoints, spread_keypoints
+from pano_mvs.algorithms.features.tile_sampling import owned_pixels, sample_tile
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import PinholeView, pixel_from_ray
 from pano_mvs.scene import Features
@@ -40,7 +41,7 @@ class _Found:
         return _Found(self.pixels_px[keep], self.sizes_px[keep], self.scores[keep], self.descriptors[keep])
 
 
-_Detector = Callable[[NDArray[np.uint8]], _Found]
+_Detector = Callable[[NDArray[np.uint8], NDArray[np.uint8]], _Found]
 
 
 def extract_sift(
@@ -71,8 +72,9 @@ def extract_sift(
         contrastThreshold=contrast_threshold, edgeThreshold=_SIFT_EDGE_RATIO, enable_precise_upscale=True
     )
 
-    def detect(tile_image: NDArray[np.uint8]) -> _Found:
-        keypoints, descriptors = detector.detectAndCompute(tile_image, None)
+    def detect(tile_image: NDArray[np.uint8], owned: NDArray[np.uint8]) -> _Found:
+        # Descriptors are half of the work, and three of four key points belong to another tile.
+        keypoints, descriptors = detector.detectAndCompute(tile_image, owned)
         pixels = np.array([k.pt for k in keypoints]).reshape(-1, 2) + 0.5
         described = np.zeros((0, 128), np.float32) if descriptors is None else descriptors
         return _Found(pixels, *_sizes_and_scores(keypoints), _rooted(described) if root else described)
@@ -106,7 +108,8 @@ def extract_orb(
         fastThreshold=fast_threshold,
     )
 
-    def detect(tile_image: NDArray[np.uint8]) -> _Found:
+    def detect(tile_image: NDArray[np.uint8], _owned: NDArray[np.uint8]) -> _Found:
+        # A mask would change which key points ORB retains as the best of each level.
         keypoints, descriptors = detector.detectAndCompute(tile_image, None)
         described = np.zeros((0, 32), np.uint8) if descriptors is None else descriptors
         return _Found(_orb_pixels(keypoints, tile_image), *_sizes_and_scores(keypoints), described)
@@ -130,7 +133,10 @@ def _extract(
     gray: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     valid = np.where(mask, np.uint8(255), np.uint8(0))
     tiles = tangent_tiles(size_hw)
-    found = [_owned(_unmasked(detect(sample_view(gray, t)), valid, t, clearance), t, i) for i, t in enumerate(tiles)]
+    detected = [detect(sample_tile(gray, idx), owned_pixels(size_hw, idx)) for idx in range(len(tiles))]
+    found = [
+        _owned(_unmasked(f, valid, t, clearance), t, i) for i, (f, t) in enumerate(zip(detected, tiles, strict=True))
+    ]
     bearings = np.concatenate([t.bearings_from_pixels(f.pixels_px) for t, f in zip(tiles, found, strict=True)])
     sizes = np.concatenate([_angular_sizes(t, f) for t, f in zip(tiles, found, strict=True)])
     scores = np.concatenate([f.scores for f in found])
@@ -170,12 +176,7 @@ def _owned(found: _Found, tile: PinholeView, tile_idx: int) -> _Found:
     Two tiles place a key point on their common edge a little differently, and each might leave it to the other; so
     either takes what lies just beyond the edge too, and the weaker of two is dropped later on.
     """
-    centers = face_centers()
-    across = centers - centers[tile_idx]
-    lengths = np.linalg.norm(across, axis=1)
-    lengths[tile_idx] = 1.0
-    beyond_rad = tile.bearings_from_pixels(found.pixels_px) @ (across / lengths[:, None]).T
-    return found[beyond_rad.max(axis=1) < _EDGE_PX / tile.focal_px]
+    return found[beyond_face_rad(tile.bearings_from_pixels(found.pixels_px), tile_idx) < _EDGE_PX / tile.focal_px]
 
 
 def _angular_sizes(tile: PinholeView, found: _Found) -> NDArray[np.float64]:

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.matching.nearest_two import nearest_two
+from pano_mvs.algorithms.matching.whole_numbers import fits_whole_numbers, nearest_two_whole
 from pano_mvs.core.errors import UsageError
 from pano_mvs.scene import Features
-
-_BLOCK_ROWS = 256
 
 
 def match_features(first: Features, second: Features, *, ratio: float = 0.8, mutual: bool = True) -> NDArray[np.int32]:
@@ -44,31 +44,12 @@ def match_features(first: Features, second: Features, *, ratio: float = 0.8, mut
 def _match_l2(
     first: NDArray[np.generic], second: NDArray[np.generic], *, ratio: float, mutual: bool
 ) -> NDArray[np.int32]:
-    """Compare by Euclidean distance: |a − b|² = |a|² + |b|² − 2 a·b, blocks of rows at a time."""
-    a, b = first.astype(np.float32, copy=False), second.astype(np.float32, copy=False)
-    half_squared_b = 0.5 * np.sum(b**2, axis=1)
-    squared_a = np.sum(a**2, axis=1)
-    nearest = np.empty(len(a), np.intp)
-    best, runner_up = np.empty(len(a), np.float32), np.empty(len(a), np.float32)
-    best_of_column = np.full(len(b), -np.inf, np.float32)
-    half_squared_a = 0.5 * squared_a
-    for start in range(0, len(a), _BLOCK_ROWS):
-        rows = slice(start, start + _BLOCK_ROWS)
-        # a·b − |b|²/2 orders a row, and less |a|²/2 a column, as the distance does.
-        closeness = a[rows] @ b.T
-        closeness -= half_squared_b
-        row_idx = np.arange(len(closeness))
-        nearest[rows] = closeness.argmax(axis=1)
-        best[rows] = closeness[row_idx, nearest[rows]]
-        if mutual:
-            np.maximum(best_of_column, (closeness - half_squared_a[rows, None]).max(axis=0), out=best_of_column)
-        closeness[row_idx, nearest[rows]] = -np.inf
-        runner_up[rows] = closeness.max(axis=1)
-    distance, next_distance = squared_a - 2 * best, squared_a - 2 * runner_up
-    kept = distance < np.float32(ratio**2) * next_distance if ratio < 1 else np.ones(len(a), np.bool_)
+    whole = fits_whole_numbers(first) and fits_whole_numbers(second)
+    found = nearest_two_whole(first, second) if whole else nearest_two(first, second)
+    kept = found.squared < np.float32(ratio**2) * found.next_squared if ratio < 1 else np.ones(len(first), np.bool_)
     if mutual:
-        kept &= best - half_squared_a >= best_of_column[nearest]
-    return _one_to_one(np.flatnonzero(kept), nearest, distance, mutual=mutual)
+        kept &= found.squared <= found.squared_back[found.nearest]
+    return _one_to_one(np.flatnonzero(kept), found.nearest, found.squared, mutual=mutual)
 
 
 def _match_hamming(

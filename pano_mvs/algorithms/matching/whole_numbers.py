@@ -1,0 +1,83 @@
+"""The nearest two of each descriptor by exact products of 16-bit numbers, where descriptors are whole and small."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.matching.nearest_two import NearestTwo
+from pano_mvs.core.errors import UsageError
+
+# Sums of products stay below 3 × 2^27; what fills up the last block is farther away, and the start is farther still.
+_MAX_SQUARE = 1 << 27
+_FAR = 1 << 29
+_START = -(1 << 30)
+
+
+def fits_whole_numbers(descriptors: NDArray[np.generic]) -> bool:
+    """Return whether descriptors (N, D) are whole numbers so small that this machine can compare them exactly."""
+    from pano_mvs.algorithms.sweep.kernels_vector import HAS_VECTOR
+
+    if not HAS_VECTOR:
+        return False
+    # The comparison is false for what is not a number, too.
+    greatest = float(np.abs(descriptors).max(initial=0))
+    return greatest**2 * descriptors.shape[1] <= _MAX_SQUARE and np.array_equal(descriptors, np.rint(descriptors))
+
+
+def nearest_two_whole(first: NDArray[np.generic], second: NDArray[np.generic]) -> NearestTwo:
+    """Return the nearest two of each descriptor by Euclidean distance, as `nearest_two` does, without rounding.
+
+    Args:
+        first: (N, D) whole numbers for which `fits_whole_numbers` is true.
+        second: (M, D) likewise, M at least 2.
+
+    Raises:
+        UsageError: if there are fewer than two to choose from, or the descriptors do not fit.
+    """
+    from pano_mvs.algorithms.matching import kernels_vector_match as kernels
+
+    if len(second) < 2 or first.shape[1] != second.shape[1]:
+        raise UsageError(f"cannot find the nearest two among descriptors {second.shape} for descriptors {first.shape}")
+    if not (fits_whole_numbers(first) and fits_whole_numbers(second)):
+        raise UsageError("descriptors must be small whole numbers, on a machine with vector instructions")
+    rows, columns = _filled_up(first, kernels.ROWS), _filled_up(second, kernels.COLUMNS)
+    row_squares, column_squares = _squares(rows, len(first)), _squares(columns, len(second))
+    packed = columns.reshape(-1, kernels.COLUMNS, columns.shape[1] // 2, 2).transpose(0, 2, 1, 3)
+    state = np.full((len(rows), 3, kernels.LANES), _START, np.int32)
+    column_best = np.full(len(columns), _START, np.int32)
+    kernels.compare_all(rows, np.ascontiguousarray(packed), row_squares, column_squares, state, column_best)
+    best, second_best, nearest = _over_lanes(state[: len(first)])
+    squares = row_squares[: len(first)]
+    return NearestTwo(
+        nearest=nearest,
+        squared=(squares - best).astype(np.float32),
+        next_squared=(squares - second_best).astype(np.float32),
+        squared_back=(column_squares - column_best)[: len(second)].astype(np.float32),
+    )
+
+
+def _filled_up(descriptors: NDArray[np.generic], multiple: int) -> NDArray[np.int16]:
+    """Return descriptors as 16-bit numbers, zeros added so that rows are a multiple and columns are even."""
+    count, size = descriptors.shape
+    filled = np.zeros((-(-count // multiple) * multiple, size + size % 2), np.int16)
+    filled[:count, :size] = descriptors
+    return filled
+
+
+def _squares(descriptors: NDArray[np.int16], count: int) -> NDArray[np.int32]:
+    """Return the squared lengths; those after the first `count` are farther away than any."""
+    squares = np.full(len(descriptors), _FAR, np.int32)
+    squares[:count] = np.einsum("nd,nd->n", descriptors[:count], descriptors[:count], dtype=np.int32)
+    return squares
+
+
+def _over_lanes(state: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.intp]]:
+    """Return the greatest and second greatest value of each row, and the first column of the greatest."""
+    best, second, column = state.transpose(1, 0, 2)
+    greatest = best.max(axis=1)
+    nearest = np.where(best == greatest[:, None], column, np.iinfo(np.int32).max).min(axis=1).astype(np.intp)
+    others = best.copy()
+    lanes = best.shape[1]
+    others[np.arange(len(best)), nearest % lanes] = second[np.arange(len(best)), nearest % lanes]
+    return greatest, np.maximum(others.max(axis=1), second.max(axis=1)), nearest
