@@ -18,6 +18,10 @@ _SUSPICIOUS = 0.75
 _DOUBTFUL = 0.55
 # … or is left out, if its pairs do not support it either.
 _HOPELESS, _MIN_EXPLAINED = 0.3, 0.5
+# Nobody doubts a camera that confirms this share of what is expected, whatever its pairs say.
+_CONFIRMED = 0.9
+# A second geometry of this share of the best one's weight is a rival.
+_RIVAL = 0.4
 # Another place must be better by this factor, and by this much, to be taken; within the factor it is a rival.
 _BETTER, _MARGIN = 1.15, 0.03
 # Where nothing more than this can be expected to be confirmed, nothing can be said.
@@ -209,30 +213,40 @@ def _alternatives(model: PlacedModel, image: int, cameras: Mapping[int, Rigid3])
 
 
 def _conclude(model: PlacedModel, found: Arbitration, *, fixed: Collection[int], remove: bool) -> None:
-    """Doubt or take out what is still confirmed much less than expected."""
-    for image in _suspects(found):
-        share, expected = found.shares[image], found.expected[image]
-        if not share < _DOUBTFUL * expected:
+    """Doubt or take out what is still confirmed much less than expected, or what its own pairs contradict."""
+    for image, share in found.shares.items():
+        expected, explained = found.expected[image], model.explained_share_of(image)
+        ratio = share / expected if expected > _MIN_EXPECTED else float("nan")
+        reasons = []
+        if ratio < _DOUBTFUL:
+            reasons.append(
+                f"other images confirm {100 * share:.0f} % of its texture, where its neighbours lead to expect "
+                f"{100 * expected:.0f} %"
+            )
+        if explained < _MIN_EXPLAINED and not ratio > _CONFIRMED:
+            reasons.append(f"only {100 * explained:.0f} % of its pairs, by weight, agree with its place")
+        if not reasons:
             continue
-        said = (f"other images confirm {100 * share:.0f} % of its texture, where its neighbours lead to expect "
-                f"{100 * expected:.0f} %")  # fmt: skip
         removable = remove and image not in fixed and len(model.cameras) - len(found.removed) > 2
-        if removable and share < _HOPELESS * expected and _explained(model, image) < _MIN_EXPLAINED:
-            found.removed[image] = f"{said}, and its pairs do not agree on another place"
+        if removable and ratio < _HOPELESS and explained < _MIN_EXPLAINED:
+            found.removed[image] = "; ".join(reasons)
         else:
-            found.doubts[image] = said
+            found.doubts[image] = "; ".join(reasons)
+    _doubt_pairs_alone(model, found)
     for image in found.removed:
         model.remove(image)
         del found.shares[image], found.expected[image]
 
 
-def _explained(model: PlacedModel, image: int) -> float:
-    """Return the share of an image's pairs, by weight, that its camera explains."""
-    total = kept = 0.0
-    for partner in model.pairs.partners[image]:
-        if partner in model.cameras:
-            edge = min(image, partner), max(image, partner)
-            total += model.pairs.geometries[edge][0].weight
-            if edge in model.chosen:
-                kept += model.pairs.geometries[edge][model.chosen[edge]].weight
-    return kept / total if total else 0.0
+def _doubt_pairs_alone(model: PlacedModel, found: Arbitration) -> None:
+    """Doubt two cameras that stand alone with several geometries, of which nothing else can tell the true one."""
+    if len(model.cameras) != 2:
+        return
+    first, second = sorted(model.cameras)
+    geometries = model.pairs.geometries.get((first, second), ())
+    if len(geometries) > 1 and geometries[1].weight > _RIVAL * geometries[0].weight:
+        for image in (first, second):
+            found.doubts[image] = (
+                f"its only pair has another geometry that {len(geometries[1].view)} matches support "
+                f"({len(geometries[0].view)} support the one that was taken): take panoramas in between"
+            )

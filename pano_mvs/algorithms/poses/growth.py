@@ -50,12 +50,11 @@ class GrownModel:
             return self.model.explained_share() > _SATISFYING
         return not self.arbitration.doubts and not self.arbitration.removed
 
-    def rank(self) -> tuple[float, float, float]:
-        """Return what models are sorted by: cameras without doubts, then what images and pairs confirm."""
+    def rank(self) -> tuple[float, float]:
+        """Return what models are sorted by: how much of the images, then of the pairs, they explain in all."""
         arbitration = self.arbitration
-        share = arbitration.mean_share() if arbitration is not None else float("nan")
-        doubts = len(arbitration.doubts) if arbitration is not None else 0
-        return doubts - len(self.model.cameras), -np.nan_to_num(share), -self.model.explained_share()
+        confirmed = sum(np.nan_to_num(share) for share in arbitration.shares.values()) if arbitration else 0.0
+        return -float(confirmed), -self.model.explained_weight()
 
 
 def grown_models(
@@ -92,7 +91,10 @@ def ranked_seeds(pairs: Pairs, images: Collection[int]) -> list[tuple[Edge, int]
         return len(geometry.view) * min(geometry.parallax_deg / _FULL_PARALLAX_DEG, 1.0)
 
     seeds = [
-        (edge, rank) for edge, found in pairs.geometries.items() if edge[0] in members for rank in range(len(found))
+        (edge, rank)
+        for edge, found in pairs.geometries.items()
+        if members.issuperset(edge)
+        for rank in range(len(found))
     ]
     seeds.sort(key=lambda seed: (-quality(*seed), seed))
     seeds = seeds[:_SEEDS]
@@ -142,7 +144,7 @@ def _grown(
     settle(model, adjust=adjust, confirmation=confirmation)
     refused = {image: reasons.get(image, _why_nothing(model, image)) for image in sorted(left)}
     arbitration = None
-    if confirmation is not None and model.explained_share() < _CERTAIN:
+    if confirmation is not None and (left or model.explained_share() < _CERTAIN):
         arbitration = arbitrate(model, confirmation)
         refused |= arbitration.removed
         if arbitration.moved:

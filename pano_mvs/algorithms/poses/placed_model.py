@@ -259,12 +259,26 @@ class PlacedModel:
 
     def explained_share(self) -> float:
         """Return the share of all pairs of registered images, by weight, that a geometry of theirs explains."""
+        total = sum(
+            found[0].weight
+            for (a, b), found in self.pairs.geometries.items()
+            if a in self.cameras and b in self.cameras
+        )
+        return self.explained_weight() / total if total else 1.0
+
+    def explained_weight(self) -> float:
+        """Return the weight of all geometries that agree with the cameras."""
+        return sum(self.pairs.geometries[edge][rank].weight for edge, rank in self.chosen.items())
+
+    def explained_share_of(self, image: int) -> float:
+        """Return the share of a registered image's pairs, by weight, that its camera explains; 1 without any."""
         total = kept = 0.0
-        for (a, b), found in self.pairs.geometries.items():
-            if a in self.cameras and b in self.cameras:
-                total += found[0].weight
-                if (a, b) in self.chosen:
-                    kept += found[self.chosen[a, b]].weight
+        for partner in self.pairs.partners[image]:
+            if partner in self.cameras:
+                edge = _edge(image, partner)
+                total += self.pairs.geometries[edge][0].weight
+                if edge in self.chosen:
+                    kept += self.pairs.geometries[edge][self.chosen[edge]].weight
         return kept / total if total else 1.0
 
     def _learn_ranges(self, edge: Edge) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from pano_mvs.algorithms.poses.confirmation import Confirmation, Picture
 from pano_mvs.algorithms.poses.gauge import normalised_poses
 from pano_mvs.algorithms.poses.growth import GrownModel, grown_models
+from pano_mvs.algorithms.poses.pair_weights import weighed_by_images
 from pano_mvs.algorithms.poses.placed_model import pairs_of
 from pano_mvs.algorithms.poses.reasons import why_no_pair
 from pano_mvs.algorithms.poses.scale import ScaleEstimator
@@ -55,6 +56,8 @@ def solve_scaled_translation(
     names = tuple(features)
     pairs = pairs_of(features, two_views, estimator=scale_estimator, kappa=kappa)
     confirmation = None if load is None else Confirmation(lambda image: load(names[image]))
+    if confirmation is not None:
+        pairs = weighed_by_images(pairs, confirmation)
     groups: list[Poses] = []
     reasons: dict[int, str] = {}
     waiting = [group for group in connected_groups(pairs.geometries, len(names)) if len(group) > 1]
