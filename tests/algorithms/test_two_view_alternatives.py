@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.two_view import verify_pair
+from pano_mvs.algorithms.two_view.alternatives import distinct_geometries
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from tests.algorithms.synthetic_capture import features_from_bearings, noisy_bearings
 from tests.algorithms.test_two_view import HARD, draw, errors_deg, rng_of
@@ -130,3 +131,19 @@ def test_no_alternatives_on_request_nor_without_refinement():
     assert not verified(p, q, refine=False).alternatives
     best = verified(p, q, max_alternatives=0)
     assert best.rotation.tobytes() == verified(p, q).rotation.tobytes()
+
+
+@pytest.mark.parametrize("trial", range(3))
+def test_what_many_wrong_matches_agree_on_by_chance_is_no_alternative(trial):
+    """Of 1500 wrong matches between key points near the horizon a few dozen agree with some pose."""
+    rng = rng_of(f"horizon {trial}")
+    p, q, _, pose = draw(rng, (0.4, 0.1, 0.2), (0.0, 0.3, 0.0), points=120, outliers=0.0)
+    best = Rigid3(pose.rotation, pose.translation / np.linalg.norm(pose.translation))
+    wrong = rng.normal(size=(2, 1500, 3)) / (1, 6, 1)
+    wrong /= np.linalg.norm(wrong, axis=2, keepdims=True)
+    first, second = np.concatenate([p, wrong[0]]), np.concatenate([q, wrong[1]])
+    found = distinct_geometries(
+        best, first, second, rng=rng, threshold_rad=float(np.deg2rad(0.2)), min_inliers=20, most=4
+    )
+    assert len(found) == 1
+    assert max(errors_deg(found[0].rotation, found[0].translation, pose)) < 0.5

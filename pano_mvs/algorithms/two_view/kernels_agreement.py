@@ -164,10 +164,10 @@ def direction_costs(rotated, second, directions, threshold, costs):  # type: ign
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _rotation_of(essential, t, rotation):  # type: ignore[no-untyped-def]
-    """Write the rotation of E = [t]× R, made orthonormal row by row.
+def _rotation_of(essential, t, sign, rotation):  # type: ignore[no-untyped-def]
+    """Write the rotation of E = ±[t]× R, made orthonormal row by row.
 
-    With |t| = 1 it is cof(E) − [t]× E (Horn 1990, "Recovering baseline and orientation from essential matrix").
+    With |t| = 1 it is cof(E) ∓ [t]× E (Horn 1990, "Recovering baseline and orientation from essential matrix").
     """
     e = essential
     for row in range(3):
@@ -175,12 +175,20 @@ def _rotation_of(essential, t, rotation):  # type: ignore[no-untyped-def]
         for column in range(3):
             k, m = (column + 1) % 3, (column + 2) % 3
             cofactor = e[i, k] * e[j, m] - e[i, m] * e[j, k]
-            rotation[row, column] = cofactor - (t[i] * e[j, column] - t[j] * e[i, column])
-    x, y, z = rotation[0], rotation[1], rotation[2]
-    x /= math.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
-    y -= (x[0] * y[0] + x[1] * y[1] + x[2] * y[2]) * x
-    y /= math.sqrt(y[0] * y[0] + y[1] * y[1] + y[2] * y[2])
-    z[0], z[1], z[2] = x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]
+            rotation[row, column] = cofactor - sign * (t[i] * e[j, column] - t[j] * e[i, column])
+    r = rotation
+    length = math.sqrt(r[0, 0] * r[0, 0] + r[0, 1] * r[0, 1] + r[0, 2] * r[0, 2])
+    for column in range(3):
+        r[0, column] /= length
+    along = r[0, 0] * r[1, 0] + r[0, 1] * r[1, 1] + r[0, 2] * r[1, 2]
+    for column in range(3):
+        r[1, column] -= along * r[0, column]
+    length = math.sqrt(r[1, 0] * r[1, 0] + r[1, 1] * r[1, 1] + r[1, 2] * r[1, 2])
+    for column in range(3):
+        r[1, column] /= length
+    for column in range(3):
+        k, m = (column + 1) % 3, (column + 2) % 3
+        r[2, column] = r[0, k] * r[1, m] - r[0, m] * r[1, k]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -190,16 +198,20 @@ def decompose_facing(essential, first, second, threshold, rotation, t):  # type:
     longest = -1.0
     normal = np.empty(3)
     for column in range(3):
-        a, b = essential[:, column], essential[:, (column + 1) % 3]
-        x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+        other = (column + 1) % 3
+        x = essential[1, column] * essential[2, other] - essential[2, column] * essential[1, other]
+        y = essential[2, column] * essential[0, other] - essential[0, column] * essential[2, other]
+        z = essential[0, column] * essential[1, other] - essential[1, column] * essential[0, other]
         squared = x * x + y * y + z * z
         if squared > longest:
             longest = squared
             normal[0], normal[1], normal[2] = x, y, z
-    normal /= math.sqrt(longest)
+    length = math.sqrt(longest)
+    for i in range(3):
+        normal[i] /= length
     rotations = np.empty((2, 3, 3))
-    _rotation_of(essential, normal, rotations[0])
-    _rotation_of(essential, -normal, rotations[1])
+    _rotation_of(essential, normal, 1.0, rotations[0])
+    _rotation_of(essential, normal, -1.0, rotations[1])
     fronts = np.zeros(4, np.int64)
     for idx in range(len(first)):
         p, q = first[idx], second[idx]
@@ -219,9 +231,14 @@ def decompose_facing(essential, first, second, threshold, rotation, t):  # type:
                 fronts[2 * which] += 1
             if to_a > 0.0 and to_q > 0.0:
                 fronts[2 * which + 1] += 1
-    chosen = int(np.argmax(fronts))
-    rotation[:] = rotations[chosen // 2]
-    t[:] = normal if chosen % 2 == 0 else -normal
+    chosen = 0
+    for n in range(1, 4):
+        if fronts[n] > fronts[chosen]:
+            chosen = n
+    for i in range(3):
+        t[i] = normal[i] if chosen % 2 == 0 else -normal[i]
+        for j in range(3):
+            rotation[i, j] = rotations[chosen // 2, i, j]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

@@ -219,8 +219,9 @@ def _sturm_chain(polynomial, chain):  # type: ignore[no-untyped-def]
 
     Member n is of degree 10 − n. All are scaled to coefficients of 1 at most, which leaves the signs as they are.
     """
-    chain[0] = polynomial
+    chain[0, _DEGREE] = polynomial[_DEGREE]
     for power in range(_DEGREE):
+        chain[0, power] = polynomial[power]
         chain[1, power] = (power + 1) * polynomial[power + 1]
     for n in range(_DEGREE + 1):
         degree = _DEGREE - n

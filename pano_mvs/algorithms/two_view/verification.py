@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -82,49 +84,51 @@ def verify_pair(
     reason = _why_chance(pose, p, q, witnesses, rng=rng, threshold_rad=threshold_rad, solver=solver)
     if reason:
         return TwoView.failed(reason, candidates=count)
-    best = _judged(pose.second_from_first, pose.residuals_rad, kept, matches_idx, p, q, threshold_rad)
+    pair = _Pair(matches_idx, p, q, threshold_rad)
+    best = pair.judged(pose.second_from_first)
     if not (best and refine and max_alternatives):
         return best
     poses = distinct_geometries(
         pose.second_from_first, p, q,
         rng=rng, threshold_rad=threshold_rad, min_inliers=min_inliers, most=max_alternatives,
     )  # fmt: skip
-    views: list[TwoView] = []
-    for idx in np.argsort(facing_costs(poses, p, q, threshold_rad), kind="stable"):
-        residuals, agreeing = agreement(poses[idx], p, q, threshold_rad)
-        view = _judged(poses[idx], residuals, agreeing, matches_idx, p, q, threshold_rad)
-        if view:
-            views.append(view)
-    return views[0].with_alternatives(views[1:]) if views else best
+    costs = facing_costs(poses, p, q, threshold_rad)
+    views = [view for idx in np.argsort(costs, kind="stable") if (view := pair.judged(poses[idx]))]
+    return views[0].with_alternatives(sorted(views[1:], key=len, reverse=True)) if views else best
 
 
-def _judged(
-    pose: Rigid3,
-    residuals: FloatArray,
-    kept: NDArray[np.bool_],
-    matches_idx: NDArray[np.int32],
-    p: FloatArray,
-    q: FloatArray,
-    threshold_rad: float,
-) -> TwoView:
-    """Return the geometry of a pose, or why its matches do not determine it."""
-    witnesses = independent_count(p[kept], q[kept])
-    rotation_std_deg, direction_std_deg = _uncertainty_deg(pose, residuals, kept, p, q, witnesses, threshold_rad)
-    parallax = _parallax(p[kept], q[kept], pose)
-    reason = _why_no_parallax(parallax, threshold_rad) or _why_open(direction_std_deg)
-    if reason:
-        return TwoView.failed(reason, candidates=len(p))
-    return TwoView(
-        matches_idx=matches_idx[kept],
-        rotation=pose.rotation,
-        direction=pose.translation,
-        residuals_rad=residuals[kept].astype(np.float32),
-        geometry="general",
-        candidates=len(p),
-        parallax_deg=float(np.rad2deg(np.median(parallax))),
-        rotation_std_deg=rotation_std_deg,
-        direction_std_deg=direction_std_deg,
-    )
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """The matches of a pair, (M, 2), and their unit bearings, (M, 3)."""
+
+    matches_idx: NDArray[np.int32]
+    p: FloatArray
+    q: FloatArray
+    threshold_rad: float
+
+    def judged(self, pose: Rigid3) -> TwoView:
+        """Return the geometry of a pose, or why its matches do not determine it."""
+        residuals, kept = agreement(pose, self.p, self.q, self.threshold_rad)
+        p, q, residuals = self.p[kept], self.q[kept], residuals[kept]
+        noise_rad = max(float(np.sqrt(np.mean(residuals**2))), 0.1 * self.threshold_rad)
+        # A crowd of matches counts as one witness.
+        noise_rad *= float(np.sqrt(len(p) / independent_count(p, q)))
+        rotation_std_deg, direction_std_deg = np.rad2deg(pose_uncertainty(pose, p, q, noise_rad=noise_rad))
+        parallax = angle_between(p @ pose.rotation.T, q)
+        reason = _why_no_parallax(parallax, self.threshold_rad) or _why_open(direction_std_deg)
+        if reason:
+            return TwoView.failed(reason, candidates=len(self.p))
+        return TwoView(
+            matches_idx=self.matches_idx[kept],
+            rotation=pose.rotation,
+            direction=pose.translation,
+            residuals_rad=residuals.astype(np.float32),
+            geometry="general",
+            candidates=len(self.p),
+            parallax_deg=float(np.rad2deg(np.median(parallax))),
+            rotation_std_deg=float(rotation_std_deg),
+            direction_std_deg=float(direction_std_deg),
+        )
 
 
 def _from_one_place(
@@ -186,23 +190,3 @@ def _why_open(direction_std_deg: float) -> str:
         return ""
     return (f"the matches leave the direction between the pictures open by {direction_std_deg:.0f}°: they lie too "
             "close together, or show too little parallax")  # fmt: skip
-
-
-def _uncertainty_deg(
-    pose: Rigid3,
-    residuals: FloatArray,
-    kept: NDArray[np.bool_],
-    p: FloatArray,
-    q: FloatArray,
-    witnesses: int,
-    threshold_rad: float,
-) -> tuple[float, float]:
-    """Return the standard deviations of rotation and direction, a crowd of matches counting as one witness."""
-    noise_rad = max(float(np.sqrt(np.mean(residuals[kept] ** 2))), 0.1 * threshold_rad)
-    noise_rad *= np.sqrt(kept.sum() / witnesses)
-    rotation_rad, direction_rad = pose_uncertainty(pose, p[kept], q[kept], noise_rad=noise_rad)
-    return float(np.rad2deg(rotation_rad)), float(np.rad2deg(direction_rad))
-
-
-def _parallax(p: FloatArray, q: FloatArray, pose: Rigid3) -> FloatArray:
-    return angle_between(p @ pose.rotation.T, q)
