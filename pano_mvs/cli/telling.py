@@ -9,6 +9,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from pano_mvs.cli.judgement import add_dense_doubts
 from pano_mvs.cli.summary import summarise
 from pano_mvs.core.errors import PanoMvsError
 from pano_mvs.core.files import write_text
@@ -21,7 +22,8 @@ INTERRUPTED = 130
 
 
 def tell(out: Path, run: Run, *, started: datetime, clock: float) -> dict[str, Any]:
-    """Write run.json and the report, and return what they say."""
+    """Judge the run, write run.json and the report, and return what they say."""
+    add_dense_doubts(run)
     summary = summarise(run, run.result, started=started, seconds=time.perf_counter() - clock)
     write_text(out / "run.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
     write_report(out, summary, Results.of_run(run, summary["results"]))
