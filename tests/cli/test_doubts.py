@@ -79,6 +79,8 @@ def test_a_doubtful_camera_is_said_once_and_the_run_ends_with_code_3_every_time(
     for computed in (7, 0):
         result = pano_mvs("run", doubting, "--out", "out")
         assert result.code == 3, result.text
+        assert result.flat.count("see nothing of it where it stands") == 1
+        assert "Usable, with doubts: see below. doubtful: 1 camera is doubtful: 001.png (the images see" in result.flat
         summary = run_json(Path("out"))
         assert (summary["exit_code"], summary["units"]["run"]) == (3, computed)
         assert summary["doubts"] == {
@@ -93,6 +95,8 @@ def test_a_doubtful_camera_is_said_once_and_the_run_ends_with_code_3_every_time(
 def test_a_camera_that_a_later_stage_clears_is_not_doubted(pano_mvs: Command, doubting: Path) -> None:
     result = pano_mvs("run", doubting, "--out", "out", "--set", "again.doubts={}")
     assert result.code == 0, result.text
+    assert "doubtful" not in result.flat
+    assert "The result looks reliable." in result.flat
     assert run_json(Path("out"))["poses"]["doubts"] == {}
 
 
@@ -108,6 +112,17 @@ def test_dense_results_doubt_a_camera_in_the_wrong_place_alone(pano_mvs: Command
         assert bool(summary["units"]["run"]) == computed
         assert list(summary["poses"]["doubts"]) == ["002.png"]
         assert summary["doubts"]["002.png"]["stage"] == "checked"
+        assert "in one direction" in result.flat
+
+
+def test_programs_are_told_the_verdict_and_the_doubts(pano_mvs: Command, doubting: Path) -> None:
+    result = pano_mvs("run", doubting, "--out", "out", "--json", "--executor", "serial")
+    assert result.code == 3, result.text
+    last = json.loads(result.text.splitlines()[-1])
+    assert (last["event"], last["exit_code"]) == ("run_finished", 3)
+    assert last["doubts"] == {"001.png": "the images see nothing of it where it stands"}
+    assert (last["verdict"]["mood"], last["verdict"]["judgement"]) == ("fair", "Usable, with doubts: see below.")
+    assert last["verdict"]["findings"][0]["text"].startswith("1 camera is doubtful: 001.png (")
 
 
 @pytest.mark.slow
