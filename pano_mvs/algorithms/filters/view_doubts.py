@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 _NEIGHBOURS = 4
-# Of what its neighbours have. Cameras with true poses had 0.69 and more of it (rendered and synthetic rooms, plain ones
-# too; 4 to 9 views), those at the edge of a capture least; a camera that was half a metre off had 0.45 at most.
+# Of what its neighbours have. Cameras with true poses had 0.64 and more of it (rendered and synthetic rooms, plain ones
+# too; 4 to 9 views, 2 to 8 sources), those at the edge of a capture least; half a metre off they had 0.47 at most.
 _LEAST_SHARE_OF_NEIGHBOURS = 0.55
-# Cameras with true poses had 0.6 at most, half a metre off 0.63 and more: errors that scatter have less.
+# Cameras with true poses had 0.62 at most, half a metre off 0.63 and more. This does not suffice alone: it keeps views
+# apart that agree little because their errors scatter.
 _LEAST_ONE_WAY = 0.55
 # Where neighbours agree with nobody either, or little can be compared, nothing is known.
 _LEAST_AGREED, _LEAST_COMPARED = 0.1, 0.2
