@@ -9,7 +9,9 @@ Every object has `event` and `time` (seconds since 1970). The events, in the ord
     unit_finished   stage, item, outcome ("run" | "cached" | "failed" | "blocked"), seconds
     stage_finished  stage, use, units, run, cached, failed, blocked, seconds, unit_seconds, metrics
     warning         text
-    run_finished    exit_code, stopped, run, cached, failed, blocked, seconds, out
+    run_finished    exit_code, stopped, run, cached, failed, blocked, seconds, out; and of a run that was not broken off
+                    verdict (mood, outcome, judgement, sentence, tiles, findings (mood, text, remedy), as in the
+                    report) and doubts (image to reason)
 
 `item` is empty where a stage has one unit only. Stages overlap. If a damaged part of the store is found, the run starts
 over: `stage_started` comes again for every stage, and what was counted before does not count. `run_finished` is always

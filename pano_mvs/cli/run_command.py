@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -37,7 +37,7 @@ from pano_mvs.engine.executors.protocol import Executor
 from pano_mvs.engine.memory import bytes_from_size
 from pano_mvs.engine.run import Run
 from pano_mvs.engine.store import LEAST_FREE_BYTES, Store
-from pano_mvs.report.findings import pictures_between
+from pano_mvs.report.verdict import Verdict
 from pano_mvs.viewer.shown_scene import is_to_see
 
 MIN_FREE_VARIABLE = "PANO_MVS_MIN_FREE"
@@ -103,22 +103,24 @@ def least_free_bytes(size: str = "") -> int:
 def _run_for_people(session: Session, store: Store, executor: Executor, console: Console) -> int:
     bars = ProgressBars(console, stages=len(session.workflow.stages), workers=executor.capacity)
     with bars:
-        result, summary = _run(session, store, executor, bars)
-    print_summary(summary, session.out, console, written=len(result.written))
+        result, summary, verdict = _run(session, store, executor, bars)
+    print_summary(summary, session.out, console, written=len(result.written), verdict=verdict)
     return result.exit_code
 
 
 def _run_for_programs(session: Session, store: Store, executor: Executor, events: JsonEvents) -> int:
     clock = time.perf_counter()
     counts: Mapping[str, int] = {}
+    told: Mapping[str, Any] = {}
     exit_code, stopped = 1, "internal error"
     events.write("run_started", schema=SCHEMA, workflow=session.workflow.name, stages=list(session.graph.order),
                  executor=executor.name, workers=executor.capacity, threads=executor.threads,
                  out=str(session.out))  # fmt: skip
     try:
         with redirect_stdout(sys.stderr):  # a plugin that lists its items does so in this process
-            result, summary = _run(session, store, executor, events)
+            result, summary, verdict = _run(session, store, executor, events)
         exit_code, stopped, counts = result.exit_code, result.stopped, summary["units"]
+        told = {"verdict": asdict(verdict), "doubts": summary["poses"].get("doubts", {})}
     except PanoMvsError as error:
         exit_code, stopped = error.exit_code, str(error)
         raise
@@ -128,11 +130,13 @@ def _run_for_programs(session: Session, store: Store, executor: Executor, events
     finally:
         events.write("run_finished", exit_code=exit_code, stopped=stopped,
                      **{name: counts.get(name, 0) for name in ("run", "cached", "failed", "blocked")},
-                     seconds=round(time.perf_counter() - clock, 3), out=str(session.out))  # fmt: skip
+                     seconds=round(time.perf_counter() - clock, 3), out=str(session.out), **told)  # fmt: skip
     return exit_code
 
 
-def _run(session: Session, store: Store, executor: Executor, observer: Observer) -> tuple[RunResult, dict[str, Any]]:
+def _run(
+    session: Session, store: Store, executor: Executor, observer: Observer
+) -> tuple[RunResult, dict[str, Any], Verdict]:
     """Run, and write what there is to say of it into the output folder."""
     started, clock = datetime.now(UTC), time.perf_counter()
     earlier = earlier_files(session.out)
@@ -145,11 +149,11 @@ def _run(session: Session, store: Store, executor: Executor, observer: Observer)
             tell_of_end(run, error, partial(tell, session.out, run, started=started, clock=clock))
             raise
         try:
-            summary = tell(session.out, run, started=started, clock=clock)
+            summary, verdict = tell(session.out, run, started=started, clock=clock)
             break
         except DamagedBlobError as error:  # found only now; it has been removed, so a further round computes it
             observer.warn(str(error))
-    return result, summary
+    return result, summary, verdict
 
 
 @contextmanager
@@ -187,7 +191,7 @@ def earlier_files(out: Path) -> dict[str, str]:
     return {str(name): str(digest) for name, digest in files.items()}
 
 
-def print_summary(summary: Mapping[str, Any], out: Path, console: Console, *, written: int) -> None:
+def print_summary(summary: Mapping[str, Any], out: Path, console: Console, *, written: int, verdict: Verdict) -> None:
     """Print where the results are and how good they are known to be."""
     units = summary["units"]
     failed = f", {units['failed']} failed" if units["failed"] else ""
@@ -200,13 +204,12 @@ def print_summary(summary: Mapping[str, Any], out: Path, console: Console, *, wr
     _print_comparison(summary["all_scores"], console)
     for note in summary["notes"]:
         console.print(f"note: {escape(note)}", highlight=False, soft_wrap=True)
-    if summary["stopped"]:
-        console.print(f"[red]stopped:[/] {escape(summary['stopped'])}", highlight=False, soft_wrap=True)
     if summary["left_over"]:
         count = len(summary["left_over"])
         console.print(
             f"{count} files of an earlier run, which this one did not write, are still there", highlight=False
         )
+    _print_verdict(verdict, console)
     look = f", or look around with pano-mvs view {escape(shlex.quote(str(out)))}" if is_to_see(summary["files"]) else ""
     console.print(
         f"results in {escape(str(out))} ({len(summary['files'])} files, {written} written now): open report.html{look}",
@@ -225,8 +228,6 @@ def _print_failures(summary: Mapping[str, Any], console: Console) -> None:
             console.print(f"  what it printed is in {escape(failure['log'])}", highlight=False, soft_wrap=True)
     if len(causes) > _SHOWN_FAILURES:
         console.print(f"… and {len(causes) - _SHOWN_FAILURES} more, all in run.json", highlight=False)
-    if summary["blocked"]:
-        console.print(f"{len(summary['blocked'])} further units could not run because of these", highlight=False)
     for image, rejected in summary["rejected"].items():
         text = f"{image}: {rejected['reason']}"
         console.print(f"[yellow]left out:[/] {escape(text)}", highlight=False, soft_wrap=True)
@@ -238,11 +239,22 @@ def _print_poses(summary: Mapping[str, Any], console: Console) -> None:
         total = len(poses["registered"]) + len(poses["rejected"])
         console.print(f"poses: {len(poses['registered'])} of {total} registered, {poses['points']} points; "
                       f"scale: {escape(poses['scale'])}", highlight=False)  # fmt: skip
-        if len(poses["groups"]) > 1:
-            sizes = " + ".join(str(len(group["images"])) for group in poses["groups"])
-            console.print(f"[yellow]{len(poses['groups'])} groups[/] ({sizes} panoramas) share no reliable connection: "
-                          f"each has its own frame and scale. {escape(pictures_between(poses))}",
-                          highlight=False, soft_wrap=True)  # fmt: skip
+
+
+def _print_verdict(verdict: Verdict, console: Console) -> None:
+    """Print whether the result can be relied on, as the report says it, and what is wrong or doubtful."""
+    if verdict.judgement:
+        console.print(f"[{_COLORS[verdict.mood]}]{escape(verdict.judgement)}[/]", highlight=False, soft_wrap=True)
+    for finding in verdict.findings:
+        if finding.mood in _MARKS:
+            text = (
+                f"[{_COLORS[finding.mood]}]{_MARKS[finding.mood]}:[/] {escape(finding.text)} {escape(finding.remedy)}"
+            )
+            console.print(text.rstrip(), highlight=False, soft_wrap=True)
+
+
+_COLORS = {"good": "green", "fair": "yellow", "bad": "red"}
+_MARKS = {"fair": "doubtful", "bad": "bad"}
 
 
 def print_scores(scores: Mapping[str, Any], console: Console) -> None:

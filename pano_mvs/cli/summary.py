@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
+from math import isfinite
 from pathlib import PurePosixPath
 from typing import Any
 
@@ -63,6 +64,7 @@ def summarise(run: Run, result: RunResult, *, started: datetime, seconds: float)
         ],
         "blocked": [{"stage": f.stage, "item": f.item, "cause": f.cause} for f in result.failures if f.blocked],
         "rejected": {image: {"stage": stage, "reason": why} for image, (stage, why) in result.rejected.items()},
+        "doubts": {image: {"stage": stage, "reason": why} for image, (stage, why) in result.doubts.items()},
         "warnings": list(result.warnings),
         "notes": [note for summary in result.stages for note in summary.notes],
         "results": _result_stages(run),
@@ -139,6 +141,8 @@ def _poses(run: Run, result: RunResult) -> dict[str, Any]:
         "registered": list(poses.names),
         "blocked": [{"stage": f.stage, "item": f.item, "cause": f.cause} for f in result.failures if f.blocked],
         "rejected": {image: why for image, (_, why) in result.rejected.items()},
+        "doubts": {image: result.doubts[image][1] for image in poses.names if image in result.doubts},
+        "confirmed": _confirmed(poses),
         "centers": poses.centers.tolist(),
         "points": len(poses.points_in_world),
         "frame": poses.frame,
@@ -159,6 +163,16 @@ def _poses(run: Run, result: RunResult) -> dict[str, Any]:
         ],
         "links": links,
     }
+
+
+def _confirmed(poses: Poses) -> dict[str, list[float | None]]:
+    """Return the confirmed and the expected share of each image for which one is known; None where one is not."""
+    if poses.confirmed_shares is None or poses.expected_shares is None:
+        return {}
+    pairs = zip(poses.confirmed_shares.tolist(), poses.expected_shares.tolist(), strict=True)
+    shares = {name: [round(v, 4) if isfinite(v) else None for v in pair]
+              for name, pair in zip(poses.names, pairs, strict=True)}  # fmt: skip
+    return {name: pair for name, pair in shares.items() if pair[0] is not None}
 
 
 def nearest_pair(largest: Sequence[str], other: Sequence[str], links: Sequence[Sequence[Any]]) -> list[Any] | None:

@@ -9,23 +9,25 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from pano_mvs.cli.judgement import add_dense_doubts
 from pano_mvs.cli.summary import summarise
 from pano_mvs.core.errors import PanoMvsError
 from pano_mvs.core.files import write_text
 from pano_mvs.engine.run import Run
 from pano_mvs.report.page import write_report
 from pano_mvs.report.results import Results
+from pano_mvs.report.verdict import Verdict
 
 INTERRUPTED = 130
 """The exit code of a run that was interrupted."""
 
 
-def tell(out: Path, run: Run, *, started: datetime, clock: float) -> dict[str, Any]:
-    """Write run.json and the report, and return what they say."""
+def tell(out: Path, run: Run, *, started: datetime, clock: float) -> tuple[dict[str, Any], Verdict]:
+    """Judge the run, write run.json and the report, and return what they say: the summary and the report's verdict."""
+    add_dense_doubts(run)
     summary = summarise(run, run.result, started=started, seconds=time.perf_counter() - clock)
     write_text(out / "run.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
-    write_report(out, summary, Results.of_run(run, summary["results"]))
-    return summary
+    return summary, write_report(out, summary, Results.of_run(run, summary["results"]))
 
 
 def tell_of_end(run: Run, error: BaseException, tell: Callable[[], object]) -> None:

@@ -64,8 +64,9 @@ class RunResult:
         stages: those that were begun, in the order of the workflow.
         failures: units without a result.
         rejected: image to the stage that left it out and why.
+        doubts: image to the stage that finds it doubtful and why; see `Record.doubted`.
         stopped: why the run ended early; empty if it did not.
-        exit_code: 0 ok, 3 finished with failed items, 4 stopped by a gate.
+        exit_code: 0 ok, 3 finished with failed or doubtful items, 4 stopped by a gate.
         left_over: files, with their digests, of earlier runs that this one did not write and that are still there.
         written: files written into the output folder by this run.
         warnings: damaged parts of the store that were computed again, and the like.
@@ -74,6 +75,7 @@ class RunResult:
     stages: list[StageSummary] = field(default_factory=list)
     failures: list[Failure] = field(default_factory=list)
     rejected: dict[str, tuple[str, str]] = field(default_factory=dict)
+    doubts: dict[str, tuple[str, str]] = field(default_factory=dict)
     stopped: str = ""
     exit_code: int = 0
     written: list[str] = field(default_factory=list)
@@ -81,6 +83,11 @@ class RunResult:
     published: Mapping[str, str] = field(default_factory=dict)
     left_over: Mapping[str, str] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+
+    @property
+    def complete(self) -> bool:
+        """Whether the run made all that it was to make; doubtful results count as made."""
+        return not (self.stopped or self.failures or self.rejected)
 
     @property
     def computed(self) -> int:

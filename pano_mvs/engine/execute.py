@@ -45,6 +45,7 @@ def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
         context.metrics,
         tuple(context.notes),
         context.rejected,
+        value.doubted(),
         time.perf_counter() - started,
     )
     store.put(record)

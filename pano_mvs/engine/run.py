@@ -95,7 +95,7 @@ class Run:
             for unit in self.demands.refresh:
                 if ":" in unit and unit not in self._refreshed:
                     self._warn(f"--refresh {unit}: nothing was computed again, no unit of that name was reached")
-            if self.result.exit_code == 0 and not self.graph.is_part:
+            if self.result.complete and not self.graph.is_part:
                 self.result.removed = self._publisher.remove_stale(earlier)
         except KeyboardInterrupt:
             self.result.stopped = "interrupted"
@@ -148,7 +148,7 @@ class Run:
 
     def _execute_once(self) -> None:
         result = self.result
-        result.stages, result.failures, result.rejected, result.stopped = [], [], {}, ""
+        result.stages, result.failures, result.rejected, result.doubts, result.stopped = [], [], {}, {}, ""
         tally = Tally(result, self.observer, lambda name: self.states[name], self._publisher.name_items)
         board = Board(self.workflow, self.graph, self.store, tally)
         self.states = board.states
@@ -161,11 +161,22 @@ class Run:
         except GateError as error:
             stop = error
         finally:
-            tally.put_in_order(board.place)
+            tally.put_in_order(board.place, replaced=self._replaced())
         if stop is not None:
             result.stopped, result.exit_code = str(stop), stop.exit_code
         else:
-            result.exit_code = 3 if result.failures or result.rejected else 0
+            result.exit_code = 0 if result.complete and not result.doubts else 3
+
+    def _replaced(self) -> set[str]:
+        """Return the stages whose values another stage has made anew: it reads them, makes their kind, and finished."""
+        stages = self.workflow.stages
+        return {
+            edge.producer
+            for name in self.graph.order
+            if name in self.states and self.states[name].items
+            for edge in self.graph.edges[name].values()
+            if issubclass(stages[name].spec.output, stages[edge.producer].spec.output)
+        }
 
     def _find(self, unit: Unit) -> UnitRecord | None:
         """Return a unit's record if the store has it and nobody asked for it anew."""

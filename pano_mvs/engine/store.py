@@ -64,6 +64,7 @@ class UnitRecord:
         metrics: figures of the unit.
         notes: what a user should know.
         rejected: image name to why the result leaves it out.
+        doubts: image name to why the value is doubtful there.
         seconds: how long it took when it was computed.
     """
 
@@ -74,6 +75,7 @@ class UnitRecord:
     metrics: Mapping[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     rejected: Mapping[str, str] = field(default_factory=dict)
+    doubts: Mapping[str, str] = field(default_factory=dict)
     seconds: float = 0.0
 
     def to_json(self) -> dict[str, Any]:
@@ -86,6 +88,7 @@ class UnitRecord:
             "metrics": dict(self.metrics),
             "notes": list(self.notes),
             "rejected": dict(self.rejected),
+            "doubts": dict(self.doubts),
             "seconds": self.seconds,
         }
 
@@ -96,9 +99,9 @@ class UnitRecord:
         Raises:
             ValueError, KeyError, TypeError, AttributeError, OverflowError: if it is none.
         """
-        identity, rejected = value["identity"], value["rejected"]
-        if not isinstance(identity, dict) or not isinstance(rejected, dict):
-            raise TypeError("a record's identity and its rejected images are objects")
+        identity, rejected, doubts = value["identity"], value["rejected"], value.get("doubts", {})
+        if not all(isinstance(part, dict) for part in (identity, rejected, doubts)):
+            raise TypeError("a record's identity and its rejected and doubtful images are objects")
         metrics, seconds = {str(name): float(metric) for name, metric in value["metrics"].items()}, value["seconds"]
         if not all(map(math.isfinite, (*metrics.values(), seconds))):
             raise ValueError("a figure that is none")
@@ -110,6 +113,7 @@ class UnitRecord:
             metrics=metrics,
             notes=tuple(str(note) for note in value["notes"]),
             rejected={str(name): str(reason) for name, reason in rejected.items()},
+            doubts={str(name): str(reason) for name, reason in doubts.items()},
             seconds=float(seconds),
         )
 

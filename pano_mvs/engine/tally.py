@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from pano_mvs.core.errors import GateError, InputError
@@ -25,6 +25,7 @@ class _Count:
     metrics: dict[str, dict[str, float]] = field(default_factory=dict)
     notes: dict[str, tuple[str, ...]] = field(default_factory=dict)
     rejected: dict[str, dict[str, str]] = field(default_factory=dict)
+    doubts: dict[str, dict[str, str]] = field(default_factory=dict)
 
 
 class Tally:
@@ -95,6 +96,8 @@ class Tally:
             count.notes[item] = record.notes
         if record.rejected:
             count.rejected[item] = dict(record.rejected)
+        if record.doubts:
+            count.doubts[item] = dict(record.doubts)
         self._observer.unit_finished(entry.name, item, outcome, record.seconds if outcome == "run" else 0.0)
 
     def unit_failed(self, failure: Failure, seconds: float) -> None:
@@ -127,8 +130,15 @@ class Tally:
             raise InputError(f"{entry.name}: none of the {len(state.members)} items can be used{shown}")
         _check_gates(entry, summary)
 
-    def put_in_order(self, place: Callable[[str, str], tuple[int, int]]) -> None:
-        """Put what is told of the run into the order of the workflow and the capture, whatever came first."""
+    def put_in_order(
+        self, place: Callable[[str, str], tuple[int, int]], *, replaced: Collection[str] = frozenset()
+    ) -> None:
+        """Put what is told of the run into the order of the workflow and the capture, whatever came first.
+
+        Args:
+            place: returns where a unit stands in the workflow and in the capture.
+            replaced: stages whose values later stages have made anew: what they doubted does not count any more.
+        """
         self._result.stages.sort(key=lambda summary: place(summary.name, ""))
         self._result.failures.sort(key=lambda failure: place(failure.stage, failure.item))
         for summary in self._result.stages:
@@ -136,6 +146,10 @@ class Tally:
             for item in sorted(rejected, key=lambda item: place(summary.name, item)):
                 for image, reason in rejected[item].items():
                     self._result.rejected.setdefault(image, (summary.name, reason))
+            doubts = self._counts[summary.name].doubts if summary.name not in replaced else {}
+            for item in sorted(doubts, key=lambda item: place(summary.name, item)):
+                for image, reason in doubts[item].items():
+                    self._result.doubts.setdefault(image, (summary.name, reason))
 
 
 def _check_gates(entry: StageEntry, summary: StageSummary) -> None:

@@ -50,6 +50,7 @@ class CameraMap:
         size_wh: of the view box.
         links: rejected ones first, then the others, strong ones last and so on top.
         cameras: (x, y, name, where its label goes: x and y, or None).
+        doubtful: (x, y, name, reason) of cameras whose poses are doubtful; they are drawn over the others.
         dots: an SVG path of cameras that are too many to be named.
         bar: (x, y, length, text) of the scale bar.
         north: whether north is upwards.
@@ -63,6 +64,7 @@ class CameraMap:
     dots: str
     bar: tuple[float, float, float, str]
     north: bool = False
+    doubtful: tuple[tuple[float, float, str, str], ...] = ()
 
     @property
     def radius(self) -> float:
@@ -81,7 +83,7 @@ def camera_maps(
     """Return the cameras from above and from the side; none where no centre is known.
 
     Args:
-        poses: as in run.json: `registered`, `centers`, `links`, `metric`, `frame`, `up`.
+        poses: as in run.json: `registered`, `centers`, `links`, `metric`, `frame`, `up`, `doubts`.
         reasons: why pairs have no common geometry, where that is known.
     """
     names = [str(name) for name in poses.get("registered") or []]
@@ -93,9 +95,11 @@ def camera_maps(
     labels = short_names(names)
     links = _chosen(poses.get("links") or [], names, labels, reasons or {})
     north = bool(_ALONG_NORTH.search(str(poses.get("frame") or "")))
+    known = poses.get("doubts") or {}
+    doubts = {idx: str(known[name]) for idx, name in enumerate(names) if name in known}
     return tuple(
-        _drawn(title, np.stack([sign * centers[:, axis] for axis, sign in axes], axis=-1), labels, links, unit=unit,
-               tallest=tallest, north=north and title == "From above")
+        _drawn(title, np.stack([sign * centers[:, axis] for axis, sign in axes], axis=-1), labels, links, doubts,
+               unit=unit, tallest=tallest, north=north and title == "From above")
         for title, axes, tallest in (("From above", _ABOVE, _HEIGHT), ("From the side", _SIDE, _SIDE_HEIGHT))
     )  # fmt: skip
 
@@ -155,9 +159,17 @@ def _measured(length: float, unit: str) -> str:
 
 
 def _drawn(
-    title: str, flat: FloatArray, labels: list[str], links: list[_Joined], *, unit: str, tallest: int, north: bool
+    title: str,
+    flat: FloatArray,
+    labels: list[str],
+    links: list[_Joined],
+    doubts: Mapping[int, str],
+    *,
+    unit: str,
+    tallest: int,
+    north: bool,
 ) -> CameraMap:
-    """Return the drawing of cameras at (N, 2), x to the right and y down."""
+    """Return the drawing of cameras at (N, 2), x to the right and y down, some of them doubtful."""
     low, high = flat.min(axis=0), flat.max(axis=0)
     extent = np.maximum(high - low, 1e-9 + 0.02 * float((high - low).max()))
     if not (high - low).any():
@@ -179,7 +191,9 @@ def _drawn(
     wide, deep = (f"{float(size):.3g} {unit}" for size in high - low)
     text = f"{len(labels)} cameras {title.lower()}, {wide} across and {deep} {'deep' if tallest == _HEIGHT else 'high'}"
     dots = "" if named else "".join(f"M{x:g} {y:g}h0" for x, y in placed)
-    return CameraMap(title, text, (_WIDTH, height), lines, tuple(cameras if named else ()), dots, bar, north)
+    text += f", {len(doubts)} of them doubtful" if doubts else ""
+    doubtful = tuple((float(placed[idx, 0]), float(placed[idx, 1]), labels[idx], why) for idx, why in doubts.items())
+    return CameraMap(title, text, (_WIDTH, height), lines, tuple(cameras if named else ()), dots, bar, north, doubtful)
 
 
 def _label_spots(placed: FloatArray, labels: list[str]) -> list[tuple[float, float] | None]:

@@ -22,8 +22,8 @@ from pano_mvs.report.view_cards import ViewCard, chosen_views, view_cards
 from pano_mvs.scene.index import pair_name
 
 _MOST_REASONS = 300
-_NO_POSES: Mapping[str, Any] = {"registered": [], "rejected": {}, "centers": [], "links": [], "frame": "", "scale": "",
-                                "metric": False}  # fmt: skip
+_NO_POSES: Mapping[str, Any] = {"registered": [], "rejected": {}, "doubts": {}, "confirmed": {}, "centers": [],
+                                "links": [], "frame": "", "scale": "", "metric": False}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def gather(out_dir: Path, summary: Mapping[str, Any], results: Results, kept: Ke
     rejected_pairs = _rejected_pairs(links, results)
     record = results.poses
     residuals = reprojection_residuals(record) if record is not None else None
-    cards = view_cards(out_dir, [views[idx] for idx in chosen_views(views)], results, kept)
+    cards = view_cards(out_dir, [views[idx] for idx in chosen_views(views, always=poses["doubts"])], results, kept)
     shares = measured_shares(views, results, kept) | {card.name: card.shares for card in cards if card.shares}
     rows = panorama_rows(summary, shares=shares, residuals=residuals,
                          thumbnails=thumbnails(out_dir, views, results, kept))  # fmt: skip
@@ -137,6 +137,7 @@ def pose_groups(poses: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:
             "centers": [centers[name] for name in names if name in centers],
             "links": [link for link in poses["links"] if link[0] in names and link[1] in names],
             "frame": group.get("frame", ""), "scale": group.get("scale", ""), "metric": group.get("metric", False),
+            "doubts": {name: poses["doubts"][name] for name in names if name in poses["doubts"]},
             "up": group.get("up"), "points": group.get("points"), "nearest_pair": group.get("nearest_pair"),
         })  # fmt: skip
     return tuple(found)

@@ -19,6 +19,9 @@ GOOD_COMPLETE, FAIR_COMPLETE = 0.8, 0.35
 GOOD_CONSISTENT, FAIR_CONSISTENT = 0.3, 0.12
 _FEW_LINKS = 2
 _SHOWN_GROUPS = 5
+_SHOWN_DOUBTS = 5
+# A model more than half of whose cameras are doubtful is not to be relied on.
+FAIR_UNDOUBTED = 0.5
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,7 @@ def findings(summary: Mapping[str, Any], *, residual_px: float | None = None) ->
         *_stopped(summary),
         *_failures(summary),
         *_registration(summary),
+        *_doubts(summary),
         *_groups(summary),
         *_graph(summary),
         *_residual(residual_px),
@@ -82,7 +86,7 @@ def _failures(summary: Mapping[str, Any]) -> list[Finding]:
     where = ", ".join(f"{count} in {stage}" for stage, count in stages.most_common(3))
     more = f"; {_units(len(blocked))} could not run because of them" if blocked else ""
     verb = "unit of work failed" if len(failures) == 1 else "units of work failed"
-    return [Finding("fair", f"{figure(len(failures))} {verb} ({where}){more}.", "Their causes are listed below.")]
+    return [Finding("fair", f"{figure(len(failures))} {verb} ({where}){more}.", "Each is listed with its cause.")]
 
 
 def _registration(summary: Mapping[str, Any]) -> list[Finding]:
@@ -98,6 +102,25 @@ def _registration(summary: Mapping[str, Any]) -> list[Finding]:
         return [Finding("", text)]
     return [Finding(mood, text, "Take more pictures between those, 0.5–1 m apart indoors, each seeing much of what the "
                     "next one sees.")]  # fmt: skip
+
+
+def doubt_mood(poses: Mapping[str, Any]) -> str:
+    """Return "fair" if some registered cameras are doubtful, "bad" if more than half are, else "good"."""
+    registered, doubts = len(poses.get("registered") or []), len(poses.get("doubts") or {})
+    return mood_of(1 - doubts / max(1, registered), 1.0, FAIR_UNDOUBTED)
+
+
+def _doubts(summary: Mapping[str, Any]) -> list[Finding]:
+    poses = summary.get("poses") or {}
+    doubts = poses.get("doubts") or {}
+    if not doubts:
+        return []
+    reasons = [f"{name} ({reason})" for name, reason in doubts.items()]
+    more = f"; and {len(reasons) - _SHOWN_DOUBTS} more" if len(reasons) > _SHOWN_DOUBTS else ""
+    count = "1 camera is doubtful" if len(reasons) == 1 else f"{len(reasons)} cameras are doubtful"
+    return [Finding(doubt_mood(poses), f"{count}: {'; '.join(reasons[:_SHOWN_DOUBTS])}{more}.",
+                    "Take panoramas between them and their neighbours, with things in view that occur only once, or "
+                    "leave these images out.")]  # fmt: skip
 
 
 def _groups(summary: Mapping[str, Any]) -> list[Finding]:
@@ -182,7 +205,7 @@ def _views(summary: Mapping[str, Any]) -> list[Finding]:
     complete, consistent = (median([view.get(key) for view in views]) for key in ("completeness", "consistent"))
     if complete is not None and (mood := mood_of(complete, GOOD_COMPLETE, FAIR_COMPLETE)) != "good":
         found.append(Finding(mood, f"Half of the views have a range for less than {share(complete)} of their pixels.",
-                             "Sky and masks have none; elsewhere look at the views below."))  # fmt: skip
+                             "Sky and masks have none; elsewhere look at the views in the report."))  # fmt: skip
     if consistent is not None and not compares_views(summary):
         found.append(Finding("", "No stage compared the views with each other, so nothing is known of their agreement.",
                              "filters.consistency does it."))  # fmt: skip
@@ -196,7 +219,7 @@ def _views(summary: Mapping[str, Any]) -> list[Finding]:
 def _cloud(summary: Mapping[str, Any]) -> list[Finding]:
     if (summary.get("cloud") or {}).get("points") == 0:
         return [Finding("bad", "The cloud has no points: no two views agree on any surface.",
-                        "Look at the ranges below; if they are sound, the poses are not.")]  # fmt: skip
+                        "Look at the ranges in the report; if they are right, the poses are wrong.")]  # fmt: skip
     return []
 
 

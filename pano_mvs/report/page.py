@@ -19,13 +19,14 @@ from pano_mvs.report import figures
 from pano_mvs.report.content import gather
 from pano_mvs.report.kept import Kept
 from pano_mvs.report.results import Results
+from pano_mvs.report.verdict import Verdict
 
 MOST_SHOWN = 200
 """Failures, rejected pairs and the like that the page lists; run.json has all of them."""
 
 
-def write_report(out_dir: Path, summary: Mapping[str, Any], results: Results | None = None) -> None:
-    """Write `report.html`: no network, every picture within, at most 30 MB.
+def write_report(out_dir: Path, summary: Mapping[str, Any], results: Results | None = None) -> Verdict:
+    """Write `report.html`: no network, every picture within, at most 30 MB; return the verdict that it gives.
 
     Args:
         out_dir: the output folder; previews are looked up below it, and the pictures of the page that is there are
@@ -35,8 +36,10 @@ def write_report(out_dir: Path, summary: Mapping[str, Any], results: Results | N
             stages [{name, use, params, units, run, cached, failed, blocked, seconds, unit_seconds, metrics}],
             failures [{stage, item, cause, consequence, log}], blocked, warnings [text], notes [text],
             poses {registered [name], rejected {name: reason}, centers [[x, y, z]] in the order of `registered`, frame,
-            scale, metric, up [x, y, z], links [[name, name, inliers, candidates, residual_deg]]},
-            rejected {name: {stage, reason}}, scores {poses {metric: value}, views {image: {metric: value}}, notes},
+            scale, metric, up [x, y, z], doubts {name: reason}, confirmed {name: [share, expected]},
+            links [[name, name, inliers, candidates, residual_deg]]},
+            rejected {name: {stage, reason}}, doubts {name: {stage, reason}},
+            scores {poses {metric: value}, views {image: {metric: value}}, notes},
             all_scores {stage: scores}, views [{name, preview, completeness, consistent}], cloud {points}, files {name},
             workflow_text, versions {name: version}.
         results: the values behind it; None where only the summary is known.
@@ -57,6 +60,7 @@ def write_report(out_dir: Path, summary: Mapping[str, Any], results: Results | N
         script_digest=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii"),
     )  # fmt: skip
     write_text(out_dir / "report.html", page)
+    return content.verdict
 
 
 @cache

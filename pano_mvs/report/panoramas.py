@@ -22,6 +22,7 @@ class Row:
         name: of the image.
         registered: whether it has a pose; None if no stage made any.
         reason: why it was left out, "" if it was not.
+        doubtful: why its pose is doubtful, "" if it is not.
         shares: of the sphere around it, if measured.
         completeness: share of pixels with a range, as its stage reported it, or None.
         consistent: share of pixels on which other views agree, likewise.
@@ -35,6 +36,7 @@ class Row:
     name: str
     registered: bool | None
     reason: str
+    doubtful: str
     shares: Shares | None
     completeness: float | None
     consistent: float | None
@@ -46,9 +48,9 @@ class Row:
 
     @property
     def doubt(self) -> float:
-        """What the rows are sorted by, largest first: panoramas left out, then those of which least is known."""
-        if self.reason:
-            return 3.0
+        """What rows are sorted by, largest first: panoramas left out, doubtful ones, those of which least is known."""
+        if self.reason or self.doubtful:
+            return 4.0 if self.reason else 3.0
         known = (self.completeness or 0.0) + (self.consistent or 0.0)
         return round(2.0 - known, 4)
 
@@ -82,14 +84,15 @@ def panorama_rows(
         str(name): number for number, group in enumerate(groups) for name in group.get("images") or () if groups[1:]
     }
     names = dict.fromkeys([*map(str, poses.get("registered") or []), *figures, *rejected])
+    doubts = {str(name): str(reason) for name, reason in (poses.get("doubts") or {}).items()}
     rows = []
     for name in list(names)[:MOST_ROWS]:
         median, p95, _ = (residuals.views.get(name) if residuals else None) or (None, None, 0)
         view = figures.get(name, {})
         rows.append(
-            Row(name, name in registered if poses else None, rejected.get(name, ""), shares.get(name),
-                _number(view.get("completeness")), _number(view.get("consistent")), links[name], median, p95,
-                thumbnails.get(name), group_of.get(name))
+            Row(name, name in registered if poses else None, rejected.get(name, ""), doubts.get(name, ""),
+                shares.get(name), _number(view.get("completeness")), _number(view.get("consistent")), links[name],
+                median, p95, thumbnails.get(name), group_of.get(name))
         )  # fmt: skip
     return tuple(rows)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,22 +18,23 @@ from pano_mvs.report.findings import (
     GOOD_RESIDUAL_PX,
     Finding,
     compares_views,
+    doubt_mood,
     findings,
     mood_of,
 )
 from pano_mvs.report.residuals import Residuals
 
-_INTERRUPTED = 130
+_SOME_FAILED, _INTERRUPTED = 3, 130
 _OUTCOMES = {
     0: ("good", "Finished"),
     1: ("bad", "Stopped by an internal error"),
     2: ("bad", "Stopped: the workflow or an input cannot be used"),
-    3: ("fair", "Finished, with failed items"),
+    _SOME_FAILED: ("fair", "Finished, with failed items"),
     4: ("bad", "Stopped by a quality gate or a guard"),
     _INTERRUPTED: ("fair", "Interrupted"),
 }
 _JUDGEMENTS = {
-    "good": "The result looks sound.",
+    "good": "The result looks reliable.",
     "fair": "Usable, with doubts: see below.",
     "bad": "Do not rely on this result.",
     "": "",
@@ -88,18 +89,24 @@ def verdict(
     """
     code = summary.get("exit_code", 0)
     mood, outcome = _OUTCOMES.get(code, ("bad", f"Ended with code {code}"))
+    if code == _SOME_FAILED and summary.get("doubts") and not (summary.get("failures") or summary.get("rejected")):
+        outcome = "Finished, with doubtful cameras"
     residual_deg = residuals.overall.median_deg if residuals else None
     residual_px = residual_deg * image_width / 360 if residual_deg is not None and image_width else None
     tiles = [*_registered(summary), *_residual(residual_deg, residual_px), *_coverage(summary), *_cloud(summary),
              *_accuracy(summary)]  # fmt: skip
     found = findings(summary, residual_px=residual_px)
     moods = {mood, *(tile.mood for tile in tiles), *(finding.mood for finding in found)}
-    overall = next((name for name in ("bad", "fair", "good") if name in moods), "good")
+    overall = _worst(moods)
     judged = any(tile.mood for tile in tiles) or overall == "bad"
     judgement = _JUDGEMENTS[overall] if judged else ""
     if code == _INTERRUPTED and overall != "bad":
         judgement = "Not finished."
     return Verdict(overall, outcome, judgement, _sentence(summary), tuple(tiles), found)
+
+
+def _worst(moods: Collection[str]) -> str:
+    return next((name for name in ("bad", "fair", "good") if name in moods), "good")
 
 
 def _sentence(summary: Mapping[str, Any]) -> str:
@@ -121,10 +128,11 @@ def _registered(summary: Mapping[str, Any]) -> list[Tile]:
     registered, rejected = len(poses.get("registered") or []), len(poses.get("rejected") or {})
     if not registered + rejected:
         return []
-    mood = mood_of(registered / (registered + rejected), GOOD_REGISTERED, FAIR_REGISTERED)
-    groups = len(poses.get("groups") or [])
+    moods = {mood_of(registered / (registered + rejected), GOOD_REGISTERED, FAIR_REGISTERED), doubt_mood(poses)}
+    groups, doubts = len(poses.get("groups") or []), len(poses.get("doubts") or {})
     label = "panoramas registered" + (f", in {groups} groups" if groups > 1 else "")
-    return [Tile(f"{registered} of {registered + rejected}", label, mood)]
+    label += f", {doubts} doubtful" if doubts else ""
+    return [Tile(f"{registered} of {registered + rejected}", label, _worst(moods))]
 
 
 def _residual(residual_deg: float | None, residual_px: float | None) -> list[Tile]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,12 +55,19 @@ class ViewCard:
     ticks: tuple[tuple[float, float], ...]
 
 
-def chosen_views(views: Sequence[Mapping[str, Any]], most: int = MOST_CARDS) -> list[int]:
-    """Return the positions of the views to show in full: all; of many, the least complete third and others evenly."""
+def chosen_views(
+    views: Sequence[Mapping[str, Any]], most: int = MOST_CARDS, *, always: Collection[str] = ()
+) -> list[int]:
+    """Return the positions of the views to show in full: all; of many, the least complete third and others evenly.
+
+    The views named in `always` come first in that third, as far as there is room.
+    """
     everything = list(range(len(views)))
     if len(views) <= most:
         return everything
-    by_quality = sorted(everything, key=lambda idx: (_quality(views[idx]), idx))
+    by_quality = sorted(
+        everything, key=lambda idx: (str(views[idx].get("name")) not in always, _quality(views[idx]), idx)
+    )
     worst, rest = by_quality[: most // 3], sorted(by_quality[most // 3 :])
     evenly = [rest[round(at)] for at in np.linspace(0, len(rest) - 1, most - len(worst))]
     return sorted({*worst, *evenly})

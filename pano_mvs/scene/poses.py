@@ -177,6 +177,10 @@ class Poses(Record):
         groups = self.groups.tolist()
         return {name: Pose(self.cam_from_world(idx), groups[idx]) for idx, name in enumerate(self.names)}
 
+    def doubted(self) -> Mapping[str, str]:
+        """Return the images whose poses are doubtful, with the reason."""
+        return self.doubts
+
     def check(self) -> None:
         """Raise ContractError unless all arrays agree."""
         images, points, tracks = len(self.names), len(self.points_in_world), len(self.track_point_idx)

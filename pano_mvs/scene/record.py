@@ -70,6 +70,13 @@ class Record:
         """Return the items of a collection by image name; each is stored and digested on its own."""
         return {}
 
+    def doubted(self) -> Mapping[str, str]:
+        """Return the images that the value says are doubtful, with the reason; a run with any ends with exit code 3.
+
+        A value that is made from another of its kind takes its place here too: what it does not doubt is cleared.
+        """
+        return {}
+
     def check(self) -> None:
         """Raise ContractError if shapes, types or values are not what the kind promises."""
 

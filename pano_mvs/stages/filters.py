@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Literal
 
 import numpy as np
@@ -10,7 +11,7 @@ from pydantic import Field
 
 from pano_mvs.algorithms.filters.bilateral_solver import fast_bilateral_solver
 from pano_mvs.algorithms.filters.confidence import require_confidence
-from pano_mvs.algorithms.filters.consistency import check_consistency
+from pano_mvs.algorithms.filters.consistency import checked_with_agreement
 from pano_mvs.algorithms.filters.fill import fill_from_neighbours
 from pano_mvs.algorithms.filters.gaussian import gaussian_range
 from pano_mvs.algorithms.filters.guided import guided_range
@@ -110,7 +111,7 @@ class ConsistencyParams(Params):
     min_contradictions: int = Field(default=2, ge=1, description="sources that must contradict for that")
 
 
-@stage("filters.consistency", memory=bytes_per_pixel(110, each_source=8))
+@stage("filters.consistency", memory=bytes_per_pixel(112, each_source=8))
 def consistency(
     range_map: Each[RangeMap],
     pose: Each[Pose],
@@ -121,13 +122,15 @@ def consistency(
 ) -> RangeMap:
     """Compare each range with those of the neighbours, forward and back: confidence 128–255 where they confirm it."""
     require_one_group(pose, source_poses)
-    checked = check_consistency(
+    checked, agreement = checked_with_agreement(
         range_map,
         pose.cam_from_world,
         sources,
         [other.cam_from_world for other in source_poses],
         **params.model_dump(),
     )
+    for name, value in asdict(agreement).items():
+        ctx.metric(name, value)
     return _measured(checked, ctx)
 
 

@@ -221,8 +221,6 @@ def checked_poses(poses: Poses, ctx: Context, *, remedy: str = _CLOSER) -> Poses
     registered = len(poses.names)
     ctx.metric("registered", registered / max(1, registered + len(poses.rejected)))
     ctx.metric("points", len(poses.points_in_world))
-    for name, reason in poses.doubts.items():
-        ctx.note(f"the pose of {name} is doubtful: {reason}")
     if poses.confirmed_shares is not None and np.isfinite(poses.confirmed_shares).any():
         ctx.metric("confirmed_share_median", np.nanmedian(poses.confirmed_shares))
     ctx.metric("groups", len(poses.worlds))

@@ -24,6 +24,7 @@ _CLOUD, _MESH, _MODELS = "cloud.ply", "mesh.ply", "colmap/sparse"
 _HEAD_BYTES = 1 << 14
 # The cameras' own directions up must agree this well to count as the scene's.
 _LEAST_AGREEMENT = 0.5
+_NAMED_DOUBTS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +38,7 @@ class ShownCamera:
         preview: a small picture whose upper half is the panorama, or None.
         range_file: its ranges as float32 TIFF, or None.
         confidence_file: its confidences as PNG, or None.
+        doubtful: whether the run found its pose doubtful.
     """
 
     name: str
@@ -45,6 +47,12 @@ class ShownCamera:
     preview: Path | None
     range_file: Path | None = None
     confidence_file: Path | None = None
+    doubtful: bool = False
+
+    @property
+    def label(self) -> str:
+        """What is written beside the camera."""
+        return f"{self.name} (doubtful)" if self.doubtful else self.name
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +118,9 @@ def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> Sho
     cloud_name, mesh_name, model = group_file(_CLOUD, group), group_file(_MESH, group), f"{_MODELS}/{group}"
     cloud_file, mesh_file = _written(path, run, cloud_name), _written(path, run, mesh_name)
     cameras = _cameras(path, model, run, images, notes)
+    if doubtful := [camera.name for camera in cameras if camera.doubtful]:
+        shown = ", ".join(doubtful[:_NAMED_DOUBTS]) + (" …" if len(doubtful) > _NAMED_DOUBTS else "")
+        notes.append(f"doubtful: {shown}; the ranges of these cameras may be in the wrong place, see report.html")
     cloud = None if cloud_file is None else open_ply_points(cloud_file)
     if cloud is None:
         notes.append(f"no {cloud_name}: the workflow has no export.ply, or the run did not get there")
@@ -172,6 +183,7 @@ def _cameras(
     poses = read_poses(model)
     source = images or _source_folder(run)
     previews = {str(view.get("name")): str(view.get("preview") or "") for view in run.get("views") or ()}
+    doubts = (run.get("poses") or {}).get("doubts") or {}
     cameras = []
     for idx, name in enumerate(poses.names):
         picture = source / name if source is not None else None
@@ -183,6 +195,7 @@ def _cameras(
             preview=preview if preview.is_file() else None,
             range_file=_map_of(folder, "range", name, ".tiff"),
             confidence_file=_map_of(folder, "confidence", name, ".png"),
+            doubtful=name in doubts,
         ))  # fmt: skip
     if any(camera.picture is None for camera in cameras):
         where = source if source is not None else "the place from which the run read them"

@@ -224,7 +224,7 @@ class SceneWindow:
             named = [int(idx) for idx in self._nearest(state.viewpoint.eye, _MOST_LABELS) if idx != state.inside]
         if named:
             above = centers[named] + 1.4 * self.tour.radius * self.tour.scene.up
-            self._overlay.label(above, [self.tour.scene.cameras[idx].name for idx in named], "names")
+            self._overlay.label(above, [self.tour.scene.cameras[idx].label for idx in named], "names")
 
     def _nearest(self, eye: NDArray[np.float64], count: int) -> NDArray[np.intp]:
         """Return the cameras nearest to the eye."""
@@ -276,7 +276,7 @@ class SceneWindow:
         scene, cloud = self.tour.scene, self.tour.cloud
         title = scene.name
         if state.inside is not None:
-            title = f"inside {scene.cameras[state.inside].name}   (Esc or right click: out)"
+            title = f"inside {scene.cameras[state.inside].label}   (Esc or right click: out)"
         counts = []
         if cloud is not None:
             of = f" of {cloud.total:,}" if len(cloud.points) < cloud.total else ""

@@ -42,7 +42,7 @@ def test_compiled_verdicts_equal_the_plain_ones(size):
         judge_rows(0, 5, reference.range, ray_grid(size), view, ranges, limits, verdicts, supports, motions)
         judge_rows(5, size[0] - 5, reference.range, ray_grid(size), view, ranges, limits, verdicts, supports, motions)
         expected, expected_supports, expected_motions = oracle.judge(reference.range, pose, ranges, 0.2, 3, 0.3)
-        assert len(np.unique(expected)) == 3
+        assert len(np.unique(expected)) == 4
         np.testing.assert_array_equal(verdicts, expected)
         np.testing.assert_allclose(supports, expected_supports, rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(motions, expected_motions, rtol=1e-3, atol=1e-6)

@@ -15,6 +15,7 @@ from pano_mvs.geometry import Similarity3, rotation_from_rotvec
 from pano_mvs.io.ply import read_ply
 from pano_mvs.io.pose_files import read_groups, read_poses
 from pano_mvs.io.range_files import read_range_tiff
+from pano_mvs.report.verdict import verdict
 from pano_mvs.scene.image_file import write_png
 from pano_mvs.testing.room import capture_poses, default_room, render
 from pano_mvs.viewer.shown_scene import open_scene
@@ -113,7 +114,7 @@ def test_both_rooms_are_delivered(pano_mvs: Command, rooms: Path) -> None:
     assert sum(group["points"] for group in poses["groups"]) == poses["points"]
     first, second, *_ = poses["groups"][1]["nearest_pair"]
     assert (first in LARGE, second in SMALL) == (True, True)
-    assert "2 groups (3 + 2 panoramas) share no reliable connection: each has its own frame and scale" in result.flat
+    assert "2 groups of panoramas share no reliable connection: each has its own frame and scale" in result.flat
     assert f"between {first} and {second}" in result.flat
     assert f"To join them take pictures between {first} and {second}" in (out / "report.html").read_text()
     _check_models(out, rooms)
@@ -175,18 +176,16 @@ def _check_evaluation(pano_mvs: Command, out: Path, rooms: Path) -> None:
     assert "1 further groups of 2 images" in poses.flat
 
 
-def test_the_terminal_says_in_a_line_that_there_are_groups(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_terminal_says_what_the_report_finds_of_groups(capsys: pytest.CaptureFixture[str]) -> None:
     groups = [{"images": ["a", "b", "c"]}, {"images": ["x", "y"], "nearest_pair": ["b", "x", 0, 31]}]
     poses = {"registered": [*"abcxy"], "rejected": {}, "points": 7, "scale": "its own", "groups": groups}
     summary = {"units": {"run": 0, "cached": 3, "failed": 0}, "seconds": 1.0, "failures": [], "blocked": [],
                "rejected": {}, "poses": poses, "scores": {}, "all_scores": {}, "notes": [], "stopped": "",
                "left_over": {}, "files": {}}  # fmt: skip
-    print_summary(summary, Path("out"), Console(width=200), written=0)
+    print_summary(summary, Path("out"), Console(width=200), written=0, verdict=verdict(summary))
     told = capsys.readouterr().out
-    assert (
-        "2 groups (3 + 2 panoramas) share no reliable connection: each has its own frame and scale. "
-        "To join them take pictures between b and x (31 candidates)." in told
-    )
+    assert "Usable, with doubts: see below.\ndoubtful: 2 groups of panoramas share no reliable connection" in told
+    assert "To join them take pictures between b and x (31 candidates)." in told
     poses["groups"] = groups[:1]
-    print_summary(summary, Path("out"), Console(width=200), written=0)
+    print_summary(summary, Path("out"), Console(width=200), written=0, verdict=verdict(summary))
     assert "reliable connection" not in capsys.readouterr().out

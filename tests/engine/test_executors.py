@@ -62,7 +62,15 @@ def told(result: RunResult) -> object:
     """Return all that a result says, in its order, without the times and the folders."""
     stages = [(s.name, s.units, s.run, s.failed, s.blocked, s.metrics, s.unit_metrics, s.notes) for s in result.stages]
     failures = [(f.stage, f.item, f.cause, f.consequence, f.blocked) for f in result.failures]
-    return stages, failures, result.exit_code, result.stopped, dict(result.published), result.written, result.rejected
+    return (
+        stages,
+        failures,
+        result.exit_code,
+        result.stopped,
+        dict(result.published),
+        result.written,
+        [result.rejected, result.doubts],
+    )
 
 
 # Slow tests of dask run before the slow ones here, and its loops are collected late.

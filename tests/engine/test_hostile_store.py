@@ -284,7 +284,7 @@ nearly_records = st.fixed_dictionaries({
     "key": anything, "identity": st.dictionaries(st.text(max_size=4), anything, max_size=2) | anything,
     "output": item_refs | anything, "items": st.dictionaries(st.text(max_size=4), item_refs, max_size=2) | anything,
     "metrics": st.dictionaries(st.text(max_size=4), st.floats() | anything, max_size=2), "notes": anything,
-    "rejected": anything, "seconds": st.floats() | anything,
+    "rejected": anything, "doubts": anything, "seconds": st.floats() | anything,
 })  # fmt: skip
 
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from pano_mvs.geometry import angle_between, pad_panorama, pixel_from_ray, ray_grid
 
-UNKNOWN, AGREES, CONTRADICTS = 0, 1, 2
+UNKNOWN, AGREES, CONTRADICTS, HIDDEN = 0, 1, 2, 3
 
 
 def wrap(row, column, height, width):
@@ -95,6 +95,8 @@ def judge(ranges, source_from_reference, source_ranges, max_error, max_px, max_s
             motions[row, column] = (angle_between(point_in_source, a_little_further) / 1e-6) ** 2
         elif seen > distance * (1 + 2 * max_error):
             verdicts[row, column] = CONTRADICTS
+        elif seen < distance * (1 - 2 * max_error):
+            verdicts[row, column] = HIDDEN
     return verdicts, supports, motions
 
 

@@ -40,6 +40,14 @@ def test_links_are_weighted_by_their_inliers_and_rejected_ones_told_apart():
     assert above.links[2].text == "1 – 2: 300 matches of 410 candidates"
 
 
+def test_doubtful_cameras_are_drawn_over_the_others_where_they_stand():
+    above, side = camera_maps(POSES | {"doubts": {"a/3.png": "nobody sees it there", "gone.png": "no pose"}})
+    for drawn in (above, side):
+        assert drawn.doubtful == ((*drawn.cameras[2][:2], "3", "nobody sees it there"),)
+        assert drawn.text.endswith(", 1 of them doubtful")
+    assert not camera_maps(POSES)[0].doubtful
+
+
 def test_of_very_many_links_the_strongest_are_drawn():
     names = [str(number) for number in range(200)]
     links = [[a, b, idx] for idx, (a, b) in enumerate((a, b) for a in names for b in names if a < b)]

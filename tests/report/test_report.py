@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.report import write_report
+from pano_mvs.report.view_cards import chosen_views
 from tests.report.html_page import Page
 
 NAMES = ["a/1.png", "a/2.png", "a/3.png"]
@@ -36,6 +37,8 @@ SUMMARY = {
     "poses": {
         "registered": NAMES,
         "rejected": {"a/4.png": "too few matches"},
+        "doubts": {"a/1.png": "hardly confirmed"},
+        "confirmed": {"a/1.png": [0.125, 0.62], "a/2.png": [0.6, None]},
         "centers": [[0, 0, 0], [1, 0.1, 0.2], [0.4, 0, 2]],
         "frame": "the first camera",
         "scale": "the first baseline is 1",
@@ -102,9 +105,31 @@ def test_everything_that_is_known_is_said(out_dir):
         "the scale was fitted", "PSNR dB", "pano_mvs: 1 stages: {}", "numpy 2.1", "no preview", "1 min 30 s",
         "9 blocked", "depth.planes=64", "logs/depth.txt", "1 further unit", "a blob was damaged", "not a picture",
         "workers: 2", "cores: 2", "range/ (2)", "cloud.ply", "planes", "census", "3 of 4 have a common geometry",
-        "2 min 50 s of work", "show 1 of 1 rejected pairs", "in scene units, not metres", "no range map",
+        "2 min 50 s of work", "show 1 of 1 rejected pairs",
+        "1 camera is doubtful: a/1.png (hardly confirmed).", "triangles are doubtful cameras",
+        "a/1.png 12 % 62 % hardly confirmed", "Doubtful (1)", "in scene units, not metres", "no range map",
     ):  # fmt: skip
         assert text in page.words, text
+
+
+def test_a_doubtful_camera_is_marked_wherever_it_is_shown(out_dir):
+    """On both maps, in its view card and in the table of all panoramas; nothing is where no camera is doubtful."""
+    page = reported(out_dir, SUMMARY)
+    assert page.source.count('class="doubtful"') == 2
+    assert page.words.count("▲ doubtful: hardly confirmed") == 2
+    poses = SUMMARY["poses"] | {"doubts": {}, "confirmed": {}}
+    cleared = reported(out_dir, SUMMARY | {"poses": poses})
+    assert 'class="doubtful"' not in cleared.source
+    assert "doubtful:" not in cleared.words
+    assert "triangles" not in cleared.words
+
+
+def test_of_very_many_views_doubtful_ones_are_always_shown_in_full():
+    views = [{"name": str(idx), "completeness": 1.0, "consistent": 0.01 * idx} for idx in range(100)]
+    assert 90 not in chosen_views(views)
+    chosen = chosen_views(views, always=("90",))
+    assert 90 in chosen
+    assert len(chosen) == len(chosen_views(views))
 
 
 @pytest.mark.parametrize("key", [None, *SUMMARY])

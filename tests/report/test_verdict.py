@@ -22,12 +22,16 @@ def residuals(median_deg):
 
 def test_a_good_run_is_called_good_and_nothing_is_found():
     found = verdict(GOOD, residuals=residuals(0.04), image_width=1024)
-    assert (found.mood, found.judgement, found.findings) == ("good", "The result looks sound.", ())
+    assert (found.mood, found.judgement, found.findings) == ("good", "The result looks reliable.", ())
 
 
 def rejecting(count):
     reasons = {f"x{number}.png": f"{number} matches, 20 needed" for number in range(count)}
     return GOOD["poses"] | {"rejected": reasons}
+
+
+def doubting(count):
+    return GOOD["poses"] | {"doubts": dict.fromkeys(NAMES[:count], "confirmed 1 %")}
 
 
 @pytest.mark.parametrize(
@@ -48,13 +52,18 @@ def rejecting(count):
         ({"exit_code": 1, "stopped": "division by zero"}, "bad", "division by zero"),
         ({"poses": GOOD["poses"] | {"links": [[NAMES[0], name, 90] for name in NAMES[1:]]}}, "fair",
          "9 cameras share a verified geometry with one other alone"),
+        ({"exit_code": 3, "poses": doubting(1)}, "fair", "1 camera is doubtful: 0.png (confirmed 1 %)."),
+        ({"poses": doubting(5)}, "fair", "5 cameras are doubtful: 0.png (confirmed 1 %); 1.png"),
+        ({"poses": doubting(6)}, "bad", "4.png (confirmed 1 %); and 1 more."),
+        ({"poses": GOOD["poses"] | {"groups": [{"images": NAMES[:7]}, {"images": NAMES[7:]}]}}, "fair",
+         "2 groups of panoramas share no reliable connection"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_found_and_named(change, mood, words):
     found = verdict(GOOD | change)
     assert found.mood == mood
     assert any(words in finding.text for finding in found.findings), found.findings
-    assert found.judgement != "The result looks sound."
+    assert found.judgement != "The result looks reliable."
 
 
 @pytest.mark.parametrize(("median_deg", "mood"), [(0.3, "good"), (0.5, "fair"), (1.0, "bad")])
@@ -90,6 +99,16 @@ def test_the_outcome_is_that_of_the_exit_code(code, text, mood):
     found = verdict({"exit_code": code})
     assert text in found.outcome
     assert found.mood == mood
+
+
+def test_a_run_with_doubtful_cameras_alone_has_no_failed_items():
+    doubts = {"0.png": {"stage": "checked", "reason": "confirmed 1 %"}}
+    doubtful = GOOD | {"exit_code": 3, "poses": doubting(1), "doubts": doubts}
+    found = verdict(doubtful)
+    assert found.outcome == "Finished, with doubtful cameras"
+    assert (found.tiles[0].label, found.tiles[0].mood) == ("panoramas registered, 1 doubtful", "fair")
+    failed = doubtful | {"failures": [{"stage": "depth", "item": "1.png"}]}
+    assert verdict(failed).outcome == "Finished, with failed items"
 
 
 def test_where_nothing_is_known_nothing_is_judged():

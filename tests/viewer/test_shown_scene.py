@@ -50,6 +50,18 @@ def test_an_output_folder_is_opened_with_all_that_it_holds(tmp_path: Path) -> No
     assert scene.cloud.count == 20_000
 
 
+def test_doubtful_cameras_are_labelled_and_noted(tmp_path: Path) -> None:
+    out = write_output(tmp_path, turned_poses(3))
+    run = json.loads((out / "run.json").read_text())
+    run["poses"] = run.get("poses", {}) | {"doubts": {"lobby/001.png": "hardly confirmed"}}
+    (out / "run.json").write_text(json.dumps(run))
+    scene = open_scene(out)
+    assert [camera.label for camera in scene.cameras] == ["lobby/000.png", "lobby/001.png (doubtful)", "lobby/002.png"]
+    assert scene.notes == (
+        "doubtful: lobby/001.png; the ranges of these cameras may be in the wrong place, see report.html",
+    )
+
+
 def test_what_is_missing_is_noted_and_the_rest_is_shown(tmp_path: Path) -> None:
     out = write_output(tmp_path / "a", turned_poses(2), points=0, metric=False)
     scene = open_scene(out)

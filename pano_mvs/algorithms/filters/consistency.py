@@ -10,9 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.filters.view_doubts import Agreement
 from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import Rigid3, pad_panorama, ray_grid
+from pano_mvs.geometry import Rigid3, pad_panorama, pixel_solid_angle, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
 
@@ -22,6 +23,8 @@ _MAX_SURFACE_STEP = 0.05
 _PRECISION_PX = 0.2
 # Beside a step like this, in ln range, it is doubtful which side a pixel belongs to, so far away from it.
 _DOUBTFUL_STEP, _DOUBTFUL_RADIUS = 0.1, 2
+# Of the sources that can tell, these must contradict a pixel in one direction for it to count as contradicted.
+_ONE_WAY, _LEAST_JUDGES = 0.75, 2
 
 
 def check_consistency(
@@ -38,6 +41,39 @@ def check_consistency(
     remove_inconsistent: bool = False,
     min_contradictions: int = 2,
 ) -> RangeMap:
+    """Return the reference's range map with its confidence set by what the sources confirm.
+
+    See `checked_with_agreement`, which also returns what the sources say of the view as a whole.
+    """
+    return checked_with_agreement(
+        reference,
+        reference_pose,
+        sources,
+        source_poses,
+        max_relative_error=max_relative_error,
+        max_reprojection_px=max_reprojection_px,
+        min_support=min_support,
+        min_motion_px=min_motion_px,
+        min_views=min_views,
+        remove_inconsistent=remove_inconsistent,
+        min_contradictions=min_contradictions,
+    )[0]
+
+
+def checked_with_agreement(
+    reference: RangeMap,
+    reference_pose: Rigid3,
+    sources: Sequence[RangeMap],
+    source_poses: Sequence[Rigid3],
+    *,
+    max_relative_error: float,
+    max_reprojection_px: float,
+    min_support: float,
+    min_motion_px: float,
+    min_views: int,
+    remove_inconsistent: bool,
+    min_contradictions: int,
+) -> tuple[RangeMap, Agreement]:
     """Return the reference's range map with its confidence set by what the sources confirm.
 
     Forward and backward: the point at range r along a pixel's ray is projected into a source, X' = R r F(u) + t. The
@@ -71,6 +107,9 @@ def check_consistency(
         remove_inconsistent: whether to invalidate pixels that no source confirms and `min_contradictions` contradict.
         min_contradictions: how many sources must contradict; no more than there are sources.
 
+    Returns:
+        The checked range map, and what the sources say of the view as a whole.
+
     Raises:
         UsageError: if sources and poses differ in number, or a limit is not positive.
     """
@@ -96,7 +135,7 @@ def check_consistency(
         removed = (votes.agreeing == 0) & (votes.contradicting >= min(min_contradictions, len(sources)))
         ranges = np.where(removed, np.float32(np.nan), ranges)
     confidence[np.isnan(ranges)] = 0
-    return RangeMap(ranges, confidence, reference.normals_in_cam)
+    return RangeMap(ranges, confidence, reference.normals_in_cam), _agreement(votes, seen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,12 +145,14 @@ class _Votes:
     Attributes:
         agreeing: how many agree.
         contradicting: how many see through it.
+        hiding: how many see something nearer.
         support: sum of the supports of those that agree.
         motion: sum of their supports times their squared motions, in rad².
     """
 
     agreeing: NDArray[np.int64]
     contradicting: NDArray[np.int64]
+    hiding: NDArray[np.uint16]
     support: NDArray[np.float64]
     motion: NDArray[np.float64]
 
@@ -128,7 +169,10 @@ def _count_votes(
     from pano_mvs.algorithms.filters import kernels_reprojection as kernels  # compiles on import
 
     shape = reference.range.shape
-    votes = _Votes(np.zeros(shape, np.int64), np.zeros(shape, np.int64), np.zeros(shape), np.zeros(shape))
+    votes = _Votes(
+        np.zeros(shape, np.int64), np.zeros(shape, np.int64), np.zeros(shape, np.uint16), np.zeros(shape),
+        np.zeros(shape),
+    )  # fmt: skip
     ranges, rays = np.ascontiguousarray(reference.range), ray_grid((shape[0], shape[1]))
     verdicts, supports, motions = np.empty(shape, np.uint8), np.empty(shape), np.empty(shape)
     for source, pose in zip(sources, source_poses, strict=True):
@@ -139,10 +183,30 @@ def _count_votes(
         for_bands(partial(_judge, kernels.judge_rows, arguments), shape[0], threads=numba.get_num_threads())
         votes.agreeing[...] += verdicts == kernels.AGREES
         votes.contradicting[...] += verdicts == kernels.CONTRADICTS
+        votes.hiding[...] += verdicts == kernels.HIDDEN
         # Rounded, so that the sum of a few does not depend on the order of the sources.
         votes.support[...] += np.rint(supports * 2**40) / 2**40
         votes.motion[...] += np.rint(supports * motions * 2**40) / 2**40
     return votes
+
+
+def _agreement(votes: _Votes, seen: NDArray[np.bool_]) -> Agreement:
+    """Return what the sources say of all pixels that were seen, (H, W)."""
+    judges = votes.agreeing + votes.contradicting + votes.hiding
+    row_weights = pixel_solid_angle(seen.shape) * seen.shape[1] / (4 * np.pi)
+
+    def share(where: NDArray[np.bool_]) -> float:
+        return float(np.sum(where.mean(axis=1) * row_weights))
+
+    compared = seen & (judges > 0)
+    contradicted = compared & (votes.agreeing == 0) & (judges >= _LEAST_JUDGES)
+    total = share(compared)
+    parts = (
+        compared & (votes.agreeing > 0),
+        contradicted & (votes.contradicting >= _ONE_WAY * judges),
+        contradicted & (votes.hiding >= _ONE_WAY * judges),
+    )
+    return Agreement(total, *(share(part) / total if total else 0.0 for part in parts))
 
 
 def _judge(kernel: Callable[..., object], arguments: tuple[object, ...], first: int, rows: int) -> None:

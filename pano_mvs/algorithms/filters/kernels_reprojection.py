@@ -6,9 +6,9 @@ import math
 
 from numba import njit
 
-# What a source says of a point: it cannot tell (no range there, or something nearer hides the point), it sees the
-# same surface, or it sees through the point to something farther away.
-UNKNOWN, AGREES, CONTRADICTS = 0, 1, 2
+# What a source says of a point: it cannot tell, it sees the same surface, it sees through the point to something
+# farther away, or something nearer hides the point.
+UNKNOWN, AGREES, CONTRADICTS, HIDDEN = 0, 1, 2, 3
 
 
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
@@ -97,6 +97,8 @@ def judge_point(point, rotation, translation, baseline, ranges, limits):  # type
         return AGREES, error, x, y, seen
     if seen > distance * (1 + 2 * limits[0]):
         return CONTRADICTS, error, x, y, seen
+    if seen < distance * (1 - 2 * limits[0]):
+        return HIDDEN, error, x, y, seen
     return UNKNOWN, error, x, y, seen
 
 

@@ -24,7 +24,7 @@ _MIN_MOVE = 0.05
 # Moves are one if they differ by less than this share of their length and of the usual distance between cameras.
 _SAME_MOVE, _SAME_PLACE = 0.06, 0.02
 _MIN_PAIRS = 3
-_MAX_ALIASES = 3
+_MAX_ALIASES = 2
 # How much a pair that agrees as things are counts against separating its images.
 _HELD = 0.1
 _LABELLINGS = 2

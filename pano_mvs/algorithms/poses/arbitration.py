@@ -35,6 +35,7 @@ _BLOCK_ROUNDS = 2
 _MIN_BLOCK_GAIN = 0.05
 _FLIPPED = 3
 _ASKED = 6
+_HOPELESS_GAIN = -0.1  # of the first two that are asked
 
 
 @dataclass(eq=False)
@@ -154,9 +155,22 @@ def _gain_of(model: PlacedModel, alias: Alias, labels: dict[int, int], confirmat
         }
         crossing[image] = sum(labels[idx] != labels[image] for idx in around)
     asked = sorted((image for image in crossing if crossing[image]), key=lambda idx: (-crossing[idx], idx))[:_ASKED]
-    before = sum(np.nan_to_num(confirmation.share(idx, model.cameras[idx], model.cameras)) for idx in asked)
-    after = sum(np.nan_to_num(confirmation.share(idx, cameras[idx], cameras)) for idx in asked)
-    return float(after / before - 1) if before > 0 else 0.0
+    before = after = gain = 0.0
+    for number, image in enumerate(asked):
+        before += float(np.nan_to_num(confirmation.share(image, model.cameras[image], model.cameras)))
+        after += float(np.nan_to_num(confirmation.share(image, cameras[image], cameras)))
+        gain = after / before - 1 if before > 0 else 0.0
+        if number >= 1 and gain < _HOPELESS_GAIN:
+            break
+    return gain
+
+
+def judge(model: PlacedModel, confirmation: Confirmation) -> Arbitration:
+    """Return what the images say about the cameras of a model, which is not changed."""
+    found = Arbitration()
+    _judge(model, confirmation, found)
+    _conclude(model, found, fixed=range(len(model.pairs.names)), remove=False)
+    return found
 
 
 def _judge(model: PlacedModel, confirmation: Confirmation, found: Arbitration) -> None:

@@ -214,7 +214,7 @@ def _parallax_classes(ranges: NDArray[np.float32], pose: Rigid3, sources: Sequen
 
     Angles under 2° do not count, since they tell little. Pixels without such a source are in the last class.
     """
-    points = ray_grid(ranges.shape) * np.nan_to_num(ranges)[..., None]
+    points = ray_grid(ranges.shape) * np.where(np.isnan(ranges), 1.0, ranges)[..., None]
     smallest = np.full(ranges.shape, np.inf)
     for source in sources:
         offset = (source @ pose.inverse()).center

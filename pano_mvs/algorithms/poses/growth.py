@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pano_mvs.algorithms.poses.arbitration import Arbitration, arbitrate
+from pano_mvs.algorithms.poses.aliases import find_aliases
+from pano_mvs.algorithms.poses.arbitration import Arbitration, arbitrate, judge
 from pano_mvs.algorithms.poses.confirmation import Confirmation
 from pano_mvs.algorithms.poses.placed_model import MIN_POINTS, MIN_SHARE, Pairs, PlacedModel, enough_points
 from pano_mvs.algorithms.poses.placement import Placement, agreement
@@ -75,7 +76,18 @@ def grown_models(
         models.append(_grown(pairs, images, edge, rank, adjust=adjust, confirmation=confirmation))
         if models[-1].satisfies() or len(models) == _MAX_GROWN:
             break
-    return sorted(models, key=GrownModel.rank)
+    models.sort(key=GrownModel.rank)
+    if models and models[0].arbitration is not None and confirmation is not None:
+        models[0] = _arbitrated(models[0], adjust=adjust, confirmation=confirmation)
+    return models
+
+
+def _arbitrated(grown: GrownModel, *, adjust: bool, confirmation: Confirmation) -> GrownModel:
+    """Return a model in which cameras and blocks of cameras stand where the images confirm most."""
+    arbitration = arbitrate(grown.model, confirmation)
+    if arbitration.moved:
+        settle(grown.model, adjust=adjust, confirmation=confirmation)
+    return GrownModel(grown.model, grown.refused | arbitration.removed, arbitration)
 
 
 def ranked_seeds(pairs: Pairs, images: Collection[int]) -> list[tuple[Edge, int]]:
@@ -144,11 +156,8 @@ def _grown(
     settle(model, adjust=adjust, confirmation=confirmation)
     refused = {image: reasons.get(image, _why_nothing(model, image)) for image in sorted(left)}
     arbitration = None
-    if confirmation is not None and (left or model.explained_share() < _CERTAIN):
-        arbitration = arbitrate(model, confirmation)
-        refused |= arbitration.removed
-        if arbitration.moved:
-            settle(model, adjust=adjust, confirmation=confirmation)
+    if confirmation is not None and (left or model.explained_share() < _CERTAIN or find_aliases(model)):
+        arbitration = judge(model, confirmation)
     return GrownModel(model, refused, arbitration)
 
 
