@@ -24,8 +24,10 @@ from typing import Any
 import numpy as np
 
 from pano_mvs.algorithms.metrics.placements import judge_placements
+from pano_mvs.algorithms.poses.confirmation import Picture
 from pano_mvs.algorithms.poses.refine import refine_poses
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
+from pano_mvs.algorithms.poses.verification import verify_poses
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.image_file import decode_image, write_png
@@ -54,9 +56,13 @@ class Row:
 def place_cameras(
     pictures: Pictures, features: dict[str, Features], two_views: dict[tuple[str, str], TwoView]
 ) -> Poses:
-    """Return the poses that are measured as ours."""
-    del pictures
-    return refine_poses(solve_scaled_translation(features, two_views, rng=np.random.default_rng(SEED)))
+    """Return the poses that are measured as ours: solved, verified by the images, refined, as in the shipped presets."""
+
+    def load(name: str) -> Picture:
+        return pictures[name], np.ones(pictures[name].shape[:2], np.bool_)
+
+    poses = solve_scaled_translation(features, two_views, load=load, rng=np.random.default_rng(SEED))
+    return refine_poses(verify_poses(poses, load, features=features, two_views=two_views))
 
 
 def ours(pictures: Pictures) -> tuple[Poses, float]:

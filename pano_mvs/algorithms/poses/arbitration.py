@@ -33,6 +33,9 @@ _ROUNDS = 3
 _BLOCK_ROUNDS = 2
 # A block is moved if the images around the cut confirm this much more of themselves.
 _MIN_BLOCK_GAIN = 0.05
+# If they would confirm hardly less than now, nobody can tell which is true.
+_AMBIGUOUS_GAIN = -0.15
+_NAMED = 4
 _FLIPPED = 3
 _ASKED = 6
 _HOPELESS_GAIN = -0.1  # of the first two that are asked
@@ -77,8 +80,9 @@ def arbitrate(
         remove: whether a camera that nothing explains is taken out of the model.
     """
     found = Arbitration()
+    ambiguity = ""
     if not fixed:
-        found.moved |= _unshift_blocks(model, confirmation)
+        found.moved, ambiguity = _unshift_blocks(model, confirmation)
     for _ in range(_ROUNDS):
         _judge(model, confirmation, found)
         suspects = _suspects(found)
@@ -102,26 +106,43 @@ def arbitrate(
     return found
 
 
-def _unshift_blocks(model: PlacedModel, confirmation: Confirmation) -> set[int]:
-    """Move blocks of cameras that the images confirm clearly better elsewhere; return the images that were moved."""
+def _unshift_blocks(model: PlacedModel, confirmation: Confirmation) -> tuple[set[int], str]:
+    """Move blocks of cameras that the images confirm clearly better elsewhere.
+
+    Returns:
+        The images that were moved, and what is ambiguous: a move of a block after which the images would confirm about
+        as much as they do now; "" if there is none.
+    """
     moved: set[int] = set()
     for _ in range(_BLOCK_ROUNDS):
-        best: tuple[float, Alias, dict[int, int]] | None = None
-        for alias in find_aliases(model):
-            for labels in labellings(model, alias):
-                gain = _gain_of(model, alias, labels, confirmation)
-                if gain > _MIN_BLOCK_GAIN and (best is None or gain > best[0]):
-                    best = (gain, alias, labels)
-        if best is None:
-            break
-        gain, alias, labels = best
+        gains = [
+            (_gain_of(model, alias, labels, confirmation), alias, labels)
+            for alias in find_aliases(model)
+            for labels in labellings(model, alias)
+        ]
+        if not gains:
+            return moved, ""
+        gain, alias, labels = max(gains, key=lambda found: found[0])
+        if gain <= _MIN_BLOCK_GAIN:
+            return moved, _ambiguity(model, alias, labels) if gain > _AMBIGUOUS_GAIN else ""
         labels = _with_better_labels(model, alias, labels, gain, confirmation)
         model.cameras = moved_cameras(model, alias, labels)
         moved |= {image for image, label in labels.items() if label}
         model.choose_again()
         model.learn_ranges()
         model.choose_again()
-    return moved
+    return moved, ""
+
+
+def _ambiguity(model: PlacedModel, alias: Alias, labels: dict[int, int]) -> str:
+    """Say which images might as well stand elsewhere."""
+    block = [image for image, label in labels.items() if label]
+    rest = [image for image, label in labels.items() if not label]
+    smaller = [model.pairs.names[image] for image in min(block, rest, key=len)]
+    named = ", ".join(smaller[:_NAMED]) + (" …" if len(smaller) > _NAMED else "")
+    distance = float(np.linalg.norm(alias.move))
+    return (f"the place repeats: the images would confirm about as much if {named} stood {distance:.2g} units away from "
+            "where they are, relative to the others")  # fmt: skip
 
 
 def _with_better_labels(
