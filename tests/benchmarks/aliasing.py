@@ -56,7 +56,7 @@ class Row:
 def place_cameras(
     pictures: Pictures, features: dict[str, Features], two_views: dict[tuple[str, str], TwoView]
 ) -> Poses:
-    """Return the poses that are measured as ours: solved, verified by the images, refined, as in the shipped presets."""
+    """Return the poses that are measured as ours: solved, verified, refined, as in the shipped presets."""
 
     def load(name: str) -> Picture:
         return pictures[name], np.ones(pictures[name].shape[:2], np.bool_)

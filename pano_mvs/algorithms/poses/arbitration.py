@@ -103,6 +103,9 @@ def arbitrate(
             break
     _judge(model, confirmation, found)
     _conclude(model, found, fixed=fixed, remove=remove)
+    if ambiguity:
+        for image in model.cameras:
+            found.doubts[image] = "; ".join(filter(None, (found.doubts.get(image), ambiguity)))
     return found
 
 
@@ -141,8 +144,10 @@ def _ambiguity(model: PlacedModel, alias: Alias, labels: dict[int, int]) -> str:
     smaller = [model.pairs.names[image] for image in min(block, rest, key=len)]
     named = ", ".join(smaller[:_NAMED]) + (" …" if len(smaller) > _NAMED else "")
     distance = float(np.linalg.norm(alias.move))
-    return (f"the place repeats: the images would confirm about as much if {named} stood {distance:.2g} units away from "
-            "where they are, relative to the others")  # fmt: skip
+    return (
+        f"the place repeats: the images would confirm about as much if {named} stood {distance:.2g} units away from "
+        "where they are, relative to the others"
+    )
 
 
 def _with_better_labels(
