@@ -123,7 +123,7 @@ def through_the_engine(images: Path, steps: Steps, *, neighbours: int = 0) -> Ca
         pairs = _SIMILAR_PAIRS.format(neighbours=neighbours) if neighbours else _ALL_PAIRS
         (folder / "workflow.yaml").write_text(WORKFLOW.format(images=images.resolve(), pairs=pairs))
         command = [sys.executable, "-m", "pano_mvs", "run", str(folder / "workflow.yaml"), "--out", str(folder / "out"),
-                   "--cache", str(folder / "cache"), "--executor", "serial", "--threads", "1"]  # fmt: skip
+                   "--cache", str(folder / "cache"), "--executor", "serial", "--threads-per-worker", "1"]  # fmt: skip
         steps.take("pano-mvs run", lambda: subprocess.run(command, check=True, capture_output=True))
         model = read_poses(next((folder / "out").rglob("poses.json")))
     return cameras_of(model)
