@@ -243,14 +243,24 @@ def _mapped(path: Path) -> np.ndarray[Any, Any]:
 
 
 def _read(path: Path) -> np.ndarray[Any, Any]:
-    """Return the array of a small .npy file, which cannot be written to; see `_mapped`."""
+    """Return the array of a small .npy file, which cannot be written to; see `_mapped`.
+
+    Raises:
+        ValueError: if it is none, or one of Python objects, or does not hold as many values as it says.
+    """
     data = path.read_bytes()
     if not data.startswith(_MAGIC):
         return _mapped(path)
     begin = len(_MAGIC) + 2 + int.from_bytes(data[len(_MAGIC) : len(_MAGIC) + 2], "little")
     shape, dtype, fortran_order = _header(data[len(_MAGIC) : begin])
-    values = np.frombuffer(data, dtype, math.prod(shape), begin) if math.prod(shape) else np.zeros(0, dtype)
-    array = values.reshape(shape, order="F" if fortran_order else "C")
+    count = math.prod(shape)
+    if min(shape, default=0) < 0 or count * dtype.itemsize != len(data) - begin:
+        raise ValueError(f"{len(data) - begin} bytes for an array of {shape}")
+    try:
+        values = np.frombuffer(data, dtype, count, begin) if count else np.zeros(0, dtype)
+        array = values.reshape(shape, order="F" if fortran_order else "C")
+    except Exception as error:  # a shape that no array can have
+        raise ValueError(str(error)) from error
     array.flags.writeable = False
     return array
 
