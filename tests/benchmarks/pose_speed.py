@@ -125,7 +125,7 @@ def through_the_engine(images: Path, steps: Steps, *, neighbours: int = 0) -> Ca
         command = [sys.executable, "-m", "pano_mvs", "run", str(folder / "workflow.yaml"), "--out", str(folder / "out"),
                    "--cache", str(folder / "cache"), "--executor", "serial", "--threads-per-worker", "1"]  # fmt: skip
         steps.take("pano-mvs run", lambda: subprocess.run(command, check=True, capture_output=True))
-        model = read_poses(next((folder / "out").rglob("poses.json")))
+        model = read_poses(folder / "out" / "colmap")
     return cameras_of(model)
 
 
