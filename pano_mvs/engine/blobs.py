@@ -5,11 +5,13 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import math
 import os
 import re
 import shutil
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,9 @@ from pano_mvs.scene import FilePart, Part
 
 SUFFIX = re.compile(r"(\.[a-z0-9_+-]{1,16})?")
 _LARGEST_BYTES = 1 << 50
+# Smaller arrays are read whole: that is faster than to map them, and a mapped array keeps a file open.
+_MAPPED_FROM_BYTES = 1 << 18
+_MAGIC = np.lib.format.magic(1, 0)
 
 
 class DamagedBlobError(StoreError):
@@ -48,6 +53,11 @@ class BlobRef:
     def to_json(self) -> list[Any]:
         """Return the reference as a JSON value."""
         return [self.digest, self.size_bytes, self.suffix, self.external]
+
+    @property
+    def is_mapped(self) -> bool:
+        """Whether the part is an array that is memory-mapped when it is loaded."""
+        return self.suffix == ".npy" and not self.external and self.size_bytes >= _MAPPED_FROM_BYTES
 
     @staticmethod
     def from_json(value: list[Any]) -> BlobRef:
@@ -110,7 +120,7 @@ class BlobStore:
         )
 
     def get(self, ref: BlobRef) -> Part:
-        """Return a stored part; arrays are memory-mapped.
+        """Return a stored part; arrays cannot be written to, and large ones are memory-mapped.
 
         Raises:
             DamagedBlobError: if the bytes are not those that were stored; the blob is removed.
@@ -118,7 +128,7 @@ class BlobStore:
         path = self.verified_path(ref)
         try:
             if ref.suffix == ".npy" and not ref.external:
-                return _mapped(path)
+                return _mapped(path) if ref.is_mapped else _read(path)
             if ref.suffix == ".json" and not ref.external:
                 value = json.loads(path.read_bytes())
                 if not isinstance(value, dict):
@@ -230,3 +240,42 @@ def _mapped(path: Path) -> np.ndarray[Any, Any]:
         raise
     except Exception as error:  # numpy reads the header with Python's own parser, which fails in a dozen ways
         raise ValueError(str(error)) from error
+
+
+def _read(path: Path) -> np.ndarray[Any, Any]:
+    """Return the array of a small .npy file, which cannot be written to; see `_mapped`.
+
+    Raises:
+        ValueError: if it is none, or one of Python objects, or does not hold as many values as it says.
+    """
+    data = path.read_bytes()
+    if not data.startswith(_MAGIC):
+        return _mapped(path)
+    begin = len(_MAGIC) + 2 + int.from_bytes(data[len(_MAGIC) : len(_MAGIC) + 2], "little")
+    shape, dtype, fortran_order = _header(data[len(_MAGIC) : begin])
+    count = math.prod(shape)
+    if min(shape, default=0) < 0 or count * dtype.itemsize != len(data) - begin:
+        raise ValueError(f"{len(data) - begin} bytes for an array of {shape}")
+    try:
+        values = np.frombuffer(data, dtype, count, begin) if count else np.zeros(0, dtype)
+        array = values.reshape(shape, order="F" if fortran_order else "C")
+    except Exception as error:  # a shape that no array can have
+        raise ValueError(str(error)) from error
+    array.flags.writeable = False
+    return array
+
+
+@lru_cache(maxsize=4096)
+def _header(data: bytes) -> tuple[tuple[int, ...], np.dtype[Any], bool]:
+    """Return shape, type and whether columns come first, from the header of a .npy file after its magic string.
+
+    Raises:
+        ValueError: if it is none, or one of Python objects.
+    """
+    try:
+        shape, fortran_order, dtype = np.lib.format.read_array_header_1_0(io.BytesIO(data))
+    except Exception as error:  # see `_mapped`
+        raise ValueError(str(error)) from error
+    if dtype.hasobject:
+        raise ValueError("an array of Python objects")
+    return shape, dtype, fortran_order

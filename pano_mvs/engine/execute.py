@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
@@ -16,6 +17,10 @@ from pano_mvs.engine.store import ItemRef, Store, UnitRecord
 from pano_mvs.engine.units import Unit, UnitInput
 from pano_mvs.scene import Axis
 from pano_mvs.scene.index import pair_from_name
+
+# A process may open no more than about a thousand files, and a stage may gather several kinds.
+_MOST_OPEN = 128
+_MOST_BYTES = 128_000_000
 
 
 def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
@@ -68,7 +73,17 @@ def _load(port: Port, value: UnitInput, store: Store) -> object:
     if port.cardinality is Cardinality.NAMES:
         return Names(value)
     refs = {_gathered_key(port, name): ref for name, ref in value.items()}
-    return Gather(refs, partial(store.load, kind=port.kind))
+    return Gather(refs, partial(store.load, kind=port.kind), kept=kept_items(value.values()))
+
+
+def kept_items(refs: Iterable[ItemRef]) -> int:
+    """Return how many loaded items are kept: few enough for open files and memory, though the largest came together."""
+    opened, read = 0, 1
+    for ref in refs:
+        opened = max(opened, sum(part.is_mapped for part in ref.parts.values()))
+        read = max(read, sum(part.size_bytes for part in ref.parts.values() if not part.is_mapped))
+    by_memory = max(1, _MOST_BYTES // read)
+    return min(by_memory, max(1, _MOST_OPEN // opened)) if opened else by_memory
 
 
 def _gathered_key(port: Port, name: str) -> str | tuple[str, ...]:

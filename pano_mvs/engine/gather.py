@@ -10,9 +10,6 @@ Key = TypeVar("Key")
 Ref = TypeVar("Ref")
 Value = TypeVar("Value")
 
-# A loaded item keeps a file open for each of its arrays, and a process may open no more than about a thousand.
-_KEPT = 64
-
 
 class Gather(Mapping[Key, Value], Generic[Key, Ref, Value]):
     """A mapping that loads a value on access and keeps the latest few, so that thousands need not fit in memory.
@@ -22,10 +19,12 @@ class Gather(Mapping[Key, Value], Generic[Key, Ref, Value]):
     Args:
         refs: key to what `load` turns into the value, in the order of iteration.
         load: reads one value; whatever it raises comes out of the access.
+        kept: so many of the latest values are kept.
     """
 
-    def __init__(self, refs: Mapping[Key, Ref], load: Callable[[Ref], Value]) -> None:
+    def __init__(self, refs: Mapping[Key, Ref], load: Callable[[Ref], Value], *, kept: int = 64) -> None:
         """Remember where the values are."""
+        self._kept = kept
         self._refs = refs
         self._load = load
         self._latest: OrderedDict[Key, Value] = OrderedDict()
@@ -36,7 +35,7 @@ class Gather(Mapping[Key, Value], Generic[Key, Ref, Value]):
             self._latest.move_to_end(key)
             return self._latest[key]
         value = self._latest[key] = self._load(self._refs[key])
-        if len(self._latest) > _KEPT:
+        if len(self._latest) > self._kept:
             self._latest.popitem(last=False)
         return value
 

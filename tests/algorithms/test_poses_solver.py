@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.metrics.poses import relative_pose_errors
-from pano_mvs.algorithms.poses.bundle import Bundle, adjust_bundle, robust_cost, robust_weights
+from pano_mvs.algorithms.poses.bundle import Bundle, adjust_bundle, reduced_cameras, robust_cost, robust_weights
 from pano_mvs.algorithms.poses.camera_system import camera_span, dense_from_band
 from pano_mvs.algorithms.poses.gauge import first_neighbour, in_gauge_of, moved_poses
-from pano_mvs.algorithms.poses.kernels_bundle import reduced_system
+from pano_mvs.algorithms.poses.kernels_bundle import moved_points, ray_errors, reduced_system
 from pano_mvs.algorithms.poses.refine import refine_poses
 from pano_mvs.algorithms.poses.resection import refine_resection
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
@@ -250,6 +250,30 @@ def test_kernel_equals_the_dense_system():
     np.testing.assert_allclose(system, expected_system, atol=1e-6 * np.abs(expected_system).max())
     np.testing.assert_allclose(gradient, expected_gradient, atol=1e-6 * np.abs(expected_gradient).max())
     assert np.all(diagonal >= np.diag(system) - 1e-12)
+
+
+def test_compiled_errors_are_those_of_the_bundle():
+    bundle = bundle_of(np.random.default_rng(21), points=15, noise_deg=3.0)
+    found = ray_errors(
+        bundle.rotations, bundle.centers, bundle.points, bundle.point_idx, bundle.image_idx, bundle.bearings
+    )
+    np.testing.assert_allclose(found, bundle.errors_rad(), atol=1e-12)
+
+
+def test_points_move_by_back_substitution():
+    rng = np.random.default_rng(22)
+    bundle = bundle_of(rng, points=15, noise_deg=3.0)
+    system = reduced_cameras(bundle, np.ones(len(bundle.bearings)), damping=0.01)
+    steps = rng.normal(0, 0.01, (len(bundle.centers), 6))
+    coupled = np.einsum("tij,ti->tj", system.couplings, steps[bundle.image_idx])
+    right = system.point_gradients.copy()
+    np.add.at(right, bundle.point_idx, coupled)
+    expected = bundle.points - np.einsum("pij,pj->pi", system.inverses, right)
+    starts = np.searchsorted(bundle.point_idx, np.arange(len(bundle.points) + 1))
+    found = moved_points(
+        bundle.points, starts, bundle.image_idx, system.couplings, system.inverses, system.point_gradients, steps
+    )
+    np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])

@@ -17,6 +17,7 @@ from tests.algorithms.synthetic_capture import (
     synthetic_features,
     synthetic_two_views,
 )
+from tests.oracles.triangulation_numpy import triangulate_numpy
 
 
 def pair(matches, residuals=None, pose=None, geometry="general"):
@@ -114,6 +115,36 @@ def test_triangulation_drops_the_wrong_observation_and_keeps_the_point():
     )
     np.testing.assert_allclose(found.points_in_world[0], point, atol=1e-9)
     assert found.used.tolist() == [True, True, True, True, False, True]
+
+
+def many_tracks(rng, count=400):
+    """Observations of tracks of 1 to 6 views with noise, wrong rays, far points and cameras in one place."""
+    sizes = rng.integers(1, 7, count)
+    point_idx = np.repeat(np.arange(count), sizes).astype(np.int32)
+    points = rng.normal(size=(count, 3)) * np.where(rng.random(count) < 0.1, 300.0, 4.0)[:, None]
+    centers = rng.normal(size=(8, 3))[rng.integers(8, size=len(point_idx))]
+    centers[np.isin(point_idx, np.flatnonzero(rng.random(count) < 0.05))] = 0.5
+    rays = points[point_idx] - centers
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays += rng.normal(0, 0.002, rays.shape) + rng.normal(0, 0.3, rays.shape) * (rng.random((len(rays), 1)) < 0.15)
+    return centers, rays / np.linalg.norm(rays, axis=1, keepdims=True), point_idx
+
+
+@pytest.mark.parametrize("shuffled", [False, True])
+def test_triangulation_is_that_of_numpy(shuffled):
+    rng = np.random.default_rng(31)
+    given = many_tracks(rng)
+    if shuffled:
+        order = rng.permutation(len(given[0]))
+        given = tuple(column[order] for column in given)
+    limits = {"count": 400, "max_error_rad": 0.01, "min_angle_rad": 0.02}
+    found, expected = triangulate_observations(*given, **limits), triangulate_numpy(*given, **limits)
+    assert 150 < expected.valid.sum() < 350
+    assert (expected.valid[given[2]] & ~expected.used).sum() > 0
+    np.testing.assert_array_equal(found.valid, expected.valid)
+    np.testing.assert_array_equal(found.used, expected.used)
+    np.testing.assert_allclose(found.points_in_world, expected.points_in_world, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(found.errors_rad, expected.errors_rad, atol=1e-7)
 
 
 @pytest.mark.parametrize("point", [(0, 0, 400.0), (0, 0, -3.0)])

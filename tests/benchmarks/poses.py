@@ -64,30 +64,51 @@ def turned(pictures: Pictures, truth: Cameras) -> tuple[Pictures, Cameras]:
 
 def native(pictures: Pictures, mapper: str, scratch: Path) -> Cameras:
     """Return the poses of COLMAP on its own."""
-    import pycolmap
-
     (scratch / "images").mkdir()
     for name, picture in pictures.items():
         cv2.imwrite(str(scratch / "images" / name), picture[..., ::-1])
-    options = pycolmap.IncrementalPipelineOptions() if mapper == "incremental" else pycolmap.GlobalPipelineOptions()
-    options.random_seed, options.num_threads = SEED, 1
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = SEED
     database = scratch / "native.db"
-    run = pycolmap.incremental_mapping if mapper == "incremental" else pycolmap.global_mapping
+    native_features(database, scratch / "images")
+    native_matches(database)
+    return native_model(database, scratch / "images", mapper)
+
+
+def native_features(database: Path, images: Path) -> None:
+    """Have COLMAP extract its features from all pictures of a folder, on one thread."""
+    import pycolmap
+
     with quiet_colmap():
         pycolmap.extract_features(
-            database, scratch / "images",
+            database, images,
             camera_mode=pycolmap.CameraMode.SINGLE,
             reader_options=pycolmap.ImageReaderOptions(camera_model="EQUIRECTANGULAR"),
             extraction_options=pycolmap.FeatureExtractionOptions(num_threads=1),
         )  # fmt: skip
+
+
+def native_matches(database: Path) -> None:
+    """Have COLMAP match and verify all pairs, on one thread."""
+    import pycolmap
+
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = SEED
+    with quiet_colmap():
         pycolmap.match_exhaustive(
             database,
             matching_options=pycolmap.FeatureMatchingOptions(num_threads=1),
             verification_options=verification,
         )
-        models = run(database, scratch / "images", scratch, options)
+
+
+def native_model(database: Path, images: Path, mapper: str) -> Cameras:
+    """Return the poses of COLMAP's largest model from a database with matches, on one thread."""
+    import pycolmap
+
+    options = pycolmap.IncrementalPipelineOptions() if mapper == "incremental" else pycolmap.GlobalPipelineOptions()
+    options.random_seed, options.num_threads = SEED, 1
+    run = pycolmap.incremental_mapping if mapper == "incremental" else pycolmap.global_mapping
+    with quiet_colmap():
+        models = run(database, images, database.parent, options)
     if not models:
         return {}
     largest = max(models.values(), key=lambda model: model.num_reg_images())

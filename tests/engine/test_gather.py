@@ -2,7 +2,10 @@
 
 import pytest
 
+from pano_mvs.engine.blobs import BlobRef
+from pano_mvs.engine.execute import kept_items
 from pano_mvs.engine.gather import Gather
+from pano_mvs.engine.store import ItemRef
 
 
 @pytest.fixture
@@ -55,3 +58,20 @@ def test_a_failure_comes_out_of_the_access():
 
     with pytest.raises(OSError, match="no 1"):
         Gather({"a": 1}, load)["a"]
+
+
+def test_as_many_are_kept_as_are_asked_for(loaded):
+    gather = Gather({idx: idx for idx in range(5)}, lambda ref: loaded.append(ref) or [ref], kept=2)
+    for key in (0, 1, 0, 2, 0, 1):
+        gather[key]
+    assert loaded == [0, 1, 2, 1]
+
+
+def ref_of(*sizes):
+    return ItemRef("kind", "d", {str(n): BlobRef("d", size, ".npy") for n, size in enumerate(sizes)})
+
+
+def test_how_many_are_kept_depends_on_open_files_and_on_memory():
+    assert kept_items([ref_of(1_000, 9_000), ref_of(10)]) == 12_800
+    assert kept_items([ref_of(1_000), ref_of(10_000_000, 10_000_000)]) == 64
+    assert kept_items([ref_of(*[200_000] * 100)]) == 6

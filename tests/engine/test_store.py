@@ -40,6 +40,24 @@ def test_values_come_back_as_they_were(tmp_path: Path) -> None:
     assert not back.array.flags.writeable
 
 
+@pytest.mark.parametrize("shape", [(0, 3), (), (3, 5), (3, 100_000)])
+@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize("dtype", ["uint8", "int32", "float64"])
+def test_arrays_of_any_form_come_back_read_only(tmp_path: Path, shape: tuple[int, ...], order: str, dtype: str) -> None:
+    blobs = Store(tmp_path).blobs
+    count = int(np.prod(shape))
+    array = np.asarray(np.arange(count).astype(dtype).reshape(shape, order=order))  # type: ignore[call-overload]
+    ref = blobs.put(array)
+    assert ref.is_mapped == (array.nbytes > 200_000)
+    back = blobs.get(ref)
+    assert isinstance(back, np.ndarray)
+    assert isinstance(back, np.memmap) == ref.is_mapped
+    assert back.dtype == array.dtype
+    assert not back.flags.writeable
+    assert back.flags.aligned
+    np.testing.assert_array_equal(back, array)
+
+
 def test_equal_values_share_blobs_and_digest(tmp_path: Path) -> None:
     first, second = Store(tmp_path / "a"), Store(tmp_path / "b")
     value = Sample(np.ones((2, 2), np.float32), (), (), 1.0)

@@ -19,7 +19,6 @@ IndexArray = NDArray[np.int32]
 Loss: TypeAlias = Literal["huber", "cauchy"]
 
 _MIN_DAMPING, _MAX_DAMPING = 1e-9, 1e6
-_CONVERGED = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +57,13 @@ class Bundle:
 
 
 def adjust_bundle(
-    bundle: Bundle, *, loss: Loss, scale_rad: float, max_iterations: int = 50, fixed_camera: int = 0
+    bundle: Bundle,
+    *,
+    loss: Loss,
+    scale_rad: float,
+    max_iterations: int = 50,
+    tolerance: float = 1e-7,
+    fixed_camera: int = 0,
 ) -> Bundle:
     """Return the bundle with the least robust sum of squared angular errors; one camera stays where it is.
 
@@ -69,6 +74,7 @@ def adjust_bundle(
         loss: "huber" min(r², 2 s r − s²), or "cauchy" s² log(1 + r²/s²).
         scale_rad: s, the error from which an observation loses influence.
         max_iterations: at most so many steps.
+        tolerance: the adjustment ends with a step that lowers the cost by a smaller share than this.
         fixed_camera: position of the camera that is not moved.
 
     Raises:
@@ -81,7 +87,7 @@ def adjust_bundle(
     place = np.argsort(order)
     ordered = _adjust_ordered(
         with_camera_order(bundle, order, place), loss=loss, scale_rad=scale_rad, max_iterations=max_iterations,
-        fixed_camera=int(place[fixed_camera]),
+        tolerance=tolerance, fixed_camera=int(place[fixed_camera]),
     )  # fmt: skip
     return with_camera_order(ordered, place, order)
 
@@ -96,20 +102,27 @@ def with_camera_order(bundle: Bundle, order: NDArray[np.intp], place: NDArray[np
     )
 
 
-def _adjust_ordered(bundle: Bundle, *, loss: Loss, scale_rad: float, max_iterations: int, fixed_camera: int) -> Bundle:
-    errors = bundle.errors_rad()
+def _adjust_ordered(
+    bundle: Bundle, *, loss: Loss, scale_rad: float, max_iterations: int, tolerance: float, fixed_camera: int
+) -> Bundle:
+    # Importing numba takes most of a second; who adjusts nothing does not pay for it.
+    from pano_mvs.algorithms.poses.kernels_bundle import ray_errors
+
+    layout = _Layout.of(bundle)
+    observed = bundle.point_idx, bundle.image_idx, bundle.bearings
+    errors = ray_errors(bundle.rotations, bundle.centers, bundle.points, *observed)
     cost, damping = robust_cost(errors, loss=loss, scale_rad=scale_rad), 1e-4
     for _ in range(max_iterations):
         weights = robust_weights(errors, loss=loss, scale_rad=scale_rad)
-        moved = _step(bundle, weights, damping=damping, fixed_camera=fixed_camera)
-        moved_errors = moved.errors_rad()
+        moved = _step(bundle, layout, weights, damping=damping, fixed_camera=fixed_camera)
+        moved_errors = ray_errors(moved.rotations, moved.centers, moved.points, *observed)
         moved_cost = robust_cost(moved_errors, loss=loss, scale_rad=scale_rad)
         if not moved_cost < cost:
             damping *= 10
             if damping > _MAX_DAMPING:
                 break
             continue
-        converged = cost - moved_cost < _CONVERGED * cost
+        converged = cost - moved_cost < tolerance * cost
         bundle, errors, cost, damping = moved, moved_errors, moved_cost, max(damping / 10, _MIN_DAMPING)
         if converged:
             break
@@ -152,24 +165,49 @@ class ReducedCameras:
     point_gradients: FloatArray
 
 
+@dataclass(frozen=True, eq=False)
+class _Layout:
+    """What stays the same in all steps of an adjustment.
+
+    Attributes:
+        starts: (P + 1,) the observations of point p are starts[p] to starts[p + 1].
+        width: of the band, see `camera_system`.
+        bases: (T, 3, 2) two vectors normal to each observed ray.
+    """
+
+    starts: NDArray[np.intp]
+    width: int
+    bases: FloatArray
+
+    @staticmethod
+    def of(bundle: Bundle) -> _Layout:
+        """Return the layout of a bundle."""
+        starts = np.searchsorted(bundle.point_idx, np.arange(len(bundle.points) + 1))
+        width = 6 * (camera_span(starts, bundle.image_idx) + 1)
+        return _Layout(starts, width, tangent_basis(bundle.bearings))
+
+
 def reduced_cameras(bundle: Bundle, weights: FloatArray, *, damping: float) -> ReducedCameras:
     """Return the cameras' system of a weighted bundle; points are damped, cameras are not."""
-    # Importing numba takes most of a second; who adjusts nothing does not pay for it.
+    return _reduced_cameras(bundle, _Layout.of(bundle), weights, damping=damping)
+
+
+def _reduced_cameras(bundle: Bundle, layout: _Layout, weights: FloatArray, *, damping: float) -> ReducedCameras:
     from pano_mvs.algorithms.poses.kernels_bundle import reduced_system
 
-    starts = np.searchsorted(bundle.point_idx, np.arange(len(bundle.points) + 1))
-    width = 6 * (camera_span(starts, bundle.image_idx) + 1)
-    bases = tangent_basis(bundle.bearings)
     return ReducedCameras(
         *reduced_system(
-            bundle.rotations, bundle.centers, bundle.points, starts, bundle.image_idx, bases, weights, damping, width
+            bundle.rotations, bundle.centers, bundle.points, layout.starts, bundle.image_idx, layout.bases, weights,
+            damping, layout.width,
         )
-    )
+    )  # fmt: skip
 
 
-def _step(bundle: Bundle, weights: FloatArray, *, damping: float, fixed_camera: int) -> Bundle:
+def _step(bundle: Bundle, layout: _Layout, weights: FloatArray, *, damping: float, fixed_camera: int) -> Bundle:
     """Return the bundle after one damped step."""
-    system = reduced_cameras(bundle, weights, damping=damping)
+    from pano_mvs.algorithms.poses.kernels_bundle import moved_points
+
+    system = _reduced_cameras(bundle, layout, weights, damping=damping)
     # The small constant keeps a camera without observations in place.
     system.band[:, 0] += damping * system.diagonal + 1e-12 * system.diagonal.mean()
     band, gradient = held(system.band, system.gradient, fixed_camera)
@@ -177,13 +215,12 @@ def _step(bundle: Bundle, weights: FloatArray, *, damping: float, fixed_camera: 
         steps = -camera_solver(band)(gradient).reshape(-1, 6)
     except LinAlgError:
         return bundle
-    coupled = np.einsum("tij,ti->tj", system.couplings, steps[bundle.image_idx])
-    right = system.point_gradients + np.stack(
-        [np.bincount(bundle.point_idx, column, len(bundle.points)) for column in coupled.T], axis=1
-    )
     return replace(
         bundle,
         rotations=rotation_from_rotvec(steps[:, :3]) @ bundle.rotations,
         centers=bundle.centers + steps[:, 3:],
-        points=bundle.points - np.einsum("pij,pj->pi", system.inverses, right),
-    )
+        points=moved_points(
+            bundle.points, layout.starts, bundle.image_idx, system.couplings, system.inverses, system.point_gradients,
+            np.ascontiguousarray(steps),
+        ),
+    )  # fmt: skip

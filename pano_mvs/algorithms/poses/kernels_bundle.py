@@ -12,93 +12,115 @@ from numba import njit
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _observation(rotation, center, point, basis, weight, camera_rows, point_rows, residual):  # type: ignore[no-untyped-def]
-    """Write √w-scaled derivatives by (ω, C), (2, 6), by X, (2, 3), and the residual, (2,)."""
-    x = np.empty(3)
-    for i in range(3):
-        x[i] = (
-            rotation[i, 0] * (point[0] - center[0])
-            + rotation[i, 1] * (point[1] - center[1])
-            + rotation[i, 2] * (point[2] - center[2])
-        )
-    inverse = 1.0 / np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
-    root = np.sqrt(weight)
-    for k in range(2):
-        along = (basis[0, k] * x[0] + basis[1, k] * x[1] + basis[2, k] * x[2]) * inverse
-        residual[k] = root * along
+def _derivatives(rotations, centers, points, bases, weights, t, k, p, rows):  # type: ignore[no-untyped-def]
+    """Write √w-scaled rows of derivatives by (ω, C) and X, and the residual, (2, 10), of observation t."""
+    dx, dy, dz = points[p, 0] - centers[k, 0], points[p, 1] - centers[k, 1], points[p, 2] - centers[k, 2]
+    r00, r01, r02 = rotations[k, 0, 0], rotations[k, 0, 1], rotations[k, 0, 2]
+    r10, r11, r12 = rotations[k, 1, 0], rotations[k, 1, 1], rotations[k, 1, 2]
+    r20, r21, r22 = rotations[k, 2, 0], rotations[k, 2, 1], rotations[k, 2, 2]
+    x0, x1, x2 = r00 * dx + r01 * dy + r02 * dz, r10 * dx + r11 * dy + r12 * dz, r20 * dx + r21 * dy + r22 * dz
+    inverse = 1.0 / np.sqrt(x0 * x0 + x1 * x1 + x2 * x2)
+    root = np.sqrt(weights[t])
+    for k2 in range(2):
+        b0, b1, b2 = bases[t, 0, k2], bases[t, 1, k2], bases[t, 2, k2]
+        along = (b0 * x0 + b1 * x1 + b2 * x2) * inverse
         # ∂r/∂x, the row that the chain rule multiplies from the left
-        d0 = root * (basis[0, k] - along * x[0] * inverse) * inverse
-        d1 = root * (basis[1, k] - along * x[1] * inverse) * inverse
-        d2 = root * (basis[2, k] - along * x[2] * inverse) * inverse
+        d0 = root * (b0 - along * x0 * inverse) * inverse
+        d1 = root * (b1 - along * x1 * inverse) * inverse
+        d2 = root * (b2 - along * x2 * inverse) * inverse
         # R ← exp(ω) R gives ∂x/∂ω = −[x]×
-        camera_rows[k, 0] = d2 * x[1] - d1 * x[2]
-        camera_rows[k, 1] = d0 * x[2] - d2 * x[0]
-        camera_rows[k, 2] = d1 * x[0] - d0 * x[1]
-        for j in range(3):
-            by_point = d0 * rotation[0, j] + d1 * rotation[1, j] + d2 * rotation[2, j]
-            point_rows[k, j] = by_point
-            camera_rows[k, 3 + j] = -by_point
+        rows[k2, 0] = d2 * x1 - d1 * x2
+        rows[k2, 1] = d0 * x2 - d2 * x0
+        rows[k2, 2] = d1 * x0 - d0 * x1
+        by_x = d0 * r00 + d1 * r10 + d2 * r20
+        by_y = d0 * r01 + d1 * r11 + d2 * r21
+        by_z = d0 * r02 + d1 * r12 + d2 * r22
+        rows[k2, 3], rows[k2, 4], rows[k2, 5] = -by_x, -by_y, -by_z
+        rows[k2, 6], rows[k2, 7], rows[k2, 8] = by_x, by_y, by_z
+        rows[k2, 9] = root * along
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _invert_symmetric(matrix, inverse):  # type: ignore[no-untyped-def]
-    """Write the inverse of a symmetric positive definite (3, 3) matrix."""
+def _invert_symmetric(matrix, inverses, p):  # type: ignore[no-untyped-def]
+    """Write the inverse of a symmetric positive definite (3, 3) matrix to the place p."""
     a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
     d, e, f = matrix[1, 1], matrix[1, 2], matrix[2, 2]
-    inverse[0, 0] = d * f - e * e
-    inverse[0, 1] = c * e - b * f
-    inverse[0, 2] = b * e - c * d
-    inverse[1, 1] = a * f - c * c
-    inverse[1, 2] = b * c - a * e
-    inverse[2, 2] = a * d - b * b
-    inverse[1, 0], inverse[2, 0], inverse[2, 1] = inverse[0, 1], inverse[0, 2], inverse[1, 2]
-    determinant = a * inverse[0, 0] + b * inverse[0, 1] + c * inverse[0, 2]
-    for i in range(3):
-        for j in range(3):
-            inverse[i, j] /= determinant
+    i00, i01, i02 = d * f - e * e, c * e - b * f, b * e - c * d
+    i11, i12, i22 = a * f - c * c, b * c - a * e, a * d - b * b
+    scale = 1.0 / (a * i00 + b * i01 + c * i02)
+    inverses[p, 0, 0], inverses[p, 1, 1], inverses[p, 2, 2] = i00 * scale, i11 * scale, i22 * scale
+    inverses[p, 0, 1], inverses[p, 0, 2], inverses[p, 1, 2] = i01 * scale, i02 * scale, i12 * scale
+    inverses[p, 1, 0], inverses[p, 2, 0], inverses[p, 2, 1] = i01 * scale, i02 * scale, i12 * scale
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _add_observation(camera_rows, point_rows, residual, row, band, gradient, diagonal, coupling, block, by_point):  # type: ignore[no-untyped-def]
+def _add_observation(rows, t, row, p, band, gradient, diagonal, couplings, block, point_gradients):  # type: ignore[no-untyped-def]
     """Add one observation's products of derivatives to its camera's and its point's blocks."""
-    for i in range(6):
-        for j in range(i + 1):
-            band[row + j, i - j] += camera_rows[0, i] * camera_rows[0, j] + camera_rows[1, i] * camera_rows[1, j]
-        for j in range(3):
-            coupling[i, j] = camera_rows[0, i] * point_rows[0, j] + camera_rows[1, i] * point_rows[1, j]
-        gradient[row + i] += camera_rows[0, i] * residual[0] + camera_rows[1, i] * residual[1]
-        diagonal[row + i] += camera_rows[0, i] ** 2 + camera_rows[1, i] ** 2
-    for i in range(3):
-        for j in range(3):
-            block[i, j] += point_rows[0, i] * point_rows[0, j] + point_rows[1, i] * point_rows[1, j]
-        by_point[i] += point_rows[0, i] * residual[0] + point_rows[1, i] * residual[1]
+    p0, p1, p2, residual_0 = rows[0, 6], rows[0, 7], rows[0, 8], rows[0, 9]
+    q0, q1, q2, residual_1 = rows[1, 6], rows[1, 7], rows[1, 8], rows[1, 9]
+    for j in range(6):
+        first, second = rows[0, j], rows[1, j]
+        for i in range(j, 6):
+            band[row + j, i - j] += rows[0, i] * first + rows[1, i] * second
+        couplings[t, j, 0] = first * p0 + second * q0
+        couplings[t, j, 1] = first * p1 + second * q1
+        couplings[t, j, 2] = first * p2 + second * q2
+        gradient[row + j] += first * residual_0 + second * residual_1
+        diagonal[row + j] += first * first + second * second
+    block[0, 0] += p0 * p0 + q0 * q0
+    block[0, 1] += p0 * p1 + q0 * q1
+    block[0, 2] += p0 * p2 + q0 * q2
+    block[1, 1] += p1 * p1 + q1 * q1
+    block[1, 2] += p1 * p2 + q1 * q2
+    block[2, 2] += p2 * p2 + q2 * q2
+    point_gradients[p, 0] += p0 * residual_0 + q0 * residual_1
+    point_gradients[p, 1] += p1 * residual_0 + q1 * residual_1
+    point_gradients[p, 2] += p2 * residual_0 + q2 * residual_1
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _eliminate(start, stop, image_idx, couplings, inverse, by_point, product, band, gradient):  # type: ignore[no-untyped-def]
-    """Take one point out of the system: S −= W V⁻¹ Wᵀ, g −= W V⁻¹ b, over all pairs of its observations."""
+def _eliminate(start, stop, p, image_idx, couplings, inverses, point_gradients, product, band, gradient):  # type: ignore[no-untyped-def]
+    """Take one point out of the system: S −= W V⁻¹ Wᵀ, g −= W V⁻¹ b, over all pairs of its observations.
+
+    Rows are written out: a compiler that cannot know that the arrays lie apart would load W V⁻¹ anew for each entry.
+    """
     for t in range(start, stop):
         row = 6 * image_idx[t]
         for i in range(6):
             for j in range(3):
                 product[i, j] = (
-                    couplings[t, i, 0] * inverse[0, j]
-                    + couplings[t, i, 1] * inverse[1, j]
-                    + couplings[t, i, 2] * inverse[2, j]
+                    couplings[t, i, 0] * inverses[p, 0, j]
+                    + couplings[t, i, 1] * inverses[p, 1, j]
+                    + couplings[t, i, 2] * inverses[p, 2, j]
                 )
-            for j in range(3):
-                gradient[row + i] -= product[i, j] * by_point[j]
+            gradient[row + i] -= (
+                product[i, 0] * point_gradients[p, 0]
+                + product[i, 1] * point_gradients[p, 1]
+                + product[i, 2] * point_gradients[p, 2]
+            )
+        a0, b0, c0 = product[0, 0], product[0, 1], product[0, 2]
+        a1, b1, c1 = product[1, 0], product[1, 1], product[1, 2]
+        a2, b2, c2 = product[2, 0], product[2, 1], product[2, 2]
+        a3, b3, c3 = product[3, 0], product[3, 1], product[3, 2]
+        a4, b4, c4 = product[4, 0], product[4, 1], product[4, 2]
+        a5, b5, c5 = product[5, 0], product[5, 1], product[5, 2]
         for s in range(start, stop):
             column = 6 * image_idx[s]
             if column > row:
                 continue
             for j in range(6):
-                for i in range(j if column == row else 0, 6):
-                    band[column + j, row + i - column - j] -= (
-                        product[i, 0] * couplings[s, j, 0]
-                        + product[i, 1] * couplings[s, j, 1]
-                        + product[i, 2] * couplings[s, j, 2]
-                    )
+                u, v, w = couplings[s, j, 0], couplings[s, j, 1], couplings[s, j, 2]
+                at = row - column - j
+                if column == row:
+                    for i in range(j, 6):
+                        band[column + j, i - j] -= product[i, 0] * u + product[i, 1] * v + product[i, 2] * w
+                else:
+                    band[column + j, at] -= a0 * u + b0 * v + c0 * w
+                    band[column + j, at + 1] -= a1 * u + b1 * v + c1 * w
+                    band[column + j, at + 2] -= a2 * u + b2 * v + c2 * w
+                    band[column + j, at + 3] -= a3 * u + b3 * v + c3 * w
+                    band[column + j, at + 4] -= a4 * u + b4 * v + c4 * w
+                    band[column + j, at + 5] -= a5 * u + b5 * v + c5 * w
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -116,23 +138,52 @@ def reduced_system(rotations, centers, points, starts, image_idx, bases, weights
     """
     cameras, count = len(centers), len(points)
     band, gradient, diagonal = np.zeros((6 * cameras, width)), np.zeros(6 * cameras), np.zeros(6 * cameras)
-    couplings = np.zeros((len(image_idx), 6, 3))
-    inverses, point_gradients = np.zeros((count, 3, 3)), np.zeros((count, 3))
-    camera_rows, point_rows, residual = np.empty((2, 6)), np.empty((2, 3)), np.empty(2)
-    block, product = np.empty((3, 3)), np.empty((6, 3))
+    couplings = np.empty((len(image_idx), 6, 3))
+    inverses, point_gradients = np.empty((count, 3, 3)), np.zeros((count, 3))
+    rows, block, product = np.empty((2, 10)), np.empty((3, 3)), np.empty((6, 3))
     for p in range(count):
         block[:] = 0.0
         for t in range(starts[p], starts[p + 1]):
             k = image_idx[t]
-            _observation(rotations[k], centers[k], points[p], bases[t], weights[t], camera_rows, point_rows, residual)
-            _add_observation(
-                camera_rows, point_rows, residual, 6 * k, band, gradient, diagonal, couplings[t], block,
-                point_gradients[p],
-            )  # fmt: skip
+            _derivatives(rotations, centers, points, bases, weights, t, k, p, rows)
+            _add_observation(rows, t, 6 * k, p, band, gradient, diagonal, couplings, block, point_gradients)
         for i in range(3):
             block[i, i] *= 1.0 + damping
-        _invert_symmetric(block, inverses[p])
+        _invert_symmetric(block, inverses, p)
         _eliminate(
-            starts[p], starts[p + 1], image_idx, couplings, inverses[p], point_gradients[p], product, band, gradient
+            starts[p], starts[p + 1], p, image_idx, couplings, inverses, point_gradients, product, band, gradient
         )
     return band, gradient, diagonal, couplings, inverses, point_gradients
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def moved_points(points, starts, image_idx, couplings, inverses, point_gradients, steps):  # type: ignore[no-untyped-def]
+    """Return where the points go, (P, 3), when the cameras take their steps (N, 6): X − V⁻¹ (b + Wᵀ s)."""
+    moved = np.empty_like(points)
+    for p in range(len(points)):
+        x, y, z = point_gradients[p, 0], point_gradients[p, 1], point_gradients[p, 2]
+        for t in range(starts[p], starts[p + 1]):
+            k = image_idx[t]
+            for i in range(6):
+                x += couplings[t, i, 0] * steps[k, i]
+                y += couplings[t, i, 1] * steps[k, i]
+                z += couplings[t, i, 2] * steps[k, i]
+        for i in range(3):
+            moved[p, i] = points[p, i] - (inverses[p, i, 0] * x + inverses[p, i, 1] * y + inverses[p, i, 2] * z)
+    return moved
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def ray_errors(rotations, centers, points, point_idx, image_idx, bearings):  # type: ignore[no-untyped-def]
+    """Return the angle between every observed ray and the one to its point, (T,)."""
+    errors = np.empty(len(point_idx))
+    for t in range(len(point_idx)):
+        k, p = image_idx[t], point_idx[t]
+        dx, dy, dz = points[p, 0] - centers[k, 0], points[p, 1] - centers[k, 1], points[p, 2] - centers[k, 2]
+        x = rotations[k, 0, 0] * dx + rotations[k, 0, 1] * dy + rotations[k, 0, 2] * dz
+        y = rotations[k, 1, 0] * dx + rotations[k, 1, 1] * dy + rotations[k, 1, 2] * dz
+        z = rotations[k, 2, 0] * dx + rotations[k, 2, 1] * dy + rotations[k, 2, 2] * dz
+        u, v, w = bearings[t, 0], bearings[t, 1], bearings[t, 2]
+        sine = np.sqrt((v * z - w * y) ** 2 + (w * x - u * z) ** 2 + (u * y - v * x) ** 2)
+        errors[t] = np.arctan2(sine, u * x + v * y + w * z)
+    return errors

@@ -19,6 +19,8 @@ from pano_mvs.scene.pose_groups import per_group
 FloatArray = NDArray[np.float64]
 
 _ROUNDS = 3
+# The first rounds only choose the observations of the last.
+_TOLERANCES = (1e-3, 1e-3, 1e-7)
 _MIN_ANGLE_RAD = float(np.deg2rad(1.0))
 
 
@@ -70,8 +72,9 @@ def _refined(poses: Poses, *, loss: Loss, loss_scale_deg: float, max_iterations:
         widen = 2 ** (_ROUNDS - 1 - round_idx)
         bundle, colors = _fitting(bundle, colors, max_error_rad=float(np.deg2rad(max_error_deg * widen)))
         bundle = adjust_bundle(
-            bundle, loss=loss, scale_rad=float(np.deg2rad(loss_scale_deg * widen)), max_iterations=max_iterations
-        )
+            bundle, loss=loss, scale_rad=float(np.deg2rad(loss_scale_deg * widen)), max_iterations=max_iterations,
+            tolerance=_TOLERANCES[round_idx],
+        )  # fmt: skip
     bundle, colors = _without_outliers(bundle, colors, max_error_rad=float(np.deg2rad(max_error_deg)))
     refined = _poses(poses, bundle, colors)
     neighbour = first_neighbour(poses.centers)

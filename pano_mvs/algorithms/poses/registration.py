@@ -27,6 +27,8 @@ _MIN_POINTS = 15
 _MIN_SHARE = 0.4
 _MAX_PARTNERS = 8
 _ADJUST_STEPS = 20
+# What further steps would gain, the refinement of the finished model gains as well.
+_ADJUST_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,6 +141,7 @@ class GrowingModel:
             loss="cauchy",
             scale_rad=_MAX_ERROR_RAD / 4,
             max_iterations=_ADJUST_STEPS,
+            tolerance=_ADJUST_TOLERANCE,
             fixed_camera=images.index(next(iter(self.cameras))),
         )
         for image, rotation, center in zip(images, bundle.rotations, bundle.centers, strict=True):

@@ -1,0 +1,114 @@
+"""Compiled: triangulation of tracks, track by track; what it computes is told in `points`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _solved(matrix, vector, least, point):  # type: ignore[no-untyped-def]
+    """Write the solution of a symmetric (3, 3) system; return whether its least eigenvalue exceeds a bound.
+
+    A − λ I is positive definite just if all eigenvalues of A exceed λ: its LDLᵀ decomposition tells.
+    """
+    for shift in (least, 0.0):
+        a, b, c = matrix[0, 0] - shift, matrix[0, 1], matrix[0, 2]
+        if not a > 0:
+            return False
+        l10, l20 = b / a, c / a
+        d = matrix[1, 1] - shift - l10 * b
+        if not d > 0:
+            return False
+        e = matrix[1, 2] - l10 * c
+        l21 = e / d
+        f = matrix[2, 2] - shift - l20 * c - l21 * e
+        if not f > 0:
+            return False
+    y1 = vector[1] - l10 * vector[0]
+    y2 = vector[2] - l20 * vector[0] - l21 * y1
+    point[2] = y2 / f
+    point[1] = y1 / d - l21 * point[2]
+    point[0] = vector[0] / a - l10 * point[1] - l20 * point[2]
+    return True
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _nearest_point(centers, rays, used, start, stop, least, weights, matrix, vector, point):  # type: ignore[no-untyped-def]
+    """Write the point nearest to the rays in use, twice reweighted by range; return whether they tell one."""
+    count = 0
+    for t in range(start, stop):
+        count += used[t]
+        weights[t] = 1.0
+    if count < 2:
+        return False
+    for step in range(3):
+        matrix[:], vector[:] = 0.0, 0.0
+        for t in range(start, stop):
+            if used[t]:
+                w, x, y, z = weights[t], rays[t, 0], rays[t, 1], rays[t, 2]
+                along = x * centers[t, 0] + y * centers[t, 1] + z * centers[t, 2]
+                matrix[0, 0] += w * (1.0 - x * x)
+                matrix[1, 1] += w * (1.0 - y * y)
+                matrix[2, 2] += w * (1.0 - z * z)
+                matrix[0, 1] -= w * x * y
+                matrix[0, 2] -= w * x * z
+                matrix[1, 2] -= w * y * z
+                vector[0] += w * (centers[t, 0] - along * x)
+                vector[1] += w * (centers[t, 1] - along * y)
+                vector[2] += w * (centers[t, 2] - along * z)
+        if not _solved(matrix, vector, least if step == 0 else 0.0, point):
+            return False
+        mean = 0.0
+        for t in range(start, stop):
+            if used[t]:
+                weights[t] = (
+                    (point[0] - centers[t, 0]) ** 2 + (point[1] - centers[t, 1]) ** 2 + (point[2] - centers[t, 2]) ** 2
+                )
+                mean += weights[t] / count
+        # Rays that cross in the very place of their cameras (one place for all) say nothing of a point.
+        if not mean > 0:
+            return False
+        for t in range(start, stop):
+            weights[t] = mean / max(weights[t], 1e-6 * mean + 1e-300)
+    return True
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def triangulate(centers, rays, starts, least, max_error, rounds):  # type: ignore[no-untyped-def]
+    """Return points (P, 3), whether they are valid (P,), which observations fit (T,), and their errors (T,).
+
+    Observations are sorted by track; those of track p are starts[p] to starts[p + 1].
+    """
+    count = len(starts) - 1
+    points, valid = np.full((count, 3), np.nan), np.zeros(count, np.bool_)
+    used, errors, weights = np.ones(len(rays), np.bool_), np.full(len(rays), np.pi), np.empty(len(rays))
+    matrix, vector, point = np.empty((3, 3)), np.empty(3), np.empty(3)
+    for p in range(count):
+        start, stop = starts[p], starts[p + 1]
+        fits = False
+        for _ in range(rounds):
+            fits = _nearest_point(centers, rays, used, start, stop, least, weights, matrix, vector, point)
+            worst = 0.0
+            for t in range(start, stop):
+                errors[t] = np.pi
+                if fits:
+                    x, y, z = point[0] - centers[t, 0], point[1] - centers[t, 1], point[2] - centers[t, 2]
+                    u, v, w = rays[t, 0], rays[t, 1], rays[t, 2]
+                    sine = np.sqrt((v * z - w * y) ** 2 + (w * x - u * z) ** 2 + (u * y - v * x) ** 2)
+                    errors[t] = np.arctan2(sine, u * x + v * y + w * z)
+                    if used[t] and errors[t] > worst:
+                        worst = errors[t]
+            if not fits or worst <= max_error:
+                break
+            for t in range(start, stop):
+                if errors[t] >= worst:
+                    used[t] = False
+        for t in range(start, stop):
+            fits = fits and not (used[t] and errors[t] > max_error)
+        valid[p] = fits
+        if fits:
+            points[p] = point
+        for t in range(start, stop):
+            used[t] = used[t] and fits
+    return points, valid, used, errors
