@@ -1,0 +1,71 @@
+"""Small pictures of the synthetic room, rendered once for all tests that ask the images about their poses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.geometry import Rigid3
+from pano_mvs.scene import Features, TwoView
+from pano_mvs.testing.room import capture_poses, default_room, range_along, render
+from tests.algorithms.aliased_capture import same_matches, view_of
+from tests.algorithms.synthetic_capture import features_from_bearings, noisy_bearings
+
+Vector = tuple[float, float, float]
+
+SIZE_HW = (128, 256)
+WHOLE = np.ones(SIZE_HW, np.bool_)
+
+
+@cache
+def room_capture() -> tuple[tuple[Rigid3, ...], tuple[NDArray[np.uint8], ...]]:
+    """Return five cameras about 0.6 apart and their panoramas."""
+    poses = tuple(capture_poses(5, seed=1, spread=0.7))
+    return poses, tuple(render(default_room(), pose, SIZE_HW)[0] for pose in poses)
+
+
+def moved(pose: Rigid3, by: Vector) -> Rigid3:
+    """Return a camera whose centre is elsewhere."""
+    return Rigid3.from_center(pose.rotation, pose.center + np.array(by))
+
+
+def room_matches(
+    feigned: Mapping[int, Vector] | None = None, *, false: int = 60
+) -> tuple[dict[str, Features], dict[tuple[str, str], TwoView]]:
+    """Return key points on what the cameras see, and the verified pairs of all of them.
+
+    Args:
+        feigned: images that most matches with the others place elsewhere, by so much; the truth is the runner-up.
+        false: number of points that such matches have; the true ones have 60.
+    """
+    poses, _ = room_capture()
+    feigned = feigned or {}
+    rng = np.random.default_rng(23)
+    rays = rng.normal(size=(60, 3))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    seen = rays * range_along(default_room(), np.zeros(3), rays)[:, None]
+    repeated = rng.uniform(-1, 1, size=(false, 3)) * (3.0, 0.0, 2.5) + (0.0, 1.3, 0.0)
+    # After the true key points come repeated things, as each image sees them from where it seems to stand.
+    features = {
+        f"{idx}.png": features_from_bearings(
+            np.concatenate([
+                noisy_bearings(rng, pose, seen, noise_deg=0.05),
+                noisy_bearings(rng, moved(pose, feigned.get(idx, (0.0, 0.0, 0.0))), repeated, noise_deg=0.05),
+            ])
+        )
+        for idx, pose in enumerate(poses)
+    }  # fmt: skip
+    true = same_matches(len(seen))
+    views = {}
+    for (i, a), (j, b) in combinations(enumerate(features), 2):
+        view = view_of(poses[j] @ poses[i].inverse(), true)
+        shift = np.array(feigned.get(j, (0.0, 0.0, 0.0))) - feigned.get(i, (0.0, 0.0, 0.0))
+        if np.any(shift != 0):
+            there = Rigid3.from_center(poses[j].rotation, poses[j].center + shift)
+            view = view_of(there @ poses[i].inverse(), same_matches(false, len(seen))).with_alternatives([view])
+        views[a, b] = view
+    return features, views

@@ -1,0 +1,120 @@
+"""Blocks of cameras that all pairs between them shift alike, and the moves that put them back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pano_mvs.algorithms.metrics.poses import relative_pose_errors
+from pano_mvs.algorithms.poses.aliases import find_aliases, labellings, moved_cameras
+from pano_mvs.algorithms.poses.placed_model import PlacedModel, pairs_of
+from pano_mvs.geometry import Rigid3
+from tests.algorithms.aliased_capture import TILE, AliasedCapture, aliased_capture, shifted_pose
+
+COUNT = 7
+
+
+def shifted_block(name: str, block: set[int], *, tiles: int = 1) -> tuple[AliasedCapture, PlacedModel]:
+    """Return a capture and a model of it in which a block of cameras stands some tiles further.
+
+    All pairs across have a false geometry that says so, and the truth as their runner-up.
+    """
+    false = {
+        (i, j): tiles if j in block else -tiles
+        for i in range(COUNT)
+        for j in range(i + 1, COUNT)
+        if (i in block) != (j in block)
+    }
+    capture = aliased_capture(name, false=false, views=COUNT)
+    model = model_of(capture, {one: shifted_pose(capture.poses[capture.names[one]], tiles) for one in block})
+    return capture, model
+
+
+def model_of(capture: AliasedCapture, instead: dict[int, Rigid3] | None = None) -> PlacedModel:
+    """Return a model with the true cameras of a capture, or some others instead."""
+    poses = dict(enumerate(capture.poses.values())) | (instead or {})
+    model = PlacedModel(pairs_of(capture.features, capture.two_views), poses)
+    model.choose_again()
+    model.learn_ranges()
+    model.choose_again()
+    return model
+
+
+BLOCKS = [
+    pytest.param({4, 5, 6}, 1, id="the last three"),
+    pytest.param({0, 2}, -1, id="two, the first among them"),
+    pytest.param({1, 2, 3, 5}, 2, id="most, by two tiles"),
+    pytest.param({3}, 1, id="one"),
+]
+
+
+@pytest.mark.parametrize(("block", "tiles"), BLOCKS)
+def test_a_shifted_block_and_its_way_back_are_found(block: set[int], tiles: int) -> None:
+    capture, model = shifted_block(f"block {sorted(block)}", block, tiles=tiles)
+    before = dict(model.cameras)
+    aliases = find_aliases(model)
+    assert aliases
+    error = min(np.linalg.norm(sign * aliases[0].move - tiles * TILE) for sign in (1, -1))
+    assert error < 0.05 * np.linalg.norm(tiles * TILE)
+    labels = labellings(model, aliases[0])[0]
+    moved = {image for image, label in labels.items() if label}
+    assert moved in (block, set(range(COUNT)) - block)
+    put_back = moved_cameras(model, aliases[0], labels)
+    found = {capture.names[image]: pose for image, pose in put_back.items()}
+    errors = relative_pose_errors(found, capture.poses)
+    assert errors.registered == COUNT
+    assert errors.pair_deg.max() < 6
+    wrong = {capture.names[image]: pose for image, pose in before.items()}
+    assert relative_pose_errors(wrong, capture.poses).pair_deg.max() > 15
+    assert model.cameras == before
+
+
+@pytest.mark.parametrize(("block", "tiles"), BLOCKS)
+def test_every_vote_is_across_the_cut_and_points_the_same_way(block: set[int], tiles: int) -> None:
+    _, model = shifted_block(f"votes {sorted(block)}", block, tiles=tiles)
+    alias = find_aliases(model)[0]
+    back = -1.0 if alias.move @ (tiles * TILE) > 0 else 1.0
+    for (i, j), vote in alias.votes.items():
+        assert (i in block) != (j in block)
+        assert np.sign(vote) == (back if j in block else -back)
+    assert alias.support == pytest.approx(sum(map(abs, alias.votes.values())))
+
+
+def test_a_true_model_in_which_nothing_repeats_has_no_alias() -> None:
+    assert find_aliases(model_of(aliased_capture("no alias", false={}, views=COUNT))) == []
+
+
+def test_two_pairs_do_not_make_an_alias() -> None:
+    """Errors of single pairs are no block."""
+    capture = aliased_capture("two pairs", false={(0, 3): 1, (2, 5): 1}, views=COUNT)
+    assert find_aliases(model_of(capture)) == []
+
+
+def test_a_true_model_in_which_a_block_might_be_shifted_has_the_alias_too() -> None:
+    """The false geometries, which were not chosen, suggest the move: the images are to decide."""
+    capture, _ = shifted_block("true model", {4, 5, 6})
+    aliases = find_aliases(model_of(capture))
+    assert abs(abs(aliases[0].move @ TILE) / (TILE @ TILE) - 1) < 0.05
+
+
+def test_the_unit_of_the_world_does_not_matter() -> None:
+    _, model = shifted_block("unit", {4, 5, 6})
+    large = PlacedModel(
+        model.pairs,
+        {image: Rigid3.from_center(pose.rotation, 30 * pose.center) for image, pose in model.cameras.items()},
+        dict(model.chosen),
+    )
+    large.learn_ranges()
+    one, other = find_aliases(model), find_aliases(large)
+    assert len(one) == len(other)
+    np.testing.assert_allclose(other[0].move, 30 * one[0].move, rtol=1e-6, atol=1e-9)
+    assert labellings(large, other[0]) == labellings(model, one[0])
+
+
+def test_labels_move_only_what_they_say() -> None:
+    _, model = shifted_block("labels", {4, 5, 6})
+    alias = find_aliases(model)[0]
+    labels = {image: int(image == 2) for image in model.cameras}
+    for image, pose in moved_cameras(model, alias, labels).items():
+        np.testing.assert_allclose(pose.center, model.cameras[image].center + (image == 2) * alias.move, atol=1e-12)
+        np.testing.assert_array_equal(pose.rotation, model.cameras[image].rotation)
