@@ -23,7 +23,7 @@ _MAX_TURN_RAD = float(np.deg2rad(3.0))
 _MIN_MOVE = 0.05
 # Moves are one if they differ by less than this share of their length and of the usual distance between cameras.
 _SAME_MOVE, _SAME_PLACE = 0.06, 0.02
-_MIN_PAIRS = 3
+_MIN_PAIRS, _MIN_PAIR_SHARE = 3, 0.1
 _MAX_ALIASES = 2
 # How much a pair that agrees as things are counts against separating its images.
 _HELD = 0.1
@@ -47,7 +47,10 @@ class Alias:
 
 
 def find_aliases(model: PlacedModel) -> list[Alias]:
-    """Return the moves that runner-up geometries of at least three pairs suggest alike, best supported first."""
+    """Return the moves that runner-up geometries of several pairs suggest alike, best supported first.
+
+    Fewer than three pairs, or than a tenth of those that agree as things are, may do so by chance.
+    """
     edges, moves, weights = _suggested_moves(model)
     if not edges:
         return []
@@ -66,7 +69,7 @@ def find_aliases(model: PlacedModel) -> list[Alias]:
         members = np.flatnonzero(near[best] & left)
         left[members] = False
         left[best] = False
-        if len(votes[best]) < _MIN_PAIRS:
+        if len(votes[best]) < max(_MIN_PAIRS, _MIN_PAIR_SHARE * len(model.chosen)):
             continue
         signs = np.where(apart[best, members] <= opposite[best, members], 1.0, -1.0)
         move = np.average(moves[members] * signs[:, None], axis=0, weights=weights[members])

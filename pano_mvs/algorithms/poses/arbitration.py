@@ -21,7 +21,7 @@ _HOPELESS, _MIN_EXPLAINED = 0.3, 0.5
 # Of all pairs of a group; below this, a camera that looks right may still be the wrong one.
 _MIN_EXPLAINED_IN_ALL = 0.6
 # Nobody doubts a camera that confirms this share of what is expected, whatever its pairs say.
-_CONFIRMED = 0.9
+_CONFIRMED = 0.8
 # A second geometry of this share of the best one's weight is a rival.
 _RIVAL = 0.4
 # Another place must be better by this factor, and by this much, to be taken; within the factor it is a rival.

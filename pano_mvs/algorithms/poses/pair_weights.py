@@ -14,6 +14,7 @@ from pano_mvs.geometry import Rigid3
 
 # A pair is ambiguous if its second geometry has more than this share of the first one's weight.
 _RIVAL = 0.25
+_MIN_AMBIGUOUS = 1 / 3
 _ASKED_PARTNERS = 6
 # What is left of the weight of an ambiguous pair that is not asked for, since others suffice.
 _UNDECIDED = 0.3
@@ -26,12 +27,16 @@ def weighed_by_images(pairs: Pairs, confirmation: Confirmation) -> Pairs:
     Two panoramas are swept against one another under each geometry of their pair. Under the true one they confirm
     more than under those that repeated structure suggests, however many matches these have. A geometry's weight is
     multiplied by the cube of its confirmed share relative to the pair's best. This is done for the pairs of every
-    image with its six best partners; the other ambiguous pairs count for less.
+    image with its six best partners; the other ambiguous pairs count for less. Where less than a third of the pairs
+    are ambiguous, the others decide, and nothing is asked.
 
     Args:
         pairs: of a capture.
         confirmation: of the same capture.
     """
+    ambiguous = sum(is_ambiguous(found) for found in pairs.geometries.values())
+    if ambiguous < _MIN_AMBIGUOUS * len(pairs.geometries):
+        return pairs
     asked = {
         (min(image, partner), max(image, partner))
         for image, partners in enumerate(pairs.partners)
