@@ -168,6 +168,23 @@ def test_blocks_change_nothing(room, monkeypatch):
     assert whole.track_sigmas_rad.tobytes() == parts.track_sigmas_rad.tobytes()
 
 
+def test_only_the_longest_tracks_are_aligned_where_there_are_many(room, monkeypatch):
+    poses, pictures = room
+    monkeypatch.setattr(alignment, "_MOST_PER_IMAGE", 300)
+    cut = np.ones(6000, np.bool_)
+    cut[: 4 * 1200 : 4] = False  # the first 1200 tracks have an observation less
+    shorter = replace(
+        poses,
+        track_point_idx=poses.track_point_idx[cut],
+        track_image_idx=poses.track_image_idx[cut],
+        track_bearings=poses.track_bearings[cut],
+    )
+    aligned = align_tracks(shorter, pictures.__getitem__)
+    changed = np.any(aligned.track_bearings != shorter.track_bearings, axis=1)
+    assert shorter.track_point_idx[changed].min() >= 1200
+    assert changed.sum() > 250
+
+
 def test_poses_without_tracks_and_single_observations_stay(room):
     poses, pictures = room
     nothing = Poses.without_points({"0.png": poses.cam_from_world(0)}, frame="x", scale="x", metric=False)

@@ -27,7 +27,9 @@ _STIFFNESS = 6.0
 _MIN_CORRELATION = 0.85
 _MAX_SHIFT = 1.0  # samples
 _FLOOR = 0.1  # samples: what the aligned patches' own deviation leaves out
-_NOT_ALIGNED = 0.3  # samples: of an observation that stays where the detector put it
+_NOT_ALIGNED = 0.3  # samples: of an observation that does not align and stays where the detector put it …
+_NOT_TRIED = 0.15  # … and of one of a track beyond the most that are aligned
+_MOST_PER_IMAGE = 1500  # observations: where there are more, their number makes for precision
 _AT_ONCE = 100_000  # observations whose patches are in memory
 
 
@@ -39,7 +41,7 @@ def align_tracks(poses: Poses, load: Callable[[str], Picture]) -> Poses:
     average. A patch of 13 × 13 pixels about it, normal to the reference's ray, is sampled in all images of the track
     as the poses and the point's range predict, and aligned with the reference's by Lucas and Kanade's method with an
     affine warp. Observations that do not align (too faint, hidden, on an edge of depth) stay where they are and count
-    for less.
+    for less. Where there are more than 1500 observations an image on average, only the longest tracks are aligned.
 
     Cameras and points are not moved: adjust them afterwards (`refine_poses`). Nothing is drawn at random.
 
@@ -60,10 +62,20 @@ def _aligned(poses: Poses, load: Callable[[str], Picture]) -> Poses:
     step_rad = _step_rad(load(poses.names[0])[0].shape[1])
     sightings = _sightings(poses, step_rad)
     bearings = np.array(poses.track_bearings)
-    sigmas_rad = np.full(len(bearings), _NOT_ALIGNED * step_rad)
-    for block in _blocks(sightings.reference_idx, poses.track_image_idx):
+    chosen = _longest_tracks(poses.track_point_idx, _MOST_PER_IMAGE * len(poses.names))
+    sigmas_rad = np.where(chosen, _NOT_ALIGNED, _NOT_TRIED) * step_rad
+    for block in _blocks(sightings.reference_idx, poses.track_image_idx, chosen):
         _align_block(poses, sightings, block, load, step_rad, bearings, sigmas_rad)
     return replace(poses, track_bearings=bearings, track_sigmas_rad=sigmas_rad.astype(np.float32))
+
+
+def _longest_tracks(point_idx: NDArray[np.int32], most: int) -> NDArray[np.bool_]:
+    """Return which observations, (T,), are of the longest tracks, `most` of them at most."""
+    lengths = np.bincount(point_idx)
+    order = np.argsort(-lengths, kind="stable")
+    chosen = np.zeros(len(lengths), np.bool_)
+    chosen[order[np.cumsum(lengths[order]) <= most]] = True
+    return np.asarray(chosen[point_idx])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,9 +128,14 @@ def _references(point_idx: NDArray[np.int32], rays: FloatArray, ranges: FloatArr
     return references
 
 
-def _blocks(reference_idx: NDArray[np.intp], image_idx: NDArray[np.int32]) -> Iterator[NDArray[np.intp]]:
-    """Yield positions of observations, whole tracks, about `_AT_ONCE` at a time; references in one image together."""
+def _blocks(
+    reference_idx: NDArray[np.intp], image_idx: NDArray[np.int32], chosen: NDArray[np.bool_]
+) -> Iterator[NDArray[np.intp]]:
+    """Yield positions of chosen observations, whole tracks, about `_AT_ONCE` at a time, those of one image together."""
     order = np.lexsort((reference_idx, image_idx[reference_idx]))
+    order = order[chosen[order]]
+    if not len(order):
+        return
     starts = np.flatnonzero(np.concatenate([[True], np.diff(reference_idx[order]) != 0]))
     chosen = starts[np.unique(np.searchsorted(starts, np.arange(0, len(order), _AT_ONCE)).clip(max=len(starts) - 1))]
     yield from np.split(order, chosen[1:])
