@@ -121,6 +121,7 @@ def _part(poses: Poses, cameras: NDArray[np.bool_], points: NDArray[np.bool_], n
         track_point_idx=_renumbered(points)[poses.track_point_idx[tracks]],
         track_image_idx=_renumbered(cameras)[poses.track_image_idx[tracks]],
         track_bearings=poses.track_bearings[tracks],
+        track_sigmas_rad=None if poses.track_sigmas_rad is None else poses.track_sigmas_rad[tracks],
         rejected={},
         frame=world.frame,
         scale=world.scale,
@@ -176,11 +177,18 @@ def _concatenated(groups: Sequence[Poses], position: Mapping[str, int]) -> Poses
         track_point_idx=np.concatenate(points),
         track_image_idx=place[np.concatenate(images)],
         track_bearings=joined("track_bearings"),
+        track_sigmas_rad=_joined_sigmas(groups),
         group_idx=numbers[order] if len(groups) > 1 else None,
         other_worlds=tuple(group.worlds[0] for group in groups[1:]),
         doubts={name: why for group in groups for name, why in group.doubts.items()},
         **_joined_values(groups, order),
     )
+
+
+def _joined_sigmas(groups: Sequence[Poses]) -> NDArray[np.float32] | None:
+    """Return the sigmas of all groups' observations; None if a group does not know them."""
+    known = [group.track_sigmas_rad for group in groups if group.track_sigmas_rad is not None]
+    return np.concatenate(known) if len(known) == len(groups) else None
 
 
 def _joined_values(groups: Sequence[Poses], order: NDArray[np.intp]) -> dict[str, Any]:

@@ -94,10 +94,12 @@ class Poses(Record):
             confirm in a small sweep with these poses; NaN where too little can be judged; None if not computed.
         expected_shares: (N,) float64 what that share should be, judged from the neighbouring cameras.
         doubts: name of every registered image whose pose is doubtful, with the reason.
+        track_sigmas_rad: (T,) float32 standard deviation of each observation's ray, positive; the adjustment weighs
+            observations by it. None: unknown, all are alike.
     """
 
     axis: ClassVar[Axis | None] = Axis.ONE
-    kind_version: ClassVar[int] = 3
+    kind_version: ClassVar[int] = 4
     explodes_into: ClassVar[type[Record] | None] = Pose
 
     names: tuple[str, ...]
@@ -120,6 +122,7 @@ class Poses(Record):
     expected_shares: NDArray[np.float64] | None = None
     doubts: dict[str, str] = field(default_factory=dict)
     other_worlds: tuple[World, ...] = ()
+    track_sigmas_rad: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         """Turn the worlds, which are stored as plain lists, back into what they were."""
@@ -193,6 +196,9 @@ class Poses(Record):
         require_array(self, "track_point_idx", dtype=np.int32, shape=(tracks,))
         require_array(self, "track_image_idx", dtype=np.int32, shape=(tracks,))
         require_array(self, "track_bearings", dtype=np.float64, shape=(tracks, 3))
+        if self.track_sigmas_rad is not None:
+            sigmas = require_array(self, "track_sigmas_rad", dtype=np.float32, shape=(tracks,))
+            require(bool((sigmas > 0).all()), self, "an observation has a sigma that is not positive")
         for name in ("center_stds", "rotation_stds_rad", "confirmed_shares", "expected_shares"):
             if getattr(self, name) is not None:
                 require_array(self, name, dtype=np.float64, shape=(images,), finite=False)

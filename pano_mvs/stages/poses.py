@@ -126,13 +126,17 @@ class RefineParams(Params):
     loss_scale_deg: float = Field(default=0.1, gt=0, description="residual at which the loss starts to bend")
     max_error_deg: float = Field(default=0.4, gt=0, description="observations further off are dropped")
     max_iterations: int = Field(default=50, ge=1, description="of the optimiser, in each round")
+    align: bool = Field(
+        default=True, description="place observations anew by aligning patches of the images, and adjust once more"
+    )
 
 
-@stage("poses.refine")
-def refine(poses: One[Poses], params: RefineParams, ctx: Context) -> Poses:
+@stage("poses.refine", version=2)
+def refine(poses: One[Poses], images: All[Panorama], params: RefineParams, ctx: Context) -> Poses:
     """Angular bundle adjustment: all poses and points together, in degrees on the sphere rather than in pixels.
 
-    Groups of poses are adjusted one by one.
+    Between two adjustments patches of the images are aligned, which places the observations more precisely than the
+    detector does and says how precise each is. Groups of poses are adjusted one by one.
     """
     refined = refine_poses(
         poses,
@@ -140,6 +144,7 @@ def refine(poses: One[Poses], params: RefineParams, ctx: Context) -> Poses:
         loss_scale_deg=params.loss_scale_deg,
         max_error_deg=params.max_error_deg,
         max_iterations=params.max_iterations,
+        load=panorama_loader(images) if params.align else None,
     )
     largest = split_groups(refined)[0]
     if largest.center_stds is not None and largest.rotation_stds_rad is not None:

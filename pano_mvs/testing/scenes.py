@@ -22,7 +22,7 @@ from pano_mvs.testing.paint import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, 
 from pano_mvs.testing.room import Room, default_room, render, write_views
 from pano_mvs.testing.surfaces import Ball, Cuboid, Quad, Rod, Surface, Vector
 
-__all__ = ["SCENES", "Scene", "corridor", "courtyard", "poles", "white_room", "write_scene"]
+__all__ = ["SCENES", "Scene", "corridor", "courtyard", "large_plain_room", "poles", "white_room", "write_scene"]
 
 Painted = tuple[Surface, Texture]
 
@@ -171,6 +171,40 @@ def weak_room(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: f
     """
     room = default_room(seed, "weak")
     return _scene("weak_room", room, views=views, turned=turned, spread=(0.6, 0.3, 0.6), exposure=exposure)
+
+
+def large_plain_room(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: float = 0.0) -> Scene:
+    """Return a nearly empty room of 12 × 4 × 9: plain walls and ceiling, a faint floor, few and small things.
+
+    Most key points are coarse, faint and few, so that they fix the poses of cameras badly. It is not one of `SCENES`:
+    most of its surfaces have no texture at all, so that its ranges say little.
+
+    Args:
+        seed: of textures, cameras and exposures.
+        views: number of cameras, about 1.5 apart.
+        turned: whether every camera is turned by an arbitrary rotation.
+        exposure: as of `courtyard`.
+    """
+    frame = ((0.70, 0.72, 0.74), (0.70, 0.72, 0.74))
+    surfaces: list[Painted] = [
+        (Cuboid((-6.0, -2.4, -4.5), (6.0, 1.6, 4.5), WHITE), "none"),
+        (Quad((-6.0, 1.599, -4.5), (12.0, 0.0, 0.0), (0.0, 0.0, 9.0), STONE), "weak"),
+        (Cuboid((-0.6, -0.6, 4.46), (0.5, 1.6, 4.5), frame), "none"),
+        (Cuboid((2.5, -0.9, -4.5), (4.5, 0.7, -4.46), frame), "none"),
+        (Cuboid((-4.0, 1.0, -4.5), (-2.2, 1.5, -4.38), WHITE), "none"),
+        (Quad((-5.99, -0.6, -1.0), (0.0, 0.0, 1.4), (0.0, 1.0, 0.0), BLUE), "weak"),
+        (Quad((2.0, -0.7, 4.49), (1.6, 0.0, 0.0), (0.0, 1.1, 0.0), RED), "weak"),
+        (Quad((5.99, -0.4, 1.5), (0.0, 0.0, 0.9), (0.0, 0.7, 0.0), LEAVES), "strong"),
+        (Cuboid((-5.0, 0.85, 2.2), (-3.2, 0.9, 3.2), OAK), "strong"),
+        (Rod((-4.9, 0.9, 2.3), (-4.9, 1.6, 2.3), 0.04, OAK), "strong"),
+        (Rod((-3.3, 0.9, 3.1), (-3.3, 1.6, 3.1), 0.04, OAK), "strong"),
+        (Cuboid((4.6, 0.0, -2.2), (5.6, 1.6, -1.2), WHITE), "none"),
+        (Ball((-2.6, 1.3, -3.4), 0.3, LEAVES), "strong"),
+        (Ball((0.0, -1.9, 0.0), 0.25, WHITE), "none"),
+        (Rod((0.0, -2.4, 0.0), (0.0, -1.9, 0.0), 0.02, STEEL), "none"),
+    ]
+    room = _painted("large plain room", surfaces, seed=seed, lamp=(1.0, -1.2, 0.8))
+    return _scene("large_plain_room", room, views=views, turned=turned, spread=(2.0, 0.4, 2.0), exposure=exposure)
 
 
 SCENES: dict[str, Callable[..., Scene]] = {

@@ -32,6 +32,7 @@ class Bundle:
         point_idx: (T,) ascending.
         image_idx: (T,).
         bearings: (T, 3) unit rays in the camera.
+        sigmas: (T,) standard deviation of each ray in units of a usual one's, positive; None: all are alike.
     """
 
     rotations: FloatArray
@@ -40,11 +41,14 @@ class Bundle:
     point_idx: IndexArray
     image_idx: IndexArray
     bearings: FloatArray
+    sigmas: FloatArray | None = None
 
     def check(self) -> None:
-        """Raise UsageError unless the observations are sorted by point and every point has one."""
+        """Raise UsageError unless observations are sorted by point, every point has one, and sigmas are positive."""
         if np.any(np.diff(self.point_idx) < 0) or len(np.unique(self.point_idx)) != len(self.points):
             raise UsageError("the observations of a bundle must be sorted by point, and every point must have one")
+        if self.sigmas is not None and (self.sigmas.shape != self.point_idx.shape or not np.all(self.sigmas > 0)):
+            raise UsageError("a bundle needs one positive sigma for each observation, or none at all")
 
     def errors_rad(self) -> FloatArray:
         """Return the angle between every observed ray and the one to its point, (T,), in [0, π]."""
@@ -54,6 +58,16 @@ class Bundle:
         sine = np.linalg.norm(np.cross(self.bearings, in_cam), axis=1)
         angles: FloatArray = np.arctan2(sine, np.sum(self.bearings * in_cam, axis=1))
         return angles
+
+    def scaled_errors_rad(self) -> FloatArray:
+        """Return the errors divided by the sigmas, (T,): what the robust loss is of."""
+        errors = self.errors_rad()
+        return errors if self.sigmas is None else errors / self.sigmas
+
+    def weights(self, scaled_errors_rad: FloatArray, *, loss: Loss, scale_rad: float) -> FloatArray:
+        """Return the weight of each squared error in the reweighted least-squares problem, (T,)."""
+        weights = robust_weights(scaled_errors_rad, loss=loss, scale_rad=scale_rad)
+        return weights if self.sigmas is None else weights / self.sigmas**2
 
 
 def adjust_bundle(
@@ -67,12 +81,13 @@ def adjust_bundle(
 ) -> Bundle:
     """Return the bundle with the least robust sum of squared angular errors; one camera stays where it is.
 
+    Errors are divided by the sigmas of their observations, so that precise rays count for more than coarse ones.
     The length that only the gauge decides (the scale) stays near where it was, held by the damping.
 
     Args:
         bundle: where to begin.
         loss: "huber" min(r², 2 s r − s²), or "cauchy" s² log(1 + r²/s²).
-        scale_rad: s, the error from which an observation loses influence.
+        scale_rad: s, the error from which an observation of sigma 1 loses influence.
         max_iterations: at most so many steps.
         tolerance: the adjustment ends with a step that lowers the cost by a smaller share than this.
         fixed_camera: position of the camera that is not moved.
@@ -110,12 +125,17 @@ def _adjust_ordered(
 
     layout = _Layout.of(bundle)
     observed = bundle.point_idx, bundle.image_idx, bundle.bearings
-    errors = ray_errors(bundle.rotations, bundle.centers, bundle.points, *observed)
+
+    def scaled_errors_rad(of: Bundle) -> FloatArray:
+        errors: FloatArray = ray_errors(of.rotations, of.centers, of.points, *observed)
+        return errors if bundle.sigmas is None else errors / bundle.sigmas
+
+    errors = scaled_errors_rad(bundle)
     cost, damping = robust_cost(errors, loss=loss, scale_rad=scale_rad), 1e-4
     for _ in range(max_iterations):
-        weights = robust_weights(errors, loss=loss, scale_rad=scale_rad)
+        weights = bundle.weights(errors, loss=loss, scale_rad=scale_rad)
         moved = _step(bundle, layout, weights, damping=damping, fixed_camera=fixed_camera)
-        moved_errors = ray_errors(moved.rotations, moved.centers, moved.points, *observed)
+        moved_errors = scaled_errors_rad(moved)
         moved_cost = robust_cost(moved_errors, loss=loss, scale_rad=scale_rad)
         if not moved_cost < cost:
             damping *= 10

@@ -150,6 +150,7 @@ def _with_points(poses: Poses, tracks: Tracks, *, max_error_deg: float, min_angl
         track_point_idx=point_idx,
         track_image_idx=image_idx[used].astype(np.int32),
         track_bearings=bearings[used],
+        track_sigmas_rad=None,
     )
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError
 
-from pano_mvs.algorithms.poses.bundle import Bundle, Loss, reduced_cameras, robust_weights, with_camera_order
+from pano_mvs.algorithms.poses.bundle import Bundle, Loss, reduced_cameras, with_camera_order
 from pano_mvs.algorithms.poses.camera_system import camera_order, camera_solver, held
 
 FloatArray = NDArray[np.float64]
@@ -18,10 +18,10 @@ _HELD_LENGTH = 1e6  # how much stiffer than the stiffest camera the unit of leng
 def camera_deviations(bundle: Bundle, *, loss: Loss, scale_rad: float, neighbour: int) -> tuple[FloatArray, FloatArray]:
     """Return the standard deviations of camera centres and rotations, given the first camera and first baseline.
 
-    The covariance is σ² S⁻¹, S being the reduced system of the cameras with the robust weights w at the optimum, and
-    σ² = Σ w r² / (2T − 6N − 3P + 7) the variance of the residuals r; Triggs et al., "Bundle Adjustment — A Modern
-    Synthesis", 2000, sections 4 and 9. It speaks of noise in the rays; of wrong stitching or repeated structure it
-    knows nothing.
+    The covariance is σ² S⁻¹, S being the reduced system of the cameras with the robust weights w at the optimum
+    (divided by the squared sigmas), and σ² = Σ w r² / (2T − 6N − 3P + 7) the variance of the residuals r; Triggs et
+    al., "Bundle Adjustment — A Modern Synthesis", 2000, sections 4 and 9. It speaks of noise in the rays; of wrong
+    stitching or repeated structure it knows nothing.
 
     Args:
         bundle: an adjusted bundle.
@@ -37,8 +37,8 @@ def camera_deviations(bundle: Bundle, *, loss: Loss, scale_rad: float, neighbour
     order = camera_order(bundle.point_idx, bundle.image_idx, len(bundle.centers))
     place = np.argsort(order)
     ordered = with_camera_order(bundle, order, place)
+    weights = ordered.weights(ordered.scaled_errors_rad(), loss=loss, scale_rad=scale_rad)
     errors = ordered.errors_rad()
-    weights = robust_weights(errors, loss=loss, scale_rad=scale_rad)
     system = reduced_cameras(ordered, weights, damping=0.0)
     band, _ = held(system.band, system.gradient, int(place[0]))
     _hold_length(band, ordered.centers, int(place[0]), int(place[neighbour]))

@@ -1,0 +1,260 @@
+"""Compiled: sampling of patches of a panorama, and their alignment by Lucas–Kanade with an affine warp."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+_PARAMETERS = 6
+_ITERATIONS, _CONVERGED = 12, 0.003
+_LEAST_CONTRAST = 0.5  # grey levels
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _cubic(t, weights):  # type: ignore[no-untyped-def]
+    """Write the weights of cubic convolution (a = −1/2) of four neighbours, the place being t after the second."""
+    weights[0] = t * (-0.5 + t * (1.0 - 0.5 * t))
+    weights[1] = 1.0 + t * t * (-2.5 + 1.5 * t)
+    weights[2] = t * (0.5 + t * (2.0 - 1.5 * t))
+    weights[3] = t * t * (-0.5 + 0.5 * t)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def sample_patches(padded, pad_px, middles, first_axes, second_axes, patches):  # type: ignore[no-untyped-def]
+    """Fill patches (M, n, n) from a panorama with a margin, by cubic convolution.
+
+    Entry (j, i) of patch m is the panorama along the ray middles[m] + (i − k) first_axes[m] + (j − k) second_axes[m],
+    k = (n − 1) / 2, in the camera frame.
+    """
+    height, width = padded.shape[0] - 2 * pad_px, padded.shape[1] - 2 * pad_px
+    size = patches.shape[1]
+    half = (size - 1) // 2
+    across, down = np.empty(4), np.empty(4)
+    for m in range(len(middles)):
+        for j in range(size):
+            for i in range(size):
+                a, b = i - half, j - half
+                x = middles[m, 0] + a * first_axes[m, 0] + b * second_axes[m, 0]
+                y = middles[m, 1] + a * first_axes[m, 1] + b * second_axes[m, 1]
+                z = middles[m, 2] + a * first_axes[m, 2] + b * second_axes[m, 2]
+                column = (0.5 + np.arctan2(x, z) / (2 * np.pi)) * width - 0.5 + pad_px
+                row = (0.5 + np.arctan2(y, np.sqrt(x * x + z * z)) / np.pi) * height - 0.5 + pad_px
+                left, top = int(np.floor(column)), int(np.floor(row))
+                _cubic(column - left, across)
+                _cubic(row - top, down)
+                value = 0.0
+                for v in range(4):
+                    line = 0.0
+                    for u in range(4):
+                        line += across[u] * padded[top - 1 + v, left - 1 + u]
+                    value += down[v] * line
+                patches[m, j, i] = value
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _factorise(matrix):  # type: ignore[no-untyped-def]
+    """Replace a symmetric positive definite matrix by its Cholesky factor L; what is above the diagonal stays."""
+    size = len(matrix)
+    for j in range(size):
+        for k in range(j):
+            matrix[j, j] -= matrix[j, k] * matrix[j, k]
+        matrix[j, j] = np.sqrt(matrix[j, j])
+        for i in range(j + 1, size):
+            for k in range(j):
+                matrix[i, j] -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] /= matrix[j, j]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _substitute(factor, vector):  # type: ignore[no-untyped-def]
+    """Replace a vector v by the solution of L Lᵀ x = v."""
+    size = len(vector)
+    for i in range(size):
+        for k in range(i):
+            vector[i] -= factor[i, k] * vector[k]
+        vector[i] /= factor[i, i]
+    for i in range(size - 1, -1, -1):
+        for k in range(i + 1, size):
+            vector[i] -= factor[k, i] * vector[k]
+        vector[i] /= factor[i, i]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _normalised(values, window, total):  # type: ignore[no-untyped-def]
+    """Give values weighted mean 0 and variance 1; return their standard deviation before."""
+    mean = 0.0
+    for k in range(len(values)):
+        mean += window[k] * values[k]
+    mean /= total
+    variance = 0.0
+    for k in range(len(values)):
+        values[k] -= mean
+        variance += window[k] * values[k] * values[k]
+    deviation = np.sqrt(variance / total)
+    for k in range(len(values)):
+        values[k] /= deviation + 1e-12
+    return deviation
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _warped(patch, warp, size, margin, values):  # type: ignore[no-untyped-def]
+    """Write the inner size × size samples of a patch under an affine warp; return False if it leaves the patch."""
+    outer = patch.shape[0]
+    half = (size - 1) // 2
+    across, down = np.empty(4), np.empty(4)
+    for j in range(size):
+        for i in range(size):
+            a, b = i - half, j - half
+            column = warp[0] + warp[2] * a + warp[3] * b + half + margin
+            row = warp[1] + warp[4] * a + warp[5] * b + half + margin
+            left, top = int(np.floor(column)), int(np.floor(row))
+            if left < 1 or top < 1 or left + 2 >= outer or top + 2 >= outer:
+                return False
+            _cubic(column - left, across)
+            _cubic(row - top, down)
+            value = 0.0
+            for v in range(4):
+                line = 0.0
+                for u in range(4):
+                    line += across[u] * patch[top - 1 + v, left - 1 + u]
+                value += down[v] * line
+            values[j * size + i] = value
+    return True
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _prepare(reference, size, margin, weights, total, template, columns):  # type: ignore[no-untyped-def]
+    """Write the normalised template and its derivatives by the warp, free of gain and offset; return its contrast."""
+    half = (size - 1) // 2
+    for j in range(size):
+        for i in range(size):
+            template[j * size + i] = reference[j + margin, i + margin]
+    contrast = _normalised(template, weights, total)
+    for j in range(size):
+        for i in range(size):
+            row, column, k = j + margin, i + margin, j * size + i
+            du = 0.5 * (reference[row, column + 1] - reference[row, column - 1]) / (contrast + 1e-12)
+            dv = 0.5 * (reference[row + 1, column] - reference[row - 1, column]) / (contrast + 1e-12)
+            a, b = i - half, j - half
+            columns[k, 0], columns[k, 2], columns[k, 3] = du, du * a, du * b
+            columns[k, 1], columns[k, 4], columns[k, 5] = dv, dv * a, dv * b
+    for p in range(_PARAMETERS):
+        mean, along = 0.0, 0.0
+        for k in range(size * size):
+            mean += weights[k] * columns[k, p]
+            along += weights[k] * columns[k, p] * template[k]
+        for k in range(size * size):
+            columns[k, p] -= mean / total + along / total * template[k]
+    return contrast
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _normal_matrix(columns, weights, stiffness, matrix):  # type: ignore[no-untyped-def]
+    """Write Jᵀ W J, the prior on the linear part of the warp added."""
+    for p in range(_PARAMETERS):
+        for q in range(p + 1):
+            entry = 0.0
+            for k in range(len(weights)):
+                entry += weights[k] * columns[k, p] * columns[k, q]
+            matrix[p, q] = entry
+            matrix[q, p] = entry
+        matrix[p, p] += stiffness if p > 1 else 1e-9
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _largest_deviation(factor, unit):  # type: ignore[no-untyped-def]
+    """Return the root of the largest eigenvalue of the shift's block of the inverse of L Lᵀ."""
+    unit[:] = 0.0
+    unit[0] = 1.0
+    _substitute(factor, unit)
+    first, mixed = unit[0], unit[1]
+    unit[:] = 0.0
+    unit[1] = 1.0
+    _substitute(factor, unit)
+    second = unit[1]
+    return np.sqrt(0.5 * (first + second) + np.sqrt(0.25 * (first - second) ** 2 + mixed * mixed))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _compose(warp, step):  # type: ignore[no-untyped-def]
+    """Replace W by W ∘ Δ⁻¹, Δ x = (I + E) x + e with the step (e, E); return False where Δ folds the patch."""
+    e00, e01, e10, e11 = 1.0 + step[2], step[3], step[4], 1.0 + step[5]
+    determinant = e00 * e11 - e01 * e10
+    if not determinant > 0.1:
+        return False
+    i00, i01, i10, i11 = e11 / determinant, -e01 / determinant, -e10 / determinant, e00 / determinant
+    s0, s1 = -(i00 * step[0] + i01 * step[1]), -(i10 * step[0] + i11 * step[1])
+    w0, w1, w2, w3 = warp[2], warp[3], warp[4], warp[5]
+    warp[0] += w0 * s0 + w1 * s1
+    warp[1] += w2 * s0 + w3 * s1
+    warp[2], warp[3] = w0 * i00 + w1 * i10, w0 * i01 + w1 * i11
+    warp[4], warp[5] = w2 * i00 + w3 * i10, w2 * i01 + w3 * i11
+    return True
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _align(target, size, margin, weights, total, stiffness, factor, template, columns, values, step, warp):  # type: ignore[no-untyped-def]
+    """Write the warp that aligns a patch with the template; return their correlation, 0 if it leaves the patch."""
+    warp[:] = 0.0
+    warp[2], warp[5] = 1.0, 1.0
+    for _ in range(_ITERATIONS):
+        if not _warped(target, warp, size, margin, values):
+            return 0.0
+        _normalised(values, weights, total)
+        for p in range(_PARAMETERS):
+            entry = 0.0
+            for k in range(len(weights)):
+                entry += weights[k] * columns[k, p] * (values[k] - template[k])
+            step[p] = entry
+        step[2] += stiffness * (warp[2] - 1.0)
+        step[3] += stiffness * warp[3]
+        step[4] += stiffness * warp[4]
+        step[5] += stiffness * (warp[5] - 1.0)
+        _substitute(factor, step)
+        if not _compose(warp, step):
+            return 0.0
+        if abs(step[0]) < _CONVERGED and abs(step[1]) < _CONVERGED:
+            break
+    if not _warped(target, warp, size, margin, values):
+        return 0.0
+    _normalised(values, weights, total)
+    correlation = 0.0
+    for k in range(len(weights)):
+        correlation += weights[k] * values[k] * template[k]
+    return correlation / total
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def align_patches(patches, reference_idx, target_idx, window, stiffness, shifts, correlations, deviations):  # type: ignore[no-untyped-def]
+    """Align patches with reference patches: inverse compositional Gauss–Newton, affine, free of gain and offset.
+
+    Baker & Matthews, "Lucas–Kanade 20 Years On: A Unifying Framework", 2004, section 3.2. `patches`
+    (T, n + 2 m, n + 2 m) have a margin of m samples around the n × n that the `window` (n, n) weighs. `stiffness` is
+    the weight of the prior that holds the linear part of the warp near the identity, contrast being 1.
+
+    Writes for every target: shifts (M, 2) of its middle in samples, correlations (M,) after alignment, 0 where there is
+    no contrast or the warp left the patch, and deviations (M,) of the shift along its least certain axis, for noise of
+    the size of the contrast.
+    """
+    size = window.shape[0]
+    margin = (patches.shape[1] - size) // 2
+    weights = window.ravel()
+    total = weights.sum()
+    template, values = np.empty(size * size), np.empty(size * size)
+    columns, factor = np.empty((size * size, _PARAMETERS)), np.empty((_PARAMETERS, _PARAMETERS))
+    step, warp = np.empty(_PARAMETERS), np.empty(_PARAMETERS)
+    for m in range(len(target_idx)):
+        shifts[m, :] = 0.0
+        correlations[m], deviations[m] = 0.0, np.inf
+        contrast = _prepare(patches[reference_idx[m]], size, margin, weights, total, template, columns)
+        if contrast < _LEAST_CONTRAST:
+            continue
+        _normal_matrix(columns, weights, stiffness, factor)
+        _factorise(factor)
+        deviations[m] = _largest_deviation(factor, step)
+        correlations[m] = _align(
+            patches[target_idx[m]], size, margin, weights, total, stiffness, factor, template, columns, values, step,
+            warp,
+        )  # fmt: skip
+        if correlations[m] != 0.0:
+            shifts[m, 0], shifts[m, 1] = warp[0], warp[1]
