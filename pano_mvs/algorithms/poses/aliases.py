@@ -24,10 +24,13 @@ _MIN_MOVE = 0.05
 # Moves are one if they differ by less than this share of their length and of the usual distance between cameras.
 _SAME_MOVE, _SAME_PLACE = 0.06, 0.02
 _MIN_PAIRS, _MIN_PAIR_SHARE = 3, 0.1
-_MAX_ALIASES = 2
+_MAX_ALIASES, _ATTEMPTS = 2, 6
 # How much a pair that agrees as things are counts against separating its images.
 _HELD = 0.1
 _LABELLINGS = 2
+_STARTS = 50
+# Of very many suggested moves the heaviest are compared with one another.
+_MAX_MOVES = 1500
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +65,9 @@ def find_aliases(model: PlacedModel) -> list[Alias]:
     near = np.minimum(apart, opposite) < tolerance[:, None]
     left = np.ones(len(edges), np.bool_)
     found: list[Alias] = []
-    while left.any() and len(found) < _MAX_ALIASES:
+    for _ in range(_ATTEMPTS):
+        if not left.any() or len(found) == _MAX_ALIASES:
+            break
         votes = [_votes(edges, weights, apart[row] <= opposite[row], near[row] & left) for row in range(len(edges))]
         support = np.array([sum(map(abs, vote.values())) for vote in votes]) * left
         best = int(np.argmax(support))
@@ -96,7 +101,7 @@ def labellings(model: PlacedModel, alias: Alias) -> list[dict[int, int]]:
         gain[place[a], place[b]] += abs(vote)
         gain[place[b], place[a]] -= abs(vote)
     found: dict[tuple[int, ...], float] = {}
-    for (i, j), vote in sorted(alias.votes.items(), key=lambda item: (-abs(item[1]), item[0])):
+    for (i, j), vote in sorted(alias.votes.items(), key=lambda item: (-abs(item[1]), item[0]))[:_STARTS]:
         a, b = (place[i], place[j]) if vote > 0 else (place[j], place[i])
         labels = np.zeros(len(images), np.intp)
         labels[b] = 1
@@ -136,7 +141,8 @@ def _suggested_moves(model: PlacedModel) -> tuple[list[Edge], FloatArray, FloatA
                     edges.append((i, j))
                     moves.append(move)
                     weights.append(float(witnesses.weight[idx]))
-    return edges, np.array(moves).reshape(-1, 3), np.array(weights)
+    heaviest = np.sort(np.argsort(-np.array(weights), kind="stable")[:_MAX_MOVES])
+    return [edges[idx] for idx in heaviest], np.array(moves).reshape(-1, 3)[heaviest], np.array(weights)[heaviest]
 
 
 def _votes(
@@ -152,21 +158,19 @@ def _votes(
 
 
 def _improved(gain: FloatArray, labels: NDArray[np.intp], *, kept: tuple[int, int]) -> tuple[NDArray[np.intp], float]:
-    """Change one label after another as long as the score rises; the two labels of the first vote stay."""
+    """Change one label after another as long as the score rises; the two labels of the first vote stay.
 
-    def score(of: NDArray[np.intp]) -> float:
-        return float(gain[np.ix_(of == 0, of == 1)].sum())
-
-    best = score(labels)
-    while True:
-        changes = []
-        for idx in range(len(labels)):
-            if idx not in kept:
-                changed = labels.copy()
-                changed[idx] = 1 - changed[idx]
-                changes.append((score(changed), -idx))
-        if not changes or max(changes)[0] <= best + 1e-12:
-            return labels, best
-        best, negative = max(changes)
-        labels = labels.copy()
-        labels[-negative] = 1 - labels[-negative]
+    The score is the sum of gain[a, b] over all a with label 0 and b with label 1.
+    """
+    labels = labels.copy()
+    for _ in range(4 * len(labels)):
+        stays, moves = (labels == 0).astype(np.float64), (labels == 1).astype(np.float64)
+        # What an image contributes as one that moves, less what it contributes as one that stays.
+        rise = stays @ gain - gain @ moves
+        rise = np.where(labels == 0, rise, -rise)
+        rise[list(kept)] = -np.inf
+        best = int(np.argmax(rise))
+        if rise[best] <= 1e-12:
+            break
+        labels[best] = 1 - labels[best]
+    return labels, float(gain[np.ix_(labels == 0, labels == 1)].sum())

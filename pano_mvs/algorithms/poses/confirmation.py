@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -30,7 +31,7 @@ _MAX_RELATIVE_ERROR, _MAX_REPROJECTION_PX, _MIN_SUPPORT, _MIN_MOTION_PX = 0.05, 
 # Less texture than this share of the sphere says nothing about a pose.
 MIN_TEXTURED = 0.05
 # Maps that are kept for an image with the same sources; relative poses that differ by less than this give the same map.
-_MAPS_PER_IMAGE = 3
+_MAPS_PER_IMAGE, _MAX_KEPT = 3, 400
 _SAME_PLACE, _SAME_TURN_RAD = 0.005, float(np.deg2rad(0.1))
 _PARALLAX_EDGES_DEG = np.array([2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 50.0, 65.0, 180.0])
 _CLASSES = len(_PARALLAX_EDGES_DEG)
@@ -103,7 +104,7 @@ class Confirmation:
     def __init__(self, load: Callable[[int], Picture]) -> None:
         self._load = load
         self._small: dict[int, _Small] = {}
-        self._maps: dict[tuple[int, ...], list[tuple[list[Rigid3], float, RangeMap]]] = {}
+        self._maps: OrderedDict[tuple[int, ...], list[tuple[list[Rigid3], float, RangeMap]]] = OrderedDict()
 
     def share(self, image: int, pose: Rigid3, cameras: Mapping[int, Rigid3]) -> float:
         """Return the share of an image's textured pixels, by solid angle, that other images confirm; see `evidence`."""
@@ -167,12 +168,15 @@ class Confirmation:
         relative = [cameras[idx] @ pose.inverse() for idx in sources]
         scale = float(np.median([np.linalg.norm(to.translation) for to in relative]))
         known = self._maps.setdefault((image, *sources), [])
+        self._maps.move_to_end((image, *sources))
         for before, before_scale, ranges in known:
             if all(_nearly(a, scale, b, before_scale) for a, b in zip(relative, before, strict=True)):
                 return RangeMap(ranges.range * np.float32(scale / before_scale), ranges.confidence)
         ranges = self._sweep(image, sources, relative)
         known.append((relative, scale, ranges))
         del known[:-_MAPS_PER_IMAGE]
+        if len(self._maps) > _MAX_KEPT:
+            self._maps.popitem(last=False)
         return ranges
 
     def _sweep(self, image: int, sources: Sequence[int], relative: Sequence[Rigid3]) -> RangeMap:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +21,8 @@ _SEEDS = 12  # seeds of which the support by third images is computed
 _THIRDS = 8
 _MAX_GROWN = 3  # seeds from which models are grown
 _ADJUST_GROWTH = 1.25  # all cameras are adjusted whenever there are a quarter more than at the last time
-_LOOKED_AT = 4  # images that are placed before the clearest of them is added
+_LOOKED_AT = 6  # images that are placed before the clearest of them is added, where none is clear
+_MIN_SHARE = 0.5  # of an image's pairs, by weight, that agree with a clear placement
 _CLEAR = 0.8  # a runner-up with more than this share of the best score leaves a placement in doubt …
 _CLEAR_TO_REFEREE = 0.4  # … and with more than this where there is somebody to ask
 _SATISFYING = 0.85  # share of the pairs explained with which the first model is good enough
@@ -136,15 +137,17 @@ def _grown(
     model = PlacedModel(pairs)
     model.seed(edge, rank)
     left = set(images) - set(edge)
+    weights: dict[int, float] = {}
+    for image in edge:
+        _count_pairs(pairs, image, left, weights)
     adjusted = 2
     reasons: dict[int, str] = {}
-    while left:
-        step = _next(model, left, confirmation=confirmation, reasons=reasons)
-        if step is None:
-            break
+    while step := _next(model, weights, confirmation=confirmation, reasons=reasons):
         image, pose = step
         model.add(image, pose)
         left.discard(image)
+        del weights[image]
+        _count_pairs(pairs, image, left, weights)
         if adjust and len(model.cameras) > _ADJUST_GROWTH * adjusted:
             model.adjust()
             adjusted = len(model.cameras)
@@ -159,6 +162,14 @@ def _grown(
     if confirmation is not None and (left or model.explained_share() < _CERTAIN or find_aliases(model)):
         arbitration = judge(model, confirmation)
     return GrownModel(model, refused, arbitration)
+
+
+def _count_pairs(pairs: Pairs, image: int, left: Collection[int], weights: dict[int, float]) -> None:
+    """Add the pairs of an image that was registered to the weights of its partners that are not."""
+    for partner in pairs.partners[image]:
+        if partner in left:
+            edge = min(image, partner), max(image, partner)
+            weights[partner] = weights.get(partner, 0.0) + pairs.geometries[edge][0].weight
 
 
 def _unsupported(model: PlacedModel, image: int) -> str:
@@ -176,38 +187,34 @@ def _unsupported(model: PlacedModel, image: int) -> str:
 
 
 def _next(
-    model: PlacedModel, left: Collection[int], *, confirmation: Confirmation | None, reasons: dict[int, str]
+    model: PlacedModel, weights: Mapping[int, float], *, confirmation: Confirmation | None, reasons: dict[int, str]
 ) -> tuple[int, Rigid3] | None:
-    """Return the image to add next and its pose; None if none can be added."""
-    partners = {image: [idx for idx in model.pairs.partners[image] if idx in model.cameras] for image in left}
-    weights = {
-        image: sum(model.pairs.geometries[min(image, idx), max(image, idx)][0].weight for idx in found)
-        for image, found in partners.items()
-        if found
-    }
-    doubtful: list[tuple[float, int, Witnesses, list[Placement]]] = []
-    looked_at = 0
-    for image in sorted(weights, key=lambda idx: (-weights[idx], idx)):
-        witnesses, found = model.place(image)
-        if not found:
-            reasons[image] = _why_nothing(model, image)
-            continue
-        looked_at += 1
-        rival = found[1].score / found[0].score if len(found) > 1 else 0.0
-        share = found[0].score / witnesses.total
-        if (
-            rival < (_CLEAR if confirmation is None else _CLEAR_TO_REFEREE)
-            and share > 0.5
-            and (pose := _accepted(model, image, witnesses, found[0], reasons))
-        ):
-            return image, pose
-        doubtful.append((share * (1 - 0.5 * rival), image, witnesses, found))
-        if looked_at >= max(_LOOKED_AT, len(model.cameras)):
-            break
-    for _, image, witnesses, found in sorted(doubtful, key=lambda item: (-item[0], item[1])):
-        for placement in _by_pictures(model, image, found, confirmation):
-            if pose := _accepted(model, image, witnesses, placement, reasons):
+    """Return the image to add next and its pose; None if none can be added.
+
+    Args:
+        model: to be added to.
+        weights: images that share pairs with registered ones, with the weight of these pairs.
+        confirmation: of the images.
+        reasons: receives why an image cannot be added yet.
+    """
+    order = sorted(weights, key=lambda idx: (-weights[idx], idx))
+    for first in range(0, len(order), _LOOKED_AT):
+        doubtful: list[tuple[float, int, Witnesses, list[Placement]]] = []
+        for image in order[first : first + _LOOKED_AT]:
+            witnesses, found = model.place(image)
+            if not found:
+                reasons[image] = _why_nothing(model, image)
+                continue
+            rival = found[1].score / found[0].score if len(found) > 1 else 0.0
+            share = found[0].score / witnesses.total
+            clear = rival < (_CLEAR if confirmation is None else _CLEAR_TO_REFEREE) and share > _MIN_SHARE
+            if clear and (pose := _accepted(model, image, witnesses, found[0], reasons)):
                 return image, pose
+            doubtful.append((share * (1 - 0.5 * rival), image, witnesses, found))
+        for _, image, witnesses, found in sorted(doubtful, key=lambda item: (-item[0], item[1])):
+            for placement in _by_pictures(model, image, found, confirmation):
+                if pose := _accepted(model, image, witnesses, placement, reasons):
+                    return image, pose
     return None
 
 
