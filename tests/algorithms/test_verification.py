@@ -200,9 +200,7 @@ def test_groups_are_judged_apart() -> None:
     there = Similarity3(3.0, rotation_from_rotvec([0.5, -0.2, 1.0]), np.array([0.2, 0.1, -0.3]))
     first = poses_of({name: TRUTH[name] for name in NAMES[:3]})
     whole = displaced("2.png")
-    second = moved_poses(
-        poses_of({f"b{name}": whole.cam_from_world(idx) for idx, name in enumerate(NAMES)}), there
-    )
+    second = moved_poses(poses_of({f"b{name}": whole.cam_from_world(idx) for idx, name in enumerate(NAMES)}), there)
     given = join_groups([first, second], order=(*first.names, *second.names), rejected={})
     found = verify_poses(given, lambda name: load(name.removeprefix("b")))
     found.check()

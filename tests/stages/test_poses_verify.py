@@ -84,9 +84,7 @@ def test_one_pose_is_no_model(tiny: TinyCapture, ctx: Context) -> None:
         {"000.png": tiny.poses[0]}, rejected={"001.png": "no pair"}, frame="x", scale="x", metric=False
     )
     with pytest.raises(GateError, match=r"001\.png: no pair"):
-        verify(
-            poses=alone, images=tiny.items[Panorama], features=None, matches=None, params=VerifyParams(), ctx=ctx
-        )
+        verify(poses=alone, images=tiny.items[Panorama], features=None, matches=None, params=VerifyParams(), ctx=ctx)
     assert ctx.rejected == {"001.png": "no pair"}
 
 
