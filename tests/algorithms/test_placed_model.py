@@ -106,8 +106,8 @@ def test_adjusting_keeps_the_first_camera_and_improves_the_others(model: PlacedM
     before = _error_deg(model, capture)
     model.adjust()
     assert _error_deg(model, capture) < 0.3 * before
-    np.testing.assert_array_equal(model.cameras[0].rotation, first.rotation)
-    np.testing.assert_array_equal(model.cameras[0].center, first.center)
+    np.testing.assert_allclose(model.cameras[0].rotation, first.rotation, atol=1e-12)
+    np.testing.assert_allclose(model.cameras[0].center, first.center, atol=1e-12)
 
 
 def _error_deg(model: PlacedModel, capture: AliasedCapture) -> float:
