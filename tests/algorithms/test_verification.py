@@ -65,21 +65,23 @@ def matches() -> Matches:
     return room_matches()
 
 
-def test_true_poses_stay_and_nobody_is_doubted(matches: Matches) -> None:
+@pytest.mark.parametrize("with_matches", [False, True])
+def test_true_poses_stay_and_nobody_is_doubted(matches: Matches, with_matches: bool) -> None:
     given = displaced()
-    for found in (verified(given, matches), verified(given)):
-        assert found.names == NAMES
-        assert found.doubts == {}
-        assert found.rejected == {}
-        assert found.rotations.tobytes() == given.rotations.tobytes()
-        assert found.translations.tobytes() == given.translations.tobytes()
-        assert (found.frame, found.scale, found.metric) == ("site", "metres", True)
-        assert found.confirmed_shares is not None
-        assert found.expected_shares is not None
-        assert (found.confirmed_shares > 0.4).all()
-        np.testing.assert_allclose(found.expected_shares, found.confirmed_shares, atol=0.3)
+    found = verified(given, matches if with_matches else None)
+    assert found.names == NAMES
+    assert found.doubts == {}
+    assert found.rejected == {}
+    assert found.rotations.tobytes() == given.rotations.tobytes()
+    assert found.translations.tobytes() == given.translations.tobytes()
+    assert (found.frame, found.scale, found.metric) == ("site", "metres", True)
+    assert found.confirmed_shares is not None
+    assert found.expected_shares is not None
+    assert (found.confirmed_shares > 0.4).all()
+    np.testing.assert_allclose(found.expected_shares, found.confirmed_shares, atol=0.3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", ["0.png", "2.png", "4.png"])
 def test_a_moved_camera_is_put_back(matches: Matches, wrong: str) -> None:
     found = verified(displaced(wrong), matches)
@@ -93,6 +95,7 @@ def test_a_moved_camera_is_put_back(matches: Matches, wrong: str) -> None:
     assert aligned.right.all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", ["0.png", "2.png", "4.png"])
 @pytest.mark.xfail(reason="the other cameras are moved as a block instead of the one, or written anew")
 def test_the_cameras_that_stand_right_keep_their_poses_to_the_last_bit(matches: Matches, wrong: str) -> None:
@@ -113,6 +116,7 @@ def test_a_turned_camera_is_put_back_and_the_others_keep_their_poses_to_the_last
         assert bytes_of(found, name) == bytes_of(given, name)
 
 
+@pytest.mark.slow
 def test_a_shifted_block_is_put_back() -> None:
     """All pairs across the cut agree with the shift; the images do not."""
     block = ("1.png", "4.png")
@@ -202,10 +206,9 @@ def test_groups_are_judged_apart() -> None:
     found.check()
     assert set(found.doubts) == {"b2.png"}
     assert found.rotations.tobytes() == given.rotations.tobytes()
-    alone = [verify_poses(group, lambda name: load(name.removeprefix("b"))) for group in split_groups(given)]
-    for group, expected in zip(split_groups(found), alone, strict=True):
-        assert group.names == expected.names
-        np.testing.assert_allclose(group.confirmed_shares, expected.confirmed_shares, atol=1e-9)
+    small, alone = split_groups(found)[1], verified(first)
+    assert small.names == alone.names
+    np.testing.assert_allclose(small.confirmed_shares, alone.confirmed_shares, atol=1e-9)
 
 
 def test_what_was_rejected_before_stays_rejected() -> None:
@@ -230,6 +233,7 @@ def test_pictures_without_any_texture_are_no_reason_to_doubt() -> None:
     assert np.isnan(found.confirmed_shares).all()
 
 
+@pytest.mark.slow
 def test_the_same_bytes_again(matches: Matches) -> None:
     first, second = (verified(displaced("4.png"), matches) for _ in range(2))
     assert first.translations.tobytes() == second.translations.tobytes()

@@ -1,0 +1,107 @@
+"""poses.verify: what it tells the user of cameras that the images contradict."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pano_mvs.api import Features, GateError, Panorama, Poses, TwoView
+from pano_mvs.engine.context import Context
+from pano_mvs.geometry import Rigid3, rotation_from_rotvec
+from pano_mvs.stages.poses import ScaledTranslationParams, VerifyParams, scaled_translation, verify
+from pano_mvs.testing.tiny_capture import TinyCapture, Variant, tiny_capture
+
+WRONG = "002.png"
+
+
+@pytest.fixture(scope="module")
+def tiny() -> TinyCapture:
+    return tiny_capture(Variant(size_hw=(128, 256)))
+
+
+@pytest.fixture
+def ctx(tmp_path: Path) -> Context:
+    return Context(np.random.default_rng(0), tmp_path)
+
+
+def poses_of(tiny: TinyCapture, *, wrong: bool) -> Poses:
+    """Return the true poses, or with one of them turned and moved."""
+    cameras = dict(zip(tiny.names, tiny.poses, strict=True))
+    if wrong:
+        pose = cameras[WRONG]
+        turn = rotation_from_rotvec([0.0, 0.4, 0.1])
+        cameras[WRONG] = Rigid3.from_center(turn @ pose.rotation, pose.center + np.array([0.3, 0.0, 0.3]))
+    return Poses.without_points(cameras, frame="site", scale="metres", metric=True)
+
+
+def verified(
+    tiny: TinyCapture, ctx: Context, *, wrong: bool = True, matched: bool = True, correct: bool = True
+) -> Poses:
+    return verify(
+        poses=poses_of(tiny, wrong=wrong),
+        images=tiny.items[Panorama],
+        features=tiny.items[Features] if matched else None,
+        matches=tiny.items[TwoView] if matched else None,
+        params=VerifyParams(correct=correct),
+        ctx=ctx,
+    )
+
+
+def test_a_moved_camera_is_noted(tiny: TinyCapture, ctx: Context) -> None:
+    poses = verified(tiny, ctx)
+    assert ctx.notes == [f"{WRONG} was moved to another place, which the images confirm better"]
+    assert poses.doubts == {}
+    assert poses.points_in_world.shape[0] > 50
+    truth = dict(zip(tiny.names, tiny.poses, strict=True))
+    found = poses.cam_from_world(poses.names.index(WRONG))
+    assert np.linalg.norm(found.center - truth[WRONG].center) < 0.02
+    assert ctx.rejected == {}
+    assert ctx.metrics["registered"] == 1
+    assert ctx.metrics["confirmed_share_median"] > 0.4
+
+
+@pytest.mark.parametrize(("matched", "correct"), [(False, True), (True, False)])
+def test_without_matches_or_permission_it_only_reports(
+    tiny: TinyCapture, ctx: Context, matched: bool, correct: bool
+) -> None:
+    poses = verified(tiny, ctx, matched=matched, correct=correct)
+    assert set(poses.doubts) == {WRONG}
+    assert ctx.notes == []
+    assert poses.translations.tobytes() == poses_of(tiny, wrong=True).translations.tobytes()
+
+
+def test_nothing_is_said_of_true_poses(tiny: TinyCapture, ctx: Context) -> None:
+    poses = verified(tiny, ctx, wrong=False)
+    assert poses.doubts == {}
+    assert ctx.notes == []
+    assert ctx.rejected == {}
+
+
+def test_one_pose_is_no_model(tiny: TinyCapture, ctx: Context) -> None:
+    alone = Poses.without_points(
+        {"000.png": tiny.poses[0]}, rejected={"001.png": "no pair"}, frame="x", scale="x", metric=False
+    )
+    with pytest.raises(GateError, match=r"001\.png: no pair"):
+        verify(poses=alone, images=tiny.items[Panorama], features=None, matches=None, params=VerifyParams(), ctx=ctx)
+    assert ctx.rejected == {"001.png": "no pair"}
+
+
+@pytest.mark.parametrize("ask_images", [False, True])
+def test_the_solver_opens_pictures_only_where_it_may(
+    tiny: TinyCapture, ctx: Context, monkeypatch: pytest.MonkeyPatch, ask_images: bool
+) -> None:
+    """Nothing is ambiguous in the room, so the poses are the same either way."""
+    opened = []
+    load = Panorama.load
+    monkeypatch.setattr(Panorama, "load", lambda image: opened.append(image) or load(image))
+    poses = scaled_translation(
+        features=tiny.items[Features],
+        matches=tiny.items[TwoView],
+        images=tiny.items[Panorama],
+        params=ScaledTranslationParams(ask_images=ask_images),
+        ctx=ctx,
+    )
+    assert poses.names == tiny.names
+    assert len(opened) <= (len(tiny.names) if ask_images else 0)
