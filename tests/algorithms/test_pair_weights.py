@@ -9,6 +9,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from pano_mvs.algorithms.poses import pair_weights
 from pano_mvs.algorithms.poses.confirmation import Confirmation
 from pano_mvs.algorithms.poses.pair_weights import is_ambiguous, weighed_by_images
 from pano_mvs.algorithms.poses.placed_model import Pairs, pairs_of
@@ -52,7 +53,8 @@ def is_true(pairs: Pairs, edge: tuple[int, int], rank: int) -> bool:
     return bool(pairs.geometries[edge][rank].view.direction @ direction / np.linalg.norm(direction) > 0.999)
 
 
-def test_the_true_geometry_of_an_ambiguous_pair_becomes_the_heaviest() -> None:
+def test_the_true_geometry_of_an_ambiguous_pair_becomes_the_heaviest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pair_weights, "_MIN_AMBIGUOUS", 0.05)  # one of ten pairs is ambiguous here
     before = pairs()
     after = weighed_by_images(before, confirmation_of())
     assert not is_true(before, AMBIGUOUS, 0)
@@ -70,6 +72,16 @@ def test_clear_pairs_keep_their_weights() -> None:
         assert not is_ambiguous(before.geometries[edge])
         assert after.geometries[edge] == before.geometries[edge]
     assert after.names == before.names
+
+
+def test_a_capture_with_few_ambiguous_pairs_is_not_asked_for() -> None:
+    """The other pairs outvote them, and a sweep of every pair costs more than all of its matching."""
+
+    def load(image: int):
+        raise AssertionError("nobody should look at the images")
+
+    before = pairs()
+    assert weighed_by_images(before, Confirmation(load)) is before
 
 
 def test_a_capture_without_texture_leaves_all_weights_as_they_are() -> None:

@@ -124,7 +124,6 @@ def _scrambled(view: TwoView, rng: np.random.Generator, *, count: int) -> TwoVie
     return replace(view, matches_idx=wrong, residuals_rad=view.residuals_rad[:count])
 
 
-@pytest.mark.xfail(reason="one pair of five is enough for a place that the other four contradict")
 def test_an_image_whose_pairs_contradict_one_another_is_rejected_or_doubted() -> None:
     """Its five pairs put it in five places, and none of them has the truth."""
     capture = aliased_capture("contradicted", false=CONTRADICTED, with_truth=False)

@@ -97,7 +97,6 @@ def test_a_moved_camera_is_put_back(matches: Matches, wrong: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("wrong", ["0.png", "2.png", "4.png"])
-@pytest.mark.xfail(reason="the other cameras are moved as a block instead of the one, or written anew")
 def test_the_cameras_that_stand_right_keep_their_poses_to_the_last_bit(matches: Matches, wrong: str) -> None:
     given = displaced(wrong)
     found = verified(given, matches)

@@ -113,9 +113,14 @@ def labellings(model: PlacedModel, alias: Alias) -> list[dict[int, int]]:
 
 
 def moved_cameras(model: PlacedModel, alias: Alias, labels: dict[int, int]) -> dict[int, Rigid3]:
-    """Return the cameras of a model with those that have label 1 moved by an alias."""
+    """Return the cameras of a model with a block moved by an alias.
+
+    Those with label 1 move; if they are the larger part, the others move the other way, which is the same arrangement.
+    """
+    ones = sum(labels.values())
+    mover, move = (1, alias.move) if 2 * ones <= len(labels) else (0, -alias.move)
     return {
-        image: Rigid3.from_center(camera.rotation, camera.center + labels[image] * alias.move)
+        image: Rigid3.from_center(camera.rotation, camera.center + move) if labels[image] == mover else camera
         for image, camera in model.cameras.items()
     }
 

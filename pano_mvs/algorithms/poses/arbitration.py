@@ -53,6 +53,7 @@ class Arbitration:
         moved: images that were put in another place.
         doubts: images whose pose is doubtful, with the reason.
         removed: images that were taken out of the model, with the reason.
+        asked: whether the images were looked at.
     """
 
     shares: dict[int, float] = field(default_factory=dict)
@@ -60,6 +61,7 @@ class Arbitration:
     moved: set[int] = field(default_factory=set)
     doubts: dict[int, str] = field(default_factory=dict)
     removed: dict[int, str] = field(default_factory=dict)
+    asked: bool = True
 
     def mean_share(self) -> float:
         """Return the mean confirmed share of the images that can be judged; NaN if there is none."""
@@ -131,8 +133,8 @@ def _unshift_blocks(model: PlacedModel, confirmation: Confirmation) -> tuple[set
         if gain <= _MIN_BLOCK_GAIN:
             return moved, _ambiguity(model, alias, labels) if gain > _AMBIGUOUS_GAIN else ""
         labels = _with_better_labels(model, alias, labels, gain, confirmation)
-        model.cameras = moved_cameras(model, alias, labels)
-        moved |= {image for image, label in labels.items() if label}
+        before, model.cameras = model.cameras, moved_cameras(model, alias, labels)
+        moved |= {image for image, camera in model.cameras.items() if camera is not before[image]}
         model.choose_again()
         model.learn_ranges()
         model.choose_again()
@@ -193,10 +195,13 @@ def _gain_of(model: PlacedModel, alias: Alias, labels: dict[int, int], confirmat
     return gain
 
 
-def judge(model: PlacedModel, confirmation: Confirmation) -> Arbitration:
-    """Return what the images say about the cameras of a model, which is not changed."""
-    found = Arbitration()
-    _judge(model, confirmation, found)
+def judge(model: PlacedModel, confirmation: Confirmation | None) -> Arbitration:
+    """Return what the images, or without them the pairs alone, say about the cameras of a model; nothing is changed."""
+    found = Arbitration(asked=confirmation is not None)
+    if confirmation is None:
+        found.shares = found.expected = dict.fromkeys(model.cameras, float("nan"))
+    else:
+        _judge(model, confirmation, found)
     _conclude(model, found, fixed=range(len(model.pairs.names)), remove=False)
     return found
 

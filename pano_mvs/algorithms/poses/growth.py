@@ -159,7 +159,7 @@ def _grown(
     settle(model, adjust=adjust, confirmation=confirmation)
     refused = {image: reasons.get(image, _why_nothing(model, image)) for image in sorted(left)}
     arbitration = None
-    if confirmation is not None and (left or model.explained_share() < _CERTAIN or find_aliases(model)):
+    if left or model.explained_share() < _CERTAIN or (confirmation is not None and find_aliases(model)):
         arbitration = judge(model, confirmation)
     return GrownModel(model, refused, arbitration)
 

@@ -103,7 +103,7 @@ def with_arbitration(poses: Poses, pairs: Pairs, arbitration: Arbitration) -> Po
 
     return replace(
         poses,
-        confirmed_shares=of_each(arbitration.shares),
-        expected_shares=of_each(arbitration.expected),
+        confirmed_shares=of_each(arbitration.shares) if arbitration.asked else None,
+        expected_shares=of_each(arbitration.expected) if arbitration.asked else None,
         doubts={pairs.names[idx]: why for idx, why in sorted(arbitration.doubts.items())},
     )
