@@ -86,7 +86,8 @@ def labellings(model: PlacedModel, alias: Alias) -> list[dict[int, int]]:
     """Return which cameras an alias may have shifted, image position to 0 or 1 (to be moved); the likeliest first.
 
     A labelling is good if many pairs that suggest the move join images with different labels, the right way round, and
-    few pairs join such images that do not suggest it. Each is the best that single changes lead to from one vote.
+    few pairs join such images that do not suggest it. Each is the best that single changes lead to from one vote. The
+    last is the best that cuts the capture in two where it lies in its order, since people take panoramas along a way.
     """
     images = sorted(model.cameras)
     place = {image: idx for idx, image in enumerate(images)}
@@ -109,6 +110,7 @@ def labellings(model: PlacedModel, alias: Alias) -> list[dict[int, int]]:
         if score > 0:
             found[tuple(labels.tolist())] = score
     best = sorted(found, key=lambda labels: (-found[labels], labels))[:_LABELLINGS]
+    best += [labels for labels in _best_cut(gain) if labels not in best]
     return [dict(zip(images, labels, strict=True)) for labels in best]
 
 
@@ -160,6 +162,17 @@ def _votes(
         if abs(signed) > abs(votes.get(edges[idx], 0.0)):
             votes[edges[idx]] = signed
     return votes
+
+
+def _best_cut(gain: FloatArray) -> list[tuple[int, ...]]:
+    """Return the best labelling in which the images up to one have one label, and those after it the other."""
+    count = len(gain)
+    cuts = []
+    for first in range(1, count):
+        for before, after in ((0, 1), (1, 0)):
+            labels = np.repeat([before, after], [first, count - first])
+            cuts.append((float(gain[np.ix_(labels == 0, labels == 1)].sum()), tuple(labels.tolist())))
+    return [max(cuts)[1]] if cuts else []
 
 
 def _improved(gain: FloatArray, labels: NDArray[np.intp], *, kept: tuple[int, int]) -> tuple[NDArray[np.intp], float]:

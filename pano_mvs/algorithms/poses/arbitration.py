@@ -9,6 +9,7 @@ import numpy as np
 
 from pano_mvs.algorithms.poses.aliases import Alias, find_aliases, labellings, moved_cameras
 from pano_mvs.algorithms.poses.confirmation import Confirmation, nearest_cameras
+from pano_mvs.algorithms.poses.pair_weights import pair_shares
 from pano_mvs.algorithms.poses.placed_model import PlacedModel, enough_points
 from pano_mvs.geometry import Rigid3
 
@@ -21,7 +22,10 @@ _HOPELESS, _MIN_EXPLAINED = 0.3, 0.5
 # Of all pairs of a group; below this, a camera that looks right may still be the wrong one.
 _MIN_EXPLAINED_IN_ALL = 0.6
 # Nobody doubts a camera that confirms this share of what is expected, whatever its pairs say.
-_CONFIRMED = 0.8
+_CONFIRMED = 0.9
+# A geometry under which two images confirm this share of what they confirm under their best one is likely.
+_LIKELY = 0.9
+_MOST_PAIRS = 0.75
 # A second geometry of this share of the best one's weight is a rival.
 _RIVAL = 0.4
 # Another place must be better by this factor, and by this much, to be taken; within the factor it is a rival.
@@ -37,6 +41,8 @@ _BLOCK_ROUNDS = 2
 _MIN_BLOCK_GAIN = 0.05
 # If they would confirm hardly less than now, nobody can tell which is true.
 _AMBIGUOUS_GAIN = -0.15
+# Where almost every pair of images would agree with the same move, the place is periodic throughout.
+_PERIODIC, _AMBIGUOUS_GAIN_PERIODIC = 0.7, -0.3
 _NAMED = 4
 _FLIPPED = 3
 _ASKED = 6
@@ -106,7 +112,7 @@ def arbitrate(
         if not moved:
             break
     _judge(model, confirmation, found)
-    _conclude(model, found, fixed=fixed, remove=remove)
+    _conclude(model, confirmation, found, fixed=fixed, remove=remove)
     if ambiguity:
         for image in model.cameras:
             found.doubts[image] = "; ".join(filter(None, (found.doubts.get(image), ambiguity)))
@@ -131,7 +137,9 @@ def _unshift_blocks(model: PlacedModel, confirmation: Confirmation) -> tuple[set
             return moved, ""
         gain, alias, labels = max(gains, key=lambda found: found[0])
         if gain <= _MIN_BLOCK_GAIN:
-            return moved, _ambiguity(model, alias, labels) if gain > _AMBIGUOUS_GAIN else ""
+            periodic = len(alias.votes) > _PERIODIC * len(model.chosen)
+            limit = _AMBIGUOUS_GAIN_PERIODIC if periodic else _AMBIGUOUS_GAIN
+            return moved, _ambiguity(model, alias, labels) if gain > limit else ""
         labels = _with_better_labels(model, alias, labels, gain, confirmation)
         before, model.cameras = model.cameras, moved_cameras(model, alias, labels)
         moved |= {image for image, camera in model.cameras.items() if camera is not before[image]}
@@ -202,7 +210,7 @@ def judge(model: PlacedModel, confirmation: Confirmation | None) -> Arbitration:
         found.shares = found.expected = dict.fromkeys(model.cameras, float("nan"))
     else:
         _judge(model, confirmation, found)
-    _conclude(model, found, fixed=range(len(model.pairs.names)), remove=False)
+    _conclude(model, confirmation, found, fixed=range(len(model.pairs.names)), remove=False)
     return found
 
 
@@ -259,7 +267,14 @@ def _alternatives(model: PlacedModel, image: int, cameras: Mapping[int, Rigid3])
     return poses
 
 
-def _conclude(model: PlacedModel, found: Arbitration, *, fixed: Collection[int], remove: bool) -> None:
+def _conclude(
+    model: PlacedModel,
+    confirmation: Confirmation | None,
+    found: Arbitration,
+    *,
+    fixed: Collection[int],
+    remove: bool,
+) -> None:
     """Doubt or take out what is still confirmed much less than expected, or what its own pairs contradict."""
     for image, share in found.shares.items():
         expected, explained = found.expected[image], model.explained_share_of(image)
@@ -270,7 +285,8 @@ def _conclude(model: PlacedModel, found: Arbitration, *, fixed: Collection[int],
                 f"other images confirm {100 * share:.0f} % of its texture, where its neighbours lead to expect "
                 f"{100 * expected:.0f} %"
             )
-        if explained < _MIN_EXPLAINED and not ratio > _CONFIRMED:
+        contradicted = explained < _MIN_EXPLAINED and not ratio > _CONFIRMED
+        if contradicted and not _confirmed_by_pairs(model, image, confirmation):
             reasons.append(f"only {100 * explained:.0f} % of its pairs, by weight, agree with its place")
         if not reasons:
             continue
@@ -283,6 +299,26 @@ def _conclude(model: PlacedModel, found: Arbitration, *, fixed: Collection[int],
     for image in found.removed:
         model.remove(image)
         del found.shares[image], found.expected[image]
+
+
+def _confirmed_by_pairs(model: PlacedModel, image: int, confirmation: Confirmation | None) -> bool:
+    """Return whether most pairs of a camera have a geometry that agrees with it, and the images speak for these.
+
+    Repeats may give false geometries more matches than the true ones have.
+    """
+    if confirmation is None:
+        return False
+    partners = [idx for idx in model.pairs.partners[image] if idx in model.cameras]
+    agreeing = sum((min(image, idx), max(image, idx)) in model.chosen for idx in partners)
+    if agreeing < _MOST_PAIRS * len(partners):
+        return False
+    asked = confirmed = 0
+    for partner in partners[:_NEIGHBOURS]:
+        edge = min(image, partner), max(image, partner)
+        shares = pair_shares(edge, model.pairs.geometries[edge], confirmation)
+        asked += 1
+        confirmed += edge in model.chosen and shares[model.chosen[edge]] >= _LIKELY * max(shares)
+    return 2 * confirmed > asked
 
 
 def _doubt_pairs_alone(model: PlacedModel, found: Arbitration) -> None:

@@ -75,7 +75,9 @@ def grown_models(
         if any(grown.model.chosen.get(edge) == rank for grown in models):
             continue
         models.append(_grown(pairs, images, edge, rank, adjust=adjust, confirmation=confirmation))
-        if models[-1].satisfies() or len(models) == _MAX_GROWN:
+        # Seeds that nothing attaches to are not worth a try.
+        tried = sum(len(grown.model.cameras) > 2 for grown in models)
+        if models[-1].satisfies() or tried == _MAX_GROWN or len(models) == 2 * _MAX_GROWN:
             break
     models.sort(key=GrownModel.rank)
     if models and models[0].arbitration is not None and confirmation is not None:

@@ -58,13 +58,19 @@ def is_ambiguous(found: tuple[Geometry, ...]) -> bool:
     return len(found) > 1 and found[1].weight > _RIVAL * found[0].weight
 
 
-def _weighed(edge: Edge, found: tuple[Geometry, ...], confirmation: Confirmation) -> tuple[Geometry, ...]:
-    """Return the geometries of a pair, weighed by the images, the heaviest first."""
+def pair_shares(edge: Edge, found: tuple[Geometry, ...], confirmation: Confirmation) -> list[float]:
+    """Return the mean share of their texture that two images confirm of one another under each of their geometries."""
     first, second = edge
     shares = []
     for one in found:
         poses = {first: Rigid3.identity(), second: Rigid3(one.view.rotation, one.view.direction)}
-        shares.append(np.nan_to_num([confirmation.share(image, poses[image], poses) for image in edge]).mean())
+        shares.append(float(np.nan_to_num([confirmation.share(image, poses[image], poses) for image in edge]).mean()))
+    return shares
+
+
+def _weighed(edge: Edge, found: tuple[Geometry, ...], confirmation: Confirmation) -> tuple[Geometry, ...]:
+    """Return the geometries of a pair, weighed by the images, the heaviest first."""
+    shares = pair_shares(edge, found, confirmation)
     most = max(shares)
     if most <= 0:
         return found
