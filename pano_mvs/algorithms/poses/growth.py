@@ -24,7 +24,7 @@ _ADJUST_GROWTH = 1.25  # all cameras are adjusted whenever there are a quarter m
 _LOOKED_AT = 6  # images that are placed before the clearest of them is added, where none is clear
 _MIN_SHARE = 0.5  # of an image's pairs, by weight, that agree with a clear placement
 _CLEAR = 0.8  # a runner-up with more than this share of the best score leaves a placement in doubt …
-_CLEAR_TO_REFEREE = 0.4  # … and with more than this where there is somebody to ask
+_CLEAR_WITH_IMAGES = 0.4  # … and with more than this where there is somebody to ask
 _SATISFYING = 0.85  # share of the pairs explained with which the first model is good enough
 _CERTAIN = 0.97  # share of the pairs explained from which the images are not asked
 _RIVALS = 2
@@ -209,22 +209,22 @@ def _next(
                 continue
             rival = found[1].score / found[0].score if len(found) > 1 else 0.0
             share = found[0].score / witnesses.total
-            clear = rival < (_CLEAR if confirmation is None else _CLEAR_TO_REFEREE) and share > _MIN_SHARE
+            clear = rival < (_CLEAR if confirmation is None else _CLEAR_WITH_IMAGES) and share > _MIN_SHARE
             if clear and (pose := _accepted(model, image, witnesses, found[0], reasons)):
                 return image, pose
             doubtful.append((share * (1 - 0.5 * rival), image, witnesses, found))
         for _, image, witnesses, found in sorted(doubtful, key=lambda item: (-item[0], item[1])):
-            for placement in _by_pictures(model, image, found, confirmation):
+            for placement in _by_images(model, image, found, confirmation):
                 if pose := _accepted(model, image, witnesses, placement, reasons):
                     return image, pose
     return None
 
 
-def _by_pictures(
+def _by_images(
     model: PlacedModel, image: int, found: list[Placement], confirmation: Confirmation | None
 ) -> list[Placement]:
-    """Return the placements in the order in which they are to be tried: where they are rivals the pictures decide."""
-    rivals = [placement for placement in found[:_RIVALS] if placement.score > _CLEAR_TO_REFEREE * found[0].score]
+    """Return the placements in the order in which they are to be tried: where they are rivals the images decide."""
+    rivals = [placement for placement in found[:_RIVALS] if placement.score > _CLEAR_WITH_IMAGES * found[0].score]
     if confirmation is None or len(rivals) < 2:
         return found[:_RIVALS]
     shares = [confirmation.share(image, placement.cam_from_world, model.cameras) for placement in rivals]
@@ -269,13 +269,13 @@ def _moved_cameras(model: PlacedModel, confirmation: Confirmation | None) -> boo
         _, found = model.place(image)
         if found and found[0].score > 1.2 * score:
             pose, support, known = model.polished(image, witnesses, found[0])
-            if enough_points(support, known) and _better_by_pictures(model, image, pose, confirmation):
+            if enough_points(support, known) and _better_by_images(model, image, pose, confirmation):
                 model.add(image, pose)
                 moved = True
     return moved
 
 
-def _better_by_pictures(model: PlacedModel, image: int, pose: Rigid3, confirmation: Confirmation | None) -> bool:
+def _better_by_images(model: PlacedModel, image: int, pose: Rigid3, confirmation: Confirmation | None) -> bool:
     """Return whether the images do not speak against moving a camera."""
     if confirmation is None:
         return True
