@@ -33,6 +33,8 @@ _BETTER, _MARGIN = 1.15, 0.03
 # Where nothing more than this can be expected to be confirmed, nothing can be said.
 _MIN_EXPECTED = 0.1
 _NEIGHBOURS = 6
+# From this many cameras on the first look is by shared sweeps; a second one follows below this share of the expected.
+_MANY, _SECOND_LOOK = 8, 0.9
 _ALTERNATIVES = 4
 _MIN_SCORE = 0.2  # of the best placement's score by matches, for a place to be tried at all
 _ROUNDS = 3
@@ -46,7 +48,7 @@ _PERIODIC, _AMBIGUOUS_GAIN_PERIODIC = 0.7, -0.3
 _NAMED = 4
 _FLIPPED = 3
 _ASKED = 6
-_HOPELESS_GAIN = -0.1  # of the first two that are asked
+_HOPELESS_GAINS = -0.45, -0.1  # of the first that is asked, and of the first two or more: no more are asked then
 
 
 @dataclass(eq=False)
@@ -198,7 +200,7 @@ def _gain_of(model: PlacedModel, alias: Alias, labels: dict[int, int], confirmat
         before += float(np.nan_to_num(confirmation.share(image, model.cameras[image], model.cameras)))
         after += float(np.nan_to_num(confirmation.share(image, cameras[image], cameras)))
         gain = after / before - 1 if before > 0 else 0.0
-        if number >= 1 and gain < _HOPELESS_GAIN:
+        if gain < _HOPELESS_GAINS[min(number, 1)]:
             break
     return gain
 
@@ -215,16 +217,31 @@ def judge(model: PlacedModel, confirmation: Confirmation | None) -> Arbitration:
 
 
 def _judge(model: PlacedModel, confirmation: Confirmation, found: Arbitration) -> None:
-    """Compare what each image confirms with what its nearest neighbours' experience leads to expect."""
+    """Compare what each image confirms with what its nearest neighbours' experience leads to expect.
+
+    In larger captures the images share their small sweeps; those that then look less than perfect are judged again by
+    sweeps of their neighbours without them.
+    """
+    shared = len(model.cameras) >= _MANY
     evidence = {
-        image: confirmation.evidence(image, pose, model.cameras) for image, pose in sorted(model.cameras.items())
+        image: confirmation.evidence(image, pose, model.cameras, independent=not shared)
+        for image, pose in sorted(model.cameras.items())
     }
+    neighbours = {
+        image: nearest_cameras(pose, {idx: camera for idx, camera in model.cameras.items() if idx != image},
+                               count=_NEIGHBOURS)
+        for image, pose in model.cameras.items()
+    }  # fmt: skip
+
+    def expected_of(image: int) -> float:
+        return evidence[image].expected_share([evidence[idx] for idx in neighbours[image]])
+
+    if shared:
+        doubted = [image for image in evidence if evidence[image].share < _SECOND_LOOK * expected_of(image)]
+        for image in doubted:
+            evidence[image] = confirmation.evidence(image, model.cameras[image], model.cameras)
     found.shares = {image: own.share for image, own in evidence.items()}
-    found.expected = {}
-    for image, pose in model.cameras.items():
-        others = {idx: camera for idx, camera in model.cameras.items() if idx != image}
-        around = nearest_cameras(pose, others, count=_NEIGHBOURS)
-        found.expected[image] = evidence[image].expected_share([evidence[idx] for idx in around])
+    found.expected = {image: expected_of(image) for image in evidence}
 
 
 def _suspects(found: Arbitration) -> list[int]:

@@ -110,18 +110,22 @@ class Confirmation:
         """Return the share of an image's textured pixels, by solid angle, that other images confirm; see `evidence`."""
         return self.evidence(image, pose, cameras).share
 
-    def evidence(self, image: int, pose: Rigid3, cameras: Mapping[int, Rigid3]) -> Evidence:
+    def evidence(
+        self, image: int, pose: Rigid3, cameras: Mapping[int, Rigid3], *, independent: bool = True
+    ) -> Evidence:
         """Return how much of what an image sees its nearest neighbours confirm.
 
         Args:
             image: position of the image.
             pose: the cam_from_world to judge.
-            cameras: cam_from_world of other images, which are taken as they are; `image` itself is left out.
+            cameras: cam_from_world of other images, which are taken as they are.
+            independent: whether the neighbours are swept without this image. If not, all images of a capture share
+                their maps, one sweep each, and a wrong pose spoils its neighbours' maps a little.
         """
         with _one_thread():
-            return self._evidence(image, pose, cameras)
+            return self._evidence(image, pose, cameras, independent=independent)
 
-    def _evidence(self, image: int, pose: Rigid3, cameras: Mapping[int, Rigid3]) -> Evidence:
+    def _evidence(self, image: int, pose: Rigid3, cameras: Mapping[int, Rigid3], *, independent: bool) -> Evidence:
         others = {idx: camera for idx, camera in cameras.items() if idx != image}
         sources = nearest_cameras(pose, others)
         small = self.small(image)
@@ -133,9 +137,10 @@ class Confirmation:
         maps, poses = [], []
         for source in sources:
             around = {idx: camera for idx, camera in others.items() if idx != source}
+            everybody = {**around, image: pose}
             # Of two images each can only be checked against the other.
-            seen_by = nearest_cameras(others[source], around) or [image]
-            maps.append(self._swept(source, others[source], seen_by, {**around, image: pose}))
+            seen_by = nearest_cameras(others[source], around if independent else everybody) or [image]
+            maps.append(self._swept(source, others[source], seen_by, everybody))
             poses.append(others[source])
         checked = check_consistency(
             own, pose, maps, poses,

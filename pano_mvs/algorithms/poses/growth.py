@@ -142,6 +142,8 @@ def _grown(
     weights: dict[int, float] = {}
     for image in edge:
         _count_pairs(pairs, image, left, weights)
+    if not adjust:
+        model.adjust(cameras=False)
     adjusted = 2
     reasons: dict[int, str] = {}
     while step := _next(model, weights, confirmation=confirmation, reasons=reasons):
@@ -150,8 +152,8 @@ def _grown(
         left.discard(image)
         del weights[image]
         _count_pairs(pairs, image, left, weights)
-        if adjust and len(model.cameras) > _ADJUST_GROWTH * adjusted:
-            model.adjust()
+        if not adjust or len(model.cameras) > _ADJUST_GROWTH * adjusted:
+            model.adjust(cameras=adjust)
             adjusted = len(model.cameras)
     for image in edge:
         if reason := _unsupported(model, image):
@@ -185,7 +187,8 @@ def _unsupported(model: PlacedModel, image: int) -> str:
     pose = model.cameras[image]
     agrees = agreement(witnesses, pose.rotation[None], pose.center[None])[0]
     _, support, known = without.polished(image, witnesses, Placement(pose, agrees, 0.0))
-    return "" if enough_points(support, known) else _why_refused(model.pairs, image, support, known)
+    agreeing = len(set(witnesses.partner[agrees].tolist()))
+    return "" if enough_points(support, known, agreeing=agreeing) else _why_refused(model.pairs, image, support, known)
 
 
 def _next(
@@ -236,7 +239,8 @@ def _accepted(
 ) -> Rigid3 | None:
     """Return the pose of a placement polished on known points, or None if it sees too few of them; notes the reason."""
     pose, support, known = model.polished(image, witnesses, placement)
-    if enough_points(support, known):
+    agreeing = len(set(witnesses.partner[placement.explained].tolist()))
+    if enough_points(support, known, agreeing=agreeing):
         return pose
     reasons[image] = _why_refused(model.pairs, image, support, known)
     return None

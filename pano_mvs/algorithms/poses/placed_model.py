@@ -24,7 +24,7 @@ _MAX_ERROR_RAD = float(np.deg2rad(0.5))
 _FIRST_GUESS_RAD = float(np.deg2rad(2.0))
 _MIN_ANGLE_RAD = float(np.deg2rad(1.5))
 MIN_POINTS = 15
-MIN_SHARE = 0.4
+MIN_SHARE, MIN_SHARE_OF_AGREEING = 0.4, 0.2
 _MAX_PARTNERS = 16
 
 
@@ -200,17 +200,24 @@ class PlacedModel:
             pose = refine_resection(pose, points, rays, scale_rad=scale_rad)
         return pose, int((resection_errors(pose, points, rays) < _MAX_ERROR_RAD).sum()), len(points)
 
-    def adjust(self) -> None:
-        """Refine all cameras but the first together with the points, and learn all ranges anew."""
+    def adjust(self, *, cameras: bool = True) -> None:
+        """Refine all cameras but the first together with the points, and learn all ranges anew.
+
+        Args:
+            cameras: False leaves the cameras where they are and only triangulates.
+        """
         tracks, members = self.tracks()
         model = GrowingModel(tracks, {}, self.pairs.estimator, self.pairs.kappa)
         first = next(iter(self.cameras))
         # The camera that comes first is the one that stays.
         order = [members.index(first), *(idx for idx, image in enumerate(members) if image != first)]
         model.cameras = {idx: self.cameras[members[idx]] for idx in order}
-        model.adjust()
-        for idx, image in enumerate(members):
-            self.cameras[image] = model.cameras[idx]
+        if cameras:
+            model.adjust()
+            for idx, image in enumerate(members):
+                self.cameras[image] = model.cameras[idx]
+        else:
+            model.triangulate()
         for image in members:
             self._ranges[image][:] = np.nan
             self._parallax[image][:] = 0
@@ -292,6 +299,7 @@ class PlacedModel:
         parallax = angle_between(p @ relative.rotation.T, q)
         with np.errstate(invalid="ignore"):
             usable = (ranges[0] > 0) & (ranges[1] > 0) & (parallax > _MIN_ANGLE_RAD)
+        usable &= view.residuals_rad < _MAX_ERROR_RAD
         for image, keypoints, found in ((first, mine, ranges[0]), (second, theirs, ranges[1])):
             better = usable & (parallax > self._parallax[image][keypoints])
             self._ranges[image][keypoints[better]] = found[better]
@@ -306,9 +314,16 @@ def explained_partners(witnesses: Witnesses, explained: NDArray[np.bool_]) -> di
     return found
 
 
-def enough_points(support: int, known: int) -> bool:
-    """Return whether a camera that sees `support` of `known` points where they should be is to be believed."""
-    return support >= max(MIN_POINTS, MIN_SHARE * known)
+def enough_points(support: int, known: int, *, agreeing: int = 1) -> bool:
+    """Return whether a camera that sees `support` of `known` points where they should be is to be believed.
+
+    Args:
+        support: number of points that it sees where they should be.
+        known: number of known points that it matches.
+        agreeing: number of pairs that agree with its pose. Two pairs or more are evidence of their own, so that
+            imprecise matches, as the paper's are, do not cost the camera.
+    """
+    return support >= max(MIN_POINTS, (MIN_SHARE if agreeing < 2 else MIN_SHARE_OF_AGREEING) * known)
 
 
 def _edge(a: int, b: int) -> Edge:

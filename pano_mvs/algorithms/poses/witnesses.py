@@ -143,7 +143,7 @@ def gather_witnesses(
                 (
                     partner, rank, geometry.weight, from_partner.rotation @ camera.rotation, camera.center,
                     camera.rotation.T @ from_partner.center, length,
-                    np.deg2rad(1.0 + 2 * min(geometry.direction_std_deg, 1.0)),
+                    np.deg2rad(1.0 + 2 * min(geometry.direction_std_deg, 1.0) + 5 * geometry.view.residual_deg),
                 )
             )  # fmt: skip
     columns = list(zip(*rows, strict=True)) if rows else [()] * 8
