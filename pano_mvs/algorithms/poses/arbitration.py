@@ -42,7 +42,7 @@ _BLOCK_ROUNDS = 2
 # A block is moved if the images around the cut confirm this much more of themselves.
 _MIN_BLOCK_GAIN = 0.05
 # If they would confirm hardly less than now, nobody can tell which is true.
-_AMBIGUOUS_GAIN = -0.15
+_AMBIGUOUS_GAIN = -0.2
 # Where almost every pair of images would agree with the same move, the place is periodic throughout.
 _PERIODIC, _AMBIGUOUS_GAIN_PERIODIC = 0.7, -0.3
 _NAMED = 4
