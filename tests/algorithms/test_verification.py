@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.metrics.placements import judge_placements
+from pano_mvs.algorithms.poses import arbitration
 from pano_mvs.algorithms.poses.arbitration import arbitrate, judge
 from pano_mvs.algorithms.poses.confirmation import Confirmation, Picture
 from pano_mvs.algorithms.poses.gauge import moved_poses
@@ -221,6 +222,17 @@ def test_plain_walls_are_no_reason_to_doubt_true_poses() -> None:
     assert found.names == given.names
     assert found.doubts == {}
     assert found.rejected == {}
+
+
+def test_a_group_whose_pairs_contradict_one_another_is_doubted(
+    matches: Matches, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: the limit was defined and nothing read it."""
+    assert verified(displaced(), matches).doubts == {}
+    monkeypatch.setattr(arbitration, "_MIN_EXPLAINED_IN_ALL", 1.01)
+    found = verified(displaced(), matches)
+    assert set(found.doubts) == set(NAMES)
+    assert all("agree with one arrangement" in reason for reason in found.doubts.values())
 
 
 def test_pictures_without_any_texture_are_no_reason_to_doubt() -> None:

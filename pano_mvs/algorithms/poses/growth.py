@@ -10,7 +10,14 @@ import numpy as np
 from pano_mvs.algorithms.poses.aliases import find_aliases
 from pano_mvs.algorithms.poses.arbitration import Arbitration, arbitrate, judge
 from pano_mvs.algorithms.poses.confirmation import Confirmation
-from pano_mvs.algorithms.poses.placed_model import MIN_POINTS, MIN_SHARE, Pairs, PlacedModel, enough_points
+from pano_mvs.algorithms.poses.placed_model import (
+    MIN_POINTS,
+    MIN_SHARE,
+    MIN_SHARE_OF_AGREEING,
+    Pairs,
+    PlacedModel,
+    enough_points,
+)
 from pano_mvs.algorithms.poses.placement import Placement, agreement
 from pano_mvs.algorithms.poses.view_graph import Edge
 from pano_mvs.algorithms.poses.witnesses import Witnesses
@@ -188,7 +195,9 @@ def _unsupported(model: PlacedModel, image: int) -> str:
     agrees = agreement(witnesses, pose.rotation[None], pose.center[None])[0]
     _, support, known = without.polished(image, witnesses, Placement(pose, agrees, 0.0))
     agreeing = len(set(witnesses.partner[agrees].tolist()))
-    return "" if enough_points(support, known, agreeing=agreeing) else _why_refused(model.pairs, image, support, known)
+    if enough_points(support, known, agreeing=agreeing):
+        return ""
+    return _why_refused(model.pairs, image, support, known, agreeing=agreeing)
 
 
 def _next(
@@ -242,7 +251,7 @@ def _accepted(
     agreeing = len(set(witnesses.partner[placement.explained].tolist()))
     if enough_points(support, known, agreeing=agreeing):
         return pose
-    reasons[image] = _why_refused(model.pairs, image, support, known)
+    reasons[image] = _why_refused(model.pairs, image, support, known, agreeing=agreeing)
     return None
 
 
@@ -293,9 +302,10 @@ def _why_nothing(model: PlacedModel, image: int) -> str:
     return "its pairs are with images that could not be registered either"
 
 
-def _why_refused(pairs: Pairs, image: int, support: int, known: int) -> str:
+def _why_refused(pairs: Pairs, image: int, support: int, known: int, *, agreeing: int) -> str:
     if known >= MIN_POINTS:
-        needed = max(MIN_POINTS, int(np.ceil(MIN_SHARE * known)))
+        share = MIN_SHARE if agreeing < 2 else MIN_SHARE_OF_AGREEING
+        needed = max(MIN_POINTS, int(np.ceil(share * known)))
         return (
             f"only {support} of {known} points known from other images are seen where they should be, {needed} needed: "
             "repeated structure, something that moved, stitching errors, or an image that is no panorama"
