@@ -115,16 +115,19 @@ def arbitrate(
             break
     _judge(model, confirmation, found)
     _conclude(model, confirmation, found, fixed=fixed, remove=remove)
-    for doubt in filter(None, (ambiguity, _contradiction(model))):
+    for doubt in filter(None, (ambiguity, _contradiction(model, found.doubts))):
         for image in model.cameras:
             found.doubts[image] = "; ".join(filter(None, (found.doubts.get(image), doubt)))
     return found
 
 
-def _contradiction(model: PlacedModel) -> str:
-    """Say so if the pairs contradict one another so much that no arrangement can be relied on."""
-    explained = model.explained_share()
-    if len(model.cameras) < 3 or explained >= _MIN_EXPLAINED_IN_ALL:
+def _contradiction(model: PlacedModel, doubted: Collection[int]) -> str:
+    """Say so if the pairs contradict one another so much that no arrangement can be relied on.
+
+    Pairs with cameras that are doubted already are not counted: a single wrong camera contradicts all of its pairs.
+    """
+    explained = model.explained_share(without=doubted)
+    if len(model.cameras) - len(doubted) < 3 or explained >= _MIN_EXPLAINED_IN_ALL:
         return ""
     return f"only {100 * explained:.0f} % of all pairs, by weight, agree with one arrangement of the cameras"
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -264,14 +264,18 @@ class PlacedModel:
         for edge in sorted(self.chosen):
             self._learn_ranges(edge)
 
-    def explained_share(self) -> float:
-        """Return the share of all pairs of registered images, by weight, that a geometry of theirs explains."""
-        total = sum(
-            found[0].weight
-            for (a, b), found in self.pairs.geometries.items()
-            if a in self.cameras and b in self.cameras
+    def explained_share(self, *, without: Collection[int] = ()) -> float:
+        """Return the share of all pairs of registered images, by weight, that a geometry of theirs explains.
+
+        Args:
+            without: images whose pairs do not count.
+        """
+        images = set(self.cameras) - set(without)
+        total = sum(found[0].weight for edge, found in self.pairs.geometries.items() if images.issuperset(edge))
+        kept = sum(
+            self.pairs.geometries[edge][rank].weight for edge, rank in self.chosen.items() if images.issuperset(edge)
         )
-        return self.explained_weight() / total if total else 1.0
+        return kept / total if total else 1.0
 
     def explained_weight(self) -> float:
         """Return the weight of all geometries that agree with the cameras."""
