@@ -14,7 +14,7 @@ from pano_mvs.algorithms.poses.bundle import Bundle, adjust_bundle
 from pano_mvs.algorithms.poses.kernels_alignment import sample_patches
 from pano_mvs.algorithms.poses.refine import refine_poses
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import Rigid3, angle_between, ray_from_pixel, rotation_from_rotvec
+from pano_mvs.geometry import Rigid3, angle_between, pixel_from_ray, ray_from_pixel, rotation_from_rotvec
 from pano_mvs.scene import Poses
 from pano_mvs.scene.pose_groups import join_groups, split_groups
 from pano_mvs.testing.room import default_room, render
@@ -157,6 +157,27 @@ def test_alignment_places_observations_several_times_as_well_and_says_how_well(r
     best, worst = (np.median(after[changed][part]) for part in np.array_split(order, 4)[::3])
     assert worst > 1.5 * best
     assert np.array_equal(aligned.points_in_world, poses.points_in_world)
+
+
+def test_what_the_mask_ignores_is_not_aligned(room):
+    """Observations whose patches reach into a masked area keep their bearings; the others are aligned as before."""
+    poses, pictures = room
+    mask = np.ones(SIZE_HW, np.bool_)
+    mask[:, 100:300] = False
+    mask[:, :30] = False  # its border is the seam
+    image, _ = pictures["1.png"]
+    whole = align_tracks(poses, pictures.__getitem__)
+    masked = align_tracks(poses, {**pictures, "1.png": (image, mask)}.__getitem__)
+    column, _ = pixel_from_ray(poses.track_bearings, SIZE_HW).T
+    in_masked_image = poses.track_image_idx == 1
+    inside = in_masked_image & (((column > 98) & (column < 302)) | (column < 32) | (column > SIZE_HW[1] - 2))
+    assert inside.sum() > 100
+    assert np.array_equal(masked.track_bearings[inside], poses.track_bearings[inside])
+    changed = np.any(whole.track_bearings != poses.track_bearings, axis=1)
+    assert changed[inside].sum() > 20
+    far = in_masked_image & (column > 340) & (column < SIZE_HW[1] - 40)
+    moved = np.any(masked.track_bearings != poses.track_bearings, axis=1)
+    assert moved[far].sum() > 0.5 * changed[far].sum() > 10
 
 
 def test_blocks_change_nothing(room, monkeypatch):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view.refinement import tangent_basis
-from pano_mvs.geometry import pad_panorama
+from pano_mvs.geometry import pad_panorama, pixel_from_ray
 from pano_mvs.scene import Poses
 from pano_mvs.scene.pose_groups import per_group
 
@@ -40,8 +40,8 @@ def align_tracks(poses: Poses, load: Callable[[str], Picture]) -> Poses:
     be aligned far better. Each track has a reference, the observation that looks at the point most as all others do on
     average. A patch of 13 × 13 pixels about it, normal to the reference's ray, is sampled in all images of the track
     as the poses and the point's range predict, and aligned with the reference's by Lucas and Kanade's method with an
-    affine warp. Observations that do not align (too faint, hidden, on an edge of depth) stay where they are and count
-    for less. Where there are more than 1500 observations an image on average, only the longest tracks are aligned.
+    affine warp. Observations that do not align (too faint, hidden, on an edge of depth, next to what the mask ignores)
+    stay where they are and count for less. Where there are more than 1500 observations an image on average, only the longest tracks are aligned.
 
     Cameras and points are not moved: adjust them afterwards (`refine_poses`). Nothing is drawn at random.
 
@@ -188,12 +188,28 @@ def _patches(
         own = np.flatnonzero(image_idx == image)
         seen = block[own]
         sampled = np.empty((len(own), side, side), np.float32)
-        gray = smoothed_gray(load(poses.names[image])[0])
-        sample_patches(
-            gray, _PAD_PX, sightings.middles[seen], sightings.first_axes[seen], sightings.second_axes[seen], sampled
-        )
+        panorama, mask = load(poses.names[image])
+        rays = sightings.middles[seen], sightings.first_axes[seen], sightings.second_axes[seen]
+        sample_patches(smoothed_gray(panorama), _PAD_PX, *rays, sampled)
+        sampled[_masked(mask, *rays)] = 0.0  # patches without contrast do not align
         patches[own] = sampled
     return patches
+
+
+def _masked(
+    mask: NDArray[np.bool_], middles: FloatArray, first_axes: FloatArray, second_axes: FloatArray
+) -> NDArray[np.bool_]:
+    """Return which patches, (M,), reach into the ignored part of an image; five by five rays of each are looked up."""
+    masked = np.zeros(len(middles), np.bool_)
+    if mask.all():
+        return masked
+    height, width = mask.shape
+    steps = np.linspace(-(SIZE - 1) / 2, (SIZE - 1) / 2, 5)
+    for across in steps:
+        for down in steps:
+            pixels = pixel_from_ray(middles + across * first_axes + down * second_axes, mask.shape).astype(np.intp)
+            masked |= ~mask[pixels[:, 1].clip(max=height - 1), pixels[:, 0] % width]
+    return masked
 
 
 def smoothed_gray(panorama: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -60,10 +60,10 @@ class GrownModel:
         return not self.arbitration.doubts and not self.arbitration.removed
 
     def rank(self) -> tuple[float, float]:
-        """Return what models are sorted by: how much of the images, then of the pairs, they explain in all."""
+        """Return what models are sorted by: how much of the images and of the pairs they explain in all."""
         arbitration = self.arbitration
         confirmed = sum(np.nan_to_num(share) for share in arbitration.shares.values()) if arbitration else 0.0
-        return -float(confirmed), -self.model.explained_weight()
+        return -float(confirmed) * float(np.sqrt(self.model.explained_share())), -self.model.explained_weight()
 
 
 def grown_models(
@@ -110,7 +110,7 @@ def ranked_seeds(pairs: Pairs, images: Collection[int]) -> list[tuple[Edge, int]
 
     def quality(edge: Edge, rank: int) -> float:
         geometry = pairs.geometries[edge][rank]
-        return len(geometry.view) * min(geometry.parallax_deg / _FULL_PARALLAX_DEG, 1.0)
+        return geometry.weight**2 * min(geometry.parallax_deg / _FULL_PARALLAX_DEG, 1.0)
 
     seeds = [
         (edge, rank)
