@@ -41,7 +41,8 @@ def align_tracks(poses: Poses, load: Callable[[str], Picture]) -> Poses:
     average. A patch of 13 × 13 pixels about it, normal to the reference's ray, is sampled in all images of the track
     as the poses and the point's range predict, and aligned with the reference's by Lucas and Kanade's method with an
     affine warp. Observations that do not align (too faint, hidden, on an edge of depth, next to what the mask ignores)
-    stay where they are and count for less. Where there are more than 1500 observations an image on average, only the longest tracks are aligned.
+    stay where they are and count for less. Where there are more than 1500 observations an image on average, only the
+    longest tracks are aligned.
 
     Cameras and points are not moved: adjust them afterwards (`refine_poses`). Nothing is drawn at random.
 

@@ -39,8 +39,9 @@ _ALTERNATIVES = 4
 _MIN_SCORE = 0.2  # of the best placement's score by matches, for a place to be tried at all
 _ROUNDS = 3
 _BLOCK_ROUNDS = 2
-# A block is moved if the images around the cut confirm this much more of themselves.
-_MIN_BLOCK_GAIN = 0.05
+# A block is moved if the images around the cut confirm this much more of themselves; where a first choice of the block
+# loses no more than this, others like it are tried.
+_MIN_BLOCK_GAIN, _PROMISING_GAIN = 0.05, -0.1
 # If they would confirm hardly less than now, nobody can tell which is true.
 _AMBIGUOUS_GAIN = -0.2
 # Where almost every pair of images would agree with the same move, the place is periodic throughout.
@@ -48,7 +49,8 @@ _PERIODIC, _AMBIGUOUS_GAIN_PERIODIC = 0.7, -0.3
 _NAMED = 4
 _FLIPPED = 3
 _ASKED = 6
-_PAIRS_POWER = 0.5
+# How much the share of the pairs that an arrangement explains counts beside the share of the images.
+PAIRS_POWER = 0.25
 _HOPELESS_GAINS = -0.45, -0.1  # of the first that is asked, and of the first two or more: no more are asked then
 
 
@@ -150,11 +152,12 @@ def _unshift_blocks(model: PlacedModel, confirmation: Confirmation) -> tuple[set
         if not gains:
             break
         gain, alias, labels = max(gains, key=lambda found: found[0])
+        if gain > _PROMISING_GAIN and remaining:
+            labels, gain = _with_better_labels(model, alias, labels, gain, confirmation)
         if gain <= _MIN_BLOCK_GAIN or not remaining:
             periodic = len(alias.votes) > _PERIODIC * len(model.chosen)
             limit = _AMBIGUOUS_GAIN_PERIODIC if periodic else _AMBIGUOUS_GAIN
             return moved, _ambiguity(model, alias, labels) if gain > limit else ""
-        labels = _with_better_labels(model, alias, labels, gain, confirmation)
         before, after = model.cameras, _with_block_moved(model, alias, labels)
         model.cameras, model.chosen = after.cameras, after.chosen
         model.learn_ranges()
@@ -187,17 +190,21 @@ def _ambiguity(model: PlacedModel, alias: Alias, labels: dict[int, int]) -> str:
 
 def _with_better_labels(
     model: PlacedModel, alias: Alias, labels: dict[int, int], gain: float, confirmation: Confirmation
-) -> dict[int, int]:
-    """Change the labels of the images that confirm least, one after the other, where the images confirm more then."""
-    cameras = moved_cameras(model, alias, labels)
-    shares = {image: confirmation.share(image, pose, cameras) for image, pose in cameras.items()}
-    for image in sorted(shares, key=lambda idx: (np.nan_to_num(shares[idx]), idx))[:_FLIPPED]:
-        flipped = {**labels, image: 1 - labels[image]}
-        if 0 < sum(flipped.values()) < len(flipped):
-            flipped_gain = _gain_of(model, alias, flipped, confirmation)
-            if flipped_gain > gain:
-                labels, gain = flipped, flipped_gain
-    return labels
+) -> tuple[dict[int, int], float]:
+    """Change the labels of the images that confirm least, one after the other, as long as that gains; return both."""
+    for _ in range(_FLIPPED):
+        cameras = moved_cameras(model, alias, labels)
+        shares = {image: confirmation.share(image, pose, cameras) for image, pose in cameras.items()}
+        before = gain
+        for image in sorted(shares, key=lambda idx: (np.nan_to_num(shares[idx]), idx))[:_FLIPPED]:
+            flipped = {**labels, image: 1 - labels[image]}
+            if 0 < sum(flipped.values()) < len(flipped):
+                flipped_gain = _gain_of(model, alias, flipped, confirmation)
+                if flipped_gain > gain:
+                    labels, gain = flipped, flipped_gain
+        if gain == before:
+            break
+    return labels, gain
 
 
 def _gain_of(model: PlacedModel, alias: Alias, labels: dict[int, int], confirmation: Confirmation) -> float:
@@ -227,7 +234,7 @@ def _gain_of(model: PlacedModel, alias: Alias, labels: dict[int, int], confirmat
         if gain < _HOPELESS_GAINS[min(number, 1)]:
             return gain
     explained = _with_block_moved(model, alias, labels).explained_share() / max(model.explained_share(), 1e-9)
-    return (1 + gain) * explained**_PAIRS_POWER - 1
+    return float((1 + gain) * explained**PAIRS_POWER - 1)
 
 
 def judge(model: PlacedModel, confirmation: Confirmation | None) -> Arbitration:

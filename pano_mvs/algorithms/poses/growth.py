@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pano_mvs.algorithms.poses.aliases import find_aliases
-from pano_mvs.algorithms.poses.arbitration import Arbitration, arbitrate, judge
+from pano_mvs.algorithms.poses.arbitration import PAIRS_POWER, Arbitration, arbitrate, judge
 from pano_mvs.algorithms.poses.confirmation import Confirmation
 from pano_mvs.algorithms.poses.placed_model import (
     MIN_POINTS,
@@ -45,25 +45,33 @@ class GrownModel:
         model: the cameras.
         refused: images that could not be added, with the reason.
         arbitration: what the images say about the cameras; None if they were not asked.
+        aliased: whether runner-up geometries of several pairs suggest the same move of a block of cameras.
     """
 
     model: PlacedModel
     refused: dict[int, str]
     arbitration: Arbitration | None
+    aliased: bool = False
 
     def satisfies(self) -> bool:
         """Return whether no other model need be tried."""
-        if self.refused:
+        if self.refused or self.aliased:
             return False
         if self.arbitration is None:
             return self.model.explained_share() > _SATISFYING
         return not self.arbitration.doubts and not self.arbitration.removed
 
     def rank(self) -> tuple[float, float]:
-        """Return what models are sorted by: how much of the images and of the pairs they explain in all."""
-        arbitration = self.arbitration
-        confirmed = sum(np.nan_to_num(share) for share in arbitration.shares.values()) if arbitration else 0.0
-        return -float(confirmed) * float(np.sqrt(self.model.explained_share())), -self.model.explained_weight()
+        """Return what models are sorted by: how much of the images and of the pairs they explain in all.
+
+        Cameras that are doubtful confirm nothing: a model in which all cameras are confirmed about as expected is
+        better than one in which most are confirmed a little more and one hardly is.
+        """
+        confirmed = 0.0
+        if self.arbitration is not None:
+            shares, doubts = self.arbitration.shares, self.arbitration.doubts
+            confirmed = sum(np.nan_to_num(share) for image, share in shares.items() if image not in doubts)
+        return -float(confirmed) * self.model.explained_share() ** PAIRS_POWER, -self.model.explained_weight()
 
 
 def grown_models(
@@ -78,13 +86,15 @@ def grown_models(
         confirmation: decides between placements, and between models, that the pairs do not decide; asked only then.
     """
     models: list[GrownModel] = []
-    for edge, rank in ranked_seeds(pairs, images):
-        if any(grown.model.chosen.get(edge) == rank for grown in models):
-            continue
+    tried: set[tuple[Edge, int]] = set()
+    while seeds := ranked_seeds(pairs, images, without=tried):
+        edge, rank = seeds[0]
         models.append(_grown(pairs, images, edge, rank, adjust=adjust, confirmation=confirmation))
+        # A seed that a model agrees with would lead to the same model again.
+        tried |= {seeds[0], *models[-1].model.chosen.items()}
         # Seeds that nothing attaches to are not worth a try.
-        tried = sum(len(grown.model.cameras) > 2 for grown in models)
-        if models[-1].satisfies() or tried == _MAX_GROWN or len(models) == 2 * _MAX_GROWN:
+        grown = sum(len(found.model.cameras) > 2 for found in models)
+        if models[-1].satisfies() or grown == _MAX_GROWN or len(models) == 2 * _MAX_GROWN:
             break
     models.sort(key=GrownModel.rank)
     if models and models[0].arbitration is not None and confirmation is not None:
@@ -97,14 +107,21 @@ def _arbitrated(grown: GrownModel, *, adjust: bool, confirmation: Confirmation) 
     arbitration = arbitrate(grown.model, confirmation)
     if arbitration.moved:
         settle(grown.model, adjust=adjust, confirmation=confirmation)
-    return GrownModel(grown.model, grown.refused | arbitration.removed, arbitration)
+    return replace(grown, refused=grown.refused | arbitration.removed, arbitration=arbitration)
 
 
-def ranked_seeds(pairs: Pairs, images: Collection[int]) -> list[tuple[Edge, int]]:
+def ranked_seeds(
+    pairs: Pairs, images: Collection[int], *, without: Collection[tuple[Edge, int]] = ()
+) -> list[tuple[Edge, int]]:
     """Return pairs with the geometry to begin with, the best first.
 
-    Many matches and enough parallax make a good seed, and third images that both of its cameras place alike. A seed
+    Much weight and enough parallax make a good seed, and third images that both of its cameras place alike. A seed
     with a false geometry has few of those.
+
+    Args:
+        pairs: of the capture.
+        images: of the group.
+        without: seeds that are not wanted.
     """
     members = set(images)
 
@@ -117,6 +134,7 @@ def ranked_seeds(pairs: Pairs, images: Collection[int]) -> list[tuple[Edge, int]
         for edge, found in pairs.geometries.items()
         if members.issuperset(edge)
         for rank in range(len(found))
+        if (edge, rank) not in without
     ]
     seeds.sort(key=lambda seed: (-quality(*seed), seed))
     seeds = seeds[:_SEEDS]
@@ -170,9 +188,10 @@ def _grown(
     settle(model, adjust=adjust, confirmation=confirmation)
     refused = {image: reasons.get(image, _why_nothing(model, image)) for image in sorted(left)}
     arbitration = None
-    if left or model.explained_share() < _CERTAIN or (confirmation is not None and find_aliases(model)):
+    aliased = confirmation is not None and bool(find_aliases(model))
+    if left or aliased or model.explained_share() < _CERTAIN:
         arbitration = judge(model, confirmation)
-    return GrownModel(model, refused, arbitration)
+    return GrownModel(model, refused, arbitration, aliased)
 
 
 def _count_pairs(pairs: Pairs, image: int, left: Collection[int], weights: dict[int, float]) -> None:

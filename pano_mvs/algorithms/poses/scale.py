@@ -12,7 +12,7 @@ from pano_mvs.core.errors import UsageError
 FloatArray = NDArray[np.float64]
 ScaleEstimator: TypeAlias = Literal["kappa", "log_median", "cauchy"]
 
-_CAUCHY_STEPS = 20
+_CAUCHY_STEPS, _CONVERGED = 20, 1e-7
 
 
 def estimate_scale(ratios: FloatArray, weights: FloatArray, *, estimator: ScaleEstimator, kappa: float) -> float:
@@ -48,13 +48,19 @@ def _most_neighbours(ratios: FloatArray, kappa: float) -> float:
 
 
 def _cauchy_center(logs: FloatArray, weights: FloatArray, center: float) -> float:
-    spread = np.sqrt(weights / np.median(weights))
+    spread = np.sqrt(weights / _median(weights))
     for _ in range(_CAUCHY_STEPS):
         deviations = (logs - center) * spread
-        scale = max(1.4826 * float(np.median(np.abs(deviations))), 1e-9)
+        scale = max(1.4826 * _median(np.abs(deviations)), 1e-9)
         robust = weights / (1 + (deviations / (2 * scale)) ** 2)
         moved = float(np.sum(robust * logs) / np.sum(robust))
-        if abs(moved - center) < 1e-10:
+        if abs(moved - center) < _CONVERGED:
             break
         center = moved
     return center
+
+
+def _median(values: FloatArray) -> float:
+    """Return the median; of some hundred values several times as fast as numpy's, which is called very often here."""
+    ordered = np.sort(values)
+    return float(0.5 * (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]))
