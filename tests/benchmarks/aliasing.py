@@ -62,7 +62,7 @@ def place_cameras(
         return pictures[name], np.ones(pictures[name].shape[:2], np.bool_)
 
     poses = solve_scaled_translation(features, two_views, load=load, rng=np.random.default_rng(SEED))
-    return refine_poses(verify_poses(poses, load, features=features, two_views=two_views))
+    return refine_poses(verify_poses(poses, load, features=features, two_views=two_views), load=load)
 
 
 def ours(pictures: Pictures) -> tuple[Poses, float]:
