@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.metrics.poses import relative_pose_errors
-from pano_mvs.algorithms.poses.aliases import find_aliases, labellings, moved_cameras
+from pano_mvs.algorithms.poses.aliases import (
+    Alias,
+    _Suggestion,
+    _turned_aliases,
+    find_aliases,
+    labellings,
+    moved_cameras,
+)
 from pano_mvs.algorithms.poses.placed_model import PlacedModel, pairs_of
-from pano_mvs.geometry import Rigid3
+from pano_mvs.geometry import Rigid3, geodesic_angle, rotation_from_rotvec
 from tests.algorithms.aliased_capture import TILE, AliasedCapture, aliased_capture, shifted_pose
 
 COUNT = 7
@@ -118,3 +125,57 @@ def test_labels_move_only_what_they_say() -> None:
     for image, pose in moved_cameras(model, alias, labels).items():
         np.testing.assert_allclose(pose.center, model.cameras[image].center + (image == 2) * alias.move, atol=1e-12)
         np.testing.assert_array_equal(pose.rotation, model.cameras[image].rotation)
+
+
+def suggestions_of(motion: Rigid3, rng: np.random.Generator, *, pairs: int, noise: float) -> list[_Suggestion]:
+    """Return what some pairs suggest of one motion, half of them of its inverse, and as many random motions."""
+    found = []
+    for number in range(2 * pairs):
+        center = rng.normal(size=3)
+        true = motion if number < pairs else Rigid3(rotation_from_rotvec(rng.normal(size=3) * 2), rng.normal(size=3))
+        shaken = Rigid3(rotation_from_rotvec(noise * rng.normal(size=3)) @ true.rotation, true.translation)
+        found.append(
+            _Suggestion(
+                (number, number + 1), 1.0 + 0.1 * rng.random(), shaken if number % 2 else shaken.inverse(), center,
+                true.apply(center) - center,
+            )
+        )  # fmt: skip
+    return found
+
+
+@pytest.mark.parametrize("angle_deg", [70.0, 180.0])
+def test_a_motion_that_turns_is_found_among_random_ones(angle_deg: float) -> None:
+    rng = np.random.default_rng([3, int(angle_deg)])
+    turn = rotation_from_rotvec(np.deg2rad(angle_deg) * np.array([0.0, 1.0, 0.0]))
+    pivot = np.array([2.0, 0.0, -1.0])
+    motion = Rigid3(turn, pivot - turn @ pivot)
+    (alias,) = _turned_aliases(suggestions_of(motion, rng, pairs=4, noise=0.005))
+    assert set(alias.votes) == {(number, number + 1) for number in range(4)}
+    assert alias.own_inverse == (angle_deg == 180)
+    found = alias.motion(inverse=bool(alias.votes[1, 2] < 0))
+    assert geodesic_angle(found.rotation, turn) < 0.02
+    np.testing.assert_allclose(found.apply(pivot), pivot, atol=0.05)
+    if not alias.own_inverse:
+        assert [np.sign(alias.votes[number, number + 1]) for number in range(4)] in ([1, -1, 1, -1], [-1, 1, -1, 1])
+
+
+def test_one_pair_or_random_motions_do_not_make_an_alias_that_turns() -> None:
+    rng = np.random.default_rng(4)
+    random = suggestions_of(Rigid3.identity(), rng, pairs=6, noise=0.0)[6:]
+    assert _turned_aliases(random) == []
+    assert _turned_aliases(random[:1]) == []
+
+
+def test_a_turned_block_is_the_same_whichever_part_has_the_label() -> None:
+    _, model = shifted_block("turned", {4, 5, 6})
+    turn = rotation_from_rotvec([0.1, 2.0, -0.3])
+    alias = Alias(np.array([1.0, -0.5, 2.0]), 1.0, {}, turn)
+    inverse = Alias(alias.motion(inverse=True).translation, 1.0, {}, turn.T)
+    labels = {image: int(image in {0, 2}) for image in model.cameras}
+    block = moved_cameras(model, alias, labels)
+    rest = moved_cameras(model, inverse, {image: 1 - label for image, label in labels.items()})
+    for image, camera in model.cameras.items():
+        points = np.array([[1.0, 2.0, 3.0], [-1.0, 0.5, 0.0]])
+        seen = camera.apply(alias.motion(inverse=True).apply(points)) if labels[image] else camera.apply(points)
+        np.testing.assert_allclose(block[image].apply(points), seen, atol=1e-12)
+        np.testing.assert_allclose(rest[image].apply(points), seen, atol=1e-12)

@@ -11,7 +11,7 @@ from pano_mvs.algorithms.poses.aliases import Alias, find_aliases, labellings, m
 from pano_mvs.algorithms.poses.confirmation import Confirmation, nearest_cameras
 from pano_mvs.algorithms.poses.pair_weights import pair_shares
 from pano_mvs.algorithms.poses.placed_model import PlacedModel, enough_points
-from pano_mvs.geometry import Rigid3
+from pano_mvs.geometry import Rigid3, geodesic_angle
 
 # A camera whose images confirm less than this share of what its neighbours lead to expect is looked at again …
 _SUSPICIOUS = 0.75
@@ -46,7 +46,7 @@ _MIN_BLOCK_GAIN, _PROMISING_GAIN = 0.05, -0.1
 _AMBIGUOUS_GAIN = -0.2
 # Where almost every pair of images would agree with the same move, the place is periodic throughout.
 _PERIODIC, _AMBIGUOUS_GAIN_PERIODIC = 0.7, -0.3
-_NAMED = 4
+_NAMED, _NAMED_TURN_DEG = 4, 5.0
 _FLIPPED = 3
 _ASKED = 6
 # How much the share of the pairs that an arrangement explains counts beside the share of the images.
@@ -144,9 +144,10 @@ def _unshift_blocks(model: PlacedModel, confirmation: Confirmation) -> tuple[set
     """
     moved: set[int] = set()
     for remaining in reversed(range(_BLOCK_ROUNDS + 1)):
+        aliases = find_aliases(model)
         gains = [
             (_gain_of(model, alias, labels, confirmation), alias, labels)
-            for alias in find_aliases(model)
+            for alias in aliases
             for labels in labellings(model, alias)
         ]
         if not gains:
@@ -157,7 +158,9 @@ def _unshift_blocks(model: PlacedModel, confirmation: Confirmation) -> tuple[set
         if gain <= _MIN_BLOCK_GAIN or not remaining:
             periodic = len(alias.votes) > _PERIODIC * len(model.chosen)
             limit = _AMBIGUOUS_GAIN_PERIODIC if periodic else _AMBIGUOUS_GAIN
-            return moved, _ambiguity(model, alias, labels) if gain > limit else ""
+            if gain > limit:
+                return moved, _ambiguity(model, alias, labels)
+            return moved, next((_turned_ambiguity(other) for other in aliases if _turn_deg(other)), "")
         before, after = model.cameras, _with_block_moved(model, alias, labels)
         model.cameras, model.chosen = after.cameras, after.chosen
         model.learn_ranges()
@@ -181,11 +184,27 @@ def _ambiguity(model: PlacedModel, alias: Alias, labels: dict[int, int]) -> str:
     rest = [image for image, label in labels.items() if not label]
     smaller = [model.pairs.names[image] for image in min(block, rest, key=len)]
     named = ", ".join(smaller[:_NAMED]) + (" …" if len(smaller) > _NAMED else "")
-    distance = float(np.linalg.norm(alias.move))
+    after = moved_cameras(model, alias, labels)
+    distance = max(float(np.linalg.norm(after[image].center - pose.center)) for image, pose in model.cameras.items())
+    turned = f", turned by {_turn_deg(alias):.0f}°" if _turn_deg(alias) else ""
     return (
         f"the place repeats: the images would confirm about as much if {named} stood {distance:.2g} units away from "
-        "where they are, relative to the others"
+        f"where they are{turned}, relative to the others"
     )
+
+
+def _turned_ambiguity(alias: Alias) -> str:
+    """Say that a part of the capture may be turned; which images it has is hardly known from a few pairs."""
+    return (
+        f"the place repeats: {len(alias.votes)} pairs would agree if some of the images were turned by "
+        f"{_turn_deg(alias):.0f}° and stood elsewhere, as in a second room like the first"
+    )
+
+
+def _turn_deg(alias: Alias) -> float:
+    """Return by how much an alias turns a block; 0 if it only moves it."""
+    turn_deg = float(np.rad2deg(geodesic_angle(alias.turn, np.eye(3))))
+    return turn_deg if turn_deg > _NAMED_TURN_DEG else 0.0
 
 
 def _with_better_labels(
@@ -329,7 +348,8 @@ def _conclude(
         expected, explained = found.expected[image], model.explained_share_of(image)
         ratio = share / expected if expected > _MIN_EXPECTED else float("nan")
         reasons = []
-        if ratio < _DOUBTFUL:
+        # Images and pairs may each be short of what makes a camera doubtful, and both speak against it.
+        if ratio < (_SUSPICIOUS if explained < _MIN_EXPLAINED_IN_ALL else _DOUBTFUL):
             reasons.append(
                 f"other images confirm {100 * share:.0f} % of its texture, where its neighbours lead to expect "
                 f"{100 * expected:.0f} %"
