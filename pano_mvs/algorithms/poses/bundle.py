@@ -88,7 +88,7 @@ def adjust_bundle(
         bundle: where to begin.
         loss: "huber" min(r², 2 s r − s²), or "cauchy" s² log(1 + r²/s²).
         scale_rad: s, the error from which an observation of sigma 1 loses influence.
-        max_iterations: at most so many steps.
+        max_iterations: maximum number of steps.
         tolerance: the adjustment ends with a step that lowers the cost by a smaller share than this.
         fixed_camera: position of the camera that is not moved.
 

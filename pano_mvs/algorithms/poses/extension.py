@@ -29,7 +29,7 @@ def extend_poses(
 
     The tracks of the known cameras are triangulated; every new image is attached by its pairs with registered ones,
     and its pose refined by resection against the points (angular, robust). When all are attached the points are
-    triangulated anew from old and new cameras, and the new ones refined against them, a few times.
+    triangulated again from old and new cameras, and the new ones refined against them, a few times.
 
     Args:
         known: poses by the names of `features`; others are left out. Its points are replaced.

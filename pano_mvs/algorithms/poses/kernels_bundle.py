@@ -82,7 +82,7 @@ def _add_observation(rows, t, row, p, band, gradient, diagonal, couplings, block
 def _eliminate(start, stop, p, image_idx, couplings, inverses, point_gradients, product, band, gradient):  # type: ignore[no-untyped-def]
     """Take one point out of the system: S −= W V⁻¹ Wᵀ, g −= W V⁻¹ b, over all pairs of its observations.
 
-    Rows are written out: a compiler that cannot know that the arrays lie apart would load W V⁻¹ anew for each entry.
+    Rows are written out: a compiler that cannot know that the arrays lie apart would load W V⁻¹ again for each entry.
     """
     for t in range(start, stop):
         row = 6 * image_idx[t]

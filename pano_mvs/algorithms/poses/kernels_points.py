@@ -1,4 +1,4 @@
-"""Compiled: triangulation of tracks, track by track; what it computes is told in `points`."""
+"""Compiled: triangulation of tracks, track by track; see `points` for what it computes."""
 
 from __future__ import annotations
 

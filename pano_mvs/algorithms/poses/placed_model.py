@@ -201,7 +201,7 @@ class PlacedModel:
         return pose, int((resection_errors(pose, points, rays) < _MAX_ERROR_RAD).sum()), len(points)
 
     def adjust(self, *, cameras: bool = True) -> None:
-        """Refine all cameras but the first together with the points, and learn all ranges anew.
+        """Refine all cameras but the first together with the points, and learn all ranges again.
 
         Args:
             cameras: False leaves the cameras where they are and only triangulates.
@@ -258,7 +258,7 @@ class PlacedModel:
                 self.chosen.setdefault(_edge(image, int(witnesses.partner[idx])), int(witnesses.rank[idx]))
 
     def learn_ranges(self) -> None:
-        """Compute the ranges of all matches of chosen geometries anew."""
+        """Compute the ranges of all matches of chosen geometries again."""
         for ranges, parallax in zip(self._ranges, self._parallax, strict=True):
             ranges[:], parallax[:] = np.nan, 0
         for edge in sorted(self.chosen):

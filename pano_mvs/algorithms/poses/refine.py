@@ -40,13 +40,13 @@ def refine_poses(
     """Return the poses and points with the least robust sum of squared angles between observed and expected rays.
 
     The angle is measured on the tangent plane of each observed ray, so that a pixel near a pole counts for as little
-    as it covers, and nothing happens at the seam. Between rounds points are triangulated anew, and observations that
+    as it covers, and nothing happens at the seam. Between rounds points are triangulated again, and observations that
     do not fit are dropped. The world frame is kept: the first camera does not move and neither does the length of its
     first baseline; where lengths are metres, the cameras as a whole stay where they were.
     How sure each camera is, relative to the first camera and first baseline, is in `center_stds` and
     `rotation_stds_rad`; see `camera_deviations`. Groups are adjusted one by one, each in its own world.
 
-    With the images, observations are then placed anew where the images agree best, each with how precise it is (see
+    With the images, observations are then placed again where the images agree best, each with how precise it is (see
     `align_tracks`), and all is adjusted once more. That halves the error where key points are few or coarse.
 
     Args:
@@ -54,7 +54,7 @@ def refine_poses(
         loss: "huber" or "cauchy".
         loss_scale_deg: error from which an observation loses influence; where the precision of observations is known,
             of one with a standard deviation of 0.07°, and of others in proportion.
-        max_iterations: at most so many steps in each round.
+        max_iterations: maximum number of steps in each round.
         max_error_deg: observations with a larger error are dropped.
         load: returns the panorama and the mask of an image by its name; None leaves the observations where they are.
 
@@ -117,7 +117,7 @@ def _bundle(poses: Poses) -> tuple[Bundle, NDArray[np.uint8]]:
 
 
 def _fitting(bundle: Bundle, colors: NDArray[np.uint8], *, max_error_rad: float) -> tuple[Bundle, NDArray[np.uint8]]:
-    """Triangulate all points anew, and keep what fits."""
+    """Triangulate all points again, and keep what fits."""
     found = triangulate_observations(
         bundle.centers[bundle.image_idx],
         np.einsum("tji,tj->ti", bundle.rotations[bundle.image_idx], bundle.bearings),

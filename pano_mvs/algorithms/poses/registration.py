@@ -121,7 +121,7 @@ class GrowingModel:
         return seen, found
 
     def adjust(self) -> None:
-        """Refine all cameras but the first together with the points (bundle adjustment), and triangulate anew."""
+        """Refine all cameras but the first together with the points (bundle adjustment), and triangulate again."""
         seen, found = self.triangulate()
         used = seen[found.used]
         images = sorted(self.cameras)

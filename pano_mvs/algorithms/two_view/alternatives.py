@@ -76,7 +76,7 @@ def distinct_geometries(
         threshold_rad: Sampson error below which a match agrees.
         min_inliers: independent matches that the best geometry needed; another needs 0.6 times as many of its own, and
             a twelfth of what the best one has.
-        most: at most so many others.
+        most: maximum number of others.
     """
     search = _Search(first, second, rng, threshold_rad, min_inliers)
     best, twins = search.better_twin(best)

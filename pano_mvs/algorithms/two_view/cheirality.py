@@ -78,7 +78,7 @@ def least_essentials(
         threshold_rad: Sampson error from which a match costs 1.
         limit: only those that cost less.
         sigmas: how far it may lag behind, in standard deviations; infinity gives up none that would have led.
-        count: at most so many.
+        count: maximum number to return.
 
     Returns:
         (K, 3, 3), K ≤ count, best first.

@@ -153,7 +153,7 @@ def refine_pose(rotation, t, first, second, scale, max_iterations):  # type: ign
         first: (M, 3) unit bearings.
         second: (M, 3) unit bearings.
         scale: residual, in radians, at which the weight has fallen to a half.
-        max_iterations: at most so many steps.
+        max_iterations: maximum number of steps.
     """
     squared_scale = scale * scale
     hessian, gradient, step = np.empty((5, 5)), np.empty(5), np.empty(5)

@@ -76,7 +76,7 @@ def estimate_two_view(
             (the paper's), and many essential matrices fit a plane in it.
         refine: False gives the best minimal hypothesis as it comes, as the paper does.
         confidence: stop once a better model would have been met with this probability.
-        max_iterations: at most so many hypotheses.
+        max_iterations: maximum number of hypotheses.
 
     Raises:
         UsageError: if the shapes differ, the threshold is not positive, or there is no such solver.

@@ -1,4 +1,4 @@
-"""Help poses out of local optima: keep the rotation, draw the direction anew, and let both settle."""
+"""Help poses out of local optima: keep the rotation, draw the direction again, and let both settle."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ def refine_relative_pose(
         first: (M, 3) unit bearings in the first image.
         second: (M, 3) unit bearings in the second.
         scale_rad: residual at which the weight has fallen to a half.
-        max_iterations: at most so many steps.
+        max_iterations: maximum number of steps.
     """
     from pano_mvs.algorithms.two_view.kernels_refinement import refine_pose
 

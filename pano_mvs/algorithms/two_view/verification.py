@@ -57,9 +57,9 @@ def verify_pair(
         min_inliers: fewer independent agreeing matches are never enough.
         solver: see `estimate_two_view`.
         refine: False gives the best minimal hypothesis as it comes, as the paper does.
-        max_iterations: at most so many hypotheses.
-        max_alternatives: keep at most so many runner-up geometries (see `distinct_geometries`); without `refine` there
-            are none.
+        max_iterations: maximum number of hypotheses.
+        max_alternatives: maximum number of runner-up geometries to keep (see `distinct_geometries`); without `refine`
+            there are none.
 
     Returns:
         geometry "general"; or "rotation", where the pictures were taken from one place; or "none". The last two are
