@@ -18,6 +18,7 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.io.captures import PICTURE_SUFFIXES
 from pano_mvs.io.exr import read_exr
 from pano_mvs.io.range_files import read_confidence_png
+from pano_mvs.scene.decoding import decode_picture
 
 RANGE_SUFFIXES = (".tiff", ".tif", ".exr", ".npy", ".npz", ".png")
 """What files of ranges are called; of two for one picture the earlier is taken."""
@@ -174,7 +175,7 @@ def _read_picture(path: Path, _key: str) -> NDArray[Any]:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
-    array = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    array = decode_picture(data, path, cv2.IMREAD_UNCHANGED)
     if array is None:
         raise InputError(f"{path}: not a picture that can be decoded ({len(data)} bytes). Write it again")
     return np.asarray(array)

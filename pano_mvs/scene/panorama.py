@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.scene.cropping import inside_crop, placed_picture, same_shape
+from pano_mvs.scene.decoding import MAX_PIXELS
 from pano_mvs.scene.image_file import decode_image, write_png
 from pano_mvs.scene.masking import decode_mask, painted_over, placed_mask
 from pano_mvs.scene.record import Axis, FilePart, Record, require
@@ -76,7 +77,8 @@ class Panorama(Record):
         Raises:
             InputError: as `load`.
         """
-        image = decode_image(self.image.path)
+        height, width = self.source_size_hw  # the source has accepted it, perhaps beyond the usual limit
+        image = decode_image(self.image.path, max_pixels=max(MAX_PIXELS, height * width))
         _, _, width, height = self.covers_ltwh
         if (not same_shape(image.shape[:2], (height, width))) or (
             self.crop_ltwh is None and image.shape[:2] != self.source_size_hw

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Annotated
 
 from pydantic import Field
 
 from pano_mvs.algorithms.dual_fisheye import is_dual_fisheye
-from pano_mvs.api import Context, FilePart, InputError, Panorama, Params, SourceItem, SourcePath, source
+from pano_mvs.api import NOT_IN_KEY, Context, FilePart, InputError, Panorama, Params, SourceItem, SourcePath, source
 from pano_mvs.io.captures import PictureInfo, describe_picture, list_pictures
 from pano_mvs.io.mask_files import find_mask, require_masks
 from pano_mvs.io.names import printable_name
+from pano_mvs.scene.decoding import MAX_PIXELS
 from pano_mvs.scene.image_file import decode_image
 
 
@@ -26,6 +28,14 @@ class FolderParams(Params):
     )
     zenith_deg: float = Field(default=0.0, ge=0, le=90, description="ignore so much around straight up")
     max_width: int = Field(default=4096, ge=16, description="wider panoramas are scaled down to this width")
+    max_megapixels: Annotated[float, NOT_IN_KEY] = Field(
+        default=MAX_PIXELS / 1e6, gt=0, description="larger files are refused, before they take memory"
+    )
+
+    @property
+    def max_pixels(self) -> int:
+        """The largest number of pixels of a file."""
+        return int(self.max_megapixels * 1e6)
 
 
 def list_folder(params: FolderParams) -> Iterator[SourceItem]:
@@ -58,12 +68,12 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
     what the picture covers, or the whole sphere, at any resolution.
     """
     path = item.files["image"]
-    info = describe_picture(path)
+    info = describe_picture(path, max_pixels=params.max_pixels)
     for warning in info.warnings:
         ctx.note(f"{item.name}: {warning}")
     for trait in info.traits:
         ctx.note(f"some pictures have {trait}")
-    _check_pixels(path, info)
+    _check_pixels(path, info, params.max_pixels)
     mask = item.files.get("mask")
     panorama = Panorama(
         image=FilePart(path, external=True),
@@ -84,9 +94,9 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
     return panorama
 
 
-def _check_pixels(path: Path, info: PictureInfo) -> None:
+def _check_pixels(path: Path, info: PictureInfo, max_pixels: int) -> None:
     """Decode the whole picture once, so that a damaged file is named here and not in the middle of a sweep."""
-    picture = decode_image(path)
+    picture = decode_image(path, max_pixels=max_pixels)
     height, width = picture.shape[:2]
     if (height, width) != info.file_size_hw:
         raise InputError(f"{path}: decodes to {width}×{height} px, its header says {info.file_size_hw[::-1]}. "
