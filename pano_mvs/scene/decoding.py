@@ -46,9 +46,7 @@ _STDERR = 2
 _turned = threading.Lock()
 
 
-def decode_picture(
-    data: bytes, path: Path, flags: int, *, max_pixels: int = MAX_PIXELS
-) -> NDArray[np.generic] | None:
+def decode_picture(data: bytes, path: Path, flags: int, *, max_pixels: int = MAX_PIXELS) -> NDArray[np.generic] | None:
     """Return a picture as OpenCV decodes it, BGR; None if the bytes are no picture that it knows.
 
     Args:
@@ -156,4 +154,5 @@ def _why_not(error: Exception, size: Size | None) -> str:
                 f"{_OPENCV_SIDE} px on a side. Scale it down")  # fmt: skip
     if code == _OPENCV_NO_MEMORY:
         return f"there is not enough memory to decode a picture{of}. Close other programs, or scale it down"
-    return f"not a picture that can be decoded{f' (its header states {width}×{height} px)' if size else ''}. Copy it again"
+    states = f" (its header states {width}×{height} px)" if size else ""
+    return f"not a picture that can be decoded{states}. Copy it again"

@@ -48,7 +48,7 @@ def decode_image(path: Path, *, max_pixels: int = MAX_PIXELS) -> NDArray[np.uint
                          f"JPEG, or to PNG or TIFF of 8 or 16 bits")  # fmt: skip
     del data  # of large pictures each copy counts
     if image.dtype == np.uint16:
-        image = np.right_shift(image, 8, out=image)  # both 257 v and 256 v, as which programs write 8 bits in 16, give v
+        np.right_shift(image, 8, out=image)  # both 257 v and 256 v, as which programs write 8 bits in 16, give v
         return np.asarray(image[..., ::-1].astype(np.uint8, order="C"))
     if image.dtype != np.uint8:
         raise InputError(f"{path}: {image.dtype} pictures are not supported. Convert it to 8 or 16 bits")

@@ -134,7 +134,10 @@ def test_heic_without_its_extra_says_what_to_install(tmp_path: Path, monkeypatch
         decode_image(tmp_path / "a.heic")
 
 
-@pytest.mark.parametrize(("suffix", "width", "budget"), [(".jpg", 8192, 110e6), (".png", 4096, 32e6), (".tif", 2048, 26e6)])
+BUDGETS = [(".jpg", 8192, 110e6), (".png", 4096, 32e6), (".tif", 2048, 26e6)]
+
+
+@pytest.mark.parametrize(("suffix", "width", "budget"), BUDGETS)
 def test_large_pictures_are_read_within_their_budget(tmp_path: Path, suffix: str, width: int, budget: float) -> None:
     """One picture of 3 bytes a pixel; of a TIFF of 16 bits 6 and 3; the file only while it is decoded."""
     ramp = np.add.outer(np.arange(width // 2), np.arange(width)).astype(np.uint8)
