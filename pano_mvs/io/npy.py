@@ -18,8 +18,10 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.scene.decoding import MAX_PIXELS
 
 # All that zipfile, its decompressors and the parser of .npy headers raise on damaged files.
-DAMAGE = (OSError, ValueError, TypeError, LookupError, EOFError, RuntimeError, SyntaxError, OverflowError,
-          MemoryError, AttributeError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error, lzma.LZMAError)  # fmt: skip
+DAMAGE = (
+    *(OSError, ValueError, TypeError, LookupError, AttributeError, EOFError, RuntimeError, SyntaxError, OverflowError),
+    *(MemoryError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error, lzma.LZMAError),
+)
 _MAX_DIMENSIONS = 4
 _RATIOS = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 1032}  # how many bytes a decompressor makes of one at most
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
