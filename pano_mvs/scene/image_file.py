@@ -37,7 +37,7 @@ def decode_image(path: Path, *, max_pixels: int = MAX_PIXELS) -> NDArray[np.uint
         check_stated_size(data, path, max_pixels)
         return _decode_heic(data, path)
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    if not data.startswith(PNG_START):  # whose 16 bits OpenCV takes to 8 as we do, with a quarter of the memory
+    if not data.startswith(PNG_START):  # whose 16 bits OpenCV takes to 8 as we do, with half of the memory
         flags |= cv2.IMREAD_ANYDEPTH
     image = decode_picture(data, path, flags, max_pixels=max_pixels)
     if image is None and data[4:12] in (b"ftypavif", b"ftypavis"):

@@ -19,7 +19,8 @@ Size: TypeAlias = "tuple[int, int]"
 PNG_START = b"\x89PNG\r\n\x1a\n"
 TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _WIDTH, _HEIGHT = 256, 257
-_FIRST_BYTES = 1 << 20
+_FIRST_BYTES = 1 << 16
+_HEIF_BYTES = 1 << 20
 _DAMAGE = (struct.error, IndexError, OverflowError)
 
 
@@ -105,11 +106,11 @@ def _tiff_size(data: bytes) -> Size | None:
 def _heif_size(data: bytes) -> Size | None:
     """Return the largest of the sizes in a HEIC or AVIF file: of its tiles, its thumbnails and the whole."""
     sizes: list[Size] = []
-    at = data.find(b"ispe", 0, _FIRST_BYTES)
+    at = data.find(b"ispe", 0, _HEIF_BYTES)
     while at >= 0:
         width, height = struct.unpack_from(">II", data, at + 8)
         sizes.append((height, width))
-        at = data.find(b"ispe", at + 4, _FIRST_BYTES)
+        at = data.find(b"ispe", at + 4, _HEIF_BYTES)
     return _positive(*max(sizes, key=lambda size: size[0] * size[1])) if sizes else None
 
 

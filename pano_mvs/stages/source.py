@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import Field
 
@@ -13,8 +13,9 @@ from pano_mvs.api import NOT_IN_KEY, Context, FilePart, InputError, Panorama, Pa
 from pano_mvs.io.captures import PictureInfo, describe_picture, list_pictures
 from pano_mvs.io.mask_files import find_mask, require_masks
 from pano_mvs.io.names import printable_name
-from pano_mvs.scene.decoding import MAX_PIXELS
+from pano_mvs.scene.decoding import MASK_BYTES_PER_PIXEL, MAX_PIXELS, decoding_bytes_per_pixel
 from pano_mvs.scene.image_file import decode_image
+from pano_mvs.scene.picture_header import stated_size_of_file
 
 
 class FolderParams(Params):
@@ -59,7 +60,17 @@ def list_folder(params: FolderParams) -> Iterator[SourceItem]:
         yield SourceItem(name, files, problem, tuple(_notes_on_masks(name, mask, params)))
 
 
-@source("source.folder", list_items=list_folder)
+def folder_memory_bytes(params: FolderParams, inputs: Mapping[str, Any]) -> int:
+    """Return what reading a picture and its mask takes, by the header of the file; 0 for what is refused anyway."""
+    item: SourceItem = inputs["item"]
+    height, width = stated_size_of_file(item.files["image"]) or (0, 0)
+    if height * width > params.max_pixels:
+        return 0
+    masked = MASK_BYTES_PER_PIXEL if "mask" in item.files else 0
+    return height * width * max(decoding_bytes_per_pixel(item.files["image"]), masked)
+
+
+@source("source.folder", list_items=list_folder, memory=folder_memory_bytes)
 def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
     """Read the panoramas of a folder and its subfolders.
 

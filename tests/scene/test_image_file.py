@@ -139,7 +139,7 @@ BUDGETS = [(".jpg", 8192, 110e6), (".png", 2048, 10e6), (".tif", 2048, 26e6)]
 
 @pytest.mark.parametrize(("suffix", "width", "budget"), BUDGETS)
 def test_large_pictures_are_read_within_their_budget(tmp_path: Path, suffix: str, width: int, budget: float) -> None:
-    """One picture of 3 bytes a pixel; of a TIFF of 16 bits 6 and 3; the file only while it is decoded."""
+    """In numpy: one picture of 3 bytes a pixel, of a TIFF of 16 bits 6 and 3; the file only while it is decoded."""
     ramp = np.add.outer(np.arange(width // 2), np.arange(width)).astype(np.uint8)
     picture = np.dstack([ramp] * 3).astype(np.uint8 if suffix == ".jpg" else np.uint16)
     path = tmp_path / f"a{suffix}"
