@@ -83,7 +83,7 @@ class ModelImage:
         """
         if not (np.isfinite(self.quat_wxyz).all() and np.isfinite(self.translation).all()):
             raise InputError(f"{self.where}: the pose holds NaN or infinite numbers")
-        if not 1e-6 < np.linalg.norm(self.quat_wxyz) < 1e6:
+        if not 1e-6 < np.abs(self.quat_wxyz).max() < 1e100:
             raise InputError(f"{self.where}: its quaternion is no rotation")
         return rigid_from_arrays(rotation_from_quat_wxyz(self.quat_wxyz), self.translation, self.where)
 

@@ -141,9 +141,10 @@ def _add_cameras(model: Any, sizes_hw: list[tuple[int, int]]) -> dict[tuple[int,
 
 
 def _pose(image: ModelImage) -> Rigid3:
-    if np.isfinite(image.quat_wxyz).all() and abs(np.linalg.norm(image.quat_wxyz) - 1) > _MAX_QUAT_ERROR:
+    pose = image.cam_from_world()
+    if np.abs(image.quat_wxyz).max() > 2 or abs(np.linalg.norm(image.quat_wxyz) - 1) > _MAX_QUAT_ERROR:
         raise InputError(f"{image.where}: its quaternion has not length 1. Write the model anew")
-    return image.cam_from_world()
+    return pose
 
 
 def _observations(

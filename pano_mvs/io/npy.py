@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.core.text import shortened
 from pano_mvs.scene.decoding import MAX_PIXELS
 
 # All that zipfile, its decompressors and the parser of .npy headers raise on damaged files.
@@ -23,6 +24,7 @@ DAMAGE = (
     *(MemoryError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error, lzma.LZMAError),
 )
 _MAX_DIMENSIONS = 4
+_MAX_REASON = 300  # characters; numpy repeats whole headers
 _RATIOS = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 1032}  # how many bytes a decompressor makes of one at most
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
@@ -107,5 +109,5 @@ def _read_exactly(stream: IO[bytes], size_bytes: int) -> bytes:
 
 
 def _reason(error: BaseException) -> str:
-    """Return an exception's text, or its kind where it has none."""
-    return str(error) or type(error).__name__
+    """Return an exception's text in few words, or its kind where it has none."""
+    return shortened(str(error), _MAX_REASON) or type(error).__name__
