@@ -61,7 +61,7 @@ def read_exr(path: Path) -> dict[str, NDArray[np.float32]]:
         width, height = int(right) - int(left) + 1, int(bottom) - int(top) + 1
         if width * height > MAX_PIXELS:
             raise ValueError(f"its header states {width}×{height} px, more than the limit of {MAX_PIXELS}")
-        with OpenEXR.File(str(path), separate_channels=True) as file, np.errstate(over="ignore"):
+        with OpenEXR.File(str(path), separate_channels=True) as file, np.errstate(over="ignore", invalid="ignore"):
             return {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
     except _DAMAGE as error:
         raise InputError(f"{path}: no EXR file that can be read ({str(error) or type(error).__name__}). Write it "

@@ -77,7 +77,7 @@ class PlyPoints:
 
     def _stacked(self, names: tuple[str, ...], part: slice) -> NDArray[np.float32]:
         chosen = self.vertices[part]
-        with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is refused as such
+        with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite is refused
             return np.stack([chosen[name].astype(np.float32) for name in names], axis=-1)
 
 

@@ -56,7 +56,7 @@ class RangeFile:
             raise InputError(f"{self.path}: holds {array.shape} {array.dtype}, not a map of ranges (height, width) in "
                              "floats or 16-bit steps. Write ranges as float TIFF, EXR or NPY, or as 16-bit PNG "
                              "with --unit")  # fmt: skip
-        with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and so unknown
+        with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold becomes infinite, and so unknown
             ranges = array.astype(np.float32) * np.float32(self.unit)
         return np.where(np.isfinite(ranges) & (ranges > 0), ranges, np.float32(np.nan))
 

@@ -70,7 +70,7 @@ class Truth:
         if array.ndim != 2 or array.dtype.kind not in "fiu":
             raise InputError(f"{path}: {view.range_key} has shape {array.shape} of {array.dtype}, expected numbers "
                              "(H, W)")  # fmt: skip
-        with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and so unknown
+        with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold becomes infinite, and so unknown
             array = array.astype(np.float32)
         return np.where(np.isfinite(array) & (array > 0), array, np.float32(np.nan))
 
