@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Annotated, Optional
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 
 from pano_mvs import __version__
 from pano_mvs.cli.cache_app import cache_app
+from pano_mvs.cli.console import Console
 from pano_mvs.cli.doctor.command import doctor
 from pano_mvs.cli.evaluate_app import evaluate_app
 from pano_mvs.cli.guard import guarded

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
+from pano_mvs.cli.console import Console
 from pano_mvs.cli.guard import guarded
 from pano_mvs.cli.options import CacheOption
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rich.console import Console
-
 from pano_mvs.algorithms.metrics.score import score_capture
 from pano_mvs.algorithms.metrics.view_scores import Judging
+from pano_mvs.cli.console import Console
 from pano_mvs.cli.evaluate_cloud import CloudRequest, evaluate_cloud
 from pano_mvs.cli.evaluate_depth import DepthRequest, evaluate_depth
 from pano_mvs.cli.run_command import print_scores

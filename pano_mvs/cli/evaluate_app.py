@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Annotated, Literal, Optional
 
 import typer
-from rich.console import Console
 
+from pano_mvs.cli.console import Console
 from pano_mvs.cli.default_command import RunByDefault
 from pano_mvs.cli.guard import guarded
 

@@ -10,9 +10,9 @@ from functools import wraps
 from typing import Any, TypeVar, cast
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 
+from pano_mvs.cli.console import Console
 from pano_mvs.core.errors import PanoMvsError, WorkflowError
 
 Command = TypeVar("Command", bound=Callable[..., None])

@@ -25,6 +25,7 @@ import json
 import time
 from typing import Any, TextIO
 
+from pano_mvs.core.text import json_without_controls
 from pano_mvs.engine.events import Failure, Outcome, StageSummary
 
 SCHEMA = 1
@@ -41,7 +42,7 @@ class JsonEvents:
         line = json.dumps(
             {"event": event, "time": round(time.time(), 3), **fields}, ensure_ascii=False, allow_nan=False
         )
-        self._stream.write(line + "\n")
+        self._stream.write(json_without_controls(line) + "\n")
         self._stream.flush()
 
     def stage_started(self, name: str, units: int) -> None:

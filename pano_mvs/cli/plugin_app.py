@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Annotated, Optional
 
 import typer
-from rich.console import Console
 
 from pano_mvs.cli.completion import complete_plugin_kind, complete_stage_kind
+from pano_mvs.cli.console import Console
 from pano_mvs.cli.guard import guarded
 
 plugin_app = typer.Typer(help="Write plugins.", no_args_is_help=True)

@@ -19,10 +19,10 @@ from statistics import median
 from types import FrameType
 from typing import Any
 
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from pano_mvs.cli.console import Console
 from pano_mvs.cli.json_events import SCHEMA, JsonEvents
 from pano_mvs.cli.progress import ProgressBars
 from pano_mvs.cli.session import Session, check_output

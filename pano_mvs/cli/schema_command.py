@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from rich.console import Console
 from rich.markup import escape
 
+from pano_mvs.cli.console import Console
 from pano_mvs.cli.session import presets_folder
 from pano_mvs.core.errors import StoreError, UsageError
 from pano_mvs.core.files import write_text

@@ -115,6 +115,12 @@ class Board:
         self._settle(unit.entry.name, unit.item)
         self._spread()
 
+    def withdraw(self, stage: str, item: str, cause: str) -> None:
+        """Enter that a unit of a stage that is not complete yet has lost its result."""
+        self.states[stage].items.pop(item, None)
+        self.states[stage].failed[item] = cause
+        self._stages[stage].collections.pop(item, None)
+
     def producers(self, stage: str) -> set[str]:
         """Return the stages that feed a stage."""
         return {edge.producer for edge in self._stages[stage].edges.values()}

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from pano_mvs.core.text import shortened
+
 
 @dataclass(slots=True)
 class Context:
@@ -36,8 +38,8 @@ class Context:
 
     def note(self, text: str) -> None:
         """Record what a user should know; a cached unit says it again."""
-        self.notes.append(text)
+        self.notes.append(shortened(text))
 
     def reject(self, image: str, reason: str) -> None:
         """Record that the result leaves an image out; the run then ends with exit code 3."""
-        self.rejected[image] = reason
+        self.rejected[image] = shortened(reason)

@@ -15,12 +15,14 @@ from pano_mvs.engine.execute import arguments_of
 from pano_mvs.engine.executors.capture import tail
 from pano_mvs.engine.executors.protocol import Executor, Job, Outcome
 from pano_mvs.engine.memory import size_text
-from pano_mvs.engine.store import Store
-from pano_mvs.engine.units import Unit
+from pano_mvs.engine.store import ItemRef, Store
+from pano_mvs.engine.units import PENDING, Unit
+from pano_mvs.scene import Record
 
 LOG_FOLDER = "logs"
 _SHOWN_LINES = 20
 _TRIES_AFTER_DEATH = 2
+_COUNTED_BYTES = 300_000_000  # what reading inputs takes counts from here on; every worker has room for less
 _NOT_IN_NAMES = re.compile(r'[<>:"\\|?*\x00-\x1f]')
 
 
@@ -59,6 +61,8 @@ class Desk:
         self._out: dict[int, _Out] = {}
         self._next = 0
         self._free_bytes = 0
+        self._loading_bytes: dict[str, int] = {}  # of inputs, by their digest
+        self._latest = ("", 0)  # the key of the unit that was asked for last, and its memory
 
     def __len__(self) -> int:
         """Return how many jobs are out."""
@@ -71,7 +75,7 @@ class Desk:
 
     def fits(self, unit: Unit) -> bool:
         """Return whether a unit's declared memory is free beside that of those that are out."""
-        wanted = memory_of(unit, self._store)
+        wanted = self._memory_of(unit)
         if not wanted:
             return True
         used = sum(out.memory_bytes for out in self._out.values())
@@ -81,7 +85,7 @@ class Desk:
 
     def refusal(self, unit: Unit) -> str:
         """Return why a unit that does not fit, though nothing else is out, cannot run at all."""
-        wanted, free = size_text(memory_of(unit, self._store)), size_text(self._free_bytes)
+        wanted, free = size_text(self._memory_of(unit)), size_text(self._free_bytes)
         return (
             f"it declares {wanted} of memory, and {free} are free. Close other programs, use smaller pictures or "
             f"settings, or say with `memory:` in stage {unit.entry.name!r} what it really needs"
@@ -93,7 +97,7 @@ class Desk:
         log = self._store.blobs.temporary / f"log-{uuid.uuid4().hex}.txt"
         job = Job(self._next, unit, threads, unit.entry.policy.timeout_s, log, self._plugins)
         self._next += 1
-        self._out[job.number] = _Out(job, memory_of(unit, self._store))
+        self._out[job.number] = _Out(job, self._memory_of(unit))
         self._executor.submit(job)
 
     def take(self, timeout_s: float | None = None) -> Ended | None:
@@ -120,6 +124,32 @@ class Desk:
                 out.job.log.unlink(missing_ok=True)
         self._out.clear()
 
+    def _memory_of(self, unit: Unit) -> int:
+        """Return the bytes that a unit takes, as far as anybody says so; 0 if nobody does."""
+        if self._latest[0] != unit.key:
+            loading = 0 if unit.entry.policy.memory_bytes else self._loading_of(unit)
+            counted = loading if loading >= _COUNTED_BYTES else 0
+            self._latest = unit.key, memory_of(unit, self._store) + counted
+        return self._latest[1]
+
+    def _loading_of(self, unit: Unit) -> int:
+        """Return the most that reading one of a unit's inputs takes for a moment."""
+        most = 0
+        for port in unit.entry.spec.ports:
+            value = unit.inputs.get(port.name)
+            if value is None or port.kind.loading_bytes is Record.loading_bytes:
+                continue
+            for ref in [value] if isinstance(value, ItemRef) else value.values():
+                if ref is PENDING:
+                    continue
+                if ref.digest not in self._loading_bytes:
+                    try:
+                        self._loading_bytes[ref.digest] = self._store.load(ref, port.kind).loading_bytes()
+                    except DamagedBlobError:
+                        continue  # the unit meets it too, and is computed again with what it reads
+                most = max(most, self._loading_bytes[ref.digest])
+        return most
+
     def _keep_log(self, job: Job) -> tuple[Path | None, tuple[str, ...]]:
         """Move what a unit printed into the output folder; of an earlier run there is nothing left."""
         unit = job.unit
@@ -144,7 +174,8 @@ def memory_of(unit: Unit, store: Store) -> int:
     if stated or spec.memory_needed is None:
         return stated or spec.memory_bytes
     try:
-        return spec.memory_needed(unit.entry.params, arguments_of(unit, store))
+        inputs = {"item": unit.source} if unit.source is not None else arguments_of(unit, store)
+        return spec.memory_needed(unit.entry.params, inputs)
     except DamagedBlobError:
         return 0  # the unit meets it too, and is computed again with what it reads
 

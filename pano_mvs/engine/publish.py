@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 from pano_mvs.core.errors import StoreError, UsageError
 from pano_mvs.core.files import OUTPUT_MARK, clear_abandoned, copy_file, set_aside
@@ -17,6 +18,17 @@ from pano_mvs.scene import Files
 from pano_mvs.scene.files import item_stems
 
 _PLACEHOLDER = re.compile(r"\{(?:item|name)\}")
+
+
+class _Owner(NamedTuple):
+    """The unit that a file is of."""
+
+    stage: str
+    item: str
+
+
+class NameClashError(UsageError):
+    """A unit would write a file where another unit of its stage, or itself, writes one."""
 
 
 class Publisher:
@@ -45,8 +57,10 @@ class Publisher:
         self.published: dict[str, str] = {}
         self.earlier: Mapping[str, str] = {}
         self.set_aside: dict[str, str] = {}
-        self._owners: dict[str, str] = {}
+        self._owners: dict[str, _Owner] = {}
+        self._folders: set[str] = set()
         self._stems: dict[str, str] = {}
+        self._ranks: dict[str, int] = {}
         try:
             out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -66,24 +80,79 @@ class Publisher:
     def name_items(self, names: Iterable[str]) -> None:
         """Fix the `{item}` of each image: its path without the extension, kept where two would collide."""
         self._stems = item_stems(names)
+        self._ranks = {name: rank for rank, name in enumerate(self._stems)}
 
-    def publish(self, stage: str, item: str, ref: ItemRef, *, to: str = "") -> None:
+    def publish(self, stage: str, item: str, ref: ItemRef, *, to: str = "") -> Mapping[str, str]:
         """Write the files of one unit, unless they are there with the right bytes.
 
+        Where two units of one stage write the same file, that of the image that comes first in the capture is
+        written, whichever of them was computed first.
+
+        Returns:
+            The units of the same stage that were published before and are not any more, since files of theirs clash
+            with those of this one: item to the reason.
+
         Raises:
+            NameClashError: if files of this unit clash with one another, or with those of a unit that comes first;
+                nothing is written then.
             UsageError: if two stages write the same file.
             StoreError: if a file cannot be written.
             DamagedBlobError: if the store's copy is damaged.
         """
+        owner = _Owner(stage, item)
+        files: dict[str, BlobRef] = {}
         for target, blob in self._files(ref):
             name = str(PurePosixPath(to) / self._placed(target, item))
-            owner = self._owners.setdefault(name, f"{stage}:{item}")
-            if owner != f"{stage}:{item}":
-                other = owner.partition(":")[0]
-                raise UsageError(f"stages {other!r} and {stage!r} both write {name}; give one a folder of its own "
-                                 "with `to: NAME`")  # fmt: skip
+            if name in files:
+                raise NameClashError(f"it delivers {name} twice. Give each of its files a name of its own")
+            files[name] = blob
+        losers = self._resolved_clashes(owner, files)
+        for loser in losers:
+            self._withdraw(_Owner(stage, loser))
+        for name, blob in files.items():
+            self._owners[name] = owner
+            self._folders.update(_folders_of(name))
             self._write(name, blob)
             self.published[name] = blob.digest
+        return losers
+
+    def _resolved_clashes(self, owner: _Owner, files: Mapping[str, BlobRef]) -> dict[str, str]:
+        """Return the items that have to give way to a unit, each with the reason; raise if the unit has to."""
+        losers: dict[str, str] = {}
+        for what, other in self._clashes(owner, files):
+            if other.stage != owner.stage:
+                raise UsageError(f"stages {other.stage!r} and {owner.stage!r} both write {what}; give one a folder of "
+                                 "its own with `to: NAME`")  # fmt: skip
+            if self._order(owner) > self._order(other):
+                raise NameClashError(_clash(what, other.item))
+            losers[other.item] = _clash(what, owner.item)
+        return losers
+
+    def _clashes(self, owner: _Owner, files: Mapping[str, BlobRef]) -> Iterator[tuple[str, _Owner]]:
+        """Yield what clashes, in words, with the unit whose file it is already."""
+        for name in files:
+            if (other := self._owners.get(name)) is not None and other != owner:
+                yield name, other
+            for folder in _folders_of(name):
+                if folder in files:
+                    raise NameClashError(f"it delivers {folder} as a file and {name} inside of it. Rename one of them")
+                if (other := self._owners.get(folder)) is not None and other != owner:
+                    yield f"{folder}, as a file and as a folder,", other
+            if name in self._folders:
+                inside = {other for path, other in self._owners.items() if path.startswith(f"{name}/")}
+                yield from ((f"{name}, as a file and as a folder,", other) for other in sorted(inside - {owner}))
+
+    def _order(self, owner: _Owner) -> tuple[int, str]:
+        return self._ranks.get(owner.item, len(self._ranks)), owner.item
+
+    def _withdraw(self, owner: _Owner) -> None:
+        """Take the files of a unit out of the output folder again."""
+        for name in [name for name, found in self._owners.items() if found == owner]:
+            del self._owners[name], self.published[name]
+            with suppress(ValueError):
+                self.written.remove(name)
+            (self.out / name).unlink(missing_ok=True)
+            self._remove_emptied([name])
 
     def remove_stale(self, earlier: dict[str, str]) -> list[str]:
         """Delete files that an earlier run wrote and this one did not, if nobody has changed them since.
@@ -155,6 +224,16 @@ class Publisher:
 
     def _is_stored(self, path: Path, digest: str, suffix: str) -> bool:
         return self.store.blobs.exists(BlobRef(digest, path.stat().st_size, suffix))
+
+
+def _folders_of(name: str) -> list[str]:
+    """Return the folders that a file is in, below the output folder."""
+    return [str(folder) for folder in PurePosixPath(name).parents if folder.parts]
+
+
+def _clash(what: str, other: str) -> str:
+    return (f"{what} is delivered for {other} too. Rename one of the images or their folders, or, in the stage, put "
+            "{item} or {name} into the names of the files")  # fmt: skip
 
 
 def _is_inside(path: Path, folder: Path) -> bool:

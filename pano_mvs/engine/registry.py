@@ -20,6 +20,7 @@ from types import ModuleType
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import PluginError
 from pano_mvs.core.parts import PartMark, marks_of, set_unusable_parts
+from pano_mvs.core.text import shortened
 from pano_mvs.engine.code_digest import code_digest
 from pano_mvs.engine.plugin_files import (
     PLUGINS_VARIABLE,
@@ -223,7 +224,7 @@ class Registry:
 
 
 def _broken(origin: str, names: tuple[tuple[str, str], ...], error: BaseException) -> Plugin:
-    summary = " ".join(f"{type(error).__name__}: {error}".split())
+    summary = shortened(" ".join(f"{type(error).__name__}: {error}".split()))
     return Plugin(origin, tuple(dict.fromkeys(names)), summary, _trace(error))
 
 
@@ -296,4 +297,5 @@ def _where(error: BaseException, path: Path) -> str:
     own = [frame for frame in frames if Path(frame.filename) == path.absolute()]
     place = f"{path}:{own[-1].lineno}: " if own else ""
     deeper = own and own[-1] is not frames[-1] and "importlib" not in frames[-1].filename
-    return f"{place}{type(error).__name__}: {error}" + (f"\n{_trace(error).rstrip()}" if deeper else "")
+    text = f"{place}{type(error).__name__}: {shortened(str(error))}"
+    return f"{text}\n{_trace(error).rstrip()}" if deeper else text

@@ -12,10 +12,11 @@ from pano_mvs.engine.events import Failure
 from pano_mvs.engine.executors.protocol import Outcome
 from pano_mvs.engine.executors.unit_text import input_blobs
 from pano_mvs.engine.failures import lost
-from pano_mvs.engine.publish import Publisher
+from pano_mvs.engine.publish import NameClashError, Publisher
 from pano_mvs.engine.store import Store, UnitRecord
 from pano_mvs.engine.tally import Tally
 from pano_mvs.engine.units import Unit
+from pano_mvs.engine.workflow import StageEntry
 from pano_mvs.scene import Axis, Files
 
 _STOPPING = {error.__name__: error for error in (StoreError, GateError, UsageError)}
@@ -144,13 +145,26 @@ class Scheduler:
     def _accept(self, unit: Unit, record: UnitRecord, *, was_computed: bool) -> None:
         if issubclass(unit.entry.spec.output, Files):
             try:
-                self._publisher.publish(unit.entry.name, unit.item, record.output, to=unit.entry.policy.to)
+                losers = self._publisher.publish(unit.entry.name, unit.item, record.output, to=unit.entry.policy.to)
+            except NameClashError as error:
+                self._fail(Ended(unit, Outcome("failed", cause=str(error), seconds=record.seconds), None, ()))
+                return
             except DamagedBlobError as error:
                 self._store.drop(record.key)
                 self.damaged.append(str(error))
                 return
+            for item, cause in losers.items():
+                self._give_way(unit.entry, item, cause)
         self._tally.unit_done(unit.entry, unit.item, record, "run" if was_computed else "cached")
         self._board.finish(unit, record)
+
+    def _give_way(self, entry: StageEntry, item: str, cause: str) -> None:
+        """List a unit as failed that had a result: its files clash with those of a unit that comes first."""
+        was_computed = self.keys.get(entry.name, {}).get(item) in self.computed
+        self._tally.unit_withdrawn(Failure(entry.name, item, cause, consequence=lost(entry, item)), was_computed)
+        self._board.withdraw(entry.name, item, cause)
+        if entry.policy.on_error == "stop":
+            raise GateError(f"stage {entry.name!r} has on_error: stop, and {entry.name}:{item} failed: {cause}")
 
     def _doubt(self, unit: Unit) -> None:
         """Have all computed again that could have led a unit to something damaged, lest it leads there again."""

@@ -40,7 +40,7 @@ class SourceItem:
 
 ListItems = Callable[[Any], Iterable[SourceItem]]
 MemoryNeeded = Callable[[Any, Mapping[str, Any]], int]
-"""Takes a unit's params and its inputs by port; returns bytes."""
+"""Takes a unit's params and its inputs by port, those of a source as {"item": SourceItem}; returns bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,16 +131,19 @@ def stage(name: str, *, version: int = 1, memory: str | int | MemoryNeeded = 0) 
     return decorate
 
 
-def source(name: str, *, list_items: ListItems, version: int = 1) -> Callable[[Function], Function]:
+def source(
+    name: str, *, list_items: ListItems, version: int = 1, memory: str | int | MemoryNeeded = 0
+) -> Callable[[Function], Function]:
     """Declare a function as a source: `list_items(params)` names the items, the function reads one of them.
 
     The function takes `item: SourceItem`, `params` and `ctx`, and returns a kind of the image axis. The list is made
-    anew at each run; reading an item is cached by the content of its files.
+    anew at each run; reading an item is cached by the content of its files. `memory` is as in `stage`; a function is
+    given `{"item": item}` as inputs.
     """
 
     def decorate(function: Function) -> Function:
         signature = _read_signature(function, name, leading="item")
-        setattr(function, _ATTRIBUTE, _spec(name, version, function, signature, list_items))
+        setattr(function, _ATTRIBUTE, _spec(name, version, function, signature, list_items, memory))
         return function
 
     return decorate

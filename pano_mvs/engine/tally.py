@@ -107,6 +107,17 @@ class Tally:
         self._observer.unit_failed(failure)
         self._observer.unit_finished(failure.stage, failure.item, "failed", seconds)
 
+    def unit_withdrawn(self, failure: Failure, was_computed: bool) -> None:
+        """Note that a unit counts as failed that was noted with a result."""
+        count = self._counts[failure.stage]
+        count.summary.run -= was_computed
+        count.summary.cached -= not was_computed
+        count.summary.failed += 1
+        for found in (count.metrics, count.notes, count.rejected, count.doubts):
+            found.pop(failure.item, None)
+        self._result.failures.append(failure)
+        self._observer.unit_failed(failure)
+
     def stage_complete(self, entry: StageEntry) -> None:
         """Sum a stage up.
 

@@ -13,6 +13,7 @@ from pano_mvs.core.files import OUTPUT_MARK
 from pano_mvs.io.containers import read_container
 from pano_mvs.io.exif import orientation_from_exif, position_from_exif
 from pano_mvs.io.gpano import GPano, find_gpano, read_file
+from pano_mvs.scene.decoding import MAX_PIXELS, check_stated_size
 from pano_mvs.scene.image_file import decode_image
 
 PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif", ".heic", ".heif"})
@@ -79,20 +80,28 @@ def natural_key(name: str) -> tuple[list[tuple[int, int, str]], str]:
     return [(0, int(chunk), "") if chunk.isdecimal() else (1, 0, chunk) for chunk in chunks if chunk], name
 
 
-def describe_picture(path: Path) -> PictureInfo:
+def describe_picture(path: Path, *, max_pixels: int = MAX_PIXELS) -> PictureInfo:
     """Return what is known of a panorama without decoding it (but for HEIC and AVIF).
 
     A picture is a panorama if its GPano metadata say so, whole or cropped, or, with a warning, if it is exactly
     twice as wide as high.
 
+    Args:
+        path: the file.
+        max_pixels: larger pictures are refused.
+
     Raises:
-        InputError: if the file cannot be read, is no picture, or is no equirectangular panorama.
+        InputError: if the file cannot be read, is no picture, is larger than the limit, or is no equirectangular
+            panorama.
     """
     data = read_file(path)
+    check_stated_size(data, path, max_pixels)
     container = read_container(data)
     gpano, warnings = find_gpano(container.xmp, data)
+    if container.warning:
+        warnings = (container.warning, *warnings)
     del data  # decoding reads it anew
-    size = container.size_hw or decode_image(path).shape[:2]
+    size = container.size_hw or decode_image(path, max_pixels=max_pixels).shape[:2]
     height, width = int(size[0]), int(size[1])
     if gpano is not None and gpano.projection_type != "equirectangular":
         raise InputError(f"{path}: its metadata say that it is {gpano.projection_type}, not equirectangular. "

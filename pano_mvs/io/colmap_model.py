@@ -1,4 +1,4 @@
-"""COLMAP sparse models with EQUIRECTANGULAR cameras: written and read through pycolmap."""
+"""COLMAP sparse models with EQUIRECTANGULAR cameras: written through pycolmap, read by `colmap_files`."""
 
 from __future__ import annotations
 
@@ -10,15 +10,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, UsageError
-from pano_mvs.geometry import pixel_from_ray, ray_from_pixel
+from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_from_pixel
 from pano_mvs.io.captures import natural_key
+from pano_mvs.io.colmap_files import (
+    ModelCamera,
+    ModelImage,
+    ModelPoints3D,
+    model_files,
+    read_cameras,
+    read_images,
+    read_points,
+)
 from pano_mvs.io.colmap_points import ModelForm, ModelPoints, write_model
 from pano_mvs.io.colmap_sphere import has_sphere_cameras, read_sphere_model
 from pano_mvs.io.pose_json import require_distinct
 from pano_mvs.scene import Poses
 
 _MAX_QUAT_ERROR = 1e-3
-_MODEL_FILES = (("cameras.bin", "images.bin", "points3D.bin"), ("cameras.txt", "images.txt", "points3D.txt"))
+_MAX_ERROR_PX = 1e9
 
 
 def write_colmap_model(
@@ -72,30 +81,35 @@ def read_colmap_model(folder: Path) -> Poses:
     """
     if is_colmap_model(folder) and has_sphere_cameras(folder):
         return read_sphere_model(folder)
-    model = _loaded(folder)
-    for camera_id, camera in sorted(model.cameras.items()):
-        if camera.model_name != "EQUIRECTANGULAR":
-            raise InputError(f"{folder}: camera {camera_id} is {camera.model_name}, expected EQUIRECTANGULAR. Only "
-                             "models of panoramas can be used")  # fmt: skip
-    images = sorted((model.images[idx] for idx in model.reg_image_ids()), key=lambda image: natural_key(image.name))
+    files = model_files(folder)
+    if files is None:
+        raise InputError(f"{folder}: no COLMAP model here. Give the folder that holds cameras, images and points3D as "
+                         ".bin or .txt (often sparse/0)")  # fmt: skip
+    cameras = read_cameras(files[0])
+    for camera_id, camera in sorted(cameras.items()):
+        if camera.model != "EQUIRECTANGULAR":
+            raise InputError(f"{folder}: camera {camera_id} is {camera.model}, expected EQUIRECTANGULAR. Only models "
+                             "of panoramas can be used")  # fmt: skip
+    by_id = read_images(files[1])
+    images = sorted(by_id.values(), key=lambda image: natural_key(image.name))
     if not images:
         raise InputError(f"{folder}: the model registers no image")
     require_distinct([image.name for image in images], folder)
+    poses = [_pose(image) for image in images]
     for image in images:
-        if abs(np.linalg.norm(image.cam_from_world().rotation.quat) - 1) > _MAX_QUAT_ERROR:
-            raise InputError(f"{folder}: image {image.name}: its quaternion has not length 1. Write the model anew")
-    point_ids = sorted(model.points3D)
-    point_idx = {point_id: idx for idx, point_id in enumerate(point_ids)}
-    points = [model.points3D[point_id] for point_id in point_ids]
-    tracks = [_observations(model, image, point_idx) for image in images]
-    errors_rad = [point.error * _mean_rad_per_px(model, point) if point.error > 0 else 0.0 for point in points]
+        if image.camera_id not in cameras:
+            raise InputError(f"{image.where}: its camera {image.camera_id} is not in {files[0].name}. Do the files "
+                             "belong together?")  # fmt: skip
+    points = read_points(files[2])
+    tracks = [_observations(image, cameras[image.camera_id], points, files[2]) for image in images]
+    width_by_id = {image_id: cameras[image.camera_id].size_hw[1] for image_id, image in by_id.items()}
     return Poses(
         names=tuple(image.name for image in images),
-        rotations=np.array([image.cam_from_world().rotation.matrix() for image in images]),
-        translations=np.array([image.cam_from_world().translation for image in images]),
-        points_in_world=np.array([point.xyz for point in points], np.float64).reshape(-1, 3),
-        point_colors_rgb=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
-        point_errors_rad=np.array(errors_rad, np.float32),
+        rotations=np.array([pose.rotation for pose in poses]),
+        translations=np.array([pose.translation for pose in poses]),
+        points_in_world=points.xyz,
+        point_colors_rgb=points.rgb,
+        point_errors_rad=_errors_rad(points, width_by_id, files[2]),
         track_point_idx=np.concatenate([indices for indices, _ in tracks]),
         track_image_idx=np.repeat(np.arange(len(images), dtype=np.int32), [len(indices) for indices, _ in tracks]),
         track_bearings=np.concatenate([bearings for _, bearings in tracks]),
@@ -108,7 +122,7 @@ def read_colmap_model(folder: Path) -> Poses:
 
 def is_colmap_model(folder: Path) -> bool:
     """Return whether a folder holds the files of a COLMAP model."""
-    return any(all((folder / name).is_file() for name in names) for names in _MODEL_FILES)
+    return model_files(folder) is not None
 
 
 def _add_cameras(model: Any, sizes_hw: list[tuple[int, int]]) -> dict[tuple[int, int], int]:
@@ -126,27 +140,47 @@ def _add_cameras(model: Any, sizes_hw: list[tuple[int, int]]) -> dict[tuple[int,
     return ids
 
 
-def _loaded(folder: Path) -> Any:
-    import pycolmap
-
-    if not is_colmap_model(folder):
-        raise InputError(f"{folder}: no COLMAP model here. Give the folder that holds cameras, images and points3D as "
-                         ".bin or .txt (often sparse/0)")  # fmt: skip
-    try:
-        return pycolmap.Reconstruction(str(folder))
-    except (RuntimeError, ValueError, IndexError, MemoryError) as error:
-        raise InputError(f"{folder}: the COLMAP model cannot be read ({error}). Is it complete?") from error
+def _pose(image: ModelImage) -> Rigid3:
+    pose = image.cam_from_world()
+    if np.abs(image.quat_wxyz).max() > 2 or abs(np.linalg.norm(image.quat_wxyz) - 1) > _MAX_QUAT_ERROR:
+        raise InputError(f"{image.where}: its quaternion has not length 1. Write the model anew")
+    return pose
 
 
-def _observations(model: Any, image: Any, point_idx: dict[int, int]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """Return the points that an image observes, and the bearings of the observations."""
-    camera = model.cameras[image.camera_id]
-    observed = [(point_idx[p.point3D_id], p.xy) for p in image.points2D if p.has_point3D()]
-    pixels = np.array([xy for _, xy in observed], np.float64).reshape(-1, 2)
-    indices = np.array([idx for idx, _ in observed], np.int32)
-    return indices, ray_from_pixel(pixels, (camera.height, camera.width))
+def _observations(
+    image: ModelImage, camera: ModelCamera, points: ModelPoints3D, path: Path
+) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """Return the points that an image observes, and the bearings of the observations.
+
+    Raises:
+        InputError: if there is no such point.
+    """
+    observed = image.point_ids >= 0
+    ids = image.point_ids[observed]
+    idx = np.searchsorted(points.ids, ids)
+    unknown = np.append(points.ids, -1)[idx] != ids
+    if unknown.any():
+        raise InputError(f"{image.where}: observes point {ids[unknown][0]}, which {path.name} does not have. Do the "
+                         "files belong together?")  # fmt: skip
+    return idx.astype(np.int32), ray_from_pixel(image.pixels[observed], camera.size_hw).reshape(-1, 3)
 
 
-def _mean_rad_per_px(model: Any, point: Any) -> float:
-    widths = [model.cameras[model.images[element.image_id].camera_id].width for element in point.track.elements]
-    return 2 * np.pi / float(np.mean(widths)) if widths else 0.0
+def _errors_rad(points: ModelPoints3D, width_by_id: Mapping[int, int], path: Path) -> NDArray[np.float32]:
+    """Return the errors of points as angles, by the mean width of the images that observe each; 0 where not known.
+
+    Raises:
+        InputError: if a track names an image that there is not.
+    """
+    observers, which = np.unique(points.track_image_ids, return_inverse=True)
+    unknown = next((image_id for image_id in observers.tolist() if image_id not in width_by_id), None)
+    if unknown is not None:
+        raise InputError(f"{path}: a point is observed by image {unknown}, which is not in the model. Do the files "
+                         "belong together?")  # fmt: skip
+    widths = np.array([width_by_id[image_id] for image_id in observers.tolist()], np.float64)[which]
+    of_point = np.repeat(np.arange(len(points.ids)), points.track_lengths)
+    sums = np.bincount(of_point, widths, minlength=len(points.ids))
+    known = (points.errors_px > 0) & np.isfinite(points.errors_px) & (sums > 0)
+    rad_per_px = 2 * np.pi * points.track_lengths[known] / sums[known]
+    errors = np.zeros(len(points.ids))
+    errors[known] = np.minimum(points.errors_px[known], _MAX_ERROR_PX) * rad_per_px
+    return errors.astype(np.float32)

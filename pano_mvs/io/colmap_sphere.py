@@ -7,22 +7,17 @@ COLMAP number 11 is another model with more of them, so that pycolmap cannot rea
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-
 from pano_mvs.core.errors import InputError
-from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
 from pano_mvs.io.captures import natural_key
-from pano_mvs.io.pose_json import require_distinct, rigid_from_arrays
+from pano_mvs.io.colmap_files import read_images
+from pano_mvs.io.pose_json import require_distinct
 from pano_mvs.scene import Poses
 
 _SPHERE_NAME, _SPHERE_ID, _SPHERE_PARAMS = "SPHERE", 11, 3
 _CAMERA = struct.Struct("<IiQQ3d")
 _COUNT = struct.Struct("<Q")
-_IMAGE = struct.Struct("<I7dI")
-_BYTES_PER_POINT2D = 24
 
 
 def has_sphere_cameras(folder: Path) -> bool:
@@ -49,14 +44,7 @@ def read_sphere_model(folder: Path) -> Poses:
     """
     binary = folder / "images.bin"
     path = binary if binary.is_file() else folder / "images.txt"
-    try:
-        found = list(_binary_images(path) if path == binary else _text_images(path))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    except (struct.error, UnicodeDecodeError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path}: the images cannot be read ({error}). Is the file complete?") from error
+    found = [(image.name, image.cam_from_world()) for image in read_images(path).values()]
     require_distinct([name for name, _ in found], path)
     return Poses.without_points(
         dict(sorted(found, key=lambda item: natural_key(item[0]))),
@@ -73,40 +61,6 @@ def _is_sphere_binary(data: bytes) -> bool:
     if count == 0 or len(data) != _COUNT.size + count * _CAMERA.size:
         return False
     return all(_CAMERA.unpack_from(data, _COUNT.size + n * _CAMERA.size)[1] == _SPHERE_ID for n in range(count))
-
-
-def _binary_images(path: Path) -> Iterator[tuple[str, Rigid3]]:
-    data = path.read_bytes()
-    (count,) = _COUNT.unpack_from(data)
-    offset = _COUNT.size
-    for _ in range(count):
-        values = _IMAGE.unpack_from(data, offset)
-        end = data.index(b"\0", offset + _IMAGE.size)
-        name = data[offset + _IMAGE.size : end].decode()
-        (points,) = _COUNT.unpack_from(data, end + 1)
-        offset = end + 1 + _COUNT.size + points * _BYTES_PER_POINT2D
-        if offset > len(data):
-            raise InputError(f"{path}: ends within image {name!r}. Is the file complete?")
-        yield _posed(name, np.array(values[1:8]), f"{path} ({name})")
-
-
-def _text_images(path: Path) -> Iterator[tuple[str, Rigid3]]:
-    """Yield the poses of an images.txt: two lines for each image, the second its key points, which may be empty."""
-    lines = [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
-    for line in lines[::2]:
-        cells = line.split(maxsplit=9)
-        if not cells:
-            continue
-        if len(cells) < 10:
-            raise InputError(f"{path}: expected an id, a quaternion, a translation, a camera and a name, got {line!r}")
-        yield _posed(cells[9], np.array([float(cell) for cell in cells[1:8]]), f"{path} ({cells[9]})")
-
-
-def _posed(name: str, numbers: np.ndarray, where: str) -> tuple[str, Rigid3]:
-    quat_wxyz = numbers[:4]
-    if not np.isfinite(quat_wxyz).all() or np.linalg.norm(quat_wxyz) < 1e-6:
-        raise InputError(f"{where}: its quaternion is no rotation")
-    return name, rigid_from_arrays(rotation_from_quat_wxyz(quat_wxyz), numbers[4:], where)
 
 
 def _content_lines(path: Path) -> list[tuple[int, str]]:

@@ -12,14 +12,14 @@ import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from pano_mvs.io.tiff_directory import open_tiff
-from pano_mvs.scene.jpeg import JPEG_FRAMES, JPEG_START, jpeg_segments
+from pano_mvs.scene.jpeg import JPEG_START, jpeg_segments
+from pano_mvs.scene.picture_header import PNG_START, TIFF_STARTS, riff_chunks, stated_size
+from pano_mvs.scene.tiff_directory import open_tiff
 
-_PNG_START = b"\x89PNG\r\n\x1a\n"
 _EXIF, _XMP, _MORE_XMP = b"Exif\0\0", b"http://ns.adobe.com/xap/1.0/\0", b"http://ns.adobe.com/xmp/extension/\0"
 _APP1 = 0xE1
-_WIDTH, _HEIGHT, _TIFF_XMP = 256, 257, 700
-_MOST_XMP_BYTES = 64 << 20
+_TIFF_XMP = 700
+_MAX_DECOMPRESSED_BYTES = 16 << 20  # of all compressed packets of a file together
 _MOST_EXIF_BYTES = 1 << 20
 _EXIF_IN_HEIF = re.compile(rb"Exif\0\0(?=II\*\0|MM\0\*)")
 
@@ -32,11 +32,13 @@ class Container:
         size_hw: (height, width) as stored, or None where only decoding tells.
         exif: EXIF metadata from their byte order on; empty where there are none.
         xmp: XMP packets, whole or with what surrounds them.
+        warning: what of the metadata was not read although it is there, and why; empty if all was.
     """
 
     size_hw: tuple[int, int] | None = None
     exif: bytes = b""
     xmp: tuple[bytes, ...] = ()
+    warning: str = ""
 
 
 def read_container(data: bytes) -> Container:
@@ -55,13 +57,10 @@ def read_container(data: bytes) -> Container:
 
 
 def _read_jpeg(data: bytes) -> Container:
-    size: tuple[int, int] | None = None
     exif = b""
     packets: list[bytes] = []
     extended: dict[bytes, dict[int, bytes]] = {}
     for marker, start, end in jpeg_segments(data):
-        if marker in JPEG_FRAMES and size is None:
-            size = _sound(*struct.unpack_from(">HH", data, start + 1))
         if marker != _APP1:
             continue
         body = data[start:end]
@@ -73,7 +72,7 @@ def _read_jpeg(data: bytes) -> Container:
             guid, offset, part = _extension(body[len(_MORE_XMP) :])
             extended.setdefault(guid, {}).setdefault(offset, part)
     joined = [b"".join(part for _, part in sorted(parts.items())) for parts in extended.values()]
-    return Container(size, exif, (*packets, *joined))
+    return Container(stated_size(data), exif, (*packets, *joined))
 
 
 def _extension(body: bytes) -> tuple[bytes, int, bytes]:
@@ -83,92 +82,67 @@ def _extension(body: bytes) -> tuple[bytes, int, bytes]:
 
 
 def _read_png(data: bytes) -> Container:
-    size: tuple[int, int] | None = None
-    exif = b""
+    exif, warning = b"", ""
     packets: list[bytes] = []
+    left = _MAX_DECOMPRESSED_BYTES
     for kind, start, end in _png_chunks(data):
-        if kind == b"IHDR":
-            width, height = struct.unpack_from(">II", data, start)
-            size = _sound(height, width)
-        elif kind == b"eXIf":
+        if kind == b"eXIf":
             exif = exif or data[start:end].removeprefix(_EXIF)
-        elif kind == b"iTXt":
-            packets.extend(_international_text(data[start:end]))
-    return Container(size, exif, tuple(packets))
+        elif kind == b"iTXt" and (text := _xmp_text(data[start:end])) is not None:
+            packet, is_compressed = text
+            if is_compressed:
+                packet = _decompressed(packet, left + 1)
+                left -= len(packet)
+            if left < 0:
+                limit = _MAX_DECOMPRESSED_BYTES >> 20
+                warning = f"its compressed XMP metadata is larger than {limit} MiB and was not read to its end"
+                break
+            packets.append(packet)
+    return Container(stated_size(data), exif, tuple(packets), warning)
 
 
 def _png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
-    offset = len(_PNG_START)
+    offset = len(PNG_START)
     while offset + 8 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, offset)
         yield kind, offset + 8, min(offset + 8 + length, len(data))
         offset += 12 + length
 
 
-def _international_text(chunk: bytes) -> Iterator[bytes]:
-    """Yield the XMP packet of a PNG's international text chunk, decompressed, if it is one."""
+def _xmp_text(chunk: bytes) -> tuple[bytes, bool] | None:
+    """Return the XMP packet in a PNG's international text chunk, and whether it is compressed; None if it has none."""
     keyword, _, rest = chunk.partition(b"\0")
     parts = rest[2:].split(b"\0", 2)
     if keyword != b"XML:com.adobe.xmp" or len(parts) != 3:
-        return
+        return None
+    return parts[2], rest[:1] == b"\1"
+
+
+def _decompressed(packet: bytes, most: int) -> bytes:
+    """Return a packet decompressed, up to a number of bytes; nothing of one that is damaged."""
     try:
-        yield zlib.decompressobj().decompress(parts[2], _MOST_XMP_BYTES) if rest[:1] == b"\1" else parts[2]
+        return zlib.decompressobj().decompress(packet, most)
     except zlib.error:
-        return
+        return b""
 
 
 def _read_webp(data: bytes) -> Container:
-    size: tuple[int, int] | None = None
     exif = b""
     packets: list[bytes] = []
-    for kind, start, end in _riff_chunks(data):
-        if kind in _WEBP_SIZES:
-            size = size or _sound(*_WEBP_SIZES[kind](data, start))
-        elif kind == b"EXIF":
+    for kind, start, end in riff_chunks(data):
+        if kind == b"EXIF":
             exif = exif or data[start:end].removeprefix(_EXIF)
         elif kind == b"XMP ":
             packets.append(data[start:end])
-    return Container(size, exif, tuple(packets))
-
-
-def _riff_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
-    offset = 12
-    while offset + 8 <= len(data):
-        kind, length = struct.unpack_from("<4sI", data, offset)
-        yield kind, offset + 8, min(offset + 8 + length, len(data))
-        offset += 8 + length + length % 2
-
-
-def _canvas(data: bytes, start: int) -> tuple[int, int]:
-    low_width, high_width, low_height, high_height = struct.unpack_from("<HBHB", data, start + 4)
-    return (high_height << 16 | low_height) + 1, (high_width << 16 | low_width) + 1
-
-
-def _lossy(data: bytes, start: int) -> tuple[int, int]:
-    width, height = struct.unpack_from("<HH", data, start + 6)
-    return height & 0x3FFF, width & 0x3FFF
-
-
-def _lossless(data: bytes, start: int) -> tuple[int, int]:
-    (bits,) = struct.unpack_from("<I", data, start + 1)
-    return (bits >> 14 & 0x3FFF) + 1, (bits & 0x3FFF) + 1
-
-
-_WEBP_SIZES: dict[bytes, Callable[[bytes, int], tuple[int, int]]] = {
-    b"VP8X": _canvas,
-    b"VP8 ": _lossy,
-    b"VP8L": _lossless,
-}
+    return Container(stated_size(data), exif, tuple(packets))
 
 
 def _read_tiff(data: bytes) -> Container:
     tiff = open_tiff(data)
     if tiff is None:
         return Container()
-    entries = tiff.directory(tiff.first)
-    height, width = tiff.integer(entries.get(_HEIGHT)), tiff.integer(entries.get(_WIDTH))
-    packet = entries.get(_TIFF_XMP)
-    return Container(_sound(height or 0, width or 0), data, () if packet is None else (tiff.raw(packet),))
+    packet = tiff.directory(tiff.first).get(_TIFF_XMP)
+    return Container(stated_size(data), data, () if packet is None else (tiff.raw(packet),))
 
 
 def _read_heif(data: bytes) -> Container:
@@ -177,14 +151,10 @@ def _read_heif(data: bytes) -> Container:
     return Container(None, b"" if found is None else data[found.end() : found.end() + _MOST_EXIF_BYTES], ())
 
 
-def _sound(height: int, width: int) -> tuple[int, int] | None:
-    return (height, width) if height and width else None
-
-
 _READERS: tuple[tuple[Callable[[bytes], bool], Callable[[bytes], Container]], ...] = (
     (lambda data: data.startswith(JPEG_START), _read_jpeg),
-    (lambda data: data.startswith(_PNG_START), _read_png),
+    (lambda data: data.startswith(PNG_START), _read_png),
     (lambda data: data.startswith(b"RIFF") and data[8:12] == b"WEBP", _read_webp),
-    (lambda data: data[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), _read_tiff),
+    (lambda data: data.startswith(TIFF_STARTS), _read_tiff),
     (lambda data: data[4:8] == b"ftyp", _read_heif),
 )

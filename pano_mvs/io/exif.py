@@ -9,7 +9,7 @@ import math
 import struct
 from collections.abc import Mapping
 
-from pano_mvs.io.tiff_directory import Entry, Tiff, open_tiff
+from pano_mvs.scene.tiff_directory import Entry, Tiff, open_tiff
 
 _ORIENTATION, _GPS_DIRECTORY = 0x0112, 0x8825
 _LATITUDE_REF, _LATITUDE, _LONGITUDE_REF, _LONGITUDE, _ALTITUDE_REF, _ALTITUDE = range(1, 7)

@@ -9,6 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.scene.decoding import MAX_PIXELS
+
+# All that the package OpenEXR raises on damaged files.
+_DAMAGE = (OSError, RuntimeError, ValueError, TypeError, LookupError, OverflowError, MemoryError)
 
 REMEDY = "EXR files need the package OpenEXR: pip install 'pano-mvs[exr]'"
 
@@ -45,14 +49,20 @@ def read_exr(path: Path) -> dict[str, NDArray[np.float32]]:
 
     Raises:
         UsageError: if OpenEXR is not installed.
-        InputError: if the file cannot be read.
+        InputError: if the file cannot be read, or its header states more pixels than are read of any picture.
     """
     if not has_exr():
         raise UsageError(REMEDY)
     import OpenEXR
 
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            (left, top), (right, bottom) = file.header()["dataWindow"]
+        width, height = int(right) - int(left) + 1, int(bottom) - int(top) + 1
+        if width * height > MAX_PIXELS:
+            raise ValueError(f"its header states {width}×{height} px, more than the limit of {MAX_PIXELS}")
+        with OpenEXR.File(str(path), separate_channels=True) as file, np.errstate(over="ignore", invalid="ignore"):
             return {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
-    except RuntimeError as error:
-        raise InputError(f"{path}: no EXR file that can be read ({error}). Write it again") from error
+    except _DAMAGE as error:
+        raise InputError(f"{path}: no EXR file that can be read ({str(error) or type(error).__name__}). Write it "
+                         "again")  from error  # fmt: skip

@@ -18,6 +18,7 @@ from pano_mvs.io.containers import read_container
 _NAMESPACE = "{http://ns.google.com/photos/1.0/panorama/}"
 _WRAPPED, _BARE = (b"<x:xmpmeta", b"</x:xmpmeta>"), (b"<rdf:RDF", b"</rdf:RDF>")
 _PACKET_BYTES = 1 << 20
+_MAX_WARNINGS = 3
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,8 @@ def find_gpano(chunks: Iterable[bytes], data: bytes = b"") -> tuple[GPano | None
             try:
                 fields = _fields(packet)
             except (ElementTree.ParseError, ValueError) as error:
-                warnings.append(f"its XMP metadata is malformed ({error}) and was ignored")
+                if len(warnings) < _MAX_WARNINGS:
+                    warnings.append(f"its XMP metadata is malformed ({error}) and was ignored")
                 continue
             if fields:
                 return _gpano(fields, warnings), tuple(warnings)

@@ -63,7 +63,7 @@ def read_ply(path: Path) -> PointCloud:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
     head, mark, body = data.partition(b"end_header\n")
-    counted = re.search(rb"^element vertex ([0-9]+)$", head, re.MULTILINE)
+    counted = re.search(rb"^element vertex ([0-9]{1,18})$", head, re.MULTILINE)
     count = int(counted[1]) if counted else 0
     layout = next((known for known in (_PLAIN, _WITH_QUALITY) if head + mark == _header(count, known)), None)
     if layout is None:

@@ -52,7 +52,7 @@ def read_ply_mesh(path: Path) -> MeshArrays:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
     head, mark, body = data.partition(b"end_header\n")
-    counts = [int(count) for count in re.findall(rb"^element (?:vertex|face) ([0-9]+)$", head, re.MULTILINE)]
+    counts = [int(count) for count in re.findall(rb"^element (?:vertex|face) ([0-9]{1,18})$", head, re.MULTILINE)]
     layouts = [
         layout
         for line, layout in _FACE_PROPERTIES.items()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,7 @@ _NUMBERS = {
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _MARK = b"end_header"
 _LONGEST_HEAD = 1 << 20
+_COUNT = re.compile("[0-9]{1,18}")
 
 
 class _Layout(NamedTuple):
@@ -75,7 +77,8 @@ class PlyPoints:
 
     def _stacked(self, names: tuple[str, ...], part: slice) -> NDArray[np.float32]:
         chosen = self.vertices[part]
-        return np.stack([chosen[name].astype(np.float32) for name in names], axis=-1)
+        with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite is refused
+            return np.stack([chosen[name].astype(np.float32) for name in names], axis=-1)
 
 
 def read_ply_points(path: Path) -> NDArray[np.float32]:
@@ -122,11 +125,11 @@ def _binary_vertices(path: Path, offset: int, size: int, layout: _Layout) -> NDA
 
 def _text_vertices(path: Path, offset: int, layout: _Layout) -> NDArray[np.void] | None:
     lines = path.read_bytes()[offset:].splitlines()[: layout.points]
+    if len(lines) < layout.points:
+        return None
     try:
         rows = [tuple(float(number) for number in line.split()) for line in lines]
-        return (
-            np.array(rows, [(name, "f8") for name in layout.vertex.names or ()]) if len(rows) == layout.points else None
-        )
+        return np.array(rows, [(name, "f8") for name in layout.vertex.names or ()])
     except ValueError:  # a line that is cut off, or holds no numbers
         return None
 
@@ -143,12 +146,14 @@ def _layout(lines: list[str], path: Path) -> _Layout:
     if words[:1] != [["ply"]] or form not in _ORDERS or not elements:
         raise InputError(f"{path}: not a PLY file: its header names no known format or no element")
     first = words[elements[0]]
-    if first[1] != "vertex" or not first[2].isdigit():
-        raise InputError(f"{path}: the first element of a PLY file must be its vertices, this has '{' '.join(first)}'")
+    if first[1:2] != ["vertex"] or len(first) != 3 or not _COUNT.fullmatch(first[2]):
+        raise InputError(f"{path}: the first element of a PLY file must be its vertices with their number, this has "
+                         f"'{' '.join(first)[:80]}'")  # fmt: skip
     properties = words[elements[0] + 1 : elements[1] if len(elements) > 1 else len(words)]
     if not all(len(word) == 3 and word[0] == "property" and word[1] in _NUMBERS for word in properties):
         raise InputError(f"{path}: its vertices have lists or properties of unknown types: write plain numbers")
+    names = [word[2] for word in properties]
+    if len(set(names)) < len(names) or not {"x", "y", "z"} <= set(names):
+        raise InputError(f"{path}: its vertices lack x, y or z, or have a property twice")
     vertex = np.dtype([(word[2], _ORDERS[form] + _NUMBERS[word[1]]) for word in properties])
-    if not {"x", "y", "z"} <= set(vertex.names or ()):
-        raise InputError(f"{path}: its vertices lack x, y or z")
     return _Layout(int(first[2]), vertex, form == "ascii")

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.core.text import shortened
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
 from pano_mvs.io.colmap_model import is_colmap_model, read_colmap_model
 from pano_mvs.io.opensfm import is_opensfm, opensfm_poses
@@ -149,8 +150,8 @@ def _pose_from_row(row: list[str], where: str) -> Rigid3:
     try:
         numbers = np.array([float(cell) for cell in row[1:]])
     except ValueError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise InputError(f"{where}: {shortened(str(error), 200)}") from error
     quat_wxyz = numbers[3:]
-    if not np.isfinite(numbers).all() or np.linalg.norm(quat_wxyz) < 1e-6:
+    if not np.isfinite(numbers).all() or not 1e-6 < np.abs(quat_wxyz).max() < 1e100:
         raise InputError(f"{where}: the pose of {row[0]} has no finite numbers, or a quaternion of length 0")
     return rigid_from_arrays(rotation_from_quat_wxyz(quat_wxyz), numbers[:3], where)

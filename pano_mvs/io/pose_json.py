@@ -113,9 +113,11 @@ def read_transforms(path: Path) -> dict[str, Rigid3]:
             raise InputError(f"{where} ({name}): camera_model is {model}, expected EQUIRECTANGULAR. Only panoramas "
                              "can be used")  # fmt: skip
         matrix = number_array(frame, "transform_matrix", (4, 4), where)
+        if not np.isfinite(matrix).all():
+            raise InputError(f"{where} ({name}): the pose holds NaN or infinite numbers")
         if not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
             raise InputError(f"{where}: the last row of transform_matrix must be 0 0 0 1. Is the matrix transposed?")
-        world_from_cam = rigid_from_arrays(matrix[:3, :3] @ _CAM_FROM_OPENGL, matrix[:3, 3], where)
+        world_from_cam = rigid_from_arrays(matrix[:3, :3] @ _CAM_FROM_OPENGL, matrix[:3, 3], f"{where} ({name})")
         poses.append((name, world_from_cam.inverse()))
     require_distinct([name for name, _ in poses], path)
     return dict(poses)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.scene.decoding import decode_picture
 
 _DEFLATE = 8  # TIFF's code for the compression that every reader has (zlib)
 _LARGEST_STEP = 65535
@@ -158,10 +159,7 @@ def _decoded(path: Path) -> NDArray[np.generic] | None:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
-    if not data:
-        return None
-    array: NDArray[np.generic] | None = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    return array
+    return decode_picture(data, path, cv2.IMREAD_UNCHANGED)
 
 
 def _encoded(suffix: str, array: NDArray[np.generic], options: list[int]) -> bytes:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
@@ -17,14 +15,14 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.io.captures import PICTURE_SUFFIXES
 from pano_mvs.io.exr import read_exr
+from pano_mvs.io.npy import keys_of_npz, read_npy, read_npz
 from pano_mvs.io.range_files import read_confidence_png
+from pano_mvs.scene.decoding import decode_picture
 
 RANGE_SUFFIXES = (".tiff", ".tif", ".exr", ".npy", ".npz", ".png")
 """What files of ranges are called; of two for one picture the earlier is taken."""
 
 _PICTURES = frozenset({*RANGE_SUFFIXES, *PICTURE_SUFFIXES, ".heic"})
-# All that zipfile, zlib and the .npy reader raise on damaged files.
-_DAMAGE = (OSError, ValueError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 # Channels of an EXR file that may be meant, where it holds several.
 _EXR_CHANNELS = ("range", "depth", "distance", "Z", "Depth.Z", "V", "Y", "R")
 
@@ -58,7 +56,8 @@ class RangeFile:
             raise InputError(f"{self.path}: holds {array.shape} {array.dtype}, not a map of ranges (height, width) in "
                              "floats or 16-bit steps. Write ranges as float TIFF, EXR or NPY, or as 16-bit PNG "
                              "with --unit")  # fmt: skip
-        ranges = array.astype(np.float32) * np.float32(self.unit)
+        with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold becomes infinite, and so unknown
+            ranges = array.astype(np.float32) * np.float32(self.unit)
         return np.where(np.isfinite(ranges) & (ranges > 0), ranges, np.float32(np.nan))
 
     def read_confidence(self) -> NDArray[np.uint8] | None:
@@ -159,11 +158,7 @@ def _closeness(name: str, other: str) -> tuple[int, bool]:
 
 
 def _in_archive(path: Path, unit: float) -> dict[str, RangeFile]:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            keys = sorted(name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy"))
-    except _DAMAGE as error:
-        raise InputError(f"{path}: not a readable .npz file ({error}). Fetch it again") from error
+    keys = keys_of_npz(path)
     if not keys:
         raise InputError(f"{path}: holds no arrays. Give a file with one range map for each picture")
     return {key: RangeFile(path, key, unit) for key in keys}
@@ -174,18 +169,14 @@ def _read_picture(path: Path, _key: str) -> NDArray[Any]:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
-    array = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    array = decode_picture(data, path, cv2.IMREAD_UNCHANGED)
     if array is None:
         raise InputError(f"{path}: not a picture that can be decoded ({len(data)} bytes). Write it again")
     return np.asarray(array)
 
 
 def _read_npy(path: Path, _key: str) -> NDArray[Any]:
-    try:
-        with path.open("rb") as stream:
-            return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
-    except _DAMAGE as error:
-        raise InputError(f"{path}: not a readable .npy file ({error}). Write it again") from error
+    return read_npy(path)
 
 
 def _read_npz(path: Path, key: str) -> NDArray[Any]:
@@ -196,11 +187,7 @@ def _read_npz(path: Path, key: str) -> NDArray[Any]:
         if len(inside) > 1 and key not in ("range", "depth"):
             raise InputError(f"{path}: holds {len(inside)} arrays ({', '.join(inside[:3])} …), none of them called "
                              "'range'. Name one so, or give this file itself as the folder")  # fmt: skip
-    try:
-        with zipfile.ZipFile(path) as archive, archive.open(f"{key}.npy") as stream:
-            return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
-    except _DAMAGE as error:
-        raise InputError(f"{path}: the array {key} cannot be read ({error}). Fetch the file again") from error
+    return read_npz(path, key)
 
 
 def _read_exr(path: Path, _key: str) -> NDArray[Any]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +12,9 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.names import match_image_names
+from pano_mvs.io.npy import keys_of_npz, read_npz
 from pano_mvs.io.pose_json import PosedView, read_posed_views
 from pano_mvs.io.range_folders import RangeFile, find_ranges
-
-# All that zipfile, zlib and the .npy reader raise on damaged files.
-_DAMAGE = (OSError, ValueError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 
 
 @dataclass(frozen=True)
@@ -69,14 +65,13 @@ class Truth:
         """
         if view.range_key is None:
             return None
-        try:
-            with zipfile.ZipFile(self.folder / "depth.npz") as archive, archive.open(f"{view.range_key}.npy") as stream:
-                array = np.asarray(np.lib.format.read_array(stream, allow_pickle=False), dtype=np.float32)
-        except _DAMAGE as error:
-            raise InputError(f"{self.folder / 'depth.npz'}: the range map of {view.name} cannot be read ({error}). "
-                             "Fetch the file again") from error  # fmt: skip
-        if array.ndim != 2:
-            raise InputError(f"{self.folder / 'depth.npz'}: {view.range_key} has shape {array.shape}, expected (H, W)")
+        path = self.folder / "depth.npz"
+        array = read_npz(path, view.range_key, what=f"the range map of {view.name}")
+        if array.ndim != 2 or array.dtype.kind not in "fiu":
+            raise InputError(f"{path}: {view.range_key} has shape {array.shape} of {array.dtype}, expected numbers "
+                             "(H, W)")  # fmt: skip
+        with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold becomes infinite, and so unknown
+            array = array.astype(np.float32)
         return np.where(np.isfinite(array) & (array > 0), array, np.float32(np.nan))
 
 
@@ -122,13 +117,7 @@ def find_true_ranges(path: Path, *, unit: float = 1.0) -> dict[str, RangeFile]:
 
 def _range_keys(path: Path) -> frozenset[str]:
     """Return the names of the arrays in an .npz file; none if there is no such file."""
-    if not path.exists():
-        return frozenset()
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return frozenset(name.removesuffix(".npy") for name in archive.namelist())
-    except _DAMAGE as error:
-        raise InputError(f"{path}: not a readable .npz file ({error}). Fetch it again") from error
+    return frozenset(keys_of_npz(path)) if path.exists() else frozenset()
 
 
 def _claimed_keys(path: Path, views: Sequence[PosedView], keys: frozenset[str]) -> dict[str, str]:

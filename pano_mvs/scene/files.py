@@ -61,12 +61,27 @@ def group_file(name: str, group: int) -> str:
 
 
 def item_stems(names: Iterable[str]) -> dict[str, str]:
-    """Return the `{item}` of each image: its path without the extension, kept where two would collide."""
+    """Return the `{item}` of each image: its path without the extension, kept where two would collide.
+
+    It is kept too where a folder of images is called like an image without its extension, and then a dot: a file
+    `{item}.tiff` of the image `000.png` would stand where the folder `000.tiff` of others belongs.
+    """
     found = list(names)
     stems = {name: str(PurePosixPath(name).with_suffix("")) for name in found}
+    folders = {parent for name in found for parent in PurePosixPath(name).parents if "." in parent.name}
+    taken = {str(folder)[:end].casefold() for folder in folders for end in _dots(str(folder))}
     while True:
         count = Counter(stem.casefold() for stem in stems.values())
-        clashing = [name for name in found if count[stems[name].casefold()] > 1 and stems[name] != name]
+        clashing = [
+            name
+            for name in found
+            if (count[stems[name].casefold()] > 1 or stems[name].casefold() in taken) and stems[name] != name
+        ]
         if not clashing:
             return stems
         stems.update({name: name for name in clashing})
+
+
+def _dots(folder: str) -> list[int]:
+    """Return where the dots are in the last part of a path."""
+    return [idx for idx in range(folder.rfind("/") + 1, len(folder)) if folder[idx] == "."]

@@ -10,38 +10,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.scene.jpeg import JPEG_START, is_cut_short
-
-# What OpenCV prints of pictures that it cannot decode is said better by our own error.
-_SILENT = 0
-if hasattr(cv2, "setLogLevel"):  # OpenCV 4
-    cv2.setLogLevel(_SILENT)
-else:
-    cv2.utils.logging.setLogLevel(_SILENT)
+from pano_mvs.scene.decoding import MAX_PIXELS, check_stated_size, decode_picture
+from pano_mvs.scene.picture_header import PNG_START
 
 _HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
 
 
-def decode_image(path: Path) -> NDArray[np.uint8]:
+def decode_image(path: Path, *, max_pixels: int = MAX_PIXELS) -> NDArray[np.uint8]:
     """Return a picture as (H, W, 3) uint8 RGB; 16-bit pictures are scaled, EXIF orientation is ignored.
 
     Of pictures with transparency the colours are taken, of those with several pages the first.
 
+    Args:
+        path: the file.
+        max_pixels: larger pictures are refused by their header, before they take memory.
+
     Raises:
-        InputError: if the file cannot be read, is no picture, is truncated, or needs an extra that is not installed.
+        InputError: if the file cannot be read, is no picture, is truncated or damaged, is larger than the limit, or
+            needs an extra that is not installed.
     """
     try:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
-    if data.startswith(JPEG_START) and is_cut_short(data):
-        raise InputError(
-            f"{path}: the JPEG ends early (truncated after {len(data)} bytes). Copy it again from the camera"
-        )
     if data[4:8] == b"ftyp" and data[8:12] in _HEIC_BRANDS and b"avif" not in data[:64]:
+        check_stated_size(data, path, max_pixels)
         return _decode_heic(data, path)
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    if not data.startswith(PNG_START):  # whose 16 bits OpenCV takes to 8 as we do, with half of the memory
+        flags |= cv2.IMREAD_ANYDEPTH
+    image = decode_picture(data, path, flags, max_pixels=max_pixels)
     if image is None and data[4:12] in (b"ftypavif", b"ftypavis"):
         raise InputError(f"{path}: this OpenCV ({cv2.__version__}) reads no AVIF pictures, or it is damaged. Install a "
                          "newer opencv-python-headless, or convert it to JPEG")  # fmt: skip
@@ -50,11 +48,11 @@ def decode_image(path: Path) -> NDArray[np.uint8]:
                          f"JPEG, or to PNG or TIFF of 8 or 16 bits")  # fmt: skip
     del data  # of large pictures each copy counts
     if image.dtype == np.uint16:
-        image >>= 8  # both 257 v and 256 v, as which programs write 8 bits in 16, give v
+        np.right_shift(image, 8, out=image)  # both 257 v and 256 v, as which programs write 8 bits in 16, give v
         return np.asarray(image[..., ::-1].astype(np.uint8, order="C"))
     if image.dtype != np.uint8:
         raise InputError(f"{path}: {image.dtype} pictures are not supported. Convert it to 8 or 16 bits")
-    rgb: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    rgb: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)  # in place
     return rgb
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import pad_panorama
 from pano_mvs.scene.cropping import Crop
+from pano_mvs.scene.decoding import decode_picture
 
 Mask = NDArray[np.bool_]
 
@@ -36,7 +37,7 @@ def decode_mask(path: Path) -> Mask:
     except OSError as error:
         raise InputError(f"{path}: the mask cannot be read ({error.strerror}). Check that it exists and may be read "
                          "by you") from error  # fmt: skip
-    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    picture = decode_picture(data, path, cv2.IMREAD_UNCHANGED)
     if picture is None:
         raise InputError(f"{path}: the mask is not a picture that can be decoded ({len(data)} bytes). Save it as PNG")
     channels = np.atleast_3d(picture)

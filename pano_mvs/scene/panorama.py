@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.scene.cropping import inside_crop, placed_picture, same_shape
+from pano_mvs.scene.decoding import MASK_BYTES_PER_PIXEL, MAX_PIXELS, decoding_bytes_per_pixel
 from pano_mvs.scene.image_file import decode_image, write_png
 from pano_mvs.scene.masking import decode_mask, painted_over, placed_mask
 from pano_mvs.scene.record import Axis, FilePart, Record, require
@@ -56,6 +57,14 @@ class Panorama(Record):
         height, width = self.size_hw
         require(width == 2 * height and height > 0, self, f"size_hw {self.size_hw} is not that of a full sphere")
 
+    def loading_bytes(self) -> int:
+        """Return the memory that `load` and `load_mask` take for a moment: the files at their own resolution."""
+        _, _, width, height = self.covers_ltwh
+        masked = 0
+        if self.mask_file is not None:  # a stage's mask, which the store keeps, has the working resolution
+            masked = height * width if self.mask_file.external else self.size_hw[0] * self.size_hw[1]
+        return max(height * width * decoding_bytes_per_pixel(self.image.path), masked * MASK_BYTES_PER_PIXEL)
+
     def load(self) -> NDArray[np.uint8]:
         """Return the picture at working resolution, (H, W, 3) uint8 RGB, without what is masked.
 
@@ -76,7 +85,8 @@ class Panorama(Record):
         Raises:
             InputError: as `load`.
         """
-        image = decode_image(self.image.path)
+        height, width = self.source_size_hw  # the source has accepted it, perhaps beyond the usual limit
+        image = decode_image(self.image.path, max_pixels=max(MAX_PIXELS, height * width))
         _, _, width, height = self.covers_ltwh
         if (not same_shape(image.shape[:2], (height, width))) or (
             self.crop_ltwh is None and image.shape[:2] != self.source_size_hw

@@ -77,6 +77,13 @@ class Record:
         """
         return {}
 
+    def loading_bytes(self) -> int:
+        """Return the memory that reading the record's files takes for a moment, besides what is then kept.
+
+        The engine counts it for each unit that reads the record, one record at a time.
+        """
+        return 0
+
     def check(self) -> None:
         """Raise ContractError if shapes, types or values are not what the kind promises."""
 

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Annotated, Any
 
 from pydantic import Field
 
 from pano_mvs.algorithms.dual_fisheye import is_dual_fisheye
-from pano_mvs.api import Context, FilePart, InputError, Panorama, Params, SourceItem, SourcePath, source
+from pano_mvs.api import NOT_IN_KEY, Context, FilePart, InputError, Panorama, Params, SourceItem, SourcePath, source
 from pano_mvs.io.captures import PictureInfo, describe_picture, list_pictures
 from pano_mvs.io.mask_files import find_mask, require_masks
 from pano_mvs.io.names import printable_name
+from pano_mvs.scene.decoding import MASK_BYTES_PER_PIXEL, MAX_PIXELS, decoding_bytes_per_pixel
 from pano_mvs.scene.image_file import decode_image
+from pano_mvs.scene.picture_header import stated_size_of_file
 
 
 class FolderParams(Params):
@@ -26,6 +29,14 @@ class FolderParams(Params):
     )
     zenith_deg: float = Field(default=0.0, ge=0, le=90, description="ignore so much around straight up")
     max_width: int = Field(default=4096, ge=16, description="wider panoramas are scaled down to this width")
+    max_megapixels: Annotated[float, NOT_IN_KEY] = Field(
+        default=MAX_PIXELS / 1e6, gt=0, description="larger files are refused, before they take memory"
+    )
+
+    @property
+    def max_pixels(self) -> int:
+        """The largest number of pixels of a file."""
+        return int(self.max_megapixels * 1e6)
 
 
 def list_folder(params: FolderParams) -> Iterator[SourceItem]:
@@ -49,7 +60,17 @@ def list_folder(params: FolderParams) -> Iterator[SourceItem]:
         yield SourceItem(name, files, problem, tuple(_notes_on_masks(name, mask, params)))
 
 
-@source("source.folder", list_items=list_folder)
+def folder_memory_bytes(params: FolderParams, inputs: Mapping[str, Any]) -> int:
+    """Return what reading a picture and its mask takes, by the header of the file; 0 for what is refused anyway."""
+    item: SourceItem = inputs["item"]
+    height, width = stated_size_of_file(item.files["image"]) or (0, 0)
+    if height * width > params.max_pixels:
+        return 0
+    masked = MASK_BYTES_PER_PIXEL if "mask" in item.files else 0
+    return height * width * max(decoding_bytes_per_pixel(item.files["image"]), masked)
+
+
+@source("source.folder", list_items=list_folder, memory=folder_memory_bytes)
 def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
     """Read the panoramas of a folder and its subfolders.
 
@@ -58,12 +79,12 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
     what the picture covers, or the whole sphere, at any resolution.
     """
     path = item.files["image"]
-    info = describe_picture(path)
+    info = describe_picture(path, max_pixels=params.max_pixels)
     for warning in info.warnings:
         ctx.note(f"{item.name}: {warning}")
     for trait in info.traits:
         ctx.note(f"some pictures have {trait}")
-    _check_pixels(path, info)
+    _check_pixels(path, info, params.max_pixels)
     mask = item.files.get("mask")
     panorama = Panorama(
         image=FilePart(path, external=True),
@@ -84,9 +105,9 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
     return panorama
 
 
-def _check_pixels(path: Path, info: PictureInfo) -> None:
+def _check_pixels(path: Path, info: PictureInfo, max_pixels: int) -> None:
     """Decode the whole picture once, so that a damaged file is named here and not in the middle of a sweep."""
-    picture = decode_image(path)
+    picture = decode_image(path, max_pixels=max_pixels)
     height, width = picture.shape[:2]
     if (height, width) != info.file_size_hw:
         raise InputError(f"{path}: decodes to {width}×{height} px, its header says {info.file_size_hw[::-1]}. "

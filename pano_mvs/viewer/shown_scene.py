@@ -154,7 +154,7 @@ def has_faces(path: Path) -> bool:
             head = stream.read(_HEAD_BYTES)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
-    counted = re.search(rb"^element face ([0-9]+)\s*$", head.partition(b"end_header")[0], re.MULTILINE)
+    counted = re.search(rb"^element face ([0-9]{1,18})\s*$", head.partition(b"end_header")[0], re.MULTILINE)
     return counted is not None and int(counted[1]) > 0
 
 

@@ -182,6 +182,18 @@ def test_stages_that_write_one_file_are_told_so(toy: Toy) -> None:
     assert "second/all.txt" in toy.deliverables()
 
 
+def test_a_stage_that_gives_all_items_one_file_costs_all_but_the_first(toy: Toy) -> None:
+    toy.edit("plug.py", lambda text: text.replace("mean/{item}.txt", "mean/fixed.txt"))
+    for _ in range(2):  # also when the units are cached
+        result = toy.run()
+        assert result.exit_code == 3
+        assert [failure.item for failure in result.failures] == ["2.txt", "3.txt", "4.txt", "5.txt"]
+        assert all("mean/fixed.txt is delivered for 1.txt too" in failure.cause for failure in result.failures)
+        files = toy.deliverables()
+        assert {name: files[name] for name in files if name.startswith("mean")} == {"mean/fixed.txt": b"45.0"}
+        assert "all.txt" in files
+
+
 def test_output_folder_that_cannot_be_made_is_an_error(toy: Toy) -> None:
     (toy.folder / "out").write_text("a file is in the way")
     with pytest.raises(UsageError, match="Choose another folder with --out"):

@@ -1,6 +1,7 @@
 """COLMAP models: pycolmap reads what we write, and we read what COLMAP writes."""
 
 import dataclasses
+import struct
 import subprocess
 import sys
 
@@ -196,3 +197,79 @@ def test_models_are_written_as_text_binary_or_both(tmp_path, form, suffixes):
     expected = zip(noisy_poses().points_in_world, noisy_poses().point_colors_rgb, strict=True)
     assert colors == {tuple(xyz.round(9)): tuple(color) for xyz, color in expected}
     assert {point.track.length() for point in model.points3D.values()} == {2, 3}
+
+
+def test_what_we_read_is_what_colmaps_own_reader_reads(model_folder, tmp_path):
+    model = pycolmap.Reconstruction(str(model_folder))
+    model.write_text(str(tmp_path))
+    for folder in (model_folder, tmp_path):
+        poses = read_colmap_model(folder)
+        images = sorted((image for image in model.images.values()), key=lambda image: NAMES.index(image.name))
+        for idx, image in enumerate(images):
+            assert poses.rotations[idx] == pytest.approx(image.cam_from_world().rotation.matrix(), abs=1e-12)
+            assert poses.translations[idx] == pytest.approx(image.cam_from_world().translation, abs=1e-12)
+        points = [point for _, point in sorted(model.points3D.items())]
+        np.testing.assert_allclose(poses.points_in_world, [point.xyz for point in points], atol=1e-12)
+        np.testing.assert_array_equal(poses.point_colors_rgb, [point.color for point in points])
+        lengths = np.bincount(poses.track_point_idx, minlength=len(points))
+        np.testing.assert_array_equal(lengths, [point.track.length() for point in points])
+
+
+def copied(model_folder, folder, name, change):
+    """A copy of the binary model in which one file is changed."""
+    for file in ("cameras", "images", "points3D"):
+        data = (model_folder / f"{file}.bin").read_bytes()
+        (folder / f"{file}.bin").write_bytes(change(data) if file == name else data)
+    return folder
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+@pytest.mark.parametrize("count", [10**6, 2**40, 2**64 - 1])
+def test_a_count_beyond_the_file_is_refused_before_it_takes_memory(model_folder, tmp_path, name, count):
+    """An absurd count of points filled all memory once: the reader made room for what the file promised."""
+    folder = copied(model_folder, tmp_path, name, lambda data: struct.pack("<Q", count) + data[8:])
+    with pytest.raises(InputError, match=rf"{name}\.bin: the COLMAP model cannot be read: it states {count} entries"):
+        read_colmap_model(folder)
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+def test_an_empty_file_is_named(model_folder, tmp_path, name):
+    with pytest.raises(InputError, match=rf"{name}\.bin: the COLMAP model cannot be read"):
+        read_colmap_model(copied(model_folder, tmp_path, name, lambda data: b""))
+
+
+def test_points_that_images_observe_but_the_model_lacks_are_named(model_folder, tmp_path):
+    with pytest.raises(InputError, match=r"images\.bin \(b/1\.jpg\): observes point \d+, which points3D\.bin does not"):
+        read_colmap_model(copied(model_folder, tmp_path, "points3D", lambda data: bytes(8)))
+
+
+@pytest.mark.parametrize("place", [4, 36, 52])
+def test_a_pose_that_is_no_number_is_named_when_it_is_read(model_folder, tmp_path, place):
+    change = lambda data: data[: 8 + place] + struct.pack("<d", np.nan) + data[16 + place :]  # noqa: E731
+    with pytest.raises(InputError, match=r"images\.bin \(.*\.\w+\): the pose holds NaN or infinite numbers"):
+        read_colmap_model(copied(model_folder, tmp_path, "images", change))
+
+
+@pytest.mark.parametrize(
+    ("file", "line", "what"),
+    [
+        ("cameras", "1 EQUIRECTANGULAR 1024", "expected an id, a camera model"),
+        ("cameras", "1 EQUIRECTANGULAR 1024 0 1024 0", "camera 1 has 1024×0 px"),
+        ("cameras", f"1 EQUIRECTANGULAR {'9' * 5000} 512", "is no number from 0"),
+        ("images", "1 1 0 0 0 0 0 0 9 a.jpg\n", "its camera 9 is not in cameras.txt"),
+        ("images", "1 1 0 0 0 0 0 0 1 a.jpg\n1 2", "are not three numbers each"),
+        ("images", "1 1 0 0 0 0 0 0 1 a.jpg\nnan 2 1", "a key point without a finite place"),
+        ("images", "1 1 0 0 0 0 0 0 1 a.jpg\n1 2 7", "observes point 7"),
+        ("points3D", "1 0 0 0 0 0 0", "expected an id, a place"),
+        ("points3D", "1 0 0 nan 0 0 0 1", "point 1 has no finite place"),
+        ("points3D", "1 0 0 0 0 0 256 1", "is no number from 0 to 255"),
+        ("points3D", "1 0 0 0 0 0 0 1 8 0", "observed by image 8, which is not in the model"),
+        ("points3D", "1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1", "point 1 is listed twice"),
+    ],
+)
+def test_a_malformed_text_is_named(tmp_path, file, line, what):
+    lines = {"cameras": "1 EQUIRECTANGULAR 1024 512 1024 512", "images": "1 1 0 0 0 0 0 0 1 a.jpg\n", "points3D": ""}
+    for name, text in (lines | {file: line}).items():
+        (tmp_path / f"{name}.txt").write_text(text + "\n")
+    with pytest.raises(InputError, match=what):
+        read_colmap_model(tmp_path)

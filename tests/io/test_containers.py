@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import struct
+import tracemalloc
+import zlib
 from pathlib import Path
 
 import cv2
@@ -15,7 +17,18 @@ from PIL import Image
 from pano_mvs.io.captures import describe_picture
 from pano_mvs.io.containers import read_container
 from pano_mvs.io.gpano import GPano, read_gpano
-from tests.io.pictures import app1, by_pillow, exif, full_sphere, picture, sound_files, write_jpeg, write_png, xmp
+from tests.io.pictures import (
+    app1,
+    by_pillow,
+    exif,
+    full_sphere,
+    picture,
+    png_chunk,
+    sound_files,
+    write_jpeg,
+    write_png,
+    xmp,
+)
 
 SIZE = (32, 64)
 PACKET = xmp(full_sphere(*SIZE, PosePitchDegrees="1.5", PoseRollDegrees="-2"), form="attribute")
@@ -111,3 +124,20 @@ def test_chunks_of_odd_length_are_padded_in_a_webp(tmp_path: Path) -> None:
     (tmp_path / "a.webp").write_bytes(by_pillow(SIZE, "WEBP", exif=exif() + b"\0", xmp=PACKET, lossless=True))
     assert len(read_container((tmp_path / "a.webp").read_bytes()).xmp) == 1
     assert describe_picture(tmp_path / "a.webp").gpano == EXPECTED
+
+
+def test_compressed_packets_have_one_limit_for_the_whole_file(tmp_path: Path) -> None:
+    """150 chunks of 64 MB each were all decompressed and kept once."""
+    bomb = b"XML:com.adobe.xmp\0\1\0\0\0" + zlib.compress(bytes(12 << 20))
+    path = write_png(tmp_path / "a.png", SIZE, PACKET)
+    data = path.read_bytes()
+    path.write_bytes(data[:-12] + png_chunk(b"iTXt", bomb) * 20 + data[-12:])
+    tracemalloc.start()
+    container = read_container(path.read_bytes())
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 60e6
+    assert "larger than 16 MiB" in container.warning
+    info = describe_picture(path)
+    assert info.gpano == EXPECTED
+    assert info.warnings == (container.warning,)

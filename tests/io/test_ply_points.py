@@ -66,6 +66,9 @@ def test_our_own_files(tmp_path, quality):
         (header("binary_middle_endian", ["float x", "float y", "float z"]), "no known format"),
         (header("ascii", ["list uchar int x", "float y", "float z"]), "lists or properties of unknown types"),
         (b"ply\nformat ascii 1.0\nelement face 1\nend_header\n", "must be its vertices"),
+        (header("ascii", ["float x"], "9" * 5000), "must be its vertices with their number"),
+        (header("binary_little_endian", ["float x", "float y", "float z"], 10**15), "promises 10+ points"),
+        (header("ascii", ["float x", "float x", "float y", "float z"]), "or have a property twice"),
     ],
 )
 def test_damaged_and_strange_files_are_named(tmp_path, data, what):

@@ -1,4 +1,4 @@
-"""The scripts that kill runs and damage stores, with small numbers; larger ones in CI's second step."""
+"""The scripts that kill runs, damage stores and read hostile files, with small numbers; larger in CI's second step."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.stress import damage, kills
+from tests.stress import damage, hostile, kills
 
 
 @pytest.mark.parametrize(
@@ -16,6 +16,15 @@ from tests.stress import damage, kills
 def test_what_is_flipped_or_cut_short_is_noticed_and_healed(tmp_path: Path, check: damage.Check) -> None:
     patient = damage.make_patient(tmp_path / "toy", numbers=5)
     assert check(patient, 50, random.Random(0)) == []
+
+
+def test_hostile_files_are_read_or_refused_by_name(tmp_path: Path) -> None:
+    assert hostile.faults_in_process(25, 1, tmp_path) == []
+
+
+@pytest.mark.slow
+def test_hostile_files_take_little_memory_and_end_no_run() -> None:
+    assert hostile.main(["120"]) == 0
 
 
 @pytest.mark.slow

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from pano_mvs.cli.console import Console
 from pano_mvs.cli.doctor.finding import Finding
 from pano_mvs.cli.guard import guarded
 from pano_mvs.cli.options import CacheOption, OutOption

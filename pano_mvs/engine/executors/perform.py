@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 
 from pano_mvs.core.errors import GateError, InputError, StoreError, UsageError
+from pano_mvs.core.text import shortened
 from pano_mvs.engine.blobs import DamagedBlobError
 from pano_mvs.engine.execute import execute_unit
 from pano_mvs.engine.executors.capture import captured
@@ -33,7 +34,7 @@ def perform(unit: Unit, store: Store, *, threads: int, log: Path) -> Outcome:
         return Outcome("damaged", cause=str(error))
     except (StoreError, GateError) as error:
         kind = StoreError if isinstance(error, StoreError) else GateError
-        return Outcome("stopped", cause=str(error), error=kind.__name__, exit_code=error.exit_code)
+        return Outcome("stopped", cause=shortened(str(error)), error=kind.__name__, exit_code=error.exit_code)
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # a stage that exits, or raises what is no Exception, is a unit that failed

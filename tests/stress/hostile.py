@@ -1,0 +1,256 @@
+"""Read damaged and hostile files of every kind: `python -m tests.stress.hostile [N] [options]`.
+
+N mutations, seeded, of good files (lost ends, flipped bits, numbers at their extremes, text that is none), and beside
+them all files that were crafted by hand: headers that promise more than there is, compressed bombs, counts of
+thousands of digits, poses that are no numbers. Each is read in a process whose memory is limited. It must be read, or
+refused with an error of ours that names the file in few words: no traceback, no warning, no crash, no endless reading.
+Then all hostile pictures are given to a run, which must lose these and nothing else.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import random
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from pano_mvs.cli.session import open_session
+from pano_mvs.core.errors import PanoMvsError
+from pano_mvs.engine.executors.serial import SerialExecutor
+from pano_mvs.engine.run import Run
+from pano_mvs.engine.store import Store
+from tests.stress.hostile_crafted import crafted
+from tests.stress.hostile_samples import Sample, samples
+
+_LONGEST_MESSAGE = 4500
+_SECONDS_EACH = 120.0
+_SERVE = """
+import sys
+from pathlib import Path
+from tests.stress.hostile import serve
+count, seed, scratch, first, extra_bytes = sys.argv[1:]
+serve(int(count), int(seed), Path(scratch), int(first), int(extra_bytes))
+"""
+_EXTREMES = (0, 1, 0x7F, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 2**40, 2**63, 2**64 - 1)
+_TEXTS = (b"nan", b"-inf", b"1e999", b"-1", b"9" * 5000, b"", b"null", b"[]", b"{}", b'"', b"\0", b"\xff\xfe",
+          b"\x1b[2J", b"0", b"true", b"[" * 2000)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Case:
+    """One hostile input: the kind of its sample, what was done to it, and its files."""
+
+    name: str
+    kind: str
+    files: Mapping[str, bytes]
+
+
+def cases(count: int, seed: int, scratch: Path) -> list[Case]:
+    """Return all crafted inputs, and as many mutations, spread over the kinds."""
+    good = samples(scratch)
+    found = [Case(f"crafted: {name}", kind, dict(good[kind].files) | files) for name, kind, files in crafted(good)]
+    rng, kinds = random.Random(seed), list(good)
+    for number in range(count):
+        kind = kinds[number % len(kinds)]
+        sample = good[kind]
+        file = rng.choice(list(sample.files)[: sample.mutated])
+        data, what = mutated(sample.files[file], rng)
+        found.append(Case(f"{number}: {kind}/{file}: {what}", kind, dict(sample.files) | {file: data}))
+    return found
+
+
+def mutated(data: bytes, rng: random.Random) -> tuple[bytes, str]:
+    """Return bytes that were damaged in one to three ways, and how."""
+    how = []
+    for _ in range(rng.randint(1, 3)):
+        change = rng.choice([_cut, _flip, _extreme, _text, _double, _drop, _noise, _empty])
+        if change is _empty and rng.random() < 0.8:
+            change = _flip
+        data = change(data, rng) if data else data
+        how.append(change.__name__.strip("_"))
+    return data, "+".join(how)
+
+
+def _cut(data: bytes, rng: random.Random) -> bytes:
+    return data[: rng.randrange(len(data))]
+
+
+def _flip(data: bytes, rng: random.Random) -> bytes:
+    changed = bytearray(data)
+    for _ in range(rng.randint(1, 8)):
+        changed[_place(data, rng)] ^= 1 << rng.randrange(8)
+    return bytes(changed)
+
+
+def _extreme(data: bytes, rng: random.Random) -> bytes:
+    size, value = rng.choice([1, 2, 4, 8]), rng.choice(_EXTREMES)
+    place = _place(data, rng)
+    number = (value & (256**size - 1)).to_bytes(size, rng.choice(["little", "big"]))
+    return data[:place] + number + data[place + size :]
+
+
+def _text(data: bytes, rng: random.Random) -> bytes:
+    place = _place(data, rng)
+    return data[:place] + rng.choice(_TEXTS) + data[place + rng.randrange(12) :]
+
+
+def _double(data: bytes, rng: random.Random) -> bytes:
+    first, second = sorted(rng.choices(range(len(data) + 1), k=2))
+    return data[:second] + data[first:]
+
+
+def _drop(data: bytes, rng: random.Random) -> bytes:
+    first = _place(data, rng)
+    return data[:first] + data[first + rng.randrange(1, 64) :]
+
+
+def _noise(data: bytes, rng: random.Random) -> bytes:
+    place = _place(data, rng)
+    return data[:place] + rng.randbytes(rng.randrange(1, 200)) + data[place:]
+
+
+def _empty(_data: bytes, _rng: random.Random) -> bytes:
+    return b""
+
+
+def _place(data: bytes, rng: random.Random) -> int:
+    """Return a place, in every second case near the beginning, where headers are."""
+    return rng.randrange(min(len(data), 400) if rng.random() < 0.5 else len(data))
+
+
+def fault(case: Case, sample: Sample, folder: Path) -> str:
+    """Read an input; return what is wrong with how that ended, empty if nothing is."""
+    folder.mkdir(parents=True)
+    for name, data in case.files.items():
+        (folder / name).write_bytes(data)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            sample.read(folder)
+    except PanoMvsError as error:
+        text = str(error)
+        if case.kind == "workflow":
+            return ""
+        if len(text) > _LONGEST_MESSAGE:
+            return f"a message of {len(text)} characters: {text[:200]}"
+        return "" if str(folder) in text else f"the file is not named: {text[:200]}"
+    except Exception:
+        return traceback.format_exc()
+    return ""
+
+
+def faults_in_process(count: int, seed: int, scratch: Path) -> list[str]:
+    """Read a part of all inputs in this process, whose memory is not limited; return the faults."""
+    good, drawn = samples(scratch), random.Random(seed).sample(cases(count, seed, scratch), count)
+    return [
+        f"{case.name}\n{text}"
+        for number, case in enumerate(drawn)
+        if (text := fault(case, good[case.kind], scratch / f"{number}"))
+    ]
+
+
+def serve(count: int, seed: int, scratch: Path, first: int, extra_bytes: int) -> None:
+    """Read the inputs from one on with limited memory, and print the outcome of each in a line."""
+    good, found = samples(scratch), cases(count, seed, scratch)
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + extra_bytes, used + extra_bytes))
+    for number in range(first, len(found)):
+        print(json.dumps({"begun": number}), flush=True)
+        text = fault(found[number], good[found[number].kind], scratch / f"in-{number}")
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+        print(json.dumps({"number": number, "fault": text, "peak": peak}), flush=True)
+
+
+def outcomes(count: int, seed: int, extra_bytes: int) -> Iterator[tuple[str, int]]:
+    """Yield for each input what is wrong, or nothing, and the peak of memory; a process that dies is started anew."""
+    with tempfile.TemporaryDirectory(prefix="pano-mvs-hostile-") as name:
+        scratch = Path(name)
+        found, first, started = cases(count, seed, scratch), 0, 0
+        while first < len(found):
+            started += 1
+            folder = scratch / f"process-{started}"
+            folder.mkdir()
+            arguments = [str(count), str(seed), str(folder), str(first), str(extra_bytes)]
+            process = subprocess.Popen([sys.executable, "-c", _SERVE, *arguments], stdout=subprocess.PIPE,
+                                       stderr=subprocess.PIPE, text=True)  # fmt: skip
+            try:
+                out, errors = process.communicate(timeout=_SECONDS_EACH + (len(found) - first) * 2)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                out, errors = process.communicate()
+            begun = first - 1
+            for line in out.splitlines():
+                answer = json.loads(line) if line.startswith("{") else {}
+                begun = answer.get("begun", begun)
+                if "number" in answer:
+                    text = answer["fault"]
+                    yield f"{found[answer['number']].name}\n{text}" if text else "", answer["peak"]
+                    first = answer["number"] + 1
+            if first < len(found):
+                how = f"the process ended with {process.returncode}: {errors[-500:]}"
+                yield f"{found[max(begun, first)].name}\n{how}", 0
+                first = max(begun, first) + 1
+
+
+def faults_of_run(count: int, seed: int, folder: Path) -> tuple[int, list[str]]:
+    """Give all hostile pictures to a run beside two good ones; return how many there were, and what was wrong."""
+    images, number = folder / "images", 0
+    images.mkdir(parents=True)
+    good = samples(folder)
+    for name in ("good 1.png", "good 2.png"):
+        (images / name).write_bytes(good["png"].files["picture.img"])
+    for case in cases(count, seed, folder):
+        if "picture.img" in case.files:
+            number += 1
+            (images / f"bad {number}.jpg").write_bytes(case.files["picture.img"])
+    workflow = folder / "w.yaml"
+    workflow.write_text(f"pano_mvs: 1\nstages:\n  images: {{use: source.folder, path: {images}}}\n")
+    session = open_session(str(workflow), cache=folder / "cache", out=folder / "out")
+    store = Store(session.store_root, least_free_bytes=0)
+    executor = SerialExecutor(store)
+    try:
+        result = Run(session.workflow, session.graph, store, session.out, executor=executor).execute()
+    finally:
+        executor.close()
+    wrong = [f"{failure.item}: {failure.trace}" for failure in result.failures if failure.trace]
+    wrong += [f"{failure.item} failed" for failure in result.failures if failure.item.startswith("good")]
+    wrong += [f"{failure.item}: a long cause" for failure in result.failures if len(failure.cause) > _LONGEST_MESSAGE]
+    if result.exit_code != 3 or result.stopped:
+        wrong.append(f"exit code {result.exit_code}: {result.stopped}")
+    return number, wrong
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Read, print what came of it, and return the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m tests.stress.hostile", description=__doc__.splitlines()[0])
+    parser.add_argument("count", nargs="?", type=int, default=400, help="how many mutations")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--memory-mb", type=int, default=1500, help="what reading may take beyond the program itself")
+    options = parser.parse_args(arguments)
+    started, total, peak, wrong = time.monotonic(), 0, 0, list[str]()
+    for text, bytes_used in outcomes(options.count, options.seed, options.memory_mb * 1_000_000):
+        total, peak = total + 1, max(peak, bytes_used)
+        if text:
+            wrong.append(text)
+            print(text, flush=True)
+    with tempfile.TemporaryDirectory(prefix="pano-mvs-hostile-") as name:
+        pictures, faults = faults_of_run(options.count, options.seed, Path(name))
+    print(*faults, sep="\n")
+    kinds = Counter(text.partition(":")[0] == "crafted" for text in wrong)
+    print(f"{total} inputs read, {len(wrong)} faults ({kinds[True]} crafted), at most {peak / 1e6:.0f} MB; a run with "
+          f"{pictures} hostile pictures: {len(faults)} faults; {time.monotonic() - started:.0f} s")  # fmt: skip
+    return 1 if wrong or faults else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
