@@ -145,7 +145,7 @@ def _run(
     while True:
         try:
             result = run.execute(earlier_files=earlier)
-        except (Exception, KeyboardInterrupt) as error:
+        except (Exception, KeyboardInterrupt, SystemExit) as error:
             tell_of_end(run, error, partial(tell, session.out, run, started=started, clock=clock))
             raise
         try:
