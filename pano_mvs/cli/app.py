@@ -74,10 +74,11 @@ def run(
     out: OutOption = None,
     overrides: SetOption = None,
     cache: CacheOption = None,
-    executor: Annotated[str, typer.Option("--executor", help="serial, processes or dask; by default processes where "
-                                          "there is more than one core.", show_default=False)] = "",
-    workers: Annotated[int, typer.Option("--workers", min=0, help="Units at a time; 0: as many as there are cores "
-                                         "for.")] = 0,
+    executor: Annotated[str, typer.Option("--executor", help="processes (the default), dask, or serial: one unit "
+                                          "after another in this process, for a debugger; a crash ends the run.",
+                                          show_default=False)] = "",
+    workers: Annotated[int, typer.Option("--workers", min=0, help="Units at a time, each in a process of its own; 0: "
+                                         "as many as there are cores for.")] = 0,
     threads: Annotated[int, typer.Option("--threads-per-worker", min=0, help="Threads of each; 0: an equal share of "
                                          "the cores.")] = 0,
     scheduler: Annotated[str, typer.Option("--scheduler", metavar="ADDRESS", help="An existing dask scheduler, such as "

@@ -8,9 +8,10 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 
-from pano_mvs.core.errors import StoreError, UsageError
+from pano_mvs.core.errors import ContractError, StoreError, UsageError
 from pano_mvs.core.files import OUTPUT_MARK, clear_abandoned, copy_file, set_aside
 from pano_mvs.engine.blobs import BlobRef, DamagedBlobError
+from pano_mvs.engine.names import is_of_the_run
 from pano_mvs.engine.room import is_full_disk
 from pano_mvs.engine.store import ItemRef, Store
 from pano_mvs.scene import Files
@@ -74,9 +75,13 @@ class Publisher:
             UsageError: if two stages write the same file.
             StoreError: if a file cannot be written.
             DamagedBlobError: if the store's copy is damaged.
+            ContractError: if a file would take the place of the run's own; nothing is written then.
         """
-        for target, blob in self._files(ref):
-            name = str(PurePosixPath(to) / self._placed(target, item))
+        files = [(str(PurePosixPath(to) / self._placed(target, item)), blob) for target, blob in self._files(ref)]
+        if own := next((name for name, _ in files if is_of_the_run(name)), None):
+            raise ContractError(f"it delivers {own}, which is the run's own: change the stage's name for the file, or "
+                                "give it a folder with `to: NAME`")  # fmt: skip
+        for name, blob in files:
             owner = self._owners.setdefault(name, f"{stage}:{item}")
             if owner != f"{stage}:{item}":
                 other = owner.partition(":")[0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from pano_mvs.core.errors import GateError, PanoMvsError, StoreError, UsageError
+from pano_mvs.core.errors import ContractError, GateError, PanoMvsError, StoreError, UsageError
 from pano_mvs.engine.blobs import DamagedBlobError
 from pano_mvs.engine.board import Board
 from pano_mvs.engine.desk import Desk, Ended
@@ -148,6 +148,9 @@ class Scheduler:
             except DamagedBlobError as error:
                 self._store.drop(record.key)
                 self.damaged.append(str(error))
+                return
+            except ContractError as error:
+                self._fail(Ended(unit, Outcome("failed", cause=str(error)), None, ()))
                 return
         self._tally.unit_done(unit.entry, unit.item, record, "run" if was_computed else "cached")
         self._board.finish(unit, record)

@@ -215,3 +215,33 @@ def test_time_left_is_a_bound_until_all_is_known() -> None:
     estimate.count("b", 4.0, computed=True)
     assert estimate.of_run(2) == "about 80 s left"
     assert [duration(s) for s in (5, 600, 9000)] == ["5 s", "10 min", "2.5 h"]
+
+
+@ON_POSIX
+@pytest.mark.slow
+@pytest.mark.parametrize(("place", "how"), [
+    ('"""Multiply."""\n    if x.value == 30: ', "os._exit(0)"),
+    ("def list_items(params):\n    ", "sys.exit(0)"),
+    ('"""A toy pipeline."""\nimport os, sys\n', "os._exit(0)"),
+])  # fmt: skip
+def test_a_plugin_that_exits_in_this_process_is_an_error(toy: Toy, place: str, how: str) -> None:  # noqa: F811
+    """Each of them ended the command with exit code 0 and without a word."""
+    toy.edit("plug.py", lambda text: text.replace(place.strip().splitlines()[0], f"{place}{how}", 1))
+    toy.edit("plug.py", lambda text: text.replace("import os\n", "import os, sys\n", 1))
+    code, out, err = finish(start(toy, "--executor", "serial"))
+    in_unit, at_import = "Multiply" in place, "pipeline" in place
+    assert code == (3 if in_unit else 2 if at_import else 1), err
+    assert how.partition("(")[0] in (toy.folder / "out" / "report.html").read_text() if in_unit else how[:-3] in err
+    assert "plug.py" in (out if in_unit else err)
+
+
+@ON_POSIX
+@pytest.mark.slow
+def test_an_interrupt_lets_a_single_worker_finish_its_unit(toy: Toy) -> None:  # noqa: F811
+    process = start(toy, "--workers", "1", sleep_s=1.0)
+    wait_for(process, toy, 18)
+    process.send_signal(signal.SIGTERM)
+    code, out, _ = finish(process)
+    assert code == 130
+    assert "1 units may finish within" in out
+    assert finished_records(toy) >= 19

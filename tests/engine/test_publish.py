@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
+from pano_mvs.core.errors import ContractError
 from pano_mvs.core.files import OUTPUT_MARK
 from pano_mvs.engine.publish import Publisher
 from pano_mvs.engine.store import Store
@@ -58,3 +61,20 @@ def test_a_linked_folder_and_what_it_leads_to_stay(tmp_path: Path) -> None:
     assert publisher.remove_stale({"inner/1.txt": digest, "outer/1.txt": digest}) == ["inner/1.txt"]
     assert (out / "inner").is_dir()
     assert (outside / "1.txt").is_file()
+
+
+@pytest.mark.parametrize("target", ["run.json", "Report.HTML", "logs/{item}.txt", "{item}", ".pano-mvs-output",
+                                    "sub/.pano-mvs-output", ".tmp-1-2-x", "run.json/x"])  # fmt: skip
+def test_what_is_the_runs_own_is_not_delivered(tmp_path: Path, target: str) -> None:
+    store = Store(tmp_path / "cache")
+    publisher = Publisher(tmp_path / "out", store)
+    publisher.name_items(["report.html.png"])
+    path = tmp_path / "text.txt"
+    path.write_text("x")
+    files = store.put_value(Files({"a.txt": path, target: path}))
+    with pytest.raises(ContractError, match="which is the run's own"):
+        publisher.publish("toy", "report.html.png", files)
+    assert publisher.written == []
+    if not target.rpartition("/")[2].startswith("."):  # marks and temporary files are the run's in any folder
+        publisher.publish("toy", "report.html.png", files, to="results")
+        assert len(publisher.written) == 2
