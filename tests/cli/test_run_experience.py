@@ -135,7 +135,7 @@ def test_a_terminal_that_closes_interrupts_once() -> None:
 def test_a_second_run_into_a_folder_is_refused_until_the_first_has_ended(toy: Toy) -> None:  # noqa: F811
     """The second computed beside the first, and whichever came last said that all was well."""
     first = start(toy, "--workers", "2", sleep_s=600)
-    wait_for(first, toy, 18)
+    wait_for(first, toy, 6)
     earlier = {path.name for path in (toy.folder / "cache" / "tmp").iterdir()}
     code, out, err = finish(start(toy, "--json"))
     assert code == 4
