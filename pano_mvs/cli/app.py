@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-import io
+import faulthandler
 import os
 import sys
 from pathlib import Path
@@ -20,7 +20,7 @@ from pano_mvs.cli.cache_app import cache_app
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.doctor.command import doctor
 from pano_mvs.cli.evaluate_app import evaluate_app
-from pano_mvs.cli.guard import guarded
+from pano_mvs.cli.guard import guarded, turn_exits_into_errors
 from pano_mvs.cli.options import (
     AcceptOption,
     CacheOption,
@@ -35,6 +35,7 @@ from pano_mvs.cli.options import (
     WorkflowArgument,
 )
 from pano_mvs.cli.plugin_app import plugin_app, plugins, stage_app
+from pano_mvs.cli.streams import protect_standard_streams
 from pano_mvs.engine.executors.threads import available_threads, bound_environment
 
 app = typer.Typer(
@@ -73,10 +74,11 @@ def run(
     out: OutOption = None,
     overrides: SetOption = None,
     cache: CacheOption = None,
-    executor: Annotated[str, typer.Option("--executor", help="serial, processes or dask; by default processes where "
-                                          "there is more than one core.", show_default=False)] = "",
-    workers: Annotated[int, typer.Option("--workers", min=0, help="Units at a time; 0: as many as there are cores "
-                                         "for.")] = 0,
+    executor: Annotated[str, typer.Option("--executor", help="processes (the default), dask, or serial: one unit "
+                                          "after another in this process, for a debugger; a crash ends the run.",
+                                          show_default=False)] = "",
+    workers: Annotated[int, typer.Option("--workers", min=0, help="Units at a time, each in a process of its own; 0: "
+                                         "as many as there are cores for.")] = 0,
     threads: Annotated[int, typer.Option("--threads-per-worker", min=0, help="Threads of each; 0: an equal share of "
                                          "the cores.")] = 0,
     scheduler: Annotated[str, typer.Option("--scheduler", metavar="ADDRESS", help="An existing dask scheduler, such as "
@@ -235,7 +237,11 @@ def inspect_pixel(
 def main() -> None:
     """Run the command line."""
     bound_environment(os.environ, available_threads())  # before a command loads the libraries
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")  # a log in another encoding is no reason to fail
-    app()
+    output = protect_standard_streams()
+    faulthandler.enable(os.dup(2))  # a stage that runs in this process may turn descriptor 2
+    turn_exits_into_errors()
+    try:
+        app()
+    except SystemExit as end:
+        sys.stdout.flush()
+        sys.exit(output.exit_code(end.code) if isinstance(end.code, int) else end.code)

@@ -58,7 +58,7 @@ def verify_cache(store: Store, console: Console) -> int:
     """Check every file of the cache; return the exit code."""
     damage = verify(store)
     for what, paths in (("removed, damaged", damage.removed), ("incomplete", damage.incomplete),
-                        ("not of the cache", damage.foreign)):  # fmt: skip
+                        ("not of the cache", damage.foreign), ("temporary", damage.temporary)):  # fmt: skip
         for path in paths[:_SHOWN]:
             console.print(f"{what}: {escape(path)}", highlight=False, soft_wrap=True)
         if len(paths) > _SHOWN:

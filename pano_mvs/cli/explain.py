@@ -26,7 +26,7 @@ def explain_unit(session: Session, label: str, console: Console) -> None:
     """
     stage, _, item = label.partition(":")
     workflow, graph = Demands(until=(stage,)).applied_to(session.workflow, session.graph)
-    store = Store(session.store_root)
+    store = Store(session.store_root, for_reading=True)
     found: list[tuple[Unit, UnitRecord | None, str]] = []
 
     def look(unit: Unit, record: UnitRecord | None, reason: str) -> None:

@@ -114,7 +114,7 @@ def _inspection(session: Session, wanted: PixelWanted) -> Inspection:
     if not (math.isfinite(wanted.x) and math.isfinite(wanted.y)):
         raise UsageError(f"({wanted.x}, {wanted.y}) is no pixel: give its column and its row as numbers")
     sweep = _sweep_stage(session, wanted.stage)
-    store = Store(session.store_root)
+    store = Store(session.store_root, for_reading=True)
     found = _Found()
     plans = make_plan(session.workflow, session.graph, store, workflow_id(session.workflow), visit=found.look)
     image = _image(wanted.image, found.images)

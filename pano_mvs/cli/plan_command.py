@@ -6,7 +6,7 @@ import gc
 import json
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from rich.console import Console
@@ -14,6 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from pano_mvs.cli.session import Session
+from pano_mvs.core.errors import StoreError
 from pano_mvs.engine.plan import StagePlan, make_plan
 from pano_mvs.engine.run import workflow_id
 from pano_mvs.engine.store import Store
@@ -76,11 +77,12 @@ def without_collector() -> Iterator[None]:
 
 
 def _plans(session: Session) -> list[StagePlan]:
-    store = Store(session.store_root)
+    store = Store(session.store_root, for_reading=True)
     workflow, graph = session.demands.applied_to(session.workflow, session.graph)
     with without_collector():
         plans = make_plan(workflow, graph, store, workflow_id(session.workflow), session.demands)
-    store.stat_cache.save()
+    with suppress(StoreError):  # a cache that others own may be read all the same
+        store.stat_cache.save()
     return plans
 
 

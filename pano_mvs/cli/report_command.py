@@ -12,6 +12,7 @@ from rich.markup import escape
 
 from pano_mvs.cli.session import CACHE_VARIABLE
 from pano_mvs.core.errors import InputError
+from pano_mvs.engine.output_lock import output_lock
 from pano_mvs.engine.store import Store
 from pano_mvs.report import write_report
 from pano_mvs.report.results import Results
@@ -25,14 +26,15 @@ def rewrite_report(out: Path, cache: Path | None, console: Console) -> None:
     Raises:
         InputError: if there is no run.json, or the cache is not there: a page without pictures would take the place of
             one that has them.
-        StoreError: if the cache's book of runs is damaged.
+        StoreError: if the cache's book of runs is damaged, or a run is writing into the folder.
     """
     summary = _summary(out / "run.json")
     root = cache or Path(os.environ.get(CACHE_VARIABLE) or str(summary.get("cache") or ".pano-mvs"))
     if not (root / "layout.json").is_file():
         raise InputError(f"there is no cache in {root}, from which the pictures come. Give the one that the run used "
                          "with --cache DIR")  # fmt: skip
-    write_report(out, summary, Results.of_folder(out, summary, Store(root)))
+    with output_lock(out):
+        write_report(out, summary, Results.of_folder(out, summary, Store(root, for_reading=True)))
     console.print(escape(f"{out / 'report.html'} is written"), highlight=False, soft_wrap=True)
 
 

@@ -35,6 +35,7 @@ from pano_mvs.engine.events import Observer, RunResult
 from pano_mvs.engine.executors.choose import make_executor
 from pano_mvs.engine.executors.protocol import Executor
 from pano_mvs.engine.memory import bytes_from_size
+from pano_mvs.engine.output_lock import output_lock
 from pano_mvs.engine.run import Run
 from pano_mvs.engine.store import LEAST_FREE_BYTES, Store
 from pano_mvs.report.verdict import Verdict
@@ -139,38 +140,55 @@ def _run(
 ) -> tuple[RunResult, dict[str, Any], Verdict]:
     """Run, and write what there is to say of it into the output folder."""
     started, clock = datetime.now(UTC), time.perf_counter()
-    earlier = earlier_files(session.out)
     run = Run(session.workflow, session.graph, store, session.out, observer=observer, executor=executor,
               demands=session.demands)  # fmt: skip
+    with output_lock(session.out):
+        return _run_alone(session, run, started, clock)
+
+
+def _run_alone(
+    session: Session, run: Run, started: datetime, clock: float
+) -> tuple[RunResult, dict[str, Any], Verdict]:
+    """Run while no other run writes into the folder."""
+    earlier = earlier_files(session.out)
     while True:
         try:
             result = run.execute(earlier_files=earlier)
-        except (Exception, KeyboardInterrupt) as error:
+        except (Exception, KeyboardInterrupt, SystemExit) as error:
             tell_of_end(run, error, partial(tell, session.out, run, started=started, clock=clock))
             raise
         try:
             summary, verdict = tell(session.out, run, started=started, clock=clock)
             break
         except DamagedBlobError as error:  # found only now; it has been removed, so a further round computes it
-            observer.warn(str(error))
+            run.observer.warn(str(error))
     return result, summary, verdict
 
 
 @contextmanager
 def interrupted_by_termination() -> Iterator[None]:
-    """Let a request to terminate (SIGTERM) end a run as an interrupt does."""
+    """Let a request to terminate (SIGTERM) and the end of the terminal (SIGHUP) end a run as an interrupt does.
+
+    A terminal that closes sends SIGHUP more than once: only the first counts. Under nohup it is ignored, as is wanted.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield  # only a main thread is told
         return
 
+    hangup = getattr(signal, "SIGHUP", None)
+    ends = [signal.SIGTERM, *([hangup] if hangup and signal.getsignal(hangup) is not signal.SIG_IGN else [])]
+
     def interrupt(_number: int, _frame: FrameType | None) -> None:
+        if hangup is not None:
+            signal.signal(hangup, signal.SIG_IGN)
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+    before = {number: signal.signal(number, interrupt) for number in ends}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _keep_what_is_not_ours(out: Path) -> None:

@@ -9,6 +9,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from pano_mvs.cli.guard import exit_text
 from pano_mvs.cli.judgement import add_dense_doubts
 from pano_mvs.cli.summary import summarise
 from pano_mvs.core.errors import PanoMvsError
@@ -35,9 +36,13 @@ def tell_of_end(run: Run, error: BaseException, tell: Callable[[], object]) -> N
     if not any(stage.run + stage.cached + stage.failed for stage in run.result.stages):
         return
     interrupted = isinstance(error, KeyboardInterrupt)
-    run.result.stopped = "interrupted" if interrupted else str(error)
+    run.result.stopped = "interrupted" if interrupted else _why(error)
     run.result.exit_code = INTERRUPTED if interrupted else error.exit_code if isinstance(error, PanoMvsError) else 1
     try:
         tell()
     except (PanoMvsError, OSError) as second:
         error.add_note(f"Nor could the report be written: {second}")
+
+
+def _why(error: BaseException) -> str:
+    return exit_text(error) if isinstance(error, SystemExit) else str(error)

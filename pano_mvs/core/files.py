@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 import shutil
-import socket
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from functools import cache
 from itertools import count
 from pathlib import Path
 
 from pano_mvs.core.errors import StoreError
+from pano_mvs.core.processes import is_running, process_place
 
 OUTPUT_MARK = ".pano-mvs-output"
 """An empty file in every output folder, written first: no source takes what lies there for pictures."""
@@ -48,7 +46,17 @@ def set_aside(path: Path) -> Path:
 
 def temporary_prefix() -> str:
     """Return how the names of this process's temporary files begin: they tell whether who made them is still there."""
-    return f".tmp-{_place()}-{os.getpid()}-"
+    return f".tmp-{process_place()}-{os.getpid()}-"
+
+
+def whose_temporary(path: Path) -> str:
+    """Return to whom a temporary file or folder belongs, in words."""
+    match = _TEMPORARY.fullmatch(path.name)
+    if match is None:
+        return "not of this version; removed when it is seven days old"
+    if match[1] != process_place() or os.name != "posix":
+        return "of another host or container; removed when it is seven days old"
+    return f"of process {match[2]} on this host, which is {'running' if is_running(int(match[2])) else 'gone'}"
 
 
 def clear_abandoned(folder: Path) -> None:
@@ -74,8 +82,8 @@ def remove_whole(path: Path) -> None:
 
 def _is_abandoned(path: Path) -> bool:
     match = _TEMPORARY.fullmatch(path.name)
-    if match and match[1] == _place() and os.name == "posix":
-        return not _lives(int(match[2]))
+    if match and match[1] == process_place() and os.name == "posix":
+        return not is_running(int(match[2]))
     return is_older(path, _ABANDONED_AFTER_S)
 
 
@@ -85,26 +93,6 @@ def is_older(path: Path, seconds: float) -> bool:
         return time.time() - path.lstat().st_mtime > seconds
     except OSError:
         return False
-
-
-def _lives(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except OSError:
-        return True
-    return True
-
-
-@cache
-def _place() -> str:
-    """Return a name for that within which a process's number means one process: this start of this container."""
-    marks = [socket.gethostname()]
-    with suppress(OSError):
-        marks.append(Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii"))
-        marks.append(str(Path("/proc/self/ns/pid").readlink()))
-    return hashlib.blake2b("\n".join(marks).encode(), digest_size=4).hexdigest()
 
 
 @contextmanager

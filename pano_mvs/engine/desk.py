@@ -10,6 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from pano_mvs.core.files import temporary_prefix
 from pano_mvs.engine.blobs import DamagedBlobError
 from pano_mvs.engine.execute import arguments_of
 from pano_mvs.engine.executors.capture import tail
@@ -94,7 +95,7 @@ class Desk:
     def hand_out(self, unit: Unit, *, siblings: int) -> None:
         """Give a unit to the executor; if its stage has few units, each of them may use the more threads."""
         threads = max(self._executor.threads, self._executor.cores // siblings)
-        log = self._store.blobs.temporary / f"log-{uuid.uuid4().hex}.txt"
+        log = self._store.blobs.temporary / f"{temporary_prefix()}log-{uuid.uuid4().hex}.txt"
         job = Job(self._next, unit, threads, unit.entry.policy.timeout_s, log, self._plugins)
         self._next += 1
         self._out[job.number] = _Out(job, self._memory_of(unit))

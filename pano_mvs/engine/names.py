@@ -8,6 +8,8 @@ from pathlib import PurePosixPath
 MAX_NAME_LENGTH = 100
 _RESERVED = {"con", "prn", "aux", "nul", *(f"{port}{digit}" for port in ("com", "lpt") for digit in "0123456789")}
 _NOT_IN_NAMES = '<>:"|?*'
+_OF_THE_RUN = {"logs", "run.json", "report.html"}
+_PREFIXES_OF_THE_RUN = (".pano-mvs", ".tmp-")
 
 
 def is_plain_name(name: object) -> bool:
@@ -54,6 +56,12 @@ def folder_problem(folder: str) -> str:
             return f"{part!r} is a device on Windows; choose another name"
         if len(part) > MAX_NAME_LENGTH:
             return f"{part[:20]!r}… is too long; {MAX_NAME_LENGTH} characters are allowed"
-    if str(PurePosixPath(folder)).casefold().split("/")[0] in {"logs", "run.json", "report.html"}:
+    if is_of_the_run(folder):
         return f"{folder!r} is where the run itself writes; choose another folder"
     return ""
+
+
+def is_of_the_run(path: str) -> bool:
+    """Return whether the run itself writes at a path relative to the output folder: its results, logs, marks, locks."""
+    parts = [part.casefold().rstrip(" .") for part in PurePosixPath(path).parts]
+    return bool(parts) and (parts[0] in _OF_THE_RUN or any(part.startswith(_PREFIXES_OF_THE_RUN) for part in parts))

@@ -9,9 +9,10 @@ from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
-from pano_mvs.core.errors import StoreError, UsageError
+from pano_mvs.core.errors import ContractError, StoreError, UsageError
 from pano_mvs.core.files import OUTPUT_MARK, clear_abandoned, copy_file, set_aside
 from pano_mvs.engine.blobs import BlobRef, DamagedBlobError
+from pano_mvs.engine.names import is_of_the_run
 from pano_mvs.engine.room import is_full_disk
 from pano_mvs.engine.store import ItemRef, Store
 from pano_mvs.scene import Files
@@ -98,11 +99,17 @@ class Publisher:
             UsageError: if two stages write the same file.
             StoreError: if a file cannot be written.
             DamagedBlobError: if the store's copy is damaged.
+            ContractError: if a file would take the place of the run's own; nothing is written then.
         """
         owner = _Owner(stage, item)
         files: dict[str, BlobRef] = {}
         for target, blob in self._files(ref):
             name = str(PurePosixPath(to) / self._placed(target, item))
+            if is_of_the_run(name):
+                raise ContractError(
+                    f"it delivers {name}, which is the run's own: change the stage's name for the file, or give it a "
+                    "folder with `to: NAME`"
+                )
             if name in files:
                 raise NameClashError(f"it delivers {name} twice. Give each of its files a name of its own")
             files[name] = blob

@@ -190,7 +190,7 @@ class Run:
     def _let_finish(self) -> None:
         """Give units in flight some time after an interrupt; a second interrupt ends it at once."""
         deadline = time.monotonic() + GRACE_S
-        if self._desk and self.executor.capacity > 1:
+        if self._desk and self.executor.enforces_timeouts:  # units run elsewhere, and go on
             self.observer.warn(f"interrupted: {len(self._desk)} units may finish within {GRACE_S:.0f} s; "
                                "interrupt again to stop at once")  # fmt: skip
             while self._desk and (left := deadline - time.monotonic()) > 0:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from pano_mvs.core.errors import GateError, PanoMvsError, StoreError, UsageError
+from pano_mvs.core.errors import ContractError, GateError, PanoMvsError, StoreError, UsageError
 from pano_mvs.engine.blobs import DamagedBlobError
 from pano_mvs.engine.board import Board
 from pano_mvs.engine.desk import Desk, Ended
@@ -146,7 +146,7 @@ class Scheduler:
         if issubclass(unit.entry.spec.output, Files):
             try:
                 losers = self._publisher.publish(unit.entry.name, unit.item, record.output, to=unit.entry.policy.to)
-            except NameClashError as error:
+            except (NameClashError, ContractError) as error:
                 self._fail(Ended(unit, Outcome("failed", cause=str(error), seconds=record.seconds), None, ()))
                 return
             except DamagedBlobError as error:

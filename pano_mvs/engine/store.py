@@ -126,13 +126,15 @@ class UnitRecord:
 class Store:
     """The cache of one or many workflows."""
 
-    def __init__(self, root: Path, *, durable: bool = False, least_free_bytes: int = LEAST_FREE_BYTES) -> None:
+    def __init__(self, root: Path, *, durable: bool = False, least_free_bytes: int = LEAST_FREE_BYTES,
+                 for_reading: bool = False) -> None:  # fmt: skip
         """Open or create a store.
 
         Args:
             root: its folder.
             durable: flush every blob and record to the disk before going on, for machines that lose power.
             least_free_bytes: room on the disk below which no unit is begun; 0 for no such guard.
+            for_reading: take a folder that cannot be written, or made, for what it holds, instead of refusing it.
 
         Raises:
             UsageError: if the folder cannot be written, or was made by a version with another layout.
@@ -143,7 +145,7 @@ class Store:
         self.damaged: list[str] = []
         self._records = str(root / "records")
         self._room = Room(root, least_free_bytes=least_free_bytes)
-        self._open_layout()
+        self._open_layout(for_reading=for_reading)
         self._clear_abandoned()
         self.runs = RunBook(root)
         self.stat_cache = StatCache(root / "stat-cache.json")
@@ -240,7 +242,7 @@ class Store:
         """Return where the record of a key is or would be."""
         return self.root / "records" / key[:2] / f"{key}.json"
 
-    def _open_layout(self) -> None:
+    def _open_layout(self, *, for_reading: bool) -> None:
         for name in _FOLDERS:
             if (self.root / name).is_symlink():
                 raise UsageError(f"cache {self.root}: {name} is a link: what is written there would land elsewhere. "
@@ -249,7 +251,11 @@ class Store:
         try:
             layout = json.loads(path.read_bytes())
         except FileNotFoundError:
-            self._create(path)
+            try:
+                self._create(path)
+            except (UsageError, StoreError):
+                if not for_reading:
+                    raise
             return
         except (OSError, ValueError, RecursionError) as error:
             raise UsageError(f"{path} cannot be read ({error}), so it is not known how the cache is laid out. If it "

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from pano_mvs.core.digest import IS_DIGEST, digest_from_file
 from pano_mvs.core.errors import StoreError
+from pano_mvs.core.files import whose_temporary
 from pano_mvs.engine.blobs import SUFFIX
 from pano_mvs.engine.runs import RunEntry
 from pano_mvs.engine.store import Store, UnitRecord, record_from_bytes
@@ -51,6 +52,7 @@ class Damage:
         removed: damaged files, which were removed: the next run computes them again.
         incomplete: records whose blobs are gone, which count as not there.
         foreign: files that are none of the store's.
+        temporary: what lies in its folder for temporary files, and whose it is.
     """
 
     records: int = 0
@@ -58,6 +60,7 @@ class Damage:
     removed: list[str] = field(default_factory=list)
     incomplete: list[str] = field(default_factory=list)
     foreign: list[str] = field(default_factory=list)
+    temporary: list[str] = field(default_factory=list)
 
 
 @dataclass(slots=True)
@@ -130,6 +133,8 @@ def verify(store: Store) -> Damage:
             damage.foreign.append(file.path)
         elif data is not None:
             _verify_record(store, damage, sound, file.path, key=key, data=data)
+    for entry in _sorted(store.blobs.temporary):
+        damage.temporary.append(f"{entry.path} ({whose_temporary(Path(entry.path))})")
     return damage
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import stat
+import tempfile
 import threading
 import time
 from collections.abc import Callable
@@ -15,10 +16,12 @@ from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
 from pano_mvs.core.digest import digest_from_bytes
+from pano_mvs.core.errors import UsageError
+from pano_mvs.core.files import temporary_prefix
 from pano_mvs.engine.blobs import BlobStore
 from pano_mvs.engine.store import Store
 from pano_mvs.engine.upkeep import collect
-from tests.engine.conftest import Toy, toy  # noqa: F401 (a fixture)
+from tests.engine.conftest import Toy, settle, toy  # noqa: F401 (a fixture)
 from tests.engine.test_run import ALL_UNITS
 from tests.stress.captures import deliverables
 
@@ -51,6 +54,54 @@ def files_of(folder: Path) -> dict[str, int]:
 def make_old(folder: Path) -> None:
     for path in folder.rglob("*"):
         os.utime(path, (1e9, 1e9), follow_symlinks=False)
+
+
+def test_verify_names_what_is_temporary(toy: Toy, cache: Cache) -> None:  # noqa: F811
+    toy.run()
+    folder = toy.folder / "cache" / "tmp"
+    (folder / f"{temporary_prefix()}scratch").mkdir()
+    (folder / ".tmp-00000000-7-log.txt").touch()
+    (folder / "worker-1.txt").touch()
+    code, said = cache("verify")
+    assert code == 0
+    assert f"scratch (of process {os.getpid()} on this host, which is running)" in said
+    assert f"{folder / '.tmp-00000000-7-log.txt'} (of another host or container;" in said
+    assert f"{folder / 'worker-1.txt'} (not of this version;" in said
+
+
+@pytest.fixture
+def unwritable(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Let nothing be written below the caches `cache` and `none`; for root, permissions would not."""
+    make = tempfile.mkstemp
+
+    def refuse(*, dir: Path, **options: str) -> tuple[int, str]:  # noqa: A002
+        if Path(dir).is_relative_to(tmp_path / "cache") or Path(dir).is_relative_to(tmp_path / "none"):
+            raise PermissionError(13, "Permission denied")
+        return make(dir=dir, **options)
+
+    monkeypatch.setattr(tempfile, "mkstemp", refuse)
+
+
+def test_a_cache_that_can_only_be_read_is_enough_to_plan(
+    toy: Toy,  # noqa: F811
+    request: pytest.FixtureRequest,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """`plan` failed since it could not write down which digests it had found."""
+    monkeypatch.setenv("COLUMNS", "200")
+    assert run(toy, "out")[0] == 0
+    shutil.copyfile(toy.folder / "capture" / "1.txt", toy.folder / "capture" / "6.txt")
+    settle(toy.folder / "capture" / "6.txt")
+    request.getfixturevalue("unwritable")
+    more = ["--out", str(toy.folder / "out")]
+    for name in ("cache", "none"):
+        for command, *options in (["plan"], ["status"], ["plan", "--explain", "scaled:1.txt"]):
+            where = [str(toy.folder / "wf.yaml"), "--cache", str(toy.folder / name)]
+            result = CliRunner().invoke(app, [command, *where, *more, *options])
+            assert result.exit_code == 0, result.output
+    assert "cannot be written" in run(toy, "out", "--cache", str(toy.folder / "none"))[1]
+    with pytest.raises(UsageError, match="none cannot be written"):
+        Store(toy.folder / "none")
 
 
 def test_usage_names_every_stage_and_the_whole(toy: Toy, cache: Cache) -> None:  # noqa: F811

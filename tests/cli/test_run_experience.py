@@ -18,6 +18,7 @@ from rich.console import Console
 
 from pano_mvs.cli.estimate import Estimate, duration
 from pano_mvs.cli.progress import ProgressBars
+from pano_mvs.cli.run_command import interrupted_by_termination
 from tests.engine.conftest import Toy, toy  # noqa: F401 (a fixture)
 from tests.engine.test_resume import deliverables, finished_records
 
@@ -90,13 +91,17 @@ def test_events_of_a_run_that_cannot_begin_end_as_well(toy: Toy) -> None:  # noq
 
 
 @ON_POSIX
-@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
-def test_interrupt_lets_units_finish_and_says_how_to_go_on(toy: Toy, number: signal.Signals) -> None:  # noqa: F811
+@pytest.mark.parametrize(
+    "number", ["SIGINT", *(pytest.param(name, marks=pytest.mark.slow) for name in ("SIGTERM", "SIGHUP"))]
+)
+def test_interrupt_lets_units_finish_and_says_how_to_go_on(toy: Toy, number: str) -> None:  # noqa: F811
     process = start(toy, "--executor", "processes", "--workers", "2", sleep_s=1.0)
     wait_for(process, toy, 18)  # the means have begun
-    process.send_signal(number)
+    process.send_signal(signal.Signals[number])
     code, out, err = finish(process)
     assert code == 130
+    assert json.loads((toy.folder / "out" / "run.json").read_bytes())["stopped"] == "interrupted"
+    assert (toy.folder / "out" / "report.html").is_file()
     assert "may finish within" in out
     assert f"pano-mvs run {toy.folder / 'wf.yaml'}" in err.replace("\n", "")
     kept = finished_records(toy)
@@ -104,6 +109,51 @@ def test_interrupt_lets_units_finish_and_says_how_to_go_on(toy: Toy, number: sig
     code, out, _ = finish(start(toy, "--executor", "serial"))
     assert code == 0
     assert f"{28 - kept} units computed, {kept} cached" in out
+
+
+def _interrupts(number: signal.Signals) -> bool:
+    try:
+        os.kill(os.getpid(), number)
+    except KeyboardInterrupt:
+        return True
+    return False
+
+
+@ON_POSIX
+def test_a_terminal_that_closes_interrupts_once() -> None:
+    """A terminal that closes may send its signal twice; under nohup it must not end anything."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    try:
+        with interrupted_by_termination():
+            assert _interrupts(signal.SIGHUP)
+            assert not _interrupts(signal.SIGHUP)
+            assert _interrupts(signal.SIGTERM)
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_DFL
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        with interrupted_by_termination():
+            assert not _interrupts(signal.SIGHUP)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+@ON_POSIX
+@pytest.mark.slow
+def test_a_second_run_into_a_folder_is_refused_until_the_first_has_ended(toy: Toy) -> None:  # noqa: F811
+    """The second computed beside the first, and whichever came last said that all was well."""
+    first = start(toy, "--workers", "2", sleep_s=600)
+    wait_for(first, toy, 6)
+    earlier = {path.name for path in (toy.folder / "cache" / "tmp").iterdir()}
+    code, out, err = finish(start(toy, "--json"))
+    assert code == 4
+    assert events_of(out)[-1]["exit_code"] == 4
+    assert f"another run is writing into {toy.folder / 'out'}: process {first.pid} on" in err.replace("\n", "")
+    assert first.poll() is None
+    first.kill()
+    finish(first)
+    assert earlier & {path.name for path in (toy.folder / "cache" / "tmp").iterdir()}
+    assert finish(start(toy, "--executor", "serial"))[0] == 0
+    assert not (toy.folder / "out" / ".pano-mvs-lock").exists()
+    assert not list((toy.folder / "cache" / "tmp").iterdir()), "what the killed run left behind is gone"
 
 
 def _read_until(process: subprocess.Popen[str], *words: str) -> None:
@@ -215,3 +265,33 @@ def test_time_left_is_a_bound_until_all_is_known() -> None:
     estimate.count("b", 4.0, computed=True)
     assert estimate.of_run(2) == "about 80 s left"
     assert [duration(s) for s in (5, 600, 9000)] == ["5 s", "10 min", "2.5 h"]
+
+
+@ON_POSIX
+@pytest.mark.slow
+@pytest.mark.parametrize(("place", "how"), [
+    ('"""Multiply."""\n    if x.value == 30: ', "os._exit(0)"),
+    ("def list_items(params):\n    ", "sys.exit(0)"),
+    ('"""A toy pipeline."""\nimport os, sys\n', "os._exit(0)"),
+])  # fmt: skip
+def test_a_plugin_that_exits_in_this_process_is_an_error(toy: Toy, place: str, how: str) -> None:  # noqa: F811
+    """Each of them ended the command with exit code 0 and without a word."""
+    toy.edit("plug.py", lambda text: text.replace(place.strip().splitlines()[0], f"{place}{how}", 1))
+    toy.edit("plug.py", lambda text: text.replace("import os\n", "import os, sys\n", 1))
+    code, out, err = finish(start(toy, "--executor", "serial"))
+    in_unit, at_import = "Multiply" in place, "pipeline" in place
+    assert code == (3 if in_unit else 2 if at_import else 1), err
+    assert how.partition("(")[0] in (toy.folder / "out" / "report.html").read_text() if in_unit else how[:-3] in err
+    assert "plug.py" in (out if in_unit else err)
+
+
+@ON_POSIX
+@pytest.mark.slow
+def test_an_interrupt_lets_a_single_worker_finish_its_unit(toy: Toy) -> None:  # noqa: F811
+    process = start(toy, "--workers", "1", sleep_s=1.0)
+    wait_for(process, toy, 18)
+    process.send_signal(signal.SIGTERM)
+    code, out, _ = finish(process)
+    assert code == 130
+    assert "1 units may finish within" in out
+    assert finished_records(toy) >= 19

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from pano_mvs.core.errors import GateError, PanoMvsError, UsageError
+from pano_mvs.core.errors import GateError, InputError, PanoMvsError, UsageError
 from pano_mvs.engine.events import RunResult, Silent
-from pano_mvs.engine.executors import worker_process
+from pano_mvs.engine.executors import choose, worker_process
 from pano_mvs.engine.executors.choose import make_executor
 from pano_mvs.engine.executors.processes import ProcessExecutor
 from pano_mvs.engine.executors.protocol import Executor
@@ -144,6 +144,38 @@ def test_unit_that_kills_its_worker_again_is_listed_and_the_others_go_on(toy: To
     assert (failure.item, failure.said) == ("3.txt", ("about to go",))
     assert "SIGKILL" in failure.cause
     assert ran(result)["scaled"] == 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("how", "cause"), [("os._exit(0)", "exit code 0"), ("os.abort()", "killed by SIGABRT")])
+def test_a_unit_that_ends_its_process_fails_with_one_worker_too(toy: Toy, how: str, cause: str) -> None:
+    """One worker was no process: os._exit(0) in a stage ended the run with exit code 0 and without a report."""
+    toy.edit("plug.py", lambda text: text.replace('    """Multiply."""', f'''    """Multiply."""
+    if x.value == 30:
+        {how}'''))  # fmt: skip
+    result = run_with(toy, lambda store: make_executor(store, workers=1, threads=1))
+    (failure,) = (f for f in result.failures if f.stage == "scaled")
+    assert (failure.item, result.exit_code) == ("3.txt", 3)
+    assert f"its worker process died ({cause})" in failure.cause
+    assert ran(result)["scaled"] == 4
+
+
+@pytest.mark.parametrize("make", [SerialExecutor, two_processes])
+def test_a_stage_that_calls_sys_exit_is_a_unit_that_failed(toy: Toy, make: Make) -> None:
+    toy.edit("plug.py", lambda text: text.replace('    """Multiply."""', '''    """Multiply."""
+    if x.value == 30: raise SystemExit(0)'''))  # fmt: skip
+    result = run_with(toy, make)
+    failure = next(f for f in result.failures if f.stage == "scaled")
+    assert (failure.item, result.exit_code) == ("3.txt", 3)
+    assert "SystemExit: 0" in failure.cause
+
+
+@pytest.mark.slow
+def test_an_import_that_ends_the_worker_costs_the_units_that_need_it(toy: Toy) -> None:
+    exits = "import os, sys\nif 'pano_mvs.engine.executors.worker' in sys.modules: os._exit(0)\n"
+    toy.edit("plug.py", lambda text: exits + text)
+    with pytest.raises(InputError, match=r"(?s)none of the 5 items.*its worker process died \(exit code 0\)"):
+        run_with(toy, two_processes)
 
 
 @pytest.mark.parametrize("make", [SerialExecutor, two_processes])
@@ -331,10 +363,17 @@ def test_libraries_are_bound_by_the_environment_and_the_user_may_bind_them_furth
     assert environment["OPENBLAS_NUM_THREADS"] == "1"
 
 
-def test_executors_are_chosen_by_name_and_contradictions_refused(tmp_path: Path) -> None:
+def test_executors_are_chosen_by_name_and_contradictions_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     store = Store(tmp_path)
     assert make_executor(store, "serial").name == "serial"
     assert make_executor(store, workers=3).capacity == 3
+    one = make_executor(store, workers=1)
+    assert (one.name, one.capacity) == ("processes", 1)
+    monkeypatch.delenv("PANO_MVS_EXECUTOR")
+    monkeypatch.setattr(choose, "available_threads", lambda: 1)
+    assert make_executor(store).name == "processes"
     with pytest.raises(UsageError, match="there is no executor 'thread'"):
         make_executor(store, "thread")
     with pytest.raises(UsageError, match="one unit at a time"):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from pano_mvs.core.errors import ContractError
 from pano_mvs.core.files import OUTPUT_MARK
 from pano_mvs.engine.publish import NameClashError, Publisher
 from pano_mvs.engine.store import Store
@@ -142,3 +143,20 @@ def test_an_image_and_a_folder_of_images_called_alike_do_not_clash(tmp_path: Pat
         "range/b/2.v1.tiff": "b/2.v1.png",
         "range/b/2.png/y.tiff": "b/2.png/y.png",
     }
+
+
+@pytest.mark.parametrize("target", ["run.json", "Report.HTML", "logs/{item}.txt", "{item}", ".pano-mvs-output",
+                                    "sub/.pano-mvs-output", ".tmp-1-2-x", "run.json/x"])  # fmt: skip
+def test_what_is_the_runs_own_is_not_delivered(tmp_path: Path, target: str) -> None:
+    store = Store(tmp_path / "cache")
+    publisher = Publisher(tmp_path / "out", store)
+    publisher.name_items(["report.html.png"])
+    path = tmp_path / "text.txt"
+    path.write_text("x")
+    files = store.put_value(Files({"a.txt": path, target: path}))
+    with pytest.raises(ContractError, match="which is the run's own"):
+        publisher.publish("toy", "report.html.png", files)
+    assert publisher.written == []
+    if not target.rpartition("/")[2].startswith("."):  # marks and temporary files are the run's in any folder
+        publisher.publish("toy", "report.html.png", files, to="results")
+        assert len(publisher.written) == 2

@@ -194,6 +194,21 @@ def test_a_stage_that_gives_all_items_one_file_costs_all_but_the_first(toy: Toy)
         assert "all.txt" in files
 
 
+def test_a_unit_that_delivers_what_is_the_runs_own_fails_and_nothing_else(toy: Toy) -> None:
+    """A stage's file named run.json was written, and lost when the run wrote its own."""
+    toy.edit("plug.py", lambda text: text.replace('"mean/{item}.txt": path', '"Run.json" if mean.value > 130 else '
+                                                  '"mean/{item}.txt": path'))  # fmt: skip
+    for _ in range(2):  # computed, and found in the cache
+        result = toy.run()
+        assert result.exit_code == 3
+        (failure,) = result.failures
+        assert "it delivers Run.json, which is the run's own" in failure.cause
+        assert not (toy.folder / "out" / "Run.json").exists()
+        assert len([name for name in result.published if name.startswith("mean/")]) == 4
+    assert not toy.run("each.to=sub").failures
+    assert (toy.folder / "out" / "sub" / "Run.json").is_file()
+
+
 def test_output_folder_that_cannot_be_made_is_an_error(toy: Toy) -> None:
     (toy.folder / "out").write_text("a file is in the way")
     with pytest.raises(UsageError, match="Choose another folder with --out"):

@@ -22,8 +22,8 @@ def make_executor(store: Store, name: str = "", *, workers: int = 0, threads: in
 
     Args:
         store: where values are.
-        name: of the executor; by default that which the other settings or $PANO_MVS_EXECUTOR ask for, else processes
-            where there is more than one core.
+        name: of the executor; by default dask if there is a scheduler, else what $PANO_MVS_EXECUTOR says (unless a
+            number of workers is given), else processes.
         workers: units at a time; 0 for as many as there are cores for, and memory (3 GB each).
         threads: threads of each worker; 0 for an equal share of the cores.
         scheduler: address of a dask scheduler; without one, dask starts a cluster on this host.
@@ -32,8 +32,7 @@ def make_executor(store: Store, name: str = "", *, workers: int = 0, threads: in
         UsageError: if the settings contradict each other, or the executor is not installed or cannot be reached.
     """
     cores = available_threads()
-    name = name or ("dask" if scheduler else "" if workers else os.environ.get(VARIABLE, ""))
-    name = name or ("processes" if workers > 1 or (cores > 1 and workers != 1) else "serial")
+    name = name or ("dask" if scheduler else "" if workers else os.environ.get(VARIABLE, "")) or "processes"
     if name not in EXECUTORS:
         raise UsageError(f"there is no executor {name!r}; there are {', '.join(EXECUTORS)}")
     if scheduler and name != "dask":

@@ -16,6 +16,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.files import temporary_prefix
 from pano_mvs.engine.code_digest import code_texts
 from pano_mvs.engine.executors.dask_task import differences, end_workers, introduce, run_unit, versions
 from pano_mvs.engine.executors.protocol import Job, Outcome
@@ -56,6 +57,7 @@ class DaskExecutor:
         self._ended: queue.SimpleQueue[tuple[int, int, Any]] = queue.SimpleQueue()
         self._out: dict[int, tuple[int, Any]] = {}  # job to its try and its future
         self._tries = 0
+        self._requests: dict[int, Path] = {}  # job to the file that holds its request, where that is large
         self._sources: dict[str, Any] = {}
         self._cluster: Any = None
         if not scheduler:
@@ -86,6 +88,7 @@ class DaskExecutor:
         if len(text) > _LARGE_BYTES:
             path = job.log.with_suffix(".json").absolute()
             path.write_text(text, encoding="utf-8")
+            self._requests[job.number] = path
             text = str(path)
         self._tries += 1
         number, attempt = job.number, self._tries
@@ -105,6 +108,8 @@ class DaskExecutor:
                 return None
             if number in self._out and self._out[number][0] == attempt:
                 del self._out[number]
+                if number in self._requests:
+                    self._requests.pop(number).unlink(missing_ok=True)
                 return number, _outcome(future)
         return None
 
@@ -138,7 +143,7 @@ class DaskExecutor:
 
     def _check_workers(self) -> tuple[int, int, int]:
         """Return how many units the workers take at a time, how many threads each may use, and how many if alone."""
-        token = f"hello-{uuid.uuid4().hex}"
+        token = f"{temporary_prefix()}hello-{uuid.uuid4().hex}"
         folder = self._store.blobs.temporary
         try:
             folder.mkdir(parents=True, exist_ok=True)

@@ -9,6 +9,7 @@ import uuid
 from dataclasses import replace
 from typing import Any
 
+from pano_mvs.core.files import temporary_prefix
 from pano_mvs.engine.executors.protocol import Job, Outcome
 from pano_mvs.engine.executors.unit_text import request_to_json
 from pano_mvs.engine.executors.worker_process import WorkerProcess
@@ -91,7 +92,7 @@ class ProcessExecutor:
         self._keepers.clear()
 
     def _add_keeper(self) -> None:
-        errors = self._store.blobs.temporary / f"worker-{uuid.uuid4().hex}.txt"
+        errors = self._store.blobs.temporary / f"{temporary_prefix()}worker-{uuid.uuid4().hex}.txt"
         try:
             errors.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:

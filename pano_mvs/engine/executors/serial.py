@@ -1,4 +1,8 @@
-"""One unit after another, in this process: nothing to start, and a debugger sees everything."""
+"""One unit after another, in this process: nothing to start, and a debugger sees everything.
+
+Nothing separates a unit from the run: native code that crashes or exits ends both, and a unit that hangs
+cannot be ended.
+"""
 
 from __future__ import annotations
 
