@@ -13,7 +13,8 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from pano_mvs.core.errors import PanoMvsError, WorkflowError
+from pano_mvs.core.errors import PanoMvsError, StoreError, WorkflowError
+from pano_mvs.core.paths import reason_of
 
 Command = TypeVar("Command", bound=Callable[..., None])
 
@@ -36,7 +37,11 @@ def guarded(command: Command) -> Command:
             raise typer.Exit(130) from None
         except typer.Exit:
             raise
-        except Exception:
+        except Exception as error:
+            if isinstance(error, OSError) and error.filename is not None:  # where no better message was foreseen
+                problem = f"{error.filename}: {reason_of(error)}. Mend its permissions, or choose another path"
+                errors.print(f"[red]error:[/] {escape(problem)}", highlight=False, soft_wrap=True)
+                raise typer.Exit(StoreError.exit_code) from None
             traceback.print_exc()
             errors.print("[red]internal error:[/] this is a bug in pano_mvs; what was finished is kept")
             raise typer.Exit(1) from None

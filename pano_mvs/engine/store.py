@@ -2,7 +2,8 @@
 
 Layout under the root: `blobs/ab/<digest><suffix>`, `records/ab/<key>.json`, `runs/<id>.json` (which key each unit had
 in the latest run of a workflow into a folder: for the reasons that the plan gives, and what a collection keeps),
-`pins/` (runs kept whatever happens), `stat-cache.json`, `tmp/`, `layout.json`.
+`pins/` (runs kept whatever happens), `stat-cache.json`, `tmp/`, `layout.json`, and an empty file that marks the folder
+as a cache.
 What is cached is derived from the records: there is no status file that could be wrong and nothing to unlock.
 Names are taken in one step by renaming, nothing is ever changed in place, and no link is made: any number of runs, on
 several hosts, may share a store.
@@ -13,14 +14,15 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from pano_mvs.core.digest import digest_from_bytes, digest_from_value
 from pano_mvs.core.errors import ContractError, StoreError, UsageError
-from pano_mvs.core.files import clear_abandoned, is_older, remove_whole, write_text
+from pano_mvs.core.files import CACHE_MARK, clear_abandoned, is_older, remove_whole, write_text
+from pano_mvs.core.paths import children, exists, is_link
 from pano_mvs.engine.blobs import BlobRef, BlobStore, DamagedBlobError
 from pano_mvs.engine.room import Room, is_full_disk
 from pano_mvs.engine.runs import RunBook
@@ -174,7 +176,7 @@ class Store:
         """Write a record; its blobs must be there already."""
         body = json.dumps(record.to_json(), sort_keys=True)
         path = self.record_path(record.key)
-        if path.parent.is_symlink():
+        if is_link(path.parent):
             raise StoreError(f"{path.parent} is a link, which no cache has: remove it, or choose another cache "
                              "with --cache DIR")  # fmt: skip
         write_text(path, f"{digest_from_bytes(body.encode())}\n{body}", temporary_in=self.blobs.temporary,
@@ -183,7 +185,7 @@ class Store:
     def drop(self, key: str) -> None:
         """Remove a record that turned out to be of no use."""
         path = self.record_path(key)
-        if not path.parent.is_symlink():
+        if not is_link(path.parent):
             path.unlink(missing_ok=True)
 
     def put_value(self, value: Record) -> ItemRef:
@@ -242,7 +244,7 @@ class Store:
 
     def _open_layout(self) -> None:
         for name in _FOLDERS:
-            if (self.root / name).is_symlink():
+            if is_link(self.root / name):
                 raise UsageError(f"cache {self.root}: {name} is a link: what is written there would land elsewhere. "
                                  "Remove it, or choose another cache with --cache DIR")  # fmt: skip
         path = self.root / "layout.json"
@@ -260,17 +262,26 @@ class Store:
                 f"cache {self.root} has layout {layout!r}, this version uses {LAYOUT_VERSION}. "
                 "Choose another with --cache DIR"
             )
+        self._mark()
+
+    def _mark(self) -> None:
+        """Mark a cache that an earlier version made; one that cannot be written stays without the mark."""
+        mark = self.root / CACHE_MARK
+        with suppress(OSError):
+            if not exists(mark) and not is_link(mark):
+                mark.touch()
 
     def _clear_abandoned(self) -> None:
         """Remove what runs that were killed left half written."""
         folder = self.root / "tmp"
         clear_abandoned(folder)
-        for path in folder.iterdir() if folder.is_dir() else ():
+        for path in children(folder):
             if is_older(path, _ABANDONED_AFTER_S):
                 remove_whole(path)
 
     def _create(self, path: Path) -> None:
         try:
+            write_text(self.root / CACHE_MARK, "")
             write_text(path, json.dumps({"layout": LAYOUT_VERSION}))
         except StoreError as error:
             if is_full_disk(error.__cause__):

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.core.paths import is_file
 from pano_mvs.geometry import pixel_from_ray, ray_from_pixel
 from pano_mvs.io.captures import natural_key
 from pano_mvs.io.colmap_points import ModelForm, ModelPoints, write_model
@@ -108,7 +109,7 @@ def read_colmap_model(folder: Path) -> Poses:
 
 def is_colmap_model(folder: Path) -> bool:
     """Return whether a folder holds the files of a COLMAP model."""
-    return any(all((folder / name).is_file() for name in names) for names in _MODEL_FILES)
+    return any(all(is_file(folder / name) for name in names) for names in _MODEL_FILES)
 
 
 def _add_cameras(model: Any, sizes_hw: list[tuple[int, int]]) -> dict[tuple[int, int], int]:

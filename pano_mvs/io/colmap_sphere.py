@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.core.paths import is_file
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
 from pano_mvs.io.captures import natural_key
 from pano_mvs.io.pose_json import require_distinct, rigid_from_arrays
@@ -28,7 +29,7 @@ _BYTES_PER_POINT2D = 24
 def has_sphere_cameras(folder: Path) -> bool:
     """Return whether the cameras of a COLMAP model are all SphereSfM's SPHERE, told by number and parameters."""
     try:
-        if (folder / "cameras.bin").is_file():
+        if is_file(folder / "cameras.bin"):
             return _is_sphere_binary((folder / "cameras.bin").read_bytes())
         lines = _content_lines(folder / "cameras.txt")
     except OSError as error:
@@ -48,7 +49,7 @@ def read_sphere_model(folder: Path) -> Poses:
         InputError: if the images cannot be read, or there is none.
     """
     binary = folder / "images.bin"
-    path = binary if binary.is_file() else folder / "images.txt"
+    path = binary if is_file(binary) else folder / "images.txt"
     try:
         found = list(_binary_images(path) if path == binary else _text_images(path))
     except OSError as error:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.scene.jpeg import JPEG_START, is_cut_short
+from pano_mvs.scene.record import FilePart
 
 # What OpenCV prints of pictures that it cannot decode is said better by our own error.
 _SILENT = 0
@@ -22,18 +23,20 @@ else:
 _HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
 
 
-def decode_image(path: Path) -> NDArray[np.uint8]:
+def decode_image(path: Path, data: bytes | None = None) -> NDArray[np.uint8]:
     """Return a picture as (H, W, 3) uint8 RGB; 16-bit pictures are scaled, EXIF orientation is ignored.
 
     Of pictures with transparency the colours are taken, of those with several pages the first.
 
+    Args:
+        path: the file.
+        data: its bytes, if they have been read already.
+
     Raises:
         InputError: if the file cannot be read, is no picture, is truncated, or needs an extra that is not installed.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
+    if data is None:
+        data = FilePart(path).read_bytes()
     if data.startswith(JPEG_START) and is_cut_short(data):
         raise InputError(
             f"{path}: the JPEG ends early (truncated after {len(data)} bytes). Copy it again from the camera"
