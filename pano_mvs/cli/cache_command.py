@@ -13,7 +13,7 @@ from rich.table import Table
 
 from pano_mvs.cli.session import CACHE_VARIABLE
 from pano_mvs.core.errors import UsageError
-from pano_mvs.core.paths import is_file
+from pano_mvs.core.paths import is_denied, is_file
 from pano_mvs.engine.store import Store
 from pano_mvs.engine.upkeep import Collection, collect, size_on_disk, usage_of, verify
 
@@ -31,6 +31,8 @@ def open_cache(cache: Path | None) -> Store:
     variable = os.environ.get(CACHE_VARIABLE)
     root = cache or (Path(variable) if variable else Path(".pano-mvs"))
     if not is_file(root / "layout.json"):
+        if is_denied(root / "layout.json"):
+            raise UsageError(f"{root}: you may not look into this folder (permission denied). Mend its permissions")
         raise UsageError(f"{root} is no cache of pano-mvs; name one with --cache DIR (it lies beside the workflow file "
                          "as .pano-mvs, or where you ran a preset by its name)")  # fmt: skip
     return Store(root)

@@ -110,9 +110,10 @@ def home_folder() -> Path | None:
     """Return the user's home folder; None if there is none, or it may not be searched."""
     try:
         home = Path.home()
-    except RuntimeError:
+        os.stat(f"{home}/.")  # noqa: PTH116  # Path would drop the dot, for which the folder has to be searched
+    except _NO_PATH:
         return None
-    return home if is_folder(home) and os.access(home, os.X_OK) else None
+    return home
 
 
 def expanded(path: Path) -> Path:

@@ -22,7 +22,7 @@ from typing import Any
 from pano_mvs.core.digest import digest_from_bytes, digest_from_value
 from pano_mvs.core.errors import ContractError, StoreError, UsageError
 from pano_mvs.core.files import CACHE_MARK, clear_abandoned, is_older, remove_whole, write_text
-from pano_mvs.core.paths import children, exists, is_link
+from pano_mvs.core.paths import children, exists, is_link, reason_of
 from pano_mvs.engine.blobs import BlobRef, BlobStore, DamagedBlobError
 from pano_mvs.engine.room import Room, is_full_disk
 from pano_mvs.engine.runs import RunBook
@@ -253,7 +253,10 @@ class Store:
         except FileNotFoundError:
             self._create(path)
             return
-        except (OSError, ValueError, RecursionError) as error:
+        except OSError as error:
+            raise UsageError(f"cache {self.root} cannot be read ({reason_of(error)}). Mend its permissions, or choose "
+                             "another with --cache DIR")  from error  # fmt: skip
+        except (ValueError, RecursionError) as error:
             raise UsageError(f"{path} cannot be read ({error}), so it is not known how the cache is laid out. If it "
                              "is one of this version, delete that file and nothing is lost; else choose another "
                              "folder with --cache DIR")  from error  # fmt: skip
