@@ -56,6 +56,7 @@ def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
         context.rejected,
         value.doubted(),
         time.perf_counter() - started,
+        checked=True,
     )
     store.put(record)
     return record

@@ -55,6 +55,19 @@ class StatCache:
         except (OSError, ValueError):
             return None
 
+    def times_of_change(self) -> dict[str, float]:
+        """Return, by digest, when the known files of these bytes were last touched, in seconds; the latest of several.
+
+        Files that are not as they were when they were read are left out.
+        """
+        found: dict[str, float] = {}
+        for name, (size, changed, touched, inode, digest) in self._entries.items():
+            if self.state(Path(name)) == (size, changed, touched, inode):
+                assert isinstance(touched, int)
+                assert isinstance(changed, int)
+                found[str(digest)] = max(found.get(str(digest), 0.0), max(changed, touched) / 1e9)
+        return found
+
     def forget(self, path: Path) -> None:
         """Forget a file whose bytes turned out to be others."""
         self._learnt.pop(str(resolved(path)), None)

@@ -68,6 +68,8 @@ class UnitRecord:
         rejected: image name to why the result leaves it out.
         doubts: image name to why the value is doubtful there.
         seconds: how long it took when it was computed.
+        checked: whether the user's files that it read were compared with the digests in its key, as earlier versions
+            did not.
     """
 
     key: str
@@ -79,6 +81,7 @@ class UnitRecord:
     rejected: Mapping[str, str] = field(default_factory=dict)
     doubts: Mapping[str, str] = field(default_factory=dict)
     seconds: float = 0.0
+    checked: bool = False
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as a JSON value."""
@@ -92,6 +95,7 @@ class UnitRecord:
             "rejected": dict(self.rejected),
             "doubts": dict(self.doubts),
             "seconds": self.seconds,
+            "checked": self.checked,
         }
 
     @staticmethod
@@ -117,6 +121,7 @@ class UnitRecord:
             rejected={str(name): str(reason) for name, reason in rejected.items()},
             doubts={str(name): str(reason) for name, reason in doubts.items()},
             seconds=float(seconds),
+            checked=value.get("checked") is True,
         )
 
     def blobs(self) -> Iterator[BlobRef]:
