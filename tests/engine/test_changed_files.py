@@ -218,6 +218,15 @@ def test_many_that_change_take_one_more_pass(texts: Toy) -> None:
     assert len(delivered(texts)) == 2
 
 
+def test_what_was_delivered_before_the_change_is_not_of_the_result(texts: Toy) -> None:
+    texts.edit("wf.yaml", lambda text: text + "  again:  {use: toy.total, in: {numbers: late}}\n")
+    path = texts.folder / "capture" / "2.txt"
+    result = run(texts, Meddler("write", "5.txt", lambda: path.write_text("77")))
+    assert result.exit_code == 3
+    assert sorted(result.published) == ["1.out", "3.out", "4.out", "5.out"]
+    assert list(result.left_over) == ["2.out"]
+
+
 def test_image_that_changes_before_it_is_read_fails(texts: Toy) -> None:
     result = run(texts, Meddler("images", "1.txt", lambda: (texts.folder / "capture" / "4.txt").write_text("4")))
     assert result.exit_code == 3
