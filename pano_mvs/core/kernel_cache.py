@@ -11,6 +11,7 @@ import atexit
 import errno
 import os
 import shutil
+import stat
 import sys
 import tempfile
 from pathlib import Path
@@ -65,6 +66,21 @@ def _user_cache() -> Path:
     for place in places:
         if _can_be_made(place):
             return place
+    return _own_temporary_folder()
+
+
+def _own_temporary_folder() -> Path:
+    """Return a folder that stays between runs, and in which nobody else can leave code for us to execute.
+
+    Raises:
+        OSError: if there is none.
+    """
+    if sys.platform != "win32":
+        folder = Path(tempfile.gettempdir()) / f"pano-mvs-{os.getuid()}"
+        folder.mkdir(mode=0o700, exist_ok=True)
+        info = folder.lstat()
+        if stat.S_ISDIR(info.st_mode) and info.st_uid == os.getuid() and not info.st_mode & 0o077:
+            return folder
     raise OSError(errno.EACCES, "you have no folder for caches that can be written")
 
 

@@ -37,6 +37,9 @@ def changed_settings(unit: Unit, store: Store) -> list[str]:
 
 def _reason(path: Path, digest: str, store: Store) -> str:
     try:
+        if store.stat_cache.digest(path) == digest:
+            return ""
+        store.stat_cache.forget(path)  # it may be damaged
         return "" if store.stat_cache.digest(path) == digest else changed_text(path)
     except InputError:
         return vanished_text(path)

@@ -11,7 +11,7 @@ from typing import TypeAlias
 from pano_mvs.core.digest import IS_DIGEST, digest_from_bytes, digest_from_file, digest_from_value
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.files import CACHE_MARK, write_text
-from pano_mvs.core.paths import below, is_file, is_folder, resolved
+from pano_mvs.core.paths import below, is_file, is_folder, reason_of, resolved
 
 # A file changed within this time of being hashed may change again without its time stamp showing it.
 _SETTLE_S = 2.0
@@ -43,9 +43,10 @@ class StatCache:
                 files = files_of_folder(path)
                 return digest_from_value([[file.relative_to(path).as_posix(), self._file(file)] for file in files])
             return self._file(path)
-        except OSError as error:
-            reason = error.strerror or str(error)
-            raise InputError(f"{path}: cannot be read ({reason}). Check that it exists and may be read") from error
+        except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+            raise InputError(
+                f"{path}: cannot be read ({reason_of(error)}). Check that it exists and may be read"
+            ) from error
 
     @staticmethod
     def state(path: Path) -> State | None:

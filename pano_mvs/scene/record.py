@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.digest import digest_from_bytes
 from pano_mvs.core.errors import ChangedFileError, ContractError, InputError
+from pano_mvs.core.paths import reason_of
 
 
 class Axis(StrEnum):
@@ -50,8 +51,8 @@ class FilePart:
         try:
             data = self.path.read_bytes()
         except (OSError, ValueError) as error:  # ValueError: a name that no file can have
-            reason = getattr(error, "strerror", None) or error
-            raise InputError(f"{self.path}: cannot be read ({reason}). Check that it exists and may be read") from error
+            raise InputError(f"{self.path}: cannot be read ({reason_of(error)}). Check that it exists and may be "
+                             "read") from error  # fmt: skip
         if self.external and self.digest and digest_from_bytes(data) != self.digest:
             raise ChangedFileError(changed_text(self.path), self.path)
         return data

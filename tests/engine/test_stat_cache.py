@@ -157,7 +157,7 @@ def list_items''').replace("import os\n", "import os\nfrom pano_mvs.scene import
         result = Run(session.workflow, session.graph, store, session.out, executor=executor).execute()
     finally:
         executor.close()
-    assert result.exit_code == 0
+    assert result.exit_code == 0, (result.failures, result.warnings)
     assert any("capture/1.txt changed during the run" in text for text in result.warnings)
     assert toy.deliverables() == clean
 

@@ -44,6 +44,7 @@ def _failed(unit: Unit, store: Store, error: BaseException) -> Outcome:
         return Outcome("stopped", cause=str(error), error=kind.__name__, exit_code=error.exit_code)
     changed = changed_items(unit, store)
     if isinstance(error, ChangedFileError) and error.path is not None:
+        store.stat_cache.forget(error.path)
         changed.setdefault(str(error.path), str(error))  # it may be as before again
     if changed and unit.source is None:
         return Outcome("changed", cause="\n".join(changed.values()), changed=changed)
