@@ -35,11 +35,19 @@ def runs(cache: CacheOption = None) -> None:
 
 @cache_app.command("verify")
 @guarded
-def verify(cache: CacheOption = None) -> None:
-    """Check every byte; damaged files are removed, and computed again by the next run."""
+def verify(
+    cache: CacheOption = None,
+    drop_unproven: Annotated[
+        bool, typer.Option("--drop-unproven", help="Remove results of earlier versions that are not proven.")
+    ] = False,
+) -> None:
+    """Check every byte; damaged files are removed, and computed again by the next run.
+
+    Results of earlier versions that may be of images that changed during a run are listed as not proven.
+    """
     from pano_mvs.cli.cache_command import open_cache, verify_cache
 
-    raise typer.Exit(verify_cache(open_cache(cache), Console()))
+    raise typer.Exit(verify_cache(open_cache(cache), Console(), drop_unproven=drop_unproven))
 
 
 @cache_app.command("gc")

@@ -13,12 +13,15 @@ from rich.table import Table
 
 from pano_mvs.cli.session import CACHE_VARIABLE
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.paths import is_denied, is_file
 from pano_mvs.engine.store import Store
 from pano_mvs.engine.upkeep import Collection, collect, size_on_disk, usage_of, verify
 
 _SHOWN = 10
 _UNITS_S = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0, "w": 604800.0}
 _FAILED_ITEMS = 3
+_UNPROVEN = ("{} results of an earlier version, which did not check the images that it read, are not proven: images "
+             "were changed, moved or deleted since, perhaps while they were being read")  # fmt: skip
 
 
 def open_cache(cache: Path | None) -> Store:
@@ -29,7 +32,9 @@ def open_cache(cache: Path | None) -> Store:
     """
     variable = os.environ.get(CACHE_VARIABLE)
     root = cache or (Path(variable) if variable else Path(".pano-mvs"))
-    if not (root / "layout.json").is_file():
+    if not is_file(root / "layout.json"):
+        if is_denied(root / "layout.json"):
+            raise UsageError(f"{root}: you may not look into this folder (permission denied). Mend its permissions")
         raise UsageError(f"{root} is no cache of pano-mvs; name one with --cache DIR (it lies beside the workflow file "
                          "as .pano-mvs, or where you ran a preset by its name)")  # fmt: skip
     return Store(root)
@@ -54,20 +59,25 @@ def show_runs(store: Store, console: Console) -> None:
     console.print(table)
 
 
-def verify_cache(store: Store, console: Console) -> int:
+def verify_cache(store: Store, console: Console, *, drop_unproven: bool = False) -> int:
     """Check every file of the cache; return the exit code."""
-    damage = verify(store)
+    damage = verify(store, drop_unproven=drop_unproven)
     for what, paths in (("removed, damaged", damage.removed), ("incomplete", damage.incomplete),
-                        ("not of the cache", damage.foreign), ("temporary", damage.temporary)):  # fmt: skip
+                        ("not proven", damage.unproven), ("not of the cache", damage.foreign),
+                        ("temporary", damage.temporary)):  # fmt: skip
         for path in paths[:_SHOWN]:
             console.print(f"{what}: {escape(path)}", highlight=False, soft_wrap=True)
         if len(paths) > _SHOWN:
             console.print(f"{what}: … and {len(paths) - _SHOWN} more")
     console.print(f"{damage.records} records and {damage.blobs} blobs are sound, {len(damage.removed)} damaged",
                   highlight=False)  # fmt: skip
-    if not damage.removed and not damage.incomplete:
+    if damage.unproven:
+        console.print(_UNPROVEN.format(len(damage.unproven)), highlight=False, soft_wrap=True)
+        console.print("they were removed" if drop_unproven else "--drop-unproven removes them", highlight=False)
+    if not damage.removed and not damage.incomplete and not damage.unproven:
         return 0
-    console.print("the same run computes what is missing again")
+    if damage.removed or damage.incomplete or drop_unproven:
+        console.print("the same run computes what is missing again")
     return _FAILED_ITEMS
 
 

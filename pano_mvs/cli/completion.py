@@ -13,6 +13,7 @@ from typing import Any
 import typer
 
 from pano_mvs.core.errors import PanoMvsError
+from pano_mvs.core.paths import children, is_folder
 from pano_mvs.engine.workflow import StageEntry
 
 Offer = tuple[str, str]
@@ -38,12 +39,12 @@ def complete_workflow(incomplete: str) -> Iterator[Offer]:
     """Offer the presets, and workflow files and folders."""
     from pano_mvs.cli.session import presets_folder
 
-    for preset in sorted(presets_folder().glob("*.yaml")):
+    for preset in children(presets_folder(), "*.yaml"):
         yield preset.stem, _first_comment(preset)
     folder = incomplete.rpartition("/")[0]
-    for path in sorted(Path(f"{folder}/" if folder or incomplete.startswith("/") else ".").iterdir()):
+    for path in children(Path(f"{folder}/" if folder or incomplete.startswith("/") else ".")):
         shown = f"{folder}/{path.name}" if "/" in incomplete else path.name
-        if path.is_dir() and not path.name.startswith("."):
+        if is_folder(path) and not path.name.startswith("."):
             yield f"{shown}/", "folder"
         elif path.suffix in (".yaml", ".yml"):
             yield shown, "workflow file"

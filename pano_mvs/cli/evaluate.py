@@ -11,6 +11,7 @@ from pano_mvs.cli.evaluate_cloud import CloudRequest, evaluate_cloud
 from pano_mvs.cli.evaluate_depth import DepthRequest, evaluate_depth
 from pano_mvs.cli.run_command import print_scores
 from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.core.paths import is_file, is_folder
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.colmap_model import is_colmap_model
 from pano_mvs.io.pose_files import read_groups, read_poses
@@ -66,7 +67,7 @@ def _poses(out: Path, truth: Path, console: Console) -> str:
 
 def _ranges(out: Path, truth: Path, console: Console) -> str:
     """Print the scores of the range maps; return why not, or an empty text."""
-    if not (out / RANGES).is_dir():
+    if not is_folder(out / RANGES):
         return f"there is no folder {RANGES}"
     estimates = find_ranges(out)
     try:
@@ -82,7 +83,7 @@ def _ranges(out: Path, truth: Path, console: Console) -> str:
 
 def _cloud(out: Path, truth: Path, console: Console) -> str:
     """Print the scores of the cloud; return why not, or an empty text."""
-    if not (out / CLOUD).is_file():
+    if not is_file(out / CLOUD):
         return f"there is no {CLOUD}"
     if not is_colmap_model(out / MODEL):
         return f"there is no {MODEL} that tells in which frame it is"

@@ -23,6 +23,7 @@ from pano_mvs.algorithms.metrics.cloud import (
 from pano_mvs.algorithms.metrics.poses import align_centers
 from pano_mvs.algorithms.metrics.surface import TrueSurface, TrueView, surface_of_cloud, surface_of_views, view_points
 from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.core.paths import is_file, is_folder
 from pano_mvs.geometry import Rigid3, Similarity3
 from pano_mvs.io.names import match_image_names
 from pano_mvs.io.ply_points import PlyPoints, open_ply_points
@@ -156,8 +157,8 @@ def judge_cloud(request: CloudRequest) -> JudgedCloud:
     if not thresholds or not thresholds[0] > 0:
         raise UsageError(f"tolerances must be positive, got {', '.join(map(str, thresholds)) or 'none'}")
     cloud, truth = request.cloud, request.truth
-    file = open_ply_points(cloud / _CLOUD if cloud.is_dir() else cloud)
-    model = cloud / _MODEL if cloud.is_dir() and request.poses is None else request.poses
+    file = open_ply_points(cloud / _CLOUD if is_folder(cloud) else cloud)
+    model = cloud / _MODEL if is_folder(cloud) and request.poses is None else request.poses
     known, is_metric = _true_poses(truth, request.true_poses)
     used, truth_from_cloud = list(known), None
     if model is not None and (known or request.poses is not None):
@@ -179,10 +180,10 @@ def _in_truth(file: PlyPoints, truth_from_cloud: Similarity3 | None) -> Iterator
 
 def _true_poses(truth: Path, true_poses: Path | None) -> tuple[dict[str, Rigid3], bool]:
     """Return the true cameras, none of a reference cloud alone, and whether lengths are metres."""
-    if true_poses is None and not truth.is_dir():
+    if true_poses is None and not is_folder(truth):
         return {}, False
     beside = truth / "poses.json"  # of the ranges, whatever other poses lie there
-    poses = read_poses(true_poses or (beside if beside.is_file() else truth))
+    poses = read_poses(true_poses or (beside if is_file(beside) else truth))
     return {name: poses.cam_from_world(idx) for idx, name in enumerate(poses.names)}, poses.metric
 
 
@@ -203,7 +204,7 @@ def _cloud_truth(
 ) -> CloudTruth:
     cameras = np.array([known[name].center for name in used if name in known]).reshape(-1, 3)
     up = _up([known[name] for name in used if name in known])
-    if not truth.is_dir():
+    if not is_folder(truth):
         reference = open_ply_points(truth)
         some, _ = reference.some(max(1, -(-reference.count // _MOST_SAMPLES)))
         surface = surface_of_cloud(some, voxel_size=voxel_size)

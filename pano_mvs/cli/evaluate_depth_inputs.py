@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.metrics.poses import align_centers
 from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.core.paths import children, is_file, is_folder
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.captures import PICTURE_SUFFIXES, describe_picture, list_pictures
 from pano_mvs.io.pose_files import read_groups, read_poses
@@ -141,7 +142,7 @@ def mask_reader(
     Raises:
         InputError: if the folder is none, or holds no mask of any view.
     """
-    if masks is not None and not masks.is_dir():
+    if masks is not None and not is_folder(masks):
         raise InputError(f"{masks}: masks must be a folder. Give one mask for all pictures as --mask")
     names = list(names)
     if masks is not None and not any(_mask_of(masks, name) for name in names):
@@ -177,7 +178,7 @@ def picture_reader(images: Path | None, truth: Path, inputs: DepthInputs) -> Cal
         paths = {name: files[other] for name, other in match_pictures(inputs.truths, files).items()}
     else:
         places = {name: (truth / other, truth.parent / other) for name, other in inputs.true_names.items()}
-        found = {name: next((path for path in pair if path.is_file()), None) for name, pair in places.items()}
+        found = {name: next((path for path in pair if is_file(path)), None) for name, pair in places.items()}
         paths = {name: path for name, path in found.items() if path is not None}
         paths = {name: path for name, path in paths.items() if path.suffix.lower() in PICTURE_SUFFIXES}
 
@@ -196,10 +197,10 @@ def _mask_of(masks: Path, name: str) -> Path | None:
     plain = without_extension(name)
     own = [f"{name}.png"] if name != plain else []
     place, stem = (masks / plain).parent, PurePosixPath(plain).name
-    beside = (path for path in sorted(place.glob(f"{glob.escape(stem)}.*.png"))
+    beside = (path for path in children(place, f"{glob.escape(stem)}.*.png")
               if without_extension(path.stem) == stem)  # fmt: skip
     tried = [*(masks / path for path in own), *beside, masks / f"{plain}.png"]
-    return next((path for path in tried if path.is_file()), None)
+    return next((path for path in tried if is_file(path)), None)
 
 
 def _poses(path: Path) -> dict[str, Rigid3]:

@@ -15,7 +15,8 @@ import typer
 from rich.markup import escape
 
 from pano_mvs.cli.console import Console
-from pano_mvs.core.errors import PanoMvsError, WorkflowError
+from pano_mvs.core.errors import PanoMvsError, StoreError, WorkflowError
+from pano_mvs.core.paths import reason_of
 
 Command = TypeVar("Command", bound=Callable[..., None])
 
@@ -43,7 +44,11 @@ def guarded(command: Command) -> Command:
             errors.print(f"[red]error:[/] the code above called {escape(exit_text(end))}, which a plugin must not do; "
                          "what was finished is kept", highlight=False, soft_wrap=True)  # fmt: skip
             raise typer.Exit(1) from None
-        except Exception:
+        except Exception as error:
+            if isinstance(error, OSError) and error.filename is not None:  # where no better message was foreseen
+                problem = f"{error.filename}: {reason_of(error)}. Mend its permissions, or choose another path"
+                errors.print(f"[red]error:[/] {escape(problem)}", highlight=False, soft_wrap=True)
+                raise typer.Exit(StoreError.exit_code) from None
             traceback.print_exc()
             errors.print("[red]internal error:[/] this is a bug in pano_mvs; what was finished is kept")
             raise typer.Exit(1) from None

@@ -15,6 +15,7 @@ from rich.markup import escape
 from pano_mvs.cli.inspect_text import as_json_value, print_inspection
 from pano_mvs.cli.session import CACHE_VARIABLE, Session, open_session
 from pano_mvs.core.errors import InputError, StoreError, UsageError
+from pano_mvs.core.paths import is_file, is_folder
 from pano_mvs.engine.plan import StagePlan, make_plan
 from pano_mvs.engine.run import workflow_id
 from pano_mvs.engine.store import Store, UnitRecord
@@ -74,7 +75,7 @@ def open_run(target: str, *, overrides: Sequence[str], images: Path | None, cach
         InputError: if the output folder is none, or its workflow is gone.
     """
     out = Path(target)
-    if not out.is_dir():
+    if not is_folder(out):
         return open_session(target, overrides=overrides, images=images, cache=cache)
     try:
         summary = json.loads((out / "run.json").read_bytes())
@@ -85,7 +86,7 @@ def open_run(target: str, *, overrides: Sequence[str], images: Path | None, cach
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{out}: holds no run.json of a run ({error}). Give the output folder of a run, or its "
                          "workflow") from error  # fmt: skip
-    if not workflow.is_file():
+    if not is_file(workflow):
         raise InputError(f"{out}: its workflow {workflow} is gone. Give another: pano-mvs inspect WORKFLOW IMAGE X Y")
     # A relative folder was meant from where the run was started; what it was is in the settings.
     given = [f"images.path={json.dumps(read['images']['path'])}" if one.startswith("images.path=") else one
@@ -167,7 +168,7 @@ def _truth_of(session: Session, image: str) -> Path | None:
     """
     for entry in session.workflow.stages.values():
         folder = getattr(entry.params, "truth", None)
-        if isinstance(folder, Path) and (folder / "poses.json").is_file():
+        if isinstance(folder, Path) and is_file(folder / "poses.json"):
             return folder if read_truth(folder).match([image]) else None
     return None
 

@@ -16,6 +16,7 @@ from rich.table import Table
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.files import write_text
+from pano_mvs.core.paths import exists
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
 
@@ -93,7 +94,7 @@ def write_plugin(kind: str, name: str, folder: Path, console: Console) -> None:
     plugin, test = rendered(kind, name)
     paths = folder / f"{name}.py", folder / f"test_{name}.py"
     for path in paths:
-        if path.exists():
+        if exists(path):
             raise UsageError(f"{path} is there already; nothing was written. Take another name, or another --dir")
     for path, text in zip(paths, (plugin, test), strict=True):
         write_text(path, text)

@@ -12,6 +12,7 @@ from rich.markup import escape
 
 from pano_mvs.cli.session import CACHE_VARIABLE
 from pano_mvs.core.errors import InputError
+from pano_mvs.core.paths import is_file
 from pano_mvs.engine.output_lock import output_lock
 from pano_mvs.engine.store import Store
 from pano_mvs.report import write_report
@@ -30,7 +31,7 @@ def rewrite_report(out: Path, cache: Path | None, console: Console) -> None:
     """
     summary = _summary(out / "run.json")
     root = cache or Path(os.environ.get(CACHE_VARIABLE) or str(summary.get("cache") or ".pano-mvs"))
-    if not (root / "layout.json").is_file():
+    if not is_file(root / "layout.json"):
         raise InputError(f"there is no cache in {root}, from which the pictures come. Give the one that the run used "
                          "with --cache DIR")  # fmt: skip
     with output_lock(out):

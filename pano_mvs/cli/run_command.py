@@ -30,6 +30,7 @@ from pano_mvs.cli.streams import apart
 from pano_mvs.cli.telling import INTERRUPTED, tell, tell_of_end
 from pano_mvs.core.errors import PanoMvsError, UsageError
 from pano_mvs.core.files import OUTPUT_MARK, set_aside
+from pano_mvs.core.paths import exists, is_file
 from pano_mvs.engine.blobs import DamagedBlobError
 from pano_mvs.engine.events import Observer, RunResult
 from pano_mvs.engine.executors.choose import make_executor
@@ -193,9 +194,9 @@ def interrupted_by_termination() -> Iterator[None]:
 
 def _keep_what_is_not_ours(out: Path) -> None:
     """Rename files that we are about to write where no run of ours has written before."""
-    if not (out / OUTPUT_MARK).exists():
+    if not exists(out / OUTPUT_MARK):
         for path in (out / "run.json", out / "report.html"):
-            if path.is_file():
+            if is_file(path):
                 set_aside(path)
 
 

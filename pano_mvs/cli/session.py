@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pano_mvs
 from pano_mvs.core.errors import InputError, UsageError, WorkflowError
+from pano_mvs.core.paths import exists, is_denied, is_folder, problem_of, resolved
 from pano_mvs.engine.demands import NO_DEMANDS, Demands
 from pano_mvs.engine.params import files_of
 from pano_mvs.engine.registry import Registry
@@ -34,7 +35,7 @@ def presets_folder() -> Path:
     """Return the folder of the shipped workflows: inside the installed package, or beside it in a checkout."""
     package = Path(pano_mvs.__file__).parent
     inside = package / "workflows"
-    return inside if inside.is_dir() else package.parent / "workflows"
+    return inside if is_folder(inside) else package.parent / "workflows"
 
 
 def open_session(
@@ -55,12 +56,14 @@ def open_session(
         UsageError: if there is no such workflow.
         WorkflowError: with every mistake in it.
         InputError: if the folder of images is not there.
+        UsageError: if a stage reads the folder of the cache.
     """
     path, is_preset = find_workflow(name, presets_folder())
-    if images is not None and not images.is_dir():
-        if images.exists():
+    if images is not None and not is_folder(images):
+        if exists(images):
             raise InputError(f"--images {images}: this is a file; give the folder with the pictures")
-        raise InputError(f"--images {images}: there is no such folder")
+        raise InputError(f"--images {images}: there is no such folder that you may look at ({problem_of(images)})"
+                         if is_denied(images) else f"--images {images}: there is no such folder")  # fmt: skip
     registry = Registry.installed()
     try:
         workflow = load_workflow(path, registry, overrides=overrides, images=images, presets=presets_folder())
@@ -69,9 +72,14 @@ def open_session(
     workflow = replace(workflow, plugins=_all_plugins(workflow, registry))
     graph = wire(workflow)
     variable = os.environ.get(CACHE_VARIABLE)
-    beside = Path.cwd() if is_preset else path.parent
+    beside = resolved(Path()) if is_preset else path.parent
     root = cache or (Path(variable) if variable else beside / ".pano-mvs")
-    return Session(workflow, graph, registry, root, out or Path("out") / workflow.name, demands)
+    session = Session(workflow, graph, registry, root, out or Path("out") / workflow.name, demands)
+    if name := _reader_of(root, session):
+        option = "--cache" if cache or not variable else f"${CACHE_VARIABLE}"
+        raise UsageError(f"{option} {root}: stage {name!r} reads this very folder, and the cache's files would lie "
+                         "among its own. Choose another folder")  # fmt: skip
+    return session
 
 
 def check_output(session: Session) -> None:
@@ -80,10 +88,17 @@ def check_output(session: Session) -> None:
     Raises:
         UsageError: if a stage reads it.
     """
-    out = session.out.resolve()
+    if name := _reader_of(session.out, session):
+        raise UsageError(f"--out {session.out}: stage {name!r} reads this very folder. Choose another folder")
+
+
+def _reader_of(folder: Path, session: Session) -> str:
+    """Return the stage whose settings name a folder; "" if there is none."""
+    place = resolved(folder)
     for name, entry in session.workflow.stages.items():
-        if any(path.resolve() == out for paths in files_of(entry.params).values() for path in paths):
-            raise UsageError(f"--out {session.out}: stage {name!r} reads this very folder. Choose another folder")
+        if any(resolved(path) == place for paths in files_of(entry.params).values() for path in paths):
+            return name
+    return ""
 
 
 def _all_plugins(workflow: Workflow, registry: Registry) -> dict[Path, str]:
@@ -91,6 +106,6 @@ def _all_plugins(workflow: Workflow, registry: Registry) -> dict[Path, str]:
 
     Both go along to the workers, which need not have the folder.
     """
-    named = {path.resolve() for path in workflow.plugins}
+    named = {resolved(path) for path in workflow.plugins}
     behind = registry.files_behind({entry.spec.name for entry in workflow.stages.values()})
     return dict(workflow.plugins) | {path: digest for path, digest in behind.items() if path not in named}

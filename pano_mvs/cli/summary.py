@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 import pano_mvs
+from pano_mvs.core.paths import resolved
 from pano_mvs.engine.events import RunResult, StageSummary
 from pano_mvs.engine.executors.threads import available_threads
 from pano_mvs.engine.run import Run
@@ -35,7 +36,7 @@ def summarise(run: Run, result: RunResult, *, started: datetime, seconds: float)
     scores = _scores(run)
     return {
         "workflow": {"name": workflow.name, "path": str(workflow.path or ""), "overrides": list(workflow.overrides)},
-        "cache": str(run.store.root.resolve()),
+        "cache": str(resolved(run.store.root)),
         "version": pano_mvs.__version__,
         "started": started.isoformat(timespec="seconds"),
         "machine": _machine(),

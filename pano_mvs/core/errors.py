@@ -4,6 +4,7 @@
     ├── UsageError (ValueError)            exit 2: a call or an option that cannot work
     │   └── WorkflowError                  exit 2: mistakes in a workflow file, with line and column
     ├── InputError (ValueError)            exit 2, or 3 where the rest can go on: a file we cannot use
+    │   └── ChangedFileError               exit 3: a file that is not the one that the run listed
     ├── PluginError (ImportError)          exit 2: a plugin that failed to import or to register
     ├── ContractError (TypeError)          exit 1: a stage returned what it had not declared
     ├── StoreError (OSError)               exit 4: the cache or the output folder cannot be written
@@ -15,6 +16,8 @@ A message says what is wrong, with which item, where, and what to do about it. E
 """
 
 from __future__ import annotations
+
+from pathlib import Path
 
 
 class PanoMvsError(Exception):
@@ -41,6 +44,16 @@ class InputError(PanoMvsError, ValueError):
     """A file or folder given by the user that cannot be used; the message names it and the remedy."""
 
     exit_code = 2
+
+
+class ChangedFileError(InputError):
+    """A user's file that changed, or vanished, after the run had listed it."""
+
+    exit_code = 3
+
+    def __init__(self, message: str, path: Path | None = None) -> None:
+        self.path = path
+        super().__init__(message)
 
 
 class PluginError(PanoMvsError, ImportError):

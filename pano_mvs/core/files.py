@@ -13,10 +13,24 @@ from itertools import count
 from pathlib import Path
 
 from pano_mvs.core.errors import StoreError
+from pano_mvs.core.paths import children, exists, is_file, is_folder, is_link
 from pano_mvs.core.processes import is_running, process_place
 
 OUTPUT_MARK = ".pano-mvs-output"
 """An empty file in every output folder, written first: no source takes what lies there for pictures."""
+
+
+CACHE_MARK = ".pano-mvs-cache"
+"""An empty file in every cache: no source takes what lies there for pictures."""
+
+_FOLDERS_OF_A_CACHE = ("blobs", "records")
+
+
+def is_cache(folder: Path) -> bool:
+    """Return whether a folder is a cache; those of versions that wrote no mark are known by what they hold."""
+    if exists(folder / CACHE_MARK):
+        return True
+    return is_file(folder / "layout.json") and all(is_folder(folder / name) for name in _FOLDERS_OF_A_CACHE)
 
 
 def _umask() -> int:
@@ -37,7 +51,7 @@ def set_aside(path: Path) -> Path:
         StoreError: if it cannot be renamed.
     """
     names = (f"{path.name}{f'.{number}' if number else ''}.bak" for number in count())
-    free = next(path.with_name(name) for name in names if not path.with_name(name).exists())
+    free = next(path.with_name(name) for name in names if not exists(path.with_name(name)))
     try:
         return path.rename(free)
     except OSError as error:
@@ -66,7 +80,7 @@ def clear_abandoned(folder: Path) -> None:
     container, Windows), and what bears another name, it is for age to tell: no unit takes seven days.
     """
     with suppress(OSError):
-        for path in folder.glob(".tmp-*"):
+        for path in children(folder, ".tmp-*"):
             if _is_abandoned(path):
                 remove_whole(path)
 
@@ -74,7 +88,7 @@ def clear_abandoned(folder: Path) -> None:
 def remove_whole(path: Path) -> None:
     """Remove a file, a link or a whole folder; another process may be doing so too."""
     with suppress(OSError):
-        if path.is_dir() and not path.is_symlink():
+        if is_folder(path) and not is_link(path):
             shutil.rmtree(path, ignore_errors=True)
         else:
             path.unlink(missing_ok=True)
@@ -150,14 +164,14 @@ def _take_name(temporary: Path, path: Path) -> None:
     try:
         temporary.replace(path)
     except PermissionError:
-        if not path.is_file() or path.stat().st_size != temporary.stat().st_size:
+        if not is_file(path) or path.stat().st_size != temporary.stat().st_size:
             raise
         if path.read_bytes() != temporary.read_bytes():
             raise
 
 
 def _flush(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    handle = os.open(path, os.O_RDONLY if is_folder(path) else os.O_RDWR)
     try:
         os.fsync(handle)
     finally:

@@ -18,10 +18,12 @@ from typing import Any
 import numpy as np
 
 from pano_mvs.core.digest import DIGEST_BYTES, IS_DIGEST, digest_from_bytes, digest_from_file
-from pano_mvs.core.errors import StoreError
+from pano_mvs.core.errors import ChangedFileError, StoreError
 from pano_mvs.core.files import replacing
+from pano_mvs.core.paths import is_link
 from pano_mvs.engine.stat_cache import StatCache
 from pano_mvs.scene import FilePart, Part
+from pano_mvs.scene.record import changed_text
 
 SUFFIX = re.compile(r"(\.[a-z0-9_+-]{1,16})?")
 _LARGEST_BYTES = 1 << 50
@@ -93,6 +95,10 @@ class BlobStore:
         self._external[digest] = path
         return digest
 
+    def place_external(self, digest: str, path: Path) -> None:
+        """Say where a user's file of a digest is, without reading it."""
+        self._external[digest] = path
+
     def path(self, ref: BlobRef) -> Path:
         """Return where a blob is or would be."""
         return Path(self._place(ref))
@@ -122,14 +128,20 @@ class BlobStore:
     def get(self, ref: BlobRef) -> Part:
         """Return a stored part; arrays cannot be written to, and large ones are memory-mapped.
 
+        A user's own file is not read here: `FilePart.read_bytes` checks its bytes each time that they are read.
+
         Raises:
             DamagedBlobError: if the bytes are not those that were stored; the blob is removed.
         """
+        if ref.external:
+            if not self.exists(ref):
+                raise self.discard(ref, "is gone or changed")
+            return FilePart(self.path(ref), external=True, digest=ref.digest)
         path = self.verified_path(ref)
         try:
-            if ref.suffix == ".npy" and not ref.external:
+            if ref.suffix == ".npy":
                 return _mapped(path) if ref.is_mapped else _read(path)
-            if ref.suffix == ".json" and not ref.external:
+            if ref.suffix == ".json":
                 value = json.loads(path.read_bytes())
                 if not isinstance(value, dict):
                     raise ValueError("not an object")
@@ -138,14 +150,14 @@ class BlobStore:
             raise self.discard(ref, "is gone") from error
         except (ValueError, RecursionError) as error:
             raise self.discard(ref, f"holds nothing that pano_mvs writes ({error})") from error
-        return FilePart(path, external=ref.external, digest=ref.digest)
+        return FilePart(path, digest=ref.digest)
 
     def discard(self, ref: BlobRef, why: str) -> DamagedBlobError:
         """Remove a blob that is of no use, unless it is the user's own file, and return the error that says so."""
         path = self.path(ref)
         if ref.external:
             self.stat_cache.forget(path)
-        elif not path.parent.is_symlink():
+        elif not is_link(path.parent):
             path.unlink(missing_ok=True)
         self._verified.discard(str(path))
         return DamagedBlobError(f"{path} {why}; the same command computes it again")
@@ -197,6 +209,8 @@ class BlobStore:
             suffix = ""
         if part.external:
             digest = self.register_external(part.path)
+            if part.digest and digest != part.digest:
+                raise ChangedFileError(changed_text(part.path), part.path)
             return BlobRef(digest, part.path.stat().st_size, suffix, external=True)
         ref = BlobRef(digest_from_file(part.path), part.path.stat().st_size, suffix)
         if not self._keep(ref):
@@ -223,7 +237,7 @@ class BlobStore:
 
     @staticmethod
     def _refuse_link(path: Path) -> None:
-        if path.parent.is_symlink():
+        if is_link(path.parent):
             raise StoreError(f"{path.parent} is a link, which no cache has: remove it, or choose another cache "
                              "with --cache DIR")  # fmt: skip
 

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol, TypeAlias
 
+from pano_mvs.engine.listing import Listing
 from pano_mvs.engine.ports import Cardinality
 from pano_mvs.engine.resolve import Resolver, resolve_source
 from pano_mvs.engine.stage import INDEX_PORT
@@ -60,9 +61,13 @@ class Board:
 
     Attributes:
         states: stage to what it has made, in the order of the workflow.
+        listing: what the sources offer.
     """
 
-    def __init__(self, workflow: Workflow, graph: Graph, store: Store, listener: Listener) -> None:
+    def __init__(
+        self, workflow: Workflow, graph: Graph, store: Store, listener: Listener, listing: Listing | None = None
+    ) -> None:
+        self.listing = listing or Listing()
         self.states = {name: StageState(graph.axes[name], open=True) for name in graph.order}
         self._store = store
         self._only = graph.only
@@ -175,7 +180,7 @@ class Board:
         self._open_behind(name)
 
     def _list_source(self, stage: _Stage, state: StageState) -> Mapping[str, str]:
-        resolution = resolve_source(stage.entry, self._store, self._only.get(stage.entry.name))
+        resolution = resolve_source(stage.entry, self._store, self._only.get(stage.entry.name), self.listing)
         stage.found = {unit.item: unit for unit in resolution.units}
         state.members.update(resolution.members)
         said = {unit.item: unit.source.notes for unit in resolution.units if unit.source}

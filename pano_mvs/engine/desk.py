@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pano_mvs.core.files import temporary_prefix
+from pano_mvs.core.paths import exists, resolved
 from pano_mvs.engine.blobs import DamagedBlobError
 from pano_mvs.engine.execute import arguments_of
 from pano_mvs.engine.executors.capture import tail
@@ -156,10 +157,10 @@ class Desk:
         unit = job.unit
         path = self._logs / f"{log_name(unit.entry.name, unit.item)}.log"
         said = tail(job.log, _SHOWN_LINES)
-        if not path.parent.resolve().is_relative_to(self._logs.parent.resolve()):
+        if not resolved(path.parent).is_relative_to(resolved(self._logs.parent)):
             return None, said  # a link, or a plugin's name of an item, leads outside
         with suppress(OSError):  # a log is not worth failing for
-            if not job.log.exists():
+            if not exists(job.log):
                 path.unlink(missing_ok=True)
                 return None, said
             path.parent.mkdir(parents=True, exist_ok=True)

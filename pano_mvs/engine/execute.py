@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from pano_mvs.core.errors import ContractError
+from pano_mvs.core.errors import ChangedFileError, ContractError
+from pano_mvs.engine.changed_files import changed_items, changed_settings
 from pano_mvs.engine.context import Context
 from pano_mvs.engine.gather import Gather
 from pano_mvs.engine.ports import Cardinality, Names, Port
@@ -27,6 +28,7 @@ def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
     """Run a unit and store its result; the record is written last.
 
     Raises:
+        ChangedFileError: if a user's file that it reads is not the one that its key stands for.
         ContractError: if the stage returns something other than what it declared.
         Exception: whatever the stage raises.
     """
@@ -36,6 +38,8 @@ def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
         arguments = arguments_of(unit, store)
         value = unit.entry.spec.function(**arguments, **_extras(unit, context))
         _check_kind(value, unit)
+        if reasons := [*changed_items(unit, store).values(), *changed_settings(unit, store)]:
+            raise ChangedFileError(reasons[0])
         try:
             output = store.put_value(value)
             items = {name: store.put_value(item) for name, item in value.explode().items()}
@@ -52,6 +56,7 @@ def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
         context.rejected,
         value.doubted(),
         time.perf_counter() - started,
+        checked=True,
     )
     store.put(record)
     return record

@@ -9,6 +9,7 @@ from difflib import get_close_matches
 from pathlib import Path
 
 from pano_mvs.core.errors import InputError, WorkflowError
+from pano_mvs.core.paths import children, exists, is_file, resolved
 from pano_mvs.engine.names import is_plain_name
 from pano_mvs.engine.yaml_text import Located, Problems, parse_yaml
 
@@ -114,19 +115,19 @@ class LayerReader:
     def _find(self, item: Located, base: Path) -> Path | None:
         name = str(item.value)
         path = base / name
-        if _exists(path):
+        if exists(path):
             return path
         preset = self.presets / f"{name}.yaml" if self.presets and is_plain_name(name) else None
-        if preset is not None and preset.is_file():
+        if preset is not None and is_file(preset):
             return preset
-        names = [file.stem for file in self.presets.glob("*.yaml")] if self.presets else []
-        names += [file.name for file in base.glob("*.yaml")] if base.is_dir() else []
+        names = [file.stem for file in children(self.presets, "*.yaml")] if self.presets else []
+        names += [file.name for file in children(base, "*.yaml")]
         hint = did_you_mean(name, sorted(names))
         self.problems.add(item.place, f"extends: there is no file {str(path)[:200]} and no preset {name[:80]!r}.{hint}")
         return None
 
     def _follow(self, item: Located, path: Path, chain: tuple[Path, ...]) -> None:
-        real = path.resolve()
+        real = resolved(path)
         if real in chain:
             circle = " → ".join(file.name for file in (*chain[chain.index(real) :], real))
             self.problems.add(item.place, f"extends: the files extend each other in a circle: {circle}")
@@ -215,13 +216,6 @@ def overlaid(below: Located | None, above: Located) -> Located:
         return above
     value = {**below.value, **above.value}
     return Located(value, above.line, above.column, above.key_line, above.key_column, above.origin, above.file)
-
-
-def _exists(path: Path) -> bool:
-    try:
-        return path.exists()
-    except (OSError, ValueError):
-        return False
 
 
 def did_you_mean(word: str, options: Sequence[str] | Mapping[str, object]) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pano_mvs.core.errors import WorkflowError
+from pano_mvs.core.paths import resolved
 from pano_mvs.engine.layers import did_you_mean
 from pano_mvs.engine.yaml_text import Located, Problems, parse_yaml
 
@@ -47,7 +48,7 @@ def apply_overrides(
             rest.append(override)
     if images is not None:
         if "images" in stages:
-            _set(stages["images"], ("path",), Located(str(images.resolve()), 0, 0, origin=f"--images {images}"))
+            _set(stages["images"], ("path",), Located(str(resolved(images)), 0, 0, origin=f"--images {images}"))
         else:
             problems.add("--images", "this workflow has no stage called 'images'; use --set STAGE.path=DIR")
     for override in rest:

@@ -18,6 +18,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
 
 from pano_mvs.core.parts import Parts
+from pano_mvs.core.paths import expanded
 from pano_mvs.engine.code_digest import code_digest
 
 
@@ -42,7 +43,7 @@ NOT_IN_KEY = _NotInKey()
 def _resolve(path: Path, info: ValidationInfo) -> Path:
     context = info.context or {}
     base = context.get("bases", {}).get(info.field_name, context.get("base"))
-    path = path.expanduser()
+    path = expanded(path)
     return path if base is None or path.is_absolute() else Path(base) / path
 
 

@@ -10,6 +10,8 @@ from collections.abc import Iterable, Mapping
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
+from pano_mvs.core.paths import below, children, home_folder
+
 PLUGINS_VARIABLE = "PANO_MVS_PLUGINS"
 
 # A declaration is told by its text rather than by the syntax tree, since a broken file may have none.
@@ -32,7 +34,7 @@ def user_plugin_folders(environment: Mapping[str, str] = os.environ) -> list[Pat
 
 def plugin_files_in(folder: Path) -> list[Path]:
     """Return the plugin files of a folder, by name: all of Python but tests, and helpers, whose names begin with _."""
-    files = sorted(folder.glob("*.py")) if folder.is_dir() else []
+    files = children(folder, "*.py")
     return [file for file in files if not file.name.startswith(("_", ".", "test_")) and file.name != "conftest.py"]
 
 
@@ -64,19 +66,17 @@ def names_in_package(entry: EntryPoint) -> tuple[tuple[str, str], ...]:
     if spec is None:
         return ()
     folders = [Path(folder) for folder in spec.submodule_search_locations or ()]
-    files = [file for folder in folders for file in sorted(folder.rglob("*.py"))]
+    files = [file for folder in folders for file in below(folder, "*.py")]
     return names_in_files(files if folders else [Path(spec.origin)] if spec.origin else [])
 
 
 def _settings_folder(environment: Mapping[str, str]) -> Path | None:
     """Return where programs keep a user's settings, if there is such a place."""
-    try:
-        home = Path.home()
-    except RuntimeError:
-        return None
+    home = home_folder()
     if sys.platform == "win32":
-        return Path(environment.get("APPDATA") or home / "AppData" / "Roaming")
+        given = Path(environment.get("APPDATA") or "")
+        return given if given.is_absolute() else home and home / "AppData" / "Roaming"
     if sys.platform == "darwin":
-        return home / "Library" / "Application Support"
+        return home and home / "Library" / "Application Support"
     given = Path(environment.get("XDG_CONFIG_HOME") or "")
-    return given if given.is_absolute() else home / ".config"
+    return given if given.is_absolute() else home and home / ".config"

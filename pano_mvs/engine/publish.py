@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from pano_mvs.core.errors import ContractError, StoreError, UsageError
 from pano_mvs.core.files import OUTPUT_MARK, clear_abandoned, copy_file, set_aside
+from pano_mvs.core.paths import is_file, is_link, resolved
 from pano_mvs.engine.blobs import BlobRef, DamagedBlobError
 from pano_mvs.engine.names import is_of_the_run
 from pano_mvs.engine.room import is_full_disk
@@ -40,7 +41,7 @@ class Publisher:
         store: where their bytes are.
         written: the files that were written.
         published: every file of the run, and its digest.
-        earlier: file to digest, as an earlier run wrote them.
+        earlier: file to digest, as an earlier run, or an earlier pass of this one, wrote them.
         set_aside: file to what it is called now, of those that stood where one was to be written and are nobody's but
             the user's: edited since, or never a run's.
     """
@@ -56,7 +57,7 @@ class Publisher:
         self.store = store
         self.written: list[str] = []
         self.published: dict[str, str] = {}
-        self.earlier: Mapping[str, str] = {}
+        self.earlier: dict[str, str] = {}
         self.set_aside: dict[str, str] = {}
         self._owners: dict[str, _Owner] = {}
         self._folders: set[str] = set()
@@ -70,7 +71,7 @@ class Publisher:
         if not os.access(out, os.W_OK | os.X_OK):
             raise UsageError(_cannot_write(out, "permission denied"))
         try:
-            if (out / OUTPUT_MARK).is_symlink():
+            if is_link(out / OUTPUT_MARK):
                 (out / OUTPUT_MARK).unlink()  # what it leads to may not even exist yet
             (out / OUTPUT_MARK).touch()
         except OSError as error:
@@ -82,6 +83,11 @@ class Publisher:
         """Fix the `{item}` of each image: its path without the extension, kept where two would collide."""
         self._stems = item_stems(names)
         self._ranks = {name: rank for rank, name in enumerate(self._stems)}
+
+    def begin_pass(self) -> None:
+        """Take what was published so far for that of an earlier run: not all of it need be published again."""
+        self.earlier |= self.published
+        self.published = {}
 
     def publish(self, stage: str, item: str, ref: ItemRef, *, to: str = "") -> Mapping[str, str]:
         """Write the files of one unit, unless they are there with the right bytes.
@@ -169,7 +175,7 @@ class Publisher:
         removed: list[str] = []
         for name, digest in earlier.items():
             path = self.out / name
-            if name in self.published or not _is_inside(path, self.out) or not path.is_file():
+            if name in self.published or not _is_inside(path, self.out) or not is_file(path):
                 continue
             if self.store.stat_cache.digest(path) == digest:
                 path.unlink()
@@ -182,7 +188,7 @@ class Publisher:
         emptied = {folder for name in removed for folder in PurePosixPath(name).parents if folder.parts}
         for folder in sorted(emptied, key=lambda folder: len(folder.parts), reverse=True):
             path = self.out / folder
-            if _is_inside(path, self.out) and not path.is_symlink():
+            if _is_inside(path, self.out) and not is_link(path):
                 with suppress(OSError):  # it is not empty, or somebody else has removed it
                     path.rmdir()
 
@@ -214,7 +220,7 @@ class Publisher:
             raise StoreError(_cannot_write(target, "it would leave the output folder (a link leads outside)"))
         self._clear(target.parent)
         there = ""
-        if target.is_file() and not target.is_symlink():
+        if is_file(target) and not is_link(target):
             there = self.store.stat_cache.digest(target)
         if there == blob.digest:
             return
@@ -244,7 +250,7 @@ def _clash(what: str, other: str) -> str:
 
 
 def _is_inside(path: Path, folder: Path) -> bool:
-    return path.parent.resolve().is_relative_to(folder.resolve())
+    return resolved(path.parent).is_relative_to(resolved(folder))
 
 
 def _cannot_write(path: Path, reason: str) -> str:

@@ -20,6 +20,7 @@ from types import ModuleType
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import PluginError
 from pano_mvs.core.parts import PartMark, marks_of, set_unusable_parts
+from pano_mvs.core.paths import is_file, resolved
 from pano_mvs.core.text import shortened
 from pano_mvs.engine.code_digest import code_digest
 from pano_mvs.engine.plugin_files import (
@@ -114,11 +115,11 @@ class Registry:
 
     def _load_file(self, path: Path) -> tuple[ModuleType, str] | None:
         """Return a file's module and the digest of its code; None if it is registered as it is."""
-        if not path.is_file():
+        if not is_file(path):
             raise PluginError(f"plugin file {path} does not exist")
         try:
             digest = code_digest(path)
-            if self._files.get(path.resolve(), ("", None))[0] == digest:
+            if self._files.get(resolved(path), ("", None))[0] == digest:
                 return None  # named twice, or named by the workflow and in the user's folder
             module = _import_file(path)
         except KeyboardInterrupt:
@@ -131,7 +132,7 @@ class Registry:
 
     def _remember_file(self, path: Path, module: ModuleType, digest: str) -> None:
         self.plugins.append(Plugin(str(path), _names(module, own_only=True)))
-        self._files[path.resolve()] = digest, self.plugins[-1]
+        self._files[resolved(path)] = digest, self.plugins[-1]
 
     def files_behind(self, stages: Collection[str]) -> dict[Path, str]:
         """Return the plugin files that some stages need, with the digests of their code.
@@ -265,12 +266,12 @@ def _import_file(path: Path) -> ModuleType:
     The helpers that it imports from its folder are forgotten afterwards, so that another plugin's `helper.py` is not
     taken for this one's.
     """
-    name = f"pano_mvs_plugin_{digest_from_value(str(path.resolve()))[:12]}"
+    name = f"pano_mvs_plugin_{digest_from_value(str(resolved(path)))[:12]}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise PluginError(f"{path} is not a Python file")
     module = importlib.util.module_from_spec(spec)
-    folder = str(path.resolve().parent)
+    folder = str(resolved(path).parent)
     before = set(sys.modules)
     sys.modules[name] = module
     sys.path.insert(0, folder)

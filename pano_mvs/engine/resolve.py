@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.engine.listing import Listing
 from pano_mvs.engine.names import item_problem
 from pano_mvs.engine.params import key_fields
 from pano_mvs.engine.ports import Cardinality
@@ -21,17 +23,25 @@ KEY_SCHEMA = 2
 _SHOWN = 20
 
 
-def resolve_source(entry: StageEntry, store: Store, only: frozenset[str] | None = None) -> Resolution:
+def resolve_source(
+    entry: StageEntry, store: Store, only: frozenset[str] | None = None, listing: Listing | None = None
+) -> Resolution:
     """List a source's items and return a unit for each, or for those that are asked for.
+
+    Args:
+        entry: the source.
+        store: where its units are.
+        only: names of the items that are asked for; None for all.
+        listing: what the run has listed so far; None to list anew.
 
     Raises:
         InputError: if the list cannot be made, or names an item twice.
     """
-    assert entry.spec.list_items is not None
+    listing = listing or Listing()
     resolution = Resolution()
     static = _static_identity(entry, store)
     common = digest_from_value(static)
-    for item in entry.spec.list_items(entry.params):
+    for item in listing.items(entry):
         if only is not None and item.name not in only:
             continue
         if item.name in resolution.members:
@@ -41,13 +51,14 @@ def resolve_source(entry: StageEntry, store: Store, only: frozenset[str] | None 
             resolution.blocked[item.name] = problem
             continue
         try:
-            digests = {role: store.blobs.register_external(path) for role, path in sorted(item.files.items())}
+            digests = {role: listing.digest(path, store) for role, path in sorted(item.files.items())}
         except InputError as error:
             resolution.blocked[item.name] = str(error)
             continue
         inputs = {"files": digests, "name": item.name}
         key = _key(common, inputs)
-        unit = Unit(entry, item.name, (item.name,), {}, key, static | {"inputs": inputs}, item)
+        unit = Unit(entry, item.name, (item.name,), {}, key, static | {"inputs": inputs},
+                    replace(item, digests=digests))  # fmt: skip
         resolution.units.append(unit)
     return resolution
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import GateError, StoreError
+from pano_mvs.core.paths import is_file
 from pano_mvs.engine.blobs import DamagedBlobError
 from pano_mvs.engine.board import Board
 from pano_mvs.engine.demands import NO_DEMANDS, Demands
@@ -16,6 +18,7 @@ from pano_mvs.engine.desk import Desk
 from pano_mvs.engine.events import Observer, RunResult, Silent
 from pano_mvs.engine.executors.protocol import Executor
 from pano_mvs.engine.executors.serial import SerialExecutor
+from pano_mvs.engine.listing import Listing
 from pano_mvs.engine.publish import Publisher
 from pano_mvs.engine.scheduler import Scheduler
 from pano_mvs.engine.store import Store, UnitRecord
@@ -70,6 +73,7 @@ class Run:
         self.result = RunResult()
         self._publisher = Publisher(out, store)
         self._desk = Desk(self.executor, store, out, workflow.plugins)
+        self._listing = Listing()
         self._keys: dict[str, dict[str, str]] = {}
         self._computed: dict[str, UnitRecord] = {}
         self._refreshed: set[str] = set()
@@ -87,8 +91,7 @@ class Run:
             StoreError: if the store or the output folder cannot be written.
             KeyboardInterrupt: if the user interrupts; units in flight were given some time to finish.
         """
-        earlier = dict(earlier_files or {})
-        self._publisher.earlier = earlier
+        self._publisher.earlier = dict(earlier_files or {})
         self._warn_of_timeouts()
         try:
             self._execute_healing()
@@ -96,7 +99,7 @@ class Run:
                 if ":" in unit and unit not in self._refreshed:
                     self._warn(f"--refresh {unit}: nothing was computed again, no unit of that name was reached")
             if self.result.complete and not self.graph.is_part:
-                self.result.removed = self._publisher.remove_stale(earlier)
+                self.result.removed = self._publisher.remove_stale(self._publisher.earlier)
         except KeyboardInterrupt:
             self.result.stopped = "interrupted"
             self._let_finish()
@@ -104,6 +107,7 @@ class Run:
         finally:
             self._desk.cancel()
             self._remember()
+            earlier = dict(self._publisher.earlier)
             for name, aside in self._publisher.set_aside.items():
                 self._warn(f"{name} was not as a run had written it: what was there is kept as {aside}")
             self.result.written = sorted(self._publisher.written)
@@ -111,7 +115,7 @@ class Run:
             self.result.left_over = {
                 name: digest
                 for name, digest in earlier.items()
-                if name not in self._publisher.published and (self.out / name).is_file()
+                if name not in self._publisher.published and is_file(self.out / name)
             }
         return self.result
 
@@ -150,13 +154,16 @@ class Run:
         result = self.result
         result.stages, result.failures, result.rejected, result.doubts, result.stopped = [], [], {}, {}, ""
         tally = Tally(result, self.observer, lambda name: self.states[name], self._publisher.name_items)
-        board = Board(self.workflow, self.graph, self.store, tally)
+        board = Board(self.workflow, self.graph, self.store, tally, self._listing)
         self.states = board.states
         self._scheduler = Scheduler(board, tally, self._desk, self._publisher, keys=self._keys,
                                     computed=self._computed, finder=self._find, warn=self._warn)  # fmt: skip
         stop: GateError | None = None
+        self._publisher.begin_pass()
         try:
             board.start()
+            with suppress(StoreError):  # so that workers need not read whole files for their digests
+                self.store.stat_cache.save()
             self._scheduler.work()
         except GateError as error:
             stop = error

@@ -13,6 +13,7 @@ from typing import Any, TypeAlias
 from pano_mvs.core.digest import digest_from_bytes, digest_from_value
 from pano_mvs.core.errors import StoreError, UsageError
 from pano_mvs.core.files import write_text
+from pano_mvs.core.paths import children, is_file, resolved
 
 Keys: TypeAlias = "dict[str, dict[str, str]]"
 """Stage to unit to cache key."""
@@ -61,13 +62,13 @@ class RunBook:
 
         What a run that did not get to its end had not reached yet stays as it was known.
         """
-        name = f"{workflow_id[:16]}-{digest_from_value(str(out.resolve()))[:16]}"
+        name = f"{workflow_id[:16]}-{digest_from_value(str(resolved(out)))[:16]}"
         if not finished:
             own = _read(self.root / "runs" / f"{name}.json")
             before = own.keys if own is not None else self.last_keys(workflow_id)
             keys = before | {stage: before.get(stage, {}) | units for stage, units in keys.items()}
         when = datetime.now(UTC).isoformat(timespec="seconds")
-        self._write("runs", RunEntry(name, workflow, str(out.resolve()), when, keys))
+        self._write("runs", RunEntry(name, workflow, str(resolved(out)), when, keys))
 
     def last_keys(self, workflow_id: str) -> Keys:
         """Return the keys of the latest run of a workflow, empty if there is none."""
@@ -104,7 +105,7 @@ class RunBook:
         if not _PIN_NAME.fullmatch(name):
             raise UsageError(f"{name!r} is no name for a pin: use letters, digits, dots, hyphens and underscores")
         runs = [entry for entry in self.entries() if not entry.pinned]
-        found = [entry for entry in runs if entry.name.startswith(run) or entry.out == str(Path(run).resolve())]
+        found = [entry for entry in runs if entry.name.startswith(run) or entry.out == str(resolved(Path(run)))]
         if len(found) != 1:
             known = ", ".join(entry.name for entry in found or runs) or "none"
             raise UsageError(f"{len(found)} runs are called {run!r}; there are: {known}")
@@ -139,7 +140,7 @@ class RunBook:
         return self.root / ("pins" if entry.pinned else "runs") / f"{entry.name}.json"
 
     def _paths(self, folder: str, pattern: str) -> list[Path]:
-        return sorted(path for path in (self.root / folder).glob(pattern) if path.is_file() and path.name[0] != ".")
+        return [path for path in children(self.root / folder, pattern) if is_file(path) and path.name[0] != "."]
 
 
 def _read(path: Path) -> RunEntry | None:

@@ -36,8 +36,9 @@ class Scheduler:
     Attributes:
         keys: stage to unit to cache key, of all units seen.
         computed: key to what was computed rather than found, in this pass or in those before it.
-        damaged: what turned out damaged in this pass, and has been removed. Units that need it are left for the next
-            pass, and the rest goes on: much damage takes no more passes than little.
+        damaged: what turned out damaged in this pass, and has been removed, and the user's files that changed. Units
+            that need any of it are left for the next pass, and the rest goes on: much damage takes no more passes than
+            little.
     """
 
     def __init__(
@@ -129,6 +130,9 @@ class Scheduler:
         twins = self._twins.pop(unit.key)
         if outcome.status == "damaged":
             self._doubt(unit)
+            self.damaged.append(outcome.cause)
+            return
+        if outcome.status == "changed" and self._board.listing.report(outcome.changed):
             self.damaged.append(outcome.cause)
             return
         if outcome.status == "stopped":

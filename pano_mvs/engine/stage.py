@@ -14,7 +14,7 @@ from pano_mvs.engine.context import Context
 from pano_mvs.engine.memory import bytes_from_size
 from pano_mvs.engine.params import Params
 from pano_mvs.engine.ports import Cardinality, Port, port_from_annotation
-from pano_mvs.scene import Axis, Pairs, Record, Views
+from pano_mvs.scene import Axis, FilePart, Pairs, Record, Views
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 _ATTRIBUTE = "__pano_mvs_stage__"
@@ -30,12 +30,18 @@ class SourceItem:
         problem: why the item cannot be used, if that is known already.
         notes: what a user should know in each run, whether the item is read or its result cached: what hangs on where
             files lie, which is no part of what the item is known by.
+        digests: role to the digest of the file when it was listed; filled in by the engine.
     """
 
     name: str
     files: Mapping[str, Path]
     problem: str = ""
     notes: tuple[str, ...] = ()
+    digests: Mapping[str, str] = field(default_factory=dict)
+
+    def file(self, role: str) -> FilePart:
+        """Return a file as a part of a record: its `read_bytes` gives the bytes that were listed, or raises."""
+        return FilePart(self.files[role], external=True, digest=self.digests.get(role, ""))
 
 
 ListItems = Callable[[Any], Iterable[SourceItem]]

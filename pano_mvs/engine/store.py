@@ -2,7 +2,8 @@
 
 Layout under the root: `blobs/ab/<digest><suffix>`, `records/ab/<key>.json`, `runs/<id>.json` (which key each unit had
 in the latest run of a workflow into a folder: for the reasons that the plan gives, and what a collection keeps),
-`pins/` (runs kept whatever happens), `stat-cache.json`, `tmp/`, `layout.json`.
+`pins/` (runs kept whatever happens), `stat-cache.json`, `tmp/`, `layout.json`, and an empty file that marks the folder
+as a cache.
 What is cached is derived from the records: there is no status file that could be wrong and nothing to unlock.
 Names are taken in one step by renaming, nothing is ever changed in place, and no link is made: any number of runs, on
 several hosts, may share a store.
@@ -13,14 +14,15 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from pano_mvs.core.digest import digest_from_bytes, digest_from_value
 from pano_mvs.core.errors import ContractError, StoreError, UsageError
-from pano_mvs.core.files import clear_abandoned, is_older, remove_whole, write_text
+from pano_mvs.core.files import CACHE_MARK, clear_abandoned, is_older, remove_whole, write_text
+from pano_mvs.core.paths import children, exists, is_link, reason_of
 from pano_mvs.engine.blobs import BlobRef, BlobStore, DamagedBlobError
 from pano_mvs.engine.room import Room, is_full_disk
 from pano_mvs.engine.runs import RunBook
@@ -66,6 +68,8 @@ class UnitRecord:
         rejected: image name to why the result leaves it out.
         doubts: image name to why the value is doubtful there.
         seconds: how long it took when it was computed.
+        checked: whether the user's files that it read were compared with the digests in its key, as earlier versions
+            did not.
     """
 
     key: str
@@ -77,6 +81,7 @@ class UnitRecord:
     rejected: Mapping[str, str] = field(default_factory=dict)
     doubts: Mapping[str, str] = field(default_factory=dict)
     seconds: float = 0.0
+    checked: bool = False
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as a JSON value."""
@@ -90,6 +95,7 @@ class UnitRecord:
             "rejected": dict(self.rejected),
             "doubts": dict(self.doubts),
             "seconds": self.seconds,
+            "checked": self.checked,
         }
 
     @staticmethod
@@ -115,6 +121,7 @@ class UnitRecord:
             rejected={str(name): str(reason) for name, reason in rejected.items()},
             doubts={str(name): str(reason) for name, reason in doubts.items()},
             seconds=float(seconds),
+            checked=value.get("checked") is True,
         )
 
     def blobs(self) -> Iterator[BlobRef]:
@@ -176,7 +183,7 @@ class Store:
         """Write a record; its blobs must be there already."""
         body = json.dumps(record.to_json(), sort_keys=True)
         path = self.record_path(record.key)
-        if path.parent.is_symlink():
+        if is_link(path.parent):
             raise StoreError(f"{path.parent} is a link, which no cache has: remove it, or choose another cache "
                              "with --cache DIR")  # fmt: skip
         write_text(path, f"{digest_from_bytes(body.encode())}\n{body}", temporary_in=self.blobs.temporary,
@@ -185,7 +192,7 @@ class Store:
     def drop(self, key: str) -> None:
         """Remove a record that turned out to be of no use."""
         path = self.record_path(key)
-        if not path.parent.is_symlink():
+        if not is_link(path.parent):
             path.unlink(missing_ok=True)
 
     def put_value(self, value: Record) -> ItemRef:
@@ -244,7 +251,7 @@ class Store:
 
     def _open_layout(self, *, for_reading: bool) -> None:
         for name in _FOLDERS:
-            if (self.root / name).is_symlink():
+            if is_link(self.root / name):
                 raise UsageError(f"cache {self.root}: {name} is a link: what is written there would land elsewhere. "
                                  "Remove it, or choose another cache with --cache DIR")  # fmt: skip
         path = self.root / "layout.json"
@@ -257,7 +264,10 @@ class Store:
                 if not for_reading:
                     raise
             return
-        except (OSError, ValueError, RecursionError) as error:
+        except OSError as error:
+            raise UsageError(f"cache {self.root} cannot be read ({reason_of(error)}). Mend its permissions, or choose "
+                             "another with --cache DIR")  from error  # fmt: skip
+        except (ValueError, RecursionError) as error:
             raise UsageError(f"{path} cannot be read ({error}), so it is not known how the cache is laid out. If it "
                              "is one of this version, delete that file and nothing is lost; else choose another "
                              "folder with --cache DIR")  from error  # fmt: skip
@@ -266,17 +276,26 @@ class Store:
                 f"cache {self.root} has layout {layout!r}, this version uses {LAYOUT_VERSION}. "
                 "Choose another with --cache DIR"
             )
+        self._mark()
+
+    def _mark(self) -> None:
+        """Mark a cache that an earlier version made; one that cannot be written stays without the mark."""
+        mark = self.root / CACHE_MARK
+        with suppress(OSError):
+            if not exists(mark) and not is_link(mark):
+                mark.touch()
 
     def _clear_abandoned(self) -> None:
         """Remove what runs that were killed left half written."""
         folder = self.root / "tmp"
         clear_abandoned(folder)
-        for path in folder.iterdir() if folder.is_dir() else ():
+        for path in children(folder):
             if is_older(path, _ABANDONED_AFTER_S):
                 remove_whole(path)
 
     def _create(self, path: Path) -> None:
         try:
+            write_text(self.root / CACHE_MARK, "")
             write_text(path, json.dumps({"layout": LAYOUT_VERSION}))
         except StoreError as error:
             if is_full_disk(error.__cause__):

@@ -20,6 +20,7 @@ from pano_mvs.core.files import whose_temporary
 from pano_mvs.engine.blobs import SUFFIX
 from pano_mvs.engine.runs import RunEntry
 from pano_mvs.engine.store import Store, UnitRecord, record_from_bytes
+from pano_mvs.engine.unproven import Unproven
 
 _BLOB_NAME = re.compile(rf"({IS_DIGEST.pattern}){SUFFIX.pattern}")
 _RECORD_NAME = re.compile(rf"({IS_DIGEST.pattern})\.json")
@@ -53,6 +54,7 @@ class Damage:
         incomplete: records whose blobs are gone, which count as not there.
         foreign: files that are none of the store's.
         temporary: what lies in its folder for temporary files, and whose it is.
+        unproven: records of earlier versions that may be of other bytes of the user's files than their keys say.
     """
 
     records: int = 0
@@ -61,6 +63,7 @@ class Damage:
     incomplete: list[str] = field(default_factory=list)
     foreign: list[str] = field(default_factory=list)
     temporary: list[str] = field(default_factory=list)
+    unproven: list[str] = field(default_factory=list)
 
 
 @dataclass(slots=True)
@@ -104,15 +107,19 @@ def size_on_disk(store: Store) -> int:
     return sum(stat.st_size for stat in stats if stat is not None)
 
 
-def verify(store: Store) -> Damage:
+def verify(store: Store, *, drop_unproven: bool = False) -> Damage:
     """Check every record and every blob against its digest; damaged ones are removed, what is foreign stays.
 
     Runs may go on meanwhile.
 
+    Args:
+        store: the store.
+        drop_unproven: remove the records of earlier versions whose results cannot be proven, see `unproven`.
+
     Raises:
         StoreError: if a file cannot be read or removed.
     """
-    damage = Damage()
+    damage, unproven = Damage(), Unproven()
     sound: set[str] = set()
     for file in _files(store.root / "blobs"):
         name = _own_name(file, _BLOB_NAME)
@@ -132,24 +139,34 @@ def verify(store: Store) -> Damage:
         if not key:
             damage.foreign.append(file.path)
         elif data is not None:
-            _verify_record(store, damage, sound, file.path, key=key, data=data)
+            record = _verify_record(store, damage, sound, file.path, key=key, data=data)
+            stat = _stat(file.path)
+            if record is not None and stat is not None:
+                unproven.add(file.path, stat.st_mtime, record)
+    damage.unproven = list(unproven.paths(store.stat_cache))
+    for path in damage.unproven if drop_unproven else ():
+        _remove(Path(path))
     for entry in _sorted(store.blobs.temporary):
         damage.temporary.append(f"{entry.path} ({whose_temporary(Path(entry.path))})")
     return damage
 
 
-def _verify_record(store: Store, damage: Damage, sound: set[str], path: str, *, key: str, data: bytes) -> None:
+def _verify_record(
+    store: Store, damage: Damage, sound: set[str], path: str, *, key: str, data: bytes
+) -> UnitRecord | None:
+    """Enter a record into what was found; return it if it and all its blobs are sound."""
     record = record_from_bytes(data)
     if record is None or record.key != key:
         _remove(Path(path))
         damage.removed.append(path)
-        return
+        return None
     # What is not known to be sound may have come, from a run that goes on, after the blobs were checked.
     blobs = (ref for ref in record.blobs() if not ref.external and f"{ref.digest}{ref.suffix}" not in sound)
     if all(_digest(store.blobs.path(ref)) == ref.digest for ref in blobs):
         damage.records += 1
-    else:
-        damage.incomplete.append(path)
+        return record
+    damage.incomplete.append(path)
+    return None
 
 
 def collect(store: Store, *, unused_s: float, forget_after_s: float | None = None, delete: bool = False) -> Collection:

@@ -11,6 +11,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from pano_mvs.core.errors import PluginError, UsageError, WorkflowError
+from pano_mvs.core.paths import children, exists, is_denied, is_file, resolved
 from pano_mvs.engine.code_digest import code_digest
 from pano_mvs.engine.layers import Layer, LayerReader, did_you_mean, merge_stages, read_text
 from pano_mvs.engine.names import is_plain_name
@@ -145,7 +146,7 @@ class WorkflowReader:
 
     def _layers(self, text: str, path: Path | None) -> list[Layer]:
         reader = LayerReader(self.problems, self.presets)
-        reader.read(text, self.shown_as, self.base, chain=(path.resolve(),) if path is not None else ())
+        reader.read(text, self.shown_as, self.base, chain=(resolved(path),) if path is not None else ())
         self.folders = {layer.shown_as: layer.base for layer in reader.layers}
         return reader.layers
 
@@ -173,7 +174,7 @@ class WorkflowReader:
 
     def _folder(self, item: Located) -> Path:
         """Return what a relative path is relative to: its file's folder, or where the command was typed."""
-        return Path.cwd() if item.origin else self.folders.get(item.file, self.base)
+        return resolved(Path()) if item.origin else self.folders.get(item.file, self.base)
 
     def _stage(self, name: str, node: Located) -> StageEntry | None:
         use = node.value["use"]
@@ -199,8 +200,9 @@ class WorkflowReader:
     def _check_files(self, params: Params, node: Located, name: str) -> None:
         for key, paths in files_of(params).items():
             for path in paths:
-                if not path.exists():
-                    self.problems.add(node.at((key,)).place, f"stage {name!r}: {key}: {path} does not exist")
+                if not exists(path):
+                    why = "may not be looked at (permission denied)" if is_denied(path) else "does not exist"
+                    self.problems.add(node.at((key,)).place, f"stage {name!r}: {key}: {path} {why}")
 
     def _validate(self, model: type[Any], values: dict[str, Any], node: Located, name: str) -> Any:
         try:
@@ -251,15 +253,12 @@ def find_workflow(name: str, presets: Path) -> tuple[Path, bool]:
         UsageError: if there is neither.
     """
     path = Path(name)
-    try:
-        if path.is_file():
-            return path, False
-        preset = presets / f"{name}.yaml"
-        if is_plain_name(name) and preset.is_file():
-            return preset, True
-        if path.exists():
-            return path, False  # reading it says what is wrong with it
-    except (OSError, ValueError) as error:
-        raise UsageError(f"there is no workflow file {name[:80]!r}: {error}. Name a file or a preset") from error
-    names = sorted(file.stem for file in presets.glob("*.yaml"))
-    raise UsageError(f"there is no workflow file {name!r} and no preset of that name.{did_you_mean(name, names)}")
+    if is_file(path):
+        return path, False
+    preset = presets / f"{name}.yaml"
+    if is_plain_name(name) and is_file(preset):
+        return preset, True
+    if exists(path) or is_denied(path):
+        return path, False  # reading it says what is wrong with it
+    names = [file.stem for file in children(presets, "*.yaml")]
+    raise UsageError(f"there is no workflow file {name[:80]!r} and no preset of that name.{did_you_mean(name, names)}")

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.core.files import OUTPUT_MARK
+from pano_mvs.core.files import OUTPUT_MARK, is_cache
+from pano_mvs.core.paths import exists, is_denied, is_file, is_folder, problem_of, resolved
 from pano_mvs.io.containers import read_container
 from pano_mvs.io.exif import orientation_from_exif, position_from_exif
 from pano_mvs.io.gpano import GPano, find_gpano, read_file
@@ -53,24 +54,32 @@ class PictureInfo:
         return max(1, round(self.size_hw[1] * share))
 
 
-def list_pictures(folder: Path) -> list[Path]:
+def list_pictures(folder: Path, notes: list[str] | None = None) -> list[Path]:
     """Return the pictures in a folder and below it, ordered as people order them (2 before 10, case aside).
 
-    Hidden files, hidden folders, folders called `masks` and output folders of earlier runs are left out.
+    Hidden files, hidden folders, folders called `masks`, output folders of earlier runs and caches are left out.
+
+    Args:
+        folder: the folder.
+        notes: as of `files_below`.
 
     Raises:
-        InputError: if the folder does not exist or holds no picture.
+        InputError: if the folder does not exist, cannot be listed, or holds no picture.
     """
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder. Give the folder that holds the panoramas")
-    files = list(files_below(folder))
+    if not is_folder(folder):
+        raise InputError(f"{folder}: no such folder ({problem_of(folder) or 'it is a file'}). Give the folder that "
+                         "holds the panoramas")  # fmt: skip
+    notes = [] if notes is None else notes
+    files = list(files_below(folder, notes))
     pictures = [path for path in files if path.suffix.lower() in PICTURE_SUFFIXES]
     if not pictures and (film := next((path for path in files if path.suffix.lower() in VIDEO_SUFFIXES), None)):
         raise InputError(f"{folder}: no pictures here, but the video {film.name}. Use source.video: "
                          "--set images.use=source.video --set pairs.use=pairs.sequential")  # fmt: skip
     if not pictures:
         kinds = ", ".join(sorted(suffix.lstrip(".") for suffix in PICTURE_SUFFIXES))
-        raise InputError(f"{folder}: no pictures here. Panoramas may be {kinds}; folders called masks are left out")
+        raise InputError("\n  ".join([
+            f"{folder}: no pictures here. Panoramas may be {kinds}; folders called masks are left out", *notes
+        ]))  # fmt: skip
     return sorted(pictures, key=lambda path: natural_key(path.relative_to(folder).as_posix()))
 
 
@@ -80,7 +89,7 @@ def natural_key(name: str) -> tuple[list[tuple[int, int, str]], str]:
     return [(0, int(chunk), "") if chunk.isdecimal() else (1, 0, chunk) for chunk in chunks if chunk], name
 
 
-def describe_picture(path: Path, *, max_pixels: int = MAX_PIXELS) -> PictureInfo:
+def describe_picture(path: Path, data: bytes | None = None, *, max_pixels: int = MAX_PIXELS) -> PictureInfo:
     """Return what is known of a panorama without decoding it (but for HEIC and AVIF).
 
     A picture is a panorama if its GPano metadata say so, whole or cropped, or, with a warning, if it is exactly
@@ -88,20 +97,21 @@ def describe_picture(path: Path, *, max_pixels: int = MAX_PIXELS) -> PictureInfo
 
     Args:
         path: the file.
+        data: its bytes, if they have been read already.
         max_pixels: larger pictures are refused.
 
     Raises:
         InputError: if the file cannot be read, is no picture, is larger than the limit, or is no equirectangular
             panorama.
     """
-    data = read_file(path)
+    if data is None:
+        data = read_file(path)
     check_stated_size(data, path, max_pixels)
     container = read_container(data)
     gpano, warnings = find_gpano(container.xmp, data)
     if container.warning:
         warnings = (container.warning, *warnings)
-    del data  # decoding reads it anew
-    size = container.size_hw or decode_image(path, max_pixels=max_pixels).shape[:2]
+    size = container.size_hw or decode_image(path, data, max_pixels=max_pixels).shape[:2]
     height, width = int(size[0]), int(size[1])
     if gpano is not None and gpano.projection_type != "equirectangular":
         raise InputError(f"{path}: its metadata say that it is {gpano.projection_type}, not equirectangular. "
@@ -123,30 +133,47 @@ def describe_picture(path: Path, *, max_pixels: int = MAX_PIXELS) -> PictureInfo
     return PictureInfo(sphere, (height, width), crop, gpano, warnings, traits, position_from_exif(exif))
 
 
-def files_below(folder: Path) -> Iterator[Path]:
-    """Yield the files of a capture, through links too, without hidden ones, masks and the outputs of earlier runs.
+def files_below(folder: Path, notes: list[str]) -> Iterator[Path]:
+    """Yield the files of a capture, through links too, without hidden ones, masks, outputs of runs and caches.
+
+    Args:
+        folder: the folder.
+        notes: for each subfolder that cannot be listed, what to tell the user is added to it.
 
     Raises:
-        InputError: if a folder cannot be read: it is not taken for an empty one.
+        InputError: if the folder itself cannot be listed, or is a cache.
     """
+    if is_cache(folder):
+        raise InputError(f"{folder}: this is a cache of pano-mvs, in which images of its own lie. Give the folder that "
+                         "holds the panoramas; if they lie in here, move them to a folder of their own")  # fmt: skip
 
     def fail(error: OSError) -> None:
-        raise InputError(f"{error.filename}: cannot be listed ({error.strerror}). Mend its permissions or move it away")
+        problem = f"{error.filename}: cannot be listed ({error.strerror})"
+        if Path(error.filename) == folder:
+            raise InputError(f"{problem}. Mend its permissions or give another folder")
+        notes.append(f"{problem}; what it holds is left out")
 
     seen: set[Path] = set()
     for root, folders, files in os.walk(folder, followlinks=True, onerror=fail):
         here = Path(root)
-        if here.resolve() in seen:
+        if resolved(here) in seen:
             folders.clear()
             continue
-        seen.add(here.resolve())
+        seen.add(resolved(here))
         folders[:] = sorted(name for name in folders if not _is_left_out(here / name))
-        yield from (here / name for name in sorted(files) if not name.startswith(".") and (here / name).is_file())
+        yield from (here / name for name in sorted(files) if not name.startswith(".") and _is_file(here / name))
 
 
 def _is_left_out(folder: Path) -> bool:
     name = folder.name
-    return name.startswith(".") or name.lower() in _IGNORED_FOLDERS or (folder / OUTPUT_MARK).exists()
+    if name.startswith(".") or name.lower() in _IGNORED_FOLDERS:
+        return True
+    return exists(folder / OUTPUT_MARK) or is_cache(folder)
+
+
+def _is_file(path: Path) -> bool:
+    """Return whether a path leads to a file, or to something that may be one: reading it then says what is wrong."""
+    return is_file(path) or is_denied(path)
 
 
 def _placed(

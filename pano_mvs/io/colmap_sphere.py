@@ -10,6 +10,7 @@ import struct
 from pathlib import Path
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.core.paths import is_file
 from pano_mvs.io.captures import natural_key
 from pano_mvs.io.colmap_files import read_images
 from pano_mvs.io.pose_json import require_distinct
@@ -23,7 +24,7 @@ _COUNT = struct.Struct("<Q")
 def has_sphere_cameras(folder: Path) -> bool:
     """Return whether the cameras of a COLMAP model are all SphereSfM's SPHERE, told by number and parameters."""
     try:
-        if (folder / "cameras.bin").is_file():
+        if is_file(folder / "cameras.bin"):
             return _is_sphere_binary((folder / "cameras.bin").read_bytes())
         lines = _content_lines(folder / "cameras.txt")
     except OSError as error:
@@ -43,7 +44,7 @@ def read_sphere_model(folder: Path) -> Poses:
         InputError: if the images cannot be read, or there is none.
     """
     binary = folder / "images.bin"
-    path = binary if binary.is_file() else folder / "images.txt"
+    path = binary if is_file(binary) else folder / "images.txt"
     found = [(image.name, image.cam_from_world()) for image in read_images(path).values()]
     require_distinct([name for name, _ in found], path)
     return Poses.without_points(

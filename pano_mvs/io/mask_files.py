@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.core.paths import below, is_file, is_folder
 
 
 def find_mask(name: str, folder: Path) -> Path | None:
@@ -16,7 +17,7 @@ def find_mask(name: str, folder: Path) -> Path | None:
         folder: the masks'.
     """
     candidates = (folder / f"{name}.png", folder / PurePosixPath(name).with_suffix(".png"))
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
+    return next((candidate for candidate in candidates if is_file(candidate)), None)
 
 
 def require_masks(names: Sequence[str], folder: Path) -> None:
@@ -25,11 +26,11 @@ def require_masks(names: Sequence[str], folder: Path) -> None:
     Raises:
         InputError: if it has none, or is none.
     """
-    if not folder.is_dir():
+    if not is_folder(folder):
         raise InputError(f"{folder}: masks must be a folder. Give one mask for all pictures as `mask`")
     if any(find_mask(name, folder) for name in names):
         return
-    files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    files = [path.relative_to(folder).as_posix() for path in below(folder) if is_file(path)]
     there = (
         f"it holds {files[0]}" + (f" and {len(files) - 1} more" if len(files) > 1 else "") if files else "it is empty"
     )

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.core.paths import exists, is_file, is_folder
 from pano_mvs.core.text import shortened
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
 from pano_mvs.io.colmap_model import is_colmap_model, read_colmap_model
@@ -44,7 +45,7 @@ def read_poses(path: Path) -> Poses:
         InputError: naming the file, and the line or the key, that cannot be used.
     """
     path = _file_or_model(path)
-    if path.is_dir():
+    if is_folder(path):
         return read_colmap_model(path)
     suffix = path.suffix.lower()
     if suffix == ".csv":
@@ -124,16 +125,16 @@ def read_csv(path: Path) -> dict[str, Rigid3]:
 
 def _file_or_model(path: Path) -> Path:
     """Return the file with poses, or the folder of a COLMAP model, that a file or folder is or holds."""
-    if not path.exists():
+    if not exists(path):
         raise InputError(f"{path}: no such file or folder. Give a COLMAP model, a transforms.json, a "
                          "poses.json, a reconstruction.json or a CSV file")  # fmt: skip
-    if not path.is_dir():
+    if not is_folder(path):
         return path
     for model in (path, path / "sparse" / "0", path / "colmap" / "sparse" / "0"):
         if is_colmap_model(model):
             return model
     for name in _IN_A_FOLDER:
-        if (path / name).is_file():
+        if is_file(path / name):
             return path / name
     raise InputError(f"{path}: no poses here. A folder must hold a COLMAP model (cameras, images, points3D), or one "
                      f"of {', '.join(_IN_A_FOLDER)}")  # fmt: skip

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.core.paths import below, is_file, is_folder
 from pano_mvs.io.captures import PICTURE_SUFFIXES
 from pano_mvs.io.exr import read_exr
 from pano_mvs.io.npy import keys_of_npz, read_npy, read_npz
@@ -83,23 +84,21 @@ def find_ranges(path: Path, *, unit: float = 1.0) -> dict[str, RangeFile]:
     Raises:
         InputError: if there is nothing, or an archive is damaged.
     """
-    if path.is_file() and path.suffix.lower() == ".npz":
+    if is_file(path) and path.suffix.lower() == ".npz":
         return _in_archive(path, unit)
-    if not path.is_dir():
+    if not is_folder(path):
         raise InputError(
             f"{path}: no such folder or .npz file. Give the output folder of a run, or a folder of range maps"
         )
-    folder = path / "range" if (path / "range").is_dir() else path
-    files = [
-        file for file in folder.rglob("*") if file.suffix.lower() in RANGE_SUFFIXES and not file.name.startswith(".")
-    ]
+    folder = path / "range" if is_folder(path / "range") else path
+    files = [file for file in below(folder) if file.suffix.lower() in RANGE_SUFFIXES and not file.name.startswith(".")]
     if [file.name for file in files if file.suffix == ".npz"] == ["depth.npz"]:
         return _in_archive(next(file for file in files if file.suffix == ".npz"), unit)
     found: dict[str, RangeFile] = {}
     for file in sorted(files, key=lambda file: (RANGE_SUFFIXES.index(file.suffix.lower()), file)):
         name = file.relative_to(folder).with_suffix("").as_posix()
         confidence = path / "confidence" / f"{name}.png"
-        of_run = folder != path and confidence.is_file()
+        of_run = folder != path and is_file(confidence)
         found.setdefault(name, RangeFile(file, unit=unit, confidence_path=confidence if of_run else None))
     if not found:
         raise InputError(f"{folder}: no range maps here. They may be {', '.join(RANGE_SUFFIXES)}")

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.core.paths import exists, is_file
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.names import match_image_names
 from pano_mvs.io.npy import keys_of_npz, read_npz
@@ -106,7 +107,7 @@ def find_true_ranges(path: Path, *, unit: float = 1.0) -> dict[str, RangeFile]:
     Raises:
         InputError: if there are none, or a file is damaged.
     """
-    if not ((path / "poses.json").is_file() and (path / "depth.npz").is_file()):
+    if not (is_file(path / "poses.json") and is_file(path / "depth.npz")):
         return find_ranges(path, unit=unit)
     views = read_truth(path).views.values()
     found = {view.name: RangeFile(path / "depth.npz", view.range_key, unit) for view in views if view.range_key}
@@ -117,7 +118,7 @@ def find_true_ranges(path: Path, *, unit: float = 1.0) -> dict[str, RangeFile]:
 
 def _range_keys(path: Path) -> frozenset[str]:
     """Return the names of the arrays in an .npz file; none if there is no such file."""
-    return frozenset(keys_of_npz(path)) if path.exists() else frozenset()
+    return frozenset(keys_of_npz(path)) if exists(path) else frozenset()
 
 
 def _claimed_keys(path: Path, views: Sequence[PosedView], keys: frozenset[str]) -> dict[str, str]:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.core.paths import is_file, is_folder, problem_of
 from pano_mvs.io.captures import VIDEO_SUFFIXES, files_below, natural_key
 
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # what FFmpeg prints of a damaged video is said better below
@@ -48,19 +49,24 @@ class VideoInfo:
         return self.frames / self.frames_per_s
 
 
-def list_videos(path: Path) -> list[Path]:
+def list_videos(path: Path, notes: list[str] | None = None) -> list[Path]:
     """Return a video, or all videos in a folder and below it in the order in which people count.
+
+    Args:
+        path: the video, or the folder.
+        notes: as of `files_below`.
 
     Raises:
         InputError: if there is none, or only recordings that must be stitched first.
     """
-    if path.is_file():
+    if is_file(path):
         if path.suffix.lower() in _UNSTITCHED_SUFFIXES:
             raise InputError(f"{path}: {path.suffix} is what the camera records before stitching; {_UNSTITCHED}")
         return [path]
-    if not path.is_dir():
-        raise InputError(f"{path}: no such video or folder. Give a video, several, or the folder that holds them")
-    files = list(files_below(path))
+    if not is_folder(path):
+        raise InputError(f"{path}: no such video or folder ({problem_of(path) or 'it is neither'}). Give a video, "
+                         "several, or the folder that holds them")  # fmt: skip
+    files = list(files_below(path, [] if notes is None else notes))
     videos = [file for file in files if file.suffix.lower() in VIDEO_SUFFIXES]
     if not videos:
         raw = [file.name for file in files if file.suffix.lower() in _UNSTITCHED_SUFFIXES]
@@ -144,8 +150,8 @@ def _seek(capture: cv2.VideoCapture, time_s: float) -> bool:
 
 @contextmanager
 def _opened(path: Path, threads: int = 1) -> Iterator[cv2.VideoCapture]:
-    if not path.is_file():
-        raise InputError(f"{path}: no such video")
+    if not is_file(path):
+        raise InputError(f"{path}: no such video ({problem_of(path) or 'it is no file'})")
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, threads])
     try:
         if not capture.isOpened():

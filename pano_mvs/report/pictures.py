@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.paths import is_file, resolved
+
 _QUALITIES = (82, 70, 55, 40)
 _SMALLEST_PX = 32
 _LINE_PX = 4
@@ -67,8 +69,8 @@ def preview_panels(out_dir: Path, relative: str, *, small: bool = False) -> tupl
         relative: the preview's path below it.
         small: an eighth of the size, which is decoded sooner.
     """
-    path = (out_dir / relative).resolve()
-    if not relative or not path.is_relative_to(out_dir.resolve()) or not path.is_file():
+    path = resolved(out_dir / relative)
+    if not relative or not path.is_relative_to(resolved(out_dir)) or not is_file(path):
         return ()
     data = np.fromfile(path, np.uint8)
     image = cv2.imdecode(data, cv2.IMREAD_REDUCED_COLOR_8 if small else cv2.IMREAD_COLOR) if len(data) else None

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, StoreError
+from pano_mvs.core.paths import is_file, resolved
 from pano_mvs.engine.run import Run
 from pano_mvs.engine.store import ItemRef, Store
 from pano_mvs.scene import Panorama, PointCloud, Poses, RangeMap, Record
@@ -58,7 +59,7 @@ class Results:
         Raises:
             StoreError: if the book is damaged.
         """
-        own = str(out.resolve())
+        own = str(resolved(out))
         entry = next((run for run in store.runs.entries() if run.out == own and not run.pinned), None)
         if entry is None:
             return Results(notes=[f"the cache {store.root} knows no run into {out}, so pictures are missing"])
@@ -134,5 +135,5 @@ def _find_pictures(store: Store, summary: Mapping[str, Any], stage: str, refs: M
     folder = (entries[0].get("params") or {}).get("path") if entries else None
     for name, ref in refs.items() if folder else ():
         path = Path(str(folder)) / name
-        if any(part.external for part in ref.parts.values()) and path.is_file():
+        if any(part.external for part in ref.parts.values()) and is_file(path):
             store.blobs.register_external(path)

@@ -12,27 +12,27 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.scene.decoding import MAX_PIXELS, check_stated_size, decode_picture
 from pano_mvs.scene.picture_header import PNG_START
+from pano_mvs.scene.record import FilePart
 
 _HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
 
 
-def decode_image(path: Path, *, max_pixels: int = MAX_PIXELS) -> NDArray[np.uint8]:
+def decode_image(path: Path, data: bytes | None = None, *, max_pixels: int = MAX_PIXELS) -> NDArray[np.uint8]:
     """Return a picture as (H, W, 3) uint8 RGB; 16-bit pictures are scaled, EXIF orientation is ignored.
 
     Of pictures with transparency the colours are taken, of those with several pages the first.
 
     Args:
         path: the file.
+        data: its bytes, if they have been read already.
         max_pixels: larger pictures are refused by their header, before they take memory.
 
     Raises:
         InputError: if the file cannot be read, is no picture, is truncated or damaged, is larger than the limit, or
             needs an extra that is not installed.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
+    if data is None:
+        data = FilePart(path).read_bytes()
     if data[4:8] == b"ftyp" and data[8:12] in _HEIC_BRANDS and b"avif" not in data[:64]:
         check_stated_size(data, path, max_pixels)
         return _decode_heic(data, path)

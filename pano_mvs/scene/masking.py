@@ -12,6 +12,7 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import pad_panorama
 from pano_mvs.scene.cropping import Crop
 from pano_mvs.scene.decoding import decode_picture
+from pano_mvs.scene.record import FilePart
 
 Mask = NDArray[np.bool_]
 
@@ -22,21 +23,22 @@ _WIDEST_BOX = 64
 _NOTHING_SEEN = 128
 
 
-def decode_mask(path: Path) -> Mask:
+def decode_mask(path: Path, data: bytes | None = None) -> Mask:
     """Return a mask file as (H, W) bool, False where its value is 0: to be ignored.
 
     Grey or colour (the brightest channel counts) of any depth, with a palette (its colours count), or with an alpha
     channel: what is transparent is ignored as well, and where all colours are black alpha alone decides. A JPEG's
     blacks are not 0, so there half the brightness decides.
 
+    Args:
+        path: the file.
+        data: its bytes, if they have been read already.
+
     Raises:
         InputError: if the file cannot be read or is no picture.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: the mask cannot be read ({error.strerror}). Check that it exists and may be read "
-                         "by you") from error  # fmt: skip
+    if data is None:
+        data = FilePart(path).read_bytes()
     picture = decode_picture(data, path, cv2.IMREAD_UNCHANGED)
     if picture is None:
         raise InputError(f"{path}: the mask is not a picture that can be decoded ({len(data)} bytes). Save it as PNG")

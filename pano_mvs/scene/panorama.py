@@ -72,7 +72,8 @@ class Panorama(Record):
         (`painted_over`): nothing that a stage makes of the picture depends on what they showed.
 
         Raises:
-            InputError: if the file, or its mask, is gone, truncated or no picture, or has changed its size.
+            ChangedFileError: if the file, or its mask, has changed since the run listed it.
+            InputError: if one of them is gone, truncated or no picture, or has changed its size.
         """
         picture, valid = self.load_unmasked(), self.load_mask()
         return picture if valid.all() else painted_over(picture, valid)
@@ -86,7 +87,7 @@ class Panorama(Record):
             InputError: as `load`.
         """
         height, width = self.source_size_hw  # the source has accepted it, perhaps beyond the usual limit
-        image = decode_image(self.image.path, max_pixels=max(MAX_PIXELS, height * width))
+        image = decode_image(self.image.path, self.image.read_bytes(), max_pixels=max(MAX_PIXELS, height * width))
         _, _, width, height = self.covers_ltwh
         if (not same_shape(image.shape[:2], (height, width))) or (
             self.crop_ltwh is None and image.shape[:2] != self.source_size_hw
@@ -103,7 +104,8 @@ class Panorama(Record):
         A pixel is valid if no part of it is masked, within the nadir's or the zenith's cut, or outside of the crop.
 
         Raises:
-            InputError: if the mask file is gone or no picture, or covers neither the sphere nor the crop.
+            ChangedFileError: if the mask file has changed since the run listed it.
+            InputError: if it is gone or no picture, or covers neither the sphere nor the crop.
         """
         height = self.size_hw[0]
         valid = np.zeros(self.size_hw, np.bool_)
@@ -111,7 +113,8 @@ class Panorama(Record):
         nearest_deg = np.arange(height + 1) * 180 / height  # of the rows' upper edges, from straight up
         valid[(nearest_deg[:-1] < self.zenith_deg) | (nearest_deg[1:] > 180 - self.nadir_deg)] = False
         if self.mask_file is not None:
-            valid &= self._placed(decode_mask(self.mask_file.path), f"{self.mask_file.path}: the mask")
+            mask = decode_mask(self.mask_file.path, self.mask_file.read_bytes())
+            valid &= self._placed(mask, f"{self.mask_file.path}: the mask")
         return valid
 
     def with_mask(self, valid: NDArray[np.bool_], folder: Path) -> Panorama:

@@ -12,7 +12,9 @@ from typing import Any, ClassVar, Self, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.core.errors import ContractError
+from pano_mvs.core.digest import digest_from_bytes
+from pano_mvs.core.errors import ChangedFileError, ContractError, InputError
+from pano_mvs.core.paths import reason_of
 
 
 class Axis(StrEnum):
@@ -32,16 +34,42 @@ class FilePart:
         path: where the bytes are now.
         external: True for a user's own file, which the store remembers by its digest and never copies; False for
             a file that a stage wrote into its scratch folder, which the store takes in.
-        digest: of the bytes; filled in by the store when it hands the part out.
+        digest: of the bytes; filled in by the engine when it hands the part out.
     """
 
     path: Path
     external: bool = False
     digest: str = ""
 
+    def read_bytes(self) -> bytes:
+        """Return the file's bytes; of a user's own file, only if they are those that `digest` stands for.
+
+        Raises:
+            ChangedFileError: if a user's file has changed since the engine listed it.
+            InputError: if the file cannot be read.
+        """
+        try:
+            data = self.path.read_bytes()
+        except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+            raise InputError(f"{self.path}: cannot be read ({reason_of(error)}). Check that it exists and may be "
+                             "read") from error  # fmt: skip
+        if self.external and self.digest and digest_from_bytes(data) != self.digest:
+            raise ChangedFileError(changed_text(self.path), self.path)
+        return data
+
+
+def changed_text(path: Path) -> str:
+    """Return what to say of a user's file that changed after the run had listed it."""
+    return f"{path} changed during the run; run again to use it as it is now"
+
 
 Part: TypeAlias = "NDArray[Any] | FilePart | dict[str, Any]"
 Parts: TypeAlias = Mapping[str, Part]
+
+
+def vanished_text(path: Path) -> str:
+    """Return what to say of a user's file that cannot be read any more after the run had listed it."""
+    return f"{path} vanished during the run, or may not be read any more; put it back, or run again without it"
 
 
 class Record:

@@ -12,6 +12,7 @@ from pydantic import Field
 from pano_mvs.algorithms.faces.layout import Face, covers_sphere, default_face_size, panorama_faces
 from pano_mvs.algorithms.faces.render import colmap_depth_view, face_source, render_face
 from pano_mvs.api import All, Context, Each, Files, Names, One, Panorama, Params, Poses, RangeMap, UsageError, stage
+from pano_mvs.core.paths import children
 from pano_mvs.geometry import PinholeView
 from pano_mvs.io.colmap_model import write_colmap_model
 from pano_mvs.io.colmap_pictures import resized_mask, write_picture
@@ -135,7 +136,7 @@ def colmap_dense(
         raise UsageError("no panorama has both a pose and faces, so there is no workspace to describe")
     folder = ctx.scratch / "sparse"
     seen = write_rig_model(folder, largest, cuts, form=params.format)
-    files = sparse_targets(sorted(folder.iterdir())) | write_stereo_configs(ctx.scratch, seen)
+    files = sparse_targets(children(folder)) | write_stereo_configs(ctx.scratch, seen)
     for number, group in enumerate(others, start=1):
         files |= _other_model(group, number, _cuts(group.names, faces, item_stems(images)), params.format, ctx)
     _tell_blanks(seen, params.format, ctx)
@@ -180,7 +181,7 @@ def _sparse_models(poses: Poses, images: Mapping[str, Panorama], form: ModelForm
         folder = ctx.scratch / f"model_{number}"
         sizes_hw = {name: images[name].source_size_hw for name in group.names if name in images}
         write_colmap_model(folder, group, sizes_hw, form=form)
-        files |= {f"{target}/{number}/{path.name}": path for path in sorted(folder.iterdir())}
+        files |= {f"{target}/{number}/{path.name}": path for path in children(folder)}
     _tell_blanks(poses.names, form, ctx)
     return Files(files)
 
@@ -198,7 +199,7 @@ def _other_model(
     target = f"{WORKSPACE}/sparse/{number}"
     ctx.note(f"{WORKSPACE}/sparse is the model of the largest group of poses; group {number} ({shown}) has a frame of "
              f"its own and is in {target}. To fuse it, put that model in the place of sparse")  # fmt: skip
-    return {f"{target}/{path.name}": path for path in sorted(folder.iterdir())}
+    return {f"{target}/{path.name}": path for path in children(folder)}
 
 
 def _cuts(names: Iterable[str], faces: Mapping[str, FaceFiles], stems: Mapping[str, str]) -> dict[str, CutPanorama]:

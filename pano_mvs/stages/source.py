@@ -9,7 +9,8 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from pano_mvs.algorithms.dual_fisheye import is_dual_fisheye
-from pano_mvs.api import NOT_IN_KEY, Context, FilePart, InputError, Panorama, Params, SourceItem, SourcePath, source
+from pano_mvs.api import NOT_IN_KEY, Context, InputError, Panorama, Params, SourceItem, SourcePath, source
+from pano_mvs.core.paths import is_folder
 from pano_mvs.io.captures import PictureInfo, describe_picture, list_pictures
 from pano_mvs.io.mask_files import find_mask, require_masks
 from pano_mvs.io.names import printable_name
@@ -45,7 +46,10 @@ def list_folder(params: FolderParams) -> Iterator[SourceItem]:
     Raises:
         InputError: if the folder does not hold two pictures or more.
     """
-    pictures = [path for path in list_pictures(params.path) if not _is_mask(path, params)]
+    unread: list[str] = []
+    pictures = [path for path in list_pictures(params.path, unread) if not _is_mask(path, params)]
+    if not pictures:
+        raise InputError(f"{params.path}: all images in it are masks. Give the folder that holds the panoramas")
     if len(pictures) < 2:
         raise InputError(f"{params.path}: holds one picture only ({pictures[0].name}); depth needs two or more "
                          "panoramas of the same place, taken from different positions")  # fmt: skip
@@ -57,7 +61,7 @@ def list_folder(params: FolderParams) -> Iterator[SourceItem]:
         mask = None if problem else _mask_of(name, params)
         if mask is not None:
             files["mask"] = mask
-        yield SourceItem(name, files, problem, tuple(_notes_on_masks(name, mask, params)))
+        yield SourceItem(name, files, problem, (*unread, *_notes_on_masks(name, mask, params)))
 
 
 def folder_memory_bytes(params: FolderParams, inputs: Mapping[str, Any]) -> int:
@@ -78,20 +82,21 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
     are looked for as `<masks>/<image name>.png`, then `<masks>/<name without extension>.png`, then `mask`; they cover
     what the picture covers, or the whole sphere, at any resolution.
     """
-    path = item.files["image"]
-    info = describe_picture(path, max_pixels=params.max_pixels)
+    image = item.file("image")
+    path, data = image.path, image.read_bytes()
+    info = describe_picture(path, data, max_pixels=params.max_pixels)
     for warning in info.warnings:
         ctx.note(f"{item.name}: {warning}")
     for trait in info.traits:
         ctx.note(f"some pictures have {trait}")
-    _check_pixels(path, info, params.max_pixels)
-    mask = item.files.get("mask")
+    _check_pixels(path, data, info, params.max_pixels)
+    del data
     panorama = Panorama(
-        image=FilePart(path, external=True),
+        image=image,
         size_hw=working_size(info.size_hw, min(params.max_width, info.full_width_px)),
         source_size_hw=info.size_hw,
         crop_ltwh=info.crop_ltwh,
-        mask_file=None if mask is None else FilePart(mask, external=True),
+        mask_file=item.file("mask") if "mask" in item.files else None,
         nadir_deg=params.nadir_deg,
         zenith_deg=params.zenith_deg,
         up_in_cam=info.gpano.up_in_cam if info.gpano else None,
@@ -105,9 +110,9 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
     return panorama
 
 
-def _check_pixels(path: Path, info: PictureInfo, max_pixels: int) -> None:
+def _check_pixels(path: Path, data: bytes, info: PictureInfo, max_pixels: int) -> None:
     """Decode the whole picture once, so that a damaged file is named here and not in the middle of a sweep."""
-    picture = decode_image(path, max_pixels=max_pixels)
+    picture = decode_image(path, data, max_pixels=max_pixels)
     height, width = picture.shape[:2]
     if (height, width) != info.file_size_hw:
         raise InputError(f"{path}: decodes to {width}×{height} px, its header says {info.file_size_hw[::-1]}. "
@@ -133,7 +138,7 @@ def _mask_of(name: str, params: FolderParams) -> Path | None:
 def _notes_on_masks(name: str, mask: Path | None, params: FolderParams) -> Iterator[str]:
     if mask is None and params.masks is not None:
         yield f"{name} has no mask in {params.masks.name}; all of it is used"
-    if params.masks is None and (unused := params.path / "masks").is_dir():
+    if params.masks is None and is_folder(unused := params.path / "masks"):
         yield f"{unused} is there, but not used; give it as `masks` to ignore what its files mask"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,6 +15,7 @@ from pydantic import Field, model_validator
 from pano_mvs.algorithms.dual_fisheye import is_dual_fisheye
 from pano_mvs.algorithms.sharpness import sharpness
 from pano_mvs.api import NOT_IN_KEY, Context, FilePart, InputError, Panorama, Params, SourceItem, SourcePath, source
+from pano_mvs.core.paths import is_folder
 from pano_mvs.io.names import printable_name
 from pano_mvs.io.video import VideoInfo, describe_video, frames_between, list_videos
 from pano_mvs.scene.files import item_stems
@@ -65,7 +67,8 @@ def list_frames(params: VideoParams) -> Iterator[SourceItem]:
         InputError: if the only video cannot be used, or all of them give fewer than two frames.
     """
     items, failed, first_error = list[SourceItem](), list[SourceItem](), None
-    for path, name in _named_videos(params):
+    unread: list[str] = []
+    for path, name in _named_videos(params, unread):
         try:
             items += _items_of(path, name, params)
         except InputError as error:
@@ -76,7 +79,7 @@ def list_frames(params: VideoParams) -> Iterator[SourceItem]:
             raise first_error
         raise InputError(f"{items[0].files['video'] if items else params.path}: gives {len(items)} frames; depth needs "
                          "two or more. Set a smaller every_s, or another start_s and end_s")  # fmt: skip
-    yield from items
+    yield from (replace(item, notes=tuple(unread)) for item in items)
     yield from failed
 
 
@@ -96,14 +99,13 @@ def video(item: SourceItem, params: VideoParams, ctx: Context) -> Panorama:
         raise InputError(_dual_fisheye(path))
     ctx.metric("time_s", time_s)
     ctx.metric("sharpness", quality)
-    mask = item.files.get("mask")
     kept = ctx.scratch / "frame.png"
     write_png(kept, np.ascontiguousarray(frame[..., ::-1]))
     panorama = Panorama(
         image=FilePart(kept),
         size_hw=working_size(info.size_hw, params.max_width),
         source_size_hw=info.size_hw,
-        mask_file=None if mask is None else FilePart(mask, external=True),
+        mask_file=item.file("mask") if "mask" in item.files else None,
         nadir_deg=params.nadir_deg,
         zenith_deg=params.zenith_deg,
     )
@@ -111,7 +113,7 @@ def video(item: SourceItem, params: VideoParams, ctx: Context) -> Panorama:
     return panorama
 
 
-def _named_videos(params: VideoParams) -> Iterator[tuple[Path, str]]:
+def _named_videos(params: VideoParams, notes: list[str]) -> Iterator[tuple[Path, str]]:
     """Yield the videos, each with its name relative to the capture, without its suffix where one alone is called so.
 
     Raises:
@@ -119,8 +121,8 @@ def _named_videos(params: VideoParams) -> Iterator[tuple[Path, str]]:
     """
     named: dict[str, Path] = {}
     for path in params.path if isinstance(params.path, list) else [params.path]:
-        base = path if path.is_dir() else path.parent
-        for found in list_videos(path):
+        base = path if is_folder(path) else path.parent
+        for found in list_videos(path, notes):
             name = found.relative_to(base).as_posix()
             if name in named:
                 raise InputError(f"{named[name]} and {found}: frames of both would be called after {name}. Give the "

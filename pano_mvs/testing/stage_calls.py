@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.digest import digest_from_bytes, digest_from_file, digest_from_value
 from pano_mvs.core.errors import ContractError, PanoMvsError, UsageError
+from pano_mvs.core.paths import is_file, resolved
 from pano_mvs.engine.context import Context
 from pano_mvs.engine.params import Params
 from pano_mvs.engine.ports import Cardinality, Names, Port
@@ -128,8 +129,8 @@ def require_sound(value: object, spec: StageSpec, scratch: Path) -> None:
     for item in value.explode().values():
         item.check()
     for path in value.files.values() if isinstance(value, Files) else ():
-        inside = path.resolve().is_relative_to(scratch.resolve())
-        assert path.is_file(), f"{spec.name} says that it wrote {path}, which is not there"
+        inside = resolved(path).is_relative_to(resolved(scratch))
+        assert is_file(path), f"{spec.name} says that it wrote {path}, which is not there"
         assert inside, f"{spec.name} wrote {path}, outside ctx.scratch"
 
 

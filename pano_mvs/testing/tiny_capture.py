@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.paths import exists
 from pano_mvs.geometry import Rigid3, pixel_from_ray, roll_panorama
 from pano_mvs.scene import (
     Features,
@@ -148,7 +149,7 @@ class TinyCapture:
             size_hw=(height, width),
             source_size_hw=(height, width),
             crop_ltwh=(0, height // 8, width, height - 2 * (height // 8)) if self.variant.cropped else None,
-            mask_file=FilePart(mask, external=True) if mask.exists() else None,
+            mask_file=FilePart(mask, external=True) if exists(mask) else None,
             up_in_cam=(float(up[0]), float(up[1]), float(up[2])),
             position_lla=(center[2] / _METRES_PER_DEGREE, center[0] / _METRES_PER_DEGREE, 50.0 - center[1]),
         )

@@ -173,7 +173,7 @@ def _sights(
 
 
 def _sha256(picture: Panorama) -> str:
-    return hashlib.sha256(picture.image.path.read_bytes()).hexdigest()
+    return hashlib.sha256(picture.image.read_bytes()).hexdigest()
 
 
 def _true_range(

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.core.paths import is_file, is_folder, resolved
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.ply_points import PlyPoints, open_ply_points
 from pano_mvs.io.pose_files import read_poses
@@ -97,12 +98,12 @@ def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> Sho
         InputError: if there is nothing to show, or a file is damaged.
         UsageError: if there is no such group.
     """
-    if path.is_file():
+    if is_file(path):
         cloud, mesh = (None, path) if has_faces(path) else (open_ply_points(path), None)
         if cloud is not None and not cloud.count:
             raise InputError(f"{path}: holds no points, so there is nothing to show. Look at what wrote it")
         return ShownScene(path.name, cloud, mesh, (), "scene units", *_frame(()))
-    if not path.is_dir():
+    if not is_folder(path):
         raise InputError(f"{path}: no such file or folder. Give the output folder of a run, or a .ply file")
     run = _run_json(path)
     notes: list[str] = []
@@ -132,7 +133,7 @@ def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> Sho
                          "folder of a run; its report.html tells what became of it")  # fmt: skip
     metric = bool(groups[group].get("metric"))
     return ShownScene(
-        name=path.resolve().name,
+        name=resolved(path).name,
         cloud=cloud,
         mesh=mesh_file,
         cameras=cameras,
@@ -170,14 +171,14 @@ def _run_json(folder: Path) -> Mapping[str, Any]:
 def _written(folder: Path, run: Mapping[str, Any], name: str) -> Path | None:
     """Return the file of that name in the folder, or the first that the run wrote below it."""
     names = [name, *(written for written in run.get("files") or () if PurePosixPath(written).name == name)]
-    return next((folder / found for found in names if (folder / found).is_file()), None)
+    return next((folder / found for found in names if is_file(folder / found)), None)
 
 
 def _cameras(
     folder: Path, model_name: str, run: Mapping[str, Any], images: Path | None, notes: list[str]
 ) -> tuple[ShownCamera, ...]:
     model = folder / model_name
-    if not model.is_dir():
+    if not is_folder(model):
         notes.append(f"no {model_name}: the workflow has no export.colmap, or the run did not get there; no cameras")
         return ()
     poses = read_poses(model)
@@ -191,8 +192,8 @@ def _cameras(
         cameras.append(ShownCamera(
             name=name,
             cam_from_world=poses.cam_from_world(idx),
-            picture=picture if picture is not None and picture.is_file() else None,
-            preview=preview if preview.is_file() else None,
+            picture=picture if picture is not None and is_file(picture) else None,
+            preview=preview if is_file(preview) else None,
             range_file=_map_of(folder, "range", name, ".tiff"),
             confidence_file=_map_of(folder, "confidence", name, ".png"),
             doubtful=name in doubts,
@@ -206,7 +207,7 @@ def _cameras(
 def _map_of(folder: Path, kind: str, name: str, suffix: str) -> Path | None:
     """Return the file of an image in range/ or confidence/, called with its extension where need be, else without."""
     candidates = (folder / kind / f"{name}{suffix}", folder / kind / PurePosixPath(name).with_suffix(suffix))
-    return next((path for path in candidates if path.is_file()), None)
+    return next((path for path in candidates if is_file(path)), None)
 
 
 def _source_folder(run: Mapping[str, Any]) -> Path | None:

@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import ContractError, UsageError
+from pano_mvs.core.files import CACHE_MARK
 from pano_mvs.engine.blobs import DamagedBlobError
 from pano_mvs.engine.events import Silent
 from pano_mvs.engine.store import Store
 from pano_mvs.scene import RangeMap, Record
 from tests.engine.conftest import Toy, ran, settle
+from tests.permissions import permissions_hold
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +140,20 @@ def test_no_pickle_is_read(tmp_path: Path) -> None:
     store.blobs._verified.add(str(path))
     with pytest.raises(DamagedBlobError, match="Python objects"):
         store.load(ref, Sample)
+
+
+def test_caches_are_marked_also_those_of_earlier_versions(tmp_path: Path) -> None:
+    Store(tmp_path / "a")
+    mark = tmp_path / "a" / CACHE_MARK
+    assert mark.read_bytes() == b""
+    mark.unlink()
+    tmp_path.joinpath("a").chmod(0o500)
+    with permissions_hold():
+        Store(tmp_path / "a")  # a cache that may only be read stays as it is
+    assert not mark.exists()
+    tmp_path.joinpath("a").chmod(0o700)
+    Store(tmp_path / "a")
+    assert mark.exists()
 
 
 def test_store_of_another_layout_is_refused(tmp_path: Path) -> None:

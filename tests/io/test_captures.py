@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.core.files import CACHE_MARK
+from pano_mvs.engine.store import Store
 from pano_mvs.io import captures
 from pano_mvs.io.captures import describe_picture, list_pictures, natural_key
 from pano_mvs.scene import FilePart, Panorama
 from tests.io.pictures import by_pillow, full_sphere, picture, sound_files, write_jpeg, write_png, xmp
+from tests.permissions import permissions_hold
 
 
 def test_pictures_come_in_the_order_in_which_people_count(tmp_path):
@@ -38,6 +41,46 @@ def test_names_that_differ_only_in_case_or_zeros_keep_one_order():
     assert len({tuple(map(str, natural_key(name))) for name in names}) == 4
     backwards = ["img_²", "img_01", "IMG_1", "img_1"]
     assert sorted(names, key=natural_key) == sorted(backwards, key=natural_key)
+
+
+def test_caches_are_no_part_of_the_capture(tmp_path):
+    """Their masks and previews were taken for images on the second run."""
+    Store(tmp_path / "new")
+    Store(tmp_path / "deep" / "old")
+    (tmp_path / "deep" / "old" / CACHE_MARK).unlink()  # as versions without the mark left it
+    for folder in ("blobs", "records"):
+        (tmp_path / "deep" / "old" / folder).mkdir()
+    for name in ("1.jpg", "deep/2.jpg", "new/blobs/ab/3.png", "deep/old/blobs/ab/4.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    assert [path.relative_to(tmp_path).as_posix() for path in list_pictures(tmp_path)] == ["1.jpg", "deep/2.jpg"]
+    with pytest.raises(InputError, match=r"new: this is a cache of pano-mvs.* move them to a folder of their own"):
+        list_pictures(tmp_path / "new")
+
+
+@pytest.mark.parametrize("mode", [0o000, 0o400])
+def test_a_subfolder_that_cannot_be_read_costs_what_it_holds(tmp_path, mode):
+    """A `lost+found` ended the run."""
+    for name in ("1.jpg", "lost+found/2.jpg", "z/3.jpg"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    (tmp_path / "lost+found").chmod(mode)
+    notes = []
+    with permissions_hold():
+        found = [path.relative_to(tmp_path).as_posix() for path in list_pictures(tmp_path, notes)]
+    (tmp_path / "lost+found").chmod(0o700)
+    if mode:  # its names can be listed, and reading the file then says what is wrong
+        assert (found, notes) == (["1.jpg", "lost+found/2.jpg", "z/3.jpg"], [])
+    else:
+        assert found == ["1.jpg", "z/3.jpg"]
+        assert notes == [f"{tmp_path / 'lost+found'}: cannot be listed (Permission denied); what it holds is left out"]
+
+
+def test_a_folder_that_cannot_be_read_is_an_error(tmp_path):
+    (tmp_path / "photos").mkdir(mode=0o000)
+    with permissions_hold(), pytest.raises(InputError, match=r"photos: cannot be listed \(Permission denied\)"):
+        list_pictures(tmp_path / "photos")
+    (tmp_path / "photos").chmod(0o700)
 
 
 @pytest.mark.parametrize(("folder", "what"), [("gone", "no such folder"), ("empty", "no pictures here")])

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.core.paths import is_file
 
 FEWEST_POINTS = 100
 _SHALLOWEST, _DEEPEST = 5, 12
@@ -55,7 +56,7 @@ def solve_poisson(cloud_file: Path, folder: Path, *, depth: int, point_weight: f
     target = folder / "poisson.ply"
     command = [sys.executable, "-c", _SOLVE, str(cloud_file), str(target), str(depth), str(point_weight)]
     done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)  # noqa: S603  # our own
-    if done.returncode or not target.is_file():
+    if done.returncode or not is_file(target):
         said = (done.stderr or done.stdout).strip()[-_TOLD:]
         raise InputError(f"the Poisson solver ended with code {done.returncode} at depth {depth}: try another `depth`, "
                          f"or fewer points by `max_points`. It said: {said or 'nothing'}")  # fmt: skip

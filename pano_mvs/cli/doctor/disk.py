@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from pano_mvs.cli.doctor.finding import Finding
+from pano_mvs.core.paths import exists, is_folder
 from pano_mvs.engine.memory import size_text
 
 _LITTLE_BYTES = 5_000_000_000
@@ -27,7 +28,7 @@ def folder_findings(
     """
     free_bytes_of = free_bytes_of or (lambda path: shutil.disk_usage(path).free)
     there = _existing(folder)
-    if there is None or not there.is_dir():
+    if there is None or not is_folder(there):
         yield Finding(
             "disk", what, "failed", f"{folder}: {there or folder} is no folder", f"choose another with {option}"
         )
@@ -62,5 +63,5 @@ def _file_system(what: str, probe: Path, option: str) -> Iterator[Finding]:
     if old.read_bytes() != b"new":
         yield Finding("disk", what, "failed", f"{probe.parent}: a file cannot take another's name in one step",
                       f"choose a folder on a local disk with {option}")  # fmt: skip
-    if (probe / "OLD").exists():
+    if exists(probe / "OLD"):
         yield Finding("disk", what, "note", f"{probe.parent}: names that differ in case alone are one file there")

@@ -11,6 +11,7 @@ from pano_mvs.cli.doctor.finding import Finding
 from pano_mvs.cli.session import CACHE_VARIABLE
 from pano_mvs.core.kernel_cache import VARIABLE as KERNEL_VARIABLE
 from pano_mvs.core.kernel_cache import kernel_cache_folder
+from pano_mvs.core.paths import below
 from pano_mvs.engine.executors.threads import available_threads
 from pano_mvs.engine.memory import free_memory_bytes, size_text
 from pano_mvs.engine.plugin_files import PLUGINS_VARIABLE
@@ -63,7 +64,7 @@ def kernel_cache_finding(package: Path, environment: Mapping[str, str] = os.envi
     except (OSError, RuntimeError) as error:
         return Finding("machine", "compiled kernels", "warning", f"cannot be kept ({error}): every process compiles "
                        "them anew", f"set {KERNEL_VARIABLE} to a folder that you may write to")  # fmt: skip
-    count = sum(1 for _ in folder.rglob("*.nbc"))
+    count = len(below(folder, "*.nbc"))
     return Finding("machine", "compiled kernels", "ok", f"{count} kept in {folder}" if count else
                    f"none yet in {folder}: the first run compiles them, a minute or two")  # fmt: skip
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from pano_mvs.cli.doctor.finding import Finding
+from pano_mvs.core.paths import children, is_folder
 from pano_mvs.engine.plugin_files import PLUGINS_VARIABLE, plugin_files_in, user_plugin_folders
 from pano_mvs.engine.registry import Registry
 
@@ -30,7 +31,7 @@ def plugin_findings(
     else:
         yield Finding("plugins", "stages", "failed", "the built-in stages are not registered",
                       "pip install --force-reinstall pano-mvs, or pip install -e . in a checkout")  # fmt: skip
-    found = sorted(path.stem for path in presets.glob("*.yaml"))
+    found = [path.stem for path in children(presets, "*.yaml")]
     if "quickstart" in found:
         yield Finding("plugins", "presets", "ok", ", ".join(found))
     else:
@@ -48,10 +49,10 @@ def plugin_findings(
 
 def _folders(environment: Mapping[str, str]) -> Iterator[Finding]:
     for folder in user_plugin_folders(environment):
-        if PLUGINS_VARIABLE not in environment and not folder.is_dir():
+        if PLUGINS_VARIABLE not in environment and not is_folder(folder):
             continue  # few people have the folder of their settings
         files = len(plugin_files_in(folder))
-        if not folder.is_dir():
+        if not is_folder(folder):
             yield Finding("plugins", PLUGINS_VARIABLE, "warning", f"{folder} is no folder", f"mend {PLUGINS_VARIABLE}")
         else:
             yield Finding("plugins", str(folder), "ok" if files else "note", f"{files} plugin files")

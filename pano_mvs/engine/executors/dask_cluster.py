@@ -17,6 +17,7 @@ from urllib.parse import urlsplit
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.files import temporary_prefix
+from pano_mvs.core.paths import children, is_file
 from pano_mvs.engine.code_digest import code_texts
 from pano_mvs.engine.executors.dask_task import differences, end_workers, introduce, run_unit, versions
 from pano_mvs.engine.executors.protocol import Job, Outcome
@@ -156,7 +157,7 @@ class DaskExecutor:
             for worker, answer in found.items():
                 self._check(worker, answer, token)
         finally:
-            for path in folder.glob(f"{token}*"):
+            for path in children(folder, f"{token}*"):
                 path.unlink(missing_ok=True)
         if not found:
             raise UsageError("--scheduler: it has no workers; start some with `dask worker`")
@@ -176,7 +177,7 @@ class DaskExecutor:
         if others:
             raise UsageError(f"{place}: {'; '.join(others)}. Results would depend on who computes them: install the "
                              "same versions there")  # fmt: skip
-        if answer["token"] != token or not (self._store.blobs.temporary / answer["answer"]).is_file():
+        if answer["token"] != token or not is_file(self._store.blobs.temporary / answer["answer"]):
             reason = answer["reason"] or "it is another folder there"
             raise UsageError(f"{place} does not see the cache {self._store.root.absolute()} ({reason}). Choose "
                              "one with --cache DIR that all hosts share under the same path")  # fmt: skip

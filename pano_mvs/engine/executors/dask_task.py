@@ -20,6 +20,7 @@ from typing import Any
 
 import pano_mvs
 from pano_mvs.core.digest import digest_from_value
+from pano_mvs.core.paths import below
 from pano_mvs.engine.executors.threads import available_threads
 from pano_mvs.engine.executors.worker_process import WorkerProcess
 
@@ -84,7 +85,7 @@ def versions() -> dict[str, str]:
 def _own_version() -> str:
     """Return the version with a digest of the code: two checkouts of the same version may differ."""
     package = Path(pano_mvs.__file__).parent
-    sources = {path.relative_to(package).as_posix(): path.read_bytes() for path in sorted(package.rglob("*.py"))}
+    sources = {path.relative_to(package).as_posix(): path.read_bytes() for path in below(package, "*.py")}
     return f"{pano_mvs.__version__}+{digest_from_value(sources)[:12]}"
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
-from pano_mvs.core.errors import GateError, InputError, StoreError, UsageError
+from pano_mvs.core.errors import ChangedFileError, GateError, InputError, StoreError, UsageError
 from pano_mvs.core.text import shortened
 from pano_mvs.engine.blobs import DamagedBlobError
+from pano_mvs.engine.changed_files import changed_items, changed_settings
 from pano_mvs.engine.execute import execute_unit
 from pano_mvs.engine.executors.capture import captured
 from pano_mvs.engine.executors.protocol import Outcome
@@ -30,19 +32,30 @@ def perform(unit: Unit, store: Store, *, threads: int, log: Path) -> Outcome:
         with captured(log):
             bound_threads(threads)
             record = execute_unit(unit, store, threads=threads)
-    except DamagedBlobError as error:
-        return Outcome("damaged", cause=str(error))
-    except (StoreError, GateError) as error:
-        kind = StoreError if isinstance(error, StoreError) else GateError
-        return Outcome("stopped", cause=shortened(str(error)), error=kind.__name__, exit_code=error.exit_code)
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # a stage that exits, or raises what is no Exception, is a unit that failed
-        gone = next((ref for ref in input_blobs(unit) if not store.blobs.exists(ref)), None)
-        if gone is not None:  # somebody has collected it while the stage was about to read it: no fault of the stage
-            return Outcome("damaged", cause=str(store.blobs.discard(gone, "is gone")))
-        cause, trace = cause_of(unit, error)
-        exit_code = error.exit_code if isinstance(error, InputError | UsageError) else 0
-        seconds = time.perf_counter() - started
-        return Outcome("failed", cause=cause, trace=trace, exit_code=exit_code, seconds=seconds)
+        return replace(_failed(unit, store, error), seconds=time.perf_counter() - started)
     return Outcome("done", record, seconds=record.seconds)
+
+
+def _failed(unit: Unit, store: Store, error: BaseException) -> Outcome:
+    if isinstance(error, StoreError | GateError) and not isinstance(error, DamagedBlobError):
+        kind = StoreError if isinstance(error, StoreError) else GateError
+        return Outcome("stopped", cause=shortened(str(error)), error=kind.__name__, exit_code=error.exit_code)
+    changed = changed_items(unit, store)
+    if isinstance(error, ChangedFileError) and error.path is not None:
+        store.stat_cache.forget(error.path)
+        changed.setdefault(str(error.path), str(error))  # it may be as before again
+    if changed and unit.source is None:
+        return Outcome("changed", cause="\n".join(changed.values()), changed=changed)
+    if reasons := [*changed.values(), *changed_settings(unit, store)]:
+        return Outcome("failed", cause=reasons[0])
+    if isinstance(error, DamagedBlobError):
+        return Outcome("damaged", cause=str(error))
+    gone = next((ref for ref in input_blobs(unit) if not store.blobs.exists(ref)), None)
+    if gone is not None:  # somebody has collected it while the stage was about to read it: no fault of the stage
+        return Outcome("damaged", cause=str(store.blobs.discard(gone, "is gone")))
+    cause, trace = cause_of(unit, error)
+    exit_code = error.exit_code if isinstance(error, InputError | UsageError) else 0
+    return Outcome("failed", cause=cause, trace=trace, exit_code=exit_code)

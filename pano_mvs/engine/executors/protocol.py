@@ -10,7 +10,7 @@ from typing import Any, Literal, Protocol
 from pano_mvs.engine.store import UnitRecord
 from pano_mvs.engine.units import Unit
 
-Status = Literal["done", "failed", "damaged", "stopped"]
+Status = Literal["done", "failed", "damaged", "changed", "stopped"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,8 @@ class Outcome:
 
     Attributes:
         status: `done`; `failed`: the unit has no result; `damaged`: an input turned out damaged and was removed;
-            `stopped`: nothing can go on (the disk is full, the stage closed a gate).
+            `changed`: a user's file that it reads is not as it was listed; `stopped`: nothing can go on (the disk is
+            full, the stage closed a gate).
         record: the stored result of a job that is done.
         cause: what went wrong otherwise.
         trace: the Python traceback, if the stage's own code broke.
@@ -48,6 +49,7 @@ class Outcome:
         exit_code: of an error that is the user's to mend, else 0.
         died: whether the process died of it, or took too long and was ended.
         seconds: how long it took.
+        changed: the user's files that are not as they were listed, with the reason.
     """
 
     status: Status
@@ -58,6 +60,7 @@ class Outcome:
     exit_code: int = 0
     died: bool = False
     seconds: float = 0.0
+    changed: Mapping[str, str] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """Return the outcome as a JSON value."""
@@ -70,6 +73,7 @@ class Outcome:
             "exit_code": self.exit_code,
             "died": self.died,
             "seconds": self.seconds,
+            "changed": dict(self.changed),
         }
 
     @staticmethod

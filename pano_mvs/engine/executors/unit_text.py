@@ -17,7 +17,7 @@ from pano_mvs.engine.store import ItemRef, Store
 from pano_mvs.engine.units import PENDING, Unit, UnitInput
 from pano_mvs.engine.workflow import StageEntry
 
-TEXT_VERSION = 1
+TEXT_VERSION = 2
 
 
 def request_to_json(job: Job, store: Store) -> dict[str, Any]:
@@ -66,8 +66,8 @@ def unit_from_json(text: Mapping[str, Any], spec: StageSpec, store: Store) -> Un
     if found != (spec.version, spec.code_digest, TEXT_VERSION):
         raise UsageError(f"stage {spec.name!r} is not the same in the worker ({spec.origin}): it was changed while the "
                          "workflow ran, or another version is installed there. Run the same command again")  # fmt: skip
-    for path in text["external"].values():
-        store.blobs.register_external(Path(path))
+    for digest, path in text["external"].items():
+        store.blobs.place_external(digest, Path(path))
     params = spec.params_type.model_validate(text["params"])
     return Unit(
         entry=StageEntry(text["stage"], spec, params, Policy(use=spec.name), ""),
@@ -141,8 +141,10 @@ def input_blobs(unit: Unit) -> Iterator[BlobRef]:
 
 
 def _source_to_json(item: SourceItem) -> dict[str, Any]:
-    return {"name": item.name, "files": {role: str(path.absolute()) for role, path in item.files.items()}}
+    files = {role: str(path.absolute()) for role, path in item.files.items()}
+    return {"name": item.name, "files": files, "digests": dict(item.digests)}
 
 
 def _source_from_json(value: Mapping[str, Any]) -> SourceItem:
-    return SourceItem(value["name"], {role: Path(path) for role, path in value["files"].items()})
+    files = {role: Path(path) for role, path in value["files"].items()}
+    return SourceItem(value["name"], files, digests=value["digests"])

@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from pano_mvs.core.errors import PanoMvsError, PluginError, UsageError
+from pano_mvs.core.paths import resolved
 from pano_mvs.engine.code_digest import code_digest
 from pano_mvs.engine.executors.perform import perform
 from pano_mvs.engine.executors.protocol import Outcome
@@ -49,7 +50,7 @@ def _written(digest: str, name: str, texts: Mapping[str, str]) -> str:
         folder = _folders[digest] = TemporaryDirectory(prefix="pano-mvs-plugin-")
         for relative, text in texts.items():
             path = Path(folder.name) / relative
-            if not path.resolve().is_relative_to(Path(folder.name).resolve()):
+            if not resolved(path).is_relative_to(resolved(Path(folder.name))):
                 raise UsageError(f"plugin {name} imports {relative}, which is not beside it: it cannot be sent along")
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
