@@ -1,6 +1,6 @@
 """The cache: small records by key, written last and in one step, over immutable blobs.
 
-Layout under the root: `blobs/ab/<digest><suffix>`, `records/ab/<key>.json`, `runs/<id>.json` (which key each unit had
+Layout under the root: `blobs/abc/<digest><suffix>`, `records/abc/<key>.json`, `runs/<id>.json` (which key each unit had
 in the latest run of a workflow into a folder: for the reasons that the plan gives, and what a collection keeps),
 `pins/` (runs kept whatever happens), `stat-cache.json`, `tmp/`, `layout.json`.
 What is cached is derived from the records: there is no status file that could be wrong and nothing to unlock.
@@ -16,6 +16,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
+from sys import intern
 from typing import Any
 
 from pano_mvs.core.digest import digest_from_bytes, digest_from_value
@@ -27,7 +28,10 @@ from pano_mvs.engine.runs import RunBook
 from pano_mvs.engine.stat_cache import StatCache
 from pano_mvs.scene import Record
 
-LAYOUT_VERSION = 1
+LAYOUT_VERSION = 2
+_FOLDER_DIGITS = {1: 2, 2: 3}
+"""Layout to the number of digits of a key or digest that name its folder. Older caches go on with their 256 folders."""
+
 LEAST_FREE_BYTES = 200_000_000
 _ABANDONED_AFTER_S = 7 * 24 * 3600.0
 _FOLDERS = ("blobs", "records", "runs", "pins", "tmp")
@@ -48,8 +52,9 @@ class ItemRef:
     @staticmethod
     def from_json(value: Mapping[str, Any]) -> ItemRef:
         """Return the reference that `to_json` gave."""
-        parts = {str(name): BlobRef.from_json(part) for name, part in value["parts"].items()}
-        return ItemRef(str(value["kind"]), str(value["digest"]), parts)
+        # A run knows of a million of them, which have a few names in common.
+        parts = {intern(str(name)): BlobRef.from_json(part) for name, part in value["parts"].items()}
+        return ItemRef(intern(str(value["kind"])), str(value["digest"]), parts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +107,8 @@ class UnitRecord:
         identity, rejected, doubts = value["identity"], value["rejected"], value.get("doubts", {})
         if not all(isinstance(part, dict) for part in (identity, rejected, doubts)):
             raise TypeError("a record's identity and its rejected and doubtful images are objects")
-        metrics, seconds = {str(name): float(metric) for name, metric in value["metrics"].items()}, value["seconds"]
+        metrics = {intern(str(name)): float(metric) for name, metric in value["metrics"].items()}
+        seconds = value["seconds"]
         if not all(map(math.isfinite, (*metrics.values(), seconds))):
             raise ValueError("a figure that is none")
         return UnitRecord(
@@ -143,11 +149,11 @@ class Store:
         self.damaged: list[str] = []
         self._records = str(root / "records")
         self._room = Room(root, least_free_bytes=least_free_bytes)
-        self._open_layout()
+        self.folder_digits = _FOLDER_DIGITS[self._open_layout()]
         self._clear_abandoned()
         self.runs = RunBook(root)
         self.stat_cache = StatCache(root / "stat-cache.json")
-        self.blobs = BlobStore(root, self.stat_cache, durable=durable)
+        self.blobs = BlobStore(root, self.stat_cache, durable=durable, folder_digits=self.folder_digits)
 
     def find(self, key: str) -> UnitRecord | None:
         """Return the record of a key if it is sound and all its blobs are there, else None."""
@@ -158,7 +164,7 @@ class Store:
 
     def read_record(self, key: str) -> UnitRecord | None:
         """Return the record of a key whether or not its blobs are there; a damaged record is a miss."""
-        path = f"{self._records}/{key[:2]}/{key}.json"
+        path = f"{self._records}/{key[: self.folder_digits]}/{key}.json"
         try:
             with open(path, "rb") as stream:  # noqa: PTH123  # a Path costs as much as the rest
                 data = stream.read()
@@ -238,9 +244,10 @@ class Store:
 
     def record_path(self, key: str) -> Path:
         """Return where the record of a key is or would be."""
-        return self.root / "records" / key[:2] / f"{key}.json"
+        return self.root / "records" / key[: self.folder_digits] / f"{key}.json"
 
-    def _open_layout(self) -> None:
+    def _open_layout(self) -> int:
+        """Return the version of the layout; an empty folder gets the latest one."""
         for name in _FOLDERS:
             if (self.root / name).is_symlink():
                 raise UsageError(f"cache {self.root}: {name} is a link: what is written there would land elsewhere. "
@@ -250,16 +257,18 @@ class Store:
             layout = json.loads(path.read_bytes())
         except FileNotFoundError:
             self._create(path)
-            return
+            return LAYOUT_VERSION
         except (OSError, ValueError, RecursionError) as error:
             raise UsageError(f"{path} cannot be read ({error}), so it is not known how the cache is laid out. If it "
                              "is one of this version, delete that file and nothing is lost; else choose another "
                              "folder with --cache DIR")  from error  # fmt: skip
-        if not isinstance(layout, dict) or layout.get("layout") != LAYOUT_VERSION:
+        version = layout.get("layout") if isinstance(layout, dict) else None
+        if type(version) is not int or version not in _FOLDER_DIGITS:
             raise UsageError(
                 f"cache {self.root} has layout {layout!r}, this version uses {LAYOUT_VERSION}. "
                 "Choose another with --cache DIR"
             )
+        return version
 
     def _clear_abandoned(self) -> None:
         """Remove what runs that were killed left half written."""

@@ -112,7 +112,7 @@ def verify(store: Store) -> Damage:
     damage = Damage()
     sound: set[str] = set()
     for file in _files(store.root / "blobs"):
-        name = _own_name(file, _BLOB_NAME)
+        name = _own_name(store, file, _BLOB_NAME)
         if not name:
             damage.foreign.append(file.path)
             continue
@@ -124,7 +124,7 @@ def verify(store: Store) -> Damage:
             _remove(Path(file.path))
             damage.removed.append(file.path)
     for file in _files(store.root / "records"):
-        key = _own_name(file, _RECORD_NAME)
+        key = _own_name(store, file, _RECORD_NAME)
         data = _read(file.path) if key else None
         if not key:
             damage.foreign.append(file.path)
@@ -178,7 +178,7 @@ def collect(store: Store, *, unused_s: float, forget_after_s: float | None = Non
             kept_blobs.update(f"{ref.digest}{ref.suffix}" for ref in record.blobs())
     for file in _files(store.root / "blobs"):
         stat = _stat(file.path)
-        if stat is None or not _own_name(file, _BLOB_NAME):
+        if stat is None or not _own_name(store, file, _BLOB_NAME):
             continue
         if file.name in kept_blobs or stat.st_mtime > newest:
             found.kept_bytes += stat.st_size
@@ -210,7 +210,7 @@ def _remove(path: Path) -> None:
 def _records(store: Store) -> Iterator[tuple[os.DirEntry[str], UnitRecord]]:
     """Yield every record that is sound."""
     for file in _files(store.root / "records"):
-        key = _own_name(file, _RECORD_NAME)
+        key = _own_name(store, file, _RECORD_NAME)
         record = record_from_bytes(_read(file.path) or b"") if key else None
         if record is not None and record.key == key:
             yield file, record
@@ -220,11 +220,12 @@ def _stage_of(record: UnitRecord) -> str:
     return str(record.identity.get("stage", "unknown"))
 
 
-def _own_name(file: os.DirEntry[str], pattern: re.Pattern[str]) -> str:
+def _own_name(store: Store, file: os.DirEntry[str], pattern: re.Pattern[str]) -> str:
     """Return the digest in the name of a file that a store has written there, or nothing if it is no such file."""
     match = pattern.fullmatch(file.name)
-    in_place = match is not None and Path(file.path).parent.name == match[1][:2] and file.is_file(follow_symlinks=False)
-    return match[1] if match is not None and in_place else ""
+    if match is None or Path(file.path).parent.name != match[1][: store.folder_digits]:
+        return ""
+    return match[1] if file.is_file(follow_symlinks=False) else ""
 
 
 def _read(path: str) -> bytes | None:
