@@ -13,7 +13,6 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from sys import intern
 from typing import Any
 
 import numpy as np
@@ -73,7 +72,7 @@ class BlobRef:
             raise ValueError(f"no reference to a blob: {value!r}")
         if not 0 <= size_bytes < _LARGEST_BYTES:
             raise ValueError(f"a blob of {size_bytes} bytes")
-        return BlobRef(digest, size_bytes, intern(suffix), external)
+        return BlobRef(digest, size_bytes, suffix, external)
 
 
 class BlobStore:

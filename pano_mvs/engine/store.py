@@ -23,6 +23,7 @@ from pano_mvs.core.digest import digest_from_bytes, digest_from_value
 from pano_mvs.core.errors import ContractError, StoreError, UsageError
 from pano_mvs.core.files import clear_abandoned, is_older, remove_whole, write_text
 from pano_mvs.engine.blobs import BlobRef, BlobStore, DamagedBlobError
+from pano_mvs.engine.packed_parts import PackedParts
 from pano_mvs.engine.room import Room, is_full_disk
 from pano_mvs.engine.runs import RunBook
 from pano_mvs.engine.stat_cache import StatCache
@@ -52,9 +53,8 @@ class ItemRef:
     @staticmethod
     def from_json(value: Mapping[str, Any]) -> ItemRef:
         """Return the reference that `to_json` gave."""
-        # A run knows of a million of them, which have a few names in common.
-        parts = {intern(str(name)): BlobRef.from_json(part) for name, part in value["parts"].items()}
-        return ItemRef(intern(str(value["kind"])), str(value["digest"]), parts)
+        parts = {str(name): BlobRef.from_json(part) for name, part in value["parts"].items()}
+        return ItemRef(intern(str(value["kind"])), str(value["digest"]), PackedParts(parts))
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,7 +205,7 @@ class Store:
             raise ContractError(f"{value.kind_name()} holds something that cannot be stored: {error}") from error
         digests = {name: [ref.digest, ref.suffix] for name, ref in parts.items()}
         digest = digest_from_value([value.kind_name(), value.kind_version, digests])
-        return ItemRef(value.kind_name(), digest, parts)
+        return ItemRef(value.kind_name(), digest, PackedParts(parts))
 
     def load(self, ref: ItemRef, kind: type[Record]) -> Record:
         """Return a stored value; its arrays are memory-mapped and read-only.

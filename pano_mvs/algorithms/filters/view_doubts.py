@@ -79,7 +79,7 @@ def nearest_views(places: NDArray[np.float64]) -> Iterator[NDArray[np.int64]]:
     count = min(_NEIGHBOURS, len(places) - 1)
     tree = cKDTree(places)
     # The place itself is among those found, unless more than `count` others coincide with it.
-    farthest = tree.query(places, k=count + 1)[0][:, -1]
+    farthest = np.asarray(tree.query(places, k=count + 1)[0])[:, -1]
     for idx, place in enumerate(places):
         # A little more than the distance of the last one, so that none at the same distance is missed by rounding.
         within = np.array(sorted(tree.query_ball_point(place, farthest[idx] * (1 + 1e-9))), np.int64)
