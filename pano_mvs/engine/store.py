@@ -149,7 +149,8 @@ class Store:
         self.damaged: list[str] = []
         self._records = str(root / "records")
         self._room = Room(root, least_free_bytes=least_free_bytes)
-        self.folder_digits = _FOLDER_DIGITS[self._open_layout()]
+        self.folder_digits = _FOLDER_DIGITS[LAYOUT_VERSION]
+        self._open_layout()
         self._clear_abandoned()
         self.runs = RunBook(root)
         self.stat_cache = StatCache(root / "stat-cache.json")
@@ -246,8 +247,7 @@ class Store:
         """Return where the record of a key is or would be."""
         return self.root / "records" / key[: self.folder_digits] / f"{key}.json"
 
-    def _open_layout(self) -> int:
-        """Return the version of the layout; an empty folder gets the latest one."""
+    def _open_layout(self) -> None:
         for name in _FOLDERS:
             if (self.root / name).is_symlink():
                 raise UsageError(f"cache {self.root}: {name} is a link: what is written there would land elsewhere. "
@@ -257,7 +257,7 @@ class Store:
             layout = json.loads(path.read_bytes())
         except FileNotFoundError:
             self._create(path)
-            return LAYOUT_VERSION
+            return
         except (OSError, ValueError, RecursionError) as error:
             raise UsageError(f"{path} cannot be read ({error}), so it is not known how the cache is laid out. If it "
                              "is one of this version, delete that file and nothing is lost; else choose another "
@@ -268,7 +268,7 @@ class Store:
                 f"cache {self.root} has layout {layout!r}, this version uses {LAYOUT_VERSION}. "
                 "Choose another with --cache DIR"
             )
-        return version
+        self.folder_digits = _FOLDER_DIGITS[version]
 
     def _clear_abandoned(self) -> None:
         """Remove what runs that were killed left half written."""
