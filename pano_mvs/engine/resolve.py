@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from sys import intern
 from typing import Any
 
 from pano_mvs.core.digest import digest_from_value
@@ -152,7 +153,8 @@ class Resolver:
             return {}
         index = self.store.load(state.items[WHOLE], edge.port.kind)
         assert isinstance(index, Pairs | Views)
-        self.near = index.units()
+        # Each name comes as often as the image has neighbours, each time as a string of its own.
+        self.near = {name: tuple(map(intern, members)) for name, members in index.units().items()}
         if self.axis is Axis.PAIR:
             return self.near
         return {name: (name,) for name in self.near}
