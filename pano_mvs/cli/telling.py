@@ -13,7 +13,7 @@ from pano_mvs.cli.guard import exit_text
 from pano_mvs.cli.judgement import add_dense_doubts
 from pano_mvs.cli.summary import summarise
 from pano_mvs.core.errors import PanoMvsError
-from pano_mvs.core.files import write_text
+from pano_mvs.core.files import replacing
 from pano_mvs.engine.run import Run
 from pano_mvs.report.page import write_report
 from pano_mvs.report.results import Results
@@ -27,7 +27,9 @@ def tell(out: Path, run: Run, *, started: datetime, clock: float) -> tuple[dict[
     """Judge the run, write run.json and the report, and return what they say: the summary and the report's verdict."""
     add_dense_doubts(run)
     summary = summarise(run, run.result, started=started, seconds=time.perf_counter() - clock)
-    write_text(out / "run.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
+    with replacing(out / "run.json") as temporary, temporary.open("w", encoding="utf-8", newline="\n") as stream:
+        stream.writelines(json.JSONEncoder(indent=1, allow_nan=False).iterencode(summary))
+        stream.write("\n")
     return summary, write_report(out, summary, Results.of_run(run, summary["results"]))
 
 

@@ -80,10 +80,11 @@ class BlobRef:
 class BlobStore:
     """A folder of blobs. External files are known by digest and found through the paths registered in this run."""
 
-    def __init__(self, root: Path, stat_cache: StatCache, *, durable: bool = False) -> None:
+    def __init__(self, root: Path, stat_cache: StatCache, *, durable: bool = False, folder_digits: int = 3) -> None:
         self.root = root
         self.durable = durable
         self._folder = str(root / "blobs")
+        self._digits = folder_digits
         self.temporary = root / "tmp"
         self.stat_cache = stat_cache
         self._external: dict[str, Path] = {}
@@ -106,7 +107,7 @@ class BlobStore:
     def _place(self, ref: BlobRef) -> str | Path:
         if ref.external:
             return self._external.get(ref.digest, f"unregistered/{ref.digest}")
-        return f"{self._folder}/{ref.digest[:2]}/{ref.digest}{ref.suffix}"  # a Path costs ten times as much
+        return f"{self._folder}/{ref.digest[: self._digits]}/{ref.digest}{ref.suffix}"  # a Path costs ten times as much
 
     def exists(self, ref: BlobRef) -> bool:
         """Return whether a blob is there with its right size (its bytes are checked when it is read)."""

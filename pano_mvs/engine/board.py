@@ -164,7 +164,7 @@ class Board:
             members = stage.resolver.unit_names()
             assert members is not None, name
             blocked = stage.resolver.resolution.blocked
-            state.members.update(members)
+            state.members = dict(members) if not isinstance(members, dict) else members  # no second one of a million
         items = [*state.members, *(item for item in blocked if item not in state.members)]
         stage.rank = {item: rank for rank, item in enumerate(items)}
         stage.unsettled, state.open = len(items), False
@@ -235,6 +235,7 @@ class Board:
         state.items = {item: state.items[item] for item in stage.rank if item in state.items}
         state.failed = {item: state.failed[item] for item in stage.rank if item in state.failed}
         state.exploded = {key: ref for item in stage.rank for key, ref in stage.collections.get(item, {}).items()}
+        state.pending, stage.missing = set(), {}  # an empty set or dict keeps the room that it once needed
         self._listener.stage_complete(stage.entry)
         self._complete.add(name)
         self._work.append((name, None))

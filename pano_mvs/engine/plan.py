@@ -9,7 +9,7 @@ from pano_mvs.engine.demands import NO_DEMANDS, Demands
 from pano_mvs.engine.reasons import reason_to_run
 from pano_mvs.engine.resolve import resolve
 from pano_mvs.engine.store import Store, UnitRecord
-from pano_mvs.engine.units import Resolution, StageState, Unit
+from pano_mvs.engine.units import StageState, Unit
 from pano_mvs.engine.wiring import Graph
 from pano_mvs.engine.workflow import Workflow
 
@@ -64,12 +64,9 @@ def make_plan(
     plans: list[StagePlan] = []
     for name in graph.order:
         entry = workflow.stages[name]
-        resolution = resolve(entry, graph, states, store)
-        state = start_state(graph, name, resolution)
-        plan = StagePlan(name, entry.spec.name, may_run=list(resolution.waiting), blocked=dict(resolution.blocked))
-        plan.open = state.open = resolution.open
-        state.pending.update(resolution.waiting)
-        for unit in resolution.units:
+        state, plan = StageState(graph.axes[name]), StagePlan(name, entry.spec.name)
+        units, resolution = resolve(entry, graph, states, store)
+        for unit in units:
             record = None if demands.refreshes(unit) else store.find(unit.key)
             if record is not None:
                 settle(state, unit, record)
@@ -79,14 +76,13 @@ def make_plan(
                 plan.run[unit.item] = _reason(unit, last.get(name, {}), store, demands)
             if visit is not None:
                 visit(unit, record, plan.run.get(unit.item, ""))
+        state.members, state.failed = resolution.members, resolution.blocked
+        state.pending.update(resolution.waiting)
+        state.open = resolution.open
+        plan.may_run, plan.blocked, plan.open = resolution.waiting, resolution.blocked, resolution.open
         states[name] = state
         plans.append(plan)
     return plans
-
-
-def start_state(graph: Graph, name: str, resolution: Resolution) -> StageState:
-    """Return the state of a stage of which only the units are known."""
-    return StageState(graph.axes[name], members=dict(resolution.members), failed=dict(resolution.blocked))
 
 
 def settle(state: StageState, unit: Unit, record: UnitRecord) -> None:

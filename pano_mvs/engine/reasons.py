@@ -73,7 +73,7 @@ def _changed_items(unit: Unit, port: str, old: Any, new: Any) -> str:
     value = unit.inputs.get(port)
     if value is None or isinstance(value, ItemRef):
         return unit.item or "changed"
-    known = [str(entry) for entry in old or []]
+    known = {str(entry) for entry in old or []}
     names = [name for name, entry in zip(value, new, strict=True) if str(entry) not in known]
     if not names:
         return "fewer items" if len(new) < len(old or []) else "another order"

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from sys import intern
 from typing import Any
 
 from pano_mvs.core.digest import digest_from_value
@@ -63,11 +64,20 @@ def resolve_source(
     return resolution
 
 
-def resolve(entry: StageEntry, graph: Graph, states: Mapping[str, StageState], store: Store) -> Resolution:
-    """Return the units of a stage, given the states of its producers."""
+def resolve(
+    entry: StageEntry, graph: Graph, states: Mapping[str, StageState], store: Store
+) -> tuple[Iterator[Unit], Resolution]:
+    """Return a stage's units one at a time, given the states of its producers.
+
+    Returns:
+        The units whose inputs are all known, and what is known of the others, which is complete once all units have
+        been taken. A stage may have a million units, whose inputs take more memory than all else.
+    """
     if entry.spec.list_items is not None:
-        return resolve_source(entry, store, graph.only.get(entry.name))
-    return Resolver(entry, graph, states, store).resolve()
+        resolution = resolve_source(entry, store, graph.only.get(entry.name))
+        return iter(resolution.units), resolution
+    resolver = Resolver(entry, graph, states, store)
+    return resolver.resolve(), resolver.resolution
 
 
 class Resolver:
@@ -90,16 +100,17 @@ class Resolver:
         self._common = ""
         self._near_edges = [edge for edge in edges.values() if edge.port.cardinality is Cardinality.NEAR]
 
-    def resolve(self) -> Resolution:
-        """Return all units, as far as they are known."""
+    def resolve(self) -> Iterator[Unit]:
+        """Yield the units whose inputs are all known, and enter the others into `resolution`."""
         names = self.unit_names()
         if names is None:
             self.resolution.open = True
-            return self.resolution
+            return
         for name, members in names.items():
             self.resolution.members[name] = members
             self._add(name, members)
-        return self.resolution
+            if self.resolution.units:
+                yield self.resolution.units.pop()
 
     def unit(self, name: str, members: tuple[str, ...]) -> Unit | str:
         """Return a unit whose inputs have all been tried, or the reason why it cannot run."""
@@ -153,7 +164,8 @@ class Resolver:
             return {}
         index = self.store.load(state.items[WHOLE], edge.port.kind)
         assert isinstance(index, Pairs | Views)
-        self.near = index.units()
+        # Each name comes as often as the image has neighbours, each time as a string of its own.
+        self.near = {name: tuple(map(intern, members)) for name, members in index.units().items()}
         if self.axis is Axis.PAIR:
             return self.near
         return {name: (name,) for name in self.near}

@@ -75,7 +75,7 @@ class Run:
         self._desk = Desk(self.executor, store, out, workflow.plugins)
         self._listing = Listing()
         self._keys: dict[str, dict[str, str]] = {}
-        self._computed: dict[str, UnitRecord] = {}
+        self._computed: set[str] = set()
         self._refreshed: set[str] = set()
         self._last_keys = store.runs.last_keys(workflow_id(workflow)) if demands.accept_code else {}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 
 from pano_mvs.core.digest import digest_from_bytes, digest_from_value
 from pano_mvs.core.errors import StoreError, UsageError
-from pano_mvs.core.files import write_text
+from pano_mvs.core.files import replacing
 from pano_mvs.core.paths import children, is_file, resolved
 
 Keys: TypeAlias = "dict[str, dict[str, str]]"
@@ -82,15 +82,21 @@ class RunBook:
         Raises:
             StoreError: if one is damaged: what it protects is not known.
         """
-        found: list[RunEntry] = []
+        return sorted(self.each(), key=lambda entry: (entry.when, entry.name), reverse=True)
+
+    def each(self) -> Iterator[RunEntry]:
+        """Yield the runs and the pins one at a time, as a large one takes much memory.
+
+        Raises:
+            StoreError: if one is damaged: what it protects is not known.
+        """
         for folder in ("runs", "pins"):
             for path in self._paths(folder, "*.json"):
                 entry = _read(path)
                 if entry is None:
                     raise StoreError(f"{path} is damaged, so what it keeps is not known. Run its workflow again, or "
                                      "delete the file if nothing of it is wanted")  # fmt: skip
-                found.append(entry)
-        return sorted(found, key=lambda entry: (entry.when, entry.name), reverse=True)
+                yield entry
 
     def pin(self, run: str, name: str) -> RunEntry:
         """Keep what a run used, whatever runs after it.
@@ -132,9 +138,11 @@ class RunBook:
 
     def _write(self, folder: str, entry: RunEntry) -> None:
         value = {"workflow": entry.workflow, "out": entry.out, "when": entry.when, "keys": entry.keys}
-        body = json.dumps(value, sort_keys=True)
+        body = json.dumps(value, sort_keys=True).encode()  # 100 MB for a million units: no copy more than needed
         path = self.root / folder / f"{entry.name}.json"
-        write_text(path, f"{digest_from_bytes(body.encode())}\n{body}", temporary_in=self.root / "tmp")
+        with replacing(path, temporary_in=self.root / "tmp") as temporary, temporary.open("wb") as stream:
+            stream.write(f"{digest_from_bytes(body)}\n".encode())
+            stream.write(body)
 
     def _path(self, entry: RunEntry) -> Path:
         return self.root / ("pins" if entry.pinned else "runs") / f"{entry.name}.json"

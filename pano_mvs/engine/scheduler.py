@@ -35,7 +35,7 @@ class Scheduler:
 
     Attributes:
         keys: stage to unit to cache key, of all units seen.
-        computed: key to what was computed rather than found, in this pass or in those before it.
+        computed: keys of what was computed rather than found, in this pass or in those before it.
         damaged: what turned out damaged in this pass, and has been removed, and the user's files that changed. Units
             that need any of it are left for the next pass, and the rest goes on: much damage takes no more passes than
             little.
@@ -49,7 +49,7 @@ class Scheduler:
         publisher: Publisher,
         *,
         keys: dict[str, dict[str, str]],
-        computed: dict[str, UnitRecord],
+        computed: set[str],
         finder: Callable[[Unit], UnitRecord | None],
         warn: Callable[[str], None],
     ) -> None:
@@ -96,7 +96,7 @@ class Scheduler:
         """Wait for what is being computed; its results are in the store."""
         while (ended := self._desk.take()) is not None:
             if ended.outcome.record is not None:
-                self.computed[ended.unit.key] = ended.outcome.record
+                self.computed.add(ended.unit.key)
 
     def _find(self, unit: Unit) -> bool:
         """Settle a unit that is in the store; return whether it was, or soon will be."""
@@ -138,7 +138,7 @@ class Scheduler:
         if outcome.status == "stopped":
             raise _STOPPING.get(outcome.error, PanoMvsError)(outcome.cause)
         if outcome.record is not None:
-            self.computed[unit.key] = outcome.record
+            self.computed.add(unit.key)
             self._accept(unit, outcome.record, was_computed=True)
         else:
             self._fail(ended)

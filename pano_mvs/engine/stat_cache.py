@@ -15,7 +15,7 @@ from pano_mvs.core.paths import below, is_file, is_folder, reason_of, resolved
 
 # A file changed within this time of being hashed may change again without its time stamp showing it.
 _SETTLE_S = 2.0
-_MOST_ENTRIES = 200_000
+_MOST_ENTRIES = 500_000
 
 Entry: TypeAlias = "list[int | str]"
 """Size, time of the last change of the bytes and of the file in ns, inode; digest."""

@@ -1,6 +1,6 @@
 """The cache: small records by key, written last and in one step, over immutable blobs.
 
-Layout under the root: `blobs/ab/<digest><suffix>`, `records/ab/<key>.json`, `runs/<id>.json` (which key each unit had
+Layout under the root: `blobs/abc/<digest><suffix>`, `records/abc/<key>.json`, `runs/<id>.json` (which key each unit had
 in the latest run of a workflow into a folder: for the reasons that the plan gives, and what a collection keeps),
 `pins/` (runs kept whatever happens), `stat-cache.json`, `tmp/`, `layout.json`, and an empty file that marks the folder
 as a cache.
@@ -17,6 +17,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from sys import intern
 from typing import Any
 
 from pano_mvs.core.digest import digest_from_bytes, digest_from_value
@@ -24,12 +25,16 @@ from pano_mvs.core.errors import ContractError, StoreError, UsageError
 from pano_mvs.core.files import CACHE_MARK, clear_abandoned, is_older, remove_whole, write_text
 from pano_mvs.core.paths import children, exists, is_link, reason_of
 from pano_mvs.engine.blobs import BlobRef, BlobStore, DamagedBlobError
+from pano_mvs.engine.packed_parts import PackedParts
 from pano_mvs.engine.room import Room, is_full_disk
 from pano_mvs.engine.runs import RunBook
 from pano_mvs.engine.stat_cache import StatCache
 from pano_mvs.scene import Record
 
-LAYOUT_VERSION = 1
+LAYOUT_VERSION = 2
+_FOLDER_DIGITS = {1: 2, 2: 3}
+"""Layout to the number of digits of a key or digest that name its folder. Older caches go on with their 256 folders."""
+
 LEAST_FREE_BYTES = 200_000_000
 _ABANDONED_AFTER_S = 7 * 24 * 3600.0
 _FOLDERS = ("blobs", "records", "runs", "pins", "tmp")
@@ -51,7 +56,7 @@ class ItemRef:
     def from_json(value: Mapping[str, Any]) -> ItemRef:
         """Return the reference that `to_json` gave."""
         parts = {str(name): BlobRef.from_json(part) for name, part in value["parts"].items()}
-        return ItemRef(str(value["kind"]), str(value["digest"]), parts)
+        return ItemRef(intern(str(value["kind"])), str(value["digest"]), PackedParts(parts))
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +113,8 @@ class UnitRecord:
         identity, rejected, doubts = value["identity"], value["rejected"], value.get("doubts", {})
         if not all(isinstance(part, dict) for part in (identity, rejected, doubts)):
             raise TypeError("a record's identity and its rejected and doubtful images are objects")
-        metrics, seconds = {str(name): float(metric) for name, metric in value["metrics"].items()}, value["seconds"]
+        metrics = {intern(str(name)): float(metric) for name, metric in value["metrics"].items()}
+        seconds = value["seconds"]
         if not all(map(math.isfinite, (*metrics.values(), seconds))):
             raise ValueError("a figure that is none")
         return UnitRecord(
@@ -152,11 +158,12 @@ class Store:
         self.damaged: list[str] = []
         self._records = str(root / "records")
         self._room = Room(root, least_free_bytes=least_free_bytes)
+        self.folder_digits = _FOLDER_DIGITS[LAYOUT_VERSION]
         self._open_layout(for_reading=for_reading)
         self._clear_abandoned()
         self.runs = RunBook(root)
         self.stat_cache = StatCache(root / "stat-cache.json")
-        self.blobs = BlobStore(root, self.stat_cache, durable=durable)
+        self.blobs = BlobStore(root, self.stat_cache, durable=durable, folder_digits=self.folder_digits)
 
     def find(self, key: str) -> UnitRecord | None:
         """Return the record of a key if it is sound and all its blobs are there, else None."""
@@ -167,7 +174,7 @@ class Store:
 
     def read_record(self, key: str) -> UnitRecord | None:
         """Return the record of a key whether or not its blobs are there; a damaged record is a miss."""
-        path = f"{self._records}/{key[:2]}/{key}.json"
+        path = f"{self._records}/{key[: self.folder_digits]}/{key}.json"
         try:
             with open(path, "rb") as stream:  # noqa: PTH123  # a Path costs as much as the rest
                 data = stream.read()
@@ -208,7 +215,7 @@ class Store:
             raise ContractError(f"{value.kind_name()} holds something that cannot be stored: {error}") from error
         digests = {name: [ref.digest, ref.suffix] for name, ref in parts.items()}
         digest = digest_from_value([value.kind_name(), value.kind_version, digests])
-        return ItemRef(value.kind_name(), digest, parts)
+        return ItemRef(value.kind_name(), digest, PackedParts(parts))
 
     def load(self, ref: ItemRef, kind: type[Record]) -> Record:
         """Return a stored value; its arrays are memory-mapped and read-only.
@@ -247,7 +254,7 @@ class Store:
 
     def record_path(self, key: str) -> Path:
         """Return where the record of a key is or would be."""
-        return self.root / "records" / key[:2] / f"{key}.json"
+        return self.root / "records" / key[: self.folder_digits] / f"{key}.json"
 
     def _open_layout(self, *, for_reading: bool) -> None:
         for name in _FOLDERS:
@@ -271,11 +278,13 @@ class Store:
             raise UsageError(f"{path} cannot be read ({error}), so it is not known how the cache is laid out. If it "
                              "is one of this version, delete that file and nothing is lost; else choose another "
                              "folder with --cache DIR")  from error  # fmt: skip
-        if not isinstance(layout, dict) or layout.get("layout") != LAYOUT_VERSION:
+        version = layout.get("layout") if isinstance(layout, dict) else None
+        if type(version) is not int or version not in _FOLDER_DIGITS:
             raise UsageError(
                 f"cache {self.root} has layout {layout!r}, this version uses {LAYOUT_VERSION}. "
                 "Choose another with --cache DIR"
             )
+        self.folder_digits = _FOLDER_DIGITS[version]
         self._mark()
 
     def _mark(self) -> None:

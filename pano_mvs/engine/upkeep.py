@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pano_mvs.core.digest import IS_DIGEST, digest_from_file
+from pano_mvs.core.digest import DIGEST_BYTES, IS_DIGEST, digest_from_file
 from pano_mvs.core.errors import StoreError
 from pano_mvs.core.files import whose_temporary
 from pano_mvs.engine.blobs import SUFFIX
@@ -79,8 +79,8 @@ class Collection:
     """
 
     runs: list[RunEntry] = field(default_factory=list)
-    records: list[Path] = field(default_factory=list)
-    blobs: list[Path] = field(default_factory=list)
+    records: list[str] = field(default_factory=list)
+    blobs: list[str] = field(default_factory=list)
     size_bytes: int = 0
     kept_bytes: int = 0
 
@@ -122,7 +122,7 @@ def verify(store: Store, *, drop_unproven: bool = False) -> Damage:
     damage, unproven = Damage(), Unproven()
     sound: set[str] = set()
     for file in _files(store.root / "blobs"):
-        name = _own_name(file, _BLOB_NAME)
+        name = _own_name(store, file, _BLOB_NAME)
         if not name:
             damage.foreign.append(file.path)
             continue
@@ -134,7 +134,7 @@ def verify(store: Store, *, drop_unproven: bool = False) -> Damage:
             _remove(Path(file.path))
             damage.removed.append(file.path)
     for file in _files(store.root / "records"):
-        key = _own_name(file, _RECORD_NAME)
+        key = _own_name(store, file, _RECORD_NAME)
         data = _read(file.path) if key else None
         if not key:
             damage.foreign.append(file.path)
@@ -184,28 +184,29 @@ def collect(store: Store, *, unused_s: float, forget_after_s: float | None = Non
     """
     found = Collection()
     newest = time.time() - unused_s
-    kept_keys: set[str] = set()
-    for entry in store.runs.entries():
+    kept_keys: set[bytes] = set()
+    for entry in store.runs.each():
         if not entry.pinned and forget_after_s is not None and entry.age_s() > forget_after_s:
             found.runs.append(entry)
         else:
-            kept_keys.update(key for units in entry.keys.values() for key in units.values())
-    kept_blobs: set[str] = set()
+            kept_keys.update(_packed(key) for units in entry.keys.values() for key in units.values())
+    kept_blobs: set[bytes] = set()
     for file, record in _records(store):
         stat = _stat(file.path)
-        if stat is not None and record.key not in kept_keys and stat.st_mtime <= newest:
-            found.records.append(Path(file.path))
+        if stat is not None and _packed(record.key) not in kept_keys and stat.st_mtime <= newest:
+            found.records.append(file.path)
             found.size_bytes += stat.st_size
         else:
-            kept_blobs.update(f"{ref.digest}{ref.suffix}" for ref in record.blobs())
+            kept_blobs.update(_packed(ref.digest) for ref in record.blobs())
     for file in _files(store.root / "blobs"):
         stat = _stat(file.path)
-        if stat is None or not _own_name(file, _BLOB_NAME):
+        name = _own_name(store, file, _BLOB_NAME)
+        if stat is None or not name:
             continue
-        if file.name in kept_blobs or stat.st_mtime > newest:
+        if _packed(name) in kept_blobs or stat.st_mtime > newest:
             found.kept_bytes += stat.st_size
         else:
-            found.blobs.append(Path(file.path))
+            found.blobs.append(file.path)
             found.size_bytes += stat.st_size
     if delete:
         _delete(store, found, newest)
@@ -219,7 +220,15 @@ def _delete(store: Store, found: Collection, newest: float) -> None:
     for path in (*found.records, *found.blobs):
         stat = _stat(path)
         if stat is not None and stat.st_mtime <= newest:  # else a run has come to use it meanwhile
-            _remove(path)
+            _remove(Path(path))
+
+
+def _packed(digest: str) -> bytes:
+    """Return the first half of a digest as bytes, which take half the memory; nothing if it is no digest.
+
+    Of millions of digests no two begin alike. If two did, a file too many would be kept.
+    """
+    return bytes.fromhex(digest[:DIGEST_BYTES]) if IS_DIGEST.fullmatch(digest) else b""
 
 
 def _remove(path: Path) -> None:
@@ -232,7 +241,7 @@ def _remove(path: Path) -> None:
 def _records(store: Store) -> Iterator[tuple[os.DirEntry[str], UnitRecord]]:
     """Yield every record that is sound."""
     for file in _files(store.root / "records"):
-        key = _own_name(file, _RECORD_NAME)
+        key = _own_name(store, file, _RECORD_NAME)
         record = record_from_bytes(_read(file.path) or b"") if key else None
         if record is not None and record.key == key:
             yield file, record
@@ -242,11 +251,12 @@ def _stage_of(record: UnitRecord) -> str:
     return str(record.identity.get("stage", "unknown"))
 
 
-def _own_name(file: os.DirEntry[str], pattern: re.Pattern[str]) -> str:
+def _own_name(store: Store, file: os.DirEntry[str], pattern: re.Pattern[str]) -> str:
     """Return the digest in the name of a file that a store has written there, or nothing if it is no such file."""
     match = pattern.fullmatch(file.name)
-    in_place = match is not None and Path(file.path).parent.name == match[1][:2] and file.is_file(follow_symlinks=False)
-    return match[1] if match is not None and in_place else ""
+    if match is None or Path(file.path).parent.name != match[1][: store.folder_digits]:
+        return ""
+    return match[1] if file.is_file(follow_symlinks=False) else ""
 
 
 def _read(path: str) -> bytes | None:

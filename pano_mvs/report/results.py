@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -66,11 +66,7 @@ class Results:
         stages = {role: str(stage) for role, stage in (summary.get("results") or {}).items() if role in ROLES}
         if not stages:
             return Results(notes=["run.json is of an earlier version and names no results: run again to see pictures"])
-        records = {
-            role: {item: store.read_record(key) for item, key in entry.keys.get(stage, {}).items()}
-            for role, stage in stages.items()
-        }
-        refs = {role: {item: rec.output for item, rec in found.items() if rec} for role, found in records.items()}
+        refs = {role: _Recorded(store, entry.keys.get(stage, {})) for role, stage in stages.items()}
         _find_pictures(store, summary, stages.get("images", ""), refs.get("images", {}))
         return Results(store, refs)
 
@@ -127,6 +123,30 @@ class Results:
             self.notes.append(str(error))
             return None
         return value if isinstance(value, kind) else None
+
+
+class _Recorded(Mapping[str, ItemRef]):
+    """Item to its stored value, whose record is read when it is asked for: the page shows few of many pairs."""
+
+    def __init__(self, store: Store, keys: Mapping[str, str]) -> None:
+        self._store = store
+        self._keys = keys
+        self._known: dict[str, ItemRef | None] = {}
+
+    def __getitem__(self, item: str) -> ItemRef:
+        if item not in self._known:
+            record = self._store.read_record(self._keys[item])
+            self._known[item] = record.output if record is not None else None
+        found = self._known[item]
+        if found is None:
+            raise KeyError(item)
+        return found
+
+    def __iter__(self) -> Iterator[str]:
+        return (item for item in self._keys if item in self)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
 
 
 def _find_pictures(store: Store, summary: Mapping[str, Any], stage: str, refs: Mapping[str, ItemRef]) -> None:

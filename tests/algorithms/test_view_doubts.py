@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.filters.consistency import checked_with_agreement
-from pano_mvs.algorithms.filters.view_doubts import Agreement, view_doubts
+from pano_mvs.algorithms.filters.view_doubts import Agreement, nearest_views, view_doubts
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.room import capture_poses, default_room
@@ -113,3 +113,18 @@ def test_only_the_nearest_views_count() -> None:
     poor = replace(WRONG, agreed=0.22)
     assert view_doubts(*line([GOOD] * 6 + [poor] * 2 + [WRONG] + [poor] * 2)) == {}
     assert set(view_doubts(*line([GOOD] * 8 + [WRONG] + [GOOD] * 2))) == {"8.jpg"}
+
+
+@pytest.mark.parametrize("case", ["random", "grid", "few", "coincident"])
+def test_nearest_views_are_those_of_a_plain_search(case: str) -> None:
+    rng = np.random.default_rng(0)
+    places = {
+        "random": rng.normal(size=(60, 3)),
+        "grid": np.argwhere(np.ones((5, 5, 2))).astype(float),
+        "few": rng.normal(size=(3, 3)),
+        "coincident": np.repeat(rng.normal(size=(4, 3)), 9, axis=0),
+    }[case]
+    for idx, around in enumerate(nearest_views(places)):
+        distances = np.linalg.norm(places - places[idx], axis=1)
+        distances[idx] = np.inf
+        assert around.tolist() == np.argsort(distances, kind="stable")[: min(4, len(places) - 1)].tolist()

@@ -393,7 +393,7 @@ def test_folder_that_is_no_cache_is_refused_and_left_as_it_is(tmp_path: Path) ->
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("layout", ['{"layout": 2}', "[]", "{}", "1", "[" * 100_000, "\xff"])
+@pytest.mark.parametrize("layout", ['{"layout": 3}', "[]", "{}", "1", "[" * 100_000, "\xff"])
 def test_layout_of_another_version_is_refused_by_all_commands(toy: Toy, cache: Cache, layout: str) -> None:  # noqa: F811
     toy.run()
     (toy.folder / "cache" / "layout.json").write_text(layout, encoding="latin-1")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.stress import damage, hostile, kills
+from tests.stress import damage, hostile, kills, load
 
 
 @pytest.mark.parametrize(
@@ -36,3 +36,10 @@ def test_much_damage_is_healed_by_processes() -> None:
 @pytest.mark.parametrize("executor", ["processes", "serial"])
 def test_killed_runs_lose_nothing(executor: str) -> None:
     assert kills.main(["6", "--executor", executor]) == 0
+
+
+@pytest.mark.slow
+def test_bad_items_killed_workers_and_a_full_disk_cost_the_bad_items_alone(tmp_path: Path) -> None:
+    verdict = load.load(tmp_path, count=30, bad=10, kills=2, every_s=1.0)
+    assert verdict.wrong == []
+    assert verdict.runs >= 2  # the first one found the disk full

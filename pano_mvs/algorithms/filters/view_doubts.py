@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,13 +59,29 @@ def view_doubts(agreements: Mapping[str, Agreement], centers: Mapping[str, NDArr
     places = np.array([centers[name] for name in names])
     agreed = np.array([agreements[name].agreed for name in names])
     doubts = {}
-    for idx, name in enumerate(names):
-        distances = np.linalg.norm(places - places[idx], axis=1)
-        distances[idx] = np.inf
-        around = np.argsort(distances, kind="stable")[: min(_NEIGHBOURS, len(names) - 1)]
+    for idx, (name, around) in enumerate(zip(names, nearest_views(places), strict=True)):
         usual = float(np.median(agreed[around]))
         one_way = agreements[name].one_way
         if usual >= _LEAST_AGREED and agreed[idx] < _LEAST_SHARE_OF_NEIGHBOURS * usual and one_way >= _LEAST_ONE_WAY:
             doubts[name] = (f"other views agree with {100 * agreed[idx]:.0f} % of its ranges (usual around it: "
                             f"{100 * usual:.0f} %) and contradict {100 * one_way:.0f} % in one direction")  # fmt: skip
     return doubts
+
+
+def nearest_views(places: NDArray[np.float64]) -> Iterator[NDArray[np.int64]]:
+    """Yield for each view the indices of the four nearest others, the nearest first; equally near ones in their order.
+
+    Args:
+        places: (N, 3) camera centres, two or more.
+    """
+    from scipy.spatial import cKDTree
+
+    count = min(_NEIGHBOURS, len(places) - 1)
+    tree = cKDTree(places)
+    # The place itself is among those found, unless more than `count` others coincide with it.
+    farthest = np.asarray(tree.query(places, k=count + 1)[0])[:, -1]
+    for idx, place in enumerate(places):
+        # A little more than the distance of the last one, so that none at the same distance is missed by rounding.
+        within = np.array(sorted(tree.query_ball_point(place, farthest[idx] * (1 + 1e-9))), np.int64)
+        within = within[within != idx]
+        yield within[np.argsort(np.linalg.norm(places[within] - place, axis=1), kind="stable")[:count]]

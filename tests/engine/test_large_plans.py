@@ -1,0 +1,30 @@
+"""A plan of many units holds few of them at a time."""
+
+from __future__ import annotations
+
+import gc
+
+from pano_mvs.cli.session import open_session
+from pano_mvs.engine.plan import make_plan
+from pano_mvs.engine.run import workflow_id
+from pano_mvs.engine.store import Store, UnitRecord
+from pano_mvs.engine.units import Unit
+from tests.engine.conftest import Toy
+
+
+def test_a_plan_takes_units_one_at_a_time(toy: Toy) -> None:
+    for number in range(20, 40):
+        toy.number(f"{number}.txt", str(number))
+    toy.run()
+    session = open_session(str(toy.folder / "wf.yaml"), cache=toy.folder / "cache", out=toy.folder / "out")
+    alive: dict[str, int] = {}
+
+    def look(unit: Unit, record: UnitRecord | None, reason: str) -> None:
+        assert record is not None, reason
+        found = sum(isinstance(value, Unit) for value in gc.get_objects())
+        alive[unit.entry.name] = max(found, alive.get(unit.entry.name, 0))
+
+    make_plan(session.workflow, session.graph, Store(session.store_root), workflow_id(session.workflow), visit=look)
+    assert alive["images"] > 20  # a source lists its items at once
+    assert alive["difference"] - alive["pairs"] <= 1
+    assert alive["mean"] - alive["pairs"] <= 1
