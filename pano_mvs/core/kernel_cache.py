@@ -34,10 +34,10 @@ def use_kernel_cache(package: Path) -> None:
 def kernel_cache_folder(package: Path) -> Path:
     """Return the folder for the kernels below a package as they are now."""
     sources = {str(path.relative_to(package)): path.read_bytes() for path in sorted(package.rglob("kernels_*.py"))}
-    return _user_cache() / "pano-mvs" / "kernels" / digest_from_value(sources)[:16]
+    return user_cache_folder() / "pano-mvs" / "kernels" / digest_from_value(sources)[:16]
 
 
-def _user_cache() -> Path:
+def user_cache_folder() -> Path:
     """Return the folder for caches that this system gives to each user."""
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
