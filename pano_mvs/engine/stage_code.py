@@ -50,7 +50,7 @@ def stage_code(spec: StageSpec, params: Params) -> StageCode:
     if spec.code_digest:
         reached = [_reach_of_file(Path(str(sys.modules[spec.function.__module__].__file__)), spec.code_digest)]
     else:
-        reached = [_reach_of_function(spec.function.__module__, spec.function.__qualname__)]
+        reached = [_reach_in_package(spec.function.__module__, spec.function.__qualname__)]
     digests: dict[str, str] = {"": reached[0].digest}
     for setting, path in part_files(params).items():
         reached.append(_reach_of_file(path, code_digest(path)))
@@ -59,20 +59,39 @@ def stage_code(spec: StageSpec, params: Params) -> StageCode:
     return StageCode(digest_from_value(digests) if len(digests) > 1 else digests[""], libraries)
 
 
+def reach_of_function(module: str, name: str, graph: CodeGraph) -> Reach:
+    """Return what a function reaches, with the kinds and settings that its annotations name.
+
+    Args:
+        module: dotted name of its module.
+        name: its qualified name there.
+        graph: of its package and ours.
+    """
+    if "." in name:
+        # Made by another function, with arguments from who knows where: all that is near it counts.
+        return graph.reach_of([module, module.partition(".")[0]], with_annotations=True)
+    return graph.reach_of([f"{module}.{name}"], with_annotations=True)
+
+
+def code_graph(packages: Mapping[str, Path], kept_in: Path | None = None) -> CodeGraph:
+    """Return the graph of some packages, ours among them, without what only shows results or drives stages.
+
+    Args:
+        packages: name to folder, or to the file of a module.
+        kept_in: folder for what was found in each file; None keeps nothing.
+    """
+    return CodeGraph(Sources(packages, kept_in), left_out=_LEFT_OUT, kept=_KEPT)
+
+
 @cache
-def _reach_of_function(module: str, name: str) -> Reach:
+def _reach_in_package(module: str, name: str) -> Reach:
     top = module.partition(".")[0]
     root = _root_of(top)
     if root is None:  # compiled, or typed in somewhere: its version is all that is known of it
         return Reach("", {}, frozenset({top}))
-    sources = _sources(top, root)
-    graph = _graph(sources)
-    if "<locals>" in name or "." in name:
-        # Made by another function, with arguments from who knows where: all that is near it counts.
-        reach = graph.reach_of([module, top], with_annotations=True)
-    else:
-        reach = graph.reach_of([f"{module}.{name}"], with_annotations=True)
-    sources.save()
+    graph = _graph_of(top, root)
+    reach = reach_of_function(module, name, graph)
+    graph.sources.save()
     return reach
 
 
@@ -82,11 +101,9 @@ def _reach_of_file(path: Path, digest: str) -> Reach:
     _, texts = code_texts(path)
     modules = {_module_name(name): (text, name.endswith("__init__.py")) for name, text in texts.items()}
     own = {name: summarize_module(text, name, is_package=is_package) for name, (text, is_package) in modules.items()}
-    root = _root_of(_OURS)
-    assert root is not None
-    sources = Sources({_OURS: root}, _kept_in(), own)
-    reach = _graph(sources).reach_of(own, with_annotations=True)
-    sources.save()
+    graph = _graph_of(_OURS, _our_root())
+    reach = graph.with_modules(own).reach_of(own, with_annotations=True)
+    graph.sources.save()
     return Reach(digest_from_value([digest, reach.digest]), reach.definitions, reach.libraries)
 
 
@@ -96,14 +113,12 @@ def _module_name(name: str) -> str:
 
 
 @cache
-def _sources(top: str, root: Path) -> Sources:
-    ours = _root_of(_OURS)
-    return Sources({top: root} if ours is None else {top: root, _OURS: ours}, _kept_in())
+def _graph_of(top: str, root: Path) -> CodeGraph:
+    return code_graph({top: root, _OURS: _our_root()}, _kept_in())
 
 
-@cache
-def _graph(sources: Sources) -> CodeGraph:
-    return CodeGraph(sources, left_out=_LEFT_OUT, kept=_KEPT)
+def _our_root() -> Path:
+    return Path(pano_mvs.__file__).parent
 
 
 def _root_of(top: str) -> Path | None:

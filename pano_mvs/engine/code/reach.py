@@ -8,7 +8,7 @@ module does when it is imported counts wherever the module is loaded.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from pano_mvs.core.digest import digest_from_value
@@ -43,7 +43,11 @@ class _Node:
 
 
 class CodeGraph:
-    """Which definition uses which, found as far as it is asked for."""
+    """Which definition uses which, found as far as it is asked for.
+
+    Attributes:
+        sources: the modules that are followed.
+    """
 
     def __init__(self, sources: Sources, *, left_out: Iterable[str] = (), kept: Iterable[str] = ()) -> None:
         """Prepare to follow.
@@ -53,10 +57,16 @@ class CodeGraph:
             left_out: dotted names of packages and modules of which nothing counts.
             kept: those inside of these that count nevertheless.
         """
-        self._sources = sources
+        self.sources = sources
         self._is_out = dict.fromkeys(left_out, True) | dict.fromkeys(kept, False)
         self._nodes: dict[str, _Node] = {}
         self._modules: dict[str, tuple[str, ...]] = {}
+
+    def with_modules(self, known: Mapping[str, ModuleSummary]) -> CodeGraph:
+        """Return the graph of these modules and some others, which none of these uses."""
+        more = CodeGraph(self.sources.with_modules(known))
+        more._is_out, more._nodes, more._modules = dict(self._is_out), dict(self._nodes), dict(self._modules)
+        return more
 
     def reach_of(self, paths: Iterable[str], *, with_annotations: bool = False) -> Reach:
         """Return all that some definitions or modules, given by their dotted paths, use, with themselves.
@@ -87,7 +97,7 @@ class CodeGraph:
     def _node(self, name: str) -> _Node:
         if name not in self._nodes:
             module, _, what = name.partition(":")
-            summary = self._sources.summary(module)
+            summary = self.sources.summary(module)
             assert summary is not None, name
             if what == _IMPORT:
                 self._nodes[name] = self._import_node(module, summary)
@@ -124,12 +134,12 @@ class CodeGraph:
 
     def _imports(self, path: str) -> list[str]:
         """Return the nodes of the imports of the modules that a dotted path leads through."""
-        modules = self._modules_on(path) if path in self._sources else ()
+        modules = self._modules_on(path) if path in self.sources else ()
         return [f"{module}:{_IMPORT}" for module in modules if not self._is_left_out(module)]
 
     def _annotations(self, target: str, libraries: set[str]) -> set[str]:
         module, _, name = target.partition(":")
-        summary = self._sources.summary(module)
+        summary = self.sources.summary(module)
         if summary is None:
             return set()
         found = [one for own, one in summary.definitions.items() if name in (own, _WHOLE)]
@@ -142,13 +152,13 @@ class CodeGraph:
             above, _, _ = path.rpartition(".")
             modules = self._modules_on(above) if above else ()
             is_next = (modules[-1] if modules else "") == above
-            found = is_next and self._sources.summary(path) is not None
+            found = is_next and self.sources.summary(path) is not None
             self._modules[path] = (*modules, path) if found else modules
         return self._modules[path]
 
     def _targets(self, path: str, libraries: set[str], depth: int = 0) -> tuple[str, ...]:
         """Return the nodes that a dotted path stands for; enter the library if it leads out of the packages."""
-        if path not in self._sources:
+        if path not in self.sources:
             top = path.partition(".")[0]
             if top and top not in sys.stdlib_module_names:
                 libraries.add(top)
@@ -160,7 +170,7 @@ class CodeGraph:
         for module in modules:  # a name that a package itself defines comes before a module of that name
             rest = path[len(module) + 1 :]
             name, _, further = rest.partition(".")
-            summary = self._sources.summary(module)
+            summary = self.sources.summary(module)
             assert summary is not None
             if self._is_left_out(module):
                 return ()
@@ -182,10 +192,10 @@ class CodeGraph:
         if name in summary.effect_names:
             return (f"{module}:{_IMPORT}",)
         for star in summary.stars:
-            if star not in self._sources:
+            if star not in self.sources:
                 libraries.add(star.partition(".")[0])
                 continue
-            other = self._sources.summary(star)
+            other = self.sources.summary(star)
             known = other is not None and (name in other.definitions or name in other.bindings or other.stars)
             if known and depth < _DEEPEST:
                 return self._targets(f"{star}.{name}", libraries, depth + 1)

@@ -22,25 +22,27 @@ class Sources:
     To read a file's text takes microseconds, to find out what it says milliseconds: so the summaries are kept.
     """
 
-    def __init__(
-        self,
-        packages: Mapping[str, Path],
-        kept_in: Path | None = None,
-        known: Mapping[str, ModuleSummary] | None = None,
-    ) -> None:
+    def __init__(self, packages: Mapping[str, Path], kept_in: Path | None = None) -> None:
         """Prepare to read.
 
         Args:
             packages: name of each top-level package, or module, to its folder, or file.
             kept_in: folder for the summaries; None keeps none.
-            known: other modules, by their dotted names.
         """
         self._packages = dict(packages)
         self._kept_in = kept_in
-        self._summaries: dict[str, ModuleSummary | None] = dict(known or {})
-        self._tops = {*packages, *(module.partition(".")[0] for module in known or {})}
+        self._tops = set(packages)
+        self._summaries: dict[str, ModuleSummary | None] = {}
         self._kept: dict[str, dict[str, tuple[str, ModuleSummary]]] = {}
         self._changed: set[str] = set()
+
+    def with_modules(self, known: Mapping[str, ModuleSummary]) -> Sources:
+        """Return these modules and some others, whose summaries, by their dotted names, are known."""
+        more = Sources(self._packages, self._kept_in)
+        more._tops |= {module.partition(".")[0] for module in known}
+        more._summaries = {**self._summaries, **known}
+        more._kept, more._changed = self._kept, self._changed
+        return more
 
     def __contains__(self, path: str) -> bool:
         """Return whether a dotted path leads into one of the packages."""
