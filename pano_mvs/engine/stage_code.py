@@ -69,18 +69,13 @@ def reach_of_function(module: str, name: str, graph: CodeGraph) -> Reach:
     """
     if "." in name:
         # Made by another function, with arguments from who knows where: all that is near it counts.
-        return graph.reach_of([module, module.partition(".")[0]], with_annotations=True)
-    return graph.reach_of([f"{module}.{name}"], with_annotations=True)
+        return graph.reach_of([f"{module}:", f"{module.partition('.')[0]}:"], with_annotations=True)
+    return graph.reach_of([f"{module}:{name}"], with_annotations=True)
 
 
-def code_graph(packages: Mapping[str, Path], kept_in: Path | None = None) -> CodeGraph:
-    """Return the graph of some packages, ours among them, without what only shows results or drives stages.
-
-    Args:
-        packages: name to folder, or to the file of a module.
-        kept_in: folder for what was found in each file; None keeps nothing.
-    """
-    return CodeGraph(Sources(packages, kept_in), left_out=_LEFT_OUT, kept=_KEPT)
+def code_graph(sources: Sources) -> CodeGraph:
+    """Return the graph of some packages, ours among them, without what only shows results or drives stages."""
+    return CodeGraph(sources, left_out=_LEFT_OUT, kept=_KEPT)
 
 
 @cache
@@ -102,7 +97,7 @@ def _reach_of_file(path: Path, digest: str) -> Reach:
     modules = {_module_name(name): (text, name.endswith("__init__.py")) for name, text in texts.items()}
     own = {name: summarize_module(text, name, is_package=is_package) for name, (text, is_package) in modules.items()}
     graph = _graph_of(_OURS, _our_root())
-    reach = graph.with_modules(own).reach_of(own, with_annotations=True)
+    reach = graph.with_modules(own).reach_of([f"{name}:" for name in own], with_annotations=True)
     graph.sources.save()
     return Reach(digest_from_value([digest, reach.digest]), reach.definitions, reach.libraries)
 
@@ -114,7 +109,7 @@ def _module_name(name: str) -> str:
 
 @cache
 def _graph_of(top: str, root: Path) -> CodeGraph:
-    return code_graph({top: root, _OURS: _our_root()}, _kept_in())
+    return code_graph(Sources({top: root, _OURS: _our_root()}, _kept_in()))
 
 
 def _our_root() -> Path:

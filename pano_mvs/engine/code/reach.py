@@ -7,6 +7,7 @@ module does when it is imported counts wherever the module is loaded.
 
 from __future__ import annotations
 
+import builtins
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -69,10 +70,10 @@ class CodeGraph:
         return more
 
     def reach_of(self, paths: Iterable[str], *, with_annotations: bool = False) -> Reach:
-        """Return all that some definitions or modules, given by their dotted paths, use, with themselves.
+        """Return all that some definitions or modules use, with themselves.
 
         Args:
-            paths: `package.module.name`, or `package.module` for all of a module.
+            paths: `package.module:name`, or `package.module:` for all of a module.
             with_annotations: whether the kinds that their annotations name are used too, as those of a stage are.
         """
         libraries: set[str] = set()
@@ -157,33 +158,29 @@ class CodeGraph:
         return self._modules[path]
 
     def _targets(self, path: str, libraries: set[str], depth: int = 0) -> tuple[str, ...]:
-        """Return the nodes that a dotted path stands for; enter the library if it leads out of the packages."""
-        if path not in self.sources:
-            top = path.partition(".")[0]
+        """Return the nodes that a path stands for; enter the library if it leads out of the packages."""
+        top = path.replace(":", ".").partition(".")[0]
+        if top not in self.sources:
             if top and top not in sys.stdlib_module_names:
                 libraries.add(top)
             return ()
-        modules = self._modules_on(path)
-        if not modules:
-            libraries.add(path.partition(".")[0])  # compiled, say
-            return ()
-        for module in modules:  # a name that a package itself defines comes before a module of that name
-            rest = path[len(module) + 1 :]
-            name, _, further = rest.partition(".")
-            summary = self.sources.summary(module)
-            assert summary is not None
+        module, _, rest = path.partition(":") if ":" in path else path.partition(".")
+        while (summary := self.sources.summary(module)) is not None:
             if self._is_left_out(module):
                 return ()
-            if not name:
+            if not rest:
                 return (f"{module}:{_WHOLE}",)
+            name, _, further = rest.partition(".")
             if name in summary.definitions:
                 return (f"{module}:{name}",)
-            if name in summary.bindings and depth < _DEEPEST and summary.bindings[name] != f"{module}.{name}":
-                bound = summary.bindings[name]
-                return self._targets(f"{bound}.{further}" if further else bound, libraries, depth + 1)
-            if module == modules[-1]:
+            bound = summary.bindings.get(name, "")
+            if bound and bound != f"{module}:{name}" and depth < _DEEPEST:
+                return self._targets(_joined(bound, further), libraries, depth + 1)
+            if self.sources.summary(f"{module}.{name}") is None:
                 return self._by_other_means(module, summary, name, libraries, depth)
-        raise AssertionError(path)
+            module, rest = f"{module}.{name}", further
+        libraries.add(top)  # compiled, say
+        return ()
 
     def _by_other_means(
         self, module: str, summary: ModuleSummary, name: str, libraries: set[str], depth: int
@@ -198,8 +195,8 @@ class CodeGraph:
             other = self.sources.summary(star)
             known = other is not None and (name in other.definitions or name in other.bindings or other.stars)
             if known and depth < _DEEPEST:
-                return self._targets(f"{star}.{name}", libraries, depth + 1)
-        return (f"{module}:{_WHOLE}",)
+                return self._targets(f"{star}:{name}", libraries, depth + 1)
+        return () if name in vars(builtins) else (f"{module}:{_WHOLE}",)
 
     def _is_left_out(self, module: str) -> bool:
         if module not in self._is_out:
@@ -209,12 +206,16 @@ class CodeGraph:
 
 
 def _absolute(reference: str, module: str, summary: ModuleSummary) -> str:
-    """Return the dotted path of a reference; empty for what Python itself defines."""
+    """Return the path of a reference; empty for what Python itself defines."""
     if reference.startswith(ABSOLUTE):
         return reference[len(ABSOLUTE) :]
     root, _, rest = reference.partition(".")
     if root in summary.definitions or root in summary.effect_names:
-        return f"{module}.{reference}"
+        return f"{module}:{reference}"
     if root in summary.bindings:
-        return f"{summary.bindings[root]}.{rest}" if rest else summary.bindings[root]
-    return f"{module}.{reference}" if summary.stars else ""
+        return _joined(summary.bindings[root], rest)
+    return f"{module}:{reference}" if summary.stars else ""
+
+
+def _joined(path: str, rest: str) -> str:
+    return f"{path}.{rest}" if rest else path

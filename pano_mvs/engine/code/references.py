@@ -9,11 +9,12 @@ from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 ABSOLUTE = "/"
-"""Begins a reference that is a dotted path from the root; others begin with a name of the module."""
+"""Begins a reference that is a path from the root, `module.name` or `module:name`; others begin with a name of their
+own module. Behind the colon is what is looked up in the module, which may be a module itself."""
 
 Import: TypeAlias = ast.Import | ast.ImportFrom
 BindingsOf: TypeAlias = "Callable[[Import], Mapping[str, str]]"
-"""Returns the names that an import binds, each with the dotted path that it stands for."""
+"""Returns the names that an import binds, each with the path that it stands for."""
 
 _DYNAMIC_IMPORTS = frozenset({"import_module", "find_spec", "__import__"})
 _COMPREHENSIONS = (ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)

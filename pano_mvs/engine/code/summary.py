@@ -49,7 +49,7 @@ class ModuleSummary:
 
     Attributes:
         definitions: by name.
-        bindings: imported names, to the dotted path that each stands for.
+        bindings: imported names, to the path that each stands for: `package.module`, or `package.module:name`.
         stars: modules of which all names are imported.
         effects: what it does when it is imported beside defining names; None for nothing.
         effect_names: names that are defined there.
@@ -166,7 +166,7 @@ class _Summarizer:
         for alias in statement.names:
             if isinstance(statement, ast.ImportFrom):
                 base = self._base_of(statement)
-                yield (alias.asname or alias.name), base if alias.name == "*" else f"{base}.{alias.name}"
+                yield (alias.asname or alias.name), base if alias.name == "*" else f"{base}:{alias.name}"
             elif alias.asname:
                 yield alias.asname, alias.name
             else:
@@ -194,7 +194,7 @@ class _Summarizer:
         """Return the dotted path of a decorator, as far as the imports of the module say."""
         chain = dotted(decorator.func if isinstance(decorator, ast.Call) else decorator)
         root, _, rest = chain.partition(".")
-        path = self._summary.bindings.get(root, root)
+        path = self._summary.bindings.get(root, root).replace(":", ".")
         return f"{path}.{rest}" if rest else path
 
     def _definition(self, statement: ast.stmt) -> Definition:
