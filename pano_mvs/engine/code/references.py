@@ -54,7 +54,8 @@ class _Finder(ast.NodeVisitor):
         self._in_class = False
 
     def visit_Name(self, node: ast.Name) -> None:
-        self._refer(node.id)
+        if not (self._in_class and isinstance(node.ctx, ast.Store)):  # a field's name refers to nothing
+            self._refer(node.id)
 
     def visit_Attribute(self, node: ast.Attribute) -> None:
         chain = dotted(node)

@@ -8,10 +8,11 @@ import sys
 import tempfile
 from collections.abc import Mapping
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 
 from pano_mvs.core.digest import digest_from_bytes, digest_from_value
-from pano_mvs.engine.code.summary import SUMMARY_VERSION, ModuleSummary, summarize_module
+from pano_mvs.engine.code.summary import ModuleSummary, summarize_module
 
 _PYTHON = f"{sys.version_info.major}.{sys.version_info.minor}"  # which decides what is Python at all
 
@@ -112,8 +113,14 @@ class Sources:
     def _kept_path(self, top: str) -> Path | None:
         if self._kept_in is None:
             return None
-        place = digest_from_value([SUMMARY_VERSION, _PYTHON, str(self._packages[top])])
+        place = digest_from_value([_PYTHON, str(self._packages[top]), _our_texts()])
         return self._kept_in / f"{top}-{place[:16]}.json"
+
+
+@cache
+def _our_texts() -> dict[str, bytes]:
+    """Return the files by which a summary is made: where they change, those kept are made anew."""
+    return {path.name: path.read_bytes() for path in Path(__file__).parent.glob("*.py")}
 
 
 def _load(path: Path) -> dict[str, tuple[str, ModuleSummary]]:

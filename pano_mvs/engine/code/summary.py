@@ -11,9 +11,6 @@ from pano_mvs.core.digest import digest_from_bytes, digest_from_value
 from pano_mvs.engine.code.canonical import canonical_text, strip
 from pano_mvs.engine.code.references import Import, dotted, references_of
 
-SUMMARY_VERSION = 1
-"""Raise it when a file's summary changes: those kept on the disk are then made anew."""
-
 _STAGE_DECORATORS = frozenset(
     f"pano_mvs.{module}.{name}" for module in ("api", "engine.stage") for name in ("stage", "source")
 )
