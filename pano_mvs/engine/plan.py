@@ -70,7 +70,10 @@ def make_plan(
         plan.open = state.open = resolution.open
         state.pending.update(resolution.waiting)
         for unit in resolution.units:
-            record = None if demands.refreshes(unit) else store.find(unit.key)
+            record = None
+            if not demands.refreshes(unit):
+                last_key = last.get(name, {}).get(unit.item)
+                record = store.find(unit.key) or demands.acceptable(unit, last_key, store)
             if record is not None:
                 settle(state, unit, record)
                 plan.cached.append(unit.item)

@@ -61,7 +61,14 @@ def test_accepted_code_keeps_what_was_computed(toy: Toy) -> None:
     toy.edit("plug.py", lambda text: text.replace("x.value == 13", "13 == x.value"))
     toy.run()
     toy.edit("plug.py", lambda text: text.replace("13 == x.value", "x.value in (13,)"))
-    assert ran(run(toy, Demands(accept_code=True))) == {}
+    demands = Demands(accept_code=True)
+    session = toy.session()
+    plans = make_plan(
+        session.workflow, session.graph, Store(session.store_root), workflow_id(session.workflow), demands
+    )
+    assert sum(len(plan.run) + len(plan.may_run) for plan in plans) == 0
+    assert toy.plan()["images"].run, "a plan that accepts keeps nothing"
+    assert ran(run(toy, demands)) == {}
     assert ran(toy.run()) == {}, "what was accepted once is cached"
 
 
