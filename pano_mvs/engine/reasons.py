@@ -40,7 +40,7 @@ def reason_to_run(unit: Unit, last_key: str | None, store: Store) -> str:
     if before.get("code") != now["code"]:
         file = f" ({unit.entry.spec.origin.rpartition(':')[0]})" if unit.entry.spec.code_digest else ""
         differences.insert(0, f"code of {now['stage']} changed{file}")
-    differences.extend(_upgrades(before.get("libraries", {}), now["libraries"]))
+    differences.extend(_upgrades(before.get("libraries"), now["libraries"]))
     differences.extend(_differences("kind", before.get("kinds", {}), now["kinds"]))
     return "; ".join(differences) or "its key is made differently in this version"
 
@@ -51,8 +51,10 @@ def only_the_code_differs(before: Mapping[str, Any], now: Mapping[str, Any]) -> 
     return before != now and all(name in before and name in now and before[name] == now[name] for name in parts)
 
 
-def _upgrades(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+def _upgrades(before: object, now: Mapping[str, str]) -> list[str]:
     """Return the libraries of another version; where the code changed too, it may use others than before."""
+    if not isinstance(before, Mapping):
+        return []
     return [f"{name} {before[name]} → {now[name]}" for name in sorted({*before} & {*now}) if before[name] != now[name]]
 
 
