@@ -17,8 +17,8 @@ def main(asked: list[str]) -> None:
         changes = differences(before.summary, now.summary) if before is not None else ["new"]
         recorded[name] = now if changes or before is None else replace(now, summary=before.summary)
         print(f"{name}: {'; '.join(changes) or 'as before'}", flush=True)
-    names = case_names()
-    write_recorded({name: one for name, one in recorded.items() if name in names})
+        names = case_names()
+        write_recorded({name: one for name, one in recorded.items() if name in names})
 
 
 if __name__ == "__main__":
