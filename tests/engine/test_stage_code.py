@@ -10,10 +10,13 @@ from pathlib import Path
 import pytest
 
 import pano_mvs
+from pano_mvs.core.errors import UsageError
 from pano_mvs.core.kernel_cache import user_cache_folder
+from pano_mvs.engine.code.libraries import library_versions
 from pano_mvs.engine.code.reach import Reach
 from pano_mvs.engine.code.sources import Sources
 from pano_mvs.engine.code.summary import summarize_module
+from pano_mvs.engine.executors.unit_text import require_same_code
 from pano_mvs.engine.registry import Registry
 from pano_mvs.engine.stage_code import code_graph, reach_of_function, stage_code
 from tests.engine.package_copy import copied_package
@@ -140,3 +143,21 @@ def test_a_copy_elsewhere_has_the_same_keys(tmp_path: Path) -> None:
     graph = code_graph(Sources({"pano_mvs": copied_package(tmp_path)}))
     for name in ("poses.unit_translations", "filters.speckle"):
         assert reach_of_function(*functions()[name], graph) == as_it_is()[name]
+
+
+def test_a_worker_with_other_code_or_libraries_refuses() -> None:
+    spec = Registry.installed().stages["filters.median"]
+    params = spec.params_type()
+    found = stage_code(spec, params)
+    same = {"code": found.digest, "libraries": dict(found.libraries)}
+    require_same_code(spec, params, same)
+    with pytest.raises(UsageError, match="'filters.median' is not the same in the worker"):
+        require_same_code(spec, params, same | {"code": "0" * 32})
+    with pytest.raises(UsageError, match="the worker has OpenCV .*, the run was started with 1.2.3"):
+        require_same_code(spec, params, same | {"libraries": {"OpenCV": "1.2.3"}})
+
+
+def test_a_library_that_is_not_there_and_one_under_another_name() -> None:
+    assert library_versions(["cv2", "pydantic", "no_such_module"])["no_such_module"] == "not installed"
+    assert set(library_versions(["cv2", "pydantic", "pillow_heif"])) == {"OpenCV"}
+    assert library_versions(["ruamel"])["ruamel"][0].isdigit()

@@ -69,7 +69,7 @@ def unit_from_json(text: Mapping[str, Any], spec: StageSpec, store: Store) -> Un
     for path in text["external"].values():
         store.blobs.register_external(Path(path))
     params = spec.params_type.model_validate(text["params"])
-    _require_same_code(spec, params, text["identity"])
+    require_same_code(spec, params, text["identity"])
     return Unit(
         entry=StageEntry(text["stage"], spec, params, Policy(use=spec.name), ""),
         item=text["item"],
@@ -81,7 +81,7 @@ def unit_from_json(text: Mapping[str, Any], spec: StageSpec, store: Store) -> Un
     )
 
 
-def _require_same_code(spec: StageSpec, params: Params, identity: Mapping[str, Any]) -> None:
+def require_same_code(spec: StageSpec, params: Params, identity: Mapping[str, Any]) -> None:
     """Raise UsageError if a worker computes by other code, or other libraries, than the key of its unit says."""
     here = stage_code(spec, params)
     if here.digest != identity["code"]:
