@@ -151,9 +151,9 @@ def test_a_worker_with_other_code_or_libraries_refuses() -> None:
     found = stage_code(spec, params)
     same = {"code": found.digest, "libraries": dict(found.libraries)}
     require_same_code(spec, params, same)
-    with pytest.raises(UsageError, match="'filters.median' is not the same in the worker"):
+    with pytest.raises(UsageError, match=r"'filters\.median' is not the same in the worker"):
         require_same_code(spec, params, same | {"code": "0" * 32})
-    with pytest.raises(UsageError, match="the worker has OpenCV .*, the run was started with 1.2.3"):
+    with pytest.raises(UsageError, match=r"the worker has OpenCV .*, the run was started with 1\.2\.3"):
         require_same_code(spec, params, same | {"libraries": {"OpenCV": "1.2.3"}})
 
 
