@@ -5,7 +5,7 @@ from pano_mvs.api import Context, Each, Near, Panorama, Params, Pose, RangeMap, 
 class MySweepParams(Params):
     planes: int = 128
 
-@stage("depth.my_sweep", version=1)
+@stage("depth.my_sweep")
 def my_sweep(ref: Each[Panorama], pose: Each[Pose], sources: Near[Panorama], source_poses: Near[Pose],
              params: MySweepParams, ctx: Context) -> RangeMap: ...
 """

@@ -115,6 +115,7 @@ def plan(
     until: UntilOption = None,
     only: OnlyOption = None,
     refresh: RefreshOption = None,
+    accept_code: AcceptOption = False,
     explain: Annotated[str, typer.Option("--explain", metavar="STAGE:ITEM", help="All about one unit: what it reads, "
                                          "what it is made of, where its result is.", show_default=False)] = "",
 ) -> None:  # fmt: skip
@@ -124,7 +125,7 @@ def plan(
     from pano_mvs.cli.session import check_output, open_session
     from pano_mvs.engine.demands import Demands
 
-    demands = Demands(tuple(until or ()), tuple(only or ()), tuple(refresh or ()))
+    demands = Demands(tuple(until or ()), tuple(only or ()), tuple(refresh or ()), accept_code)
     session = open_session(workflow, overrides=overrides or [], images=images, cache=cache, out=out, demands=demands)
     check_output(session)
     if explain:

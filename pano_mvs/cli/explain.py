@@ -57,7 +57,9 @@ def _lines(unit: Unit, record: UnitRecord | None, reason: str, store: Store) -> 
         f"{unit.label}: {'cached' if record is not None else f'would run: {reason}'}",
         f"stage    {spec.name} version {spec.version}, {spec.origin}",
         f"key      {unit.key}",
+        f"code     {unit.identity['code']}",
     ]
+    lines += [f"library  {name} {version}" for name, version in sorted(unit.identity["libraries"].items())]
     lines += [f"setting  {name}: {value!r}" for name, value in sorted(unit.identity["params"].items())]
     lines += [f"file     {role}: {path}" for role, path in (unit.source.files.items() if unit.source else ())]
     lines += [f"reads    {port}: {_read(value)}" for port, value in unit.inputs.items()]

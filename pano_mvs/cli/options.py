@@ -52,5 +52,5 @@ DurableOption = Annotated[
     bool, typer.Option("--durable", help="Flush all results to the disk at once, for machines that lose power.")
 ]
 AcceptOption = Annotated[
-    bool, typer.Option("--accept-code", help="Keep what was computed before a plugin's code changed.")
+    bool, typer.Option("--accept-code", help="Keep what was computed before code or libraries changed.")
 ]

@@ -50,10 +50,10 @@ def kernel_cache_folder(package: Path) -> Path:
         OSError: if the user has no folder for caches that can be written.
     """
     sources = {str(path.relative_to(package)): path.read_bytes() for path in below(package, "kernels_*.py")}
-    return _user_cache() / "pano-mvs" / "kernels" / digest_from_value(sources)[:16]
+    return user_cache_folder() / "pano-mvs" / "kernels" / digest_from_value(sources)[:16]
 
 
-def _user_cache() -> Path:
+def user_cache_folder() -> Path:
     """Return the folder for caches that this system gives to each user, if it can be written.
 
     Raises:

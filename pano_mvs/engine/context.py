@@ -16,7 +16,8 @@ class Context:
     """What a stage is given beside its inputs.
 
     Attributes:
-        rng: random generator, seeded from the unit's cache key: the same unit draws the same numbers everywhere.
+        rng: random generator, seeded from the stage, the settings and the inputs: the same unit draws the same numbers
+            everywhere, and goes on to do so when code has been changed.
         scratch: an empty folder for files that the stage writes; gone after the unit, unless returned in a record.
         threads: number of threads that the unit may use.
         metrics: figures of this unit, such as `registered`; shown in the report and read by quality gates.

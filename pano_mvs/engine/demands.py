@@ -22,7 +22,7 @@ class Demands:
         until: stages behind which the run ends; empty for none.
         only: `STAGE:ITEM`, units to which the run is confined with all that they need; empty for none.
         refresh: `STAGE` or `STAGE:ITEM`, what is computed again though it is cached.
-        accept_code: take what was computed before the code of a plugin changed for what it would compute now.
+        accept_code: take what was computed before code or libraries changed for what would be computed now.
         keep_going: go on after a failed unit, whatever a stage's on_error says.
     """
 
@@ -55,16 +55,21 @@ class Demands:
         return unit.entry.name in self.refresh or f"{unit.entry.name}:{unit.item}" in self.refresh
 
     def accepted(self, unit: Unit, last_key: str | None, store: Store) -> UnitRecord | None:
-        """Return the record of a unit whose plugin's code, and nothing else, has changed, if that is accepted.
+        """Return the record of a unit of which only the code or the libraries have changed, if that is accepted.
 
         It is stored under the new key, so that the next run finds it without being asked.
         """
+        record = self.acceptable(unit, last_key, store)
+        if record is not None:
+            store.put(record)
+        return record
+
+    def acceptable(self, unit: Unit, last_key: str | None, store: Store) -> UnitRecord | None:
+        """Return what `accepted` does, and store nothing."""
         last = store.find(last_key) if self.accept_code and last_key else None
         if last is None or not only_the_code_differs(last.identity, unit.identity):
             return None
-        record = dataclasses.replace(last, key=unit.key, identity=unit.identity)
-        store.put(record)
-        return record
+        return dataclasses.replace(last, key=unit.key, identity=unit.identity)
 
 
 NO_DEMANDS = Demands()

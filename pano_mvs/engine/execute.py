@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import ChangedFileError, ContractError
 from pano_mvs.engine.changed_files import changed_items, changed_settings
 from pano_mvs.engine.context import Context
 from pano_mvs.engine.gather import Gather
 from pano_mvs.engine.ports import Cardinality, Names, Port
 from pano_mvs.engine.store import ItemRef, Store, UnitRecord
-from pano_mvs.engine.units import Unit, UnitInput
+from pano_mvs.engine.units import OF_CODE, Unit, UnitInput
 from pano_mvs.scene import Axis
 from pano_mvs.scene.index import pair_from_name
 
@@ -34,7 +35,7 @@ def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
     """
     started = time.perf_counter()
     with store.scratch() as scratch:
-        context = Context(np.random.default_rng(int(unit.key, 16)), scratch, threads)
+        context = Context(np.random.default_rng(_seed(unit)), scratch, threads)
         arguments = arguments_of(unit, store)
         value = unit.entry.spec.function(**arguments, **_extras(unit, context))
         _check_kind(value, unit)
@@ -60,6 +61,11 @@ def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
     )
     store.put(record)
     return record
+
+
+def _seed(unit: Unit) -> int:
+    """Return a number made of a unit's stage, settings and inputs: code that does the same draws the same."""
+    return int(digest_from_value({name: part for name, part in unit.identity.items() if name not in OF_CODE}), 16)
 
 
 def arguments_of(unit: Unit, store: Store) -> dict[str, Any]:

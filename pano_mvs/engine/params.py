@@ -19,7 +19,6 @@ from pydantic_core import CoreSchema, core_schema
 
 from pano_mvs.core.parts import Parts
 from pano_mvs.core.paths import expanded
-from pano_mvs.engine.code_digest import code_digest
 
 
 class Params(BaseModel):
@@ -71,11 +70,6 @@ class PartOf:
         """Return the schema of the names that there are now, plugins' among them."""
         return handler(core) | {"enum": list(self.parts.names())}
 
-    def identity(self, name: str) -> str:
-        """Return what counts towards the cache key: the name of a built-in part, or it with the digest of the code."""
-        file = self.parts.code_file(name)
-        return name if file is None else f"{name} (code {code_digest(file)[:16]})"
-
 
 def key_fields(params: Params) -> tuple[dict[str, Any], dict[str, list[Path]]]:
     """Return the fields that count towards the cache key: plain values, and paths that count by content."""
@@ -89,11 +83,19 @@ def key_fields(params: Params) -> tuple[dict[str, Any], dict[str, list[Path]]]:
             continue
         if _is_marked(field.annotation, marks, _KeyedByContent) and value is not None:
             paths[name] = _paths_in(value)
-        elif part := next((mark for mark in marks if isinstance(mark, PartOf)), None):
-            plain[name] = part.identity(value)
         else:
             plain[name] = dumped[name]
     return plain, paths
+
+
+def part_files(params: Params) -> dict[str, Path]:
+    """Return every setting that names a plugin's part, with the file that defines the part: its code counts too."""
+    found: dict[str, Path] = {}
+    for name, field in type(params).model_fields.items():
+        for mark in field.metadata:
+            if isinstance(mark, PartOf) and (file := mark.parts.code_file(getattr(params, name))) is not None:
+                found[name] = file
+    return found
 
 
 def files_of(params: Params) -> dict[str, list[Path]]:

@@ -67,7 +67,10 @@ def make_plan(
         state, plan = StageState(graph.axes[name]), StagePlan(name, entry.spec.name)
         units, resolution = resolve(entry, graph, states, store)
         for unit in units:
-            record = None if demands.refreshes(unit) else store.find(unit.key)
+            record = None
+            if not demands.refreshes(unit):
+                last_key = last.get(name, {}).get(unit.item)
+                record = store.find(unit.key) or demands.acceptable(unit, last_key, store)
             if record is not None:
                 settle(state, unit, record)
                 plan.cached.append(unit.item)

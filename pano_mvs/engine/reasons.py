@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from pano_mvs.engine.store import ItemRef, Store
-from pano_mvs.engine.units import Unit
+from pano_mvs.engine.units import OF_CODE, Unit
 
 _SHOWN = 3
 
@@ -27,6 +27,8 @@ def reason_to_run(unit: Unit, last_key: str | None, store: Store) -> str:
     if last is None:
         return "changed (its last record is gone)"
     before, now = last.identity, unit.identity
+    if before.get("schema") != now["schema"]:
+        return "its key is made differently in this version"
     differences = [
         *_differences("param", before.get("params", {}), now["params"]),
         *_inputs(unit, before.get("inputs", {}), now["inputs"]),
@@ -36,14 +38,24 @@ def reason_to_run(unit: Unit, last_key: str | None, store: Store) -> str:
     elif before.get("version") != now["version"]:
         differences.insert(0, f"version of {now['stage']} {before.get('version')} → {now['version']}")
     if before.get("code") != now["code"]:
-        differences.insert(0, f"code {unit.entry.spec.origin}")
+        file = f" ({unit.entry.spec.origin.rpartition(':')[0]})" if unit.entry.spec.code_digest else ""
+        differences.insert(0, f"code of {now['stage']} changed{file}")
+    differences.extend(_upgrades(before.get("libraries"), now["libraries"]))
     differences.extend(_differences("kind", before.get("kinds", {}), now["kinds"]))
     return "; ".join(differences) or "its key is made differently in this version"
 
 
 def only_the_code_differs(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
-    """Return whether two identities are of the same stage, settings and inputs, and of different code."""
-    return before.get("code") != now.get("code") and {**before, "code": ""} == {**now, "code": ""}
+    """Return whether two identities are of the same stage, settings and inputs, and of different code or libraries."""
+    parts = {*before, *now} - OF_CODE
+    return before != now and all(name in before and name in now and before[name] == now[name] for name in parts)
+
+
+def _upgrades(before: object, now: Mapping[str, str]) -> list[str]:
+    """Return the libraries of another version; where the code changed too, it may use others than before."""
+    if not isinstance(before, Mapping):
+        return []
+    return [f"{name} {before[name]} → {now[name]}" for name in sorted({*before} & {*now}) if before[name] != now[name]]
 
 
 def _differences(what: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

@@ -14,13 +14,16 @@ from pano_mvs.engine.names import item_problem
 from pano_mvs.engine.params import key_fields
 from pano_mvs.engine.ports import Cardinality
 from pano_mvs.engine.stage import INDEX_PORT
+from pano_mvs.engine.stage_code import stage_code
 from pano_mvs.engine.store import ItemRef, Store
 from pano_mvs.engine.units import PENDING, WHOLE, Resolution, StageState, Unit, UnitInput
 from pano_mvs.engine.wiring import Edge, Graph
 from pano_mvs.engine.workflow import StageEntry
 from pano_mvs.scene import Axis, Pairs, Record, Views
 
-KEY_SCHEMA = 2
+KEY_SCHEMA = 3
+"""Raise it when the engine gives stages other inputs, seeds or settings for the same key, or makes keys differently."""
+
 _SHOWN = 20
 
 
@@ -268,11 +271,13 @@ def _key(common: str, inputs: Mapping[str, Any]) -> str:
 def _static_identity(entry: StageEntry, store: Store) -> dict[str, Any]:
     """Return the part of the identity that all units of a stage share."""
     plain, paths = key_fields(entry.params)
+    code = stage_code(entry.spec, entry.params)
     return {
         "schema": KEY_SCHEMA,
         "stage": entry.spec.name,
         "version": entry.spec.version,
-        "code": entry.spec.code_digest,
+        "code": code.digest,
+        "libraries": dict(code.libraries),
         "params": plain | {name: [store.stat_cache.digest(path) for path in found] for name, found in paths.items()},
         "kinds": _kind_versions(entry),
     }

@@ -55,14 +55,14 @@ class StageSpec:
 
     Attributes:
         name: the `use:` name, such as `depth.sweep`.
-        version: raised by the author whenever the result changes.
+        version: raised by the author where the result changes for a reason that the code does not show.
         function: called with the ports by name, `params` and `ctx`.
         ports: what it reads.
         params_type: its settings.
         output: the kind that it returns.
         list_items: for sources, what lists the items.
         origin: where it was defined, `file:line`.
-        code_digest: digest of the code, for stages from user files; else empty.
+        code_digest: digest of the code, for stages from user files; else empty. See `stage_code` for what is in keys.
         extras: argument name to what it takes beside the ports.
         memory_bytes: what one unit needs, if the author says so.
         memory_needed: finds it for each unit, if it depends on settings and inputs.

@@ -17,6 +17,9 @@ WHOLE = ""
 PENDING = ItemRef("", "", {})
 """Stands for an item of which only the name is known."""
 
+OF_CODE = frozenset({"code", "libraries"})
+"""The parts of a unit's identity that say by which code it is computed, rather than what."""
+
 UnitInput: TypeAlias = "ItemRef | dict[str, ItemRef] | None"
 
 

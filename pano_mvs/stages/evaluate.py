@@ -18,7 +18,7 @@ class TruthParams(Params):
     truth: InputPath = Field(description="folder with poses.json and depth.npz")
 
 
-@stage("evaluate.truth", version=2)
+@stage("evaluate.truth")
 def truth(images: All[Panorama], poses: One[Poses], ranges: All[RangeMap], params: TruthParams) -> Scores:
     """Compare poses and range maps with the truth.
 

@@ -32,7 +32,7 @@ class ModelParams(Params):
     format: ModelForm = Field(default="bin", description="binary files, text files, or both (COLMAP prefers binary)")
 
 
-@stage("export.colmap", version=2)
+@stage("export.colmap")
 def colmap(poses: One[Poses], images: All[Panorama], params: ModelParams, ctx: Context) -> Files:
     """COLMAP model of EQUIRECTANGULAR cameras, with points and tracks, in colmap/sparse/0.
 

@@ -65,7 +65,7 @@ def frames_memory_bytes(params: NerfstudioFramesParams, inputs: Mapping[str, Any
     return int(40 * (height * width + (params.size_px or 0) ** 2))
 
 
-@stage("export.nerfstudio_frames", version=2, memory=frames_memory_bytes)
+@stage("export.nerfstudio_frames", memory=frames_memory_bytes)
 def nerfstudio_frames(
     image: Each[Panorama], range_map: Each[RangeMap] | None, params: NerfstudioFramesParams, ctx: Context
 ) -> NerfstudioFrames:

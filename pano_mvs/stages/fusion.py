@@ -33,7 +33,7 @@ class VoteParams(Params):
     voxel_size: float | None = Field(default=None, gt=0, description="thin to one point per cube, in scene units")
 
 
-@stage("fusion.vote", version=2)
+@stage("fusion.vote")
 def vote(
     ranges: All[RangeMap], poses: All[Pose], images: All[Panorama], params: VoteParams, ctx: Context
 ) -> PointCloud:

@@ -48,7 +48,7 @@ class ScaledTranslationParams(Params):
     )
 
 
-@stage("poses.scaled_translation", version=2)
+@stage("poses.scaled_translation")
 def scaled_translation(
     features: All[Features],
     matches: All[TwoView],
@@ -131,7 +131,7 @@ class RefineParams(Params):
     )
 
 
-@stage("poses.refine", version=2)
+@stage("poses.refine")
 def refine(poses: One[Poses], images: All[Panorama], params: RefineParams, ctx: Context) -> Poses:
     """Angular bundle adjustment: all poses and points together, in degrees on the sphere rather than in pixels.
 

@@ -16,9 +16,9 @@ FIXED = """\
 pano_mvs: 1
 stages:
   refined: null
-  verified: null
+  verified: {correct: false, in: {poses: points}}
   poses: {use: poses.from_model, path: TRUTH/poses.json}
-  points: {use: poses.triangulate}
+  points: {use: poses.triangulate, in: {poses: poses}}
   scores: {truth: TRUTH}
   scores_sad: {truth: TRUTH}
 """
@@ -53,8 +53,6 @@ def test_two_sweeps_side_by_side(pano_mvs: Command, rendered: Path) -> None:
         "known_poses",
         *known(rendered),
         *ALIKE[:4],
-        "--set",
-        "verified=null",
         "--cache",
         "cache",
         "--out",

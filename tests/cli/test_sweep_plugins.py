@@ -57,7 +57,8 @@ def test_a_plugins_cost_is_run_and_cached_by_its_code(pano_mvs: Command, workflo
     plugin.write_text("# a comment\n" + plugin.read_text())
     assert "0 units computed" in pano_mvs("run", workflow).flat
     plugin.write_text(plugin.read_text().replace("near < image", "near <= image"))
-    assert "param cost 'rank (code " in pano_mvs("plan", workflow).flat
+    assert "code of depth.sweep changed" in pano_mvs("plan", workflow).flat
+    assert "nothing to compute" in pano_mvs("plan", workflow, "--accept-code").flat
     assert "3 units computed" in pano_mvs("run", workflow).flat
 
 

@@ -3,6 +3,8 @@ from __future__ import annotations
 import pytest
 
 from pano_mvs.core.errors import UsageError
+from pano_mvs.engine import execute, stage_code
+from pano_mvs.engine.context import Context
 from pano_mvs.engine.demands import Demands
 from pano_mvs.engine.events import RunResult
 from pano_mvs.engine.plan import make_plan
@@ -61,7 +63,14 @@ def test_accepted_code_keeps_what_was_computed(toy: Toy) -> None:
     toy.edit("plug.py", lambda text: text.replace("x.value == 13", "13 == x.value"))
     toy.run()
     toy.edit("plug.py", lambda text: text.replace("13 == x.value", "x.value in (13,)"))
-    assert ran(run(toy, Demands(accept_code=True))) == {}
+    demands = Demands(accept_code=True)
+    session = toy.session()
+    plans = make_plan(
+        session.workflow, session.graph, Store(session.store_root), workflow_id(session.workflow), demands
+    )
+    assert sum(len(plan.run) + len(plan.may_run) for plan in plans) == 0
+    assert toy.plan()["images"].run, "a plan that accepts keeps nothing"
+    assert ran(run(toy, demands)) == {}
     assert ran(toy.run()) == {}, "what was accepted once is cached"
 
 
@@ -70,6 +79,35 @@ def test_code_that_changed_with_a_setting_is_not_accepted(toy: Toy) -> None:
     toy.edit("plug.py", lambda text: text.replace("x.value == 13", "13 == x.value"))
     toy.edit("wf.yaml", lambda text: text.replace("by: 3", "by: 5"))
     assert ran(run(toy, Demands(accept_code=True)))["scaled"] == 5
+
+
+def test_an_upgraded_library_costs_what_uses_it_and_can_be_accepted(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stage_code, "library_versions", lambda names: {"numba": "0.61.2"})
+    toy.run()
+    monkeypatch.setattr(stage_code, "library_versions", lambda names: {"numba": "0.62.0"})
+    assert set(toy.plan()["images"].run.values()) == {"numba 0.61.2 → 0.62.0"}
+    assert ran(run(toy, Demands(accept_code=True))) == {}
+    toy.edit("plug.py", lambda text: text.replace("x.value == 13", "13 == x.value"))
+    monkeypatch.setattr(stage_code, "library_versions", lambda names: {"numpy": "2.0.0"})
+    assert "code of toy.source changed" in toy.plan()["images"].run["1.txt"]
+    assert ran(run(toy, Demands(accept_code=True))) == {}, "changed code may use other libraries"
+
+
+def test_random_numbers_are_those_of_before_when_only_the_code_has_changed(
+    toy: Toy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seeds: list[int] = []
+    monkeypatch.setattr(
+        execute, "Context", lambda rng, *others: (seeds.append(rng.integers(2**60)), Context(rng, *others))[1]
+    )
+    toy.run()
+    before = sorted(seeds)
+    seeds.clear()
+    toy.edit("plug.py", lambda text: text.replace("x.value == 13", "13 == x.value"))
+    toy.run()
+    assert before
+    assert set(seeds) <= set(before)
+    assert len(set(before)) == len(before), "each unit draws its own"
 
 
 def test_keep_going_goes_on_where_the_workflow_would_stop(toy: Toy) -> None:

@@ -8,8 +8,10 @@ from __future__ import annotations
 import io
 import json
 import pickle
+import re
 import shutil
 from collections.abc import Callable
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +26,7 @@ from pano_mvs.core.errors import StoreError, UsageError
 from pano_mvs.engine.blobs import BlobRef, DamagedBlobError
 from pano_mvs.engine.events import RunResult
 from pano_mvs.engine.runs import _read as read_run
-from pano_mvs.engine.store import Store, record_from_bytes
+from pano_mvs.engine.store import Store, UnitRecord, record_from_bytes
 from pano_mvs.engine.upkeep import collect, usage_of, verify
 from tests.engine.conftest import Toy
 from tests.stress.captures import deliverables
@@ -277,15 +279,41 @@ anything = st.recursive(
     max_leaves=5,
 )
 fuzzing = settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow], max_examples=50)
-item_refs = st.fixed_dictionaries({"kind": anything, "digest": anything, "parts": anything | st.dictionaries(
-    st.text(max_size=4), st.tuples(st.just("0" * 32) | anything, anything, anything, anything) | anything,
-    max_size=3)})  # fmt: skip
-nearly_records = st.fixed_dictionaries({
-    "key": anything, "identity": st.dictionaries(st.text(max_size=4), anything, max_size=2) | anything,
-    "output": item_refs | anything, "items": st.dictionaries(st.text(max_size=4), item_refs, max_size=2) | anything,
-    "metrics": st.dictionaries(st.text(max_size=4), st.floats() | anything, max_size=2), "notes": anything,
-    "rejected": anything, "doubts": anything, "seconds": st.floats() | anything,
-})  # fmt: skip
+digests = st.sampled_from(["0" * 32, "ab" * 16])
+no_digests = st.sampled_from(["../" * 10 + "ab", "AB" * 16, "ab" * 15, "ab" * 16 + "\n", ""]) | anything
+sizes = st.integers(0, 10_000)
+no_sizes = st.sampled_from([-1, 2**70, 1.0, True, "1"]) | anything
+suffixes = st.sampled_from([".npy", ".json", "", ".tar-1"])
+no_suffixes = st.sampled_from(["/../../x", ".npy/x", "npy", ".", ".np y", "." + "a" * 40]) | anything
+
+
+def blob_refs(wrong: bool) -> st.SearchStrategy[Any]:
+    """References to blobs; wrong ones have one field, or the form, of something else."""
+    if not wrong:
+        return st.tuples(digests, sizes, suffixes, st.booleans())
+    return (
+        st.tuples(no_digests, sizes, suffixes, st.booleans())
+        | st.tuples(digests, no_sizes, suffixes, st.booleans())
+        | st.tuples(digests, sizes, no_suffixes, st.booleans())
+        | st.tuples(digests, sizes, suffixes, anything)
+        | anything
+    )
+
+
+def nearly_records(wrong: bool) -> st.SearchStrategy[Any]:
+    names = st.text(max_size=4)
+    parts = st.dictionaries(names, blob_refs(False), min_size=1, max_size=2)
+    if wrong:
+        parts = parts.flatmap(lambda some: blob_refs(True).map(lambda one: {**some, "wrong": one})) | anything
+    refs = st.fixed_dictionaries({"kind": names, "digest": digests, "parts": parts})
+    other = anything if wrong else st.nothing()
+    return st.fixed_dictionaries({
+        "key": digests, "identity": st.dictionaries(names, anything, max_size=2) | other, "output": refs | other,
+        "items": st.dictionaries(names, refs, max_size=2) | other,
+        "metrics": st.dictionaries(names, st.floats(allow_nan=wrong, allow_infinity=wrong), max_size=2) | other,
+        "notes": st.lists(names, max_size=2) | other, "rejected": st.dictionaries(names, names, max_size=1) | other,
+        "doubts": st.dictionaries(names, names, max_size=1) | other, "seconds": st.floats(0, 1e6) | other,
+    })  # fmt: skip
 
 
 def signed(value: object) -> bytes:
@@ -293,21 +321,56 @@ def signed(value: object) -> bytes:
     return digest_from_bytes(body).encode() + b"\n" + body
 
 
-@given(st.binary(max_size=200) | (anything | nearly_records).map(signed))
+def require_in_store(record: UnitRecord) -> None:
+    for ref in record.blobs():
+        assert re.fullmatch("[0-9a-f]{32}", ref.digest)
+        assert re.fullmatch(r"(\.[a-z0-9_+-]+)?", ref.suffix)
+        assert 0 <= ref.size_bytes < 2**63
+        assert type(ref.size_bytes) is int
+        assert type(ref.external) is bool
+    json.dumps(record.to_json(), allow_nan=True)
+    assert all(np.isfinite([record.seconds, *record.metrics.values()]))
+
+
+@given(nearly_records(wrong=False))
+@fuzzing
+def test_a_record_with_blobs_is_read_as_it_was_written(value: dict[str, Any]) -> None:
+    record = record_from_bytes(signed(value))
+    assert record is not None
+    assert len(list(record.blobs())) == sum(len(ref["parts"]) for ref in (value["output"], *value["items"].values()))
+    assert [ref.to_json() for ref in record.output.parts.values()] == [
+        list(part) for part in value["output"]["parts"].values()
+    ]
+    require_in_store(record)
+
+
+@given(st.binary(max_size=200) | (anything | nearly_records(wrong=True)).map(signed))
 @fuzzing
 def test_any_bytes_are_a_record_or_none(data: bytes) -> None:
     record = record_from_bytes(data)
     if record is not None:
-        for ref in record.blobs():
-            assert len(ref.digest) == 32
-            assert "/" not in ref.digest + ref.suffix
-        json.dumps(record.to_json(), allow_nan=True)
-        assert all(np.isfinite(list(record.metrics.values())))
+        require_in_store(record)
+
+
+@given(st.tuples(no_digests, sizes, suffixes, st.booleans()).filter(lambda ref: ref[0] not in ("0" * 32, "ab" * 16))
+       | st.tuples(digests, sizes, st.sampled_from(["/../../x", ".npy/x", "npy", "."]), st.booleans())
+       | st.tuples(digests, st.sampled_from([-1, 2**70, 1.0, True, "1"]), suffixes, st.booleans())
+       | st.tuples(digests, sizes, suffixes, st.sampled_from([0, 1, None, "yes"])))  # fmt: skip
+@fuzzing
+def test_a_record_with_a_reference_that_is_none_is_none(ref: tuple[Any, ...]) -> None:
+    item = {"kind": "Range", "digest": "0" * 32, "parts": {"range": ref}}
+    value = {"key": "0" * 32, "identity": {}, "output": item, "items": {}, "metrics": {}, "notes": [], "rejected": {},
+             "seconds": 1.0}  # fmt: skip
+    assert record_from_bytes(signed(value)) is None
+
+
+names_of_units = st.dictionaries(st.text(max_size=4), st.dictionaries(st.text(max_size=4), st.text(max_size=4)))
+TIME = "2026-11-21T08:00:00Z"
 
 
 @given(data=st.binary(max_size=100) | (anything | st.fixed_dictionaries({
-    "workflow": anything, "out": anything, "when": anything | st.datetimes().map(str) | st.just("2026-11-21T08:00:00Z"),
-    "keys": anything | st.dictionaries(st.text(max_size=4), st.dictionaries(st.text(max_size=4), anything))})
+    "workflow": anything, "out": anything, "when": anything | st.datetimes().map(str) | st.just(TIME),
+    "keys": anything | names_of_units | st.dictionaries(st.text(max_size=4), anything)})
     ).map(signed))  # fmt: skip
 @fuzzing
 def test_any_bytes_are_an_entry_of_the_book_or_none(tmp_path: Path, data: bytes) -> None:
@@ -315,8 +378,34 @@ def test_any_bytes_are_an_entry_of_the_book_or_none(tmp_path: Path, data: bytes)
     path.write_bytes(data)
     entry = read_run(path)
     if entry is not None:
-        assert entry.age_s() > -1e12
-        assert entry.units >= 0
+        checksum, _, body = data.partition(b"\n")
+        assert checksum == digest_from_bytes(body).encode()
+        assert 1970 <= datetime.fromisoformat(entry.when).year < 9999
+        assert abs(entry.age_s()) < 8100 * 366 * 86400
+        assert all(type(text) is str for text in (entry.workflow, entry.out))
+        told = [text for stage, units in entry.keys.items() for text in (stage, *units, *units.values())]
+        assert all(type(text) is str for text in told)
+
+
+@given(keys=names_of_units)
+@fuzzing
+def test_an_entry_of_the_book_is_read_as_it_was_written(tmp_path: Path, keys: dict[str, dict[str, str]]) -> None:
+    path = tmp_path / "entry.json"
+    path.write_bytes(signed({"workflow": "w", "out": "o", "when": TIME, "keys": keys}))
+    entry = read_run(path)
+    assert entry is not None
+    assert (entry.workflow, entry.out, entry.when, entry.keys) == ("w", "o", TIME, keys)
+    assert entry.units == sum(map(len, keys.values()))
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"when": "2026-11-21T08:00:00"}, {"when": "soon"}, {"when": "0001-01-01T00:00:00Z"}, {"keys": [1]},
+              {"keys": {"depth": 1}}, {"keys": None}],
+)  # fmt: skip
+def test_an_entry_with_something_else_in_it_is_none(tmp_path: Path, wrong: dict[str, Any]) -> None:
+    path = tmp_path / "entry.json"
+    path.write_bytes(signed({"workflow": "w", "out": "o", "when": TIME, "keys": {}} | wrong))
+    assert read_run(path) is None
 
 
 @given(data=st.binary(max_size=200), header=st.text(max_size=60))

@@ -13,6 +13,7 @@ from pano_mvs.engine.params import Params
 from pano_mvs.engine.policy import Policy
 from pano_mvs.engine.ports import Cardinality
 from pano_mvs.engine.stage import SourceItem, StageSpec
+from pano_mvs.engine.stage_code import stage_code
 from pano_mvs.engine.store import ItemRef, Store
 from pano_mvs.engine.units import PENDING, Unit, UnitInput
 from pano_mvs.engine.workflow import StageEntry
@@ -64,11 +65,11 @@ def unit_from_json(text: Mapping[str, Any], spec: StageSpec, store: Store) -> Un
     """
     found = (text["version"], text["code"], text["text_version"])
     if found != (spec.version, spec.code_digest, TEXT_VERSION):
-        raise UsageError(f"stage {spec.name!r} is not the same in the worker ({spec.origin}): it was changed while the "
-                         "workflow ran, or another version is installed there. Run the same command again")  # fmt: skip
+        raise UsageError(_changed(spec))
     for digest, path in text["external"].items():
         store.blobs.place_external(digest, Path(path))
     params = spec.params_type.model_validate(text["params"])
+    require_same_code(spec, params, text["identity"])
     return Unit(
         entry=StageEntry(text["stage"], spec, params, Policy(use=spec.name), ""),
         item=text["item"],
@@ -78,6 +79,23 @@ def unit_from_json(text: Mapping[str, Any], spec: StageSpec, store: Store) -> Un
         identity=text["identity"],
         source=None if text["source"] is None else _source_from_json(text["source"]),
     )
+
+
+def require_same_code(spec: StageSpec, params: Params, identity: Mapping[str, Any]) -> None:
+    """Raise UsageError if a worker computes by other code, or other libraries, than the key of its unit says."""
+    here = stage_code(spec, params)
+    if here.digest != identity["code"]:
+        raise UsageError(_changed(spec))
+    for name, version in identity["libraries"].items():
+        if here.libraries.get(name) != version:
+            raise UsageError(f"stage {spec.name!r}: the worker has {name} {here.libraries.get(name, '(none)')}, the "
+                             f"run was started with {version}. Install the same version everywhere, then run the same "
+                             "command again")  # fmt: skip
+
+
+def _changed(spec: StageSpec) -> str:
+    return (f"stage {spec.name!r} is not the same in the worker ({spec.origin}): it was changed while the workflow "
+            "ran, or another version is installed there. Run the same command again")  # fmt: skip
 
 
 def params_to_json(entry: StageEntry) -> dict[str, Any]:

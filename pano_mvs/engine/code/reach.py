@@ -1,0 +1,221 @@
+"""Follow code from a function to all that it may use, by name, over the modules of some packages.
+
+Nodes are definitions: the functions, classes and variables at the top of a module. What only a name tells at run time
+(`getattr` on a module, an import by a computed name) is not seen; a module that is used as a value counts whole. What a
+module does when it is imported counts wherever the module is loaded.
+"""
+
+from __future__ import annotations
+
+import builtins
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from pano_mvs.core.digest import digest_from_value
+from pano_mvs.engine.code.references import ABSOLUTE
+from pano_mvs.engine.code.sources import Sources
+from pano_mvs.engine.code.summary import Definition, ModuleSummary
+
+_IMPORT, _WHOLE = "<import>", "<all>"
+_DEEPEST = 50
+
+
+@dataclass(frozen=True, slots=True)
+class Reach:
+    """What is reached.
+
+    Attributes:
+        digest: of all of it.
+        definitions: `module:name` of each definition, to its digest.
+        libraries: top-level names of the modules of others that these use, the standard library's not among them.
+    """
+
+    digest: str
+    definitions: dict[str, str]
+    libraries: frozenset[str]
+
+
+@dataclass(slots=True)
+class _Node:
+    digest: str
+    targets: set[str] = field(default_factory=set)
+    libraries: set[str] = field(default_factory=set)
+
+
+class CodeGraph:
+    """Which definition uses which, found as far as it is asked for.
+
+    Attributes:
+        sources: the modules that are followed.
+    """
+
+    def __init__(self, sources: Sources, *, left_out: Iterable[str] = (), kept: Iterable[str] = ()) -> None:
+        """Prepare to follow.
+
+        Args:
+            sources: the modules that are followed; all others are libraries.
+            left_out: dotted names of packages and modules of which nothing counts.
+            kept: those inside of these that count nevertheless.
+        """
+        self.sources = sources
+        self._is_out = dict.fromkeys(left_out, True) | dict.fromkeys(kept, False)
+        self._nodes: dict[str, _Node] = {}
+        self._modules: dict[str, tuple[str, ...]] = {}
+
+    def with_modules(self, known: Mapping[str, ModuleSummary]) -> CodeGraph:
+        """Return the graph of these modules and some others, which none of these uses."""
+        more = CodeGraph(self.sources.with_modules(known))
+        more._is_out, more._nodes, more._modules = dict(self._is_out), dict(self._nodes), dict(self._modules)
+        return more
+
+    def reach_of(self, paths: Iterable[str], *, with_annotations: bool = False) -> Reach:
+        """Return all that some definitions or modules use, with themselves.
+
+        Args:
+            paths: `package.module:name`, or `package.module:` for all of a module.
+            with_annotations: whether the kinds that their annotations name are used too, as those of a stage are.
+        """
+        libraries: set[str] = set()
+        pending: set[str] = set()
+        for path in paths:
+            targets = self._targets(path, libraries)
+            pending.update(targets)
+            for target in targets if with_annotations else ():
+                pending.update(self._annotations(target, libraries))
+        reached: dict[str, str] = {}
+        while pending:
+            name = pending.pop()
+            if name not in reached:
+                node = self._node(name)
+                reached[name] = node.digest
+                libraries |= node.libraries
+                pending.update(node.targets - reached.keys())
+        reached = {name: reached[name] for name in sorted(reached) if reached[name]}
+        digest = digest_from_value([f"{name} {digest}" for name, digest in reached.items()])
+        return Reach(digest, reached, frozenset(libraries))
+
+    def _node(self, name: str) -> _Node:
+        if name not in self._nodes:
+            module, _, what = name.partition(":")
+            summary = self.sources.summary(module)
+            assert summary is not None, name
+            if what == _IMPORT:
+                self._nodes[name] = self._import_node(module, summary)
+            elif what == _WHOLE:
+                self._nodes[name] = _Node("", {f"{module}:{one}" for one in (_IMPORT, *summary.definitions)})
+            else:
+                self._nodes[name] = self._definition_node(module, summary, summary.definitions[what])
+        return self._nodes[name]
+
+    def _definition_node(self, module: str, summary: ModuleSummary, definition: Definition) -> _Node:
+        node = _Node("", {f"{module}:{_IMPORT}"})
+        edges: list[list[str]] = []
+        for reference in definition.uses:
+            path = _absolute(reference, module, summary)
+            if path:
+                targets = self._targets(path, node.libraries)
+                node.targets.update(targets)
+                edges.append([reference, *(sorted(targets) or [path])])
+        for path in definition.loads:
+            node.targets.update(self._imports(path))
+        # What a name stands for counts with the text: another import of the same name changes what is called.
+        node.digest = digest_from_value([definition.digest, edges])
+        return node
+
+    def _import_node(self, module: str, summary: ModuleSummary) -> _Node:
+        """Return the node of what happens when a module is imported: what it does itself, and what it imports."""
+        node = _Node("")
+        if summary.effects is not None:
+            node = self._definition_node(module, summary, summary.effects)
+            node.libraries.clear()  # what is only loaded with a module does not depend on the library's version
+        for path in (module, *summary.loads):
+            node.targets.update(self._imports(path))
+        return node
+
+    def _imports(self, path: str) -> list[str]:
+        """Return the nodes of the imports of the modules that a dotted path leads through."""
+        modules = self._modules_on(path) if path in self.sources else ()
+        return [f"{module}:{_IMPORT}" for module in modules if not self._is_left_out(module)]
+
+    def _annotations(self, target: str, libraries: set[str]) -> set[str]:
+        module, _, name = target.partition(":")
+        summary = self.sources.summary(module)
+        if summary is None:
+            return set()
+        found = [one for own, one in summary.definitions.items() if name in (own, _WHOLE)]
+        paths = (_absolute(reference, module, summary) for one in found for reference in one.annotations)
+        return {one for path in paths if path for one in self._targets(path, libraries)}
+
+    def _modules_on(self, path: str) -> tuple[str, ...]:
+        """Return the modules that a dotted path leads through, from the top on."""
+        if path not in self._modules:
+            above, _, _ = path.rpartition(".")
+            modules = self._modules_on(above) if above else ()
+            is_next = (modules[-1] if modules else "") == above
+            found = is_next and self.sources.summary(path) is not None
+            self._modules[path] = (*modules, path) if found else modules
+        return self._modules[path]
+
+    def _targets(self, path: str, libraries: set[str], depth: int = 0) -> tuple[str, ...]:
+        """Return the nodes that a path stands for; enter the library if it leads out of the packages."""
+        top = path.replace(":", ".").partition(".")[0]
+        if top not in self.sources:
+            if top and top not in sys.stdlib_module_names:
+                libraries.add(top)
+            return ()
+        module, _, rest = path.partition(":") if ":" in path else path.partition(".")
+        while (summary := self.sources.summary(module)) is not None:
+            if self._is_left_out(module):
+                return ()
+            if not rest:
+                return (f"{module}:{_WHOLE}",)
+            name, _, further = rest.partition(".")
+            if name in summary.definitions:
+                return (f"{module}:{name}",)
+            bound = summary.bindings.get(name, "")
+            if bound and bound != f"{module}:{name}" and depth < _DEEPEST:
+                return self._targets(_joined(bound, further), libraries, depth + 1)
+            if self.sources.summary(f"{module}.{name}") is None:
+                return self._by_other_means(module, summary, name, libraries, depth)
+            module, rest = f"{module}.{name}", further
+        libraries.add(top)  # compiled, say
+        return ()
+
+    def _by_other_means(
+        self, module: str, summary: ModuleSummary, name: str, libraries: set[str], depth: int
+    ) -> tuple[str, ...]:
+        """Return the nodes of a name that a module neither defines nor imports by that name."""
+        if name in summary.effect_names:
+            return (f"{module}:{_IMPORT}",)
+        for star in summary.stars:
+            if star not in self.sources:
+                libraries.add(star.partition(".")[0])
+                continue
+            other = self.sources.summary(star)
+            known = other is not None and (name in other.definitions or name in other.bindings or other.stars)
+            if known and depth < _DEEPEST:
+                return self._targets(f"{star}:{name}", libraries, depth + 1)
+        return () if name in vars(builtins) else (f"{module}:{_WHOLE}",)
+
+    def _is_left_out(self, module: str) -> bool:
+        if module not in self._is_out:
+            above, _, _ = module.rpartition(".")
+            self._is_out[module] = bool(above) and self._is_left_out(above)
+        return self._is_out[module]
+
+
+def _absolute(reference: str, module: str, summary: ModuleSummary) -> str:
+    """Return the path of a reference; empty for what Python itself defines."""
+    if reference.startswith(ABSOLUTE):
+        return reference[len(ABSOLUTE) :]
+    root, _, rest = reference.partition(".")
+    if root in summary.definitions or root in summary.effect_names:
+        return f"{module}:{reference}"
+    if root in summary.bindings:
+        return _joined(summary.bindings[root], rest)
+    return f"{module}:{reference}" if summary.stars else ""
+
+
+def _joined(path: str, rest: str) -> str:
+    return f"{path}.{rest}" if rest else path
