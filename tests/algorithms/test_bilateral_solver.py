@@ -75,6 +75,7 @@ class TestCells:
                 assert angle_between(found, rays[row, column]) < 0.5 * cell_px * np.pi / size[0]
 
 
+@pytest.mark.kernel("filters.kernels_bilateral")
 @pytest.mark.parametrize("smoothness", [0.1, 4, 100])
 @pytest.mark.parametrize("holes", [0.0, 0.5])
 def test_the_solution_is_that_of_the_dense_system(smoothness, holes):
