@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.metrics.depth import depth_metrics
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.scenes import weak_room, write_scene
 from tests.benchmarks.captures import read_capture, scene_capture
 from tests.benchmarks.dense_chain import DenseChain, score_view
+from tests.benchmarks.depth_metrics import depth_metrics
 from tests.benchmarks.scenes import line, measure
 from tests.benchmarks.tables import reported
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import shutil
 import textwrap
 from collections import defaultdict
 from contextlib import suppress
@@ -11,6 +12,8 @@ from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 import typer
 from ruamel.yaml import YAML
@@ -20,11 +23,12 @@ from pano_mvs.cli.app import app
 from pano_mvs.engine.policy import RESERVED_KEYS
 from pano_mvs.engine.registry import Registry
 from pano_mvs.engine.stage import StageSpec
+from tests.io.videos import tiny_video
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("docs/**/*.md"), ROOT / "README.md"])
 FENCED = re.compile(r"^( *)```(\w+)\n(.*?)^ *```$", re.DOTALL | re.MULTILINE)
-# What the workflows of the pages read; empty files will do, since nothing is run.
+# What the workflows of the pages read; empty files will do where nothing is run.
 FOLDERS = (
     "photos/lobby",
     "photos/flat",
@@ -36,6 +40,12 @@ FOLDERS = (
     "videos",
 )
 FILES = ("walk.mp4", "mask.png")
+# What the commands of the pages read, where they are run.
+PICTURES = {
+    "photos/lobby": ("hall.jpg", "stairs.jpg"),
+    "photos/flat": ("1.jpg", "2.jpg"),
+    "photos/site/hall": ("0412.jpg", "0413.jpg"),
+}
 
 
 def blocks(language: str) -> list[Any]:
@@ -152,6 +162,54 @@ def test_every_setting_of_a_command_exists(
             changes = [pair for pair in pairwise(arguments) if pair[0] in ("--set", "--images")]
             result = CliRunner().invoke(app, ["check", arguments[0], *chain(*changes)])
             assert result.exit_code == 0, result.output
+
+
+def runnable(arguments: list[str], cache: Path) -> list[str]:
+    """Return a command as the test runs it; nothing if it needs more than a few panoramas and some seconds.
+
+    A run ends with its stage `images`. What reads the results of a whole run, opens a window, or needs a scheduler is
+    left out.
+    """
+    if arguments[0] not in ("run", "check", "plan", "status", "stage", "plugins", "schema", "cache"):
+        return []
+    if {"--scheduler", "--only", "--explain", "pin"} & set(arguments):
+        return []
+    words = [str(cache) if word == "/shared/cache" else word for word in arguments]
+    if words[0] == "run":
+        words += [] if "--until" in words else ["--until", "images"]
+        words[words.index("--until") + 1] = "images"
+    return words
+
+
+SCRIPTS = [block.values[:2] for block in blocks("bash")]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", sorted({page for page, _ in SCRIPTS}), ids=lambda page: page.name)
+def test_the_commands_of_a_page_run_one_after_the_other(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, page: Path
+) -> None:
+    for place, names in PICTURES.items():
+        (folder / place).mkdir(parents=True, exist_ok=True)
+        for number, name in enumerate(names):
+            picture = np.random.default_rng(number).integers(0, 256, (64, 128, 3), np.uint8)
+            assert cv2.imwrite(str(folder / place / name), picture)
+            assert cv2.imwrite(str(folder / "masks" / f"{name}.png"), np.full((64, 128), 255, np.uint8))
+    shutil.copy(tiny_video(), folder / "videos" / "walk.mp4")
+    shutil.copytree(ROOT / "workflows", folder / "workflows")
+    monkeypatch.chdir(folder)
+    for script in [script for of_page, script in SCRIPTS if of_page == page]:
+        for arguments in filter(None, (runnable(command, folder / "cache") for command in commands(script))):
+            result = CliRunner().invoke(app, arguments)
+            assert result.exit_code == 0, f"{shlex.join(arguments)}:\n{result.output}"
+
+
+def test_a_command_of_a_page_is_cut_short_or_left_out(tmp_path: Path) -> None:
+    assert runnable(["run", "fast", "--until", "depth"], tmp_path) == ["run", "fast", "--until", "images"]
+    assert runnable(["run", "fast"], tmp_path) == ["run", "fast", "--until", "images"]
+    assert runnable(["plan", "fast", "--cache", "/shared/cache"], tmp_path)[-1] == str(tmp_path)
+    assert runnable(["run", "fast", "--scheduler", "tcp://host:8786"], tmp_path) == []
+    assert runnable(["view", "out/fast"], tmp_path) == []
 
 
 def settings_in_text() -> list[Any]:

@@ -220,7 +220,7 @@ def _shown(name: str, scores: Mapping[str, float]) -> str:
     )
     if np.isnan(value):
         return "–"
-    return f"{value:.3g}" if abs(value) < 1 else f"{value:.2f}" if abs(value) < 99.995 else f"{value:.1f}"
+    return f"{value:z.3g}" if abs(value) < 1 else f"{value:.2f}" if abs(value) < 99.995 else f"{value:.1f}"
 
 
 def _finite(values: Mapping[str, float]) -> dict[str, float | None]:

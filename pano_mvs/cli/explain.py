@@ -66,7 +66,7 @@ def _lines(unit: Unit, record: UnitRecord | None, reason: str, store: Store) -> 
     if record is None:
         return lines
     lines.append(f"took     {record.seconds:.2f} s")
-    lines += [f"figure   {name}: {value:.6g}" for name, value in record.metrics.items()]
+    lines += [f"figure   {name}: {value:z.6g}" for name, value in record.metrics.items()]
     lines += [f"note     {note}" for note in record.notes]
     for name, ref in record.output.parts.items():
         place = Path(store.blobs.path(ref))

@@ -92,7 +92,7 @@ def _verdict(found: Inspection) -> str:
         text += f"; next valley {curve.ranges[curve.runner_up]:.4g} at {curve.decisive[curve.runner_up]:.3f}"
     text += f"; unique by {100 * curve.uniqueness:.0f} %"
     if np.isfinite(found.true_range) and np.isfinite(curve.range):
-        text += f"; off the truth by {100 * (curve.range / found.true_range - 1):+.2f} %"
+        text += f"; off the truth by {100 * (curve.range / found.true_range - 1):+z.2f} %"
     return text
 
 
@@ -130,4 +130,4 @@ def _hex(color_rgb: tuple[int, int, int]) -> str:
 
 
 def _vector(values: Any) -> str:
-    return "(" + ", ".join(f"{value:.4f}" for value in values) + ")"
+    return "(" + ", ".join(f"{value:z.4f}" for value in values) + ")"

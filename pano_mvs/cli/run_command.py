@@ -331,4 +331,4 @@ def _beside_constant(values: Mapping[str, float], name: str) -> str:
 def _shown(value: float | None) -> str:
     if value is None:
         return "–"
-    return f"{value:.3g}" if abs(value) < 1 else f"{value:.2f}"
+    return f"{value:z.3g}" if abs(value) < 1 else f"{value:.2f}"

@@ -67,7 +67,7 @@ def figure(value: Any) -> str:
     if isinstance(value, float):
         if not math.isfinite(value):
             return "–"
-        return figure(round(value)) if abs(value) >= 1000 else f"{value:.4g}"
+        return figure(round(value)) if abs(value) >= 1000 else f"{value:z.4g}"
     if isinstance(value, list | tuple):
         return ", ".join(figure(item) for item in value)
     if isinstance(value, Mapping):

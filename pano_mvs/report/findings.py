@@ -232,7 +232,7 @@ def _baseline(summary: Mapping[str, Any]) -> list[Finding]:
         constant = median([view.get("best_constant_psnr_db", view.get("constant_psnr_db")) for view in views])
         if ours is not None and constant is not None and ours <= constant:
             text = f"Against the truth ({stage}), one constant range for all pixels does as well"
-            found.append(Finding("bad", f"{text}: {ours:.1f} dB to {constant:.1f} dB."))
+            found.append(Finding("bad", f"{text}: {ours:z.1f} dB to {constant:z.1f} dB."))
     return found
 
 

@@ -97,7 +97,7 @@ def color_cloud(cloud: DrawnCloud, by: str, *, up: NDArray[np.float64], unit: st
     if by == "height":
         heights = cloud.points @ up.astype(np.float32)
         low, high = np.quantile(heights, [0.02, 0.98]) if len(heights) else (0.0, 1.0)
-        return Coloring(_mapped(heights, low, high), f"height: blue {low:.3g} to red {high:.3g} {unit}")
+        return Coloring(_mapped(heights, low, high), f"height: blue {low:z.3g} to red {high:z.3g} {unit}")
     if by == "rgb":
         return _photographed(cloud)
     values = cloud.vertices[by].astype(np.float32)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from itertools import combinations
+from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +22,35 @@ SIZE_HW = (128, 256)
 WHOLE = np.ones(SIZE_HW, np.bool_)
 
 
+class RoomPictures(Sequence[NDArray[np.uint8]]):
+    """Panoramas of the room that are rendered when they are first used, so that tests are collected quickly."""
+
+    def __init__(self, poses: Sequence[Rigid3]) -> None:
+        self._poses = tuple(poses)
+
+    def __len__(self) -> int:
+        return len(self._poses)
+
+    @overload
+    def __getitem__(self, idx: int) -> NDArray[np.uint8]: ...
+    @overload
+    def __getitem__(self, idx: slice) -> list[NDArray[np.uint8]]: ...
+    def __getitem__(self, idx: int | slice) -> NDArray[np.uint8] | list[NDArray[np.uint8]]:
+        if isinstance(idx, slice):
+            return [_picture(pose) for pose in self._poses[idx]]
+        return _picture(self._poses[idx])
+
+
 @cache
-def room_capture() -> tuple[tuple[Rigid3, ...], tuple[NDArray[np.uint8], ...]]:
+def _picture(pose: Rigid3) -> NDArray[np.uint8]:
+    return render(default_room(), pose, SIZE_HW)[0]
+
+
+@cache
+def room_capture() -> tuple[tuple[Rigid3, ...], RoomPictures]:
     """Return five cameras about 0.6 apart and their panoramas."""
     poses = tuple(capture_poses(5, seed=1, spread=0.7))
-    return poses, tuple(render(default_room(), pose, SIZE_HW)[0] for pose in poses)
+    return poses, RoomPictures(poses)
 
 
 def moved(pose: Rigid3, by: Vector) -> Rigid3:

@@ -9,12 +9,12 @@ from pano_mvs.algorithms.filters.bilateral_solver import fast_bilateral_solver, 
 from pano_mvs.algorithms.filters.confidence import confidence_weight
 from pano_mvs.algorithms.filters.kernels_bilateral import COLOR_BINS
 from pano_mvs.algorithms.filters.sphere_cells import sphere_cells
-from pano_mvs.algorithms.metrics.depth import depth_metrics
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, angle_between, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.room import default_room, render
 from tests.algorithms.range_scenes import as_map, rolled
+from tests.benchmarks.depth_metrics import depth_metrics
 from tests.oracles.bilateral import corner_weights, dense_system
 
 SIZE = (128, 256)
@@ -75,6 +75,7 @@ class TestCells:
                 assert angle_between(found, rays[row, column]) < 0.5 * cell_px * np.pi / size[0]
 
 
+@pytest.mark.kernel("filters.kernels_bilateral")
 @pytest.mark.parametrize("smoothness", [0.1, 4, 100])
 @pytest.mark.parametrize("holes", [0.0, 0.5])
 def test_the_solution_is_that_of_the_dense_system(smoothness, holes):

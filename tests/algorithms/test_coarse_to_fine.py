@@ -54,14 +54,25 @@ def _good(result, truth):
 
 @pytest.mark.parametrize("changes", [{}, {"cost": "sad", "spacing": "log"}, {"combination": "parallax_weighted"}])
 def test_around_a_flat_guide_costs_are_those_of_the_plain_sweep(changes):
-    work = _work(64, SweepSettings(planes=20, exposure=False, **changes))
-    plain = np.empty((64, 20, 128), np.uint8)
+    _compare_with_the_plain_sweep(64, SweepSettings(planes=20, exposure=False, **changes))
+
+
+@pytest.mark.kernel("sweep.kernels_guided", "sweep.kernels_band")
+def test_around_a_flat_guide_costs_of_a_tiny_picture_are_those_of_the_plain_sweep():
+    """Small enough to run as plain Python too."""
+    _compare_with_the_plain_sweep(16, SweepSettings(planes=14, window=3, exposure=False))
+
+
+def _compare_with_the_plain_sweep(height, settings):
+    work, bands = _work(height, settings), range(0, height, 32)
+    plain = np.empty((height, settings.planes, 2 * height), np.uint8)
     shared = shared_arguments(work)
-    for first in (0, 32):
-        sweep_band(first, *shared.values(), plain[first : first + 32], *_fresh_state(32, 128))
+    for first in bands:
+        rows = min(32, height - first)
+        sweep_band(first, *shared.values(), plain[first : first + rows], *_fresh_state(rows, 2 * height))
     with ThreadPoolExecutor(1) as pool:
-        sweep = GuidedSweep(work, np.full((2, 64, 128), 9.0, np.float32), pool)
-        sweep._sweep(0, np.ones((64, 128), np.bool_))
+        sweep = GuidedSweep(work, np.full((2, height, 2 * height), 9.0, np.float32), pool)
+        sweep._sweep(0, np.ones((height, 2 * height), np.bool_))
     around = plain[:, 9 - STEPS : 10 + STEPS].astype(int)
     # Projections differ by rounding, and bilinear samples with them by a level now and then.
     assert (np.abs(sweep.volume[:, : 2 * STEPS + 1] - around) <= 4).mean() > 0.99
@@ -101,6 +112,7 @@ def test_runs_cover_the_tiles_that_are_set_and_no_others():
     ].flags.c_contiguous
 
 
+@pytest.mark.kernel("sweep.kernels_tube")
 @pytest.mark.parametrize("upward", [False, True])
 @pytest.mark.parametrize("drift", [0, 1, -1])
 def test_paths_among_candidates_follow_the_definition(drift, upward):
@@ -123,6 +135,7 @@ def test_paths_among_candidates_follow_the_definition(drift, upward):
     assert np.array_equal(total, expected)
 
 
+@pytest.mark.kernel("sweep.kernels_tube")
 def test_paths_along_rows_go_around_the_sphere():
     rng = np.random.default_rng(8)
     height, width, count = 3, 20, 3
@@ -141,6 +154,7 @@ def test_paths_along_rows_go_around_the_sphere():
     assert np.array_equal(total, expected)
 
 
+@pytest.mark.kernel("sweep.kernels_layers")
 def test_two_surfaces_are_told_apart_and_one_is_not_split():
     positions = np.full((12, 16), 10.0, np.float32)
     positions[:, 8:] = 30.0
@@ -154,6 +168,7 @@ def test_two_surfaces_are_told_apart_and_one_is_not_split():
     assert np.array_equal(layers[0], layers[1])
 
 
+@pytest.mark.kernel("sweep.kernels_layers")
 def test_candidates_are_adopted_with_those_that_agree():
     found, costs = np.full((9, 9), 50.0, np.float32), np.full((9, 9), np.inf, np.float32)
     found[4, 4:6], costs[4, 4:6] = (10, 12), (1, 2)

@@ -28,6 +28,7 @@ def checked(maps, **settings):
     return check_consistency(maps[0], POSES[0], maps[1:], POSES[1:], **LIMITS | settings)
 
 
+@pytest.mark.kernel("filters.kernels_reprojection")
 @pytest.mark.parametrize("size", [(12, 24), (13, 20)])
 def test_compiled_verdicts_equal_the_plain_ones(size):
     """On maps without any order, seen from all over: every branch, the seam and the poles."""

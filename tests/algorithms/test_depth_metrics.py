@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.metrics.depth import constant_baseline, depth_metrics
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import pixel_solid_angle
 from tests.algorithms.range_scenes import box_range
+from tests.benchmarks.depth_metrics import constant_baseline, depth_metrics
 
 SIZE = (16, 32)
 

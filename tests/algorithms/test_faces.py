@@ -136,6 +136,7 @@ def test_z_depths_are_the_true_ones_between_steps(panorama):
     assert np.mean(np.concatenate(errors) < 0.01) > 0.94
 
 
+@pytest.mark.kernel("faces.kernels_faces")
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_the_compiled_loop_is_the_plain_one(panorama, layout):
     ranges = panorama[1].copy()

@@ -83,6 +83,7 @@ def test_invalid_pixels_stay_invalid_and_no_others_become_so(filtered):
     np.testing.assert_array_equal(filtered(range_map).valid, range_map.valid)
 
 
+@pytest.mark.kernel("filters.kernels_components")
 @pytest.mark.parametrize("step", [0.1, 0.5, 2.0])
 def test_speckles_are_the_surfaces_that_flooding_finds(step):
     range_map = random_map(np.random.default_rng(7), SIZE)
@@ -108,6 +109,7 @@ def test_a_speckle_goes_and_a_surface_across_the_seam_and_the_pole_stays():
     assert np.isnan(remove_speckles(as_map(ranges), max_size_px=2.1 * area).range[:4, [10, 42]]).all()
 
 
+@pytest.mark.kernel("filters.kernels_fill")
 def test_fill_equals_the_plain_paths():
     range_map = random_map(np.random.default_rng(8), SIZE, holes=0.6)
     trusted = range_map.valid & (range_map.confidence >= 128)

@@ -36,6 +36,7 @@ def views():
 
 
 class TestNormals:
+    @pytest.mark.kernel("fusion.kernels_normals")
     def test_equal_the_plain_fit(self):
         size = (16, 32)
         ranges = 2 + 0.3 * np.random.default_rng(0).random(size).astype(np.float32)

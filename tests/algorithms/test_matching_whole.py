@@ -27,6 +27,7 @@ def assert_same(found: NearestTwo, expected: NearestTwo):
     np.testing.assert_array_equal(found.squared_back, expected.squared_back)
 
 
+@pytest.mark.kernel("matching.kernels_vector_match")
 @needs_vector
 @pytest.mark.parametrize("counts", [(1, 2), (6, 64), (7, 65), (5, 63), (130, 517), (401, 129)])
 @pytest.mark.parametrize("size", [128, 33])
@@ -37,6 +38,7 @@ def test_kernel_equals_the_plain_products(counts, size):
     assert_same(nearest_two_whole(first, second), nearest_two(first, second))
 
 
+@pytest.mark.kernel("matching.kernels_vector_match")
 @needs_vector
 def test_kernel_settles_ties_as_the_plain_products_do():
     """Hardly any distances differ, so that every row has many nearest ones: the first is taken."""
@@ -47,6 +49,7 @@ def test_kernel_settles_ties_as_the_plain_products_do():
     assert_same(nearest_two_whole(first, second), expected)
 
 
+@pytest.mark.kernel("matching.kernels_vector_match")
 @needs_vector
 def test_kernel_is_exact_up_to_the_greatest_numbers_that_fit():
     """Opposite signs make the products most negative; squared distances are beyond what float32 counts singly."""

@@ -70,6 +70,7 @@ def little_picture(rng, size):
     return np.clip(128 + np.stack(channels, -1), 0, 255).astype(np.uint8).reshape(*size, 3)
 
 
+@pytest.mark.kernel("patchmatch.kernels_planes")
 def test_compiled_planes_equal_least_squares():
     rng = np.random.default_rng(0)
     size, radius, max_step = (12, 24), 2, 0.05
@@ -87,6 +88,7 @@ def test_compiled_planes_equal_least_squares():
         np.testing.assert_allclose(planes[:, row, column], expected, rtol=2e-4, atol=2e-5)
 
 
+@pytest.mark.kernel("patchmatch.kernels_planes", "patchmatch.kernels_refine", "patchmatch.kernels_match")
 def test_compiled_steps_equal_normal_equations():
     """With sources of other sizes, a mask, planes of all slants, over the seam and over the poles."""
     rng = np.random.default_rng(1)

@@ -188,6 +188,7 @@ def test_settings_out_of_bounds_are_refused(room, wrong):
         tracked(room, **wrong)
 
 
+@pytest.mark.kernel("points.kernels_seen")
 def test_the_compiled_test_is_the_plain_one(room):
     """On points of the room, some moved, and a range map with holes and doubtful pixels."""
     poses, maps, samples = room

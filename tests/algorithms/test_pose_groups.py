@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields, replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from tests.algorithms.synthetic_capture import random_poses, synthetic_features,
 Views = dict[tuple[str, str], TwoView]
 
 
+@cache
 def _room(seed: int, count: int, prefix: str) -> tuple[Poses, dict[str, Features], Views]:
     rng = np.random.default_rng(seed)
     truth = random_poses(rng, count)
@@ -34,20 +36,33 @@ def _room(seed: int, count: int, prefix: str) -> tuple[Poses, dict[str, Features
     )
 
 
-_SMALL, _SMALL_FEATURES, _SMALL_PAIRS = _room(1, 2, "a")
-_LARGE, _LARGE_FEATURES, _LARGE_PAIRS = _room(2, 3, "b")
 _ORDER = ("b0.jpg", "a0.jpg", "b1.jpg", "a1.jpg", "b2.jpg")
-_FEATURES = {name: (_SMALL_FEATURES | _LARGE_FEATURES)[name] for name in _ORDER}
-# A false pair between the rooms: a repeated door, say.
-_PAIRS = _SMALL_PAIRS | _LARGE_PAIRS | {("b0.jpg", "a0.jpg"): next(iter(_LARGE_PAIRS.values()))}
+
+
+def _small() -> tuple[Poses, dict[str, Features], Views]:
+    return _room(1, 2, "a")
+
+
+def _large() -> tuple[Poses, dict[str, Features], Views]:
+    return _room(2, 3, "b")
+
+
+def _features() -> dict[str, Features]:
+    both = _small()[1] | _large()[1]
+    return {name: both[name] for name in _ORDER}
+
+
+def _pairs() -> Views:
+    """Return all pairs and a false one between the rooms: a repeated door, say."""
+    return _small()[2] | _large()[2] | {("b0.jpg", "a0.jpg"): next(iter(_large()[2].values()))}
 
 
 def _triangulated(poses: Poses) -> Poses:
-    return triangulate_tracks(poses, _FEATURES, _PAIRS)
+    return triangulate_tracks(poses, _features(), _pairs())
 
 
 def _joined() -> Poses:
-    return join_groups([_LARGE, _SMALL], order=_ORDER, rejected={"x.jpg": "blurred"})
+    return join_groups([_large()[0], _small()[0]], order=_ORDER, rejected={"x.jpg": "blurred"})
 
 
 @pytest.mark.parametrize(
@@ -60,7 +75,7 @@ def test_a_step_on_groups_is_the_step_on_each(step: Callable[[Poses], Poses]):
     together.check()
     assert together.names == _ORDER
     assert together.rejected == {"x.jpg": "blurred"}
-    for number, (group, alone) in enumerate(zip(split_groups(together), (_LARGE, _SMALL), strict=True)):
+    for number, (group, alone) in enumerate(zip(split_groups(together), (_large()[0], _small()[0]), strict=True)):
         expected = step(alone)
         for field in fields(Poses):
             found, wanted = getattr(group, field.name), getattr(expected, field.name)
@@ -78,7 +93,7 @@ def test_sources_are_of_the_references_own_group():
 
 
 def test_a_group_in_one_place_does_not_disturb_the_others():
-    together = replace(_SMALL, translations=np.array(_SMALL.translations))
+    together = replace(_small()[0], translations=np.array(_small()[0].translations))
     together.translations[:] = 0.0
-    views = select_views(join_groups([_LARGE, together], order=_ORDER))
+    views = select_views(join_groups([_large()[0], together], order=_ORDER))
     assert list(views.neighbours) == ["b0.jpg", "b1.jpg", "b2.jpg"]

@@ -35,6 +35,7 @@ def crop(picture, column, row, side=21):
     return cv2.remap(picture.astype(np.float32), x.astype(np.float32), y.astype(np.float32), cv2.INTER_LANCZOS4)
 
 
+@pytest.mark.kernel("poses.kernels_alignment")
 def test_patches_equal_the_oracle_at_the_seam_and_at_the_poles():
     rng = np.random.default_rng(1)
     padded = smoothed_gray(rng.integers(0, 256, (32, 64, 3)).astype(np.uint8))
@@ -48,6 +49,7 @@ def test_patches_equal_the_oracle_at_the_seam_and_at_the_poles():
     np.testing.assert_allclose(patches, expected, atol=2e-3)
 
 
+@pytest.mark.kernel("poses.kernels_alignment")
 def test_alignment_equals_the_oracle():
     rng = np.random.default_rng(2)
     picture = texture(rng)

@@ -234,6 +234,7 @@ def bundle_of(rng, *, cameras=4, points=60, noise_deg=0.05):
     )
 
 
+@pytest.mark.kernel("poses.kernels_bundle")
 def test_kernel_equals_the_dense_system():
     rng = np.random.default_rng(16)
     bundle = bundle_of(rng, points=15, noise_deg=3.0)
@@ -252,6 +253,7 @@ def test_kernel_equals_the_dense_system():
     assert np.all(diagonal >= np.diag(system) - 1e-12)
 
 
+@pytest.mark.kernel("poses.kernels_bundle")
 def test_compiled_errors_are_those_of_the_bundle():
     bundle = bundle_of(np.random.default_rng(21), points=15, noise_deg=3.0)
     found = ray_errors(
@@ -260,6 +262,7 @@ def test_compiled_errors_are_those_of_the_bundle():
     np.testing.assert_allclose(found, bundle.errors_rad(), atol=1e-12)
 
 
+@pytest.mark.kernel("poses.kernels_bundle")
 def test_points_move_by_back_substitution():
     rng = np.random.default_rng(22)
     bundle = bundle_of(rng, points=15, noise_deg=3.0)

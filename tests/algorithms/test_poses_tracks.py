@@ -130,6 +130,7 @@ def many_tracks(rng, count=400):
     return centers, rays / np.linalg.norm(rays, axis=1, keepdims=True), point_idx
 
 
+@pytest.mark.kernel("poses.kernels_points")
 @pytest.mark.parametrize("shuffled", [False, True])
 def test_triangulation_is_that_of_numpy(shuffled):
     rng = np.random.default_rng(31)

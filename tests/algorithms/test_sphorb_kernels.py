@@ -17,6 +17,8 @@ GRID = GeodesicGrid(STEPS, MARGIN)
 # Tangent steps to lattice steps, with the shear that a face has near its corners.
 TURN = np.array([[0.9, -0.4], [0.1, 1.1]])
 
+pytestmark = pytest.mark.kernel("features.kernels_sphorb")
+
 
 @pytest.fixture(scope="module")
 def pictures():

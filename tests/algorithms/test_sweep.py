@@ -78,6 +78,20 @@ def test_the_compiled_sweep_equals_the_readable_one(settings, masked, source_hei
     assert (np.abs(fast.confidence.astype(int) - plain.confidence) <= 1).mean() >= 0.98
 
 
+@pytest.mark.kernel(
+    "sweep.kernels_band", "sweep.kernels_sgm", "sweep.kernels_lookup", "sweep.kernels_warp", "sweep.kernels_winner"
+)
+@pytest.mark.parametrize("changes", [{}, {"cost": "sad", "aggregation": "box"}])
+def test_a_tiny_sweep_equals_the_readable_one(changes):
+    """Small enough to run as plain Python too."""
+    settings = SweepSettings(planes=6, window=3, support=3).replace(**changes)
+    pictures, poses, _ = _capture(16)
+    fast, plain = (_sweep(pictures, poses, settings, backend=backend) for backend in ("numba", "numpy"))
+    levels = np.abs(_position(fast.range, settings) - _position(plain.range, settings))
+    assert np.mean((levels < 0.5) | (np.isnan(fast.range) & np.isnan(plain.range))) >= 0.99
+    assert np.isfinite(fast.range).mean() > 0.7
+
+
 def _position(ranges, settings):
     scale = {"inverse": lambda r: 1 / r, "log": np.log, "uniform": lambda r: r}[settings.spacing]
     return (scale(ranges) - scale(NEAR)) / (scale(FAR) - scale(NEAR)) * (settings.planes - 1)

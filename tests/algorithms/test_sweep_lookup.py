@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 import pytest
 
@@ -10,13 +11,14 @@ from pano_mvs.algorithms.sweep.kernels_cost import census_row
 from pano_mvs.algorithms.sweep.kernels_lookup import warp_band
 from pano_mvs.algorithms.sweep.kernels_project import knot_rows
 from pano_mvs.algorithms.sweep.kernels_sad import add_differences, interleave_rows
-from pano_mvs.algorithms.sweep.kernels_vector import HAS_VECTOR
+from pano_mvs.algorithms.sweep.kernels_vector import HAS_VECTOR, _lanes_of_this_machine
 from pano_mvs.algorithms.sweep.packing import pack_colors, pack_plane, pack_sources
 from pano_mvs.geometry import pad_panorama, pixel_from_ray, ray_grid, rotation_from_rotvec, sample_panorama
 from tests.oracles import sweep as oracle
 
 SIZE = 16, 32
 ROTATION = rotation_from_rotvec((0.4, -1.9, 0.7))
+needs_vector = pytest.mark.skipif(not HAS_VECTOR, reason="no vector instructions, or numba compiles nothing")
 TRANSLATIONS = [(0.0, 0.0, 0.0), (0.3, -0.2, 0.5), (0.0, 0.9, 0.0), (0.0, 0.0, -0.99)]
 
 
@@ -45,10 +47,11 @@ def _warped(source, translation, size_hw, *, vector, halo=3, pad=4, first=0, row
     return pixel_costs if len(against) else warped
 
 
+@pytest.mark.kernel("sweep.kernels_lookup", "sweep.kernels_warp", "sweep.kernels_project")
 @pytest.mark.parametrize("source_hw", [(16, 32), (24, 48), (16, 64)])
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("translation", TRANSLATIONS)
-@pytest.mark.parametrize("vector", [False, HAS_VECTOR])
+@pytest.mark.parametrize("vector", [False, pytest.param(True, marks=needs_vector)])
 def test_a_warped_band_equals_exact_sampling_even_beyond_the_poles(source_hw, channels, translation, vector):
     source = _picture(1, (*source_hw, channels))
     warped = _warped(source, translation, SIZE, vector=vector)
@@ -70,16 +73,28 @@ def test_interpolated_positions_miss_by_little(translation):
     assert difference.max() < 124 * 0.08 + 0.5  # 0.08 px over the steepest step
 
 
+@pytest.mark.parametrize(
+    ("features", "lanes"), [("", 0), ("+sse2", 0), ("+ssse3,-avx2", 1), ("+avx2, +ssse3", 2), ("+avx512bw,+avx2", 4)]
+)
+def test_instructions_that_numba_must_not_use_are_left_unused(features, lanes, monkeypatch):
+    """NUMBA_CPU_NAME=generic once ended the process: the instructions of the processor could not be compiled."""
+    monkeypatch.setattr(numba.config, "CPU_FEATURES", features)
+    assert _lanes_of_this_machine() == lanes
+
+
+@needs_vector
+@pytest.mark.kernel("sweep.kernels_lookup", "sweep.kernels_vector")
 @pytest.mark.parametrize("channels", [1, 3])
 def test_vector_instructions_give_what_loops_give(channels):
     source = _picture(2, (64, 128, channels))
     loops = _warped(source, TRANSLATIONS[1], (48, 100), vector=False, first=5, rows=8)
-    instructions = _warped(source, TRANSLATIONS[1], (48, 100), vector=HAS_VECTOR, first=5, rows=8)
+    instructions = _warped(source, TRANSLATIONS[1], (48, 100), vector=True, first=5, rows=8)
     assert loops.tobytes() == instructions.tobytes()
     assert loops.std() > 30
 
 
-@pytest.mark.skipif(not HAS_VECTOR, reason="sampled and compared at once by vector instructions alone")
+@needs_vector
+@pytest.mark.kernel("sweep.kernels_lookup", "sweep.kernels_vector")
 def test_differences_added_while_sampling_are_those_of_what_is_sampled():
     reference, source = _picture(4, (3, 56, 72)), _picture(5, (64, 128, 3))
     warped = _warped(source, TRANSLATIONS[1], (48, 64), vector=True, first=5, rows=8)
@@ -103,6 +118,7 @@ def test_packed_patches_hold_the_four_neighbours_over_seam_and_poles():
         assert both[:, 1].ravel().tolist() == corners
 
 
+@pytest.mark.kernel("sweep.kernels_census")
 @pytest.mark.parametrize("side", [3, 7, 15])
 @pytest.mark.parametrize("width", [20, 64, 100])
 def test_census_by_vector_instructions_counts_what_loops_count(side, width):

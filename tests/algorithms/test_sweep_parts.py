@@ -52,6 +52,7 @@ def good_share(result, truth, ratio=1.07):
     return float((np.maximum(result.range / truth, truth / result.range) < ratio).mean())
 
 
+@pytest.mark.kernel("sweep.kernels_zncc")
 @pytest.mark.parametrize("first", [0, 6, 13])
 def test_correlation_by_running_sums_equals_the_definition(first):
     rng = np.random.default_rng(first)
@@ -77,6 +78,7 @@ def test_correlation_by_running_sums_equals_the_definition(first):
     np.testing.assert_allclose(means, expected, atol=2e-4)
 
 
+@pytest.mark.kernel("sweep.kernels_gradient")
 @pytest.mark.parametrize("row", [0, 7, 15])
 def test_differences_of_colours_and_gradients_equal_the_definition(row):
     rng = np.random.default_rng(row)
@@ -93,6 +95,7 @@ def test_differences_of_colours_and_gradients_equal_the_definition(row):
     assert len(set(expected)) > 5
 
 
+@pytest.mark.kernel("sweep.kernels_gradient")
 def test_census_beside_grey_levels_equals_the_definition():
     rng = np.random.default_rng(5)
     reference = rng.integers(0, 256, SIZE, dtype=np.uint8)

@@ -18,6 +18,10 @@ from tests.algorithms.test_two_view_solvers import samples_of_five
 from tests.oracles import two_view as plain
 from tests.oracles.five_point import essentials_by_eigenvectors
 
+pytestmark = pytest.mark.kernel(
+    "two_view.kernels_agreement", "two_view.kernels_five_point", "two_view.kernels_refinement"
+)
+
 THRESHOLD_RAD = 0.0035
 
 

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.metrics.depth import DepthMetrics, depth_metrics
 from pano_mvs.cli.session import open_session
 from pano_mvs.engine.context import Context
 from pano_mvs.engine.ports import Cardinality, Port
@@ -26,6 +25,7 @@ from pano_mvs.engine.workflow import StageEntry
 from pano_mvs.scene import Axis, Panorama, Pose, Poses, RangeMap, Record, Views
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
 from tests.benchmarks.captures import Capture
+from tests.benchmarks.depth_metrics import DepthMetrics, depth_metrics
 
 
 @dataclass

@@ -14,10 +14,10 @@ import numpy as np
 
 from pano_mvs.algorithms.filters import bilateral_solver as solver
 from pano_mvs.algorithms.filters.sphere_cells import sphere_cells
-from pano_mvs.algorithms.metrics.depth import depth_metrics
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.room import default_room, render
+from tests.benchmarks.depth_metrics import depth_metrics
 
 RUNS = 7
 GOAL_S, LIMIT_S = 0.13, 0.5  # at 512 × 1024

@@ -17,13 +17,13 @@ import argparse
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from pano_mvs.algorithms.metrics.depth import DepthMetrics, constant_baseline
 from pano_mvs.algorithms.metrics.poses import align_centers
 from pano_mvs.algorithms.poses.unit_translations import unit_translations
 from pano_mvs.cli.session import presets_folder
 from pano_mvs.scene import Poses
 from tests.benchmarks.captures import Capture, read_capture
 from tests.benchmarks.dense_chain import DenseChain, score_view
+from tests.benchmarks.depth_metrics import DepthMetrics, constant_baseline
 from tests.benchmarks.sparse_chain import SparseChain
 
 # What the paper reports: (cameras, poses) to MSE ×10⁻² and PSNR, window 7 (Table 2), …

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from functools import cache
 
 import numpy as np
 import pycolmap
@@ -19,13 +20,16 @@ from pano_mvs.io.colmap_workspace import write_stereo_configs
 from pano_mvs.scene.image_file import decode_image
 from tests.io.test_colmap_model import NAMES, noisy_poses
 
-FACES = {
-    layout: panorama_faces((512, 1024), layout=layout, fov_deg=100, size_px=240) for layout in ("cube", "icosahedron")
-}
+LAYOUTS = ("cube", "icosahedron")
+
+
+@cache
+def faces_of(layout):
+    return panorama_faces((512, 1024), layout=layout, fov_deg=100, size_px=240)
 
 
 def cuts(layout="cube", names=NAMES):
-    faces = FACES[layout]
+    faces = faces_of(layout)
     views = [face.view for face in faces]
     return {name: CutPanorama(views, [f"{name}_{face.name}.jpg" for face in faces]) for name in names}
 
@@ -74,10 +78,10 @@ def test_other_arrays_are_no_maps(tmp_path):
         write_normal_map(tmp_path / "a", np.zeros((3, 4), np.float32))
 
 
-@pytest.mark.parametrize("layout", FACES)
+@pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("form", ["bin", "txt"])
 def test_pycolmap_reads_rigs_frames_and_poses(tmp_path, layout, form):
-    poses, faces = noisy_poses(), FACES[layout]
+    poses, faces = noisy_poses(), faces_of(layout)
     write_rig_model(tmp_path, poses, cuts(layout), form=form)
     files = {"cameras", "images", "points3D", "rigs", "frames"}
     assert {path.name for path in tmp_path.iterdir()} == {f"{name}.{form}" for name in files}
@@ -98,7 +102,7 @@ def test_pycolmap_reads_rigs_frames_and_poses(tmp_path, layout, form):
     assert all(np.all(pose.translation == 0) for pose in rig.non_ref_sensors.values())
 
 
-@pytest.mark.parametrize("layout", FACES)
+@pytest.mark.parametrize("layout", LAYOUTS)
 def test_tracks_lie_in_the_faces_and_project_onto_their_key_points(tmp_path, layout):
     poses = noisy_poses()
     seen = write_rig_model(tmp_path, poses, cuts(layout))

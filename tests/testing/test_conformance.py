@@ -301,19 +301,20 @@ def backend(work):
 
 
 @pytest.mark.parametrize(
-    ("name", "body", "law"),
+    ("name", "body", "law", "why"),
     [
-        ("large", "return np.abs(reference - warped)[..., 0]", "from 0 to 1"),
-        ("constant", "return np.full(reference.shape[:2], 0.5)", "less where pictures are the same"),
+        ("large", "return np.abs(reference - warped)[..., 0]", "from 0 to 1", "must return .* from 0 to 1"),
+        ("constant", "return np.full(reference.shape[:2], 0.5)", "less where pictures are the same",
+         "is 0.500 of a picture against itself and 0.500 against another"),
         ("random", "return np.random.default_rng().random(reference.shape[:2]) * (reference[..., 0] != warped[..., 0])",
-         "the same again"),
+         "the same again", "another one the second time"),
     ],
 )  # fmt: skip
-def test_a_part_that_breaks_a_law_is_caught_by_it(tmp_path: Path, name: str, body: str, law: str) -> None:
+def test_a_part_that_breaks_a_law_is_caught_by_it(tmp_path: Path, name: str, body: str, law: str, why: str) -> None:
     path = tmp_path / f"{name}.py"
     path.write_text(PARTS.format(name, body))
     (broken,) = [each for each in cost_laws(path) if law in each.name]
-    with pytest.raises((AssertionError, ContractError)):
+    with pytest.raises((AssertionError, ContractError), match=why):
         broken.check()
 
 

@@ -128,8 +128,8 @@ def georeferenced_poses(poses: Poses, fit: GpsFit) -> Poses:
     to_first = Similarity3(1.0, np.eye(3), -first_in_local)
     moved = moved_poses(poses, to_first @ fit.local_from_world)
     moved.translations[0] = 0.0
-    frame = (f"x east, y down, z north, by GPS; origin at the first registered camera ({latitude:.7f}°, "
-             f"{longitude:.7f}°, {altitude:.1f} m)")  # fmt: skip
+    frame = (f"x east, y down, z north, by GPS; origin at the first registered camera ({latitude:z.7f}°, "
+             f"{longitude:z.7f}°, {altitude:z.1f} m)")  # fmt: skip
     return replace(moved, frame=frame, scale=f"metres, by {fit.words}", metric=True)
 
 

@@ -7,6 +7,7 @@ arithmetic is that of `kernels_warp.blend_row`, to the bit.
 
 from __future__ import annotations
 
+import re
 from typing import Any, Final
 
 import llvmlite.binding as llvm
@@ -20,8 +21,14 @@ from pano_mvs.algorithms.sweep.kernels_warp import HALFWAY_ROUND, HALFWAY_SHIFT,
 
 
 def _lanes_of_this_machine() -> int:
-    """Return how many 16-byte lanes its widest registers have that can be shuffled by bytes; 0 if they cannot."""
-    features = llvm.get_host_cpu_features()
+    """Return how many 16-byte lanes its widest registers have that can be shuffled by bytes; 0 if they cannot.
+
+    numba compiles for the instructions in NUMBA_CPU_FEATURES if that is set, and for none beyond the baseline if
+    NUMBA_CPU_NAME is generic. Any other instruction would end the process when it is compiled.
+    """
+    features: dict[str, bool] = llvm.get_host_cpu_features()
+    if numba.config.CPU_FEATURES is not None:
+        features = dict.fromkeys(re.findall(r"\+([^,\s]+)", numba.config.CPU_FEATURES), True)
     for lanes, needed in ((4, "avx512bw"), (2, "avx2"), (1, "ssse3")):
         if features.get(needed, False):
             return lanes

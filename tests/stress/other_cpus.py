@@ -1,0 +1,65 @@
+"""Run tests as on other processors: `python -m tests.stress.other_cpus [--only NAME] [pytest arguments]`.
+
+Each variant sets environment variables that make numba, numpy or OpenBLAS leave instructions of this processor unused,
+or fixes the number of threads, and runs pytest in a process of its own. Without arguments for pytest the folders whose
+results depend on arithmetic are run: tests/algorithms and tests/geometry.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+
+NUMERIC = ("tests/algorithms", "tests/geometry")
+
+
+def dispatched_features() -> list[str]:
+    """Return the instruction sets of this processor that numpy chooses at run time."""
+    from numpy._core._multiarray_umath import __cpu_dispatch__, __cpu_features__  # no public function returns them
+
+    return [name for name in __cpu_dispatch__ if __cpu_features__.get(name, False)]
+
+
+def threads(count: int) -> dict[str, str]:
+    """Return the variables that fix the number of threads."""
+    return {f"{library}_NUM_THREADS": str(count) for library in ("NUMBA", "OPENBLAS", "OMP")}
+
+
+def variants() -> dict[str, dict[str, str]]:
+    """Return the environment variables of each variant, by its name."""
+    return {
+        "numba-generic": {"NUMBA_CPU_NAME": "generic"},
+        "numpy-baseline": {"NPY_DISABLE_CPU_FEATURES": " ".join(dispatched_features())},
+        "openblas-nehalem": {"OPENBLAS_CORETYPE": "Nehalem"},
+        "openblas-haswell": {"OPENBLAS_CORETYPE": "Haswell"},
+        "one-thread": threads(1),
+        "two-threads": threads(2),
+        "oldest": {
+            "NUMBA_CPU_NAME": "generic",
+            "NPY_DISABLE_CPU_FEATURES": " ".join(dispatched_features()),
+            "OPENBLAS_CORETYPE": "Nehalem",
+        } | threads(1),
+    }  # fmt: skip
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the tests under each variant, print which of them fail, and return the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.stress.other_cpus", description="Run tests as on other processors."
+    )
+    parser.add_argument("--only", action="append", choices=sorted(variants()), help="one variant; may be repeated")
+    options, for_pytest = parser.parse_known_args(arguments)
+    failed = []
+    for name in options.only or variants():
+        print(f"== {name}", flush=True)
+        command = [sys.executable, "-m", "pytest", "-q", *(for_pytest or NUMERIC)]
+        if subprocess.run(command, env=os.environ | variants()[name], check=False).returncode:
+            failed.append(name)
+    print(f"FAILED: {', '.join(failed)}" if failed else "passed under all variants")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
