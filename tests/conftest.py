@@ -6,7 +6,11 @@ import os
 
 # pycolmap's wheel shows its own zlib to whatever is loaded after it: if that is OpenCV, writing a PNG ends the process.
 import cv2  # noqa: F401
+from hypothesis import HealthCheck, settings
 
+# How long it takes to draw an example depends on what else the machine does.
+settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("untimed")
 # A worker takes longer to start than most of the small runs in here take; tests of the executors name theirs.
 os.environ.setdefault("PANO_MVS_EXECUTOR", "serial")
 # PyVista takes seconds to start; the tests of its pictures name it.

@@ -18,10 +18,6 @@ from tests.algorithms.test_two_view_solvers import samples_of_five
 from tests.oracles import two_view as plain
 from tests.oracles.five_point import essentials_by_eigenvectors
 
-pytestmark = pytest.mark.kernel(
-    "two_view.kernels_agreement", "two_view.kernels_five_point", "two_view.kernels_refinement"
-)
-
 THRESHOLD_RAD = 0.0035
 
 
@@ -39,6 +35,7 @@ def paired(name, *, points=150, noise_deg=0.05):
     return np.concatenate([p[matches[:, 0]], far]), np.concatenate([q[matches[:, 1]], far_seen]), pose, rng
 
 
+@pytest.mark.kernel("two_view.kernels_five_point")
 @pytest.mark.parametrize("flat", [False, True])
 def test_five_point_kernel_finds_what_the_oracle_finds(flat):
     p, q, _, _ = samples_of_five(rng_of(f"five kernel {flat}"), count=60, flat=flat)
@@ -53,12 +50,14 @@ def test_five_point_kernel_finds_what_the_oracle_finds(flat):
     assert missing <= 2
 
 
+@pytest.mark.kernel("two_view.kernels_five_point")
 def test_five_point_kernel_takes_any_memory_layout():
     p, q, _, _ = samples_of_five(rng_of("kernel layout"), count=4, flat=False)
     twisted = (np.asfortranarray(p), np.asfortranarray(q))
     np.testing.assert_array_equal(essentials_from_five(*twisted)[0], essentials_from_five(p, q)[0])
 
 
+@pytest.mark.kernel("two_view.kernels_agreement")
 def test_agreement_kernel_equals_the_oracle():
     p, q, pose, _ = paired("agreement")
     for candidate in (pose, Rigid3(pose.rotation, -pose.translation)):
@@ -69,6 +68,7 @@ def test_agreement_kernel_equals_the_oracle():
     assert agreeing[-20:].any()  # what is far away agrees with either sign
 
 
+@pytest.mark.kernel("two_view.kernels_agreement")
 def test_facing_kernels_equal_the_oracle():
     p, q, pose, rng = paired("facing kernels")
     poses = [pose, Rigid3(pose.rotation, -pose.translation), Rigid3(random_rotation(rng), pose.translation)]
@@ -84,6 +84,7 @@ def test_facing_kernels_equal_the_oracle():
     assert max(errors_deg(found.rotation, found.translation, pose)) < 1e-5
 
 
+@pytest.mark.kernel("two_view.kernels_agreement")
 def test_ranking_kernel_keeps_the_order_of_plain_costs():
     p, q, pose, rng = paired("ranking kernel", points=600)
     turns = [rotation_from_rotvec(scale * rng.normal(size=3)) for scale in np.geomspace(1e-4, 0.1, 40)]
@@ -99,6 +100,7 @@ def test_ranking_kernel_keeps_the_order_of_plain_costs():
     np.testing.assert_array_equal(few, expected[: int((costs < limit).sum())])
 
 
+@pytest.mark.kernel("two_view.kernels_refinement")
 @pytest.mark.parametrize("iterations", [1, 4, 20])
 def test_refinement_kernel_takes_the_steps_of_the_oracle(iterations):
     p, q, pose, rng = paired("refinement kernel", noise_deg=0.1)
@@ -112,6 +114,7 @@ def test_refinement_kernel_takes_the_steps_of_the_oracle(iterations):
     assert np.rad2deg(geodesic_angle(start.rotation, found.rotation)) > 0.1
 
 
+@pytest.mark.kernel("two_view.kernels_refinement")
 def test_refinement_kernel_leaves_its_input_alone():
     p, q, pose, _ = paired("input")
     rotation, translation = pose.rotation.copy(), pose.translation.copy()
@@ -120,6 +123,7 @@ def test_refinement_kernel_leaves_its_input_alone():
     np.testing.assert_array_equal(pose.translation, translation)
 
 
+@pytest.mark.kernel("two_view.kernels_agreement")
 def test_kernel_costs_of_directions_are_those_of_plain_poses():
     p, q, pose, rng = paired("directions kernel")
     directions, costs = voted_directions(pose.rotation, p, q, rng=rng, threshold_rad=THRESHOLD_RAD, count=30)
@@ -129,6 +133,7 @@ def test_kernel_costs_of_directions_are_those_of_plain_poses():
     assert np.all(both[0] <= both[1] + 1e-6)
 
 
+@pytest.mark.kernel("two_view.kernels_agreement")
 def test_kernel_counts_chance_as_plain_numpy_does():
     p, q, pose, _ = paired("chance kernel")
     found = chance_of_pose(pose, p, q, rng=rng_of("pairs"), threshold_rad=0.02, draws=3000)
@@ -140,6 +145,7 @@ def test_kernel_counts_chance_as_plain_numpy_does():
     assert found == pytest.approx((expected + 1) / (len(first) + 1))
 
 
+@pytest.mark.kernel("two_view.kernels_agreement")
 def test_turning_kernel_passes_over_a_match_drawn_twice():
     """The same match twice determines no turn; and of two matches a few pairs of draws are such."""
     rng = rng_of("twice kernel")

@@ -106,6 +106,7 @@ def test_the_cameras_that_stand_right_keep_their_poses_to_the_last_bit(matches: 
         assert bytes_of(found, name) == bytes_of(given, name)
 
 
+@pytest.mark.slow
 def test_a_turned_camera_is_put_back_and_the_others_keep_their_poses_to_the_last_bit(matches: Matches) -> None:
     turn = rotation_from_rotvec([0.0, 0.3, 0.1])
     cameras = {**TRUTH, "2.png": Rigid3.from_center(turn @ POSES[2].rotation, POSES[2].center)}
@@ -224,6 +225,7 @@ def test_plain_walls_are_no_reason_to_doubt_true_poses() -> None:
     assert found.rejected == {}
 
 
+@pytest.mark.slow
 def test_a_group_whose_pairs_contradict_one_another_is_doubted(
     matches: Matches, monkeypatch: pytest.MonkeyPatch
 ) -> None:

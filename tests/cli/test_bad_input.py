@@ -13,6 +13,8 @@ import pytest
 from tests.cli.conftest import SMALL, Command, run_json
 from tests.permissions import permissions_hold
 
+TO_POSES = ("--until", "poses", *SMALL)
+
 STOPS_AFTER_FEATURES = """\
 pano_mvs: 1
 stages:
@@ -137,7 +139,7 @@ def test_pictures_of_two_places_make_no_false_model(pano_mvs: Command, capture: 
     for name in ("002.png", "003.png"):
         noise = rng.integers(0, 255, (20, 40, 3), dtype=np.uint8)
         cv2.imwrite(str(capture / "images" / name), cv2.resize(noise, (320, 160), interpolation=cv2.INTER_CUBIC))
-    result = pano_mvs("run", "quickstart", "--images", capture / "images", "--out", "out", *SMALL)
+    result = pano_mvs("run", "quickstart", "--images", capture / "images", "--out", "out", *TO_POSES)
     assert result.code == 3, result.text
     summary = run_json(Path("out"))
     assert summary["poses"]["registered"] == ["000.png", "001.png"]
@@ -197,7 +199,7 @@ def test_linked_folders_are_followed_and_loops_end(pano_mvs: Command, short: Pat
 
 
 def test_damaged_poses_are_computed_again(pano_mvs: Command, capture: Path) -> None:
-    arguments = ("run", "quickstart", "--images", capture / "images", "--cache", "cache", "--out", "out", *SMALL)
+    arguments = ("run", "quickstart", "--images", capture / "images", "--cache", "cache", "--out", "out", *TO_POSES)
     assert pano_mvs(*arguments).code == 0
     for blob in sorted(Path("cache/blobs").rglob("*.json")):
         data = blob.read_bytes()
