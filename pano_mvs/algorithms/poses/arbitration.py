@@ -20,7 +20,7 @@ _DOUBTFUL = 0.55
 # … or is left out, if its pairs do not support it either.
 _HOPELESS, _MIN_EXPLAINED = 0.3, 0.5
 # Of all pairs of a group; below this, a camera that looks right may still be the wrong one.
-_MIN_EXPLAINED_IN_ALL = 0.6
+_MIN_EXPLAINED_IN_ALL = 0.7
 # Nobody doubts a camera that confirms this share of what is expected, whatever its pairs say.
 _CONFIRMED = 0.9
 # A geometry under which two images confirm this share of what they confirm under their best one is likely.
