@@ -10,6 +10,8 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
+from pano_mvs.core.paths import exists
+
 _ENDED = "ZX"
 
 
@@ -56,7 +58,7 @@ def start_of(process: int) -> str | None:
     fields = _text(f"/proc/{process}/stat").rpartition(")")[2].split()  # the name before may hold anything
     if fields:
         return None if fields[0] in _ENDED else fields[19]
-    if Path("/proc/self/stat").exists():  # it has just ended, or is hidden from us
+    if exists(Path("/proc/self/stat")):  # it has just ended, or is hidden from us
         return "" if is_running(process) else None
     return _start_by_ps(process)
 

@@ -167,6 +167,8 @@ class Desk:
             path.unlink(missing_ok=True)  # a link there is not followed
             shutil.move(job.log, path)
             return path, said
+        with suppress(OSError):
+            job.log.unlink(missing_ok=True)  # there is no room for it in the output folder
         return None, said
 
 

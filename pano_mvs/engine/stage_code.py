@@ -11,6 +11,7 @@ from pathlib import Path, PurePath
 import pano_mvs
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.kernel_cache import user_cache_folder
+from pano_mvs.core.paths import is_folder
 from pano_mvs.engine.code.libraries import library_versions
 from pano_mvs.engine.code.reach import CodeGraph, Reach
 from pano_mvs.engine.code.sources import Sources
@@ -122,7 +123,7 @@ def _root_of(top: str) -> Path | None:
     folders = list(getattr(module, "__path__", ()))
     file = str(folders[0]) if folders else str(getattr(module, "__file__", None) or "")
     path = Path(file)
-    return path if file and (path.is_dir() if folders else path.suffix == ".py") else None
+    return path if file and (is_folder(path) if folders else path.suffix == ".py") else None
 
 
 def _kept_in() -> Path | None:

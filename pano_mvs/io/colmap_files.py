@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.core.paths import is_file
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
 from pano_mvs.io.pose_json import rigid_from_arrays
 
@@ -113,7 +114,7 @@ def model_files(folder: Path) -> tuple[Path, Path, Path] | None:
     """Return the files with cameras, images and points of the model in a folder; None if there is none."""
     for names in MODEL_FILES:
         cameras, images, points = (folder / name for name in names)
-        if cameras.is_file() and images.is_file() and points.is_file():
+        if all(is_file(path) for path in (cameras, images, points)):
             return cameras, images, points
     return None
 

@@ -12,6 +12,8 @@ from functools import cache
 from pathlib import Path
 
 from pano_mvs.core.digest import digest_from_bytes, digest_from_value
+from pano_mvs.core.paths import below as files_below
+from pano_mvs.core.paths import is_file
 from pano_mvs.engine.code.summary import ModuleSummary, summarize_module
 
 _PYTHON = f"{sys.version_info.major}.{sys.version_info.minor}"  # which decides what is Python at all
@@ -99,10 +101,10 @@ class Sources:
         if root.suffix == ".py":
             return (None if below else root), False
         folder = root.joinpath(*below)
-        if (folder / "__init__.py").is_file():
+        if is_file(folder / "__init__.py"):
             return folder / "__init__.py", True
         file = folder.with_name(f"{folder.name}.py")
-        return (file if below and file.is_file() else None), False
+        return (file if below and is_file(file) else None), False
 
     def _kept_of(self, top: str) -> dict[str, tuple[str, ModuleSummary]]:
         if top not in self._kept:
@@ -120,7 +122,7 @@ class Sources:
 @cache
 def _our_texts() -> dict[str, bytes]:
     """Return the files by which a summary is made: where they change, those kept are made anew."""
-    return {path.name: path.read_bytes() for path in Path(__file__).parent.glob("*.py")}
+    return {path.name: path.read_bytes() for path in files_below(Path(__file__).parent, "*.py")}
 
 
 def _load(path: Path) -> dict[str, tuple[str, ModuleSummary]]:
