@@ -25,19 +25,6 @@ MORE_CASES: Mapping[str, Mapping[str, Any]] = {
     "depth.sweep of the paper": {"cost": "sad", "aggregation": "box", "combination": "sum", "selection": "winner"},
 }
 
-NOT_YET = frozenset({
-    "depth.patchmatch",
-    "export.colmap_faces",
-    "export.nerfstudio_frames",
-    "fusion.vote",
-    "matches.brute_force",
-    "points.tracked",
-    "poses.colmap",
-    "poses.colmap_sift",
-    "poses.refine",
-})  # fmt: skip
-"""Cases that nobody has written down yet: record them, then take them out."""
-
 
 @dataclass(frozen=True)
 class Golden:

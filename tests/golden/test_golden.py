@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from tests.golden.record import (
-    NOT_YET,
     Golden,
     by_other_libraries,
     case_names,
@@ -25,7 +24,7 @@ OTHER_RESULT = {"range": [100, 90, 2.5, 1.0, 1.5, 2.5, 2.5, 3.0], "metrics": [0.
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", sorted({*case_names()} - NOT_YET))
+@pytest.mark.parametrize("name", sorted(case_names()))
 def test_no_result_changes_under_a_key_that_stays(name: str) -> None:
     before, now = read_recorded().get(name), made_now(name)
     problem = complaint(name, before, now)
@@ -35,7 +34,7 @@ def test_no_result_changes_under_a_key_that_stays(name: str) -> None:
 
 
 def test_every_stage_is_written_down() -> None:
-    assert set(read_recorded()) == {*case_names()} - NOT_YET
+    assert set(read_recorded()) == {*case_names()}
 
 
 def test_a_result_that_changes_under_its_key_is_a_complaint() -> None:

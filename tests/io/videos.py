@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+import pano_mvs.io.video  # noqa: F401 - it silences FFmpeg, which must happen before the first video
+
 Picture = NDArray[np.uint8]
 _folders: list[TemporaryDirectory[str]] = []
 _BITS, _CELL = 8, 8
