@@ -15,7 +15,7 @@ from pano_mvs.algorithms.sweep.kernels_project import (
     rough_runs,
 )  # fmt: skip
 from pano_mvs.algorithms.sweep.kernels_sad import add_sampled_differences
-from pano_mvs.algorithms.sweep.kernels_vector import PIXELS, blend_grey_block, sample_rgb_block
+from pano_mvs.algorithms.sweep.kernels_vector import HAS_VECTOR, PIXELS, blend_grey_block, sample_rgb_block
 from pano_mvs.algorithms.sweep.kernels_warp import blend_row, gather_row, place_row, project_row, wrap_row
 
 _F = np.float32
@@ -39,11 +39,12 @@ def _sample_planes(packed, starts, vector, index, weight_y, weight_x, patches, w
 @njit(cache=True, error_model="numpy", nogil=True)
 def _blend_blocks(patches, weight_y, weight_x, out, out_at):  # type: ignore[no-untyped-def]
     """Do what `blend_row` does; the last block overlaps the one before it."""
-    width = patches.shape[0]
-    for i in range(0, width - PIXELS + 1, PIXELS):
-        blend_grey_block(patches, weight_y, weight_x, _U(i), out, _U(out_at + i))
-    last = width - PIXELS
-    blend_grey_block(patches, weight_y, weight_x, _U(last), out, _U(out_at + last))
+    if HAS_VECTOR:  # a constant: without it the block is not compiled, which is impossible on other processors
+        width = patches.shape[0]
+        for i in range(0, width - PIXELS + 1, PIXELS):
+            blend_grey_block(patches, weight_y, weight_x, _U(i), out, _U(out_at + i))
+        last = width - PIXELS
+        blend_grey_block(patches, weight_y, weight_x, _U(last), out, _U(out_at + last))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -54,10 +55,11 @@ def _sample_rgb(colors, start, index, weight_y, weight_x, warped, row, pad):  # 
     out_at = row * warped.shape[2] + pad
     base = _U(start)
     width = index.shape[0]
-    for i in range(0, width - PIXELS + 1, PIXELS):
-        sample_rgb_block(colors, base, index, weight_y, weight_x, _U(i), flat, _U(out_at + i), step)
-    last = width - PIXELS
-    sample_rgb_block(colors, base, index, weight_y, weight_x, _U(last), flat, _U(out_at + last), step)
+    if HAS_VECTOR:
+        for i in range(0, width - PIXELS + 1, PIXELS):
+            sample_rgb_block(colors, base, index, weight_y, weight_x, _U(i), flat, _U(out_at + i), step)
+        last = width - PIXELS
+        sample_rgb_block(colors, base, index, weight_y, weight_x, _U(last), flat, _U(out_at + last), step)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

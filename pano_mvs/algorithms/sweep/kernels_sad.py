@@ -7,7 +7,7 @@ from numba import njit
 
 from pano_mvs.algorithms.sweep.kernels_combine import ENOUGH
 from pano_mvs.algorithms.sweep.kernels_cost import box_rows, difference_row
-from pano_mvs.algorithms.sweep.kernels_vector import PIXELS, difference_rgb_block
+from pano_mvs.algorithms.sweep.kernels_vector import HAS_VECTOR, PIXELS, difference_rgb_block
 from pano_mvs.algorithms.sweep.kernels_warp import wrap_row
 
 _F = np.float32
@@ -58,10 +58,11 @@ def add_sampled_differences(  # type: ignore[no-untyped-def]
     """
     base, width = _U(start), reference.shape[1]
     ours, costs = row * width, row * pixel_costs.shape[1] + pad
-    for i in range(0, width, PIXELS):
-        difference_rgb_block(
-            colors, base, index, weight_y, weight_x, _U(i), reference, _U(ours + i), pixel_costs, _U(costs + i)
-        )
+    if HAS_VECTOR:  # a constant: without it the block is not compiled, which is impossible on other processors
+        for i in range(0, width, PIXELS):
+            difference_rgb_block(
+                colors, base, index, weight_y, weight_x, _U(i), reference, _U(ours + i), pixel_costs, _U(costs + i)
+            )
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

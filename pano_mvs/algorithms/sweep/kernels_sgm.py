@@ -94,12 +94,13 @@ def sweep_strip(volume, total, penalties, p1, first, lines, drift, upward, warm)
         column = first + drift * i + (0 if i >= 0 else width // 2)
         column = (column % width + width) % width
         direct = min(lines, width - column)
-        if vector:
-            step_segment(volume, total, (row, column), (0, direct), penalties, p1, buffers[0, 1:], least[0], i >= 0)
-            step_segment(
-                volume, total, (row, 0), (direct, lines - direct), penalties, p1, buffers[0, 1:], least[0], i >= 0
-            )
-            continue
+        if HAS_VECTOR:  # a constant: without it step_segment is not compiled, which is impossible on other processors
+            if vector:
+                step_segment(volume, total, (row, column), (0, direct), penalties, p1, buffers[0, 1:], least[0], i >= 0)
+                step_segment(
+                    volume, total, (row, 0), (direct, lines - direct), penalties, p1, buffers[0, 1:], least[0], i >= 0
+                )
+                continue
         least[now, :] = _OUTSIDE
         for place, segment in (((row, column), (0, direct)), ((row, 0), (direct, lines - direct))):
             step_plain(
