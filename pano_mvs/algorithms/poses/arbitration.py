@@ -21,6 +21,8 @@ _DOUBTFUL = 0.55
 _HOPELESS, _MIN_EXPLAINED = 0.3, 0.5
 # Of all pairs of a group; below this, a camera that looks right may still be the wrong one.
 _MIN_EXPLAINED_IN_ALL = 0.7
+# … unless the pairs of the cameras that are not doubted are explained to this share.
+_MIN_EXPLAINED_BY_OTHERS = 0.85
 # Nobody doubts a camera that confirms this share of what is expected, whatever its pairs say.
 _CONFIRMED = 0.9
 # A geometry under which two images confirm this share of what they confirm under their best one is likely.
@@ -127,10 +129,11 @@ def arbitrate(
 def _contradiction(model: PlacedModel, doubted: Collection[int]) -> str:
     """Say so if the pairs contradict one another so much that no arrangement can be relied on.
 
-    Pairs with cameras that are doubted already are not counted: a single wrong camera contradicts all of its pairs.
+    A single wrong camera contradicts all of its pairs. So nothing is said if the pairs agree well once the cameras that
+    are doubted already are left aside.
     """
-    explained = model.explained_share(without=doubted)
-    if len(model.cameras) - len(doubted) < 3 or explained >= _MIN_EXPLAINED_IN_ALL:
+    explained, by_others = model.explained_share(), model.explained_share(without=doubted)
+    if len(model.cameras) < 3 or explained >= _MIN_EXPLAINED_IN_ALL or by_others >= _MIN_EXPLAINED_BY_OTHERS:
         return ""
     return f"only {100 * explained:.0f} % of all pairs, by weight, agree with one arrangement of the cameras"
 
