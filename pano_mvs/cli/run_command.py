@@ -31,6 +31,7 @@ from pano_mvs.cli.telling import INTERRUPTED, tell, tell_of_end
 from pano_mvs.core.errors import PanoMvsError, UsageError
 from pano_mvs.core.files import OUTPUT_MARK, set_aside
 from pano_mvs.core.paths import exists, is_file
+from pano_mvs.core.text import one_line
 from pano_mvs.engine.blobs import DamagedBlobError
 from pano_mvs.engine.events import Observer, RunResult
 from pano_mvs.engine.executors.choose import make_executor
@@ -39,6 +40,7 @@ from pano_mvs.engine.memory import bytes_from_size
 from pano_mvs.engine.output_lock import output_lock
 from pano_mvs.engine.run import Run
 from pano_mvs.engine.store import LEAST_FREE_BYTES, Store
+from pano_mvs.report.findings import doubts_of
 from pano_mvs.report.verdict import Verdict
 from pano_mvs.viewer.shown_scene import is_to_see
 
@@ -122,7 +124,7 @@ def _run_for_programs(session: Session, store: Store, executor: Executor, events
         with redirect_stdout(sys.stderr):  # a plugin that lists its items does so in this process
             result, summary, verdict = _run(session, store, executor, events)
         exit_code, stopped, counts = result.exit_code, result.stopped, summary["units"]
-        told = {"verdict": asdict(verdict), "doubts": summary["poses"].get("doubts", {})}
+        told = {"verdict": asdict(verdict), "doubts": doubts_of(summary)}
     except PanoMvsError as error:
         exit_code, stopped = error.exit_code, str(error)
         raise
@@ -240,7 +242,7 @@ def print_summary(summary: Mapping[str, Any], out: Path, console: Console, *, wr
 def _print_failures(summary: Mapping[str, Any], console: Console) -> None:
     causes = summary["failures"]
     for failure in causes[:_SHOWN_FAILURES]:
-        label = f"{failure['stage']}:{failure['item']}" if failure["item"] else failure["stage"]
+        label = one_line(f"{failure['stage']}:{failure['item']}" if failure["item"] else failure["stage"])
         text = f"{label}: {failure['cause']} — {failure['consequence']}"
         console.print(f"[red]failed:[/] {escape(text)}", highlight=False, soft_wrap=True)
         if failure["log"]:
@@ -248,7 +250,7 @@ def _print_failures(summary: Mapping[str, Any], console: Console) -> None:
     if len(causes) > _SHOWN_FAILURES:
         console.print(f"… and {len(causes) - _SHOWN_FAILURES} more, all in run.json", highlight=False)
     for image, rejected in summary["rejected"].items():
-        text = f"{image}: {rejected['reason']}"
+        text = f"{one_line(image)}: {rejected['reason']}"
         console.print(f"[yellow]left out:[/] {escape(text)}", highlight=False, soft_wrap=True)
 
 

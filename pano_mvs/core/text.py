@@ -32,6 +32,15 @@ def without_controls(text: str) -> str:
     return _STEERING.sub(lambda match: _spelled(match[0]), text)
 
 
+def one_line(text: str) -> str:
+    r"""Return a name as `without_controls` does, on one line: tabs and newlines are spelled out, too.
+
+    >>> one_line("a\nb.jpg")
+    'a\\x0ab.jpg'
+    """
+    return without_controls(text).replace("\t", _spelled("\t")).replace("\n", _spelled("\n"))
+
+
 def json_without_controls(line: str) -> str:
     """Return a line of JSON in which the control characters that JSON permits in strings are written as escapes."""
     return _STEERING.sub(lambda match: f"\\u{ord(match[0]):04x}", line)

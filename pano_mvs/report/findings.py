@@ -75,6 +75,7 @@ def _stopped(summary: Mapping[str, Any]) -> list[Finding]:
     if stopped == "interrupted":
         return [Finding("fair", "The run was interrupted: what is shown is what it had finished.",
                         "Run the same command again; what is finished is not computed again.")]  # fmt: skip
+    stopped = stopped if stopped.endswith((".", "!", "?")) else f"{stopped}."
     return [Finding("bad", f"The run stopped early: {stopped}", "Mend this and run the same command again.")]
 
 
@@ -104,6 +105,13 @@ def _registration(summary: Mapping[str, Any]) -> list[Finding]:
                     "next one sees.")]  # fmt: skip
 
 
+def doubts_of(summary: Mapping[str, Any]) -> dict[str, str]:
+    """Return the doubted images with the reasons: those of the final poses, and what other stages doubt besides."""
+    doubts = {str(name): str(reason) for name, reason in ((summary.get("poses") or {}).get("doubts") or {}).items()}
+    others = {str(name): str(doubt.get("reason", "")) for name, doubt in (summary.get("doubts") or {}).items()}
+    return doubts | {name: reason for name, reason in others.items() if name not in doubts}
+
+
 def doubt_mood(poses: Mapping[str, Any]) -> str:
     """Return "fair" if some registered cameras are doubtful, "bad" if more than half are, else "good"."""
     registered, doubts = len(poses.get("registered") or []), len(poses.get("doubts") or {})
@@ -111,16 +119,19 @@ def doubt_mood(poses: Mapping[str, Any]) -> str:
 
 
 def _doubts(summary: Mapping[str, Any]) -> list[Finding]:
-    poses = summary.get("poses") or {}
-    doubts = poses.get("doubts") or {}
+    doubts = doubts_of(summary)
     if not doubts:
         return []
+    poses = summary.get("poses") or {}
     reasons = [f"{name} ({reason})" for name, reason in doubts.items()]
     more = f"; and {len(reasons) - _SHOWN_DOUBTS} more" if len(reasons) > _SHOWN_DOUBTS else ""
-    count = "1 camera is doubtful" if len(reasons) == 1 else f"{len(reasons)} cameras are doubtful"
-    return [Finding(doubt_mood(poses), f"{count}: {'; '.join(reasons[:_SHOWN_DOUBTS])}{more}.",
-                    "Take panoramas between them and their neighbours, with things in view that occur only once, or "
-                    "leave these images out.")]  # fmt: skip
+    what = "camera" if poses.get("doubts") else "image"
+    count = f"1 {what} is doubtful" if len(reasons) == 1 else f"{len(reasons)} {what}s are doubtful"
+    them = "it and its" if len(reasons) == 1 else "them and their"
+    mood = doubt_mood(poses) if poses.get("doubts") else "fair"
+    return [Finding(mood, f"{count}: {'; '.join(reasons[:_SHOWN_DOUBTS])}{more}.",
+                    f"Take panoramas between {them} neighbours, with things in view that occur only once, or leave "
+                    f"{'it' if len(reasons) == 1 else 'these images'} out.")]  # fmt: skip
 
 
 def _groups(summary: Mapping[str, Any]) -> list[Finding]:

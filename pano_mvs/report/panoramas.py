@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pano_mvs.report.completeness import Shares
+from pano_mvs.report.findings import doubts_of
 from pano_mvs.report.pictures import Picture
 from pano_mvs.report.residuals import Residuals
 
@@ -83,8 +84,8 @@ def panorama_rows(
     group_of = {
         str(name): number for number, group in enumerate(groups) for name in group.get("images") or () if groups[1:]
     }
-    names = dict.fromkeys([*map(str, poses.get("registered") or []), *figures, *rejected])
-    doubts = {str(name): str(reason) for name, reason in (poses.get("doubts") or {}).items()}
+    doubts = doubts_of(summary)
+    names = dict.fromkeys([*map(str, poses.get("registered") or []), *figures, *rejected, *doubts])
     rows = []
     for name in list(names)[:MOST_ROWS]:
         median, p95, _ = (residuals.views.get(name) if residuals else None) or (None, None, 0)

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from pano_mvs.core.text import json_without_controls, shortened, without_controls
+from pano_mvs.core.text import json_without_controls, one_line, shortened, without_controls
 
 
 def test_short_texts_stay_as_they_are() -> None:
@@ -37,3 +37,9 @@ def test_what_would_steer_a_terminal_is_spelled_out(text: str, shown: str) -> No
     line = json_without_controls(json.dumps(text, ensure_ascii=False))
     assert without_controls(line) == line
     assert json.loads(line) == text
+
+
+def test_a_name_stays_on_its_line() -> None:
+    """A file name with a newline could print a line of its own, such as "results in …"."""
+    assert one_line("x\nresults in\there\x1b.jpg") == r"x\x0aresults in\x09here\x1b.jpg"
+    assert one_line("räume/1.jpg") == "räume/1.jpg"

@@ -2,6 +2,7 @@
 
 import pytest
 
+from pano_mvs.report.findings import findings
 from pano_mvs.report.residuals import Histogram, Residuals
 from pano_mvs.report.verdict import verdict
 
@@ -118,3 +119,14 @@ def test_where_nothing_is_known_nothing_is_judged():
 def test_a_run_that_computed_nothing_says_so():
     stages = [{"name": "depth", "cached": 7}, {"name": "ply", "cached": 1}]
     assert "Nothing had changed: all 8 units" in verdict({"stages": stages}).sentence
+
+
+def test_doubts_of_a_run_without_poses_are_findings_too() -> None:
+    """The run ended with exit code 3 and said nothing."""
+    doubts = {"0.png": {"stage": "judge", "reason": "the lens is dirty"}}
+    summary = {"exit_code": 3, "poses": {}, "doubts": doubts}
+    (finding,) = [finding for finding in findings(summary) if "doubtful" in finding.text]
+    assert finding.mood == "fair"
+    assert "1 image is doubtful: 0.png (the lens is dirty)" in finding.text
+    both = GOOD | {"poses": doubting(1), "doubts": doubts | {"9.png": {"stage": "judge", "reason": "dark"}}}
+    assert "9.png (dark)" in next(finding.text for finding in findings(both) if "doubtful" in finding.text)
