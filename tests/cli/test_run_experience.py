@@ -21,6 +21,7 @@ from pano_mvs.cli.progress import ProgressBars
 from pano_mvs.cli.run_command import interrupted_by_termination
 from tests.engine.conftest import Toy, toy  # noqa: F401 (a fixture)
 from tests.engine.test_resume import deliverables, finished_records
+from tests.processes import heed_interrupts
 
 ON_POSIX = pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
 
@@ -29,7 +30,8 @@ def start(toy: Toy, *options: str, sleep_s: float = 0.0) -> subprocess.Popen[str
     command = [sys.executable, "-m", "pano_mvs", "run", str(toy.folder / "wf.yaml"),
                "--cache", str(toy.folder / "cache"), "--out", str(toy.folder / "out"), *options]  # fmt: skip
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-                            env=os.environ | {"TOY_SLEEP_S": str(sleep_s)}, cwd=toy.folder)  # fmt: skip
+                            env=os.environ | {"TOY_SLEEP_S": str(sleep_s)}, cwd=toy.folder,
+                            preexec_fn=heed_interrupts)  # fmt: skip
 
 
 def finish(process: subprocess.Popen[str]) -> tuple[int, str, str]:

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.engine.conftest import Toy
+from tests.processes import heed_interrupts
 
 EXEMPT = {"run.json", "report.html"}
 
@@ -18,7 +19,7 @@ def start(toy: Toy, *, sleep_s: float = 0.0) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "pano_mvs", "run", str(toy.folder / "wf.yaml"),
                "--cache", str(toy.folder / "cache"), "--out", str(toy.folder / "out")]  # fmt: skip
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-                            env=os.environ | {"TOY_SLEEP_S": str(sleep_s)})  # fmt: skip
+                            env=os.environ | {"TOY_SLEEP_S": str(sleep_s)}, preexec_fn=heed_interrupts)  # fmt: skip
 
 
 def finished_records(toy: Toy) -> int:
