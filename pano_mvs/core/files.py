@@ -14,7 +14,7 @@ from pathlib import Path
 
 from pano_mvs.core.errors import StoreError
 from pano_mvs.core.paths import children, exists, is_file, is_folder, is_link
-from pano_mvs.core.processes import is_running, process_place
+from pano_mvs.core.processes import process_place, start_of
 
 OUTPUT_MARK = ".pano-mvs-output"
 """An empty file in every output folder, written first: no source takes what lies there for pictures."""
@@ -70,7 +70,8 @@ def whose_temporary(path: Path) -> str:
         return "not of this version; removed when it is seven days old"
     if match[1] != process_place() or os.name != "posix":
         return "of another host or container; removed when it is seven days old"
-    return f"of process {match[2]} on this host, which is {'running' if is_running(int(match[2])) else 'gone'}"
+    state = "gone" if start_of(int(match[2])) is None else "running"
+    return f"of process {match[2]} on this host, which is {state}"
 
 
 def clear_abandoned(folder: Path) -> None:
@@ -97,7 +98,7 @@ def remove_whole(path: Path) -> None:
 def _is_abandoned(path: Path) -> bool:
     match = _TEMPORARY.fullmatch(path.name)
     if match and match[1] == process_place() and os.name == "posix":
-        return not is_running(int(match[2]))
+        return start_of(int(match[2])) is None  # one that has ended and is not yet cleared away is no owner
     return is_older(path, _ABANDONED_AFTER_S)
 
 

@@ -232,6 +232,7 @@ def test_a_group_whose_pairs_contradict_one_another_is_doubted(
     """Regression: the limit was defined and nothing read it."""
     assert verified(displaced(), matches).doubts == {}
     monkeypatch.setattr(arbitration, "_MIN_EXPLAINED_IN_ALL", 1.01)
+    monkeypatch.setattr(arbitration, "_MIN_EXPLAINED_BY_OTHERS", 1.01)
     found = verified(displaced(), matches)
     assert set(found.doubts) == set(NAMES)
     assert all("agree with one arrangement" in reason for reason in found.doubts.values())

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from pano_mvs.core.errors import UsageError
+from pano_mvs.engine import stage_code
 from pano_mvs.engine.executors import dask_cluster, dask_task
 from pano_mvs.engine.executors.dask_cluster import DaskExecutor
 from pano_mvs.engine.executors.serial import SerialExecutor
@@ -94,6 +95,7 @@ def test_plugin_comes_along_as_text(toy: Toy, monkeypatch: pytest.MonkeyPatch) -
     session = toy.session()
     texts = {path: dask_cluster.code_texts(path) for path in session.workflow.plugins}
     monkeypatch.setattr(DaskExecutor, "_texts", lambda self, path: texts[path])
+    monkeypatch.setattr(stage_code, "code_texts", lambda path: texts[path])
     hidden = (toy.folder / "plug.py").rename(toy.folder / "hidden.py")
     store = Store(toy.folder / "cache")
     executor = DaskExecutor(store, workers=1, threads=1)
