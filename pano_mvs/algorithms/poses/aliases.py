@@ -35,7 +35,7 @@ _HELD = 0.1
 _LABELLINGS = 2
 _STARTS = 50
 # Of very many suggested moves the heaviest are compared with one another.
-_MAX_MOVES = 1500
+_MAX_MOVES, _MAX_TURNED = 1500, 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +118,8 @@ def _straight_aliases(model: PlacedModel, suggestions: list[_Suggestion]) -> lis
 
 
 def _turned_aliases(suggestions: list[_Suggestion]) -> list[Alias]:
-    """Return the motion with a turn that most pairs suggest, if at least two do."""
+    """Return the motion with a turn that most pairs suggest, if at least two do; the heaviest are compared."""
+    suggestions = sorted(suggestions, key=lambda found: (-found.weight, found.edge))[:_MAX_TURNED]
     if len(suggestions) < _MIN_TURNED_PAIRS:
         return []
     spread = float(np.median([np.linalg.norm(found.displacement) for found in suggestions]))
@@ -127,9 +128,9 @@ def _turned_aliases(suggestions: list[_Suggestion]) -> list[Alias]:
         same = [_same_motion(one.motion, other, spread) for other in suggestions]
         inverse = [_same_motion(one.motion.inverse(), other, spread) for other in suggestions]
         alike = [other for other, a, b in zip(suggestions, same, inverse, strict=True) if a or b]
-        heaviest = {
-            edge: max(found.weight for found in alike if found.edge == edge) for edge in {f.edge for f in alike}
-        }
+        heaviest: dict[Edge, float] = {}
+        for other in alike:
+            heaviest[other.edge] = max(other.weight, heaviest.get(other.edge, 0.0))
         support = sum(heaviest.values())
         if len(heaviest) >= _MIN_TURNED_PAIRS and support > best[0]:
             best = support, alike, [a for a, b in zip(same, inverse, strict=True) if a or b]
