@@ -16,10 +16,10 @@ from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.winner import Winners
 from pano_mvs.core.errors import GateError, InputError, PanoMvsError, UsageError
 from pano_mvs.core.parts import Parts
-from pano_mvs.engine.context import Context
-from pano_mvs.engine.params import NOT_IN_KEY, InputPath, Params, PartOf, SourcePath
-from pano_mvs.engine.ports import All, Each, Names, Near, One
-from pano_mvs.engine.stage import SourceItem, source, stage
+from pano_mvs.engine.stages.context import Context
+from pano_mvs.engine.stages.params import NOT_IN_KEY, InputPath, Params, PartOf, SourcePath
+from pano_mvs.engine.stages.ports import All, Each, Names, Near, One
+from pano_mvs.engine.stages.stage import SourceItem, source, stage
 from pano_mvs.geometry import Rigid3, Similarity3
 from pano_mvs.scene import (
     Axis,
@@ -38,7 +38,7 @@ from pano_mvs.scene import (
     TwoView,
     Views,
 )
-from pano_mvs.scene.image_file import decode_image, write_png
+from pano_mvs.scene.image_files.image_file import decode_image, write_png
 from pano_mvs.scene.pose_groups import join_groups, per_group, split_groups
 
 __all__ = [

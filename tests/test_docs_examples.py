@@ -20,10 +20,10 @@ from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
-from pano_mvs.engine.policy import RESERVED_KEYS
-from pano_mvs.engine.registry import Registry
-from pano_mvs.engine.stage import StageSpec
-from tests.io.videos import tiny_video
+from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.engine.stages.stage import StageSpec
+from pano_mvs.engine.workflows.policy import RESERVED_KEYS
+from tests.io.images.videos import tiny_video
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("docs/**/*.md"), ROOT / "README.md"])

@@ -1,4 +1,4 @@
-"""What docs/frames_and_scale.md shows works as it stands; its workflow itself is run by tests/cli/test_frame.py."""
+"""What docs/frames_and_scale.md shows works as it stands; tests/cli/workflows/test_frame.py runs its workflow."""
 
 from __future__ import annotations
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from pano_mvs.io.captures import PICTURE_SUFFIXES, VIDEO_SUFFIXES
+from pano_mvs.io.images.captures import PICTURE_SUFFIXES, VIDEO_SUFFIXES
 from pano_mvs.stages.source_video import VideoParams
 from tests.cli.conftest import Command, pano_mvs, run_json
-from tests.io.videos import write_video
+from tests.io.images.videos import write_video
 
 __all__ = ["pano_mvs"]  # the fixture
 

@@ -13,7 +13,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from pano_mvs import api
-from pano_mvs.engine.policy import RESERVED_KEYS
+from pano_mvs.engine.workflows.policy import RESERVED_KEYS
 
 ROOT = Path(__file__).parent.parent
 HOOKS = ROOT / "docs" / "_hooks"

@@ -6,13 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pano_mvs.geometry import Rigid3, ray_grid, spiral_rays
-from pano_mvs.testing.drawings import Drawing, pyramid
 from pano_mvs.testing.paint import OAK
-from pano_mvs.testing.prints import Print, sampled
-from pano_mvs.testing.repeats import REPEATS, doors, draw_capture, stairs, tiled_hall, twin_rooms
+from pano_mvs.testing.repeating.drawings import Drawing, pyramid
+from pano_mvs.testing.repeating.places import REPEATS, doors, draw_capture, stairs, tiled_hall, twin_rooms
+from pano_mvs.testing.repeating.prints import Print, sampled
+from pano_mvs.testing.repeating.walks import LAYOUTS, Ground, stands
 from pano_mvs.testing.room import Room, range_along, render
 from pano_mvs.testing.surfaces import Bounded, Cuboid
-from pano_mvs.testing.walks import LAYOUTS, Ground, stands
 
 SIZE = (32, 64)
 

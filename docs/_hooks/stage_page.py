@@ -12,12 +12,12 @@ from pydantic.fields import FieldInfo
 from setting_schema import limits_of, type_of
 
 from pano_mvs import api, stages
-from pano_mvs.engine.params import NOT_IN_KEY
-from pano_mvs.engine.policy import Policy
-from pano_mvs.engine.ports import Port
-from pano_mvs.engine.registry import Registry
-from pano_mvs.engine.schema import workflow_schema
-from pano_mvs.engine.stage import StageSpec
+from pano_mvs.engine.stages.params import NOT_IN_KEY
+from pano_mvs.engine.stages.ports import Port
+from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.engine.stages.stage import StageSpec
+from pano_mvs.engine.workflows.policy import Policy
+from pano_mvs.engine.workflows.schema import workflow_schema
 
 KINDS = {
     "source": "which pictures there are, and how one is read",

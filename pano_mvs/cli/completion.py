@@ -14,7 +14,7 @@ import typer
 
 from pano_mvs.core.errors import PanoMvsError
 from pano_mvs.core.paths import children, is_folder
-from pano_mvs.engine.workflow import StageEntry
+from pano_mvs.engine.workflows.workflow import StageEntry
 
 Offer = tuple[str, str]
 """What may be put there, and what it is."""
@@ -53,7 +53,7 @@ def complete_workflow(incomplete: str) -> Iterator[Offer]:
 @_silent
 def complete_stage_kind() -> Iterator[Offer]:
     """Offer the names of all registered stages."""
-    from pano_mvs.engine.registry import Registry
+    from pano_mvs.engine.stages.registry import Registry
 
     for name, spec in sorted(Registry.installed().stages.items()):
         yield name, spec.doc.partition("\n")[0]
@@ -91,8 +91,8 @@ def complete_plugin_kind() -> Iterator[Offer]:
 
 def _stages(ctx: typer.Context) -> Mapping[str, StageEntry]:
     from pano_mvs.cli.session import presets_folder
-    from pano_mvs.engine.registry import Registry
-    from pano_mvs.engine.workflow import find_workflow, load_workflow
+    from pano_mvs.engine.stages.registry import Registry
+    from pano_mvs.engine.workflows.workflow import find_workflow, load_workflow
 
     # click leaves arguments where they are once it has met an option that still lacks its value.
     named = ctx.params.get("workflow") or next((word for word in ctx.args if not word.startswith("-")), None)

@@ -13,9 +13,9 @@ from pano_mvs.cli.run_command import print_scores
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.paths import is_file, is_folder
 from pano_mvs.geometry import Rigid3
-from pano_mvs.io.colmap_model import is_colmap_model
-from pano_mvs.io.pose_files import read_groups, read_poses
-from pano_mvs.io.range_folders import find_ranges, match_pictures
+from pano_mvs.io.colmap.model import is_colmap_model
+from pano_mvs.io.poses.files import read_groups, read_poses
+from pano_mvs.io.ranges.folders import find_ranges, match_pictures
 from pano_mvs.io.truth import find_true_ranges
 
 MODEL_ABOVE, MODEL, CLOUD, RANGES = "colmap", "colmap/sparse/0", "cloud.ply", "range"

@@ -25,10 +25,10 @@ from pano_mvs.algorithms.metrics.surface import TrueSurface, TrueView, surface_o
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.paths import is_file, is_folder
 from pano_mvs.geometry import Rigid3, Similarity3
-from pano_mvs.io.names import match_image_names
-from pano_mvs.io.ply_points import PlyPoints, open_ply_points
-from pano_mvs.io.pose_files import read_poses
-from pano_mvs.io.range_folders import match_pictures
+from pano_mvs.io.clouds.ply_points import PlyPoints, open_ply_points
+from pano_mvs.io.images.names import match_image_names
+from pano_mvs.io.poses.files import read_poses
+from pano_mvs.io.ranges.folders import match_pictures
 from pano_mvs.io.truth import find_true_ranges
 
 _CLOUD, _MODEL = "cloud.ply", "colmap/sparse/0"

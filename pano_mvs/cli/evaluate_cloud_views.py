@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pano_mvs.io.cloud_picture import caption, distance_colors, distance_legend
 from pano_mvs.report.software_cloud import draw_cloud
 from pano_mvs.report.viewpoints import viewpoints
-from pano_mvs.scene.image_file import write_png
+from pano_mvs.scene.image_files.image_file import write_png
 
 _SIZE_HW = (640, 1024)
 

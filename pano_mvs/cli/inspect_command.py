@@ -16,16 +16,16 @@ from pano_mvs.cli.inspect_text import as_json_value, print_inspection
 from pano_mvs.cli.session import CACHE_VARIABLE, Session, open_session
 from pano_mvs.core.errors import InputError, StoreError, UsageError
 from pano_mvs.core.paths import is_file, is_folder
-from pano_mvs.engine.plan import StagePlan, make_plan
-from pano_mvs.engine.run import workflow_id
-from pano_mvs.engine.store import Store, UnitRecord
-from pano_mvs.engine.units import Unit
-from pano_mvs.io.names import match_image_names
+from pano_mvs.engine.cache.store import Store, UnitRecord
+from pano_mvs.engine.planning.plan import StagePlan, make_plan
+from pano_mvs.engine.planning.units import Unit
+from pano_mvs.engine.running.run import workflow_id
+from pano_mvs.io.images.names import match_image_names
 from pano_mvs.io.truth import read_truth
 from pano_mvs.scene import RangeMap
 from pano_mvs.stages.depth import SweepParams
-from pano_mvs.viewer.inspect_pixel import UnitFound, inspect_pixel
-from pano_mvs.viewer.inspection import Inspection
+from pano_mvs.viewer.inspect.inspection import Inspection
+from pano_mvs.viewer.inspect.pixel import UnitFound, inspect_pixel
 
 _SHOWN = 6
 
@@ -174,7 +174,7 @@ def _truth_of(session: Session, image: str) -> Path | None:
 
 
 def _write_plot(path: Path, found: Inspection) -> None:
-    from pano_mvs.viewer.curve_picture import write_curve_picture
+    from pano_mvs.viewer.inspect.curve_picture import write_curve_picture
 
     if path.suffix.lower() != ".png":
         raise UsageError(f"--plot {path}: the plot is a PNG, call it so")

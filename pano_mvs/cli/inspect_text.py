@@ -10,8 +10,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from pano_mvs.viewer.curve_text import curve_text
-from pano_mvs.viewer.inspection import Inspection
+from pano_mvs.viewer.inspect.curve_text import curve_text
+from pano_mvs.viewer.inspect.inspection import Inspection
 
 _BLOCKS = "▁█△"
 _CONFIDENCES = ((0, "no range"), (63, "filled"), (127, "seen but weak"), (255, "consistent"))

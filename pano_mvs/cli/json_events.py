@@ -26,7 +26,7 @@ import time
 from typing import Any, TextIO
 
 from pano_mvs.core.text import json_without_controls
-from pano_mvs.engine.events import Failure, Outcome, StageSummary
+from pano_mvs.engine.running.events import Failure, Outcome, StageSummary
 
 SCHEMA = 1
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from pano_mvs.algorithms.filters.view_doubts import Agreement, view_doubts
 from pano_mvs.cli.summary import chain_of, latest
-from pano_mvs.engine.run import Run
+from pano_mvs.engine.running.run import Run
 from pano_mvs.scene import Poses, RangeMap
 
 _FIGURES = tuple(Agreement.__dataclass_fields__)

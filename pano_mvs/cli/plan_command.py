@@ -15,9 +15,9 @@ from rich.table import Table
 
 from pano_mvs.cli.session import Session
 from pano_mvs.core.errors import StoreError
-from pano_mvs.engine.plan import StagePlan, make_plan
-from pano_mvs.engine.run import workflow_id
-from pano_mvs.engine.store import Store
+from pano_mvs.engine.cache.store import Store
+from pano_mvs.engine.planning.plan import StagePlan, make_plan
+from pano_mvs.engine.running.run import workflow_id
 
 _SHOWN_REASONS = 5
 

@@ -13,8 +13,8 @@ from rich.markup import escape
 from pano_mvs.cli.session import CACHE_VARIABLE
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import is_file
-from pano_mvs.engine.output_lock import output_lock
-from pano_mvs.engine.store import Store
+from pano_mvs.engine.cache.store import Store
+from pano_mvs.engine.running.output_lock import output_lock
 from pano_mvs.report import write_report
 from pano_mvs.report.results import Results
 

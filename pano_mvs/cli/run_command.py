@@ -32,14 +32,14 @@ from pano_mvs.core.errors import PanoMvsError, UsageError
 from pano_mvs.core.files import OUTPUT_MARK, set_aside
 from pano_mvs.core.paths import exists, is_file
 from pano_mvs.core.text import one_line
-from pano_mvs.engine.blobs import DamagedBlobError
-from pano_mvs.engine.events import Observer, RunResult
+from pano_mvs.engine.cache.blobs import DamagedBlobError
+from pano_mvs.engine.cache.store import LEAST_FREE_BYTES, Store
 from pano_mvs.engine.executors.choose import make_executor
 from pano_mvs.engine.executors.protocol import Executor
-from pano_mvs.engine.memory import bytes_from_size
-from pano_mvs.engine.output_lock import output_lock
-from pano_mvs.engine.run import Run
-from pano_mvs.engine.store import LEAST_FREE_BYTES, Store
+from pano_mvs.engine.running.events import Observer, RunResult
+from pano_mvs.engine.running.memory import bytes_from_size
+from pano_mvs.engine.running.output_lock import output_lock
+from pano_mvs.engine.running.run import Run
 from pano_mvs.report.findings import doubts_of
 from pano_mvs.report.verdict import Verdict
 from pano_mvs.viewer.shown_scene import is_to_see

@@ -10,11 +10,11 @@ from pathlib import Path
 import pano_mvs
 from pano_mvs.core.errors import InputError, UsageError, WorkflowError
 from pano_mvs.core.paths import exists, is_denied, is_folder, problem_of, resolved
-from pano_mvs.engine.demands import NO_DEMANDS, Demands
-from pano_mvs.engine.params import files_of
-from pano_mvs.engine.registry import Registry
-from pano_mvs.engine.wiring import Graph, wire, wiring_problems
-from pano_mvs.engine.workflow import PartialWorkflowError, Workflow, find_workflow, load_workflow
+from pano_mvs.engine.running.options import NO_DEMANDS, Demands
+from pano_mvs.engine.stages.params import files_of
+from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.engine.workflows.wiring import Graph, wire, wiring_problems
+from pano_mvs.engine.workflows.workflow import PartialWorkflowError, Workflow, find_workflow, load_workflow
 
 CACHE_VARIABLE = "PANO_MVS_CACHE"
 

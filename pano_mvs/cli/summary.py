@@ -16,11 +16,11 @@ import numpy as np
 
 import pano_mvs
 from pano_mvs.core.paths import resolved
-from pano_mvs.engine.events import RunResult, StageSummary
 from pano_mvs.engine.executors.threads import available_threads
-from pano_mvs.engine.run import Run
-from pano_mvs.engine.wiring import Graph
-from pano_mvs.engine.workflow import Workflow
+from pano_mvs.engine.running.events import RunResult, StageSummary
+from pano_mvs.engine.running.run import Run
+from pano_mvs.engine.workflows.wiring import Graph
+from pano_mvs.engine.workflows.workflow import Workflow
 from pano_mvs.scene import Axis, Panorama, PointCloud, Poses, RangeMap, Record, Scores, TwoView
 from pano_mvs.scene.index import pair_from_name
 from pano_mvs.scene.pose_groups import split_groups

@@ -14,7 +14,7 @@ from pano_mvs.cli.judgement import add_dense_doubts
 from pano_mvs.cli.summary import summarise
 from pano_mvs.core.errors import PanoMvsError
 from pano_mvs.core.files import replacing
-from pano_mvs.engine.run import Run
+from pano_mvs.engine.running.run import Run
 from pano_mvs.report.page import write_report
 from pano_mvs.report.results import Results
 from pano_mvs.report.verdict import Verdict

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.io.preview import color_mapped, range_limits, scale_ticks
+from pano_mvs.io.images.preview import color_mapped, range_limits, scale_ticks
 
 _WIDTH, _GAP, _CAPTION, _BAR = 1024, 8, 34, 20
 _PAPER, _INK, _GREY = (255, 255, 255), (60, 60, 60), (128, 128, 128)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.report.cloud_renderer import read_pictures, write_scene
-from pano_mvs.report.kept import Kept
+from pano_mvs.report.earlier_page import Kept
 from pano_mvs.report.pictures import Picture, picture
 from pano_mvs.report.results import Results
 from pano_mvs.report.software_cloud import draw_cloud

@@ -10,9 +10,9 @@ from typing import Any
 from pano_mvs.report.camera_map import CameraMap, camera_maps, up_of
 from pano_mvs.report.cloud_pictures import CloudPictures, cloud_pictures
 from pano_mvs.report.completeness import Shares
+from pano_mvs.report.earlier_page import Kept
 from pano_mvs.report.figures import score_tables, side_by_side
 from pano_mvs.report.findings import scores_by_stage
-from pano_mvs.report.kept import Kept
 from pano_mvs.report.panoramas import Row, panorama_rows
 from pano_mvs.report.residuals import Histogram, Residuals, histogram, reprojection_residuals
 from pano_mvs.report.results import Results

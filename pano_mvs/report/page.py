@@ -17,7 +17,7 @@ from markupsafe import Markup
 from pano_mvs.core.files import write_text
 from pano_mvs.report import figures
 from pano_mvs.report.content import gather
-from pano_mvs.report.kept import Kept
+from pano_mvs.report.earlier_page import Kept
 from pano_mvs.report.results import Results
 from pano_mvs.report.verdict import Verdict
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, StoreError
 from pano_mvs.core.paths import is_file, resolved
-from pano_mvs.engine.run import Run
-from pano_mvs.engine.store import ItemRef, Store
+from pano_mvs.engine.cache.store import ItemRef, Store
+from pano_mvs.engine.running.run import Run
 from pano_mvs.scene import Panorama, PointCloud, Poses, RangeMap, Record
 
 ROLES = ("images", "pairs", "poses", "ranges", "cloud")

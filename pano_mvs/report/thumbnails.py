@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pano_mvs.report.completeness import Shares, fact_of, shares_from_fact, shares_of
-from pano_mvs.report.kept import Kept
+from pano_mvs.report.earlier_page import Kept
 from pano_mvs.report.pictures import Picture, picture, preview_panels
 from pano_mvs.report.results import Results
 from pano_mvs.report.view_cards import key_of

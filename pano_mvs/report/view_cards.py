@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.io.preview import color_mapped, range_limits, scale_ticks
+from pano_mvs.io.images.preview import color_mapped, range_limits, scale_ticks
 from pano_mvs.report.completeness import Shares, fact_of, shares_from_fact, shares_of
-from pano_mvs.report.kept import Kept
+from pano_mvs.report.earlier_page import Kept
 from pano_mvs.report.pictures import Picture, picture, preview_panels, resized
 from pano_mvs.report.results import Results
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, WEAK_CONFIDENCE

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.scene.cropping import inside_crop, placed_picture, same_shape
-from pano_mvs.scene.decoding import MASK_BYTES_PER_PIXEL, MAX_PIXELS, decoding_bytes_per_pixel
-from pano_mvs.scene.image_file import decode_image, write_png
+from pano_mvs.scene.image_files.decoding import MASK_BYTES_PER_PIXEL, MAX_PIXELS, decoding_bytes_per_pixel
+from pano_mvs.scene.image_files.image_file import decode_image, write_png
 from pano_mvs.scene.masking import decode_mask, painted_over, placed_mask
 from pano_mvs.scene.record import Axis, FilePart, Record, require
 

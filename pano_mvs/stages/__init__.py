@@ -5,10 +5,10 @@ They are registered through the entry point `pano_mvs.plugins`, like anybody's.
 
 from pano_mvs.stages.depth import sweep
 from pano_mvs.stages.evaluate import truth
-from pano_mvs.stages.export import ply, previews, ranges
-from pano_mvs.stages.export_colmap import colmap, colmap_dense, colmap_dense_init, colmap_faces, colmap_masks
-from pano_mvs.stages.export_mesh import mesh
-from pano_mvs.stages.export_nerfstudio import nerfstudio, nerfstudio_frames
+from pano_mvs.stages.exports.colmap import colmap, colmap_dense, colmap_dense_init, colmap_faces, colmap_masks
+from pano_mvs.stages.exports.files import ply, previews, ranges
+from pano_mvs.stages.exports.mesh import mesh
+from pano_mvs.stages.exports.nerfstudio import nerfstudio, nerfstudio_frames
 from pano_mvs.stages.features import orb_tangent, sift_tangent, sphorb
 from pano_mvs.stages.filters import (
     bilateral_solver,

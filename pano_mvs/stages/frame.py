@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_validator
 
-from pano_mvs.algorithms.poses.georeference import fit_gps, georeferenced_poses, scaled_by_gps
-from pano_mvs.algorithms.poses.levelling import level_poses
-from pano_mvs.algorithms.poses.metric_scale import scaled_by_baseline, scaled_by_camera_height, scaled_poses
+from pano_mvs.algorithms.poses.frame.georeference import fit_gps, georeferenced_poses, scaled_by_gps
+from pano_mvs.algorithms.poses.frame.levelling import level_poses
+from pano_mvs.algorithms.poses.frame.metric_scale import scaled_by_baseline, scaled_by_camera_height, scaled_poses
+from pano_mvs.algorithms.poses.frame.vertical import find_vertical
 from pano_mvs.algorithms.poses.unit_translations import unit_translations as without_scale_factors
-from pano_mvs.algorithms.poses.vertical import find_vertical
 from pano_mvs.api import All, Context, InputError, One, Panorama, Params, Poses, stage
-from pano_mvs.io.names import match_image_names
+from pano_mvs.io.images.names import match_image_names
 from pano_mvs.scene.pose_groups import join_groups, split_groups
 
 _UP_OF_WORLD = np.array([0.0, -1.0, 0.0])

@@ -27,8 +27,8 @@ from pano_mvs.api import (
     UsageError,
     stage,
 )
-from pano_mvs.io.names import match_image_names
-from pano_mvs.io.pose_files import read_poses
+from pano_mvs.io.images.names import match_image_names
+from pano_mvs.io.poses.files import read_poses
 
 
 @stage("pairs.exhaustive")

@@ -11,11 +11,11 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from pano_mvs.algorithms.poses.confirmation import Picture
-from pano_mvs.algorithms.poses.refine import refine_poses
+from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
+from pano_mvs.algorithms.poses.adjustment.tracks import triangulate_tracks
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
-from pano_mvs.algorithms.poses.tracks import triangulate_tracks
-from pano_mvs.algorithms.poses.verification import verify_poses
+from pano_mvs.algorithms.poses.verification.confirmation import Picture
+from pano_mvs.algorithms.poses.verification.verify_poses import verify_poses
 from pano_mvs.api import (
     All,
     Context,
@@ -30,8 +30,8 @@ from pano_mvs.api import (
     TwoView,
     stage,
 )
-from pano_mvs.io.names import match_image_names
-from pano_mvs.io.pose_files import read_groups, recorded_pictures
+from pano_mvs.io.images.names import match_image_names
+from pano_mvs.io.poses.files import read_groups, recorded_pictures
 from pano_mvs.scene.pose_groups import split_groups
 
 

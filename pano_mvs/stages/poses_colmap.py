@@ -7,8 +7,8 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from pano_mvs.algorithms.poses.colmap import extend_with_colmap, solve_colmap
-from pano_mvs.algorithms.poses.colmap_sift import colmap_sift
+from pano_mvs.algorithms.poses.colmap.sift import colmap_sift
+from pano_mvs.algorithms.poses.colmap.solver import extend_with_colmap, solve_colmap
 from pano_mvs.algorithms.poses.extension import extend_poses
 from pano_mvs.api import All, Context, Features, InputPath, Panorama, Params, Poses, TwoView, stage
 from pano_mvs.stages.poses import checked_poses, known_poses

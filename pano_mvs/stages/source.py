@@ -11,12 +11,12 @@ from pydantic import Field
 from pano_mvs.algorithms.dual_fisheye import is_dual_fisheye
 from pano_mvs.api import NOT_IN_KEY, Context, InputError, Panorama, Params, SourceItem, SourcePath, source
 from pano_mvs.core.paths import is_folder
-from pano_mvs.io.captures import PictureInfo, describe_picture, list_pictures
-from pano_mvs.io.mask_files import find_mask, require_masks
-from pano_mvs.io.names import printable_name
-from pano_mvs.scene.decoding import MASK_BYTES_PER_PIXEL, MAX_PIXELS, decoding_bytes_per_pixel
-from pano_mvs.scene.image_file import decode_image
-from pano_mvs.scene.picture_header import stated_size_of_file
+from pano_mvs.io.images.captures import PictureInfo, describe_picture, list_pictures
+from pano_mvs.io.images.mask_files import find_mask, require_masks
+from pano_mvs.io.images.names import printable_name
+from pano_mvs.scene.image_files.decoding import MASK_BYTES_PER_PIXEL, MAX_PIXELS, decoding_bytes_per_pixel
+from pano_mvs.scene.image_files.header import stated_size_of_file
+from pano_mvs.scene.image_files.image_file import decode_image
 
 
 class FolderParams(Params):

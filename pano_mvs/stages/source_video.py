@@ -16,10 +16,10 @@ from pano_mvs.algorithms.dual_fisheye import is_dual_fisheye
 from pano_mvs.algorithms.sharpness import sharpness
 from pano_mvs.api import NOT_IN_KEY, Context, FilePart, InputError, Panorama, Params, SourceItem, SourcePath, source
 from pano_mvs.core.paths import is_folder
-from pano_mvs.io.names import printable_name
-from pano_mvs.io.video import VideoInfo, describe_video, frames_between, list_videos
+from pano_mvs.io.images.names import printable_name
+from pano_mvs.io.images.video import VideoInfo, describe_video, frames_between, list_videos
 from pano_mvs.scene.files import item_stems
-from pano_mvs.scene.image_file import write_png
+from pano_mvs.scene.image_files.image_file import write_png
 from pano_mvs.stages.source import working_size
 
 _TIME_IN_NAME = re.compile(r".*_(\d{8,})ms\.png")

@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.engine.ports import Cardinality
-from pano_mvs.engine.registry import Registry
-from pano_mvs.engine.stage import StageSpec, spec_of
+from pano_mvs.engine.stages.ports import Cardinality
+from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.engine.stages.stage import StageSpec, spec_of
 from pano_mvs.geometry import pixel_from_ray, roll_panorama
 from pano_mvs.scene import Features, Panorama, RangeMap
 from pano_mvs.testing.law import Law

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.sweep.backends import SWEEP_BACKENDS
 from pano_mvs.algorithms.sweep.costs import CostWindow, PluginCost, checked_cost, plugin_cost
 from pano_mvs.core.errors import UsageError
-from pano_mvs.engine.registry import Registry
+from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.testing.law import Law
 from pano_mvs.testing.sweep_backends import CASES, agreement, cost_of_case, sweep_case
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture

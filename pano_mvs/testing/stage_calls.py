@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from pano_mvs.core.digest import digest_from_bytes, digest_from_file, digest_from_value
 from pano_mvs.core.errors import ContractError, PanoMvsError, UsageError
 from pano_mvs.core.paths import is_file, resolved
-from pano_mvs.engine.context import Context
-from pano_mvs.engine.params import Params
-from pano_mvs.engine.ports import Cardinality, Names, Port
-from pano_mvs.engine.stage import StageSpec
+from pano_mvs.engine.stages.context import Context
+from pano_mvs.engine.stages.params import Params
+from pano_mvs.engine.stages.ports import Cardinality, Names, Port
+from pano_mvs.engine.stages.stage import StageSpec
 from pano_mvs.scene import Axis, FilePart, Files, Panorama, Record
 from pano_mvs.testing.tiny_capture import TinyCapture, Variant, tiny_capture
 

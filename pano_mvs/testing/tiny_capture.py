@@ -31,7 +31,7 @@ from pano_mvs.scene import (
     Views,
 )
 from pano_mvs.scene.face_files import FaceFiles
-from pano_mvs.scene.image_file import write_png
+from pano_mvs.scene.image_files.image_file import write_png
 from pano_mvs.scene.surface_samples import SurfaceSamples
 from pano_mvs.scene.tracked_points import TrackedPoints
 from pano_mvs.testing.room import capture_poses, default_room, range_along, render

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.io.captures import describe_picture
-from pano_mvs.scene.image_file import decode_image
+from pano_mvs.io.images.captures import describe_picture
+from pano_mvs.scene.image_files.image_file import decode_image
 from pano_mvs.viewer.shown_scene import ShownCamera
 
 SMALL_WIDTH, LARGE_WIDTH = 512, 4096

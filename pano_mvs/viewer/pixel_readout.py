@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import pixel_from_ray
-from pano_mvs.io.range_files import read_confidence_png, read_range_tiff
+from pano_mvs.io.ranges.files import read_confidence_png, read_range_tiff
 from pano_mvs.viewer.shown_scene import ShownCamera
 from pano_mvs.viewer.sizes import length_text
 

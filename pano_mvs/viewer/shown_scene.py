@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.paths import is_file, is_folder, resolved
 from pano_mvs.geometry import Rigid3
-from pano_mvs.io.ply_points import PlyPoints, open_ply_points
-from pano_mvs.io.pose_files import read_poses
+from pano_mvs.io.clouds.ply_points import PlyPoints, open_ply_points
+from pano_mvs.io.poses.files import read_poses
 from pano_mvs.scene.files import group_file
 
 FloatArray = NDArray[np.float64]

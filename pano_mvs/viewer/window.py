@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from pano_mvs.viewer.cloud_actor import CloudActor
 from pano_mvs.viewer.cloud_colors import POINT_BUDGET, color_cloud, drawn_cloud
-from pano_mvs.viewer.hands import Hands
+from pano_mvs.viewer.controller import Tour, TourState
+from pano_mvs.viewer.input_events import Hands
 from pano_mvs.viewer.overlay import Overlay
 from pano_mvs.viewer.panorama_pictures import LARGE_WIDTH, SMALL_WIDTH, sphere_picture
 from pano_mvs.viewer.sizes import bar_length, bar_text, length_text
 from pano_mvs.viewer.sphere_actors import rims_actor, sphere_actor
-from pano_mvs.viewer.tour import Tour, TourState
 from pano_mvs.viewer.viewpoint import Viewpoint
 
 TEXTURED = 64

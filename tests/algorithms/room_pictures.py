@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Features, TwoView
 from pano_mvs.testing.room import capture_poses, default_room, range_along, render
-from tests.algorithms.aliased_capture import same_matches, view_of
-from tests.algorithms.synthetic_capture import features_from_bearings, noisy_bearings
+from tests.algorithms.poses.aliased_capture import same_matches, view_of
+from tests.algorithms.poses.synthetic_capture import features_from_bearings, noisy_bearings
 
 Vector = tuple[float, float, float]
 

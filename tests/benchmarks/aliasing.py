@@ -1,10 +1,11 @@
 """Poses where structure repeats, against COLMAP's own: `python -m tests.benchmarks.aliasing --captures 50 --width 768`.
 
-Captures of places in which floors, columns, doors or whole rooms repeat are drawn (`pano_mvs.testing.repeats`) and
-rendered. For each method and capture the table has the number of cameras that are registered, of those that are right
-(rotation within 1°, centre within 2 % of the capture's extent, after alignment to the largest consistent subset), of
-those that are wrong, of those that are wrong without being doubted, and CPU-seconds. `--colmap` adds COLMAP on its own:
-EQUIRECTANGULAR cameras, its SIFT, its defaults. The folder `--work` keeps pictures and what COLMAP made of them.
+Captures of places in which floors, columns, doors or whole rooms repeat are drawn
+(`pano_mvs.testing.repeating.places`) and rendered. For each method and capture the table has the number of cameras
+that are registered, of those that are right (rotation within 1°, centre within 2 % of the capture's extent, after
+alignment to the largest consistent subset), of those that are wrong, of those that are wrong without being doubted,
+and CPU-seconds. `--colmap` adds COLMAP on its own: EQUIRECTANGULAR cameras, its SIFT, its defaults. The folder
+`--work` keeps pictures and what COLMAP made of them.
 """
 
 from __future__ import annotations
@@ -24,15 +25,16 @@ from typing import Any
 import numpy as np
 
 from pano_mvs.algorithms.metrics.placements import judge_placements
-from pano_mvs.algorithms.poses.confirmation import Picture
-from pano_mvs.algorithms.poses.refine import refine_poses
+from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
-from pano_mvs.algorithms.poses.verification import verify_poses
+from pano_mvs.algorithms.poses.verification.confirmation import Picture
+from pano_mvs.algorithms.poses.verification.verify_poses import verify_poses
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Features, Poses, TwoView
-from pano_mvs.scene.image_file import decode_image, write_png
-from pano_mvs.testing import drawings, fittings, paint, prints, room, surfaces
-from pano_mvs.testing.repeats import draw_arguments, draw_capture
+from pano_mvs.scene.image_files.image_file import decode_image, write_png
+from pano_mvs.testing import paint, room, surfaces
+from pano_mvs.testing.repeating import drawings, fittings, prints
+from pano_mvs.testing.repeating.places import draw_arguments, draw_capture
 from pano_mvs.testing.scenes import Scene
 from tests.benchmarks.poses import MAPPERS, SEED, Cameras, Pictures, matched, native
 

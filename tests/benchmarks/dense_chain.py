@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.cli.session import open_session
-from pano_mvs.engine.context import Context
-from pano_mvs.engine.ports import Cardinality, Port
-from pano_mvs.engine.stage import INDEX_PORT
-from pano_mvs.engine.wiring import Graph
-from pano_mvs.engine.workflow import StageEntry
+from pano_mvs.engine.stages.context import Context
+from pano_mvs.engine.stages.ports import Cardinality, Port
+from pano_mvs.engine.stages.stage import INDEX_PORT
+from pano_mvs.engine.workflows.wiring import Graph
+from pano_mvs.engine.workflows.workflow import StageEntry
 from pano_mvs.scene import Axis, Panorama, Pose, Poses, RangeMap, Record, Views
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
 from tests.benchmarks.captures import Capture

@@ -17,12 +17,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from pano_mvs.cli.session import open_session
-from pano_mvs.engine.events import RunResult
+from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.processes import ProcessExecutor
 from pano_mvs.engine.executors.protocol import Executor
 from pano_mvs.engine.executors.serial import SerialExecutor
-from pano_mvs.engine.run import Run
-from pano_mvs.engine.store import Store
+from pano_mvs.engine.running.events import RunResult
+from pano_mvs.engine.running.run import Run
 from tests.engine.toy import HELPER, PLUGIN
 
 UNITS = 5000

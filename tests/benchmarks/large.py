@@ -21,10 +21,10 @@ import numpy as np
 
 from pano_mvs.algorithms.matching.neighbours import retrieval_pairs
 from pano_mvs.algorithms.matching.vlad import vlad_descriptor
-from pano_mvs.algorithms.poses.refine import refine_poses
+from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.geometry import similarity_from_points
-from tests.algorithms.synthetic_path import path_capture, path_two_views
+from tests.algorithms.poses.synthetic_path import path_capture, path_two_views
 
 Result = TypeVar("Result")
 

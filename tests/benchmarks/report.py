@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from pano_mvs.engine.store import Store
+from pano_mvs.engine.cache.store import Store
 from pano_mvs.geometry import Rigid3
-from pano_mvs.io.preview import write_preview
+from pano_mvs.io.images.preview import write_preview
 from pano_mvs.report import write_report
 from pano_mvs.report.results import Results
 from pano_mvs.scene import Poses, RangeMap

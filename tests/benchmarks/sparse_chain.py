@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from pano_mvs.cli.session import open_session
-from pano_mvs.engine.context import Context
-from pano_mvs.engine.ports import Cardinality
-from pano_mvs.engine.workflow import StageEntry
+from pano_mvs.engine.stages.context import Context
+from pano_mvs.engine.stages.ports import Cardinality
+from pano_mvs.engine.workflows.workflow import StageEntry
 from pano_mvs.scene import Features, Panorama, Poses, TwoView
 from tests.benchmarks.captures import Capture
 

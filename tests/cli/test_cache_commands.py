@@ -18,11 +18,11 @@ from pano_mvs.cli.app import app
 from pano_mvs.core.digest import digest_from_bytes
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.files import temporary_prefix
-from pano_mvs.engine.blobs import BlobStore
-from pano_mvs.engine.store import Store
-from pano_mvs.engine.upkeep import collect
+from pano_mvs.engine.cache.blobs import BlobStore
+from pano_mvs.engine.cache.maintenance import collect
+from pano_mvs.engine.cache.store import Store
 from tests.engine.conftest import Toy, settle, toy  # noqa: F401 (a fixture)
-from tests.engine.test_run import ALL_UNITS
+from tests.engine.running.test_run import ALL_UNITS
 from tests.stress.captures import deliverables
 
 Cache = Callable[..., tuple[int, str]]
@@ -200,7 +200,7 @@ def test_run_that_did_not_end_keeps_what_its_folder_had(toy: Toy, cache: Cache) 
     run(toy, "other")
     session = toy.session("scaled.by=5")
     store = Store(session.store_root)
-    from pano_mvs.engine.run import workflow_id
+    from pano_mvs.engine.running.run import workflow_id
 
     store.runs.remember(workflow_id(session.workflow), {}, workflow="toy", out=toy.folder / "mine", finished=False)
     cache("gc", "--delete", "--unused", "0s")
@@ -329,7 +329,7 @@ def test_verification_while_a_run_writes_reports_nothing_wrong(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Units that end after the blobs were checked were told to be incomplete."""
-    from pano_mvs.engine import upkeep
+    from pano_mvs.engine.cache import maintenance as upkeep
 
     files, waiting = upkeep._files, [True]
 
@@ -347,7 +347,7 @@ def test_verification_while_a_run_writes_reports_nothing_wrong(
 
 def test_file_that_goes_while_it_is_looked_at_is_no_error(toy: Toy, cache: Cache) -> None:  # noqa: F811
     toy.run()
-    from pano_mvs.engine import upkeep
+    from pano_mvs.engine.cache import maintenance as upkeep
 
     gone = str(toy.folder / "cache" / "records" / "gone")
     assert upkeep._stat(gone) is None
@@ -361,7 +361,7 @@ def test_blob_that_a_run_came_to_use_is_not_swept(toy: Toy, monkeypatch: pytest.
     shutil.rmtree(root / "runs")
     make_old(root)
     store = Store(root)
-    from pano_mvs.engine import upkeep
+    from pano_mvs.engine.cache import maintenance as upkeep
 
     delete = upkeep._delete
 
@@ -455,7 +455,7 @@ def _refuse_writes_below(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_same_bytes_under_two_names_are_each_checked(tmp_path: Path) -> None:
     """A user's picture that had been checked stood for the store's own copy of it."""
-    from pano_mvs.engine.blobs import DamagedBlobError
+    from pano_mvs.engine.cache.blobs import DamagedBlobError
     from pano_mvs.scene import FilePart
 
     (tmp_path / "a.txt").write_bytes(b"same")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.conftest import Command, run_json
-from tests.cli.test_workflows import known
+from tests.cli.workflows.test_workflows import known
 
 SAD = ("--set", "depth_sad.planes=32")
 ALIKE = ("--set", "depth.near=0.4", "--set", "depth.far=6", "--set", "depth_sad.near=0.4", "--set", "depth_sad.far=6")

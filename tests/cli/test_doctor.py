@@ -21,7 +21,7 @@ from pano_mvs.cli.doctor.plugins import plugin_findings
 from pano_mvs.cli.doctor.probes import Outcome, library_findings, run_probe
 from pano_mvs.cli.session import presets_folder
 from pano_mvs.core.kernel_cache import kernel_cache_folder
-from pano_mvs.engine.registry import Registry
+from pano_mvs.engine.stages.registry import Registry
 from tests.cli.conftest import Command
 from tests.permissions import permissions_hold
 
@@ -198,7 +198,7 @@ def test_plugins_that_fail_clash_or_are_not_there(tmp_path: Path, monkeypatch: p
     folder.mkdir()
     (folder / "bad.py").write_text('from pano_mvs.api import stage\n1 / 0\n@stage("filters.mine")\ndef f(): ...\n')
     environment = {"PANO_MVS_PLUGINS": os.pathsep.join([str(folder), str(tmp_path / "gone")])}
-    monkeypatch.setattr("pano_mvs.engine.registry.user_plugin_folders", lambda: [folder])
+    monkeypatch.setattr("pano_mvs.engine.stages.registry.user_plugin_folders", lambda: [folder])
     found = by_what(plugin_findings(Registry.installed(), presets_folder(), environment))
     bad = found[str(folder / "bad.py")]
     assert "ZeroDivisionError" in bad.detail

@@ -11,8 +11,8 @@ import pillow_heif
 from PIL import Image
 
 from tests.cli.conftest import Command, run_json
-from tests.io.pictures import app1, exif
-from tests.io.videos import counted, write_video
+from tests.io.images.pictures import app1, exif
+from tests.io.images.videos import counted, write_video
 
 LOOK = "pano_mvs: 1\nstages: {images: {use: source.folder, path: photos}}\n"
 FILM = """

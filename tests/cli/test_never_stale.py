@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from pano_mvs.testing.tiny_capture import tiny_capture
-from tests.engine.package_copy import copied_package
+from tests.engine.code.package_copy import copied_package
 
 WORKFLOW = """\
 pano_mvs: 1

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pano_mvs.engine.publish import Publisher
+from pano_mvs.engine.running.publish import Publisher
 from pano_mvs.testing.room import capture_poses, default_room, write_capture
 from tests.cli.conftest import Command, run_json
 from tests.engine.conftest import Toy, toy  # noqa: F401 (a fixture)

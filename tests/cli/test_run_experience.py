@@ -21,7 +21,7 @@ from pano_mvs.cli.progress import ProgressBars
 from pano_mvs.cli.run_command import interrupted_by_termination
 from pano_mvs.core.processes import start_of
 from tests.engine.conftest import Toy, toy  # noqa: F401 (a fixture)
-from tests.engine.test_resume import deliverables, finished_records
+from tests.engine.running.test_resume import deliverables, finished_records
 from tests.processes import heed_interrupts
 
 ON_POSIX = pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")

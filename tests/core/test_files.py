@@ -13,7 +13,7 @@ import pytest
 from pano_mvs.core import files
 from pano_mvs.core.errors import StoreError
 from pano_mvs.core.files import clear_abandoned, replacing, temporary_prefix, write_text
-from pano_mvs.engine.store import Store
+from pano_mvs.engine.cache.store import Store
 from tests.engine.conftest import Toy, toy  # noqa: F401 (a fixture)
 
 ON_POSIX = pytest.mark.skipif(os.name != "posix", reason="elsewhere only age tells whether a process is gone")

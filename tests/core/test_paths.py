@@ -20,8 +20,12 @@ RAISING = {"is_file", "is_dir", "exists", "is_symlink", "resolve", "expanduser",
            "home", "cwd"}  # fmt: skip
 # `Resolver.resolve` resolves a stage, `blobs.exists` takes a reference, the entries of os.scandir know what they are;
 # what a plugin's code is, is asked where any error is the plugin's.
-NOT_OF_PATHS = {("engine/resolve.py", "resolve"), ("engine/upkeep.py", "is_file"), ("engine/upkeep.py", "is_dir")}
-EXEMPT = {"core/paths.py", "engine/code_digest.py"}
+NOT_OF_PATHS = {
+    ("engine/planning/resolve.py", "resolve"),
+    ("engine/cache/maintenance.py", "is_file"),
+    ("engine/cache/maintenance.py", "is_dir"),
+}
+EXEMPT = {"core/paths.py", "engine/code/plugin_digest.py"}
 
 
 @pytest.fixture(params=["denied", "long", "circle", "null"])
@@ -79,7 +83,9 @@ def test_nothing_else_in_the_package_asks_about_paths() -> None:
             if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
                 continue
             called, of = node.func.attr, ast.unparse(node.func.value)
-            is_of_blobs = called == "exists" and (of.endswith("blobs") or (of, name) == ("self", "engine/blobs.py"))
+            is_of_blobs = called == "exists" and (
+                of.endswith("blobs") or (of, name) == ("self", "engine/cache/blobs.py")
+            )
             if called in RAISING and not is_of_blobs and (name, called) not in NOT_OF_PATHS:
                 found.append(f"{name}:{node.lineno}: {of}.{called}()")
     assert found == []
@@ -98,7 +104,7 @@ def test_commands_start_where_the_home_folder_may_not_be_searched(tmp_path: Path
     code = """
 import os
 import pano_mvs.algorithms
-from pano_mvs.engine.plugin_files import plugin_files_in, user_plugin_folders
+from pano_mvs.engine.stages.plugin_files import plugin_files_in, user_plugin_folders
 os.makedirs(os.environ["NUMBA_CACHE_DIR"])
 print([plugin_files_in(folder) for folder in user_plugin_folders()], os.environ["NUMBA_CACHE_DIR"])
 """

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from pano_mvs.engine.store import Store
-from pano_mvs.engine.upkeep import collect, verify
+from pano_mvs.engine.cache.maintenance import collect, verify
+from pano_mvs.engine.cache.store import Store
 from tests.engine.conftest import Toy
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from pano_mvs.cli.session import open_session
-from pano_mvs.engine.run import Run
-from pano_mvs.engine.store import Store
+from pano_mvs.engine.cache.store import Store
+from pano_mvs.engine.running.run import Run
 from tests.benchmarks.plan import PLUGIN, WORKFLOW
 from tests.engine.conftest import settle
 

@@ -6,9 +6,9 @@ import pytest
 
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.geometry import Rigid3
-from pano_mvs.io.ply import read_ply, write_ply
-from pano_mvs.io.preview import color_mapped, range_limits, scale_ticks, write_preview
-from pano_mvs.io.range_files import read_confidence_png, read_range_tiff, write_confidence_png, write_range_tiff
+from pano_mvs.io.clouds.ply import read_ply, write_ply
+from pano_mvs.io.images.preview import color_mapped, range_limits, scale_ticks, write_preview
+from pano_mvs.io.ranges.files import read_confidence_png, read_range_tiff, write_confidence_png, write_range_tiff
 from pano_mvs.scene import PointCloud
 from pano_mvs.testing.room import default_room, render
 

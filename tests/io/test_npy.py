@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.io.npy import read_npy, read_npz
+from pano_mvs.io.ranges.npy import read_npy, read_npz
 
 
 def header(shape: str, descr: str = "'<f4'") -> bytes:

@@ -11,7 +11,7 @@ import pytest
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import pixel_from_ray, rotvec_from_rotation
-from pano_mvs.io.pose_files import read_poses
+from pano_mvs.io.poses.files import read_poses
 from pano_mvs.testing.room import capture_poses
 
 POSES = dict(zip(("1.jpg", "2.jpg", "10.jpg"), capture_poses(3, seed=5), strict=True))

@@ -7,7 +7,7 @@ import pytest
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3, quat_wxyz_from_rotation
-from pano_mvs.io.pose_files import read_poses
+from pano_mvs.io.poses.files import read_poses
 from pano_mvs.testing.room import capture_poses
 
 POSES = dict(zip(("a/1.jpg", "a/2.jpg", "a/10.jpg"), capture_poses(3, seed=5), strict=True))

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.io.pose_files import read_poses
+from pano_mvs.io.poses.files import read_poses
 
 IDENTITY = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
 

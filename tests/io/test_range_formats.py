@@ -13,15 +13,15 @@ from pydantic import ValidationError
 
 from pano_mvs.api import Context, RangeMap, UsageError
 from pano_mvs.core.errors import InputError
-from pano_mvs.io import exr
-from pano_mvs.io.range_files import (
+from pano_mvs.io.images import exr
+from pano_mvs.io.ranges.files import (
     read_normals,
     read_range_png,
     write_normals_png,
     write_normals_tiff,
     write_range_png,
 )
-from pano_mvs.stages.export import RangesParams, ranges
+from pano_mvs.stages.exports.files import RangesParams, ranges
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
 
 SIZE_HW = 24, 48

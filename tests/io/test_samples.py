@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.geometry import pixel_from_ray, ray_grid
-from pano_mvs.io.captures import describe_picture, list_pictures
+from pano_mvs.io.images.captures import describe_picture, list_pictures
 from pano_mvs.io.truth import read_truth
 
 SAMPLES = Path(__file__).parents[2] / "workflows" / "samples"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.poses.bundle import Bundle
+from pano_mvs.algorithms.poses.adjustment.bundle import Bundle
 from pano_mvs.geometry import rotation_from_rotvec
 
 FloatArray = NDArray[np.float64]

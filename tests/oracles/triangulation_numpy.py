@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.poses.points import ROUNDS, Triangulated
+from pano_mvs.algorithms.poses.adjustment.points import ROUNDS, Triangulated
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int32]

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pano_mvs.engine.store import Store
+from pano_mvs.engine.cache.store import Store
 from pano_mvs.geometry import Rigid3
-from pano_mvs.io.preview import write_preview
+from pano_mvs.io.images.preview import write_preview
 from pano_mvs.report.results import Results
 from pano_mvs.scene import Panorama, PointCloud, Poses, RangeMap, TwoView
 from pano_mvs.scene.index import pair_name

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.poses.levelling import level_poses
+from pano_mvs.algorithms.poses.frame.levelling import level_poses
 from pano_mvs.report.camera_map import camera_maps, up_of
 from pano_mvs.scene import Poses
 

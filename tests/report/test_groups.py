@@ -11,8 +11,8 @@ from pano_mvs.cli.summary import nearest_pair
 from pano_mvs.report import write_report
 from pano_mvs.report.cloud_pictures import cloud_pictures
 from pano_mvs.report.content import pose_groups
+from pano_mvs.report.earlier_page import Kept
 from pano_mvs.report.findings import findings, pictures_between
-from pano_mvs.report.kept import Kept
 from pano_mvs.report.results import Results
 from pano_mvs.report.verdict import verdict
 from pano_mvs.scene import PointCloud, Poses
@@ -47,7 +47,7 @@ def rooms(tmp_path, tiny: TinyCapture) -> tuple[dict, Results]:
 
 
 def _store(folder):
-    from pano_mvs.engine.store import Store
+    from pano_mvs.engine.cache.store import Store
 
     return Store(folder / "cache")
 

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from pano_mvs.engine.store import Store, UnitRecord
+from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.report import write_report
 from pano_mvs.report.cloud_pictures import RENDERER_VARIABLE, cloud_pictures
-from pano_mvs.report.kept import Kept
+from pano_mvs.report.earlier_page import Kept
 from pano_mvs.report.results import Results
 from tests.report.conftest import summary_of
 from tests.report.html_page import Page

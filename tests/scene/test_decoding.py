@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.scene import decoding
-from pano_mvs.scene.decoding import decode_picture
-from pano_mvs.scene.image_file import decode_image
+from pano_mvs.scene.image_files import decoding
+from pano_mvs.scene.image_files.decoding import decode_picture
+from pano_mvs.scene.image_files.header import stated_size, stated_size_of_file
+from pano_mvs.scene.image_files.image_file import decode_image
 from pano_mvs.scene.masking import decode_mask
-from pano_mvs.scene.picture_header import stated_size, stated_size_of_file
-from tests.io.pictures import png_chunk
+from tests.io.images.pictures import png_chunk
 
 NOISE = np.random.default_rng(0).integers(0, 256, (64, 128, 3)).astype(np.uint8)
 PICTURE = cv2.resize(NOISE, (256, 128), interpolation=cv2.INTER_CUBIC)

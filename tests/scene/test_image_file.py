@@ -14,8 +14,8 @@ import pytest
 from PIL import Image
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.scene.image_file import decode_image
-from tests.io.pictures import app1, by_pillow, exif
+from pano_mvs.scene.image_files.image_file import decode_image
+from tests.io.images.pictures import app1, by_pillow, exif
 
 SIZE = (32, 64)
 SMOOTH = cv2.resize(np.random.default_rng(1).integers(0, 256, (4, 8, 3)).astype(np.uint8), SIZE[::-1])

@@ -26,19 +26,19 @@ from pano_mvs.algorithms.matching.preemptive import hopeless_reason
 from pano_mvs.algorithms.matching.vlad import vlad_descriptor
 from pano_mvs.algorithms.mesh.poisson import solve_poisson
 from pano_mvs.algorithms.patchmatch.refine import refine_range
-from pano_mvs.algorithms.poses.colmap import solve_colmap
-from pano_mvs.algorithms.poses.colmap_sift import colmap_sift
+from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
+from pano_mvs.algorithms.poses.adjustment.tracks import triangulate_tracks
+from pano_mvs.algorithms.poses.colmap.sift import colmap_sift
+from pano_mvs.algorithms.poses.colmap.solver import solve_colmap
 from pano_mvs.algorithms.poses.extension import extend_poses
-from pano_mvs.algorithms.poses.georeference import fit_gps
-from pano_mvs.algorithms.poses.levelling import level_poses
-from pano_mvs.algorithms.poses.refine import refine_poses
+from pano_mvs.algorithms.poses.frame.georeference import fit_gps
+from pano_mvs.algorithms.poses.frame.levelling import level_poses
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
-from pano_mvs.algorithms.poses.tracks import triangulate_tracks
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.two_view.verification import verify_pair
 from pano_mvs.algorithms.views import select_views
-from pano_mvs.engine.registry import Registry
-from pano_mvs.io.thinning import Selection
+from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.io.clouds.thinning import Selection
 
 FUNCTIONS = {
     "features.sift_tangent": extract_sift,
@@ -51,12 +51,12 @@ FUNCTIONS = {
     "global.vlad": vlad_descriptor,
     "poses.scaled_translation": solve_scaled_translation,
     "poses.colmap": solve_colmap,
-    "poses.colmap_sift": colmap_sift,
+    "poses.colmap.sift": colmap_sift,
     "poses.extend": extend_poses,
     "poses.refine": refine_poses,
     "poses.triangulate": triangulate_tracks,
     "poses.level": level_poses,
-    "poses.scale": fit_gps,
+    "poses.placement.scale": fit_gps,
     "depth.patchmatch": refine_range,
     "filters.median": median_range,
     "filters.gaussian": gaussian_range,

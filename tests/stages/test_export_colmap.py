@@ -10,13 +10,13 @@ import numpy as np
 import pycolmap
 import pytest
 
-from pano_mvs.engine.ports import Names
+from pano_mvs.engine.stages.ports import Names
 from pano_mvs.geometry import angle_between, ray_grid
-from pano_mvs.io.colmap_maps import read_colmap_map
+from pano_mvs.io.colmap.maps import read_colmap_map
 from pano_mvs.scene import FilePart, Files, Panorama, Poses, RangeMap
 from pano_mvs.scene.face_files import FaceFiles
-from pano_mvs.scene.image_file import decode_image, write_png
-from pano_mvs.stages.export_colmap import (
+from pano_mvs.scene.image_files.image_file import decode_image, write_png
+from pano_mvs.stages.exports.colmap import (
     DenseInitParams,
     DenseParams,
     FacesParams,

@@ -14,12 +14,12 @@ import pytest
 from scipy.spatial import cKDTree
 
 from pano_mvs.api import Context, FilePart, InputError, Panorama, PointCloud, Poses, RangeMap
-from pano_mvs.engine.publish import Publisher
-from pano_mvs.engine.store import Store
-from pano_mvs.io.nerfstudio_frames import NerfstudioFrames
-from pano_mvs.io.ply import read_ply
-from pano_mvs.io.pose_files import read_poses
-from pano_mvs.stages.export_nerfstudio import (
+from pano_mvs.engine.cache.store import Store
+from pano_mvs.engine.running.publish import Publisher
+from pano_mvs.io.clouds.ply import read_ply
+from pano_mvs.io.nerfstudio.frames import NerfstudioFrames
+from pano_mvs.io.poses.files import read_poses
+from pano_mvs.stages.exports.nerfstudio import (
     NerfstudioFramesParams,
     NerfstudioParams,
     frames_memory_bytes,

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.poses.colmap_sift import colmap_sift
-from pano_mvs.engine.context import Context
-from pano_mvs.engine.registry import Registry
+from pano_mvs.algorithms.poses.colmap.sift import colmap_sift
+from pano_mvs.engine.stages.context import Context
+from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.geometry import pixel_from_ray
 from pano_mvs.scene import PointCloud, Pose, RangeMap
 from pano_mvs.stages.fusion import VoteParams, vote

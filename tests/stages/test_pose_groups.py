@@ -11,21 +11,20 @@ import numpy as np
 import pycolmap
 import pytest
 
-from pano_mvs.algorithms.poses.gauge import moved_poses
+from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.core.errors import InputError, UsageError
-from pano_mvs.engine.context import Context
-from pano_mvs.engine.ports import Names
+from pano_mvs.engine.stages.context import Context
+from pano_mvs.engine.stages.ports import Names
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec
-from pano_mvs.io.nerfstudio_frames import NerfstudioFrame, NerfstudioFrames
-from pano_mvs.io.ply import read_ply
+from pano_mvs.io.clouds.ply import read_ply
+from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, NerfstudioFrames
 from pano_mvs.scene import Files, Panorama, PointCloud, Pose, Poses, RangeMap
 from pano_mvs.scene.face_files import FaceFiles
 from pano_mvs.scene.pose_groups import join_groups, split_groups, with_cameras
 from pano_mvs.scene.surface_samples import SurfaceSamples
 from pano_mvs.stages.depth import SweepParams, sweep
 from pano_mvs.stages.evaluate import TruthParams, truth
-from pano_mvs.stages.export import PlyParams, ply
-from pano_mvs.stages.export_colmap import (
+from pano_mvs.stages.exports.colmap import (
     DenseInitParams,
     DenseParams,
     ModelParams,
@@ -33,8 +32,9 @@ from pano_mvs.stages.export_colmap import (
     colmap_dense,
     colmap_dense_init,
 )
-from pano_mvs.stages.export_mesh import MeshParams, mesh
-from pano_mvs.stages.export_nerfstudio import NerfstudioParams, nerfstudio
+from pano_mvs.stages.exports.files import PlyParams, ply
+from pano_mvs.stages.exports.mesh import MeshParams, mesh
+from pano_mvs.stages.exports.nerfstudio import NerfstudioParams, nerfstudio
 from pano_mvs.stages.filters import ConsistencyParams, consistency
 from pano_mvs.stages.frame import BaselineParams, LevelParams, ScaleParams, level, scale
 from pano_mvs.stages.fusion import VoteParams, vote

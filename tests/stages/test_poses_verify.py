@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.api import Features, GateError, Panorama, Poses, TwoView
-from pano_mvs.engine.context import Context
+from pano_mvs.engine.stages.context import Context
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.stages.poses import ScaledTranslationParams, VerifyParams, scaled_translation, verify
 from pano_mvs.testing.tiny_capture import TinyCapture, Variant, tiny_capture

@@ -14,7 +14,7 @@ import pytest
 from pano_mvs.api import FilePart, SourceItem
 from pano_mvs.core.digest import digest_from_file
 from pano_mvs.core.errors import ChangedFileError, InputError
-from pano_mvs.engine.context import Context
+from pano_mvs.engine.stages.context import Context
 from pano_mvs.scene import Panorama
 from pano_mvs.stages.source import FolderParams, folder, list_folder
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.engine.context import Context
-from pano_mvs.io.video import describe_video, frames_between
+from pano_mvs.engine.stages.context import Context
+from pano_mvs.io.images.video import describe_video, frames_between
 from pano_mvs.scene import Panorama
-from pano_mvs.scene.image_file import decode_image
+from pano_mvs.scene.image_files.image_file import decode_image
 from pano_mvs.stages.source_video import VideoParams, list_frames, video
-from tests.io.videos import Picture, counted, number_of, retimed, write_video
+from tests.io.images.videos import Picture, counted, number_of, retimed, write_video
 
 
 def params(path: Path | list[Path], **more: Any) -> VideoParams:

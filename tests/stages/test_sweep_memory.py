@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pano_mvs.engine.stage import spec_of
+from pano_mvs.engine.stages.stage import spec_of
 from pano_mvs.scene import FilePart, Panorama, RangeMap
 from pano_mvs.stages.depth import SweepParams, sweep, sweep_memory_bytes
 from pano_mvs.stages.filters import bilateral_solver, consistency, fill, planes

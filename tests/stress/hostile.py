@@ -26,9 +26,9 @@ from pathlib import Path
 
 from pano_mvs.cli.session import open_session
 from pano_mvs.core.errors import PanoMvsError
+from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.serial import SerialExecutor
-from pano_mvs.engine.run import Run
-from pano_mvs.engine.store import Store
+from pano_mvs.engine.running.run import Run
 from tests.stress.hostile_crafted import crafted
 from tests.stress.hostile_samples import Sample, samples
 

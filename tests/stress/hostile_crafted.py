@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from tests.io.pictures import png_chunk
+from tests.io.images.pictures import png_chunk
 
 if TYPE_CHECKING:
     from tests.stress.hostile_samples import Sample

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import pytest
 
-from pano_mvs.engine.registry import Registry
-from pano_mvs.io.nerfstudio_frames import NerfstudioFrame, NerfstudioFrames
+from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, NerfstudioFrames
 from pano_mvs.testing.conformance import Law, stage_laws
-from tests.io.videos import tiny_video
+from tests.io.images.videos import tiny_video
 
 SETTINGS = {
     "poses.from_model": {"path": "{capture}/truth/poses.json"},
     "poses.extend": {"path": "{capture}/truth/poses.json"},
-    "poses.scale": {"factor": 2.0},
+    "poses.placement.scale": {"factor": 2.0},
     "source.video": {"path": str(tiny_video())},
 }
 FRAME = NerfstudioFrame(
@@ -21,7 +21,7 @@ FRAME = NerfstudioFrame(
 INPUTS = {
     "export.nerfstudio": {"frames": {f"{idx:03d}.png": NerfstudioFrames({}, frames=(FRAME,)) for idx in range(4)}},
 }
-SIZES_HW = {"poses.colmap_sift": (96, 192)}
+SIZES_HW = {"poses.colmap.sift": (96, 192)}
 
 
 def laws() -> list[Law]:

@@ -9,11 +9,11 @@ import pytest
 from numpy.lib.recfunctions import drop_fields
 
 from pano_mvs.core.errors import InputError, UsageError
-from pano_mvs.io.ply import write_ply
-from pano_mvs.io.ply_points import open_ply_points
-from pano_mvs.io.preview import write_preview
+from pano_mvs.io.clouds.ply import write_ply
+from pano_mvs.io.clouds.ply_points import open_ply_points
+from pano_mvs.io.images.preview import write_preview
 from pano_mvs.scene import PointCloud
-from pano_mvs.scene.image_file import decode_image
+from pano_mvs.scene.image_files.image_file import decode_image
 from pano_mvs.viewer.cloud_colors import DrawnCloud, color_cloud, drawn_cloud
 from pano_mvs.viewer.panorama_pictures import LARGE_WIDTH, SMALL_WIDTH, sphere_picture
 from pano_mvs.viewer.shown_scene import has_faces, is_to_see, open_scene

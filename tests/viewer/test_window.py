@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from pano_mvs.geometry import Rigid3
-from pano_mvs.io.ply_mesh import write_ply_mesh
+from pano_mvs.io.clouds.ply_mesh import write_ply_mesh
 from pano_mvs.viewer.cloud_colors import drawn_cloud
+from pano_mvs.viewer.controller import Tour
 from pano_mvs.viewer.display import quiet_vtk, require_drawing
 from pano_mvs.viewer.shown_scene import open_scene
 from pano_mvs.viewer.sizes import box_of
-from pano_mvs.viewer.tour import Tour
 from pano_mvs.viewer.viewpoint import Viewpoint
 from pano_mvs.viewer.window import TEXTURED, SceneWindow
 from tests.viewer.scenes import HALF, turned_poses, world_color, write_output

@@ -10,7 +10,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import minimum_spanning_tree
 
 from pano_mvs.algorithms.matching.pairs import sequential_pairs
-from pano_mvs.algorithms.poses.geodesy import local_from_lla
+from pano_mvs.algorithms.poses.frame.geodesy import local_from_lla
 from pano_mvs.core.errors import UsageError
 from pano_mvs.scene import GlobalDescriptor, Pairs
 

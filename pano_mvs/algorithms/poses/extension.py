@@ -6,11 +6,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from pano_mvs.algorithms.poses.reasons import why_no_pair
-from pano_mvs.algorithms.poses.registration import GrowingModel
-from pano_mvs.algorithms.poses.resection import refine_resection
-from pano_mvs.algorithms.poses.tracks import build_tracks, poses_with_points
-from pano_mvs.algorithms.poses.view_graph import consistent_edges
+from pano_mvs.algorithms.poses.adjustment.tracks import build_tracks, poses_with_points
+from pano_mvs.algorithms.poses.placement.reasons import why_no_pair
+from pano_mvs.algorithms.poses.placement.registration import GrowingModel
+from pano_mvs.algorithms.poses.placement.resection import refine_resection
+from pano_mvs.algorithms.poses.placement.view_graph import consistent_edges
 from pano_mvs.scene import Features, Poses, TwoView
 
 _ROUNDS = 3

@@ -6,15 +6,15 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from pano_mvs.algorithms.poses.confirmation import Confirmation, Picture
-from pano_mvs.algorithms.poses.gauge import normalised_poses
-from pano_mvs.algorithms.poses.growth import GrownModel, grown_models
-from pano_mvs.algorithms.poses.pair_weights import weighed_by_images
-from pano_mvs.algorithms.poses.placed_model import pairs_of
-from pano_mvs.algorithms.poses.reasons import why_no_pair
-from pano_mvs.algorithms.poses.scale import ScaleEstimator
-from pano_mvs.algorithms.poses.verification import poses_of, with_arbitration
-from pano_mvs.algorithms.poses.view_graph import connected_groups
+from pano_mvs.algorithms.poses.frame.gauge import normalised_poses
+from pano_mvs.algorithms.poses.placement.growth import GrownModel, grown_models
+from pano_mvs.algorithms.poses.placement.placed_model import pairs_of
+from pano_mvs.algorithms.poses.placement.reasons import why_no_pair
+from pano_mvs.algorithms.poses.placement.scale import ScaleEstimator
+from pano_mvs.algorithms.poses.placement.view_graph import connected_groups
+from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
+from pano_mvs.algorithms.poses.verification.pair_weights import weighed_by_images
+from pano_mvs.algorithms.poses.verification.verify_poses import poses_of, with_arbitration
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import join_groups
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from pano_mvs.cli.doctor.finding import Finding
 from pano_mvs.core.paths import children, is_folder
-from pano_mvs.engine.plugin_files import PLUGINS_VARIABLE, plugin_files_in, user_plugin_folders
-from pano_mvs.engine.registry import Registry
+from pano_mvs.engine.stages.plugin_files import PLUGINS_VARIABLE, plugin_files_in, user_plugin_folders
+from pano_mvs.engine.stages.registry import Registry
 
 _BUILTIN = "source.folder"
 

@@ -8,16 +8,16 @@ from pathlib import Path
 
 from pano_mvs.core.errors import ChangedFileError, GateError, InputError, StoreError, UsageError
 from pano_mvs.core.text import shortened
-from pano_mvs.engine.blobs import DamagedBlobError
-from pano_mvs.engine.changed_files import changed_items, changed_settings
-from pano_mvs.engine.execute import execute_unit
+from pano_mvs.engine.cache.blobs import DamagedBlobError
+from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.capture import captured
 from pano_mvs.engine.executors.protocol import Outcome
 from pano_mvs.engine.executors.threads import bound_threads
 from pano_mvs.engine.executors.unit_text import input_blobs
-from pano_mvs.engine.failures import cause_of
-from pano_mvs.engine.store import Store
-from pano_mvs.engine.units import Unit
+from pano_mvs.engine.planning.units import Unit
+from pano_mvs.engine.running.changed_files import changed_items, changed_settings
+from pano_mvs.engine.running.execute import execute_unit
+from pano_mvs.engine.running.failures import cause_of
 
 
 def perform(unit: Unit, store: Store, *, threads: int, log: Path) -> Outcome:

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
-from pano_mvs.engine.store import UnitRecord
-from pano_mvs.engine.units import Unit
+from pano_mvs.engine.cache.store import UnitRecord
+from pano_mvs.engine.planning.units import Unit
 
 Status = Literal["done", "failed", "damaged", "changed", "stopped"]
 

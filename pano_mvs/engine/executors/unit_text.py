@@ -7,16 +7,16 @@ from pathlib import Path
 from typing import Any
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.engine.blobs import BlobRef
+from pano_mvs.engine.cache.blobs import BlobRef
+from pano_mvs.engine.cache.store import ItemRef, Store
+from pano_mvs.engine.code.stage_code import stage_code
 from pano_mvs.engine.executors.protocol import Job
-from pano_mvs.engine.params import Params
-from pano_mvs.engine.policy import Policy
-from pano_mvs.engine.ports import Cardinality
-from pano_mvs.engine.stage import SourceItem, StageSpec
-from pano_mvs.engine.stage_code import stage_code
-from pano_mvs.engine.store import ItemRef, Store
-from pano_mvs.engine.units import PENDING, Unit, UnitInput
-from pano_mvs.engine.workflow import StageEntry
+from pano_mvs.engine.planning.units import PENDING, Unit, UnitInput
+from pano_mvs.engine.stages.params import Params
+from pano_mvs.engine.stages.ports import Cardinality
+from pano_mvs.engine.stages.stage import SourceItem, StageSpec
+from pano_mvs.engine.workflows.policy import Policy
+from pano_mvs.engine.workflows.workflow import StageEntry
 
 TEXT_VERSION = 2
 

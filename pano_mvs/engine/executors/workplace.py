@@ -12,13 +12,13 @@ from typing import Any
 
 from pano_mvs.core.errors import PanoMvsError, PluginError, UsageError
 from pano_mvs.core.paths import resolved
-from pano_mvs.engine.code_digest import code_digest
+from pano_mvs.engine.cache.store import Store
+from pano_mvs.engine.code.plugin_digest import code_digest
 from pano_mvs.engine.executors.perform import perform
 from pano_mvs.engine.executors.protocol import Outcome
 from pano_mvs.engine.executors.unit_text import unit_from_json
-from pano_mvs.engine.registry import Registry
-from pano_mvs.engine.stage import StageSpec
-from pano_mvs.engine.store import Store
+from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.engine.stages.stage import StageSpec
 
 
 def run_request(request: Mapping[str, Any]) -> Outcome:

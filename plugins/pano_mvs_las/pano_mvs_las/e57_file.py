@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from pano_mvs.api import PointCloud
-from pano_mvs.io.thinning import CHUNK_POINTS, Kept, chunks
+from pano_mvs.io.clouds.thinning import CHUNK_POINTS, Kept, chunks
 from pye57 import libe57
 
 from pano_mvs_las.las_file import bounds

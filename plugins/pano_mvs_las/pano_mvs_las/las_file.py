@@ -8,7 +8,7 @@ import laspy
 import numpy as np
 from numpy.typing import NDArray
 from pano_mvs.api import PointCloud, UsageError
-from pano_mvs.io.thinning import Kept, chunks
+from pano_mvs.io.clouds.thinning import Kept, chunks
 
 from pano_mvs_las.placement import Placement
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Literal
 
 from pano_mvs.api import Context, Files, InputError, One, Params, PointCloud, Poses, UsageError, stage
-from pano_mvs.io.thinning import Kept, Selection, select_points
+from pano_mvs.io.clouds.thinning import Kept, Selection, select_points
 from pano_mvs.scene.files import group_file
 from pano_mvs.scene.pose_groups import split_groups
 from pydantic import Field

@@ -1,0 +1,1 @@
+"""Tracks, triangulation and angular bundle adjustment."""

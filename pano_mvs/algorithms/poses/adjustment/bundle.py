@@ -1,0 +1,246 @@
+"""Angular bundle adjustment: Levenberg–Marquardt on cameras and points, points eliminated (Schur complement)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError
+
+from pano_mvs.algorithms.poses.adjustment.camera_system import camera_order, camera_solver, camera_span, held
+from pano_mvs.algorithms.two_view.refinement import tangent_basis
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import rotation_from_rotvec
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int32]
+Loss: TypeAlias = Literal["huber", "cauchy"]
+
+_MIN_DAMPING, _MAX_DAMPING = 1e-9, 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """Cameras, points, and the observations that join them, sorted by point.
+
+    Attributes:
+        rotations: (N, 3, 3) of cam_from_world.
+        centers: (N, 3) in the world.
+        points: (P, 3) in the world.
+        point_idx: (T,) ascending.
+        image_idx: (T,).
+        bearings: (T, 3) unit rays in the camera.
+        sigmas: (T,) standard deviation of each ray in units of a usual one's, positive; None: all are alike.
+    """
+
+    rotations: FloatArray
+    centers: FloatArray
+    points: FloatArray
+    point_idx: IndexArray
+    image_idx: IndexArray
+    bearings: FloatArray
+    sigmas: FloatArray | None = None
+
+    def check(self) -> None:
+        """Raise UsageError unless observations are sorted by point, every point has one, and sigmas are positive."""
+        if np.any(np.diff(self.point_idx) < 0) or len(np.unique(self.point_idx)) != len(self.points):
+            raise UsageError("the observations of a bundle must be sorted by point, and every point must have one")
+        if self.sigmas is not None and (self.sigmas.shape != self.point_idx.shape or not np.all(self.sigmas > 0)):
+            raise UsageError("a bundle needs one positive sigma for each observation, or none at all")
+
+    def errors_rad(self) -> FloatArray:
+        """Return the angle between every observed ray and the one to its point, (T,), in [0, π]."""
+        in_cam = np.einsum(
+            "tij,tj->ti", self.rotations[self.image_idx], self.points[self.point_idx] - self.centers[self.image_idx]
+        )
+        sine = np.linalg.norm(np.cross(self.bearings, in_cam), axis=1)
+        angles: FloatArray = np.arctan2(sine, np.sum(self.bearings * in_cam, axis=1))
+        return angles
+
+    def scaled_errors_rad(self) -> FloatArray:
+        """Return the errors divided by the sigmas, (T,): what the robust loss is of."""
+        errors = self.errors_rad()
+        return errors if self.sigmas is None else errors / self.sigmas
+
+    def weights(self, scaled_errors_rad: FloatArray, *, loss: Loss, scale_rad: float) -> FloatArray:
+        """Return the weight of each squared error in the reweighted least-squares problem, (T,)."""
+        weights = robust_weights(scaled_errors_rad, loss=loss, scale_rad=scale_rad)
+        return weights if self.sigmas is None else weights / self.sigmas**2
+
+
+def adjust_bundle(
+    bundle: Bundle,
+    *,
+    loss: Loss,
+    scale_rad: float,
+    max_iterations: int = 50,
+    tolerance: float = 1e-7,
+    fixed_camera: int = 0,
+) -> Bundle:
+    """Return the bundle with the least robust sum of squared angular errors; one camera stays where it is.
+
+    Errors are divided by the sigmas of their observations, so that precise rays count for more than coarse ones.
+    The length that only the gauge decides (the scale) stays near where it was, held by the damping.
+
+    Args:
+        bundle: where to begin.
+        loss: "huber" min(r², 2 s r − s²), or "cauchy" s² log(1 + r²/s²).
+        scale_rad: s, the error from which an observation of sigma 1 loses influence.
+        max_iterations: maximum number of steps.
+        tolerance: the adjustment ends with a step that lowers the cost by a smaller share than this.
+        fixed_camera: position of the camera that is not moved.
+
+    Raises:
+        UsageError: if the observations are not sorted by point.
+    """
+    bundle.check()
+    if not len(bundle.points):
+        return bundle
+    order = camera_order(bundle.point_idx, bundle.image_idx, len(bundle.centers))
+    place = np.argsort(order)
+    ordered = _adjust_ordered(
+        with_camera_order(bundle, order, place), loss=loss, scale_rad=scale_rad, max_iterations=max_iterations,
+        tolerance=tolerance, fixed_camera=int(place[fixed_camera]),
+    )  # fmt: skip
+    return with_camera_order(ordered, place, order)
+
+
+def with_camera_order(bundle: Bundle, order: NDArray[np.intp], place: NDArray[np.intp]) -> Bundle:
+    """Return the bundle with its cameras in another order; place[order[n]] is n."""
+    return replace(
+        bundle,
+        rotations=bundle.rotations[order],
+        centers=bundle.centers[order],
+        image_idx=place[bundle.image_idx].astype(np.int32),
+    )
+
+
+def _adjust_ordered(
+    bundle: Bundle, *, loss: Loss, scale_rad: float, max_iterations: int, tolerance: float, fixed_camera: int
+) -> Bundle:
+    # Importing numba takes most of a second; who adjusts nothing does not pay for it.
+    from pano_mvs.algorithms.poses.adjustment.kernels_bundle import ray_errors
+
+    layout = _Layout.of(bundle)
+    observed = bundle.point_idx, bundle.image_idx, bundle.bearings
+
+    def scaled_errors_rad(of: Bundle) -> FloatArray:
+        errors: FloatArray = ray_errors(of.rotations, of.centers, of.points, *observed)
+        return errors if bundle.sigmas is None else errors / bundle.sigmas
+
+    errors = scaled_errors_rad(bundle)
+    cost, damping = robust_cost(errors, loss=loss, scale_rad=scale_rad), 1e-4
+    for _ in range(max_iterations):
+        weights = bundle.weights(errors, loss=loss, scale_rad=scale_rad)
+        moved = _step(bundle, layout, weights, damping=damping, fixed_camera=fixed_camera)
+        moved_errors = scaled_errors_rad(moved)
+        moved_cost = robust_cost(moved_errors, loss=loss, scale_rad=scale_rad)
+        if not moved_cost < cost:
+            damping *= 10
+            if damping > _MAX_DAMPING:
+                break
+            continue
+        converged = cost - moved_cost < tolerance * cost
+        bundle, errors, cost, damping = moved, moved_errors, moved_cost, max(damping / 10, _MIN_DAMPING)
+        if converged:
+            break
+    return bundle
+
+
+def robust_weights(errors_rad: FloatArray, *, loss: Loss, scale_rad: float) -> FloatArray:
+    """Return the weight of each observation in the reweighted least-squares problem, (T,) in (0, 1]."""
+    relative = errors_rad / scale_rad
+    weights: FloatArray = 1 / (1 + relative**2) if loss == "cauchy" else 1 / np.maximum(relative, 1.0)
+    return weights
+
+
+def robust_cost(errors_rad: FloatArray, *, loss: Loss, scale_rad: float) -> float:
+    """Return the robust loss summed over all observations, in units of the squared scale."""
+    relative = errors_rad / scale_rad
+    if loss == "cauchy":
+        return float(np.sum(np.log1p(relative**2)))
+    return float(np.sum(np.where(relative < 1, relative**2, 2 * relative - 1)))
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedCameras:
+    """The system of the cameras after elimination of the points, and what gets the points back.
+
+    Attributes:
+        band: (6N, width), see `camera_system`.
+        gradient: (6N,).
+        diagonal: (6N,) of the cameras' own blocks, before elimination.
+        couplings: (T, 6, 3) of camera and point of every observation.
+        inverses: (P, 3, 3) of the points' own blocks.
+        point_gradients: (P, 3).
+    """
+
+    band: FloatArray
+    gradient: FloatArray
+    diagonal: FloatArray
+    couplings: FloatArray
+    inverses: FloatArray
+    point_gradients: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Layout:
+    """What stays the same in all steps of an adjustment.
+
+    Attributes:
+        starts: (P + 1,) the observations of point p are starts[p] to starts[p + 1].
+        width: of the band, see `camera_system`.
+        bases: (T, 3, 2) two vectors normal to each observed ray.
+    """
+
+    starts: NDArray[np.intp]
+    width: int
+    bases: FloatArray
+
+    @staticmethod
+    def of(bundle: Bundle) -> _Layout:
+        """Return the layout of a bundle."""
+        starts = np.searchsorted(bundle.point_idx, np.arange(len(bundle.points) + 1))
+        width = 6 * (camera_span(starts, bundle.image_idx) + 1)
+        return _Layout(starts, width, tangent_basis(bundle.bearings))
+
+
+def reduced_cameras(bundle: Bundle, weights: FloatArray, *, damping: float) -> ReducedCameras:
+    """Return the cameras' system of a weighted bundle; points are damped, cameras are not."""
+    return _reduced_cameras(bundle, _Layout.of(bundle), weights, damping=damping)
+
+
+def _reduced_cameras(bundle: Bundle, layout: _Layout, weights: FloatArray, *, damping: float) -> ReducedCameras:
+    from pano_mvs.algorithms.poses.adjustment.kernels_bundle import reduced_system
+
+    return ReducedCameras(
+        *reduced_system(
+            bundle.rotations, bundle.centers, bundle.points, layout.starts, bundle.image_idx, layout.bases, weights,
+            damping, layout.width,
+        )
+    )  # fmt: skip
+
+
+def _step(bundle: Bundle, layout: _Layout, weights: FloatArray, *, damping: float, fixed_camera: int) -> Bundle:
+    """Return the bundle after one damped step."""
+    from pano_mvs.algorithms.poses.adjustment.kernels_bundle import moved_points
+
+    system = _reduced_cameras(bundle, layout, weights, damping=damping)
+    # The small constant keeps a camera without observations in place.
+    system.band[:, 0] += damping * system.diagonal + 1e-12 * system.diagonal.mean()
+    band, gradient = held(system.band, system.gradient, fixed_camera)
+    try:
+        steps = -camera_solver(band)(gradient).reshape(-1, 6)
+    except LinAlgError:
+        return bundle
+    return replace(
+        bundle,
+        rotations=rotation_from_rotvec(steps[:, :3]) @ bundle.rotations,
+        centers=bundle.centers + steps[:, 3:],
+        points=moved_points(
+            bundle.points, layout.starts, bundle.image_idx, system.couplings, system.inverses, system.point_gradients,
+            np.ascontiguousarray(steps),
+        ),
+    )  # fmt: skip

@@ -1,0 +1,250 @@
+"""Finer places for the observations of tracks: patches of the images, aligned with one another on the sphere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.two_view.refinement import tangent_basis
+from pano_mvs.geometry import pad_panorama, pixel_from_ray
+from pano_mvs.scene import Poses
+from pano_mvs.scene.pose_groups import per_group
+
+FloatArray = NDArray[np.float64]
+Picture = tuple[NDArray[np.uint8], NDArray[np.bool_]]
+
+SIZE, MARGIN = 13, 4
+_MAX_WIDTH = 4096  # panoramas of more columns are hardly sharp to a pixel, and their patches would show too little
+_SMOOTHING = 0.5  # standard deviation, in samples
+_PAD_PX = 8
+# All of these were tried on rendered and synthetic captures; the result changes little around them.
+_WINDOW = SIZE / 4  # standard deviation of the weights, in samples
+_STIFFNESS = 6.0
+_MIN_CORRELATION = 0.85
+_MAX_SHIFT = 1.0  # samples
+_FLOOR = 0.1  # samples: what the aligned patches' own deviation leaves out
+_NOT_ALIGNED = 0.3  # samples: of an observation that does not align and stays where the detector put it …
+_NOT_TRIED = 0.15  # … and of one of a track beyond the most that are aligned
+_MOST_PER_IMAGE = 1500  # observations: where there are more, their number makes for precision
+_AT_ONCE = 100_000  # observations whose patches are in memory
+
+
+def align_tracks(poses: Poses, load: Callable[[str], Picture]) -> Poses:
+    """Return poses whose observations lie where the images agree best, with how precise each is.
+
+    A key point is found in each image on its own, to a fifth of a pixel or worse; what is around it in two images can
+    be aligned far better. Each track has a reference, the observation that looks at the point most as all others do on
+    average. A patch of 13 × 13 pixels about it, normal to the reference's ray, is sampled in all images of the track
+    as the poses and the point's range predict, and aligned with the reference's by Lucas and Kanade's method with an
+    affine warp. Observations that do not align (too faint, hidden, on an edge of depth, next to what the mask ignores)
+    stay where they are and count for less. Where there are more than 1500 observations an image on average, only the
+    longest tracks are aligned.
+
+    Cameras and points are not moved: adjust them afterwards (`refine_poses`). Nothing is drawn at random.
+
+    Args:
+        poses: poses with tracks, good to a pixel or two.
+        load: returns the panorama (H, W, 3) and the mask (H, W) of an image by its name. Called once or a few times
+            for each image.
+
+    Returns:
+        The same poses with other `track_bearings`, and `track_sigmas_rad`.
+    """
+    return per_group(poses, lambda group: _aligned(group, load))
+
+
+def _aligned(poses: Poses, load: Callable[[str], Picture]) -> Poses:
+    if not len(poses.track_point_idx):
+        return poses
+    step_rad = _step_rad(load(poses.names[0])[0].shape[1])
+    sightings = _sightings(poses, step_rad)
+    bearings = np.array(poses.track_bearings)
+    chosen = _longest_tracks(poses.track_point_idx, _MOST_PER_IMAGE * len(poses.names))
+    sigmas_rad = np.where(chosen, _NOT_ALIGNED, _NOT_TRIED) * step_rad
+    for block in _blocks(sightings.reference_idx, poses.track_image_idx, chosen):
+        _align_block(poses, sightings, block, load, step_rad, bearings, sigmas_rad)
+    return replace(poses, track_bearings=bearings, track_sigmas_rad=sigmas_rad.astype(np.float32))
+
+
+def _longest_tracks(point_idx: NDArray[np.int32], most: int) -> NDArray[np.bool_]:
+    """Return which observations, (T,), are of the longest tracks, `most` of them at most."""
+    lengths = np.bincount(point_idx)
+    order = np.argsort(-lengths, kind="stable")
+    chosen = np.zeros(len(lengths), np.bool_)
+    chosen[order[np.cumsum(lengths[order]) <= most]] = True
+    return np.asarray(chosen[point_idx])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sightings:
+    """For each observation: (T,) its track's reference observation, and rays in its camera, (T, 3).
+
+    `middles` points along the observed ray, as far as the point is; the patch's sample (u, v) is in the direction of
+    middles + u first_axes + v second_axes. A sample is `step_rad` times `zoom` (T,) wide as the camera sees it.
+    """
+
+    reference_idx: NDArray[np.intp]
+    middles: FloatArray
+    first_axes: FloatArray
+    second_axes: FloatArray
+    zoom: FloatArray
+
+
+def _step_rad(width: int) -> float:
+    return 2 * np.pi / min(width, _MAX_WIDTH)
+
+
+def _sightings(poses: Poses, step_rad: float) -> _Sightings:
+    point_idx, image_idx = poses.track_point_idx, poses.track_image_idx
+    towards = poses.points_in_world[point_idx] - poses.centers[image_idx]
+    ranges = np.maximum(np.linalg.norm(towards, axis=1), 1e-12)
+    rays = towards / ranges[:, None]
+    reference_of_point = _references(point_idx, rays, ranges, len(poses.points_in_world))
+    reference_idx = reference_of_point[point_idx]
+    steps = (step_rad * ranges[reference_idx])[:, None, None]
+    axes = poses.rotations[image_idx] @ (steps * tangent_basis(rays[reference_idx]))
+    return _Sightings(
+        reference_idx=reference_idx,
+        middles=ranges[:, None] * poses.track_bearings,
+        first_axes=np.ascontiguousarray(axes[..., 0]),
+        second_axes=np.ascontiguousarray(axes[..., 1]),
+        zoom=ranges[reference_idx] / ranges,
+    )
+
+
+def _references(point_idx: NDArray[np.int32], rays: FloatArray, ranges: FloatArray, count: int) -> NDArray[np.intp]:
+    """Return the reference observation of every point, (count,): the ray nearest to the mean, the nearer of two."""
+    total = np.stack([np.bincount(point_idx, column, count) for column in rays.T], axis=1)
+    mean = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
+    # Of two observations either is as near to their mean, but for the last digits.
+    likeness = np.round(np.sum(rays * mean[point_idx], axis=1), 9)
+    order = np.lexsort((ranges, -likeness, point_idx))
+    first = np.concatenate([[True], np.diff(point_idx[order]) > 0])
+    references = np.zeros(count, np.intp)
+    references[point_idx[order[first]]] = order[first]
+    return references
+
+
+def _blocks(
+    reference_idx: NDArray[np.intp], image_idx: NDArray[np.int32], chosen: NDArray[np.bool_]
+) -> Iterator[NDArray[np.intp]]:
+    """Yield positions of chosen observations, whole tracks, about `_AT_ONCE` at a time, those of one image together."""
+    order = np.lexsort((reference_idx, image_idx[reference_idx]))
+    order = order[chosen[order]]
+    if not len(order):
+        return
+    starts = np.flatnonzero(np.concatenate([[True], np.diff(reference_idx[order]) != 0]))
+    chosen = starts[np.unique(np.searchsorted(starts, np.arange(0, len(order), _AT_ONCE)).clip(max=len(starts) - 1))]
+    yield from np.split(order, chosen[1:])
+
+
+def _align_block(
+    poses: Poses,
+    sightings: _Sightings,
+    block: NDArray[np.intp],
+    load: Callable[[str], Picture],
+    step_rad: float,
+    bearings: FloatArray,
+    sigmas_rad: FloatArray,
+) -> None:
+    """Write the bearings and sigmas of some tracks' observations."""
+    place = np.full(len(bearings), -1, np.intp)
+    place[block] = np.arange(len(block))
+    targets = block[sightings.reference_idx[block] != block]
+    references = sightings.reference_idx[targets]
+    shifts, correlations, deviations = aligned_shifts(
+        _patches(poses, sightings, block, load), place[references], place[targets]
+    )
+    zoom = sightings.zoom[targets]
+    moved = np.linalg.norm(shifts, axis=1) * zoom
+    good = (correlations > _MIN_CORRELATION) & (moved < _MAX_SHIFT)
+    targets, references, shifts = targets[good], references[good], shifts[good]
+    rays = (
+        sightings.middles[targets]
+        + shifts[:, :1] * sightings.first_axes[targets]
+        + shifts[:, 1:] * sightings.second_axes[targets]
+    )
+    bearings[targets] = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    # Two patches of one standard deviation differ by √(2 (1 − correlation)).
+    noise = np.sqrt(np.maximum(2 * (1 - correlations[good]), 1e-4))
+    sigmas_rad[targets] = step_rad * np.hypot(_FLOOR, deviations[good] * noise * zoom[good])
+    np.minimum.at(sigmas_rad, references, sigmas_rad[targets])
+
+
+def _patches(
+    poses: Poses, sightings: _Sightings, block: NDArray[np.intp], load: Callable[[str], Picture]
+) -> NDArray[np.float32]:
+    """Return the patches of observations with their margins, (M, n, n) grey levels; one image is loaded at a time."""
+    # Importing numba takes most of a second; who aligns nothing does not pay for it.
+    from pano_mvs.algorithms.poses.adjustment.kernels_patch_alignment import sample_patches
+
+    side = SIZE + 2 * MARGIN
+    patches = np.empty((len(block), side, side), np.float32)
+    image_idx = poses.track_image_idx[block]
+    for image in np.unique(image_idx):
+        own = np.flatnonzero(image_idx == image)
+        seen = block[own]
+        sampled = np.empty((len(own), side, side), np.float32)
+        panorama, mask = load(poses.names[image])
+        rays = sightings.middles[seen], sightings.first_axes[seen], sightings.second_axes[seen]
+        sample_patches(smoothed_gray(panorama), _PAD_PX, *rays, sampled)
+        sampled[_masked(mask, *rays)] = 0.0  # patches without contrast do not align
+        patches[own] = sampled
+    return patches
+
+
+def _masked(
+    mask: NDArray[np.bool_], middles: FloatArray, first_axes: FloatArray, second_axes: FloatArray
+) -> NDArray[np.bool_]:
+    """Return which patches, (M,), reach into the ignored part of an image; five by five rays of each are looked up."""
+    masked = np.zeros(len(middles), np.bool_)
+    if mask.all():
+        return masked
+    height, width = mask.shape
+    steps = np.linspace(-(SIZE - 1) / 2, (SIZE - 1) / 2, 5)
+    for across in steps:
+        for down in steps:
+            pixels = pixel_from_ray(middles + across * first_axes + down * second_axes, mask.shape).astype(np.intp)
+            masked |= ~mask[pixels[:, 1].clip(max=height - 1), pixels[:, 0] % width]
+    return masked
+
+
+def smoothed_gray(panorama: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return the grey levels that patches are sampled from, (H + 16, W + 16), a margin of 8 pixels around them."""
+    gray = cv2.cvtColor(panorama, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    sigma_px = _SMOOTHING * max(1.0, panorama.shape[1] / _MAX_WIDTH)
+    return np.asarray(cv2.GaussianBlur(pad_panorama(gray, _PAD_PX), (0, 0), sigma_px), np.float32)
+
+
+def aligned_shifts(
+    patches: NDArray[np.float32], reference_idx: NDArray[np.intp], target_idx: NDArray[np.intp]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return by how much the middles of patches must move to show what the middles of their references show.
+
+    Args:
+        patches: (T, 21, 21) grey levels: 13 × 13 samples and a margin of 4 around them.
+        reference_idx: (M,) patches to align with.
+        target_idx: (M,) patches to align.
+
+    Returns:
+        shifts (M, 2) in samples along a patch's columns and rows; correlations (M,) after alignment, 0 where there is
+        no contrast or no alignment within the margin; deviations (M,) of the shift along its least certain axis, in
+        samples, for noise as large as the contrast.
+    """
+    from pano_mvs.algorithms.poses.adjustment.kernels_patch_alignment import align_patches
+
+    count = len(target_idx)
+    shifts, correlations, deviations = np.empty((count, 2)), np.empty(count), np.empty(count)
+    align_patches(patches, reference_idx, target_idx, window(), _STIFFNESS, shifts, correlations, deviations)
+    return shifts, correlations, deviations
+
+
+def window() -> FloatArray:
+    """Return the weights of a patch's samples, (13, 13)."""
+    squared = (np.arange(SIZE) - (SIZE - 1) / 2) ** 2
+    weights: FloatArray = np.exp(-0.5 * (squared[:, None] + squared) / _WINDOW**2)
+    return weights

@@ -1,0 +1,201 @@
+"""Tracks: the key points of many images that show one point, and their triangulation with given poses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from pano_mvs.algorithms.poses.adjustment.points import triangulate_observations
+from pano_mvs.scene import Features, Poses, TwoView
+from pano_mvs.scene.pose_groups import per_group
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int32]
+TwoViews = Mapping[tuple[str, str], TwoView]
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Observations sorted by track, then by image; no track has two key points in one image.
+
+    Attributes:
+        names: image names, in the capture's order.
+        track_idx: (T,) the track of each observation, 0 … count − 1.
+        image_idx: (T,) its image, a position in `names`.
+        keypoint_idx: (T,) its key point in that image.
+        bearings: (T, 3) its unit ray in the camera frame.
+        colors_rgb: (T, 3) uint8 its colour.
+        count: number of tracks.
+    """
+
+    names: tuple[str, ...]
+    track_idx: IndexArray
+    image_idx: IndexArray
+    keypoint_idx: IndexArray
+    bearings: FloatArray
+    colors_rgb: NDArray[np.uint8]
+    count: int
+
+    def __len__(self) -> int:
+        """Return the number of tracks."""
+        return self.count
+
+
+def build_tracks(features: Mapping[str, Features], two_views: TwoViews) -> Tracks:
+    """Return the tracks that verified matches form, by union of all matches.
+
+    Where the union would bring two key points of one image together, the matches are taken again one after the other,
+    those with the smallest residual first, and those that would do so are left out.
+
+    Args:
+        features: key points by image name, in the capture's order.
+        two_views: verified pairs; those without a general geometry are ignored.
+    """
+    names = tuple(features)
+    offsets = np.cumsum([0, *(len(features[name]) for name in names)])
+    nodes, residuals = _match_nodes(names, offsets, two_views)
+    image_of_node = np.repeat(np.arange(len(names)), np.diff(offsets))
+    total = int(offsets[-1])
+    label = _labels(nodes, total)
+    conflicting = _conflicting(label, image_of_node)
+    inside = conflicting[label[nodes[:, 0]]]
+    kept = _without_conflicts(nodes[inside], residuals[inside], image_of_node)
+    label = _labels(np.concatenate([nodes[~inside], kept]), total)
+    members = np.flatnonzero(np.bincount(label, minlength=total)[label] >= 2)
+    members = members[np.lexsort((members, label[members]))]
+    track_idx = np.unique(label[members], return_inverse=True)[1].astype(np.int32)
+    image_idx = image_of_node[members].astype(np.int32)
+    bearings = np.concatenate([np.zeros((0, 3)), *(features[name].bearings for name in names)])
+    colors = np.concatenate([np.zeros((0, 3), np.uint8), *(features[name].colors_rgb for name in names)])
+    return Tracks(
+        names=names,
+        track_idx=track_idx,
+        image_idx=image_idx,
+        keypoint_idx=(members - offsets[image_idx]).astype(np.int32),
+        bearings=bearings[members],
+        colors_rgb=colors[members],
+        count=int(track_idx.max(initial=-1)) + 1,
+    )
+
+
+def triangulate_tracks(
+    poses: Poses,
+    features: Mapping[str, Features],
+    two_views: TwoViews,
+    *,
+    max_error_deg: float = 0.4,
+    min_angle_deg: float = 1.0,
+) -> Poses:
+    """Return the same poses, not moved by a digit, with the points that the verified matches give.
+
+    Matches between images of different groups are left out: the groups' worlds have nothing in common.
+
+    Args:
+        poses: known poses; its points, if any, are replaced.
+        features: key points by image name.
+        two_views: verified pairs.
+        max_error_deg: largest angle between an observed ray and the one to its point.
+        min_angle_deg: smallest angle between the rays of a point seen twice.
+    """
+
+    def triangulated(group: Poses) -> Poses:
+        known = {name: features[name] for name in group.names if name in features}
+        inside = {pair: view for pair, view in two_views.items() if pair[0] in known and pair[1] in known}
+        return poses_with_points(
+            group, build_tracks(known, inside), max_error_deg=max_error_deg, min_angle_deg=min_angle_deg
+        )
+
+    return per_group(poses, triangulated)
+
+
+def poses_with_points(poses: Poses, tracks: Tracks, *, max_error_deg: float, min_angle_deg: float) -> Poses:
+    """Return the same poses with the points of tracks, whose names are all registered or are left out.
+
+    A track that is seen from several groups gives each of them a point of its own.
+    """
+    return per_group(
+        poses, lambda group: _with_points(group, tracks, max_error_deg=max_error_deg, min_angle_deg=min_angle_deg)
+    )
+
+
+def _with_points(poses: Poses, tracks: Tracks, *, max_error_deg: float, min_angle_deg: float) -> Poses:
+    position = {name: idx for idx, name in enumerate(poses.names)}
+    pose_of_image = np.array([position.get(name, -1) for name in tracks.names], np.int32)
+    seen = pose_of_image[tracks.image_idx] >= 0
+    track_idx, image_idx = tracks.track_idx[seen], pose_of_image[tracks.image_idx[seen]]
+    bearings = tracks.bearings[seen]
+    found = triangulate_observations(
+        poses.centers[image_idx],
+        np.einsum("nji,nj->ni", poses.rotations[image_idx], bearings),
+        track_idx,
+        count=tracks.count,
+        max_error_rad=float(np.deg2rad(max_error_deg)),
+        min_angle_rad=float(np.deg2rad(min_angle_deg)),
+    )
+    used = found.used
+    point_idx = (np.cumsum(found.valid) - 1)[track_idx[used]].astype(np.int32)
+    count = int(found.valid.sum())
+    sizes = np.maximum(np.bincount(point_idx, minlength=count), 1)
+    colors = np.stack([np.bincount(point_idx, c, count) / sizes for c in tracks.colors_rgb[seen][used].T], axis=1)
+    return replace(
+        poses,
+        points_in_world=found.points_in_world[found.valid],
+        point_colors_rgb=np.rint(colors).astype(np.uint8),
+        point_errors_rad=(np.bincount(point_idx, found.errors_rad[used], count) / sizes).astype(np.float32),
+        track_point_idx=point_idx,
+        track_image_idx=image_idx[used].astype(np.int32),
+        track_bearings=bearings[used],
+        track_sigmas_rad=None,
+    )
+
+
+def _match_nodes(
+    names: tuple[str, ...], offsets: NDArray[np.intp], two_views: TwoViews
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Return all matches between nodes (key points counted through all images), (M, 2), and their residuals."""
+    start = {name: int(offset) for name, offset in zip(names, offsets[:-1], strict=True)}
+    nodes, residuals = [np.zeros((0, 2), np.int64)], [np.zeros(0, np.float32)]
+    for first, second in sorted(pair for pair, view in two_views.items() if view):
+        view = two_views[first, second]
+        nodes.append((view.matches_idx + np.array([start[first], start[second]])).astype(np.int64))
+        residuals.append(view.residuals_rad)
+    return np.concatenate(nodes), np.concatenate(residuals)
+
+
+def _labels(nodes: NDArray[np.int64], total: int) -> NDArray[np.intp]:
+    graph = coo_array((np.ones(len(nodes), np.int8), (nodes[:, 0], nodes[:, 1])), shape=(total, total))
+    return np.asarray(connected_components(graph, directed=False)[1], np.intp)
+
+
+def _conflicting(label: NDArray[np.intp], image_of_node: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Return, for every label, whether it holds two key points of one image."""
+    order = np.lexsort((image_of_node, label))
+    same = (np.diff(label[order]) == 0) & (np.diff(image_of_node[order]) == 0)
+    conflicting = np.zeros(len(label) + 1, np.bool_)
+    conflicting[label[order[1:][same]]] = True
+    return conflicting
+
+
+def _without_conflicts(
+    nodes: NDArray[np.int64], residuals: NDArray[np.float32], image_of_node: NDArray[np.intp]
+) -> NDArray[np.int64]:
+    """Return the matches that can be joined, best first, without two key points of one image in one track."""
+    members: dict[int, dict[int, int]] = {}
+    root: dict[int, int] = {}
+    kept = np.zeros(len(nodes), np.bool_)
+    for match in np.lexsort((nodes[:, 1], nodes[:, 0], residuals)):
+        a, b = (root.setdefault(node, node) for node in nodes[match].tolist())
+        for r in (a, b):
+            members.setdefault(r, {int(image_of_node[r]): r})
+        if a == b:
+            kept[match] = True
+        elif not members[a].keys() & members[b].keys():
+            kept[match] = True
+            members[a].update(members[b])
+            root.update(dict.fromkeys(members.pop(b).values(), a))
+    return nodes[kept]

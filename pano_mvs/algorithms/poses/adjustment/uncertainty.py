@@ -1,0 +1,79 @@
+"""How sure the cameras of an adjusted bundle are, from the curvature of its cost."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError
+
+from pano_mvs.algorithms.poses.adjustment.bundle import Bundle, Loss, reduced_cameras, with_camera_order
+from pano_mvs.algorithms.poses.adjustment.camera_system import camera_order, camera_solver, held
+
+FloatArray = NDArray[np.float64]
+
+_COLUMNS_AT_ONCE = 64  # cameras
+_HELD_LENGTH = 1e6  # how much stiffer than the stiffest camera the unit of length is
+
+
+def camera_deviations(bundle: Bundle, *, loss: Loss, scale_rad: float, neighbour: int) -> tuple[FloatArray, FloatArray]:
+    """Return the standard deviations of camera centres and rotations, given the first camera and first baseline.
+
+    The covariance is σ² S⁻¹, S being the reduced system of the cameras with the robust weights w at the optimum
+    (divided by the squared sigmas), and σ² = Σ w r² / (2T − 6N − 3P + 7) the variance of the residuals r; Triggs et
+    al., "Bundle Adjustment — A Modern Synthesis", 2000, sections 4 and 9. It speaks of noise in the rays; of wrong
+    stitching or repeated structure it knows nothing.
+
+    Args:
+        bundle: an adjusted bundle.
+        loss: the loss it was adjusted with.
+        scale_rad: the scale of that loss.
+        neighbour: position of the camera whose distance to the first is the unit of length.
+
+    Returns:
+        centers (N,) roots of the traces of the centres' covariances, in scene units; rotations (N,) likewise, in
+        radians. Zero for the first camera; NaN where nothing is known: a camera without observations, or a system
+        that is singular.
+    """
+    order = camera_order(bundle.point_idx, bundle.image_idx, len(bundle.centers))
+    place = np.argsort(order)
+    ordered = with_camera_order(bundle, order, place)
+    weights = ordered.weights(ordered.scaled_errors_rad(), loss=loss, scale_rad=scale_rad)
+    errors = ordered.errors_rad()
+    system = reduced_cameras(ordered, weights, damping=0.0)
+    band, _ = held(system.band, system.gradient, int(place[0]))
+    _hold_length(band, ordered.centers, int(place[0]), int(place[neighbour]))
+    unseen = system.diagonal.reshape(-1, 6)[:, 0] == 0
+    band[np.repeat(unseen, 6), 0] = 1.0
+    redundancy = 2 * len(errors) - 6 * len(bundle.centers) - 3 * len(bundle.points) + 7
+    variance = float(np.sum(weights * errors**2)) / max(redundancy, 1)
+    try:
+        diagonal = variance * _inverse_diagonal(band)
+    except LinAlgError:
+        diagonal = np.full(len(band), np.nan)
+    deviations = np.sqrt(diagonal.reshape(-1, 2, 3).sum(axis=2))
+    deviations[unseen] = np.nan
+    deviations[place[0]] = 0.0
+    return deviations[place, 1], deviations[place, 0]
+
+
+def _hold_length(band: FloatArray, centers: FloatArray, first: int, neighbour: int) -> None:
+    """Add to the system that the distance of two cameras does not change."""
+    along = centers[neighbour] - centers[first]
+    along /= np.linalg.norm(along)
+    stiffness = _HELD_LENGTH * float(band[:, 0].max())
+    for j in range(3):
+        for i in range(j, 3):
+            band[6 * neighbour + 3 + j, i - j] += stiffness * along[i] * along[j]
+
+
+def _inverse_diagonal(band: FloatArray) -> FloatArray:
+    """Return the diagonal of the inverse, (6N,)."""
+    solve = camera_solver(band)
+    size = len(band)
+    diagonal = np.empty(size)
+    for start in range(0, size, 6 * _COLUMNS_AT_ONCE):
+        columns = np.arange(start, min(size, start + 6 * _COLUMNS_AT_ONCE))
+        right = np.zeros((size, len(columns)))
+        right[columns, np.arange(len(columns))] = 1.0
+        diagonal[columns] = solve(right)[columns, np.arange(len(columns))]
+    return diagonal

@@ -1,0 +1,169 @@
+"""COLMAP's own SIFT key points and matches on whole panoramas."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.poses.colmap.mapping import quiet_colmap
+from pano_mvs.algorithms.two_view.essential import sampson_angles
+from pano_mvs.geometry import Rigid3, ray_from_pixel, skew
+from pano_mvs.scene import Features, TwoView
+
+# With more threads COLMAP numbers the pictures in the order in which they are finished.
+_THREADS = 1
+_SIFT_PATCH_SCALES = 12.0  # SIFT describes four by four bins of three scales each
+
+
+def colmap_sift(
+    pictures: Iterable[tuple[str, NDArray[np.uint8], NDArray[np.bool_]]],
+    *,
+    max_keypoints: int = 8192,
+    rng: np.random.Generator,
+    scratch: Path,
+) -> tuple[dict[str, Features], dict[tuple[str, str], TwoView]]:
+    """Return COLMAP's SIFT key points of panoramas, and all pairs as it matched and verified them.
+
+    It is planar SIFT: key points thin out beside the seam and towards the poles.
+
+    Args:
+        pictures: name, (H, W, 3) uint8 RGB and (H, W) bool valid pixels of each panorama, in the capture's order;
+            taken one after the other, so that they need not all be in memory.
+        max_keypoints: of each picture, at most.
+        rng: gives COLMAP's seed.
+        scratch: an empty folder for the pictures, their masks and COLMAP's database.
+    """
+    import pycolmap
+
+    names = _exported(pictures, scratch)
+    database_path = scratch / "sift.db"
+    with quiet_colmap():
+        pycolmap.extract_features(
+            database_path,
+            scratch / "images",
+            reader_options=_reader_options(scratch / "masks"),
+            extraction_options=_extraction_options(max_keypoints),
+        )
+        pycolmap.match_exhaustive(
+            database_path,
+            matching_options=_matching_options(),
+            verification_options=_verification_options(int(rng.integers(1, 2**31 - 1))),
+        )
+    return _read(database_path, names, scratch / "images")
+
+
+def _exported(pictures: Iterable[tuple[str, NDArray[np.uint8], NDArray[np.bool_]]], scratch: Path) -> list[str]:
+    """Write pictures and masks under numbers, in COLMAP's naming, and return the pictures' names."""
+    names = []
+    for folder in ("images", "masks"):
+        (scratch / folder).mkdir()
+    for number, (name, image, valid) in enumerate(pictures):
+        names.append(name)
+        target = _file_name(number)
+        header = f"P6 {image.shape[1]} {image.shape[0]} 255\n".encode()
+        (scratch / "images" / target).write_bytes(header + np.ascontiguousarray(image).tobytes())
+        mask = cv2.imencode(".png", np.where(valid, np.uint8(255), np.uint8(0)))[1]
+        (scratch / "masks" / f"{target}.png").write_bytes(bytes(mask))
+    return names
+
+
+def _file_name(number: int) -> str:
+    return f"{number:08d}.ppm"
+
+
+def _reader_options(masks: Path) -> Any:
+    import pycolmap
+
+    options = pycolmap.ImageReaderOptions()
+    options.camera_model, options.mask_path = "EQUIRECTANGULAR", masks
+    return options
+
+
+def _extraction_options(max_keypoints: int) -> Any:
+    import pycolmap
+
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads, options.use_gpu = _THREADS, False
+    options.sift.max_num_features = max_keypoints
+    return options
+
+
+def _matching_options() -> Any:
+    import pycolmap
+
+    options = pycolmap.FeatureMatchingOptions()
+    options.num_threads, options.use_gpu = _THREADS, False
+    return options
+
+
+def _verification_options(seed: int) -> Any:
+    import pycolmap
+
+    options = pycolmap.TwoViewGeometryOptions()
+    options.compute_relative_pose = True
+    options.ransac.random_seed, options.ransac.num_threads = seed, _THREADS
+    return options
+
+
+def _read(path: Path, names: list[str], folder: Path) -> tuple[dict[str, Features], dict[tuple[str, str], TwoView]]:
+    """Return what the database holds as records."""
+    import pycolmap
+
+    database = pycolmap.Database.open(path)
+    try:
+        ids = {image.image_id: int(Path(image.name).stem) for image in database.read_all_images()}
+        by_number = {number: image_id for image_id, number in ids.items()}
+        features = {
+            name: _features(database, by_number[number], folder / _file_name(number))
+            for number, name in enumerate(names)
+        }
+        pair_ids, geometries = database.read_two_view_geometries()
+    finally:
+        database.close()
+    found = {}
+    for pair_id, geometry in zip(pair_ids, geometries, strict=True):
+        first, second = (names[ids[image_id]] for image_id in pycolmap.pair_id_to_image_pair(pair_id))
+        found[first, second] = _two_view(geometry, features[first], features[second])
+    return features, found
+
+
+def _features(database: Any, image_id: int, picture: Path) -> Features:
+    image = cv2.cvtColor(cv2.imread(str(picture)), cv2.COLOR_BGR2RGB)
+    height, width = image.shape[:2]
+    keypoints = np.asarray(database.read_keypoints(image_id), np.float64).reshape(-1, 6)
+    columns, rows = (np.floor(keypoints[:, axis]).astype(int) for axis in (0, 1))
+    scales_px = np.sqrt(np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4]))
+    return Features(
+        bearings=ray_from_pixel(keypoints[:, :2], (height, width)),
+        descriptors=np.asarray(database.read_descriptors(image_id).data, np.float32).reshape(-1, 128),
+        sizes_rad=(_SIFT_PATCH_SCALES * scales_px * 2 * np.pi / width).astype(np.float32),
+        scores=scales_px.astype(np.float32),
+        colors_rgb=image[np.clip(rows, 0, height - 1), columns % width],
+        metric="l2",
+        size_hw=(height, width),
+    )
+
+
+def _two_view(geometry: Any, first: Features, second: Features) -> TwoView:
+    """Return COLMAP's geometry of a pair; one without a relative pose is none."""
+    matches = np.asarray(geometry.inlier_matches, np.int32).reshape(-1, 2)
+    pose = geometry.cam2_from_cam1
+    length = 0.0 if pose is None else float(np.linalg.norm(pose.translation))
+    if length == 0 or not len(matches):
+        return TwoView.failed("COLMAP found no relative pose", candidates=len(matches))
+    second_from_first = Rigid3(pose.rotation.matrix(), np.array(pose.translation) / length)
+    essential = skew(second_from_first.translation) @ second_from_first.rotation
+    residuals = sampson_angles(essential, first.bearings[matches[:, 0]], second.bearings[matches[:, 1]])
+    return TwoView(
+        matches_idx=matches,
+        rotation=second_from_first.rotation,
+        direction=second_from_first.translation,
+        residuals_rad=np.abs(residuals).astype(np.float32),
+        geometry="general",
+        candidates=len(matches),
+    )

@@ -1,0 +1,175 @@
+"""Register a capture through COLMAP's mappers, with our key points and verified matches."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from pano_mvs.algorithms.poses.colmap.database import Cameras, TwoViews, write_database
+from pano_mvs.algorithms.poses.colmap.mapping import (
+    Mapper,
+    extend_model,
+    poses_from_model,
+    registered_panoramas,
+    run_mapper,
+)
+from pano_mvs.algorithms.poses.frame.gauge import moved_poses, normalised_poses
+from pano_mvs.algorithms.poses.placement.reasons import best_pair, why_no_pair
+from pano_mvs.geometry import Similarity3
+from pano_mvs.scene import Features, Poses
+from pano_mvs.scene.pose_groups import join_groups, with_cameras
+
+_SEED_LIMIT = 2**31 - 1
+
+
+def solve_colmap(
+    features: Mapping[str, Features],
+    two_views: TwoViews,
+    *,
+    mapper: Mapper = "incremental",
+    cameras: Cameras = "sphere",
+    rng: np.random.Generator,
+    scratch: Path,
+) -> Poses:
+    """Return the poses of a capture by COLMAP's incremental or global mapper.
+
+    Schönberger & Frahm, "Structure-from-Motion Revisited", 2016; Pan et al., "Global Structure-from-Motion
+    Revisited", 2024. The mapper runs on one thread with a seed, so that the same input gives the same poses.
+
+    Args:
+        features: key points by image name, in the capture's order.
+        two_views: verified pairs; those without a general geometry are left out.
+        mapper: "incremental" or "global".
+        cameras: "sphere": EQUIRECTANGULAR cameras; "faces": six pinhole faces, held together as one rig.
+        rng: gives COLMAP's seed.
+        scratch: an empty folder for COLMAP's files.
+
+    Returns:
+        Poses in the frame of the first registered camera, the first baseline being 1. Several models become as many
+        groups, each in such a frame of its own; a panorama that is in two models is taken from the larger one. What no
+        model of two panoramas or more holds is in `rejected`, with the reason.
+    """
+    seed = int(rng.integers(1, _SEED_LIMIT))
+    (scratch / "models").mkdir()
+    images = write_database(scratch / "database.db", features, two_views, cameras=cameras)
+    try:
+        models = run_mapper(
+            scratch / "database.db",
+            scratch / "models",
+            mapper=mapper,
+            cameras=cameras,
+            seed=seed,
+            width_px=_width_px(features),
+        )
+    except (RuntimeError, ValueError, IndexError) as error:
+        return _nothing(features, f"COLMAP's {mapper} mapper stopped: {error}")
+    groups: list[Poses] = []
+    registered: set[str] = set()
+    for model in models:
+        poses = poses_from_model(model, features, images, rejected={})
+        group = with_cameras(poses, np.array([name not in registered for name in poses.names], np.bool_))
+        if len(group.names) > 1:
+            groups.append(normalised_poses(group))
+            registered.update(group.names)
+    if not groups:
+        return _nothing(features, f"COLMAP's {mapper} mapper found no model of two panoramas or more")
+    return join_groups(groups, order=tuple(features), rejected=_rejected(features, two_views, registered))
+
+
+def extend_with_colmap(
+    known: Poses,
+    features: Mapping[str, Features],
+    two_views: TwoViews,
+    *,
+    cameras: Cameras = "sphere",
+    rng: np.random.Generator,
+    scratch: Path,
+) -> Poses:
+    """Return known poses, not moved by a digit, with those that COLMAP's incremental mapper adds to them.
+
+    Args:
+        known: poses by the names of `features`; others are left out. Its points are replaced.
+        features: key points by image name, in the capture's order.
+        two_views: verified pairs; those without a general geometry are left out.
+        cameras: see `solve_colmap`.
+        rng: gives COLMAP's seed.
+        scratch: an empty folder for COLMAP's files.
+
+    Returns:
+        Poses in the frame and unit of the known ones; what COLMAP does not add is in `rejected`, with the reason, and
+        so is a known image without any sound pair, which COLMAP does not load (`extend_poses` keeps it).
+    """
+    seed = int(rng.integers(1, _SEED_LIMIT))
+    (scratch / "models").mkdir()
+    images = write_database(scratch / "database.db", features, two_views, cameras=cameras)
+    position = {name: idx for idx, name in enumerate(features)}
+    fixed = {position[name]: known.cam_from_world(idx) for idx, name in enumerate(known.names) if name in position}
+    model, stopped = None, "the known pictures give no point that it could see"
+    try:
+        if len(fixed) > 1:
+            model = extend_model(
+                scratch / "database.db",
+                scratch / "models",
+                fixed,
+                images,
+                cameras=cameras,
+                seed=seed,
+                width_px=_width_px(features),
+            )
+    except (RuntimeError, ValueError, IndexError) as error:
+        stopped = f"COLMAP's incremental mapper stopped: {error}"
+    if model is None:
+        return Poses.without_points(
+            {name: fixed[idx] for name, idx in position.items() if idx in fixed},
+            rejected={
+                name: why_no_pair(name, two_views) or stopped for name, idx in position.items() if idx not in fixed
+            },
+            frame=known.frame, scale=known.scale, metric=known.metric,
+        )  # fmt: skip
+    names = tuple(features)
+    registered = {names[idx] for idx in registered_panoramas(model, images)}
+    rejected = _rejected(features, two_views, registered)
+    poses = _in_world_of(known, poses_from_model(model, features, images, rejected=rejected))
+    return replace(poses, frame=known.frame, scale=known.scale, metric=known.metric)
+
+
+def _in_world_of(known: Poses, poses: Poses) -> Poses:
+    """Return poses in the world of the known ones among them, and those to the last digit.
+
+    COLMAP moves and scales the world of a model that it has adjusted as a whole, but does not turn it.
+    """
+    common = [(idx, known.names.index(name)) for idx, name in enumerate(poses.names) if name in known.names]
+    here, there = (np.array(column) for column in zip(*common, strict=True))
+    old, new = poses.centers[here], known.centers[there]
+    scale = float(np.linalg.norm(new - new.mean(axis=0)) / np.linalg.norm(old - old.mean(axis=0)))
+    moved = moved_poses(poses, Similarity3(scale, np.eye(3), new.mean(axis=0) - scale * old.mean(axis=0)))
+    moved.rotations[here], moved.translations[here] = known.rotations[there], known.translations[there]
+    return moved
+
+
+def _width_px(features: Mapping[str, Features]) -> float:
+    return float(np.median([found.size_hw[1] for found in features.values()])) if features else 1024.0
+
+
+def _nothing(features: Mapping[str, Features], reason: str) -> Poses:
+    return Poses.without_points(
+        {}, rejected=dict.fromkeys(features, reason), frame="the first registered camera",
+        scale="none: no image is registered", metric=False,
+    )  # fmt: skip
+
+
+def _rejected(features: Mapping[str, Features], two_views: TwoViews, registered: Collection[str]) -> dict[str, str]:
+    """Return the reason for every panorama that is not registered."""
+    return {name: _why_unregistered(name, two_views) for name in features if name not in registered}
+
+
+def _why_unregistered(name: str, two_views: TwoViews) -> str:
+    pair = best_pair(name, two_views)
+    if pair is None or not two_views[pair]:
+        return why_no_pair(name, two_views)
+    partner = pair[1] if pair[0] == name else pair[0]
+    return (f"COLMAP did not register it, although its best partner, {partner!r}, shares {len(two_views[pair])} "
+            "verified matches")  # fmt: skip

@@ -1,0 +1,1 @@
+"""The world frame: gauge, gravity, metric scale and geodetic coordinates."""

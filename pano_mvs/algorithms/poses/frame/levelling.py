@@ -1,0 +1,75 @@
+"""Turn the world so that y points down, along gravity, and z north where compasses agree."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.poses.frame.gauge import moved_poses
+from pano_mvs.algorithms.poses.frame.vertical import Evidence, Vertical, find_vertical
+from pano_mvs.geometry import Similarity3, rotation_from_rotvec, rotation_from_two_vectors
+from pano_mvs.scene import Poses
+
+FloatArray = NDArray[np.float64]
+
+_UP = np.array([0.0, -1.0, 0.0])
+_FEWEST_HEADINGS = 2
+_MAX_HEADING_DISAGREEMENT_DEG = 15.0
+
+
+def level_poses(
+    poses: Poses,
+    up_in_cam: Mapping[str, Sequence[float]] | None = None,
+    heading_deg: Mapping[str, float] | None = None,
+    *,
+    evidence: Evidence = "auto",
+) -> tuple[Poses, Vertical]:
+    """Return the same scene in a level world: origin at the first camera, y down along gravity, unit unchanged.
+
+    The z axis points north if at least two compass headings agree; else the world is turned no further than
+    levelling needs, so that z stays close to where it was.
+
+    Args:
+        poses: registered images.
+        up_in_cam: image name to the up direction (3,) that its camera's sensors measured, in the camera frame.
+        heading_deg: image name to the compass heading of its centre, clockwise from north.
+        evidence: as in `find_vertical`.
+
+    Returns:
+        The poses, and what they were levelled by; if nothing tells the vertical, the poses as they were and a falsy
+        record with the reason.
+    """
+    vertical = find_vertical(poses, up_in_cam, evidence=evidence)
+    if not vertical:
+        return poses, vertical
+    levelling = rotation_from_two_vectors(vertical.up_in_world, _UP)
+    level = moved_poses(poses, Similarity3(1.0, levelling, -levelling @ poses.centers[0]))
+    towards, heading = _northward(level, heading_deg or {})
+    # Adding 0 makes −0 a plain 0: the first camera is at the origin exactly.
+    level = moved_poses(level, Similarity3(1.0, towards, np.zeros(3)))
+    level.translations[0] = 0.0
+    frame = f"origin at the first registered camera; y down along gravity, by {vertical.evidence}; {heading}"
+    return replace(level, frame=frame), vertical
+
+
+def _northward(level: Poses, heading_deg: Mapping[str, float]) -> tuple[FloatArray, str]:
+    """Return the turn about the vertical that brings z north, and words for it."""
+    headings = [(idx, heading_deg[name]) for idx, name in enumerate(level.names) if name in heading_deg]
+    unturned = "z close to where it pointed before levelling"
+    # Zero throughout is what software writes that knows no heading.
+    if len(headings) < _FEWEST_HEADINGS or not any(heading for _, heading in headings):
+        return np.eye(3), unturned
+    forward = np.array([level.rotations[idx][2] for idx, _ in headings])
+    measured_rad = np.deg2rad([heading for _, heading in headings])
+    turns = np.exp(1j * (measured_rad - np.arctan2(forward[:, 0], forward[:, 2])))
+    medoid = turns[int(np.argmin(np.abs(np.angle(turns[:, None] / turns[None, :])).sum(axis=1)))]
+    turn_rad = float(np.angle(medoid)) + float(np.median(np.angle(turns / medoid)))
+    off_deg = float(np.median(np.abs(np.rad2deg(np.angle(turns * np.exp(-1j * turn_rad))))))
+    if off_deg > _MAX_HEADING_DISAGREEMENT_DEG:
+        return np.eye(3), f"{unturned} (the compass headings disagree by {off_deg:.0f}°)"
+    return rotation_from_rotvec([0.0, turn_rad, 0.0]), (
+        f"z north, by {len(headings)} compass headings (median disagreement {off_deg:.1f}°)"
+    )

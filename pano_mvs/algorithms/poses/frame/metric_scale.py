@@ -1,0 +1,83 @@
+"""Give poses the metre as their unit, by a length that is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.poses.frame.gauge import moved_poses
+from pano_mvs.algorithms.poses.frame.horizontal_layers import Floor, floor_below
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import Similarity3
+from pano_mvs.scene import Poses
+
+FloatArray = NDArray[np.float64]
+
+# Cameras that are closer than this share of the capture's extent stand in one place: their distance is noise.
+_COINCIDENT_SHARE = 1e-3
+
+
+def scaled_poses(poses: Poses, factor: float, *, origin: str) -> Poses:
+    """Return the same scene with all lengths multiplied, in metres from now on.
+
+    Angles, and with them the points' errors, do not change.
+
+    Args:
+        poses: in any unit.
+        factor: metres per unit of the poses.
+        origin: where the factor comes from, in words.
+
+    Raises:
+        UsageError: if the factor is not positive.
+    """
+    if not (np.isfinite(factor) and factor > 0):
+        raise UsageError(f"a scale must be a positive number, got {factor}")
+    scaled = moved_poses(poses, Similarity3(factor, np.eye(3), np.zeros(3)))
+    return replace(scaled, scale=f"metres, by {origin}", metric=True)
+
+
+def scaled_by_baseline(poses: Poses, first: str, second: str, *, metres: float) -> Poses:
+    """Return the same scene in metres, from the distance between two cameras.
+
+    Args:
+        poses: in any unit.
+        first: name of a registered image.
+        second: name of another one.
+        metres: the distance between their centres.
+
+    Raises:
+        UsageError: if an image is not registered, or the two stand in one place.
+    """
+    for name in (first, second):
+        if name not in poses.names:
+            why = poses.rejected.get(name, "no such image")
+            raise UsageError(f"the baseline's image {name} is not registered ({why}). Name two that are: "
+                             f"{', '.join(poses.names[:8])}")  # fmt: skip
+    centers = poses.centers
+    distance = float(np.linalg.norm(centers[poses.names.index(second)] - centers[poses.names.index(first)]))
+    extent = float(np.linalg.norm(np.ptp(centers, axis=0)))
+    if distance <= _COINCIDENT_SHARE * extent:
+        raise UsageError(f"{first} and {second} were taken in one place, so the distance between them gives no scale. "
+                         "Name two images that are further apart")  # fmt: skip
+    return scaled_poses(poses, metres / distance, origin=f"the baseline of {metres:g} m from {first} to {second}")
+
+
+def scaled_by_camera_height(poses: Poses, up_in_world: FloatArray, *, metres: float) -> tuple[Poses, Floor]:
+    """Return the same scene in metres, from the height of the cameras above the floor.
+
+    Args:
+        poses: in any unit, with sparse points.
+        up_in_world: (3,) unit vector away from gravity.
+        metres: median height of the cameras above the floor.
+
+    Returns:
+        The poses and the floor that was found; if there is none, the poses as they were and a falsy floor with the
+        reason.
+    """
+    floor = floor_below(poses.points_in_world, poses.centers, up_in_world)
+    if not floor:
+        return poses, floor
+    origin = f"the cameras' height of {metres:g} m above a floor of {floor.points} sparse points"
+    return scaled_poses(poses, metres / floor.depth, origin=origin), floor

@@ -1,0 +1,143 @@
+"""Which way is up in the world of solved poses: what sensors, cameras and floors say, and how well they agree."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.poses.frame.horizontal_layers import sharpest_up
+from pano_mvs.geometry import angle_between
+from pano_mvs.scene import Poses
+
+FloatArray = NDArray[np.float64]
+Evidence = Literal["auto", "sensors", "structure", "cameras"]
+
+_UP = np.array([0.0, -1.0, 0.0])
+# Sensors of one rigid capture that differ by more than this measured something else than gravity.
+_MAX_SENSOR_DISAGREEMENT_DEG = 5.0
+# Cameras that were held so far apart from each other were not held upright at all.
+_MAX_CAMERA_DISAGREEMENT_DEG = 20.0
+# Level surfaces further from the cameras' mean than the cameras (three deviations and this) are a slope or a ramp.
+_MAX_STRUCTURE_TILT_DEG = 2.0
+# Agreement that is better than this rejects nothing: readings are whole tenths of degrees at best.
+_MIN_LIMIT_DEG = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Vertical:
+    """The direction away from gravity, or the reason why it is not known (it is falsy then).
+
+    Attributes:
+        up_in_world: (3,) unit vector.
+        source: what said so: "sensors", "structure" or "cameras".
+        evidence: the same in words, with its amount and agreement.
+        disagreement_deg: median angle between the single readings and `up_in_world`; NaN where there is one only.
+        reason: why nothing is known; empty if something is.
+    """
+
+    up_in_world: FloatArray
+    source: str = ""
+    evidence: str = ""
+    disagreement_deg: float = float("nan")
+    reason: str = ""
+
+    def __bool__(self) -> bool:
+        """Return whether the direction is known."""
+        return not self.reason
+
+
+def find_vertical(
+    poses: Poses, up_in_cam: Mapping[str, Sequence[float]] | None = None, *, evidence: Evidence = "auto"
+) -> Vertical:
+    """Return the direction away from gravity in the world of some poses.
+
+    Args:
+        poses: registered images, and their sparse points for `structure`.
+        up_in_cam: image name to the up direction (3,) that its camera's sensors measured, in the camera frame.
+        evidence: "sensors" of the cameras; the "structure" of floors, ceilings and tables within 20° of where the
+            cameras' own up directions point; these "cameras" directions alone; or "auto": the first of them that can
+            be used, in this order.
+    """
+    finders: dict[str, Callable[[], Vertical]] = {
+        "sensors": lambda: vertical_from_sensors(poses, up_in_cam or {}),
+        "structure": lambda: vertical_from_structure(poses),
+        "cameras": lambda: vertical_from_cameras(poses),
+    }
+    reasons = []
+    for find in finders.values() if evidence == "auto" else [finders[evidence]]:
+        vertical = find()
+        if vertical:
+            return vertical
+        reasons.append(vertical.reason)
+    return _unknown("; ".join(reasons))
+
+
+def vertical_from_sensors(poses: Poses, up_in_cam: Mapping[str, Sequence[float]]) -> Vertical:
+    """Return the robust mean of the up directions that the cameras' sensors measured, each turned into the world."""
+    measured = [(idx, up_in_cam[name]) for idx, name in enumerate(poses.names) if name in up_in_cam]
+    if not measured:
+        return _unknown("no registered panorama states its pitch and roll")
+    readings = np.array([poses.rotations[idx].T @ np.asarray(up, np.float64) for idx, up in measured])
+    up, deviations_deg, kept = robust_mean_direction(readings)
+    disagreement_deg = float(np.median(deviations_deg))
+    if disagreement_deg > _MAX_SENSOR_DISAGREEMENT_DEG:
+        return _unknown(f"the sensors of {len(measured)} panoramas disagree by {disagreement_deg:.1f}° in the median")
+    agreement = f", median disagreement {disagreement_deg:.2f}°" if len(measured) > 1 else ", nothing to compare with"
+    evidence = f"the pitch and roll that {kept.sum()} of {len(poses.names)} panoramas state{agreement}"
+    return Vertical(up, "sensors", evidence, disagreement_deg if len(measured) > 1 else float("nan"))
+
+
+def vertical_from_cameras(poses: Poses) -> Vertical:
+    """Return the robust mean of the cameras' own up directions: panoramas are taken with the camera nearly upright."""
+    if len(poses.names) < 2:
+        return _unknown("one camera alone cannot tell how it was held")
+    up, deviations_deg, _ = robust_mean_direction(poses.rotations.transpose(0, 2, 1) @ _UP)
+    disagreement_deg = float(np.median(deviations_deg))
+    if disagreement_deg > _MAX_CAMERA_DISAGREEMENT_DEG:
+        return _unknown(f"the cameras were held {disagreement_deg:.0f}° apart from each other, not upright")
+    evidence = f"the common up direction of {len(poses.names)} cameras, median disagreement {disagreement_deg:.2f}°"
+    return Vertical(up, "cameras", evidence, disagreement_deg)
+
+
+def vertical_from_structure(poses: Poses) -> Vertical:
+    """Return the direction, not far from the cameras' own, along which the sparse points lie in the sharpest layers."""
+    prior = vertical_from_cameras(poses)
+    if not prior:
+        return prior
+    layers = sharpest_up(poses.points_in_world, poses.centers, prior.up_in_world)
+    if not layers:
+        return _unknown(layers.reason)
+    moved_deg = float(np.rad2deg(angle_between(layers.up, prior.up_in_world)))
+    limit_deg = _MAX_STRUCTURE_TILT_DEG + 3 * 1.4826 * prior.disagreement_deg
+    if moved_deg > limit_deg:
+        return _unknown(f"the layers of sparse points are {moved_deg:.1f}° from level as the cameras were held")
+    evidence = (f"the level surfaces among {len(poses.points_in_world)} sparse points, {moved_deg:.2f}° from the mean "
+                f"of {len(poses.names)} cameras")  # fmt: skip
+    return Vertical(layers.up, "structure", evidence, prior.disagreement_deg)
+
+
+def robust_mean_direction(directions: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Return the mean of unit vectors (N, 3), N ≥ 1, without those that lie far from most.
+
+    It starts at the vector with the least sum of angles to all others, and twice leaves out what is further from the
+    mean than three standard deviations, as the median of the angles tells them.
+
+    Returns:
+        The mean (3,), the angle of every vector to it in degrees (N,), and which vectors it is the mean of (N,).
+    """
+    angles = np.rad2deg(angle_between(directions[:, None], directions[None, :]))
+    mean = directions[int(np.argmin(angles.sum(axis=1)))]
+    for _ in range(2):
+        deviations_deg = np.rad2deg(angle_between(directions, mean))
+        kept = deviations_deg <= max(_MIN_LIMIT_DEG, 3 * 1.4826 * float(np.median(deviations_deg)))
+        mean = directions[kept].mean(axis=0)
+        mean = mean / np.linalg.norm(mean)
+    return mean, np.rad2deg(angle_between(directions, mean)), kept
+
+
+def _unknown(reason: str) -> Vertical:
+    return Vertical(_UP, reason=reason)

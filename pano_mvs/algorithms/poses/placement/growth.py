@@ -1,0 +1,335 @@
+"""Grow a model from a seed pair: the image that its pairs place most clearly comes first."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pano_mvs.algorithms.poses.placement.pair_evidence import Witnesses
+from pano_mvs.algorithms.poses.placement.placed_model import (
+    MIN_POINTS,
+    MIN_SHARE,
+    MIN_SHARE_OF_AGREEING,
+    Pairs,
+    PlacedModel,
+    enough_points,
+)
+from pano_mvs.algorithms.poses.placement.places import Placement, agreement
+from pano_mvs.algorithms.poses.placement.view_graph import Edge
+from pano_mvs.algorithms.poses.verification.aliases import find_aliases
+from pano_mvs.algorithms.poses.verification.arbitration import PAIRS_POWER, Arbitration, arbitrate, judge
+from pano_mvs.algorithms.poses.verification.confirmation import Confirmation
+from pano_mvs.geometry import Rigid3
+
+_FULL_PARALLAX_DEG = 10.0
+_SEEDS = 12  # seeds of which the support by third images is computed
+_THIRDS = 8
+_MAX_GROWN = 3  # seeds from which models are grown
+_ADJUST_GROWTH = 1.25  # all cameras are adjusted whenever there are a quarter more than at the last time
+_LOOKED_AT = 6  # images that are placed before the clearest of them is added, where none is clear
+_MIN_SHARE = 0.5  # of an image's pairs, by weight, that agree with a clear placement
+_CLEAR = 0.8  # a runner-up with more than this share of the best score leaves a placement in doubt …
+_CLEAR_WITH_IMAGES = 0.4  # … and with more than this where there is somebody to ask
+_SATISFYING = 0.85  # share of the pairs explained with which the first model is good enough
+_CERTAIN = 0.97  # share of the pairs explained from which the images are not asked
+_RIVALS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class GrownModel:
+    """A model with what could not be added to it.
+
+    Attributes:
+        model: the cameras.
+        refused: images that could not be added, with the reason.
+        arbitration: what the images say about the cameras; None if they were not asked.
+        aliased: whether runner-up geometries of several pairs suggest the same move of a block of cameras.
+    """
+
+    model: PlacedModel
+    refused: dict[int, str]
+    arbitration: Arbitration | None
+    aliased: bool = False
+
+    def satisfies(self) -> bool:
+        """Return whether no other model need be tried."""
+        if self.refused or self.aliased:
+            return False
+        if self.arbitration is None:
+            return self.model.explained_share() > _SATISFYING
+        return not self.arbitration.doubts and not self.arbitration.removed
+
+    def rank(self) -> tuple[float, float]:
+        """Return what models are sorted by: how much of the images and of the pairs they explain in all.
+
+        Cameras that are doubtful confirm nothing: a model in which all cameras are confirmed about as expected is
+        better than one in which most are confirmed a little more and one hardly is.
+        """
+        confirmed = 0.0
+        if self.arbitration is not None:
+            shares, doubts = self.arbitration.shares, self.arbitration.doubts
+            confirmed = sum(np.nan_to_num(share) for image, share in shares.items() if image not in doubts)
+        return -float(confirmed) * self.model.explained_share() ** PAIRS_POWER, -self.model.explained_weight()
+
+
+def grown_models(
+    pairs: Pairs, images: Collection[int], *, adjust: bool, confirmation: Confirmation | None
+) -> list[GrownModel]:
+    """Return models of a connected group of images, the one that explains the pairs best first.
+
+    Args:
+        pairs: of the capture.
+        images: of the group.
+        adjust: whether all cameras are adjusted as the model grows.
+        confirmation: decides between placements, and between models, that the pairs do not decide; asked only then.
+    """
+    models: list[GrownModel] = []
+    tried: set[tuple[Edge, int]] = set()
+    while seeds := ranked_seeds(pairs, images, without=tried):
+        edge, rank = seeds[0]
+        models.append(_grown(pairs, images, edge, rank, adjust=adjust, confirmation=confirmation))
+        # A seed that a model agrees with would lead to the same model again.
+        tried |= {seeds[0], *models[-1].model.chosen.items()}
+        # Seeds that nothing attaches to are not worth a try.
+        grown = sum(len(found.model.cameras) > 2 for found in models)
+        if models[-1].satisfies() or grown == _MAX_GROWN or len(models) == 2 * _MAX_GROWN:
+            break
+    models.sort(key=GrownModel.rank)
+    if models and models[0].arbitration is not None and confirmation is not None:
+        models[0] = _arbitrated(models[0], adjust=adjust, confirmation=confirmation)
+    return models
+
+
+def _arbitrated(grown: GrownModel, *, adjust: bool, confirmation: Confirmation) -> GrownModel:
+    """Return a model in which cameras and blocks of cameras stand where the images confirm most."""
+    arbitration = arbitrate(grown.model, confirmation)
+    if arbitration.moved:
+        settle(grown.model, adjust=adjust, confirmation=confirmation)
+    return replace(grown, refused=grown.refused | arbitration.removed, arbitration=arbitration)
+
+
+def ranked_seeds(
+    pairs: Pairs, images: Collection[int], *, without: Collection[tuple[Edge, int]] = ()
+) -> list[tuple[Edge, int]]:
+    """Return pairs with the geometry to begin with, the best first.
+
+    Much weight and enough parallax make a good seed, and third images that both of its cameras place alike. A seed
+    with a false geometry has few of those.
+
+    Args:
+        pairs: of the capture.
+        images: of the group.
+        without: seeds that are not wanted.
+    """
+    members = set(images)
+
+    def quality(edge: Edge, rank: int) -> float:
+        geometry = pairs.geometries[edge][rank]
+        return geometry.weight**2 * min(geometry.parallax_deg / _FULL_PARALLAX_DEG, 1.0)
+
+    seeds = [
+        (edge, rank)
+        for edge, found in pairs.geometries.items()
+        if members.issuperset(edge)
+        for rank in range(len(found))
+        if (edge, rank) not in without
+    ]
+    seeds.sort(key=lambda seed: (-quality(*seed), seed))
+    seeds = seeds[:_SEEDS]
+    support = {seed: _support(pairs, *seed) for seed in seeds}
+    most = max((quality(*seed) for seed in seeds), default=1.0)
+    return sorted(seeds, key=lambda seed: (-support[seed] * np.sqrt(quality(*seed) / most), -quality(*seed), seed))
+
+
+def _support(pairs: Pairs, edge: Edge, rank: int) -> float:
+    """Return how much third images speak for a seed: the weight of what both of its cameras agree on."""
+    model = PlacedModel(pairs)
+    model.seed(edge, rank)
+    thirds = [idx for idx in pairs.partners[edge[0]] if idx in pairs.partners[edge[1]]][:_THIRDS]
+    total = 0.25
+    for image in thirds:
+        _, found = model.place(image)
+        witnesses_of_both = [place for place in found if place.explained.sum() >= 2]
+        if witnesses_of_both:
+            total += witnesses_of_both[0].score
+    return total
+
+
+def _grown(
+    pairs: Pairs, images: Collection[int], edge: Edge, rank: int, *, adjust: bool, confirmation: Confirmation | None
+) -> GrownModel:
+    """Return the model that grows from a seed, and why images were refused."""
+    model = PlacedModel(pairs)
+    model.seed(edge, rank)
+    left = set(images) - set(edge)
+    weights: dict[int, float] = {}
+    for image in edge:
+        _count_pairs(pairs, image, left, weights)
+    if not adjust:
+        model.adjust(cameras=False)
+    adjusted = 2
+    reasons: dict[int, str] = {}
+    while step := _next(model, weights, confirmation=confirmation, reasons=reasons):
+        image, pose = step
+        model.add(image, pose)
+        left.discard(image)
+        del weights[image]
+        _count_pairs(pairs, image, left, weights)
+        if not adjust or len(model.cameras) > _ADJUST_GROWTH * adjusted:
+            model.adjust(cameras=adjust)
+            adjusted = len(model.cameras)
+    for image in edge:
+        if reason := _unsupported(model, image):
+            model.remove(image)
+            left.add(image)
+            reasons[image] = reason
+    settle(model, adjust=adjust, confirmation=confirmation)
+    refused = {image: reasons.get(image, _why_nothing(model, image)) for image in sorted(left)}
+    arbitration = None
+    aliased = confirmation is not None and bool(find_aliases(model))
+    if left or aliased or model.explained_share() < _CERTAIN:
+        arbitration = judge(model, confirmation)
+    return GrownModel(model, refused, arbitration, aliased)
+
+
+def _count_pairs(pairs: Pairs, image: int, left: Collection[int], weights: dict[int, float]) -> None:
+    """Add the pairs of an image that was registered to the weights of its partners that are not."""
+    for partner in pairs.partners[image]:
+        if partner in left:
+            edge = min(image, partner), max(image, partner)
+            weights[partner] = weights.get(partner, 0.0) + pairs.geometries[edge][0].weight
+
+
+def _unsupported(model: PlacedModel, image: int) -> str:
+    """Return why a camera of the seed, which nothing has checked yet, does not fit the others; "" if it does."""
+    if len(model.cameras) < 4:
+        return ""
+    without = model.copy()
+    without.remove(image)
+    without.learn_ranges()
+    witnesses = without.witnesses(image)
+    pose = model.cameras[image]
+    agrees = agreement(witnesses, pose.rotation[None], pose.center[None])[0]
+    _, support, known = without.polished(image, witnesses, Placement(pose, agrees, 0.0))
+    agreeing = len(set(witnesses.partner[agrees].tolist()))
+    if enough_points(support, known, agreeing=agreeing):
+        return ""
+    return _why_refused(model.pairs, image, support, known, agreeing=agreeing)
+
+
+def _next(
+    model: PlacedModel, weights: Mapping[int, float], *, confirmation: Confirmation | None, reasons: dict[int, str]
+) -> tuple[int, Rigid3] | None:
+    """Return the image to add next and its pose; None if none can be added.
+
+    Args:
+        model: to be added to.
+        weights: images that share pairs with registered ones, with the weight of these pairs.
+        confirmation: of the images.
+        reasons: receives why an image cannot be added yet.
+    """
+    order = sorted(weights, key=lambda idx: (-weights[idx], idx))
+    for first in range(0, len(order), _LOOKED_AT):
+        doubtful: list[tuple[float, int, Witnesses, list[Placement]]] = []
+        for image in order[first : first + _LOOKED_AT]:
+            witnesses, found = model.place(image)
+            if not found:
+                reasons[image] = _why_nothing(model, image)
+                continue
+            rival = found[1].score / found[0].score if len(found) > 1 else 0.0
+            share = found[0].score / witnesses.total
+            clear = rival < (_CLEAR if confirmation is None else _CLEAR_WITH_IMAGES) and share > _MIN_SHARE
+            if clear and (pose := _accepted(model, image, witnesses, found[0], reasons)):
+                return image, pose
+            doubtful.append((share * (1 - 0.5 * rival), image, witnesses, found))
+        for _, image, witnesses, found in sorted(doubtful, key=lambda item: (-item[0], item[1])):
+            for placement in _by_images(model, image, found, confirmation):
+                if pose := _accepted(model, image, witnesses, placement, reasons):
+                    return image, pose
+    return None
+
+
+def _by_images(
+    model: PlacedModel, image: int, found: list[Placement], confirmation: Confirmation | None
+) -> list[Placement]:
+    """Return the placements in the order in which they are to be tried: where they are rivals the images decide."""
+    rivals = [placement for placement in found[:_RIVALS] if placement.score > _CLEAR_WITH_IMAGES * found[0].score]
+    if confirmation is None or len(rivals) < 2:
+        return found[:_RIVALS]
+    shares = [confirmation.share(image, placement.cam_from_world, model.cameras) for placement in rivals]
+    return [rivals[idx] for idx in np.argsort(-np.nan_to_num(shares), kind="stable")]
+
+
+def _accepted(
+    model: PlacedModel, image: int, witnesses: Witnesses, placement: Placement, reasons: dict[int, str]
+) -> Rigid3 | None:
+    """Return the pose of a placement polished on known points, or None if it sees too few of them; notes the reason."""
+    pose, support, known = model.polished(image, witnesses, placement)
+    agreeing = len(set(witnesses.partner[placement.explained].tolist()))
+    if enough_points(support, known, agreeing=agreeing):
+        return pose
+    reasons[image] = _why_refused(model.pairs, image, support, known, agreeing=agreeing)
+    return None
+
+
+def settle(model: PlacedModel, *, adjust: bool, confirmation: Confirmation | None) -> None:
+    """Adjust a grown model, choose geometries again, and move cameras that their pairs place elsewhere by now."""
+    for _ in range(3):
+        if adjust:
+            model.adjust()
+        model.choose_again()
+        if not _moved_cameras(model, confirmation):
+            break
+    if adjust:
+        model.adjust()
+        model.choose_again()
+
+
+def _moved_cameras(model: PlacedModel, confirmation: Confirmation | None) -> bool:
+    """Move every camera of which another place explains clearly more; return whether any was moved."""
+    moved = False
+    if len(model.cameras) < 3:
+        return False
+    for image in sorted(model.cameras):
+        witnesses = model.witnesses(image)
+        mine = [rank for edge, rank in model.chosen.items() if image in edge]
+        score = sum(model.pairs.geometries[edge][rank].weight for edge, rank in model.chosen.items() if image in edge)
+        if not mine or score > 0.8 * witnesses.total:
+            continue
+        _, found = model.place(image)
+        if found and found[0].score > 1.2 * score:
+            pose, support, known = model.polished(image, witnesses, found[0])
+            if enough_points(support, known) and _better_by_images(model, image, pose, confirmation):
+                model.add(image, pose)
+                moved = True
+    return moved
+
+
+def _better_by_images(model: PlacedModel, image: int, pose: Rigid3, confirmation: Confirmation | None) -> bool:
+    """Return whether the images do not speak against moving a camera."""
+    if confirmation is None:
+        return True
+    here = confirmation.share(image, model.cameras[image], model.cameras)
+    return not confirmation.share(image, pose, model.cameras) < here
+
+
+def _why_nothing(model: PlacedModel, image: int) -> str:
+    if any(idx in model.cameras for idx in model.pairs.partners[image]):
+        return "no pair with a registered image shares enough points with a third to tell how far apart they are"
+    return "its pairs are with images that could not be registered either"
+
+
+def _why_refused(pairs: Pairs, image: int, support: int, known: int, *, agreeing: int) -> str:
+    if known >= MIN_POINTS:
+        share = MIN_SHARE if agreeing < 2 else MIN_SHARE_OF_AGREEING
+        needed = max(MIN_POINTS, int(np.ceil(share * known)))
+        return (
+            f"only {support} of {known} points known from other images are seen where they should be, {needed} needed: "
+            "repeated structure, something that moved, stitching errors, or an image that is no panorama"
+        )
+    partner = pairs.partners[image][0]
+    count = max(len(found.view) for found in pairs.geometries[min(image, partner), max(image, partner)])
+    return (f"{known} of its points are known from two other images, {MIN_POINTS} needed; its best partner is "
+            f"{pairs.names[partner]!r} with {count} matches: take panoramas in between")  # fmt: skip

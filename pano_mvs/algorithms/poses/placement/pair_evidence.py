@@ -1,0 +1,197 @@
+"""What the pairs of an image say about its pose: a rotation, a direction and a length for every geometry of a pair."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.poses.placement.scale import ScaleEstimator, estimate_scale
+from pano_mvs.algorithms.poses.placement.view_graph import Edge
+from pano_mvs.geometry import Rigid3, angle_between, ranges_from_bearings
+from pano_mvs.scene import TwoView
+
+FloatArray = NDArray[np.float64]
+
+_MIN_ANGLE_RAD = float(np.deg2rad(1.0))
+_MIN_RATIOS = 6
+# Ratios within this factor of their centre agree with it; a length that fewer than this share agree on is no length.
+_AGREEING, _MIN_AGREEING = 1.25, 0.4
+_FEW_MATCHES = 15
+# Standard deviation that is assumed for the direction of a geometry that comes without one.
+_ALTERNATIVE_STD_DEG = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """One of the geometries of a pair (i, j), i < j.
+
+    Attributes:
+        view: second_from_first with the matches that support it.
+        weight: how much it counts: grows slowly with its matches, since a repeated floor may give hundreds of them to a
+            false geometry, and with its share of the matches of the pair's best geometry.
+        direction_std_deg: standard deviation of its direction.
+        parallax_deg: median angle between the rays of its matches after de-rotation.
+    """
+
+    view: TwoView
+    weight: float
+    direction_std_deg: float
+    parallax_deg: float
+
+
+def geometries_of(view: TwoView, bearings_first: FloatArray, bearings_second: FloatArray) -> tuple[Geometry, ...]:
+    """Return all geometries of a pair, the best supported first.
+
+    Args:
+        view: the pair's two-view geometry with its alternatives.
+        bearings_first: (N, 3) of all key points of the first image.
+        bearings_second: (N, 3) of the second.
+    """
+    found = []
+    most = max(len(view), 1)
+    for rank, geometry in enumerate((view, *view.alternatives)):
+        p, q = bearings_first[geometry.matches_idx[:, 0]], bearings_second[geometry.matches_idx[:, 1]]
+        found.append(
+            Geometry(
+                view=geometry,
+                weight=(1 + np.log10(max(len(geometry), 1) / _FEW_MATCHES)) * min(1.0, np.sqrt(len(geometry) / most)),
+                direction_std_deg=view.direction_std_deg if rank == 0 else _ALTERNATIVE_STD_DEG,
+                parallax_deg=float(np.rad2deg(np.median(angle_between(p @ geometry.rotation.T, q)))) if len(p) else 0.0,
+            )
+        )
+    return tuple(sorted(found, key=lambda geometry: -geometry.weight))
+
+
+@dataclass(frozen=True, eq=False)
+class Witnesses:
+    """All geometries that join an image to registered ones, W of them.
+
+    Attributes:
+        partner: (W,) the registered image.
+        rank: (W,) position of the geometry in its pair.
+        weight: (W,) how much it counts.
+        rotations: (W, 3, 3) of cam_from_world for the image, as the geometry has it.
+        origins: (W, 3) centre of the partner in the world.
+        directions: (W, 3) unit vector from there to the image.
+        lengths: (W,) the distance that puts points where they are known to be; NaN where too few points tell.
+        tolerance_rad: (W,) by how much a direction may be off.
+    """
+
+    partner: NDArray[np.intp]
+    rank: NDArray[np.intp]
+    weight: FloatArray
+    rotations: FloatArray
+    origins: FloatArray
+    directions: FloatArray
+    lengths: FloatArray
+    tolerance_rad: FloatArray
+
+    def __len__(self) -> int:
+        """Return the number of geometries."""
+        return len(self.partner)
+
+    @property
+    def total(self) -> float:
+        """The weight that a pose has which agrees with every partner's heaviest geometry."""
+        return float(best_by_partner(self.partner, self.weight[None])[0])
+
+
+def best_by_partner(partner: NDArray[np.intp], weights: FloatArray) -> FloatArray:
+    """Return the sum over partners of the largest weight among its geometries, (C,), for weights (C, W)."""
+    total = np.zeros(len(weights))
+    for idx in np.unique(partner):
+        total += weights[:, partner == idx].max(axis=1)
+    return total
+
+
+def gather_witnesses(
+    image: int,
+    partners: Sequence[int],
+    *,
+    geometries: Mapping[Edge, tuple[Geometry, ...]],
+    cameras: Mapping[int, Rigid3],
+    bearings: Sequence[FloatArray],
+    ranges: Sequence[FloatArray],
+    estimator: ScaleEstimator,
+    kappa: float,
+) -> Witnesses:
+    """Return what the pairs of an image with registered partners say.
+
+    Args:
+        image: the image to place.
+        partners: registered images that share a pair with it.
+        geometries: of all pairs (i, j), i < j.
+        cameras: cam_from_world of registered images.
+        bearings: (N, 3) of every image's key points.
+        ranges: (N,) known range of every image's key points in scene units, NaN where it is not known.
+        estimator: see `estimate_scale`.
+        kappa: see `estimate_scale`.
+    """
+    rows = []
+    for partner in partners:
+        camera = cameras[partner]
+        for rank, geometry in enumerate(geometries[min(image, partner), max(image, partner)]):
+            from_partner, matches = oriented(geometry.view, partner, image)
+            length = _length(
+                from_partner, bearings[partner][matches[:, 0]], bearings[image][matches[:, 1]],
+                ranges[partner][matches[:, 0]], estimator=estimator, kappa=kappa,
+            )  # fmt: skip
+            rows.append(
+                (
+                    partner, rank, geometry.weight, from_partner.rotation @ camera.rotation, camera.center,
+                    camera.rotation.T @ from_partner.center, length,
+                    np.deg2rad(1.0 + 2 * min(geometry.direction_std_deg, 1.0) + 5 * geometry.view.residual_deg),
+                )
+            )  # fmt: skip
+    columns = list(zip(*rows, strict=True)) if rows else [()] * 8
+    return Witnesses(
+        partner=np.array(columns[0], np.intp),
+        rank=np.array(columns[1], np.intp),
+        weight=np.array(columns[2], np.float64),
+        rotations=np.array(columns[3], np.float64).reshape(-1, 3, 3),
+        origins=np.array(columns[4], np.float64).reshape(-1, 3),
+        directions=np.array(columns[5], np.float64).reshape(-1, 3),
+        lengths=np.array(columns[6], np.float64),
+        tolerance_rad=np.array(columns[7], np.float64),
+    )
+
+
+def oriented(view: TwoView, first: int, second: int) -> tuple[Rigid3, NDArray[np.int32]]:
+    """Return second_from_first with |t| = 1, and the matches with the first image's key points first.
+
+    `view` is stored for the smaller of the two images as the first.
+    """
+    pose, matches = Rigid3(view.rotation, view.direction), view.matches_idx
+    if first < second:
+        return pose, matches
+    reversed_matches: NDArray[np.int32] = matches[:, ::-1]
+    return pose.inverse(), reversed_matches
+
+
+def _length(
+    second_from_first: Rigid3,
+    p: FloatArray,
+    q: FloatArray,
+    known_ranges: FloatArray,
+    *,
+    estimator: ScaleEstimator,
+    kappa: float,
+) -> float:
+    """Return the length of the translation at which points come to lie at their known ranges; NaN if none does."""
+    known = np.isfinite(known_ranges)
+    if known.sum() < _MIN_RATIOS:
+        return np.nan
+    p, q, known_ranges = p[known], q[known], known_ranges[known]
+    unit_range, other_range = ranges_from_bearings(p, q, second_from_first)
+    parallax = angle_between(p @ second_from_first.rotation.T, q)
+    with np.errstate(invalid="ignore"):
+        usable = (unit_range > 0) & (other_range > 0) & (parallax > _MIN_ANGLE_RAD)
+    if usable.sum() < _MIN_RATIOS:
+        return np.nan
+    ratios = known_ranges[usable] / unit_range[usable]
+    length = estimate_scale(ratios, np.sin(parallax[usable]) ** 2, estimator=estimator, kappa=kappa)
+    agreeing = int((np.abs(np.log(ratios / length)) < np.log(_AGREEING)).sum())
+    return length if agreeing >= max(_MIN_RATIOS, _MIN_AGREEING * len(ratios)) else np.nan

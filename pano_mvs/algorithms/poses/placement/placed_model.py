@@ -1,0 +1,340 @@
+"""A model that grows by one image at a time: its cameras, the geometry chosen for every pair, and known ranges."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.poses.adjustment.tracks import Tracks, build_tracks
+from pano_mvs.algorithms.poses.placement.pair_evidence import (
+    Geometry,
+    Witnesses,
+    gather_witnesses,
+    geometries_of,
+    oriented,
+)
+from pano_mvs.algorithms.poses.placement.places import Placement, agreement, placements
+from pano_mvs.algorithms.poses.placement.registration import GrowingModel
+from pano_mvs.algorithms.poses.placement.resection import refine_resection, resection_errors
+from pano_mvs.algorithms.poses.placement.scale import ScaleEstimator
+from pano_mvs.algorithms.poses.placement.view_graph import Edge, consistent_edges
+from pano_mvs.geometry import Rigid3, angle_between, ranges_from_bearings
+from pano_mvs.scene import Features, TwoView
+
+FloatArray = NDArray[np.float64]
+
+_MAX_ERROR_RAD = float(np.deg2rad(0.5))
+_FIRST_GUESS_RAD = float(np.deg2rad(2.0))
+_MIN_ANGLE_RAD = float(np.deg2rad(1.5))
+MIN_POINTS = 15
+MIN_SHARE, MIN_SHARE_OF_AGREEING = 0.4, 0.2
+_MAX_PARTNERS = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """The pairs of a capture with all their geometries.
+
+    Attributes:
+        features: key points by image name, in the capture's order.
+        geometries: (i, j), i < j, to the geometries of the pair, the heaviest first.
+        estimator: how translation scale factors are estimated from the ratios of single features.
+        kappa: the paper's κ.
+    """
+
+    features: Mapping[str, Features]
+    geometries: Mapping[Edge, tuple[Geometry, ...]]
+    estimator: ScaleEstimator = "cauchy"
+    kappa: float = 0.01
+    names: tuple[str, ...] = field(init=False)
+    bearings: tuple[FloatArray, ...] = field(init=False)
+    partners: tuple[tuple[int, ...], ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "names", tuple(self.features))
+        object.__setattr__(self, "bearings", tuple(found.bearings for found in self.features.values()))
+        by_image: list[list[tuple[int, int]]] = [[] for _ in self.names]
+        for (first, second), found in self.geometries.items():
+            most = max(len(geometry.view) for geometry in found)
+            by_image[first].append((-most, second))
+            by_image[second].append((-most, first))
+        object.__setattr__(self, "partners", tuple(tuple(idx for _, idx in sorted(pairs)) for pairs in by_image))
+
+    @staticmethod
+    def without(names: Sequence[str]) -> Pairs:
+        """Return the pairs of images of which neither key points nor matches are known."""
+        nothing = Features(
+            bearings=np.zeros((0, 3)), descriptors=np.zeros((0, 1), np.float32), sizes_rad=np.zeros(0, np.float32),
+            scores=np.zeros(0, np.float32), colors_rgb=np.zeros((0, 3), np.uint8), metric="l2", size_hw=(1, 2),
+        )  # fmt: skip
+        return Pairs(dict.fromkeys(names, nothing), {})
+
+
+def pairs_of(
+    features: Mapping[str, Features],
+    two_views: Mapping[tuple[str, str], TwoView],
+    *,
+    estimator: ScaleEstimator = "cauchy",
+    kappa: float = 0.01,
+) -> Pairs:
+    """Return the pairs of a capture whose rotations do not contradict the pairs around them, with all their geometries.
+
+    Args:
+        features: key points by image name, in the capture's order.
+        two_views: verified pairs.
+        estimator: see `estimate_scale`.
+        kappa: see `estimate_scale`.
+    """
+    names = tuple(features)
+    geometries = {
+        (a, b): geometries_of(view, features[names[a]].bearings, features[names[b]].bearings)
+        for (a, b), view in consistent_edges(names, two_views).items()
+    }
+    return Pairs(features, geometries, estimator, kappa)
+
+
+@dataclass(eq=False)
+class PlacedModel:
+    """Registered cameras; the world is the first camera that was added.
+
+    Attributes:
+        pairs: of the capture.
+        cameras: image position to cam_from_world.
+        chosen: for pairs of registered images, the position of the geometry that agrees with their cameras; pairs of
+            which none agrees are left out.
+    """
+
+    pairs: Pairs
+    cameras: dict[int, Rigid3] = field(default_factory=dict)
+    chosen: dict[Edge, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._ranges = [np.full(len(rays), np.nan) for rays in self.pairs.bearings]
+        self._parallax = [np.zeros(len(rays)) for rays in self.pairs.bearings]
+
+    def copy(self) -> PlacedModel:
+        """Return a model that can be changed independently."""
+        model = PlacedModel(self.pairs, dict(self.cameras), dict(self.chosen))
+        model._ranges = [ranges.copy() for ranges in self._ranges]
+        model._parallax = [parallax.copy() for parallax in self._parallax]
+        return model
+
+    def witnesses(self, image: int, partners: Sequence[int] | None = None) -> Witnesses:
+        """Return what the pairs of an image with registered images, or with some of them, say about its pose."""
+        if partners is None:
+            partners = [idx for idx in self.pairs.partners[image] if idx in self.cameras][:_MAX_PARTNERS]
+        return gather_witnesses(
+            image,
+            partners,
+            geometries=self.pairs.geometries,
+            cameras=self.cameras,
+            bearings=self.pairs.bearings,
+            ranges=self._ranges,
+            estimator=self.pairs.estimator,
+            kappa=self.pairs.kappa,
+        )
+
+    def place(self, image: int) -> tuple[Witnesses, list[Placement]]:
+        """Return what the pairs of an image say about its pose, and the poses on which they agree, best first."""
+        witnesses = self.witnesses(image)
+        return witnesses, placements(witnesses)
+
+    def add(self, image: int, cam_from_world: Rigid3) -> None:
+        """Register an image, choose the geometries of its pairs that agree, and learn ranges from them."""
+        self.cameras[image] = cam_from_world
+        witnesses = self.witnesses(image)
+        for edge in [edge for edge in self.chosen if image in edge]:
+            del self.chosen[edge]
+        if not len(witnesses):
+            return
+        agrees = agreement(witnesses, cam_from_world.rotation[None], cam_from_world.center[None])[0]
+        for idx in np.flatnonzero(agrees):
+            edge = _edge(image, int(witnesses.partner[idx]))
+            # Geometries are sorted by weight, so the first that agrees is the heaviest.
+            if edge not in self.chosen:
+                self.chosen[edge] = int(witnesses.rank[idx])
+                self._learn_ranges(edge)
+
+    def remove(self, image: int) -> None:
+        """Take an image out of the model."""
+        del self.cameras[image]
+        self.chosen = {edge: rank for edge, rank in self.chosen.items() if image not in edge}
+        self._ranges[image][:] = np.nan
+        self._parallax[image][:] = 0
+
+    def seed(self, edge: Edge, rank: int) -> None:
+        """Begin with a pair of images, in the frame of the first, one unit of length apart."""
+        view = self.pairs.geometries[edge][rank].view
+        self.cameras = {edge[0]: Rigid3.identity(), edge[1]: Rigid3(view.rotation, view.direction)}
+        self.chosen = {edge: rank}
+        self._learn_ranges(edge)
+
+    def known_points(self, image: int, explained: Mapping[int, int]) -> tuple[FloatArray, FloatArray]:
+        """Return points with known positions, (M, 3), that an image matches, and its rays to them, (M, 3).
+
+        Args:
+            image: the image.
+            explained: registered partners with the rank of the geometry whose matches count.
+        """
+        points, rays = [np.zeros((0, 3))], [np.zeros((0, 3))]
+        seen = np.zeros(len(self.pairs.bearings[image]), np.bool_)
+        for partner, rank in explained.items():
+            view = self.pairs.geometries[_edge(image, partner)][rank].view
+            _, matches = oriented(view, partner, image)
+            ranges = self._ranges[partner][matches[:, 0]]
+            fresh = np.isfinite(ranges) & ~seen[matches[:, 1]]
+            theirs, mine = matches[fresh, 0], matches[fresh, 1]
+            seen[mine] = True
+            camera = self.cameras[partner]
+            points.append(ranges[fresh, None] * self.pairs.bearings[partner][theirs] @ camera.rotation + camera.center)
+            rays.append(self.pairs.bearings[image][mine])
+        return np.concatenate(points), np.concatenate(rays)
+
+    def polished(self, image: int, witnesses: Witnesses, placement: Placement) -> tuple[Rigid3, int, int]:
+        """Return a placement refined on known points, how many of them it sees where they should be, and how many.
+
+        A placement that matches too few known points is returned as it is.
+        """
+        points, rays = self.known_points(image, explained_partners(witnesses, placement.explained))
+        pose = placement.cam_from_world
+        if len(points) < MIN_POINTS:
+            return pose, 0, len(points)
+        for scale_rad in (_FIRST_GUESS_RAD / 2, _MAX_ERROR_RAD / 2, _MAX_ERROR_RAD / 4):
+            pose = refine_resection(pose, points, rays, scale_rad=scale_rad)
+        return pose, int((resection_errors(pose, points, rays) < _MAX_ERROR_RAD).sum()), len(points)
+
+    def adjust(self, *, cameras: bool = True) -> None:
+        """Refine all cameras but the first together with the points, and learn all ranges again.
+
+        Args:
+            cameras: False leaves the cameras where they are and only triangulates.
+        """
+        tracks, members = self.tracks()
+        model = GrowingModel(tracks, {}, self.pairs.estimator, self.pairs.kappa)
+        first = next(iter(self.cameras))
+        # The camera that comes first is the one that stays.
+        order = [members.index(first), *(idx for idx, image in enumerate(members) if image != first)]
+        model.cameras = {idx: self.cameras[members[idx]] for idx in order}
+        if cameras:
+            model.adjust()
+            for idx, image in enumerate(members):
+                self.cameras[image] = model.cameras[idx]
+        else:
+            model.triangulate()
+        for image in members:
+            self._ranges[image][:] = np.nan
+            self._parallax[image][:] = 0
+        points = model.points_in_world[tracks.track_idx]
+        known = np.isfinite(points[:, 0])
+        centers = np.array([self.cameras[image].center for image in members])
+        distances = np.linalg.norm(points - centers[tracks.image_idx], axis=1)
+        for idx, image in enumerate(members):
+            mine = known & (tracks.image_idx == idx)
+            self._ranges[image][tracks.keypoint_idx[mine]] = distances[mine]
+            self._parallax[image][tracks.keypoint_idx[mine]] = np.pi
+
+    def tracks(self) -> tuple[Tracks, list[int]]:
+        """Return the tracks that the chosen geometries form among registered images, and which image is which."""
+        members = sorted(self.cameras)
+        names = self.pairs.names
+        return build_tracks(
+            {names[image]: self.pairs.features[names[image]] for image in members}, self.views()
+        ), members
+
+    def views(self) -> dict[tuple[str, str], TwoView]:
+        """Return the chosen geometries by the names of their images."""
+        names = self.pairs.names
+        return {
+            (names[a], names[b]): self.pairs.geometries[a, b][rank].view for (a, b), rank in sorted(self.chosen.items())
+        }
+
+    def choose_again(self) -> None:
+        """Choose the geometry of every pair of registered images by the cameras as they are now."""
+        self.chosen = {}
+        for image in sorted(self.cameras):
+            witnesses = self.witnesses(image)
+            if not len(witnesses):
+                continue
+            pose = self.cameras[image]
+            agrees = agreement(witnesses, pose.rotation[None], pose.center[None])[0]
+            for idx in np.flatnonzero(agrees):
+                self.chosen.setdefault(_edge(image, int(witnesses.partner[idx])), int(witnesses.rank[idx]))
+
+    def learn_ranges(self) -> None:
+        """Compute the ranges of all matches of chosen geometries again."""
+        for ranges, parallax in zip(self._ranges, self._parallax, strict=True):
+            ranges[:], parallax[:] = np.nan, 0
+        for edge in sorted(self.chosen):
+            self._learn_ranges(edge)
+
+    def explained_share(self, *, without: Collection[int] = ()) -> float:
+        """Return the share of all pairs of registered images, by weight, that a geometry of theirs explains.
+
+        Args:
+            without: images whose pairs do not count.
+        """
+        images = set(self.cameras) - set(without)
+        total = sum(found[0].weight for edge, found in self.pairs.geometries.items() if images.issuperset(edge))
+        kept = sum(
+            self.pairs.geometries[edge][rank].weight for edge, rank in self.chosen.items() if images.issuperset(edge)
+        )
+        return kept / total if total else 1.0
+
+    def explained_weight(self) -> float:
+        """Return the weight of all geometries that agree with the cameras."""
+        return sum(self.pairs.geometries[edge][rank].weight for edge, rank in self.chosen.items())
+
+    def explained_share_of(self, image: int) -> float:
+        """Return the share of a registered image's pairs, by weight, that its camera explains; 1 without any."""
+        total = kept = 0.0
+        for partner in self.pairs.partners[image]:
+            if partner in self.cameras:
+                edge = _edge(image, partner)
+                total += self.pairs.geometries[edge][0].weight
+                if edge in self.chosen:
+                    kept += self.pairs.geometries[edge][self.chosen[edge]].weight
+        return kept / total if total else 1.0
+
+    def _learn_ranges(self, edge: Edge) -> None:
+        """Take the ranges of a pair's matches where they are seen under a larger parallax than known ones."""
+        first, second = edge
+        view = self.pairs.geometries[edge][self.chosen[edge]].view
+        relative = self.cameras[second] @ self.cameras[first].inverse()
+        mine, theirs = view.matches_idx[:, 0], view.matches_idx[:, 1]
+        p, q = self.pairs.bearings[first][mine], self.pairs.bearings[second][theirs]
+        ranges = ranges_from_bearings(p, q, relative)
+        parallax = angle_between(p @ relative.rotation.T, q)
+        with np.errstate(invalid="ignore"):
+            usable = (ranges[0] > 0) & (ranges[1] > 0) & (parallax > _MIN_ANGLE_RAD)
+        usable &= view.residuals_rad < _MAX_ERROR_RAD
+        for image, keypoints, found in ((first, mine, ranges[0]), (second, theirs, ranges[1])):
+            better = usable & (parallax > self._parallax[image][keypoints])
+            self._ranges[image][keypoints[better]] = found[better]
+            self._parallax[image][keypoints[better]] = parallax[better]
+
+
+def explained_partners(witnesses: Witnesses, explained: NDArray[np.bool_]) -> dict[int, int]:
+    """Return the partners of which a geometry agrees, each with the rank of its heaviest one that does."""
+    found: dict[int, int] = {}
+    for idx in np.flatnonzero(explained):
+        found.setdefault(int(witnesses.partner[idx]), int(witnesses.rank[idx]))
+    return found
+
+
+def enough_points(support: int, known: int, *, agreeing: int = 1) -> bool:
+    """Return whether a camera that sees `support` of `known` points where they should be is to be believed.
+
+    Args:
+        support: number of points that it sees where they should be.
+        known: number of known points that it matches.
+        agreeing: number of pairs that agree with its pose. Two pairs or more are evidence of their own, so that
+            imprecise matches, as the paper's are, do not cost the camera.
+    """
+    return support >= max(MIN_POINTS, (MIN_SHARE if agreeing < 2 else MIN_SHARE_OF_AGREEING) * known)
+
+
+def _edge(a: int, b: int) -> Edge:
+    return min(a, b), max(a, b)

@@ -1,0 +1,165 @@
+"""Where an image may stand: poses on which its pairs agree, the best first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.poses.placement.pair_evidence import Witnesses, best_by_partner
+from pano_mvs.geometry import Rigid3, nearest_rotation
+
+FloatArray = NDArray[np.float64]
+
+_MAX_TURN_RAD = float(np.deg2rad(2.0))
+_MAX_LENGTH_FACTOR = 1.25
+# A candidate by one chain is off by the error of its length, so that directions are compared more loosely at first.
+_LOOSE_RAD = float(np.deg2rad(3.0))
+_LENGTH_STD = 0.05
+_POLISHED = 6  # candidates that are refined
+_CROSSED = 8  # witnesses whose rays are crossed where lengths are not known
+_MIN_CROSSING_SINE = float(np.sin(np.deg2rad(5.0)))
+_SAME_TURN_RAD, _SAME_PLACE = float(np.deg2rad(1.0)), 0.03
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """A pose on which some of an image's pairs agree.
+
+    Attributes:
+        cam_from_world: the pose.
+        explained: (W,) bool, the witnesses that agree.
+        score: sum over the partners of the weight of their heaviest geometry that agrees.
+    """
+
+    cam_from_world: Rigid3
+    explained: NDArray[np.bool_]
+    score: float
+
+
+def placements(witnesses: Witnesses) -> list[Placement]:
+    """Return the distinct poses that the witnesses suggest, best score first.
+
+    Each geometry with a known length suggests a pose, and so do two rays that cross. All witnesses vote on all of them,
+    with one vote a partner: a geometry agrees with a pose that has its rotation, lies in its direction and, if its
+    length is known, at its distance. The best are refined on what agrees with them (weighted least squares of the
+    angles to the rays), and voted on again. This is translation averaging over one camera at a time with several
+    hypotheses a pair, where a false geometry of a repeated structure is outvoted however many matches it has.
+    """
+    rotations, centers = _candidates(witnesses)
+    if not len(centers):
+        return []
+    agree = agreement(witnesses, rotations, centers, loose_rad=_LOOSE_RAD)
+    scores = best_by_partner(witnesses.partner, agree * witnesses.weight)
+    found: list[Placement] = []
+    for idx in np.argsort(-scores, kind="stable"):
+        if len(found) == _POLISHED:
+            break
+        pose = _refined(witnesses, agree[idx], centers[idx])
+        if any(_same(pose, other.cam_from_world, witnesses) for other in found):
+            continue
+        tight = agreement(witnesses, pose.rotation[None], pose.center[None])[0]
+        if tight.any():
+            pose = _refined(witnesses, tight, pose.center)
+            tight = agreement(witnesses, pose.rotation[None], pose.center[None])[0]
+        score = float(best_by_partner(witnesses.partner, (tight * witnesses.weight)[None])[0])
+        if score > 0:
+            found.append(Placement(pose, tight, score))
+    found.sort(key=lambda placement: -placement.score)
+    distinct: list[Placement] = []
+    for placement in found:
+        if not any(_same(placement.cam_from_world, other.cam_from_world, witnesses) for other in distinct):
+            distinct.append(placement)
+    return distinct
+
+
+def agreement(
+    witnesses: Witnesses, rotations: FloatArray, centers: FloatArray, *, loose_rad: float = 0.0
+) -> NDArray[np.bool_]:
+    """Return which witnesses agree with poses, (C, W), given rotations (C, 3, 3) and centres (C, 3).
+
+    Args:
+        witnesses: W of them.
+        rotations: of cam_from_world.
+        centers: in the world.
+        loose_rad: is added to the tolerance of the directions.
+    """
+    offsets = centers[:, None] - witnesses.origins
+    distances = np.linalg.norm(offsets, axis=2)
+    along = np.einsum("cwi,wi->cw", offsets, witnesses.directions)
+    across = np.linalg.norm(offsets - along[..., None] * witnesses.directions, axis=2)
+    angles = np.arctan2(across, along)
+    # cos of the angle between rotations A and B is (tr(AᵀB) − 1) / 2.
+    traces = np.einsum("cij,wij->cw", rotations, witnesses.rotations)
+    turned = np.arccos(np.clip((traces - 1) / 2, -1, 1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        stretch = np.abs(np.log(distances / witnesses.lengths))
+    fits = np.isnan(witnesses.lengths) | (stretch < np.log(_MAX_LENGTH_FACTOR))
+    agrees: NDArray[np.bool_] = (
+        (angles < witnesses.tolerance_rad + loose_rad) & (turned < _MAX_TURN_RAD) & fits & (distances > 0)
+    )
+    return agrees
+
+
+def _candidates(witnesses: Witnesses) -> tuple[FloatArray, FloatArray]:
+    """Return rotations (C, 3, 3) and centres (C, 3) that single chains, or two crossing rays, suggest."""
+    known = np.flatnonzero(np.isfinite(witnesses.lengths))
+    rotations = [witnesses.rotations[known]]
+    centers = [witnesses.origins[known] + witnesses.lengths[known, None] * witnesses.directions[known]]
+    open_ended = np.flatnonzero(np.isnan(witnesses.lengths))
+    if len(open_ended):
+        heaviest = np.argsort(-witnesses.weight, kind="stable")[:_CROSSED]
+        for a in heaviest:
+            for b in heaviest:
+                if witnesses.partner[a] < witnesses.partner[b] and (a in open_ended or b in open_ended):
+                    crossing = _crossing(witnesses, a, b)
+                    if crossing is not None:
+                        rotations.append(witnesses.rotations[a][None])
+                        centers.append(crossing[None])
+    return np.concatenate(rotations), np.concatenate(centers)
+
+
+def _crossing(witnesses: Witnesses, a: np.intp, b: np.intp) -> FloatArray | None:
+    """Return the point midway between two rays where they are nearest, if that lies ahead of both."""
+    u, v = witnesses.directions[a], witnesses.directions[b]
+    gap = witnesses.origins[b] - witnesses.origins[a]
+    normal = np.cross(u, v)
+    squared = float(normal @ normal)
+    if squared < _MIN_CROSSING_SINE**2:
+        return None
+    along_u, along_v = float(np.cross(gap, v) @ normal) / squared, float(np.cross(gap, u) @ normal) / squared
+    if along_u <= 0 or along_v <= 0:
+        return None
+    point: FloatArray = 0.5 * (witnesses.origins[a] + along_u * u + witnesses.origins[b] + along_v * v)
+    return point
+
+
+def _refined(witnesses: Witnesses, agree: NDArray[np.bool_], center: FloatArray) -> Rigid3:
+    """Return the pose nearest to the rays and rotations that agree, from a first centre."""
+    if not agree.any():
+        return Rigid3.from_center(np.eye(3), center)
+    weight = witnesses.weight[agree]
+    rotation = nearest_rotation(np.einsum("w,wij->ij", weight, witnesses.rotations[agree]))
+    origins, directions, lengths = witnesses.origins[agree], witnesses.directions[agree], witnesses.lengths[agree]
+    outer = directions[:, :, None] * directions[:, None, :]
+    for _ in range(2):
+        distances = np.maximum(np.linalg.norm(center - origins, axis=1), 1e-12)
+        by_angle = weight / (distances * witnesses.tolerance_rad[agree]) ** 2
+        by_length = np.where(np.isfinite(lengths), weight / (_LENGTH_STD * distances) ** 2, 0.0)
+        matrix = np.einsum("w,wij->ij", by_angle, np.eye(3) - outer) + np.einsum("w,wij->ij", by_length, outer)
+        towards = origins + np.where(np.isfinite(lengths), lengths, 0.0)[:, None] * directions
+        vector = np.einsum("w,wij,wj->i", by_angle, np.eye(3) - outer, origins)
+        vector += np.einsum("w,wij,wj->i", by_length, outer, towards)
+        if np.linalg.eigvalsh(matrix)[0] < 1e-9 * np.trace(matrix):
+            break
+        center = np.linalg.solve(matrix, vector)
+    return Rigid3.from_center(rotation, center)
+
+
+def _same(pose: Rigid3, other: Rigid3, witnesses: Witnesses) -> bool:
+    """Return whether two poses are one, measured by the distances to the partners."""
+    nearest = float(np.median(np.linalg.norm(pose.center - witnesses.origins, axis=1)))
+    cosine = (float(np.sum(pose.rotation * other.rotation)) - 1) / 2
+    turned = float(np.arccos(np.clip(cosine, -1, 1)))
+    return turned < _SAME_TURN_RAD and float(np.linalg.norm(pose.center - other.center)) < _SAME_PLACE * nearest

@@ -1,0 +1,1 @@
+"""Check poses against the images, and resolve ambiguities of repeated structure."""

@@ -1,0 +1,284 @@
+"""Blocks of cameras that repeated structure has shifted together, and the moves that would put them back.
+
+Where a row of equal doors or columns repeats, all pairs between two blocks of cameras may agree on a relative place
+that is one period off: each camera is then well supported, and no camera can be moved alone. But some pairs also have a
+runner-up geometry, supported by what does not repeat, and all of these suggest the same move of one block. Of two equal
+rooms that face one another, one may lie on the other: the move then turns the block, too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel
+from pano_mvs.algorithms.poses.placement.view_graph import Edge
+from pano_mvs.geometry import Rigid3, geodesic_angle, nearest_rotation
+
+FloatArray = NDArray[np.float64]
+
+_MAX_TURN_RAD = float(np.deg2rad(3.0))
+# A move shorter than this share of the pair's distance is an error, not another place.
+_MIN_MOVE = 0.05
+# Moves are one if they differ by less than this share of their length and of the usual distance between cameras.
+_SAME_MOVE, _SAME_PLACE = 0.06, 0.02
+_MIN_PAIRS, _MIN_PAIR_SHARE = 3, 0.1
+# A move that turns a block by more than this has six degrees of freedom, on which two pairs hardly agree by chance.
+_MIN_TURN_RAD = float(np.deg2rad(20.0))
+_MIN_TURNED_PAIRS = 2
+_SAME_TURNED_PLACE = 0.1  # of the move and of the usual distance between cameras
+_MAX_ALIASES, _ATTEMPTS = 2, 6
+# How much a pair that agrees as things are counts against separating its images.
+_HELD = 0.1
+_LABELLINGS = 2
+_STARTS = 50
+# Of very many suggested moves the heaviest are compared with one another.
+_MAX_MOVES, _MAX_TURNED = 1500, 60
+
+
+@dataclass(frozen=True, eq=False)
+class Alias:
+    """A move that runner-up geometries of several pairs suggest alike.
+
+    Attributes:
+        move: (3,) in the world, after the turn about its origin.
+        support: weight of the pairs that suggest it.
+        votes: (i, j), i < j, to a signed weight: positive if j is to move by the motion x → turn x + move relative to
+            i, negative if by its inverse.
+        turn: (3, 3) rotation of the world, the identity for most.
+        own_inverse: whether the motion is its own inverse, as a half turn is.
+    """
+
+    move: FloatArray
+    support: float
+    votes: dict[Edge, float]
+    turn: FloatArray = field(default_factory=lambda: np.eye(3))
+    own_inverse: bool = False
+
+    def motion(self, *, inverse: bool = False) -> Rigid3:
+        """Return the motion of a block, or its inverse."""
+        motion = Rigid3(self.turn, self.move)
+        return motion.inverse() if inverse else motion
+
+
+@dataclass(frozen=True, eq=False)
+class _Suggestion:
+    """How a geometry that was not chosen would move the second image of a pair relative to the first."""
+
+    edge: Edge
+    weight: float
+    motion: Rigid3
+    center: FloatArray
+    displacement: FloatArray
+
+
+def find_aliases(model: PlacedModel) -> list[Alias]:
+    """Return the moves that runner-up geometries of several pairs suggest alike, best supported first.
+
+    Fewer than three pairs, or than a tenth of those that agree as things are, may do so by chance; of moves that turn
+    a block, two are enough.
+    """
+    suggestions = _suggestions(model)
+    straight = [found for found in suggestions if _angle(found.motion) < _MAX_TURN_RAD]
+    turned = [found for found in suggestions if _angle(found.motion) > _MIN_TURN_RAD]
+    return _straight_aliases(model, straight) + _turned_aliases(turned)
+
+
+def _straight_aliases(model: PlacedModel, suggestions: list[_Suggestion]) -> list[Alias]:
+    edges = [found.edge for found in suggestions]
+    moves = np.array([found.displacement for found in suggestions]).reshape(-1, 3)
+    weights = np.array([found.weight for found in suggestions])
+    if not edges:
+        return []
+    lengths = np.linalg.norm(moves, axis=1)
+    spread = float(np.median(lengths))
+    tolerance = _SAME_MOVE * lengths + _SAME_PLACE * spread
+    apart = np.linalg.norm(moves[:, None] - moves[None], axis=2)
+    opposite = np.linalg.norm(moves[:, None] + moves[None], axis=2)
+    near = np.minimum(apart, opposite) < tolerance[:, None]
+    left = np.ones(len(edges), np.bool_)
+    found: list[Alias] = []
+    for _ in range(_ATTEMPTS):
+        if not left.any() or len(found) == _MAX_ALIASES:
+            break
+        votes = [_votes(edges, weights, apart[row] <= opposite[row], near[row] & left) for row in range(len(edges))]
+        support = np.array([sum(map(abs, vote.values())) for vote in votes]) * left
+        best = int(np.argmax(support))
+        members = np.flatnonzero(near[best] & left)
+        left[members] = False
+        left[best] = False
+        if len(votes[best]) < max(_MIN_PAIRS, _MIN_PAIR_SHARE * len(model.chosen)):
+            continue
+        signs = np.where(apart[best, members] <= opposite[best, members], 1.0, -1.0)
+        move = np.average(moves[members] * signs[:, None], axis=0, weights=weights[members])
+        found.append(Alias(move, float(support[best]), votes[best]))
+    return found
+
+
+def _turned_aliases(suggestions: list[_Suggestion]) -> list[Alias]:
+    """Return the motion with a turn that most pairs suggest, if at least two do; the heaviest are compared."""
+    suggestions = sorted(suggestions, key=lambda found: (-found.weight, found.edge))[:_MAX_TURNED]
+    if len(suggestions) < _MIN_TURNED_PAIRS:
+        return []
+    spread = float(np.median([np.linalg.norm(found.displacement) for found in suggestions]))
+    best: tuple[float, list[_Suggestion], list[bool]] = (0.0, [], [])
+    for one in suggestions:
+        same = [_same_motion(one.motion, other, spread) for other in suggestions]
+        inverse = [_same_motion(one.motion.inverse(), other, spread) for other in suggestions]
+        alike = [other for other, a, b in zip(suggestions, same, inverse, strict=True) if a or b]
+        heaviest: dict[Edge, float] = {}
+        for other in alike:
+            heaviest[other.edge] = max(other.weight, heaviest.get(other.edge, 0.0))
+        support = sum(heaviest.values())
+        if len(heaviest) >= _MIN_TURNED_PAIRS and support > best[0]:
+            best = support, alike, [a for a, b in zip(same, inverse, strict=True) if a or b]
+    support, alike, same = best
+    if not alike:
+        return []
+    motions = [found.motion if way else found.motion.inverse() for found, way in zip(alike, same, strict=True)]
+    weights = np.array([found.weight for found in alike])
+    turn = nearest_rotation(np.einsum("n,nij->ij", weights, [motion.rotation for motion in motions]))
+    # The translations belong to slightly different turns, so that they are averaged where the cameras are.
+    pivot = np.average([found.center for found in alike], axis=0, weights=weights)
+    move = np.average([motion.apply(pivot) for motion in motions], axis=0, weights=weights) - turn @ pivot
+    motion = Rigid3(turn, move)
+    own_inverse = all(_same_motion(motion.inverse(), replace(found, motion=motion), spread) for found in alike)
+    votes: dict[Edge, float] = {}
+    for found, way in zip(alike, same, strict=True):
+        if found.weight > abs(votes.get(found.edge, 0.0)):
+            votes[found.edge] = found.weight if way or own_inverse else -found.weight
+    return [Alias(move, support, votes, turn, own_inverse)]
+
+
+def _same_motion(motion: Rigid3, other: _Suggestion, spread: float) -> bool:
+    """Return whether a motion is that of a suggestion: its turn, and where it puts the suggestion's camera."""
+    apart = float(np.linalg.norm(motion.apply(other.center) - other.motion.apply(other.center)))
+    length = float(np.linalg.norm(other.displacement))
+    turned = float(geodesic_angle(motion.rotation, other.motion.rotation))
+    return turned < _MAX_TURN_RAD and apart < _SAME_TURNED_PLACE * (length + spread)
+
+
+def _angle(motion: Rigid3) -> float:
+    return float(geodesic_angle(motion.rotation, np.eye(3)))
+
+
+def labellings(model: PlacedModel, alias: Alias) -> list[dict[int, int]]:
+    """Return which cameras an alias may have shifted, image position to 0 or 1 (to be moved); the likeliest first.
+
+    A labelling is good if many pairs that suggest the move join images with different labels, the right way round, and
+    few pairs join such images that do not suggest it. Each is the best that single changes lead to from one vote. The
+    last is the best that takes a part out of the capture's order, since people take panoramas along a way.
+    """
+    images = sorted(model.cameras)
+    place = {image: idx for idx, image in enumerate(images)}
+    # gain[a, b]: what moving b while a stays gains.
+    gain = np.zeros((len(images), len(images)))
+    for (i, j), rank in model.chosen.items():
+        held = _HELD * model.pairs.geometries[i, j][rank].weight
+        gain[place[i], place[j]] -= held
+        gain[place[j], place[i]] -= held
+    for (i, j), vote in alias.votes.items():
+        a, b = (i, j) if vote > 0 else (j, i)
+        gain[place[a], place[b]] += abs(vote)
+        gain[place[b], place[a]] += abs(vote) if alias.own_inverse else -abs(vote)
+    found: dict[tuple[int, ...], float] = {}
+    for (i, j), vote in sorted(alias.votes.items(), key=lambda item: (-abs(item[1]), item[0]))[:_STARTS]:
+        a, b = (place[i], place[j]) if vote > 0 else (place[j], place[i])
+        labels = np.zeros(len(images), np.intp)
+        labels[b] = 1
+        labels, score = _improved(gain, labels, kept=(a, b))
+        if score > 0:
+            found[tuple(labels.tolist())] = score
+    best = sorted(found, key=lambda labels: (-found[labels], labels))[:_LABELLINGS]
+    best += [labels for labels in _best_cut(gain) if labels not in best]
+    return [dict(zip(images, labels, strict=True)) for labels in best]
+
+
+def moved_cameras(model: PlacedModel, alias: Alias, labels: dict[int, int]) -> dict[int, Rigid3]:
+    """Return the cameras of a model with a block moved by an alias.
+
+    Those with label 1 move; if they are the larger part, the others move the other way, which is the same arrangement.
+    """
+    mover = 1 if 2 * sum(labels.values()) <= len(labels) else 0
+    motion = alias.motion(inverse=mover == 0)
+
+    def moved(camera: Rigid3) -> Rigid3:
+        return Rigid3.from_center(camera.rotation @ motion.rotation.T, motion.apply(camera.center))
+
+    return {image: moved(camera) if labels[image] == mover else camera for image, camera in model.cameras.items()}
+
+
+def _suggestions(model: PlacedModel) -> list[_Suggestion]:
+    """Return how geometries that were not chosen would move the second image of a pair relative to the first."""
+    suggestions: list[_Suggestion] = []
+    for i, j in model.pairs.geometries:
+        if i not in model.cameras or j not in model.cameras:
+            continue
+        for fixed, image, sign in ((i, j, 1.0), (j, i, -1.0)):
+            witnesses = model.witnesses(image, [fixed])
+            distance = float(np.linalg.norm(model.cameras[image].center - model.cameras[fixed].center))
+            for idx in np.flatnonzero(np.isfinite(witnesses.lengths)):
+                if model.chosen.get((i, j)) == witnesses.rank[idx]:
+                    continue
+                there = witnesses.origins[idx] + witnesses.lengths[idx] * witnesses.directions[idx]
+                here = model.cameras[image]
+                turn = witnesses.rotations[idx].T @ here.rotation
+                motion = Rigid3(turn, there - turn @ here.center)
+                displacement = sign * (there - here.center)
+                if float(np.linalg.norm(displacement)) > _MIN_MOVE * distance or _angle(motion) > _MIN_TURN_RAD:
+                    motion = motion if sign > 0 else motion.inverse()
+                    center = model.cameras[j].center
+                    suggestions.append(_Suggestion((i, j), float(witnesses.weight[idx]), motion, center, displacement))
+    heaviest = np.sort(np.argsort([-found.weight for found in suggestions], kind="stable")[:_MAX_MOVES])
+    return [suggestions[idx] for idx in heaviest]
+
+
+def _votes(
+    edges: list[Edge], weights: FloatArray, same_way: NDArray[np.bool_], near: NDArray[np.bool_]
+) -> dict[Edge, float]:
+    """Return the heaviest vote of each pair among the moves that are near one of them."""
+    votes: dict[Edge, float] = {}
+    for idx in np.flatnonzero(near):
+        signed = float(weights[idx]) if same_way[idx] else -float(weights[idx])
+        if abs(signed) > abs(votes.get(edges[idx], 0.0)):
+            votes[edges[idx]] = signed
+    return votes
+
+
+def _best_cut(gain: FloatArray) -> list[tuple[int, ...]]:
+    """Return the best labelling in which images that follow one another have one label, and all others the other."""
+    count = len(gain)
+    total = np.zeros((count + 1, count + 1))
+    total[1:, 1:] = gain.cumsum(axis=0).cumsum(axis=1)
+    best, found = -np.inf, []
+    for first in range(count):
+        for end in range(first + 1, count + 1 - (first == 0)):
+            inside = total[end, end] - total[first, end] - total[end, first] + total[first, first]
+            to_inside = total[count, end] - total[count, first] - inside
+            from_inside = total[end, count] - total[first, count] - inside
+            for label, score in ((1, to_inside), (0, from_inside)):
+                if score > best + 1e-9:
+                    best = score
+                    found = [tuple(label if first <= idx < end else 1 - label for idx in range(count))]
+    return found
+
+
+def _improved(gain: FloatArray, labels: NDArray[np.intp], *, kept: tuple[int, int]) -> tuple[NDArray[np.intp], float]:
+    """Change one label after another as long as the score rises; the two labels of the first vote stay.
+
+    The score is the sum of gain[a, b] over all a with label 0 and b with label 1.
+    """
+    labels = labels.copy()
+    for _ in range(4 * len(labels)):
+        stays, moves = (labels == 0).astype(np.float64), (labels == 1).astype(np.float64)
+        # What an image contributes as one that moves, less what it contributes as one that stays.
+        rise = stays @ gain - gain @ moves
+        rise = np.where(labels == 0, rise, -rise)
+        rise[list(kept)] = -np.inf
+        best = int(np.argmax(rise))
+        if rise[best] <= 1e-12:
+            break
+        labels[best] = 1 - labels[best]
+    return labels, float(gain[np.ix_(labels == 0, labels == 1)].sum())

@@ -1,0 +1,83 @@
+"""Weigh the geometries of ambiguous pairs by what the two images confirm under each."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pano_mvs.algorithms.poses.placement.pair_evidence import Geometry
+from pano_mvs.algorithms.poses.placement.placed_model import Pairs
+from pano_mvs.algorithms.poses.placement.view_graph import Edge
+from pano_mvs.algorithms.poses.verification.confirmation import Confirmation
+from pano_mvs.geometry import Rigid3
+
+# A pair is ambiguous if its second geometry has more than this share of the first one's weight.
+_RIVAL = 0.25
+_MIN_AMBIGUOUS = 1 / 3
+_ASKED_PARTNERS = 6
+# What is left of the weight of an ambiguous pair that is not asked for, since others suffice.
+_UNDECIDED = 0.3
+_SHARPNESS = 3
+
+
+def weighed_by_images(pairs: Pairs, confirmation: Confirmation) -> Pairs:
+    """Return pairs with the weights of ambiguous ones decided by the images.
+
+    Two panoramas are swept against one another under each geometry of their pair. Under the true one they confirm
+    more than under those that repeated structure suggests, however many matches these have. A geometry's weight is
+    multiplied by the cube of its confirmed share relative to the pair's best. This is done for the pairs of every
+    image with its six best partners; the other ambiguous pairs count for less. Where less than a third of the pairs
+    are ambiguous, the others decide, and nothing is asked.
+
+    Args:
+        pairs: of a capture.
+        confirmation: of the same capture.
+    """
+    ambiguous = sum(is_ambiguous(found) for found in pairs.geometries.values())
+    if ambiguous < _MIN_AMBIGUOUS * len(pairs.geometries):
+        return pairs
+    asked = {
+        (min(image, partner), max(image, partner))
+        for image, partners in enumerate(pairs.partners)
+        for partner in partners[:_ASKED_PARTNERS]
+    }
+    geometries: dict[Edge, tuple[Geometry, ...]] = {}
+    for edge, found in pairs.geometries.items():
+        if not is_ambiguous(found):
+            geometries[edge] = found
+        elif edge in asked:
+            geometries[edge] = _weighed(edge, found, confirmation)
+        else:
+            geometries[edge] = tuple(replace(one, weight=_UNDECIDED * one.weight) for one in found)
+    return Pairs(pairs.features, geometries, pairs.estimator, pairs.kappa)
+
+
+def is_ambiguous(found: tuple[Geometry, ...]) -> bool:
+    """Return whether the second geometry of a pair is a rival of the first."""
+    return len(found) > 1 and found[1].weight > _RIVAL * found[0].weight
+
+
+def pair_shares(edge: Edge, found: tuple[Geometry, ...], confirmation: Confirmation) -> list[float]:
+    """Return the mean share of their texture that two images confirm of one another under each of their geometries."""
+    first, second = edge
+    shares = []
+    for one in found:
+        poses = {first: Rigid3.identity(), second: Rigid3(one.view.rotation, one.view.direction)}
+        shares.append(float(np.nan_to_num([confirmation.share(image, poses[image], poses) for image in edge]).mean()))
+    return shares
+
+
+def _weighed(edge: Edge, found: tuple[Geometry, ...], confirmation: Confirmation) -> tuple[Geometry, ...]:
+    """Return the geometries of a pair, weighed by the images, the heaviest first."""
+    shares = pair_shares(edge, found, confirmation)
+    most = max(shares)
+    if most <= 0:
+        return found
+    heaviest = found[0].weight
+    weighed = [
+        # The best by the images counts like the best by the matches: how many of these it has says little here.
+        replace(one, weight=max(one.weight, heaviest * share / most) * (share / most) ** _SHARPNESS)
+        for one, share in zip(found, shares, strict=True)
+    ]
+    return tuple(sorted(weighed, key=lambda one: -one.weight))

@@ -1,0 +1,109 @@
+"""Check poses of any origin against the images, and put right what another place explains better."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from pano_mvs.algorithms.poses.adjustment.tracks import poses_with_points
+from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel, pairs_of
+from pano_mvs.algorithms.poses.verification.arbitration import Arbitration, arbitrate
+from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
+from pano_mvs.scene import Features, Poses, TwoView
+from pano_mvs.scene.pose_groups import join_groups, split_groups
+
+_MAX_ERROR_DEG, _MIN_ANGLE_DEG = 0.4, 1.0
+
+
+def verify_poses(
+    poses: Poses,
+    load: Callable[[str], Picture],
+    *,
+    features: Mapping[str, Features] | None = None,
+    two_views: Mapping[tuple[str, str], TwoView] | None = None,
+    correct: bool = True,
+) -> Poses:
+    """Return poses with what the images say about them: confirmed and expected shares, doubts, corrections.
+
+    Every camera is swept with its neighbours at 256 columns. A camera that confirms much less than its neighbours is
+    tried in the other places that its pairs suggest; if the images confirm one of them clearly better it is moved
+    there. A camera that neither images nor pairs support is left out; one that remains doubtful is reported.
+
+    Args:
+        poses: of any origin. Cameras that are not moved keep their poses to the last digit.
+        load: returns the panorama and the mask of an image by its name.
+        features: key points by image name; without them and `two_views` nothing is moved or left out.
+        two_views: verified pairs.
+        correct: False only reports.
+
+    Returns:
+        The poses with `confirmed_shares`, `expected_shares` and `doubts`. Points are triangulated again where a camera
+        was moved or left out.
+    """
+    if len(poses.names) < 2:
+        return poses
+    groups = [
+        _verified(group, load, features=features or {}, two_views=two_views or {}, correct=correct)
+        for group in split_groups(poses)
+    ]
+    return join_groups(groups, order=poses.names, rejected=poses.rejected)
+
+
+def _verified(
+    poses: Poses,
+    load: Callable[[str], Picture],
+    *,
+    features: Mapping[str, Features],
+    two_views: Mapping[tuple[str, str], TwoView],
+    correct: bool,
+) -> Poses:
+    """Return poses of one group, judged and put right."""
+    known = all(name in features for name in poses.names)
+    inside = {pair: view for pair, view in two_views.items() if known and {*pair} <= {*poses.names}}
+    pairs = pairs_of({name: features[name] for name in poses.names}, inside) if known else Pairs.without(poses.names)
+    model = model_of(poses, pairs)
+    confirmation = Confirmation(lambda image: load(poses.names[image]))
+    fixed = () if correct and inside else range(len(poses.names))
+    arbitration = arbitrate(model, confirmation, fixed=fixed)
+    if arbitration.moved or arbitration.removed:
+        moved = replace(poses_of(model), frame=poses.frame, scale=poses.scale, metric=poses.metric)
+        poses = replace(moved, rejected={pairs.names[idx]: why for idx, why in arbitration.removed.items()})
+    return with_arbitration(poses, pairs, arbitration)
+
+
+def model_of(poses: Poses, pairs: Pairs) -> PlacedModel:
+    """Return a model with the cameras of poses, whose names are those of the pairs, and the geometries that agree."""
+    model = PlacedModel(pairs, {idx: poses.cam_from_world(idx) for idx in range(len(poses.names))})
+    model.choose_again()
+    model.learn_ranges()
+    model.choose_again()
+    return model
+
+
+def poses_of(model: PlacedModel) -> Poses:
+    """Return the cameras of a model as poses of one group, with points."""
+    tracks, members = model.tracks()
+    poses = Poses.without_points(
+        {model.pairs.names[image]: model.cameras[image] for image in members},
+        frame="the first registered camera",
+        scale="the first reference–neighbour baseline is 1",
+        metric=False,
+    )
+    return poses_with_points(poses, tracks, max_error_deg=_MAX_ERROR_DEG, min_angle_deg=_MIN_ANGLE_DEG)
+
+
+def with_arbitration(poses: Poses, pairs: Pairs, arbitration: Arbitration) -> Poses:
+    """Return poses of one group with what the images say about them."""
+    position = {name: idx for idx, name in enumerate(pairs.names)}
+
+    def of_each(values: Mapping[int, float]) -> np.ndarray:
+        return np.array([values.get(position[name], np.nan) for name in poses.names], np.float64)
+
+    return replace(
+        poses,
+        confirmed_shares=of_each(arbitration.shares) if arbitration.asked else None,
+        expected_shares=of_each(arbitration.expected) if arbitration.asked else None,
+        doubts={pairs.names[idx]: why for idx, why in sorted(arbitration.doubts.items())},
+    )

@@ -1,0 +1,1 @@
+"""The disk cache: immutable blobs, records by key, and their maintenance."""

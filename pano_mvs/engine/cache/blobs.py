@@ -1,0 +1,296 @@
+"""Immutable content-addressed files: a blob's name is the digest of its bytes."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+import os
+import re
+import shutil
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pano_mvs.core.digest import DIGEST_BYTES, IS_DIGEST, digest_from_bytes, digest_from_file
+from pano_mvs.core.errors import ChangedFileError, StoreError
+from pano_mvs.core.files import replacing
+from pano_mvs.core.paths import is_link
+from pano_mvs.engine.cache.stat_cache import StatCache
+from pano_mvs.scene import FilePart, Part
+from pano_mvs.scene.record import changed_text
+
+SUFFIX = re.compile(r"(\.[a-z0-9_+-]{1,16})?")
+_LARGEST_BYTES = 1 << 50
+# Smaller arrays are read whole: that is faster than to map them, and a mapped array keeps a file open.
+_MAPPED_FROM_BYTES = 1 << 18
+_MAGIC = np.lib.format.magic(1, 0)
+
+
+class DamagedBlobError(StoreError):
+    """A blob whose size or digest is not what its name promises; it has been removed, to be computed again."""
+
+
+@dataclass(frozen=True, slots=True)
+class BlobRef:
+    """One stored part of a record.
+
+    Attributes:
+        digest: of the bytes.
+        size_bytes: length.
+        suffix: `.npy`, `.json`, or the native file's.
+        external: whether the bytes are in a user's own file rather than in the store.
+    """
+
+    digest: str
+    size_bytes: int
+    suffix: str
+    external: bool = False
+
+    def to_json(self) -> list[Any]:
+        """Return the reference as a JSON value."""
+        return [self.digest, self.size_bytes, self.suffix, self.external]
+
+    @property
+    def is_mapped(self) -> bool:
+        """Whether the part is an array that is memory-mapped when it is loaded."""
+        return self.suffix == ".npy" and not self.external and self.size_bytes >= _MAPPED_FROM_BYTES
+
+    @staticmethod
+    def from_json(value: list[Any]) -> BlobRef:
+        """Return the reference that `to_json` gave.
+
+        Raises:
+            ValueError: if it is none: what it names could lie outside the store.
+        """
+        digest, size_bytes, suffix, external = value
+        sound = isinstance(digest, str) and IS_DIGEST.fullmatch(digest) and isinstance(suffix, str)
+        if not sound or not SUFFIX.fullmatch(suffix) or type(size_bytes) is not int or type(external) is not bool:
+            raise ValueError(f"no reference to a blob: {value!r}")
+        if not 0 <= size_bytes < _LARGEST_BYTES:
+            raise ValueError(f"a blob of {size_bytes} bytes")
+        return BlobRef(digest, size_bytes, suffix, external)
+
+
+class BlobStore:
+    """A folder of blobs. External files are known by digest and found through the paths registered in this run."""
+
+    def __init__(self, root: Path, stat_cache: StatCache, *, durable: bool = False, folder_digits: int = 3) -> None:
+        self.root = root
+        self.durable = durable
+        self._folder = str(root / "blobs")
+        self._digits = folder_digits
+        self.temporary = root / "tmp"
+        self.stat_cache = stat_cache
+        self._external: dict[str, Path] = {}
+        self._verified: set[str] = set()
+
+    def register_external(self, path: Path) -> str:
+        """Make a user's file findable by its digest, which is returned."""
+        digest = self.stat_cache.digest(path)
+        self._external[digest] = path
+        return digest
+
+    def place_external(self, digest: str, path: Path) -> None:
+        """Say where a user's file of a digest is, without reading it."""
+        self._external[digest] = path
+
+    def path(self, ref: BlobRef) -> Path:
+        """Return where a blob is or would be."""
+        return Path(self._place(ref))
+
+    def _place(self, ref: BlobRef) -> str | Path:
+        if ref.external:
+            return self._external.get(ref.digest, f"unregistered/{ref.digest}")
+        return f"{self._folder}/{ref.digest[: self._digits]}/{ref.digest}{ref.suffix}"  # a Path costs ten times as much
+
+    def exists(self, ref: BlobRef) -> bool:
+        """Return whether a blob is there with its right size (its bytes are checked when it is read)."""
+        try:
+            return os.stat(self._place(ref)).st_size == ref.size_bytes  # noqa: PTH116  # see `_place`
+        except OSError:
+            return False
+
+    def put(self, part: Part) -> BlobRef:
+        """Store one part of a record."""
+        if isinstance(part, FilePart):
+            return self._put_file(part)
+        if isinstance(part, np.ndarray):
+            return self._put_array(part)
+        return self._put_bytes(
+            json.dumps(part, sort_keys=True, separators=(",", ":"), allow_nan=False).encode(), ".json"
+        )
+
+    def get(self, ref: BlobRef) -> Part:
+        """Return a stored part; arrays cannot be written to, and large ones are memory-mapped.
+
+        A user's own file is not read here: `FilePart.read_bytes` checks its bytes each time that they are read.
+
+        Raises:
+            DamagedBlobError: if the bytes are not those that were stored; the blob is removed.
+        """
+        if ref.external:
+            if not self.exists(ref):
+                raise self.discard(ref, "is gone or changed")
+            return FilePart(self.path(ref), external=True, digest=ref.digest)
+        path = self.verified_path(ref)
+        try:
+            if ref.suffix == ".npy":
+                return _mapped(path) if ref.is_mapped else _read(path)
+            if ref.suffix == ".json":
+                value = json.loads(path.read_bytes())
+                if not isinstance(value, dict):
+                    raise ValueError("not an object")
+                return value
+        except FileNotFoundError as error:  # somebody has collected it since it was verified
+            raise self.discard(ref, "is gone") from error
+        except (ValueError, RecursionError) as error:
+            raise self.discard(ref, f"holds nothing that pano_mvs writes ({error})") from error
+        return FilePart(path, digest=ref.digest)
+
+    def discard(self, ref: BlobRef, why: str) -> DamagedBlobError:
+        """Remove a blob that is of no use, unless it is the user's own file, and return the error that says so."""
+        path = self.path(ref)
+        if ref.external:
+            self.stat_cache.forget(path)
+        elif not is_link(path.parent):
+            path.unlink(missing_ok=True)
+        self._verified.discard(str(path))
+        return DamagedBlobError(f"{path} {why}; the same command computes it again")
+
+    def verified_path(self, ref: BlobRef) -> Path:
+        """Return a blob's path after checking its bytes, once in the life of this object."""
+        path = self.path(ref)
+        if str(path) in self._verified:
+            return path
+        if not ref.external:
+            self._refuse_link(path)
+        try:
+            sound = path.stat().st_size == ref.size_bytes and digest_from_file(path) == ref.digest
+        except OSError:
+            sound = False
+        if not sound:
+            raise self.discard(ref, "is damaged or gone")
+        self._verified.add(str(path))
+        return path
+
+    def _put_bytes(self, data: bytes, suffix: str) -> BlobRef:
+        ref = BlobRef(digest_from_bytes(data), len(data), suffix)
+        if not self._keep(ref):
+            with self._writing(ref) as temporary:
+                temporary.write_bytes(data)
+        return ref
+
+    def _put_array(self, array: np.ndarray[Any, Any]) -> BlobRef:
+        """Store an array as .npy without a second copy of it in memory."""
+        array = np.ascontiguousarray(array)
+        buffer = io.BytesIO()
+        np.lib.format.write_array_header_1_0(buffer, np.lib.format.header_data_from_array_1_0(array))
+        header = buffer.getvalue()
+        if array.dtype.hasobject:
+            raise TypeError("an array of Python objects")
+        data = array.reshape(-1).view(np.uint8).data if array.size else memoryview(b"")
+        hasher = hashlib.blake2b(header, digest_size=DIGEST_BYTES)
+        hasher.update(data)
+        ref = BlobRef(hasher.hexdigest(), len(header) + array.nbytes, ".npy")
+        if not self._keep(ref):
+            with self._writing(ref) as temporary, temporary.open("wb") as stream:
+                stream.write(header)
+                stream.write(data)
+        return ref
+
+    def _put_file(self, part: FilePart) -> BlobRef:
+        suffix = part.path.suffix.lower()
+        if not SUFFIX.fullmatch(suffix):
+            suffix = ""
+        if part.external:
+            digest = self.register_external(part.path)
+            if part.digest and digest != part.digest:
+                raise ChangedFileError(changed_text(part.path), part.path)
+            return BlobRef(digest, part.path.stat().st_size, suffix, external=True)
+        ref = BlobRef(digest_from_file(part.path), part.path.stat().st_size, suffix)
+        if not self._keep(ref):
+            with self._writing(ref) as temporary:
+                shutil.copyfile(part.path, temporary)
+        return ref
+
+    def _keep(self, ref: BlobRef) -> bool:
+        """Return whether a sound copy is there already, and mark it as used now, so that no collection takes it."""
+        if not self.exists(ref):
+            return False
+        try:
+            self.verified_path(ref)
+            os.utime(self.path(ref))
+        except (DamagedBlobError, OSError):
+            return False
+        return True
+
+    def _writing(self, ref: BlobRef) -> AbstractContextManager[Path]:
+        path = self.path(ref)
+        self._refuse_link(path)
+        self._verified.discard(str(path))  # it is not there, or not sound
+        return replacing(path, temporary_in=self.temporary, durable=self.durable)
+
+    @staticmethod
+    def _refuse_link(path: Path) -> None:
+        if is_link(path.parent):
+            raise StoreError(f"{path.parent} is a link, which no cache has: remove it, or choose another cache "
+                             "with --cache DIR")  # fmt: skip
+
+
+def _mapped(path: Path) -> np.ndarray[Any, Any]:
+    """Return the array of a .npy file; nothing in it is executed.
+
+    Raises:
+        ValueError: if it is none, or one of Python objects.
+    """
+    try:
+        return np.lib.format.open_memmap(path, mode="r")
+    except OSError:
+        raise
+    except Exception as error:  # numpy reads the header with Python's own parser, which fails in a dozen ways
+        raise ValueError(str(error)) from error
+
+
+def _read(path: Path) -> np.ndarray[Any, Any]:
+    """Return the array of a small .npy file, which cannot be written to; see `_mapped`.
+
+    Raises:
+        ValueError: if it is none, or one of Python objects, or does not hold as many values as it says.
+    """
+    data = path.read_bytes()
+    if not data.startswith(_MAGIC):
+        return _mapped(path)
+    begin = len(_MAGIC) + 2 + int.from_bytes(data[len(_MAGIC) : len(_MAGIC) + 2], "little")
+    shape, dtype, fortran_order = _header(data[len(_MAGIC) : begin])
+    count = math.prod(shape)
+    if min(shape, default=0) < 0 or count * dtype.itemsize != len(data) - begin:
+        raise ValueError(f"{len(data) - begin} bytes for an array of {shape}")
+    try:
+        values = np.frombuffer(data, dtype, count, begin) if count else np.zeros(0, dtype)
+        array = values.reshape(shape, order="F" if fortran_order else "C")
+    except Exception as error:  # a shape that no array can have
+        raise ValueError(str(error)) from error
+    array.flags.writeable = False
+    return array
+
+
+@lru_cache(maxsize=4096)
+def _header(data: bytes) -> tuple[tuple[int, ...], np.dtype[Any], bool]:
+    """Return shape, type and whether columns come first, from the header of a .npy file after its magic string.
+
+    Raises:
+        ValueError: if it is none, or one of Python objects.
+    """
+    try:
+        shape, fortran_order, dtype = np.lib.format.read_array_header_1_0(io.BytesIO(data))
+    except Exception as error:  # see `_mapped`
+        raise ValueError(str(error)) from error
+    if dtype.hasobject:
+        raise ValueError("an array of Python objects")
+    return shape, dtype, fortran_order

@@ -1,0 +1,324 @@
+"""The cache: small records by key, written last and in one step, over immutable blobs.
+
+Layout under the root: `blobs/abc/<digest><suffix>`, `records/abc/<key>.json`, `runs/<id>.json` (which key each unit had
+in the latest run of a workflow into a folder: for the reasons that the plan gives, and what a collection keeps),
+`pins/` (runs kept whatever happens), `stat-cache.json`, `tmp/`, `layout.json`, and an empty file that marks the folder
+as a cache.
+What is cached is derived from the records: there is no status file that could be wrong and nothing to unlock.
+Names are taken in one step by renaming, nothing is ever changed in place, and no link is made: any number of runs, on
+several hosts, may share a store.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from sys import intern
+from typing import Any
+
+from pano_mvs.core.digest import digest_from_bytes, digest_from_value
+from pano_mvs.core.errors import ContractError, StoreError, UsageError
+from pano_mvs.core.files import CACHE_MARK, clear_abandoned, is_older, remove_whole, write_text
+from pano_mvs.core.paths import children, exists, is_link, reason_of
+from pano_mvs.engine.cache.blobs import BlobRef, BlobStore, DamagedBlobError
+from pano_mvs.engine.cache.latest_runs import RunBook
+from pano_mvs.engine.cache.packed_parts import PackedParts
+from pano_mvs.engine.cache.stat_cache import StatCache
+from pano_mvs.engine.running.disk_guard import Room, is_full_disk
+from pano_mvs.scene import Record
+
+LAYOUT_VERSION = 2
+_FOLDER_DIGITS = {1: 2, 2: 3}
+"""Layout to the number of digits of a key or digest that name its folder. Older caches go on with their 256 folders."""
+
+LEAST_FREE_BYTES = 200_000_000
+_ABANDONED_AFTER_S = 7 * 24 * 3600.0
+_FOLDERS = ("blobs", "records", "runs", "pins", "tmp")
+
+
+@dataclass(frozen=True, slots=True)
+class ItemRef:
+    """A stored value: its kind, its parts, and the digest that stands for it in downstream keys."""
+
+    kind: str
+    digest: str
+    parts: Mapping[str, BlobRef]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the reference as a JSON value."""
+        return {"kind": self.kind, "digest": self.digest, "parts": {n: ref.to_json() for n, ref in self.parts.items()}}
+
+    @staticmethod
+    def from_json(value: Mapping[str, Any]) -> ItemRef:
+        """Return the reference that `to_json` gave."""
+        parts = {str(name): BlobRef.from_json(part) for name, part in value["parts"].items()}
+        return ItemRef(intern(str(value["kind"])), str(value["digest"]), PackedParts(parts))
+
+
+@dataclass(frozen=True, slots=True)
+class UnitRecord:
+    """What one finished unit of work left.
+
+    Attributes:
+        key: its cache key.
+        identity: what the key was made of, for the plan's reasons.
+        output: the value.
+        items: the items of a collection, by image.
+        metrics: figures of the unit.
+        notes: what a user should know.
+        rejected: image name to why the result leaves it out.
+        doubts: image name to why the value is doubtful there.
+        seconds: how long it took when it was computed.
+        checked: whether the user's files that it read were compared with the digests in its key, as earlier versions
+            did not.
+    """
+
+    key: str
+    identity: Mapping[str, Any]
+    output: ItemRef
+    items: Mapping[str, ItemRef] = field(default_factory=dict)
+    metrics: Mapping[str, float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    rejected: Mapping[str, str] = field(default_factory=dict)
+    doubts: Mapping[str, str] = field(default_factory=dict)
+    seconds: float = 0.0
+    checked: bool = False
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the record as a JSON value."""
+        return {
+            "key": self.key,
+            "identity": self.identity,
+            "output": self.output.to_json(),
+            "items": {name: item.to_json() for name, item in self.items.items()},
+            "metrics": dict(self.metrics),
+            "notes": list(self.notes),
+            "rejected": dict(self.rejected),
+            "doubts": dict(self.doubts),
+            "seconds": self.seconds,
+            "checked": self.checked,
+        }
+
+    @staticmethod
+    def from_json(value: Mapping[str, Any]) -> UnitRecord:
+        """Return the record that `to_json` gave.
+
+        Raises:
+            ValueError, KeyError, TypeError, AttributeError, OverflowError: if it is none.
+        """
+        identity, rejected, doubts = value["identity"], value["rejected"], value.get("doubts", {})
+        if not all(isinstance(part, dict) for part in (identity, rejected, doubts)):
+            raise TypeError("a record's identity and its rejected and doubtful images are objects")
+        metrics = {intern(str(name)): float(metric) for name, metric in value["metrics"].items()}
+        seconds = value["seconds"]
+        if not all(map(math.isfinite, (*metrics.values(), seconds))):
+            raise ValueError("a figure that is none")
+        return UnitRecord(
+            key=str(value["key"]),
+            identity=identity,
+            output=ItemRef.from_json(value["output"]),
+            items={name: ItemRef.from_json(item) for name, item in value["items"].items()},
+            metrics=metrics,
+            notes=tuple(str(note) for note in value["notes"]),
+            rejected={str(name): str(reason) for name, reason in rejected.items()},
+            doubts={str(name): str(reason) for name, reason in doubts.items()},
+            seconds=float(seconds),
+            checked=value.get("checked") is True,
+        )
+
+    def blobs(self) -> Iterator[BlobRef]:
+        """Yield every blob that the record names."""
+        for item in (self.output, *self.items.values()):
+            yield from item.parts.values()
+
+
+class Store:
+    """The cache of one or many workflows."""
+
+    def __init__(self, root: Path, *, durable: bool = False, least_free_bytes: int = LEAST_FREE_BYTES,
+                 for_reading: bool = False) -> None:  # fmt: skip
+        """Open or create a store.
+
+        Args:
+            root: its folder.
+            durable: flush every blob and record to the disk before going on, for machines that lose power.
+            least_free_bytes: room on the disk below which no unit is begun; 0 for no such guard.
+            for_reading: take a folder that cannot be written, or made, for what it holds, instead of refusing it.
+
+        Raises:
+            UsageError: if the folder cannot be written, or was made by a version with another layout.
+        """
+        self.root = root
+        self.durable = durable
+        self.least_free_bytes = least_free_bytes
+        self.damaged: list[str] = []
+        self._records = str(root / "records")
+        self._room = Room(root, least_free_bytes=least_free_bytes)
+        self.folder_digits = _FOLDER_DIGITS[LAYOUT_VERSION]
+        self._open_layout(for_reading=for_reading)
+        self._clear_abandoned()
+        self.runs = RunBook(root)
+        self.stat_cache = StatCache(root / "stat-cache.json")
+        self.blobs = BlobStore(root, self.stat_cache, durable=durable, folder_digits=self.folder_digits)
+
+    def find(self, key: str) -> UnitRecord | None:
+        """Return the record of a key if it is sound and all its blobs are there, else None."""
+        record = self.read_record(key)
+        if record is None:
+            return None
+        return record if all(self.blobs.exists(ref) for ref in record.blobs()) else None
+
+    def read_record(self, key: str) -> UnitRecord | None:
+        """Return the record of a key whether or not its blobs are there; a damaged record is a miss."""
+        path = f"{self._records}/{key[: self.folder_digits]}/{key}.json"
+        try:
+            with open(path, "rb") as stream:  # noqa: PTH123  # a Path costs as much as the rest
+                data = stream.read()
+        except OSError:
+            return None
+        record = record_from_bytes(data)
+        if record is None or record.key != key:
+            self.damaged.append(path)
+            return None
+        return record
+
+    def put(self, record: UnitRecord) -> None:
+        """Write a record; its blobs must be there already."""
+        body = json.dumps(record.to_json(), sort_keys=True)
+        path = self.record_path(record.key)
+        if is_link(path.parent):
+            raise StoreError(f"{path.parent} is a link, which no cache has: remove it, or choose another cache "
+                             "with --cache DIR")  # fmt: skip
+        write_text(path, f"{digest_from_bytes(body.encode())}\n{body}", temporary_in=self.blobs.temporary,
+                   durable=self.durable)  # fmt: skip
+
+    def drop(self, key: str) -> None:
+        """Remove a record that turned out to be of no use."""
+        path = self.record_path(key)
+        if not is_link(path.parent):
+            path.unlink(missing_ok=True)
+
+    def put_value(self, value: Record) -> ItemRef:
+        """Store a value's parts and return its reference.
+
+        Raises:
+            ContractError: if the value is not what its kind promises, or holds what cannot be stored.
+        """
+        value.check()
+        try:
+            parts = {name: self.blobs.put(part) for name, part in value.to_parts().items()}
+        except (TypeError, ValueError) as error:
+            raise ContractError(f"{value.kind_name()} holds something that cannot be stored: {error}") from error
+        digests = {name: [ref.digest, ref.suffix] for name, ref in parts.items()}
+        digest = digest_from_value([value.kind_name(), value.kind_version, digests])
+        return ItemRef(value.kind_name(), digest, PackedParts(parts))
+
+    def load(self, ref: ItemRef, kind: type[Record]) -> Record:
+        """Return a stored value; its arrays are memory-mapped and read-only.
+
+        Raises:
+            DamagedBlobError: if a blob is damaged; it has been removed, so that the next run computes it again.
+        """
+        try:
+            parts = {name: self.blobs.get(part) for name, part in ref.parts.items()}
+            try:
+                return kind.from_parts(parts)
+            except (TypeError, ValueError, KeyError, AttributeError, AssertionError) as error:
+                errors = [
+                    self.blobs.discard(part, f"is no part of a {kind.kind_name()}") for part in ref.parts.values()
+                ]
+                raise errors[0] from error
+        except DamagedBlobError as error:
+            self.damaged.append(str(error))
+            raise
+
+    def require_room(self) -> None:
+        """Raise StoreError if there is too little room on the disk to begin anything."""
+        self._room.require()
+
+    def scratch(self) -> AbstractContextManager[Path]:
+        """Return a context with an empty folder inside the store, removed afterwards.
+
+        Raises:
+            StoreError: if the disk is too full to begin, or was filled by what was done inside.
+        """
+        return self._room.scratch(self.blobs.temporary)
+
+    def cannot_write(self, error: OSError) -> StoreError:
+        """Return the error that says that the store cannot be written, and whether for want of room."""
+        return self._room.cannot_write(error)
+
+    def record_path(self, key: str) -> Path:
+        """Return where the record of a key is or would be."""
+        return self.root / "records" / key[: self.folder_digits] / f"{key}.json"
+
+    def _open_layout(self, *, for_reading: bool) -> None:
+        for name in _FOLDERS:
+            if is_link(self.root / name):
+                raise UsageError(f"cache {self.root}: {name} is a link: what is written there would land elsewhere. "
+                                 "Remove it, or choose another cache with --cache DIR")  # fmt: skip
+        path = self.root / "layout.json"
+        try:
+            layout = json.loads(path.read_bytes())
+        except FileNotFoundError:
+            try:
+                self._create(path)
+            except (UsageError, StoreError):
+                if not for_reading:
+                    raise
+            return
+        except OSError as error:
+            raise UsageError(f"cache {self.root} cannot be read ({reason_of(error)}). Mend its permissions, or choose "
+                             "another with --cache DIR")  from error  # fmt: skip
+        except (ValueError, RecursionError) as error:
+            raise UsageError(f"{path} cannot be read ({error}), so it is not known how the cache is laid out. If it "
+                             "is one of this version, delete that file and nothing is lost; else choose another "
+                             "folder with --cache DIR")  from error  # fmt: skip
+        version = layout.get("layout") if isinstance(layout, dict) else None
+        if type(version) is not int or version not in _FOLDER_DIGITS:
+            raise UsageError(
+                f"cache {self.root} has layout {layout!r}, this version uses {LAYOUT_VERSION}. "
+                "Choose another with --cache DIR"
+            )
+        self.folder_digits = _FOLDER_DIGITS[version]
+        self._mark()
+
+    def _mark(self) -> None:
+        """Mark a cache that an earlier version made; one that cannot be written stays without the mark."""
+        mark = self.root / CACHE_MARK
+        with suppress(OSError):
+            if not exists(mark) and not is_link(mark):
+                mark.touch()
+
+    def _clear_abandoned(self) -> None:
+        """Remove what runs that were killed left half written."""
+        folder = self.root / "tmp"
+        clear_abandoned(folder)
+        for path in children(folder):
+            if is_older(path, _ABANDONED_AFTER_S):
+                remove_whole(path)
+
+    def _create(self, path: Path) -> None:
+        try:
+            write_text(self.root / CACHE_MARK, "")
+            write_text(path, json.dumps({"layout": LAYOUT_VERSION}))
+        except StoreError as error:
+            if is_full_disk(error.__cause__):
+                raise
+            raise UsageError(f"cache {self.root} cannot be written ({error.__cause__ or error}). Choose another with "
+                             "--cache DIR") from error  # fmt: skip
+
+
+def record_from_bytes(data: bytes) -> UnitRecord | None:
+    """Return the record in a file's bytes, or None if they are damaged: the first line is a digest of the rest."""
+    checksum, _, body = data.partition(b"\n")
+    try:
+        if checksum.decode() != digest_from_bytes(body):
+            return None
+        return UnitRecord.from_json(json.loads(body.decode()))
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
+        return None

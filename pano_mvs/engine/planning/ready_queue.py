@@ -1,0 +1,241 @@
+"""Which units can run now: each as soon as its own inputs exist, gathers when all that they gather does.
+
+A unit waits for tokens: that one unit of a producer is settled (it has a result, or will have none), or that a whole
+stage is complete. A stage's list of units waits for the lists of its producers. Every order in here follows the
+workflow and the capture, never the clock.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections import deque
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Protocol, TypeAlias
+
+from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
+from pano_mvs.engine.planning.resolve import Resolver, resolve_source
+from pano_mvs.engine.planning.source_listing import Listing
+from pano_mvs.engine.planning.units import WHOLE, StageState, Unit
+from pano_mvs.engine.stages.ports import Cardinality
+from pano_mvs.engine.stages.stage import INDEX_PORT
+from pano_mvs.engine.workflows.wiring import Edge, Graph
+from pano_mvs.engine.workflows.workflow import StageEntry, Workflow
+
+Token: TypeAlias = "tuple[str, str | None]"  # noqa: S105 (no password)
+"""A unit that is settled; with None for the unit, a stage that is complete."""
+
+
+class Listener(Protocol):
+    """Hears how a run's stages come along."""
+
+    def source_listed(self, entry: StageEntry, notes: Mapping[str, tuple[str, ...]]) -> None:
+        """A source's images are known, with what there is to say of each."""
+
+    def stage_opened(self, entry: StageEntry) -> None:
+        """A stage's units are known."""
+
+    def unit_blocked(self, entry: StageEntry, item: str, reason: str) -> None:
+        """A unit cannot run."""
+
+    def stage_complete(self, entry: StageEntry) -> None:
+        """All units of a stage are settled; to raise an error here keeps back what waits for the stage."""
+
+
+@dataclass(slots=True)
+class _Stage:
+    entry: StageEntry
+    position: int
+    edges: Mapping[str, Edge]
+    resolver: Resolver
+    waits: set[str] = field(default_factory=set)  # producers whose list, or whose end, it needs to list its units
+    rank: dict[str, int] = field(default_factory=dict)
+    missing: dict[str, int] = field(default_factory=dict)  # unit to the number of tokens that it still waits for
+    found: dict[str, Unit] = field(default_factory=dict)  # a source's units
+    collections: dict[str, Mapping[str, ItemRef]] = field(default_factory=dict)
+    unsettled: int = 0
+
+
+class Board:
+    """What is known of all stages while a run goes on.
+
+    Attributes:
+        states: stage to what it has made, in the order of the workflow.
+        listing: what the sources offer.
+    """
+
+    def __init__(
+        self, workflow: Workflow, graph: Graph, store: Store, listener: Listener, listing: Listing | None = None
+    ) -> None:
+        self.listing = listing or Listing()
+        self.states = {name: StageState(graph.axes[name], open=True) for name in graph.order}
+        self._store = store
+        self._only = graph.only
+        self._listener = listener
+        self._stages = {
+            name: _Stage(
+                (entry := workflow.stages[name]),
+                position,
+                graph.edges[name],
+                Resolver(entry, graph, self.states, store),
+            )
+            for position, name in enumerate(graph.order)
+        }
+        self._ready: list[tuple[int, int, str, str]] = []
+        self._waiting: dict[Token, list[tuple[str, str]]] = {}
+        self._complete: set[str] = set()
+        self._work: deque[Token] = deque()
+
+    def start(self) -> None:
+        """Open the stages that wait for nothing; those behind them follow."""
+        for name in self.states:
+            if self.states[name].open:
+                self._open_if_known(name)
+        self._spread()
+
+    def next_unit(self) -> Unit | None:
+        """Return the first unit, in the order of the workflow, that can run; None if all others wait or are settled."""
+        while self._ready:
+            _, _, name, item = heapq.heappop(self._ready)
+            stage = self._stages[name]
+            found = stage.found.pop(item, None) or stage.resolver.unit(item, self.states[name].members[item])
+            if isinstance(found, Unit):
+                return found
+            self._block(stage, item, found)
+            self._spread()
+        return None
+
+    def finish(self, unit: Unit, record: UnitRecord) -> None:
+        """Enter a unit's result."""
+        name = unit.entry.name
+        self.states[name].items[unit.item] = record.output
+        if record.items:
+            self._stages[name].collections[unit.item] = record.items
+        self._settle(name, unit.item)
+        self._spread()
+
+    def fail(self, unit: Unit, cause: str) -> None:
+        """Enter that a unit has no result."""
+        self.states[unit.entry.name].failed[unit.item] = cause
+        self._settle(unit.entry.name, unit.item)
+        self._spread()
+
+    def withdraw(self, stage: str, item: str, cause: str) -> None:
+        """Enter that a unit of a stage that is not complete yet has lost its result."""
+        self.states[stage].items.pop(item, None)
+        self.states[stage].failed[item] = cause
+        self._stages[stage].collections.pop(item, None)
+
+    def producers(self, stage: str) -> set[str]:
+        """Return the stages that feed a stage."""
+        return {edge.producer for edge in self._stages[stage].edges.values()}
+
+    def place(self, stage: str, item: str) -> tuple[int, int]:
+        """Return where a unit stands in the order of the workflow and of the capture."""
+        return self._stages[stage].position, self._stages[stage].rank.get(item, 0)
+
+    def _spread(self) -> None:
+        """Tell those that wait, until nothing follows any more."""
+        while self._work:
+            token = self._work.popleft()
+            for name, item in self._waiting.pop(token, ()):
+                stage = self._stages[name]
+                stage.missing[item] -= 1
+                if not stage.missing[item]:
+                    heapq.heappush(self._ready, (stage.position, stage.rank[item], name, item))
+            if token[1] is None:
+                self._open_behind(token[0])
+
+    def _open_behind(self, producer: str) -> None:
+        for name, stage in self._stages.items():
+            if self.states[name].open and any(edge.producer == producer for edge in stage.edges.values()):
+                self._open_if_known(name)
+
+    def _open_if_known(self, name: str) -> None:
+        """List a stage's units, if those of its producers are listed and an index, or a collection, is there."""
+        stage, state = self._stages[name], self.states[name]
+        for port, edge in stage.edges.items():
+            lists_units = port == INDEX_PORT or (edge.exploded and edge.port.cardinality is Cardinality.EACH)
+            if self.states[edge.producer].open or (lists_units and edge.producer not in self._complete):
+                return
+        if stage.entry.spec.list_items is not None:
+            blocked = self._list_source(stage, state)
+        else:
+            members = stage.resolver.unit_names()
+            assert members is not None, name
+            blocked = stage.resolver.resolution.blocked
+            state.members = dict(members) if not isinstance(members, dict) else members  # no second one of a million
+        items = [*state.members, *(item for item in blocked if item not in state.members)]
+        stage.rank = {item: rank for rank, item in enumerate(items)}
+        stage.unsettled, state.open = len(items), False
+        state.pending.update(items)
+        self._listener.stage_opened(stage.entry)
+        for item, reason in dict(blocked).items():
+            self._block(stage, item, reason)
+        for item in items:
+            if item not in blocked:
+                self._wait(stage, item)
+        if not items:
+            self._end(name)
+        self._open_behind(name)
+
+    def _list_source(self, stage: _Stage, state: StageState) -> Mapping[str, str]:
+        resolution = resolve_source(stage.entry, self._store, self._only.get(stage.entry.name), self.listing)
+        stage.found = {unit.item: unit for unit in resolution.units}
+        state.members.update(resolution.members)
+        said = {unit.item: unit.source.notes for unit in resolution.units if unit.source}
+        self._listener.source_listed(stage.entry, {item: said.get(item, ()) for item in resolution.members})
+        return resolution.blocked
+
+    def _wait(self, stage: _Stage, item: str) -> None:
+        tokens = {token for token in self._needs(stage, item) if not self._is_there(token)}
+        if not tokens:
+            heapq.heappush(self._ready, (stage.position, stage.rank[item], stage.entry.name, item))
+            return
+        stage.missing[item] = len(tokens)
+        for token in tokens:
+            self._waiting.setdefault(token, []).append((stage.entry.name, item))
+
+    def _needs(self, stage: _Stage, item: str) -> Iterator[Token]:
+        for edge in stage.edges.values():
+            producer, cardinality = edge.producer, edge.port.cardinality
+            if edge.exploded or cardinality in (Cardinality.ALL, Cardinality.NAMES) or self._is_gated(producer):
+                yield producer, None
+            elif cardinality is Cardinality.NEAR:
+                yield from ((producer, near) for near in stage.resolver.near[item])
+            else:
+                yield producer, item if cardinality is Cardinality.EACH else WHOLE
+
+    def _is_gated(self, name: str) -> bool:
+        """Return whether nothing may follow a stage before it has passed what its entry asks for."""
+        policy = self._stages[name].entry.policy
+        return bool(policy.gate) or policy.min_success > 0
+
+    def _is_there(self, token: Token) -> bool:
+        name, item = token
+        return name in self._complete if item is None else item not in self.states[name].pending
+
+    def _block(self, stage: _Stage, item: str, reason: str) -> None:
+        self.states[stage.entry.name].failed[item] = reason
+        self._listener.unit_blocked(stage.entry, item, reason)
+        self._settle(stage.entry.name, item)
+
+    def _settle(self, name: str, item: str) -> None:
+        stage = self._stages[name]
+        self.states[name].pending.discard(item)
+        stage.missing.pop(item, None)
+        stage.unsettled -= 1
+        self._work.append((name, item))
+        if not stage.unsettled:
+            self._end(name)
+
+    def _end(self, name: str) -> None:
+        """Put a stage's results in order, whatever the order in which they came."""
+        stage, state = self._stages[name], self.states[name]
+        state.items = {item: state.items[item] for item in stage.rank if item in state.items}
+        state.failed = {item: state.failed[item] for item in stage.rank if item in state.failed}
+        state.exploded = {key: ref for item in stage.rank for key, ref in stage.collections.get(item, {}).items()}
+        state.pending, stage.missing = set(), {}  # an empty set or dict keeps the room that it once needed
+        self._listener.stage_complete(stage.entry)
+        self._complete.add(name)
+        self._work.append((name, None))

@@ -1,0 +1,288 @@
+"""From a wired stage and what its producers made to the units of work, each with its cache key."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from sys import intern
+from typing import Any
+
+from pano_mvs.core.digest import digest_from_value
+from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.core.file_names import item_problem
+from pano_mvs.engine.cache.store import ItemRef, Store
+from pano_mvs.engine.code.stage_code import stage_code
+from pano_mvs.engine.planning.source_listing import Listing
+from pano_mvs.engine.planning.units import PENDING, WHOLE, Resolution, StageState, Unit, UnitInput
+from pano_mvs.engine.stages.params import key_fields
+from pano_mvs.engine.stages.ports import Cardinality
+from pano_mvs.engine.stages.stage import INDEX_PORT
+from pano_mvs.engine.workflows.wiring import Edge, Graph
+from pano_mvs.engine.workflows.workflow import StageEntry
+from pano_mvs.scene import Axis, Pairs, Record, Views
+
+KEY_SCHEMA = 3
+"""Raise it when the engine gives stages other inputs, seeds or settings for the same key, or makes keys differently."""
+
+_SHOWN = 20
+
+
+def resolve_source(
+    entry: StageEntry, store: Store, only: frozenset[str] | None = None, listing: Listing | None = None
+) -> Resolution:
+    """List a source's items and return a unit for each, or for those that are asked for.
+
+    Args:
+        entry: the source.
+        store: where its units are.
+        only: names of the items that are asked for; None for all.
+        listing: what the run has listed so far; None to list anew.
+
+    Raises:
+        InputError: if the list cannot be made, or names an item twice.
+    """
+    listing = listing or Listing()
+    resolution = Resolution()
+    static = _static_identity(entry, store)
+    common = digest_from_value(static)
+    for item in listing.items(entry):
+        if only is not None and item.name not in only:
+            continue
+        if item.name in resolution.members:
+            raise InputError(f"{entry.name}: the item {item.name!r} is listed twice")
+        resolution.members[item.name] = (item.name,)
+        if problem := item.problem or item_problem(item.name):
+            resolution.blocked[item.name] = problem
+            continue
+        try:
+            digests = {role: listing.digest(path, store) for role, path in sorted(item.files.items())}
+        except InputError as error:
+            resolution.blocked[item.name] = str(error)
+            continue
+        inputs = {"files": digests, "name": item.name}
+        key = _key(common, inputs)
+        unit = Unit(entry, item.name, (item.name,), {}, key, static | {"inputs": inputs},
+                    replace(item, digests=digests))  # fmt: skip
+        resolution.units.append(unit)
+    return resolution
+
+
+def resolve(
+    entry: StageEntry, graph: Graph, states: Mapping[str, StageState], store: Store
+) -> tuple[Iterator[Unit], Resolution]:
+    """Return a stage's units one at a time, given the states of its producers.
+
+    Returns:
+        The units whose inputs are all known, and what is known of the others, which is complete once all units have
+        been taken. A stage may have a million units, whose inputs take more memory than all else.
+    """
+    if entry.spec.list_items is not None:
+        resolution = resolve_source(entry, store, graph.only.get(entry.name))
+        return iter(resolution.units), resolution
+    resolver = Resolver(entry, graph, states, store)
+    return resolver.resolve(), resolver.resolution
+
+
+class Resolver:
+    """Finds the units of a stage that is not a source: all at once for a plan, one by one in a run.
+
+    Attributes:
+        near: unit to its neighbours, once the unit names are known and where the stage has an index.
+    """
+
+    def __init__(self, entry: StageEntry, graph: Graph, states: Mapping[str, StageState], store: Store) -> None:
+        self.entry = entry
+        self.axis = graph.axes[entry.name]
+        self.edges = edges = graph.edges[entry.name]
+        self.only = graph.only.get(entry.name)
+        self.states = states
+        self.store = store
+        self.resolution = Resolution()
+        self.near: Mapping[str, tuple[str, ...]] = {}
+        self._static: dict[str, Any] = {}
+        self._common = ""
+        self._near_edges = [edge for edge in edges.values() if edge.port.cardinality is Cardinality.NEAR]
+
+    def resolve(self) -> Iterator[Unit]:
+        """Yield the units whose inputs are all known, and enter the others into `resolution`."""
+        names = self.unit_names()
+        if names is None:
+            self.resolution.open = True
+            return
+        for name, members in names.items():
+            self.resolution.members[name] = members
+            self._add(name, members)
+            if self.resolution.units:
+                yield self.resolution.units.pop()
+
+    def unit(self, name: str, members: tuple[str, ...]) -> Unit | str:
+        """Return a unit whose inputs have all been tried, or the reason why it cannot run."""
+        self.resolution = Resolution()
+        self._add(name, members)
+        assert not self.resolution.waiting, name
+        return self.resolution.units[0] if self.resolution.units else self.resolution.blocked[name]
+
+    def unit_names(self) -> Mapping[str, tuple[str, ...]] | None:
+        """Return the stage's units and the images each is about, or None if they are not known yet.
+
+        Raises:
+            UsageError: if the run is confined to a unit that there is not.
+        """
+        names = self._all_names()
+        if names is None or self.only is None:
+            return names
+        missing = sorted(self.only - names.keys())
+        if missing:
+            raise UsageError(f"{self.entry.name} has no unit {missing[0]!r}; it has: {', '.join(list(names)[:_SHOWN])}"
+                             f"{' …' if len(names) > _SHOWN else ''}")  # fmt: skip
+        return {name: names[name] for name in names if name in self.only}
+
+    def _all_names(self) -> Mapping[str, tuple[str, ...]] | None:
+        if INDEX_PORT in self.edges:
+            return self._units_of_index(self.edges[INDEX_PORT])
+        if self.axis is Axis.ONE:
+            return {WHOLE: ()}
+        each = [edge for edge in self.edges.values() if edge.port.cardinality is Cardinality.EACH]
+        if any(self.states[edge.producer].open for edge in each):
+            return None
+        leading = [edge for edge in each if not edge.exploded and self.states[edge.producer].axis is self.axis]
+        names: dict[str, tuple[str, ...]] = {}
+        for number, edge in enumerate(leading or each):
+            found = self._members(edge)
+            names = found if number == 0 else {name: names[name] for name in names if name in found}
+        return names
+
+    def _members(self, edge: Edge) -> dict[str, tuple[str, ...]]:
+        state = self.states[edge.producer]
+        if edge.exploded:
+            return {name: (name,) for name in state.exploded}
+        return dict(state.members)
+
+    def _units_of_index(self, edge: Edge) -> Mapping[str, tuple[str, ...]] | None:
+        state = self.states[edge.producer]
+        if state.pending or state.open:
+            return None
+        if WHOLE not in state.items:
+            self.resolution.blocked[WHOLE] = f"needs {edge.producer}, which failed"
+            return {}
+        index = self.store.load(state.items[WHOLE], edge.port.kind)
+        assert isinstance(index, Pairs | Views)
+        # Each name comes as often as the image has neighbours, each time as a string of its own.
+        self.near = {name: tuple(map(intern, members)) for name, members in index.units().items()}
+        if self.axis is Axis.PAIR:
+            return self.near
+        return {name: (name,) for name in self.near}
+
+    def _add(self, name: str, members: tuple[str, ...]) -> None:
+        inputs: dict[str, UnitInput] = {}
+        waiting = False
+        for port in self.entry.spec.ports:
+            edge = self.edges.get(port.name)
+            if edge is None:
+                inputs[port.name] = None
+                continue
+            value, problem, waits = self._input(edge, name)
+            if problem:
+                self.resolution.blocked[name] = problem
+                return
+            waiting |= waits
+            inputs[port.name] = value
+        if waiting:
+            self.resolution.waiting.append(name)
+            return
+        if not self._static:
+            self._static = _static_identity(self.entry, self.store)
+            self._common = digest_from_value(self._static)
+        encoded = {port: self._encode(port, value) for port, value in inputs.items()}
+        identity = self._static | {"inputs": encoded}
+        self.resolution.units.append(Unit(self.entry, name, members, inputs, _key(self._common, encoded), identity))
+
+    def _input(self, edge: Edge, name: str) -> tuple[UnitInput, str, bool]:
+        """Return what a unit reads at a port, why it cannot, and whether that is not known yet."""
+        state = self.states[edge.producer]
+        items = state.exploded if edge.exploded else state.items
+        match edge.port.cardinality:
+            case Cardinality.ONE:
+                wanted: Sequence[str] = (WHOLE,)
+            case Cardinality.EACH:
+                wanted = (name,)
+            case Cardinality.NEAR:
+                wanted = self._near(name)
+            case Cardinality.NAMES if not state.open and not edge.exploded:
+                # A plan takes pending units for ones that will succeed: their names are known, their values are not.
+                names = [item for item in state.members if item in items or item in state.pending]
+                return ({item: items.get(item, PENDING) for item in names}, "", False) if names else (
+                    None, self._why(edge, state, ""), False
+                )  # fmt: skip
+            case Cardinality.ALL | Cardinality.NAMES:
+                if state.open or state.pending:
+                    return None, "", True
+                return (dict(items), "", False) if items else (None, self._why(edge, state, ""), False)
+        if state.open or (edge.exploded and state.pending):
+            return None, "", True
+        if any(item in state.pending for item in wanted):
+            return None, "", True
+        if edge.port.cardinality is Cardinality.NEAR:
+            found = {item: items[item] for item in wanted if item in items}
+            missing = next((item for item in self.near[name] if item not in found), "")
+            usable = not missing if self.axis is Axis.PAIR else bool(found)
+            return (found, "", False) if usable else (None, self._why(edge, state, missing), False)
+        if wanted[0] in items:
+            return items[wanted[0]], "", False
+        return None, self._why(edge, state, wanted[0]), False
+
+    def _near(self, name: str) -> list[str]:
+        """Return a unit's neighbours that every Near port has or may come to have, so that all ports stay in step."""
+        return [item for item in self.near[name] if all(self._may_have(edge, item) for edge in self._near_edges)]
+
+    def _may_have(self, edge: Edge, item: str) -> bool:
+        state = self.states[edge.producer]
+        if state.open or item in state.pending or (edge.exploded and state.pending):
+            return True
+        return item in (state.exploded if edge.exploded else state.items)
+
+    @staticmethod
+    def _why(edge: Edge, state: StageState, item: str) -> str:
+        """Say what is missing; of a single item, whether others of its stage have failed meanwhile does not matter."""
+        item = WHOLE if WHOLE in state.failed else item
+        what = f"{edge.producer}:{item}" if item else edge.producer
+        failed = item in state.failed if item else bool(state.failed)
+        return f"needs {what}, which {'failed' if failed else 'has no result'}"
+
+    def _encode(self, port: str, value: UnitInput) -> Any:
+        """Return what of an input counts towards the key: its digests, with names only where the stage sees them."""
+        if value is None:
+            return None
+        if isinstance(value, ItemRef):
+            return value.digest
+        if self.edges[port].port.cardinality is Cardinality.NEAR:
+            return [ref.digest for ref in value.values()]
+        if self.edges[port].port.cardinality is Cardinality.NAMES:
+            return list(value)
+        state = self.states[self.edges[port].producer]
+        return [[list(state.members.get(name, (name,))), ref.digest] for name, ref in value.items()]
+
+
+def _key(common: str, inputs: Mapping[str, Any]) -> str:
+    """Return a unit's key: what its stage has in common with all its units is encoded once, not for each."""
+    return digest_from_value([common, inputs])
+
+
+def _static_identity(entry: StageEntry, store: Store) -> dict[str, Any]:
+    """Return the part of the identity that all units of a stage share."""
+    plain, paths = key_fields(entry.params)
+    code = stage_code(entry.spec, entry.params)
+    return {
+        "schema": KEY_SCHEMA,
+        "stage": entry.spec.name,
+        "version": entry.spec.version,
+        "code": code.digest,
+        "libraries": dict(code.libraries),
+        "params": plain | {name: [store.stat_cache.digest(path) for path in found] for name, found in paths.items()},
+        "kinds": _kind_versions(entry),
+    }
+
+
+def _kind_versions(entry: StageEntry) -> dict[str, int]:
+    kinds: list[type[Record]] = [entry.spec.output, *(port.kind for port in entry.spec.ports)]
+    return {kind.kind_name(): kind.kind_version for kind in kinds}

@@ -1,0 +1,93 @@
+"""Units of work, and what is known of a stage's in a run or in a plan."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+from pano_mvs.engine.cache.store import ItemRef
+from pano_mvs.engine.stages.stage import SourceItem
+from pano_mvs.engine.workflows.workflow import StageEntry
+from pano_mvs.scene import Axis
+
+WHOLE = ""
+"""The name of the one unit of a stage that has no fan-out."""
+
+PENDING = ItemRef("", "", {})
+"""Stands for an item of which only the name is known."""
+
+OF_CODE = frozenset({"code", "libraries"})
+"""The parts of a unit's identity that say by which code it is computed, rather than what."""
+
+UnitInput: TypeAlias = "ItemRef | dict[str, ItemRef] | None"
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """One unit of work: one image, pair, view, or a whole.
+
+    Attributes:
+        entry: its stage in the workflow.
+        item: its name within the stage; `WHOLE` if there is one only.
+        members: the images that it is about.
+        inputs: port to the item that it reads, or items by name for Near and All.
+        source: what to read, for units of a source.
+        key: cache key.
+        identity: what the key was made of.
+    """
+
+    entry: StageEntry
+    item: str
+    members: tuple[str, ...]
+    inputs: Mapping[str, UnitInput]
+    key: str
+    identity: Mapping[str, Any]
+    source: SourceItem | None = None
+
+    @property
+    def label(self) -> str:
+        """The unit as it is shown: `stage:item`."""
+        return f"{self.entry.name}:{self.item}" if self.item else self.entry.name
+
+
+@dataclass(slots=True)
+class StageState:
+    """What is known of a stage's output, in a run or in a plan.
+
+    Attributes:
+        axis: of its units.
+        items: unit to its stored value.
+        exploded: image to its item, where the value is a collection.
+        members: unit to the images that it is about.
+        failed: unit to the reason why it has no value.
+        pending: units whose value is not known yet (plans only).
+        open: whether even the list of units is not known yet (plans only).
+    """
+
+    axis: Axis
+    items: dict[str, ItemRef] = field(default_factory=dict)
+    exploded: dict[str, ItemRef] = field(default_factory=dict)
+    members: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    failed: dict[str, str] = field(default_factory=dict)
+    pending: set[str] = field(default_factory=set)
+    open: bool = False
+
+
+@dataclass(slots=True)
+class Resolution:
+    """The units of a stage.
+
+    Attributes:
+        units: those whose inputs are all there.
+        blocked: unit to the reason why it cannot run: an input failed.
+        waiting: units whose inputs are not known yet (plans only).
+        open: whether the list of units itself waits (plans only).
+        members: unit to the images that it is about.
+    """
+
+    units: list[Unit] = field(default_factory=list)
+    blocked: dict[str, str] = field(default_factory=dict)
+    waiting: list[str] = field(default_factory=list)
+    open: bool = False
+    members: dict[str, tuple[str, ...]] = field(default_factory=dict)

@@ -1,0 +1,43 @@
+"""Say of a unit that failed what went wrong, where, and what the result lacks because of it."""
+
+from __future__ import annotations
+
+import traceback
+
+from pano_mvs.core.errors import PanoMvsError
+from pano_mvs.core.text import shortened
+from pano_mvs.engine.planning.units import Unit
+from pano_mvs.engine.workflows.workflow import StageEntry
+
+_MAX_TRACE = 20_000  # characters
+
+
+def cause_of(unit: Unit, error: BaseException) -> tuple[str, str]:
+    """Return what went wrong, and the traceback if it is the code's fault.
+
+    Errors raised on purpose speak for themselves, others get the line they came from.
+    """
+    notes = shortened("".join(f" ({note})" for note in getattr(error, "__notes__", [])))
+    if isinstance(error, PanoMvsError):
+        return f"{shortened(str(error))}{notes}", ""
+    frames = traceback.extract_tb(error.__traceback__)
+    # The author of a plugin wants the line in the plugin; we want ours wherever it is.
+    own = unit.entry.spec.origin.rpartition(":")[0] if unit.entry.spec.code_digest else ""
+    if own and isinstance(error, ModuleNotFoundError):
+        notes += " (a plugin imports the files beside it at its top, not inside functions)"
+    frame = next((f for f in reversed(frames) if f.filename == own), frames[-1])
+    cause = f"{frame.filename}:{frame.lineno}: {type(error).__name__}: {_text(error)}{notes}"
+    return cause, shortened("".join(traceback.format_exception(error)), _MAX_TRACE)
+
+
+def _text(error: BaseException) -> str:
+    try:
+        return shortened(str(error))
+    except Exception as second:  # the text is a plugin's code too
+        return f"(its message cannot be shown: {type(second).__name__})"
+
+
+def lost(entry: StageEntry, item: str) -> str:
+    """Return what the result lacks for want of a unit."""
+    kind = entry.spec.output.kind_name()
+    return f"there is no {kind} for {item}" if item else f"there is no {kind}"

@@ -1,0 +1,302 @@
+"""Which stages, and other parts with names, there are: installed, in the user's plugin folder, or in a workflow's file.
+
+A plugin that cannot be loaded, or a name that two of them give, harms nobody until the name is used.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+import traceback
+from collections.abc import Collection, Iterator
+from contextlib import redirect_stdout
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from types import ModuleType
+
+from pano_mvs.core.digest import digest_from_value
+from pano_mvs.core.errors import PluginError
+from pano_mvs.core.parts import PartMark, marks_of, set_unusable_parts
+from pano_mvs.core.paths import is_file, resolved
+from pano_mvs.core.text import shortened
+from pano_mvs.engine.code.plugin_digest import code_digest
+from pano_mvs.engine.stages.plugin_files import (
+    PLUGINS_VARIABLE,
+    names_in_files,
+    names_in_package,
+    plugin_files_in,
+    user_plugin_folders,
+)
+from pano_mvs.engine.stages.stage import StageSpec, spec_of
+
+ENTRY_POINT_GROUP = "pano_mvs.plugins"
+
+
+@dataclass(frozen=True, slots=True)
+class Plugin:
+    """A plugin that was found.
+
+    Attributes:
+        origin: the distribution, or the file.
+        names: what it gives, or would give as far as its source tells: ("stage", name), or a part's kind and name.
+        error: why it could not be loaded, in one line; empty if it could.
+        trace: the original traceback of that.
+    """
+
+    origin: str
+    names: tuple[tuple[str, str], ...]
+    error: str = ""
+    trace: str = ""
+
+    def why_broken(self) -> str:
+        """Return what somebody who uses one of its names needs to know."""
+        return f"the plugin that defines it, {self.origin}, failed to load:\n{self.trace.rstrip()}"
+
+
+@dataclass(slots=True)
+class Registry:
+    """What there is by name, and the plugins that it comes from.
+
+    Attributes:
+        stages: by name.
+        parts: what plugins add beside stages, by kind and name.
+        origins: stage name to the plugin that it comes from.
+        plugins: all that were found, the broken ones too.
+        clashes: ("stage", name), or a part's kind and name, to where it is defined twice; neither can be used.
+    """
+
+    stages: dict[str, StageSpec] = field(default_factory=dict)
+    parts: dict[tuple[str, str], PartMark] = field(default_factory=dict)
+    origins: dict[str, str] = field(default_factory=dict)
+    plugins: list[Plugin] = field(default_factory=list)
+    clashes: dict[tuple[str, str], str] = field(default_factory=dict)
+    _files: dict[Path, tuple[str, Plugin]] = field(default_factory=dict)
+
+    @staticmethod
+    def installed() -> Registry:
+        """Return the registry of all installed plugins, ours and others', and of the user's plugin folder."""
+        registry = Registry()
+        for entry in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda entry: (entry.value, entry.name)):
+            registry._load_entry_point(entry)
+        for folder in user_plugin_folders():
+            registry._load_folder(folder)
+        registry._withhold()
+        return registry
+
+    @property
+    def broken(self) -> list[Plugin]:
+        """The plugins that could not be loaded."""
+        return [plugin for plugin in self.plugins if plugin.error]
+
+    def add_module(self, module: ModuleType, origin: str, *, code: str = "") -> None:
+        """Register all stages and parts that a module holds.
+
+        Raises:
+            PluginError: if a name is taken by another one; the message names both places.
+        """
+        if clashes := self._clashes(module, own_only=bool(code)):
+            raise PluginError("; ".join(clashes.values()))
+        self._add(module, origin, code)
+
+    def add_file(self, path: Path) -> None:
+        """Register the stages and parts of one user file; its code counts towards the cache keys of its stages.
+
+        Raises:
+            PluginError: if the file cannot be read or imported, defines neither, or defines what there is already.
+        """
+        loaded = self._load_file(path)
+        if loaded is not None:
+            module, digest = loaded
+            self.add_module(module, str(path), code=digest)
+            self._remember_file(path, module, digest)
+
+    def _load_file(self, path: Path) -> tuple[ModuleType, str] | None:
+        """Return a file's module and the digest of its code; None if it is registered as it is."""
+        if not is_file(path):
+            raise PluginError(f"plugin file {path} does not exist")
+        try:
+            digest = code_digest(path)
+            if self._files.get(resolved(path), ("", None))[0] == digest:
+                return None  # named twice, or named by the workflow and in the user's folder
+            module = _import_file(path)
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # also what is no Exception, such as pytest.skip() or a panic in Rust
+            raise PluginError(f"plugin file {path} failed to import: {_where(error, path)}") from error
+        if not any(_specs(module, own_only=True)) and not any(_marks(module, own_only=False)):
+            raise PluginError(f'plugin file {path} defines no stage: decorate a function with @stage("kind.name")')
+        return module, digest
+
+    def _remember_file(self, path: Path, module: ModuleType, digest: str) -> None:
+        self.plugins.append(Plugin(str(path), _names(module, own_only=True)))
+        self._files[resolved(path)] = digest, self.plugins[-1]
+
+    def files_behind(self, stages: Collection[str]) -> dict[Path, str]:
+        """Return the plugin files that some stages need, with the digests of their code.
+
+        A file that gives parts is needed by any stage: which of them a stage uses is its own affair.
+        """
+        return {
+            path: digest
+            for path, (digest, plugin) in self._files.items()
+            if any(kind != "stage" or name in stages for kind, name in plugin.names)
+        }
+
+    def suggest(self, name: str) -> str:
+        """Return what to do about an unknown stage name: why its plugin is broken, or what else may be meant."""
+        if ("stage", name) in self.clashes:
+            return self.clashes["stage", name]
+        for plugin in self.broken:
+            if ("stage", name) in plugin.names:
+                return plugin.why_broken()
+        known = [*self.stages, *(given for plugin in self.broken for kind, given in plugin.names if kind == "stage")]
+        close = get_close_matches(name, dict.fromkeys(known), n=3, cutoff=0.5)
+        parts = [f"did you mean {' or '.join(map(repr, close))}?"] if close else ["`pano-mvs plugins` lists all stages"]
+        parts.extend(
+            f"(plugin {plugin.origin} failed to load: {plugin.error})" for plugin in self.broken if not plugin.names
+        )
+        return " ".join(parts)
+
+    def _load_entry_point(self, entry: EntryPoint) -> None:
+        origin = f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value
+        try:
+            with redirect_stdout(sys.stderr):
+                module = entry.load()
+            if not isinstance(module, ModuleType):
+                raise PluginError(f"the entry point {entry.name} = {entry.value} must name a module")
+            clashes = self._clashes(module, own_only=False)
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
+            self.plugins.append(_broken(origin, names_in_package(entry), error))
+            return
+        self.clashes |= clashes
+        self._add(module, origin, "")
+        self.plugins.append(Plugin(origin, _names(module, own_only=False)))
+
+    def _load_folder(self, folder: Path) -> None:
+        if not folder.is_absolute():
+            error = PluginError(f"${PLUGINS_VARIABLE} holds {str(folder)!r}, which is not an absolute path")
+            self.plugins.append(_broken(f"${PLUGINS_VARIABLE}", (), error))
+            return
+        for path in plugin_files_in(folder):
+            try:
+                loaded = self._load_file(path)
+            except PluginError as error:
+                self.plugins.append(_broken(str(path), names_in_files([path]), error.__cause__ or error))
+                continue
+            if loaded is not None:
+                module, digest = loaded
+                self.clashes |= self._clashes(module, own_only=True)
+                self._add(module, str(path), digest)
+                self._remember_file(path, module, digest)
+
+    def _clashes(self, module: ModuleType, *, own_only: bool) -> dict[tuple[str, str], str]:
+        """Return which names of a module others have, with both places."""
+        places = {key: mark.origin for key, mark in self.parts.items()}
+        places |= {("stage", name): spec.origin for name, spec in self.stages.items()}
+        given = [((mark.kind, mark.name), mark.origin) for mark in _marks(module, own_only=own_only)]
+        given += [(("stage", spec.name), spec.origin) for spec in _specs(module, own_only=own_only)]
+        clashes: dict[tuple[str, str], str] = {}
+        for (kind, name), origin in given:
+            taken = places.setdefault((kind, name), origin)
+            if taken != origin:
+                clashes[kind, name] = f"{kind} {name!r} is defined twice: {taken} and {origin}. Rename one of them"
+        return clashes
+
+    def _add(self, module: ModuleType, origin: str, code: str) -> None:
+        for mark in _marks(module, own_only=bool(code)):
+            self.parts.setdefault((mark.kind, mark.name), mark)
+        for spec in _specs(module, own_only=bool(code)):
+            if spec.name not in self.stages:
+                self.stages[spec.name] = spec.with_code(code) if code else spec
+                self.origins[spec.name] = origin
+
+    def _withhold(self) -> None:
+        """Take away what is defined twice, and say of parts why they cannot be had."""
+        for kind, name in self.clashes:
+            if kind == "stage":
+                self.stages.pop(name, None)
+        missing = {name: plugin.why_broken() for plugin in self.broken for name in plugin.names if name[0] != "stage"}
+        set_unusable_parts(missing | {name: why for name, why in self.clashes.items() if name[0] != "stage"})
+
+
+def _broken(origin: str, names: tuple[tuple[str, str], ...], error: BaseException) -> Plugin:
+    summary = shortened(" ".join(f"{type(error).__name__}: {error}".split()))
+    return Plugin(origin, tuple(dict.fromkeys(names)), summary, _trace(error))
+
+
+def _trace(error: BaseException) -> str:
+    """Return the traceback from where the plugin's own code begins."""
+    step = error.__traceback__
+    while step is not None and (
+        step.tb_frame.f_code.co_filename == __file__ or "importlib" in step.tb_frame.f_code.co_filename
+    ):
+        step = step.tb_next
+    return "".join(traceback.format_exception(type(error), error, step))
+
+
+def _names(module: ModuleType, *, own_only: bool) -> tuple[tuple[str, str], ...]:
+    """Return what a module gives."""
+    stages = [("stage", spec.name) for spec in _specs(module, own_only=own_only)]
+    return tuple(dict.fromkeys([*stages, *((mark.kind, mark.name) for mark in _marks(module, own_only=own_only))]))
+
+
+def _specs(module: ModuleType, *, own_only: bool) -> Iterator[StageSpec]:
+    """Find a module's stages; a user's file may also import stages of others, which are not its own."""
+    for value in vars(module).values():
+        spec = spec_of(value)
+        if spec is not None and (not own_only or spec.function.__module__ == module.__name__):
+            yield spec
+
+
+def _marks(module: ModuleType, *, own_only: bool) -> Iterator[PartMark]:
+    """Find what a module, or a helper of it, registers beside stages."""
+    for value in vars(module).values():
+        if not own_only or getattr(value, "__module__", "") == module.__name__:
+            yield from marks_of(value)
+
+
+def _import_file(path: Path) -> ModuleType:
+    """Import a file under a name of its own; its folder is importable only meanwhile.
+
+    The helpers that it imports from its folder are forgotten afterwards, so that another plugin's `helper.py` is not
+    taken for this one's.
+    """
+    name = f"pano_mvs_plugin_{digest_from_value(str(resolved(path)))[:12]}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise PluginError(f"{path} is not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    folder = str(resolved(path).parent)
+    before = set(sys.modules)
+    sys.modules[name] = module
+    sys.path.insert(0, folder)
+    importlib.invalidate_caches()
+    try:
+        with redirect_stdout(sys.stderr):  # the standard output is for what a command gives
+            spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    finally:
+        sys.path.remove(folder)
+        for helper in set(sys.modules) - before - {name}:
+            if str(getattr(sys.modules[helper], "__file__", None) or "").startswith(folder):
+                del sys.modules[helper]
+    return module
+
+
+def _where(error: BaseException, path: Path) -> str:
+    """Return the error with the line of the plugin's own file in which it was raised."""
+    if isinstance(error, SyntaxError):
+        return f"{error.filename or path}:{error.lineno}: {error.msg}"
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if Path(frame.filename) == path.absolute()]
+    place = f"{path}:{own[-1].lineno}: " if own else ""
+    deeper = own and own[-1] is not frames[-1] and "importlib" not in frames[-1].filename
+    text = f"{place}{type(error).__name__}: {shortened(str(error))}"
+    return f"{text}\n{_trace(error).rstrip()}" if deeper else text

@@ -1,0 +1,224 @@
+"""Declare a stage: a function with typed ports, a `params` model and a kind as its result."""
+
+from __future__ import annotations
+
+import inspect
+import typing
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from pano_mvs.core.errors import PluginError
+from pano_mvs.engine.running.memory import bytes_from_size
+from pano_mvs.engine.stages.context import Context
+from pano_mvs.engine.stages.params import Params
+from pano_mvs.engine.stages.ports import Cardinality, Port, port_from_annotation
+from pano_mvs.scene import Axis, FilePart, Pairs, Record, Views
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+_ATTRIBUTE = "__pano_mvs_stage__"
+
+
+@dataclass(frozen=True, slots=True)
+class SourceItem:
+    """One item that a source offers.
+
+    Attributes:
+        name: path relative to the capture, with forward slashes.
+        files: role to file; their content is what the item is known by.
+        problem: why the item cannot be used, if that is known already.
+        notes: what a user should know in each run, whether the item is read or its result cached: what hangs on where
+            files lie, which is no part of what the item is known by.
+        digests: role to the digest of the file when it was listed; filled in by the engine.
+    """
+
+    name: str
+    files: Mapping[str, Path]
+    problem: str = ""
+    notes: tuple[str, ...] = ()
+    digests: Mapping[str, str] = field(default_factory=dict)
+
+    def file(self, role: str) -> FilePart:
+        """Return a file as a part of a record: its `read_bytes` gives the bytes that were listed, or raises."""
+        return FilePart(self.files[role], external=True, digest=self.digests.get(role, ""))
+
+
+ListItems = Callable[[Any], Iterable[SourceItem]]
+MemoryNeeded = Callable[[Any, Mapping[str, Any]], int]
+"""Takes a unit's params and its inputs by port, those of a source as {"item": SourceItem}; returns bytes."""
+
+
+@dataclass(frozen=True, slots=True)
+class StageSpec:
+    """What the engine knows of a stage.
+
+    Attributes:
+        name: the `use:` name, such as `depth.sweep`.
+        version: raised by the author where the result changes for a reason that the code does not show.
+        function: called with the ports by name, `params` and `ctx`.
+        ports: what it reads.
+        params_type: its settings.
+        output: the kind that it returns.
+        list_items: for sources, what lists the items.
+        origin: where it was defined, `file:line`.
+        code_digest: digest of the code, for stages from user files; else empty. See `stage_code` for what is in keys.
+        extras: argument name to what it takes beside the ports.
+        memory_bytes: what one unit needs, if the author says so.
+        memory_needed: finds it for each unit, if it depends on settings and inputs.
+    """
+
+    name: str
+    version: int
+    function: Callable[..., Record]
+    ports: tuple[Port, ...]
+    params_type: type[Params]
+    output: type[Record]
+    list_items: ListItems | None = None
+    origin: str = ""
+    code_digest: str = ""
+    extras: Mapping[str, Literal["params", "ctx", "item"]] = field(default_factory=dict)
+    memory_bytes: int = 0
+    memory_needed: MemoryNeeded | None = None
+
+    @property
+    def doc(self) -> str:
+        """The stage's docstring."""
+        return inspect.getdoc(self.function) or ""
+
+    @property
+    def index_kind(self) -> type[Record] | None:
+        """The index that says which items are near each other, if the stage has ports that need one."""
+        if all(port.cardinality is not Cardinality.NEAR for port in self.ports):
+            return None
+        return Pairs if self.output.axis is Axis.PAIR else Views
+
+    @property
+    def all_ports(self) -> tuple[Port, ...]:
+        """The declared ports, and `index` for the index if one is needed."""
+        if self.index_kind is None:
+            return self.ports
+        return (*self.ports, Port(INDEX_PORT, self.index_kind, Cardinality.ONE))
+
+    def with_code(self, code_digest: str) -> StageSpec:
+        """Return the stage as one whose code counts towards the cache key."""
+        return replace(self, code_digest=code_digest)
+
+
+INDEX_PORT = "index"
+
+
+@dataclass(frozen=True, slots=True)
+class _Signature:
+    ports: tuple[Port, ...]
+    params_type: type[Params]
+    output: type[Record]
+    extras: Mapping[str, Literal["params", "ctx", "item"]]
+
+
+def stage(name: str, *, version: int = 1, memory: str | int | MemoryNeeded = 0) -> Callable[[Function], Function]:
+    """Declare a function as a stage.
+
+    The function takes ports annotated `One/Each/Near/All[Kind]`, `params` annotated with a `Params` model (optional),
+    and `ctx: Context` (optional), and is annotated to return a kind. It is called with keywords. `memory`, such as
+    "2GB", is what one unit needs at most; no more of them run at a time than there is room for. Where that depends on
+    the unit it is a function `(params, inputs) -> bytes`, given what the stage itself would be given; it is called in
+    the main process, so it must be quick.
+
+    Raises:
+        PluginError: if the signature is not that of a stage.
+    """
+
+    def decorate(function: Function) -> Function:
+        signature = _read_signature(function, name)
+        setattr(function, _ATTRIBUTE, _spec(name, version, function, signature, None, memory))
+        return function
+
+    return decorate
+
+
+def source(
+    name: str, *, list_items: ListItems, version: int = 1, memory: str | int | MemoryNeeded = 0
+) -> Callable[[Function], Function]:
+    """Declare a function as a source: `list_items(params)` names the items, the function reads one of them.
+
+    The function takes `item: SourceItem`, `params` and `ctx`, and returns a kind of the image axis. The list is made
+    anew at each run; reading an item is cached by the content of its files. `memory` is as in `stage`; a function is
+    given `{"item": item}` as inputs.
+    """
+
+    def decorate(function: Function) -> Function:
+        signature = _read_signature(function, name, leading="item")
+        setattr(function, _ATTRIBUTE, _spec(name, version, function, signature, list_items, memory))
+        return function
+
+    return decorate
+
+
+def spec_of(value: object) -> StageSpec | None:
+    """Return the stage that an object was declared as, or None."""
+    spec = getattr(value, _ATTRIBUTE, None)
+    return spec if isinstance(spec, StageSpec) else None
+
+
+def _spec(
+    name: str,
+    version: int,
+    function: Callable[..., Any],
+    signature: _Signature,
+    list_items: ListItems | None,
+    memory: str | int | MemoryNeeded = 0,
+) -> StageSpec:
+    return StageSpec(
+        name=name,
+        version=version,
+        function=function,
+        ports=signature.ports,
+        params_type=signature.params_type,
+        output=signature.output,
+        list_items=list_items,
+        origin=_origin(function),
+        extras=signature.extras,
+        memory_bytes=0 if callable(memory) else bytes_from_size(memory),
+        memory_needed=memory if callable(memory) else None,
+    )
+
+
+def _origin(function: Callable[..., Any]) -> str:
+    code = function.__code__
+    return f"{code.co_filename}:{code.co_firstlineno}"
+
+
+def _read_signature(function: Callable[..., Any], name: str, *, leading: str = "") -> _Signature:
+    """Read ports, params and output from the annotations."""
+    where = f"stage {name!r} ({_origin(function)})"
+    try:
+        hints = typing.get_type_hints(function, include_extras=True)
+    except NameError as error:
+        raise PluginError(f"{where}: an annotation cannot be resolved: {error}") from error
+    ports: list[Port] = []
+    params_type: type[Params] = Params
+    extras: dict[str, Literal["params", "ctx", "item"]] = {}
+    for argument in inspect.signature(function).parameters.values():
+        annotation = hints.get(argument.name)
+        if argument.name == leading:
+            extras[argument.name] = "item"
+            continue
+        if annotation is Context:
+            extras[argument.name] = "ctx"
+            continue
+        if isinstance(annotation, type) and issubclass(annotation, Params):
+            params_type = annotation
+            extras[argument.name] = "params"
+            continue
+        port = port_from_annotation(argument.name, annotation)
+        if port is None or port.name == INDEX_PORT:
+            raise PluginError(
+                f"{where}: argument {argument.name!r} must be annotated One/Each/Near/All[Kind], a Params model or "
+                f"Context, got {annotation!r}"
+            )
+        ports.append(port)
+    output = hints.get("return")
+    if not (isinstance(output, type) and issubclass(output, Record)):
+        raise PluginError(f"{where}: the result must be annotated with a kind (a Record), got {output!r}")
+    return _Signature(tuple(ports), params_type, output, extras)

@@ -1,0 +1,1 @@
+"""Workflow files: read, merged, validated and wired into a graph of stages."""

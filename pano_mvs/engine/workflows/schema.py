@@ -1,0 +1,183 @@
+"""The JSON Schema (2020-12) of a workflow file, for editors that complete and check while one types."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+from urllib.parse import quote
+
+from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.engine.stages.stage import StageSpec
+from pano_mvs.engine.workflows.extends import FORMAT_VERSION
+from pano_mvs.engine.workflows.policy import RESERVED_KEYS, Policy
+from pano_mvs.engine.workflows.yaml_text import Located
+
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+_LIST = [{"type": "array", "items": {"type": "string"}}, {"type": "null"}]
+_NAME = {"type": "string", "pattern": "^[^\\s/\\\\.:-][^\\s/\\\\:]*$"}
+
+Schema = dict[str, Any]
+
+
+def workflow_schema(registry: Registry, inherited: Mapping[str, Located] | None = None) -> Schema:
+    """Return the schema of workflow files.
+
+    Args:
+        registry: the stages there are; their settings, with those parts of plugins that are chosen by name.
+        inherited: the stages of the workflows that a file extends: what it says of them may leave `use` out, and is
+            completed by the settings of the stage that they use.
+    """
+    specs = dict(sorted(registry.stages.items()))
+    return {
+        "$schema": DIALECT,
+        "title": "pano_mvs workflow",
+        "type": "object",
+        "required": ["pano_mvs"],
+        "additionalProperties": False,
+        "properties": _top(specs, inherited or {}),
+        "if": {"required": ["extends"]},
+        "then": {"properties": {"stages": {"additionalProperties": _ref("again")}}},
+        "else": {
+            "required": ["stages"],
+            "properties": {"stages": {"minProperties": 1, "additionalProperties": _ref("stage")}},
+        },
+        "$defs": {
+            "stage": _entry(specs),
+            "again": {"anyOf": [{"type": "null"}, _again(specs)]},
+            **{f"use.{name}": _settings(spec) for name, spec in specs.items()},
+            **_reserved_definitions(),
+        },
+    }
+
+
+def _top(specs: Mapping[str, StageSpec], inherited: Mapping[str, Located]) -> Schema:
+    known = {name: _inherited(specs, str(node.value["use"].value)) for name, node in inherited.items()}
+    return {
+        "pano_mvs": {"const": FORMAT_VERSION, "description": "version of the workflow format"},
+        "name": _NAME | {"description": "names the output folder; by default as the file"},
+        "description": {"type": "string"},
+        "extends": {
+            "description": "a preset or a file, or a list of them, over which this one is laid",
+            "anyOf": [{"type": "string", "minLength": 1}, *_LIST],
+        },
+        "plugins": {
+            "description": "Python files with further stages or parts, relative to this file",
+            "anyOf": _LIST,
+        },
+        "stages": {
+            "type": "object",
+            "description": "the stages by name, in order",
+            "properties": known,
+            "propertyNames": _NAME,
+        },
+    }  # fmt: skip
+
+
+def _entry(specs: Mapping[str, StageSpec]) -> Schema:
+    """Return the schema of a stage that stands for itself."""
+    return {
+        "type": "object",
+        "required": ["use"],
+        "properties": {"use": _use(specs)},
+        "allOf": [_when(name, _ref(f"use.{name}") | {"required": _required(spec)}) for name, spec in specs.items()],
+    }
+
+
+def _again(specs: Mapping[str, StageSpec]) -> Schema:
+    """Return the schema of a stage that may be given again: nothing of it need be said, not even `use`."""
+    return {
+        "type": "object",
+        "properties": {"use": _use(specs), **_reserved()},
+        "allOf": [_when(name, _ref(f"use.{name}")) for name in specs],
+    }
+
+
+def _inherited(specs: Mapping[str, StageSpec], use: str) -> Schema:
+    """Return the schema of a stage that is known from below: its settings, unless another `use` is given."""
+    if use not in specs:
+        return _ref("again")
+    same = {"properties": {"use": {"const": use}}}
+    return {
+        "if": {"type": "object", **same},
+        "then": _ref(f"use.{use}"),
+        "else": _ref("again"),
+    }
+
+
+def _when(use: str, then: Schema) -> Schema:
+    return {"if": {"required": ["use"], "properties": {"use": {"const": use}}}, "then": then}
+
+
+def _use(specs: Mapping[str, StageSpec]) -> Schema:
+    return {
+        "description": "the stage",
+        "enum": list(specs),
+        "markdownEnumDescriptions": [_first_line(spec) for spec in specs.values()],  # VS Code shows them
+    }
+
+
+def _settings(spec: StageSpec) -> Schema:
+    """Return the schema of all keys of a stage's entry."""
+    own = spec.params_type.model_json_schema(
+        by_alias=True, ref_template=f"{_pointer(f'use.{spec.name}')}/$defs/{{model}}"
+    )
+    schema: Schema = {
+        "type": "object",
+        "title": spec.name,
+        "description": spec.doc,
+        "additionalProperties": False,
+        "properties": {
+            "use": {"const": spec.name, "description": _first_line(spec)},
+            **_without_titles(own.get("properties", {})),
+            **_reserved(),
+            "in": _ports(spec),
+        },
+    }
+    return schema | ({"$defs": own["$defs"]} if "$defs" in own else {})
+
+
+def _required(spec: StageSpec) -> list[str]:
+    fields = spec.params_type.model_fields.items()
+    return [info.alias or name for name, info in fields if info.is_required()]
+
+
+def _reserved() -> Schema:
+    """Return, for the keys that every stage takes, where their schemas are."""
+    return {name: _ref(f"key.{name}") for name in RESERVED_KEYS if name != "use"}
+
+
+def _reserved_definitions() -> Schema:
+    """Return the schemas of the keys that every stage takes; null stands for what holds if nothing is said."""
+    own = Policy.model_json_schema(by_alias=True)
+    keys = {
+        f"key.{name}": {"description": value.pop("description", ""), "anyOf": [value, {"type": "null"}]}
+        for name, value in _without_titles(own["properties"]).items()
+        if name != "use"
+    }
+    return {**keys, **own.get("$defs", {})}
+
+
+def _ref(name: str) -> Schema:
+    return {"$ref": _pointer(name)}
+
+
+def _pointer(name: str) -> str:
+    """Return where a definition is, as RFC 6901 writes it in a URI."""
+    return f"#/$defs/{quote(name.replace('~', '~0').replace('/', '~1'))}"
+
+
+def _ports(spec: StageSpec) -> Schema:
+    ports = {port.name: {"type": "string", "description": str(port)} for port in spec.all_ports}
+    return {
+        "description": "port to the stage of this workflow that feeds it, where there is a choice",
+        "anyOf": [{"type": "object", "additionalProperties": False, "properties": ports}, {"type": "null"}],
+    }
+
+
+def _without_titles(properties: Schema) -> Schema:
+    """Leave out the titles that pydantic makes of names; an editor would show them in place of the names."""
+    return {name: {key: part for key, part in value.items() if key != "title"} for name, value in properties.items()}
+
+
+def _first_line(spec: StageSpec) -> str:
+    return spec.doc.partition("\n")[0]

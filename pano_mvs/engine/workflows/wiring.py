@@ -1,0 +1,201 @@
+"""Connect the ports of a workflow's stages, or say what does not fit; nothing has run yet."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from graphlib import CycleError, TopologicalSorter
+
+from pano_mvs.core.errors import WorkflowError
+from pano_mvs.engine.stages.ports import Cardinality, Port
+from pano_mvs.engine.stages.stage import INDEX_PORT
+from pano_mvs.engine.workflows.workflow import StageEntry, Workflow
+from pano_mvs.scene import Axis
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """What feeds a port.
+
+    Attributes:
+        port: the port.
+        producer: name of the feeding stage in the workflow.
+        exploded: whether the items of the producer's collection are meant rather than the collection.
+    """
+
+    port: Port
+    producer: str
+    exploded: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Graph:
+    """A wired workflow.
+
+    Attributes:
+        order: stage names, producers first, otherwise as in the file.
+        edges: stage name to port name to what feeds it.
+        axes: stage name to the axis of its units.
+        only: stage name to the units to which it is confined, where it is.
+        is_part: whether some stages or units of the workflow are left out.
+    """
+
+    order: tuple[str, ...]
+    edges: Mapping[str, Mapping[str, Edge]]
+    axes: Mapping[str, Axis]
+    only: Mapping[str, frozenset[str]] = field(default_factory=dict)
+    is_part: bool = False
+
+    def confined(self, ends: Collection[str], only: Mapping[str, frozenset[str]]) -> Graph:
+        """Return the part of the graph that the stages `ends` need, themselves included."""
+        needed = set(ends)
+        for name in reversed(self.order):
+            if name in needed:
+                needed.update(edge.producer for edge in self.edges[name].values())
+        order = tuple(name for name in self.order if name in needed)
+        return Graph(order, self.edges, self.axes, only, is_part=True)
+
+
+def wire(workflow: Workflow) -> Graph:
+    """Connect every port: by `in:`, else to the nearest earlier stage that produces its kind.
+
+    Raises:
+        WorkflowError: with every mistake: unknown stages or ports in `in:`, kinds that do not fit, inputs that nobody
+            produces, ambiguity, cycles.
+    """
+    wirer = _Wirer(workflow)
+    edges = {name: wirer.connect(entry) for name, entry in workflow.stages.items()}
+    order = wirer.sort(edges)
+    axes: dict[str, Axis] = {}
+    for name in order if not wirer.problems else ():
+        axes[name] = wirer.axis(workflow.stages[name], edges[name], axes)
+    if wirer.problems:
+        raise WorkflowError(wirer.problems)
+    return Graph(order, edges, axes)
+
+
+def wiring_problems(stages: Mapping[str, StageEntry]) -> list[str]:
+    """Return the mistakes in the wiring of stages whose settings may be wrong."""
+    try:
+        wire(Workflow("", None, "", dict(stages)))
+    except WorkflowError as error:
+        return error.problems
+    return []
+
+
+def _delivers(entry: StageEntry, port: Port) -> bool | None:
+    """Return whether a stage feeds a port by its items (True), as a whole (False), or not at all (None)."""
+    output = entry.spec.output
+    if port.cardinality is Cardinality.ONE:
+        return False if issubclass(output, port.kind) and output.axis in (Axis.ONE, None) else None
+    if issubclass(output, port.kind) and output.axis is not Axis.ONE:
+        return False
+    inner = output.explodes_into
+    return True if inner is not None and issubclass(inner, port.kind) else None
+
+
+class _Wirer:
+    def __init__(self, workflow: Workflow) -> None:
+        self.stages = workflow.stages
+        self.problems: list[str] = []
+        self.ancestors: dict[str, set[str]] = {}
+
+    def connect(self, entry: StageEntry) -> dict[str, Edge]:
+        ports = {port.name: port for port in entry.spec.all_ports}
+        edges: dict[str, Edge] = {}
+        for name in entry.policy.inputs:
+            if name not in ports:
+                close = get_close_matches(name, ports, n=1, cutoff=0.4)
+                hint = f"did you mean {close[0]!r}?" if close else f"its ports: {', '.join(ports) or 'none'}"
+                self._problem(entry, f"in.{name}", f"stage {entry.name!r} has no port {name!r}; {hint}")
+        for port in ports.values():
+            edge = self._named(entry, port) if port.name in entry.policy.inputs else self._nearest(entry, port)
+            if edge is not None:
+                edges[port.name] = edge
+        self.ancestors[entry.name] = set().union(
+            *({edge.producer} | self.ancestors.get(edge.producer, set()) for edge in edges.values())
+        )
+        return edges
+
+    def _named(self, entry: StageEntry, port: Port) -> Edge | None:
+        name = entry.policy.inputs[port.name]
+        place = f"in.{port.name}"
+        producer = self.stages.get(name)
+        if producer is None:
+            close = get_close_matches(name, self.stages, n=1, cutoff=0.4)
+            hint = f"did you mean {close[0]!r}?" if close else f"stages: {', '.join(self.stages)}"
+            self._problem(entry, place, f"port {port.name!r}: there is no stage {name!r}; {hint}")
+            return None
+        exploded = _delivers(producer, port)
+        if exploded is None:
+            made = producer.spec.output.kind_name()
+            self._problem(entry, place, f"port {port} cannot be fed by {name!r}, which produces {made}")
+            return None
+        return Edge(port, name, exploded)
+
+    def _nearest(self, entry: StageEntry, port: Port) -> Edge | None:
+        names = list(self.stages)
+        earlier = [self.stages[name] for name in names[: names.index(entry.name)]]
+        candidates = [stage for stage in earlier if _delivers(stage, port) is not None]
+        if not candidates:
+            if not port.optional:
+                self._problem(entry, "use", self._missing(entry, port))
+            return None
+        nearest = candidates[-1]
+        others = [stage.name for stage in candidates[:-1] if stage.name not in self.ancestors.get(nearest.name, set())]
+        if others:
+            options = ", ".join([*others, nearest.name])
+            self._problem(entry, "use", f"stage {entry.name!r}: port {port} could be fed by {options}; "
+                          f"say which with `in: {{{port.name}: …}}`")  # fmt: skip
+            return None
+        return Edge(port, nearest.name, bool(_delivers(nearest, port)))
+
+    def _missing(self, entry: StageEntry, port: Port) -> str:
+        later = [
+            name for name, stage in self.stages.items() if name != entry.name and _delivers(stage, port) is not None
+        ]
+        hint = f" ({', '.join(later)} below does: move it up or name it in `in:`)" if later else ""
+        need = "needs an index" if port.name == INDEX_PORT else "needs"
+        return f"stage {entry.name!r} {need} {port}, but no earlier stage produces {port.kind.kind_name()}{hint}"
+
+    def sort(self, edges: Mapping[str, Mapping[str, Edge]]) -> tuple[str, ...]:
+        position = {name: number for number, name in enumerate(self.stages)}
+        graph = {name: {edge.producer for edge in ports.values()} for name, ports in edges.items()}
+        sorter = TopologicalSorter(graph)
+        try:
+            sorter.prepare()
+        except CycleError as error:
+            cycle = " → ".join(reversed(error.args[1]))
+            self._problem(self.stages[error.args[1][0]], "use", f"the stages feed each other in a cycle: {cycle}")
+            return ()
+        order: list[str] = []
+        ready: list[str] = []
+        while sorter.is_active():
+            ready = sorted([*ready, *sorter.get_ready()], key=position.__getitem__)
+            order.append(ready.pop(0))
+            sorter.done(order[-1])
+        return tuple(order)
+
+    def axis(self, entry: StageEntry, edges: Mapping[str, Edge], axes: Mapping[str, Axis]) -> Axis:
+        """Return the axis of a stage's units, and check that its Each ports agree on it."""
+        if entry.spec.list_items is not None:
+            return Axis.IMAGE
+        output = entry.spec.output.axis
+        if INDEX_PORT in edges:
+            return Axis.PAIR if output is Axis.PAIR else Axis.VIEW
+        fed = [
+            Axis.IMAGE if edge.exploded else axes.get(edge.producer, Axis.ONE)
+            for edge in edges.values()
+            if edge.port.cardinality is Cardinality.EACH
+        ]
+        found = max(fed, key=(Axis.ONE, Axis.IMAGE, Axis.VIEW, Axis.PAIR).index, default=Axis.ONE)
+        if Axis.PAIR in fed and len(set(fed)) > 1:
+            self._problem(entry, "use", f"stage {entry.name!r} mixes Each inputs of pairs and of images")
+        if output is not None and (output is Axis.ONE) != (found is Axis.ONE):
+            self._problem(entry, "use", f"stage {entry.spec.name!r} returns {entry.spec.output.kind_name()} (one per "
+                          f"{output}), but its inputs give one unit per {found}")  # fmt: skip
+        return found
+
+    def _problem(self, entry: StageEntry, place: str, message: str) -> None:
+        self.problems.append(f"{entry.places.get(place, entry.place)}: {message}")

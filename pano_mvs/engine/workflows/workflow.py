@@ -1,0 +1,264 @@
+"""A workflow file: parsed, its settings validated, every mistake found at once."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from pano_mvs.core.errors import PluginError, UsageError, WorkflowError
+from pano_mvs.core.file_names import is_plain_name
+from pano_mvs.core.paths import children, exists, is_denied, is_file, resolved
+from pano_mvs.engine.code.plugin_digest import code_digest
+from pano_mvs.engine.stages.params import Params, files_of
+from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.engine.stages.stage import StageSpec
+from pano_mvs.engine.workflows.extends import Layer, LayerReader, did_you_mean, merge_stages, read_text
+from pano_mvs.engine.workflows.overrides import apply_overrides
+from pano_mvs.engine.workflows.policy import RESERVED_KEYS, Policy
+from pano_mvs.engine.workflows.yaml_text import Located, Problems
+
+
+@dataclass(frozen=True, slots=True)
+class StageEntry:
+    """One stage of a workflow, validated.
+
+    Attributes:
+        name: its name in this workflow.
+        spec: the stage it uses.
+        params: its settings.
+        policy: wiring and error handling.
+        place: `file:line:column` of its name.
+        places: port or setting to `file:line:column`.
+    """
+
+    name: str
+    spec: StageSpec
+    params: Params
+    policy: Policy
+    place: str
+    places: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Workflow:
+    """A validated workflow.
+
+    Attributes:
+        name: for the output folder and the report.
+        path: the file, or None.
+        text: the YAML as written, with that of the files that it extends.
+        stages: in the order of the file.
+        overrides: the `--set` and `--images` that were applied.
+        plugins: the plugin files that it names, with the digests of their code.
+    """
+
+    name: str
+    path: Path | None
+    text: str
+    stages: dict[str, StageEntry]
+    overrides: tuple[str, ...] = ()
+    plugins: Mapping[Path, str] = field(default_factory=dict)
+
+
+def load_workflow(
+    path: Path,
+    registry: Registry,
+    *,
+    overrides: Sequence[str] = (),
+    images: Path | None = None,
+    presets: Path | None = None,
+) -> Workflow:
+    """Read and validate a workflow file.
+
+    Args:
+        path: the YAML file; relative paths in it are relative to its folder.
+        registry: the stages there are; the plugin files that the workflow names are added to it.
+        overrides: `STAGE.PARAM=VALUE`, the value in YAML.
+        images: a folder for the stage called `images` to read instead of its own.
+        presets: folder of the workflows that it may extend by name.
+
+    Raises:
+        InputError: if the file cannot be read.
+        WorkflowError: with every mistake found, each with its place.
+    """
+    reader = WorkflowReader(str(path), path.parent, registry, presets=presets)
+    return reader.read(read_text(path), overrides=overrides, images=images, path=path)
+
+
+class PartialWorkflowError(WorkflowError):
+    """A workflow with mistakes; `stages` are its entries where all could be named, for the wiring to be checked too."""
+
+    def __init__(self, problems: list[str], stages: dict[str, StageEntry]) -> None:
+        self.stages = stages
+        super().__init__(problems)
+
+
+class WorkflowReader:
+    """Turns YAML into a workflow, collecting problems."""
+
+    def __init__(self, shown_as: str, base: Path, registry: Registry, *, presets: Path | None = None) -> None:
+        self.shown_as = shown_as
+        self.base = base
+        self.registry = registry
+        self.presets = presets
+        self.problems = Problems()
+        self.plugins: dict[Path, str] = {}
+        self.folders: dict[str, Path] = {}
+
+    def read(
+        self, text: str, *, overrides: Sequence[str] = (), images: Path | None = None, path: Path | None = None
+    ) -> Workflow:
+        """Return the workflow, or raise WorkflowError with every mistake."""
+        layers = self._layers(text, path)
+        entries = merge_stages(layers, self.problems)
+        added = apply_overrides(entries, overrides, self.problems, images=images)
+        for layer in layers:
+            self._load_plugins(layer.root.value.get("plugins"))
+        for item in added:
+            self._load_plugin(item)
+        if not entries and not self.problems.lines:
+            self.problems.add(layers[-1].root.place, "no stage is left")
+        stages = {name: entry for name, node in entries.items() if (entry := self._stage(name, node)) is not None}
+        if self.problems.lines:
+            raise PartialWorkflowError(self.problems.lines, stages if len(stages) == len(entries) else {})
+        root = layers[-1].root
+        name = root.value["name"].plain() if "name" in root.value else _name_of(self.shown_as)
+        shown = ([f"images.path={images}"] if images else []) + list(overrides)
+        return Workflow(name, path, _all_texts(layers), stages, tuple(shown), self.plugins)
+
+    def inherited(self, text: str, path: Path) -> dict[str, Located]:
+        """Return the stages that a file has from those that it extends, and load the plugins of all of them.
+
+        Mistakes are passed over: this serves an editor in which the file is being written.
+
+        Raises:
+            WorkflowError: if it is no YAML.
+        """
+        layers = self._layers(text, path)
+        for layer in layers:
+            self._load_plugins(layer.root.value.get("plugins"))
+        return merge_stages(layers[:-1], self.problems)
+
+    def _layers(self, text: str, path: Path | None) -> list[Layer]:
+        reader = LayerReader(self.problems, self.presets)
+        reader.read(text, self.shown_as, self.base, chain=(resolved(path),) if path is not None else ())
+        self.folders = {layer.shown_as: layer.base for layer in reader.layers}
+        return reader.layers
+
+    def _load_plugins(self, node: Located | None) -> None:
+        if node is None or node.value is None:
+            return
+        if not isinstance(node.value, list):
+            self.problems.add(node.place, "plugins must be a list of Python files")
+            return
+        for item in node.value:
+            self._load_plugin(item)
+
+    def _load_plugin(self, item: Located) -> None:
+        if not isinstance(item.value, str):
+            self.problems.add(item.place, "a plugin is the path of a Python file")
+            return
+        path = self._folder(item) / item.value
+        if path in self.plugins:
+            return
+        try:
+            self.registry.add_file(path)
+            self.plugins[path] = code_digest(path)
+        except PluginError as error:
+            self.problems.add(item.place, str(error))
+
+    def _folder(self, item: Located) -> Path:
+        """Return what a relative path is relative to: its file's folder, or where the command was typed."""
+        return resolved(Path()) if item.origin else self.folders.get(item.file, self.base)
+
+    def _stage(self, name: str, node: Located) -> StageEntry | None:
+        use = node.value["use"]
+        spec = self.registry.stages.get(use.value) if isinstance(use.value, str) else None
+        if spec is None:
+            shown = repr(use.plain())[:80]
+            hint = self.registry.suggest(str(use.value)[:80])
+            self.problems.add(use.place, f"stage {name!r}: there is no stage {shown}; {hint}")
+            return None
+        values = node.plain()
+        policy = self._validate(Policy, {key: values[key] for key in values if key in RESERVED_KEYS}, node, name)
+        own = {key: value for key, value in values.items() if key not in RESERVED_KEYS}
+        params = self._validate(spec.params_type, own, node, name)
+        if params is not None:
+            self._check_files(params, node, name)
+        places = {key: item.place for key, item in node.value.items()}
+        wiring = node.value.get("in")
+        if wiring is not None and isinstance(wiring.value, dict):
+            places.update({f"in.{port}": item.place for port, item in wiring.value.items()})
+        # Mistakes in settings do not keep the wiring from being checked, so that all are found in one go.
+        return StageEntry(name, spec, params or Params(), policy or Policy(use=spec.name), node.key_place, places)
+
+    def _check_files(self, params: Params, node: Located, name: str) -> None:
+        for key, paths in files_of(params).items():
+            for path in paths:
+                if not exists(path):
+                    why = "may not be looked at (permission denied)" if is_denied(path) else "does not exist"
+                    self.problems.add(node.at((key,)).place, f"stage {name!r}: {key}: {path} {why}")
+
+    def _validate(self, model: type[Any], values: dict[str, Any], node: Located, name: str) -> Any:
+        try:
+            return model.model_validate(values, context={"base": self.base, "bases": self._bases(node)})
+        except ValidationError as error:
+            known = [info.alias or field_name for field_name, info in model.model_fields.items()]
+            for problem in error.errors(include_url=False):
+                self._report(problem, node, name, known)
+            return None
+
+    def _bases(self, node: Located) -> dict[str, Path]:
+        """Return what each setting's paths are relative to."""
+        return {key: self._folder(item) for key, item in node.value.items()}
+
+    def _report(self, problem: Any, node: Located, name: str, known: list[str]) -> None:
+        path = tuple(problem["loc"])
+        found = node.at(path)
+        key = ".".join(map(str, path))
+        if problem["type"] == "extra_forbidden":
+            options = [*known, *(key for key in RESERVED_KEYS if key not in known)] if len(path) == 1 else []
+            unknown = f"unknown setting {key[:80]!r}.{did_you_mean(key, options)}"
+            self.problems.add(found.key_place, f"stage {name!r}: {unknown}")
+        elif problem["type"] == "missing":
+            self.problems.add(found.key_place, f"stage {name!r}: setting {key!r} is missing")
+        else:
+            message = problem["msg"].removeprefix("Value error, ")
+            shown = json.dumps(problem["input"], default=str, ensure_ascii=False)[:80]
+            setting = f"{key}: " if key else ""
+            self.problems.add(found.place, f"stage {name!r}: {setting}{message} (got {shown})")
+
+
+def _name_of(shown_as: str) -> str:
+    """Return a name for a workflow that has none, from its file's."""
+    word = "".join(sign if sign.isalnum() or sign in "-_." else "_" for sign in Path(shown_as).stem)
+    return word if is_plain_name(word) else "workflow"
+
+
+def _all_texts(layers: Sequence[Layer]) -> str:
+    """Return a workflow's text, with those of the files that it extends behind it."""
+    *below, own = layers
+    return own.text + "".join(f"\n---\n# extended: {layer.shown_as}\n{layer.text}" for layer in below)
+
+
+def find_workflow(name: str, presets: Path) -> tuple[Path, bool]:
+    """Return the file of a workflow given as a path or as a preset's name, and whether it is a preset.
+
+    Raises:
+        UsageError: if there is neither.
+    """
+    path = Path(name)
+    if is_file(path):
+        return path, False
+    preset = presets / f"{name}.yaml"
+    if is_plain_name(name) and is_file(preset):
+        return preset, True
+    if exists(path) or is_denied(path):
+        return path, False  # reading it says what is wrong with it
+    names = [file.stem for file in children(presets, "*.yaml")]
+    raise UsageError(f"there is no workflow file {name[:80]!r} and no preset of that name.{did_you_mean(name, names)}")

@@ -1,0 +1,255 @@
+"""Read YAML 1.2 into plain values that remember the file, line and column they were written at."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.composer import Composer
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+
+from pano_mvs.core.errors import WorkflowError
+from pano_mvs.core.file_names import is_printable
+
+MAX_DEPTH = 40
+MAX_VALUES = 100_000
+MAX_PROBLEMS = 100
+_MAX_DIGITS = 400
+_SHOWN = 40
+_CORE = "tag:yaml.org,2002:"
+_KEY_TAGS = {f"{_CORE}{name}" for name in ("str", "null", "bool", "int", "float", "merge", "value")}
+
+
+@dataclass(frozen=True, slots=True)
+class Located:
+    """A YAML value and where it stands.
+
+    Attributes:
+        value: a scalar, a dict of str to Located, or a list of Located.
+        line: 1-based line of the value.
+        column: 1-based column of the value.
+        key_line: 1-based line of its key, if it is an entry of a mapping.
+        key_column: likewise.
+        origin: what to show instead of the file and the place, for values from the command line.
+        file: what the text is called in messages.
+    """
+
+    value: Any
+    line: int
+    column: int
+    key_line: int = 0
+    key_column: int = 0
+    origin: str = ""
+    file: str = ""
+
+    @property
+    def place(self) -> str:
+        """Where the value stands: `file:line:column`, or its origin."""
+        return self.origin or f"{self.file}:{self.line}:{self.column}"
+
+    @property
+    def key_place(self) -> str:
+        """Where its key stands, if it has one."""
+        return f"{self.file}:{self.key_line}:{self.key_column}" if self.key_line else self.place
+
+    def plain(self) -> Any:
+        """Return the value without its places."""
+        if isinstance(self.value, dict):
+            return {key: item.plain() for key, item in self.value.items()}
+        if isinstance(self.value, list):
+            return [item.plain() for item in self.value]
+        return self.value
+
+    def at(self, path: tuple[Any, ...]) -> Located:
+        """Return what stands at a path of keys and positions, or the nearest thing above it."""
+        here = self
+        for step in path:
+            try:
+                inner = here.value[step]
+            except (KeyError, IndexError, TypeError):
+                break
+            here = inner if isinstance(inner, Located) else here
+        return here
+
+
+class Problems:
+    """Mistakes found so far, one line each; the search ends where there are too many."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def add(self, place: str, message: str) -> None:
+        """Note a mistake.
+
+        Raises:
+            WorkflowError: if this is one too many; with all of them.
+        """
+        self.lines.append(f"{place}: {message}")
+        if len(self.lines) >= MAX_PROBLEMS:
+            raise WorkflowError(
+                [*self.lines, f"these are the first {MAX_PROBLEMS} mistakes; mend them, then look again"]
+            )
+
+    def raise_if_any(self) -> None:
+        """Raise WorkflowError if there are mistakes."""
+        if self.lines:
+            raise WorkflowError(self.lines)
+
+
+def parse_yaml(text: str, name: str) -> Located:
+    """Return the one document of a YAML 1.2 text.
+
+    Args:
+        text: the YAML.
+        name: what to call the text in messages, such as its path.
+
+    Raises:
+        WorkflowError: for every mistake that can be seen, as `name:line:column: message`.
+    """
+    try:
+        yaml = YAML(typ="safe", pure=True)
+        yaml.Composer = _Composer
+        root = yaml.compose(text)
+    except MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        place = f"{name}:{mark.line + 1}:{mark.column + 1}" if mark else name
+        raise WorkflowError([f"{place}: {_shortened(error.problem or error.context or 'not valid YAML')}"]) from None
+    except YAMLError as error:
+        raise WorkflowError([f"{name}: {_unreadable(text) or 'not valid YAML: ' + _shortened(str(error))}"]) from None
+    except (ValueError, IndexError, AssertionError, KeyError, TypeError, AttributeError) as error:
+        # ruamel.yaml's own slips over malformed directives, tags and escapes.
+        raise WorkflowError([f"{name}: not valid YAML ({type(error).__name__}: {_shortened(str(error))})"]) from None
+    if root is None:
+        raise WorkflowError([f"{name}:1:1: the file is empty"])
+    builder = _Builder(name)
+    located = builder.build(root, 0)
+    builder.problems.raise_if_any()
+    return located
+
+
+class _Composer(Composer):
+    """ruamel's composer, which calls itself for every level, with an end to it."""
+
+    def __init__(self, loader: Any = None) -> None:
+        super().__init__(loader)
+        self.warn_double_anchors = False
+        self._level = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """Return the next node.
+
+        Raises:
+            MarkedYAMLError: if it lies too deep.
+        """
+        self._level += 1
+        if self._level > MAX_DEPTH + 1:
+            mark = self.parser.peek_event().start_mark
+            raise MarkedYAMLError(problem=f"nested too deeply; {MAX_DEPTH} levels are allowed", problem_mark=mark)
+        node = super().compose_node(parent, index)
+        self._level -= 1
+        return node
+
+
+def _shortened(text: str) -> str:
+    line = text.strip().split("\n")[0]
+    return line if len(line) <= 5 * _SHOWN else f"{line[: 5 * _SHOWN]}…"
+
+
+def _unreadable(text: str) -> str:
+    """Return where the first character stands that YAML does not have."""
+    for number, line in enumerate(text.split("\n"), 1):
+        for column, sign in enumerate(line.removesuffix("\r"), 1):
+            if sign != "\t" and not is_printable(sign):
+                return f"line {number}, column {column}: the control character {sign!r} is not allowed; remove it"
+    return ""
+
+
+class _Builder:
+    """Turn ruamel's nodes into located values, collecting every problem on the way."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.problems = Problems()
+        self.count = 0
+
+    def build(self, node: Node, depth: int) -> Located:
+        line, column = node.start_mark.line + 1, node.start_mark.column + 1
+        self.count += 1
+        if depth > MAX_DEPTH or self.count > MAX_VALUES:
+            limit = f"{MAX_DEPTH} levels" if depth > MAX_DEPTH else f"{MAX_VALUES} values"
+            raise WorkflowError([*self.problems.lines, f"{self.name}:{line}:{column}: too large; {limit} are allowed"])
+        value: Any
+        if isinstance(node, MappingNode):
+            self._require_tag(node, "map")
+            value = self._mapping(node, depth)
+        elif isinstance(node, SequenceNode):
+            self._require_tag(node, "seq")
+            value = [self.build(item, depth + 1) for item in node.value]
+        else:
+            assert isinstance(node, ScalarNode)
+            value = self._scalar(node)
+        return Located(value, line, column, file=self.name)
+
+    def _mapping(self, node: MappingNode, depth: int) -> dict[str, Located]:
+        entries: dict[str, Located] = {}
+        for key_node, value_node in node.value:
+            line, column = key_node.start_mark.line + 1, key_node.start_mark.column + 1
+            if not isinstance(key_node, ScalarNode):
+                self._problem(key_node, "a key must be a plain word")
+                continue
+            key = str(key_node.value)
+            if str(key_node.tag) not in _KEY_TAGS:
+                self._problem(key_node, f"tag {_shown(key_node.tag)} is not allowed; write a plain key")
+            elif not is_printable(key):
+                self._problem(key_node, f"key {key[:_SHOWN]!r} holds control characters")
+            elif key in entries:
+                self._problem(key_node, f"key {key[:_SHOWN]!r} is given twice (first in line {entries[key].key_line})")
+            else:
+                value = self.build(value_node, depth + 1)
+                entries[key] = Located(value.value, value.line, value.column, line, column, file=self.name)
+        return entries
+
+    def _require_tag(self, node: Node, tag: str) -> None:
+        if str(node.tag) != f"{_CORE}{tag}":
+            self._problem(node, f"tag {_shown(node.tag)} is not allowed; write a plain value")
+
+    def _scalar(self, node: ScalarNode) -> Any:
+        text = str(node.value)
+        tag = str(node.tag).removeprefix(_CORE)
+        match tag:
+            case "str":
+                if not is_printable(text.replace("\n", "").replace("\t", "")):
+                    self._problem(node, f"{text[:_SHOWN]!r} holds control characters; remove them")
+                return text
+            case "null":
+                return None
+            case "bool" if text.lower() in {"true", "false"}:
+                return text.lower() == "true"
+            case "int" | "float":
+                return self._number(node, text, tag)
+        self._problem(node, f"tag {_shown(node.tag)} is not allowed; write a plain value")
+        return None
+
+    def _number(self, node: ScalarNode, text: str, tag: str) -> int | float | None:
+        digits = text.replace("_", "") if len(text) <= _MAX_DIGITS else ""
+        try:
+            if tag == "int":
+                return int(digits, 0) if digits[:2] in ("0x", "0o") else int(digits)
+            value = float(digits.replace(".inf", "inf").replace(".nan", "nan").replace(".Inf", "inf"))
+        except ValueError:
+            self._problem(node, f"{text[:_SHOWN]!r} is not a number that can be used")
+            return None
+        if not math.isfinite(value):
+            self._problem(node, f"{text[:_SHOWN]!r} is not a finite number")
+            return None
+        return value
+
+    def _problem(self, node: Node, message: str) -> None:
+        self.problems.add(f"{self.name}:{node.start_mark.line + 1}:{node.start_mark.column + 1}", message)
+
+
+def _shown(tag: object) -> str:
+    return repr(str(tag) if len(str(tag)) <= 2 * _SHOWN else f"{str(tag)[: 2 * _SHOWN]}…")

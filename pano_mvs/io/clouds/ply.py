@@ -1,0 +1,86 @@
+"""Point clouds as binary PLY files."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import InputError
+from pano_mvs.io.clouds.thinning import Kept, chunks
+from pano_mvs.scene import PointCloud
+
+_PLAIN = np.dtype([
+    ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("nx", "<f4"), ("ny", "<f4"), ("nz", "<f4"),
+    ("red", "u1"), ("green", "u1"), ("blue", "u1"),
+])  # fmt: skip
+_WITH_QUALITY = np.dtype([*_PLAIN.descr, ("views", "u1"), ("confidence", "u1")])
+_PLY_TYPES = {"f": "float", "u": "uchar"}
+
+
+def write_ply(path: Path, cloud: PointCloud, *, quality: bool = False, kept: Kept | None = None) -> None:
+    """Write a cloud as binary little-endian PLY: x y z nx ny nz (float), red green blue (uchar).
+
+    It is written in chunks: a cloud whose arrays are memory-mapped need not fit in memory.
+
+    Args:
+        path: the file to write.
+        cloud: the points.
+        quality: whether each point is followed by views, how many agree on it, and confidence (uchar).
+        kept: the points to write, in their order; None: all.
+    """
+    layout = _WITH_QUALITY if quality else _PLAIN
+    with path.open("wb") as stream:
+        stream.write(_header(len(cloud) if kept is None else kept.count, layout))
+        for chunk in chunks(len(cloud)):
+            written = _vertices(cloud, chunk, layout)
+            stream.write((written if kept is None else written[kept.within(chunk)]).tobytes())
+
+
+def _vertices(cloud: PointCloud, chunk: slice, layout: np.dtype[np.void]) -> NDArray[np.void]:
+    vertices = np.zeros(chunk.stop - chunk.start, layout)
+    for idx, name in enumerate("xyz"):
+        vertices[name] = cloud.points_in_world[chunk, idx]
+        vertices[f"n{name}"] = cloud.normals_in_world[chunk, idx]
+    for idx, name in enumerate(("red", "green", "blue")):
+        vertices[name] = cloud.colors_rgb[chunk, idx]
+    if layout == _WITH_QUALITY:
+        vertices["views"] = cloud.view_counts[chunk]
+        vertices["confidence"] = 0 if cloud.confidence is None else cloud.confidence[chunk]
+    return vertices
+
+
+def read_ply(path: Path) -> PointCloud:
+    """Return the cloud in a PLY file of a layout that `write_ply` writes; view counts, where it lacks them, are 0.
+
+    Raises:
+        InputError: if the file cannot be read, has another layout, or ends early.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
+    head, mark, body = data.partition(b"end_header\n")
+    counted = re.search(rb"^element vertex ([0-9]{1,18})$", head, re.MULTILINE)
+    count = int(counted[1]) if counted else 0
+    layout = next((known for known in (_PLAIN, _WITH_QUALITY) if head + mark == _header(count, known)), None)
+    if layout is None:
+        raise InputError(f"{path}: not a PLY file of pano-mvs (binary little endian, x y z nx ny nz red green blue)")
+    if len(body) != count * layout.itemsize:
+        raise InputError(f"{path}: its header promises {count} points, but it holds {len(body) // layout.itemsize}. "
+                         "Write it again")  # fmt: skip
+    vertices = np.frombuffer(body, layout)
+    points, normals, colors = (
+        np.stack([vertices[name] for name in names], axis=-1)
+        for names in (("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue"))
+    )
+    if layout == _PLAIN:
+        return PointCloud(points, normals, colors, np.zeros(count, np.uint8))
+    return PointCloud(points, normals, colors, vertices["views"].copy(), vertices["confidence"].copy())
+
+
+def _header(count: int, layout: np.dtype[np.void]) -> bytes:
+    properties = "".join(f"property {_PLY_TYPES[layout[name].kind]} {name}\n" for name in layout.names or ())
+    return f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}end_header\n".encode()

@@ -1,0 +1,1 @@
+"""Read and write COLMAP models, rigs and dense workspaces."""

@@ -1,0 +1,331 @@
+"""The files of a COLMAP sparse model, read into arrays: cameras, images and points3D, as .bin or as .txt.
+
+Numbers of entries are believed only as far as the files reach, and what the files say of one another is checked, so
+that a damaged model is named with its file and its entry. (pycolmap allocates what a file promises, and ends the
+process where cameras lack parameters.) Formats: COLMAP's documentation, "Output Format".
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import InputError
+from pano_mvs.core.paths import is_file
+from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
+from pano_mvs.io.poses.json_files import rigid_from_arrays
+
+MODEL_FILES = (("cameras.bin", "images.bin", "points3D.bin"), ("cameras.txt", "images.txt", "points3D.txt"))
+"""What files a model has; COLMAP prefers the first of the two forms."""
+
+CAMERA_MODELS = (
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
+    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
+    *("SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM", "EQUIRECTANGULAR"),
+)
+"""COLMAP's camera models, in the order of their numbers."""
+
+_COUNT = struct.Struct("<Q")
+_CAMERA = struct.Struct("<IiQQ")
+_EQUIRECTANGULAR_PARAMS_BYTES = 16
+_IMAGE = struct.Struct("<I7dI")
+_POINT2D = np.dtype([("xy", "<f8", 2), ("point_id", "<i8")])
+_POINT3D = np.dtype([("id", "<i8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8")])
+_TRACK = np.dtype([("image_id", "<u4"), ("point2d_idx", "<u4")])
+_MAX_SIDE = 1 << 24
+
+
+@dataclass(frozen=True, slots=True)
+class ModelCamera:
+    """One camera.
+
+    Attributes:
+        model: its name, such as EQUIRECTANGULAR.
+        size_hw: (height, width) in pixels.
+    """
+
+    model: str
+    size_hw: tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModelImage:
+    """One registered image.
+
+    Attributes:
+        name: of the file, relative to the folder of the images.
+        quat_wxyz: rotation of cam_from_world as the file has it, (4,).
+        translation: of cam_from_world, (3,).
+        camera_id: of its camera.
+        pixels: (n, 2), its key points.
+        point_ids: (n,), the point that each observes; negative: none.
+        where: the file and the image, for messages.
+    """
+
+    name: str
+    quat_wxyz: NDArray[np.float64]
+    translation: NDArray[np.float64]
+    camera_id: int
+    pixels: NDArray[np.float64]
+    point_ids: NDArray[np.int64]
+    where: str
+
+    def cam_from_world(self) -> Rigid3:
+        """Return the pose.
+
+        Raises:
+            InputError: if its numbers are not finite, or its quaternion is no rotation.
+        """
+        if not (np.isfinite(self.quat_wxyz).all() and np.isfinite(self.translation).all()):
+            raise InputError(f"{self.where}: the pose holds NaN or infinite numbers")
+        if not 1e-6 < np.abs(self.quat_wxyz).max() < 1e100:
+            raise InputError(f"{self.where}: its quaternion is no rotation")
+        return rigid_from_arrays(rotation_from_quat_wxyz(self.quat_wxyz), self.translation, self.where)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModelPoints3D:
+    """All points.
+
+    Attributes:
+        ids: (N,), increasing.
+        xyz: (N, 3).
+        rgb: (N, 3) uint8.
+        errors_px: (N,), mean error of reprojection; COLMAP has −1 where it is not known.
+        track_lengths: (N,), how many observations each has.
+        track_image_ids: the images of these observations, point after point.
+    """
+
+    ids: NDArray[np.int64]
+    xyz: NDArray[np.float64]
+    rgb: NDArray[np.uint8]
+    errors_px: NDArray[np.float64]
+    track_lengths: NDArray[np.int64]
+    track_image_ids: NDArray[np.int64]
+
+
+def model_files(folder: Path) -> tuple[Path, Path, Path] | None:
+    """Return the files with cameras, images and points of the model in a folder; None if there is none."""
+    for names in MODEL_FILES:
+        cameras, images, points = (folder / name for name in names)
+        if all(is_file(path) for path in (cameras, images, points)):
+            return cameras, images, points
+    return None
+
+
+def read_cameras(path: Path) -> dict[int, ModelCamera]:
+    """Return the cameras by id, up to and including the first that is no EQUIRECTANGULAR.
+
+    Raises:
+        InputError: if the file cannot be read, or ends early.
+    """
+    with _damage_named(path):
+        found = _binary_cameras(path) if path.suffix == ".bin" else _text_cameras(path)
+        cameras: dict[int, ModelCamera] = {}
+        for camera_id, camera in found:
+            cameras[camera_id] = camera
+            if camera.model != "EQUIRECTANGULAR":
+                break
+            if not 0 < min(camera.size_hw) <= max(camera.size_hw) <= _MAX_SIDE:
+                height, width = camera.size_hw
+                raise ValueError(f"camera {camera_id} has {width}×{height} px")
+        return cameras
+
+
+def read_images(path: Path) -> dict[int, ModelImage]:
+    """Return the registered images by id.
+
+    Raises:
+        InputError: if the file cannot be read, or ends early.
+    """
+    with _damage_named(path):
+        images: dict[int, ModelImage] = {}
+        for image_id, image in _binary_images(path) if path.suffix == ".bin" else _text_images(path):
+            if image_id in images:
+                raise ValueError(
+                    f"images {images[image_id].name[:80]!r} and {image.name[:80]!r} have one id, {image_id}"
+                )
+            images[image_id] = image
+        return images
+
+
+def read_points(path: Path) -> ModelPoints3D:
+    """Return the points.
+
+    Raises:
+        InputError: if the file cannot be read, or ends early, or if a point has no finite place or is listed twice.
+    """
+    with _damage_named(path):
+        rows, lengths, tracks = _binary_points(path) if path.suffix == ".bin" else _text_points(path)
+        lost = ~np.isfinite(rows["xyz"]).all(axis=1)
+        if lost.any():
+            raise ValueError(f"point {rows['id'][lost][0]} has no finite place")
+        order = np.argsort(rows["id"], kind="stable")
+        ids = rows["id"][order]
+        if (ids[1:] == ids[:-1]).any():
+            raise ValueError(f"point {ids[1:][ids[1:] == ids[:-1]][0]} is listed twice")
+        starts = np.cumsum(lengths) - lengths
+        within = np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths[order]) - lengths[order], lengths[order])
+        entries = tracks[np.repeat(starts[order], lengths[order]) + within]
+        return ModelPoints3D(
+            ids.astype(np.int64),
+            np.ascontiguousarray(rows["xyz"][order], np.float64),
+            np.ascontiguousarray(rows["rgb"][order]),
+            np.ascontiguousarray(rows["error"][order], np.float64),
+            lengths[order],
+            entries.astype(np.int64),
+        )
+
+
+@contextmanager
+def _damage_named(path: Path) -> Iterator[None]:
+    """Turn what damaged files lead to into errors that name the file."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
+    except (struct.error, ValueError, OverflowError, MemoryError) as error:
+        if isinstance(error, InputError):
+            raise
+        text = "not a text file in UTF-8" if isinstance(error, UnicodeDecodeError) else str(error)
+        raise InputError(f"{path}: the COLMAP model cannot be read: {text}. Is it complete?") from error
+
+
+def _entries(data: bytes, least_bytes: int) -> int:
+    """Return the number of entries that a binary file states, after checking that it is long enough for them."""
+    (count,) = _COUNT.unpack_from(data)
+    if count * least_bytes > len(data) - _COUNT.size:
+        raise ValueError(f"it states {count} entries, but has {len(data)} bytes")
+    return int(count)
+
+
+def _binary_cameras(path: Path) -> Iterator[tuple[int, ModelCamera]]:
+    data = path.read_bytes()
+    offset = _COUNT.size
+    for _ in range(_entries(data, _CAMERA.size)):
+        camera_id, number, width, height = _CAMERA.unpack_from(data, offset)
+        known = 0 <= number < len(CAMERA_MODELS)
+        yield camera_id, ModelCamera(CAMERA_MODELS[number] if known else f"camera model {number}", (height, width))
+        offset += _CAMERA.size + _EQUIRECTANGULAR_PARAMS_BYTES
+        if offset > len(data):
+            raise ValueError("it ends within a camera")
+
+
+def _text_cameras(path: Path) -> Iterator[tuple[int, ModelCamera]]:
+    for line in _lines(path):
+        cells = line.split()
+        if len(cells) < 4:
+            raise ValueError(f"expected an id, a camera model, a width and a height, got {line[:80]!r}")
+        yield _number(cells[0]), ModelCamera(cells[1][:80], (_number(cells[3]), _number(cells[2])))
+
+
+def _binary_images(path: Path) -> Iterator[tuple[int, ModelImage]]:
+    data = path.read_bytes()
+    offset = _COUNT.size
+    for number in range(count := _entries(data, _IMAGE.size + 1 + _COUNT.size)):
+        image_id, *numbers, camera_id = _IMAGE.unpack_from(data, offset)
+        end = data.find(b"\0", offset + _IMAGE.size)
+        if end < 0:
+            raise ValueError(f"it ends within the name of image {number + 1} of {count}")
+        name = data[offset + _IMAGE.size : end].decode()
+        (points,) = _COUNT.unpack_from(data, end + 1)
+        start = end + 1 + _COUNT.size
+        offset = start + points * _POINT2D.itemsize
+        if offset > len(data):
+            raise ValueError(f"it ends within image {name[:80]!r}")
+        rows = np.frombuffer(data, _POINT2D, points, start)
+        yield image_id, _image(name, np.array(numbers), camera_id, rows["xy"], rows["point_id"], path)
+
+
+def _text_images(path: Path) -> Iterator[tuple[int, ModelImage]]:
+    """Yield the images of an images.txt: two lines for each, the second its key points, which may be empty."""
+    with path.open(encoding="utf-8") as stream:
+        for line in stream:
+            cells = line.split(maxsplit=9)
+            if not cells or line.startswith("#"):
+                continue
+            if len(cells) < 10:
+                raise ValueError(
+                    f"expected an id, a quaternion, a translation, a camera and a name, got {line.strip()[:80]!r}"
+                )
+            name = cells[9].rstrip()
+            values = np.array([float(cell) for cell in next(stream, "").split()])
+            if len(values) % 3:
+                raise ValueError(f"the key points of image {name[:80]!r} are not three numbers each")
+            rows = values.reshape(-1, 3)
+            ids = np.where(np.abs(rows[:, 2]) < 2**53, rows[:, 2], -1).astype(np.int64)
+            numbers = np.array([float(cell) for cell in cells[1:8]])
+            yield _number(cells[0]), _image(name, numbers, _number(cells[8]), rows[:, :2], ids, path)
+
+
+def _image(
+    name: str,
+    numbers: NDArray[np.float64],
+    camera_id: int,
+    pixels: NDArray[np.float64],
+    point_ids: NDArray[np.int64],
+    path: Path,
+) -> ModelImage:
+    if not np.isfinite(pixels[point_ids >= 0]).all():
+        raise ValueError(f"image {name[:80]!r} has a key point without a finite place")
+    return ModelImage(name, numbers[:4], numbers[4:], camera_id, pixels, point_ids, f"{path} ({name})")
+
+
+def _binary_points(path: Path) -> tuple[NDArray[np.void], NDArray[np.int64], NDArray[np.uint32]]:
+    """Return the points without their tracks, the lengths of these, and the ids of the images in them."""
+    data = path.read_bytes()
+    fixed = _POINT3D.itemsize + _COUNT.size
+    rows: list[bytes] = []
+    tracks: list[bytes] = []
+    offset = _COUNT.size
+    for number in range(count := _entries(data, fixed)):
+        (length,) = _COUNT.unpack_from(data, offset + _POINT3D.itemsize)
+        end = offset + fixed + length * _TRACK.itemsize
+        if end > len(data):
+            raise ValueError(f"it ends within point {number + 1} of {count}")
+        rows.append(data[offset : offset + _POINT3D.itemsize])
+        tracks.append(data[offset + fixed : end])
+        offset = end
+    lengths = np.array([len(track) // _TRACK.itemsize for track in tracks], np.int64)
+    return np.frombuffer(b"".join(rows), _POINT3D), lengths, np.frombuffer(b"".join(tracks), _TRACK)["image_id"]
+
+
+def _text_points(path: Path) -> tuple[NDArray[np.void], NDArray[np.int64], NDArray[np.uint32]]:
+    rows: list[tuple[int, list[float], list[int], float]] = []
+    lengths: list[int] = []
+    image_ids: list[int] = []
+    for line in _lines(path):
+        cells = line.split()
+        if len(cells) < 8 or len(cells) % 2:
+            raise ValueError(f"expected an id, a place, a colour, an error and a track, got {line[:80]!r}")
+        rgb = [_number(cell, below=256) for cell in cells[4:7]]
+        rows.append((_number(cells[0], below=1 << 63), [float(cell) for cell in cells[1:4]], rgb, float(cells[7])))
+        image_ids.extend(_number(cell) for cell in cells[8::2])
+        lengths.append(len(cells) // 2 - 4)
+    points = np.array([(idx, tuple(xyz), tuple(rgb), error) for idx, xyz, rgb, error in rows], _POINT3D)
+    return points, np.array(lengths, np.int64), np.array(image_ids, np.uint32)
+
+
+def _lines(path: Path) -> Iterator[str]:
+    """Yield the lines of a text file that hold something but comments."""
+    with path.open(encoding="utf-8") as stream:
+        for line in stream:
+            if line.strip() and not line.startswith("#"):
+                yield line.strip()
+
+
+def _number(text: str, *, below: int = 1 << 32) -> int:
+    """Return a whole number in a text.
+
+    Raises:
+        ValueError: if it is none, or negative or not below a limit.
+    """
+    if not 0 < len(text) <= 20 or not 0 <= int(text) < below:
+        raise ValueError(f"{text[:40]!r} is no number from 0 to {below - 1}")
+    return int(text)

@@ -1,0 +1,1 @@
+"""Image and video files: captures, metadata, masks and previews."""

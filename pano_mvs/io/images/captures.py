@@ -1,0 +1,200 @@
+"""The pictures of a capture: which files, in which order, and whether each is a panorama."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from pano_mvs.core.errors import InputError
+from pano_mvs.core.files import OUTPUT_MARK, is_cache
+from pano_mvs.core.paths import exists, is_denied, is_file, is_folder, problem_of, resolved
+from pano_mvs.io.images.containers import read_container
+from pano_mvs.io.images.exif import orientation_from_exif, position_from_exif
+from pano_mvs.io.images.gpano import GPano, find_gpano, read_file
+from pano_mvs.scene.image_files.decoding import MAX_PIXELS, check_stated_size
+from pano_mvs.scene.image_files.image_file import decode_image
+
+PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif", ".heic", ".heif"})
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi"})
+_IGNORED_FOLDERS = frozenset({"masks"})
+_TURNED = ("an EXIF orientation that turns or mirrors them, which was ignored: the pixels of a panorama are taken as "
+           "they are stored")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class PictureInfo:
+    """What is known of a panorama without decoding it.
+
+    Attributes:
+        size_hw: (height, width) of the full sphere, width = 2 × height: at the file's own resolution, or, of a crop
+            that was resized since, at that of the original, in whose pixels alone its place is exact.
+        file_size_hw: (height, width) of the picture in the file.
+        crop_ltwh: (left, top, width, height) of the part of the sphere that the file holds, or None for all of it.
+        gpano: its metadata, or None.
+        warnings: what the user should know of this picture, without the file's name.
+        traits: what else it has that the user should know, in words that are the same for all such pictures.
+        position_lla: (latitude deg, longitude deg, altitude m) from its EXIF metadata, or None.
+    """
+
+    size_hw: tuple[int, int]
+    file_size_hw: tuple[int, int]
+    crop_ltwh: tuple[int, int, int, int] | None
+    gpano: GPano | None
+    warnings: tuple[str, ...] = ()
+    traits: tuple[str, ...] = ()
+    position_lla: tuple[float, float, float] | None = None
+
+    @property
+    def full_width_px(self) -> int:
+        """How many columns the full sphere has at the file's own resolution."""
+        share = 1.0 if self.crop_ltwh is None else self.file_size_hw[1] / self.crop_ltwh[2]
+        return max(1, round(self.size_hw[1] * share))
+
+
+def list_pictures(folder: Path, notes: list[str] | None = None) -> list[Path]:
+    """Return the pictures in a folder and below it, ordered as people order them (2 before 10, case aside).
+
+    Hidden files, hidden folders, folders called `masks`, output folders of earlier runs and caches are left out.
+
+    Args:
+        folder: the folder.
+        notes: as of `files_below`.
+
+    Raises:
+        InputError: if the folder does not exist, cannot be listed, or holds no picture.
+    """
+    if not is_folder(folder):
+        raise InputError(f"{folder}: no such folder ({problem_of(folder) or 'it is a file'}). Give the folder that "
+                         "holds the panoramas")  # fmt: skip
+    notes = [] if notes is None else notes
+    files = list(files_below(folder, notes))
+    pictures = [path for path in files if path.suffix.lower() in PICTURE_SUFFIXES]
+    if not pictures and (film := next((path for path in files if path.suffix.lower() in VIDEO_SUFFIXES), None)):
+        raise InputError(f"{folder}: no pictures here, but the video {film.name}. Use source.video: "
+                         "--set images.use=source.video --set pairs.use=pairs.sequential")  # fmt: skip
+    if not pictures:
+        kinds = ", ".join(sorted(suffix.lstrip(".") for suffix in PICTURE_SUFFIXES))
+        raise InputError("\n  ".join([
+            f"{folder}: no pictures here. Panoramas may be {kinds}; folders called masks are left out", *notes
+        ]))  # fmt: skip
+    return sorted(pictures, key=lambda path: natural_key(path.relative_to(folder).as_posix()))
+
+
+def natural_key(name: str) -> tuple[list[tuple[int, int, str]], str]:
+    """Return a sort key that puts 2 before 10 and ignores case; names that differ at all have different keys."""
+    chunks = re.split(r"([0-9]+)", name.casefold())
+    return [(0, int(chunk), "") if chunk.isdecimal() else (1, 0, chunk) for chunk in chunks if chunk], name
+
+
+def describe_picture(path: Path, data: bytes | None = None, *, max_pixels: int = MAX_PIXELS) -> PictureInfo:
+    """Return what is known of a panorama without decoding it (but for HEIC and AVIF).
+
+    A picture is a panorama if its GPano metadata say so, whole or cropped, or, with a warning, if it is exactly
+    twice as wide as high.
+
+    Args:
+        path: the file.
+        data: its bytes, if they have been read already.
+        max_pixels: larger pictures are refused.
+
+    Raises:
+        InputError: if the file cannot be read, is no picture, is larger than the limit, or is no equirectangular
+            panorama.
+    """
+    if data is None:
+        data = read_file(path)
+    check_stated_size(data, path, max_pixels)
+    container = read_container(data)
+    gpano, warnings = find_gpano(container.xmp, data)
+    if container.warning:
+        warnings = (container.warning, *warnings)
+    size = container.size_hw or decode_image(path, data, max_pixels=max_pixels).shape[:2]
+    height, width = int(size[0]), int(size[1])
+    if gpano is not None and gpano.projection_type != "equirectangular":
+        raise InputError(f"{path}: its metadata say that it is {gpano.projection_type}, not equirectangular. "
+                         "Export it as an equirectangular panorama, or remove it")  # fmt: skip
+    sphere, crop = (height, width), None
+    if gpano is not None and gpano.full_size_hw is not None and gpano.crop_ltwh is not None:
+        sphere, crop, more = _placed(path, (height, width), gpano.full_size_hw, gpano.crop_ltwh)
+        warnings = (*warnings, *more)
+    elif width != 2 * height:
+        raise InputError(
+            f"{path}: {width}×{height} px is not a full sphere (the width must be twice the height) and no GPano "
+            "metadata place it on one. Remove it, export it anew as a full equirectangular panorama, or, if it is "
+            "cropped, write the GPano FullPano and CroppedArea fields into it"
+        )
+    exif = container.exif
+    traits = (_TURNED,) if orientation_from_exif(exif) != 1 else ()
+    if gpano is None:
+        traits = (*traits, "no GPano metadata; taken as full spheres, since the width is twice the height")
+    return PictureInfo(sphere, (height, width), crop, gpano, warnings, traits, position_from_exif(exif))
+
+
+def files_below(folder: Path, notes: list[str]) -> Iterator[Path]:
+    """Yield the files of a capture, through links too, without hidden ones, masks, outputs of runs and caches.
+
+    Args:
+        folder: the folder.
+        notes: for each subfolder that cannot be listed, what to tell the user is added to it.
+
+    Raises:
+        InputError: if the folder itself cannot be listed, or is a cache.
+    """
+    if is_cache(folder):
+        raise InputError(f"{folder}: this is a cache of pano-mvs, in which images of its own lie. Give the folder that "
+                         "holds the panoramas; if they lie in here, move them to a folder of their own")  # fmt: skip
+
+    def fail(error: OSError) -> None:
+        problem = f"{error.filename}: cannot be listed ({error.strerror})"
+        if Path(error.filename) == folder:
+            raise InputError(f"{problem}. Mend its permissions or give another folder")
+        notes.append(f"{problem}; what it holds is left out")
+
+    seen: set[Path] = set()
+    for root, folders, files in os.walk(folder, followlinks=True, onerror=fail):
+        here = Path(root)
+        if resolved(here) in seen:
+            folders.clear()
+            continue
+        seen.add(resolved(here))
+        folders[:] = sorted(name for name in folders if not _is_left_out(here / name))
+        yield from (here / name for name in sorted(files) if not name.startswith(".") and _is_file(here / name))
+
+
+def _is_left_out(folder: Path) -> bool:
+    name = folder.name
+    if name.startswith(".") or name.lower() in _IGNORED_FOLDERS:
+        return True
+    return exists(folder / OUTPUT_MARK) or is_cache(folder)
+
+
+def _is_file(path: Path) -> bool:
+    """Return whether a path leads to a file, or to something that may be one: reading it then says what is wrong."""
+    return is_file(path) or is_denied(path)
+
+
+def _placed(
+    path: Path, size_hw: tuple[int, int], full_hw: tuple[int, int], crop_ltwh: tuple[int, int, int, int]
+) -> tuple[tuple[int, int], tuple[int, int, int, int] | None, tuple[str, ...]]:
+    """Return the sphere's size, the part that the file holds (None: all), and warnings."""
+    (height, width), (full_height, full_width) = size_hw, full_hw
+    left, top, crop_width, crop_height = crop_ltwh
+    warnings: tuple[str, ...] = ()
+    if (crop_height, crop_width) != size_hw:
+        if abs(width * crop_height - height * crop_width) > max(width, height, crop_width, crop_height):
+            raise InputError(
+                f"{path}: {width}×{height} px, but its GPano metadata speak of {crop_width}×{crop_height}. It was cut "
+                "after it was taken: restore the original, or remove the metadata"
+            )
+        warnings = (f"resized from {crop_width}×{crop_height} to {width}×{height} px after it was taken; its GPano "
+                    "fields count the original's pixels",)  # fmt: skip
+    whole = (crop_height, crop_width) == full_hw
+    if whole:
+        full_height, full_width = size_hw
+    if full_width != 2 * full_height or left < 0 or top < 0:
+        raise InputError(f"{path}: its GPano metadata say that the full sphere is {full_width}×{full_height} px, but "
+                         "the width must be twice the height. Correct the metadata, or remove them")  # fmt: skip
+    return (full_height, full_width), None if whole else crop_ltwh, warnings

@@ -1,0 +1,69 @@
+"""Where a picture was taken, and how a viewer would turn it, as its EXIF metadata have it.
+
+EXIF 2.32: section 4.6.6 (GPS attributes) and the tag Orientation of section 4.6.4. EXIF is a TIFF without a picture.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Mapping
+
+from pano_mvs.scene.image_files.tiff_directory import Entry, Tiff, open_tiff
+
+_ORIENTATION, _GPS_DIRECTORY = 0x0112, 0x8825
+_LATITUDE_REF, _LATITUDE, _LONGITUDE_REF, _LONGITUDE, _ALTITUDE_REF, _ALTITUDE = range(1, 7)
+_DAMAGE = (struct.error, IndexError, ZeroDivisionError, OverflowError)
+
+
+def position_from_exif(exif: bytes) -> tuple[float, float, float] | None:
+    """Return (latitude deg, longitude deg, altitude m), or None.
+
+    North, east and up are positive; an altitude that is not given is 0. Metadata that are damaged, or hold no fix,
+    count as none.
+
+    Args:
+        exif: the metadata, which begin with the byte order, "II" or "MM".
+    """
+    try:
+        tiff = open_tiff(exif)
+        return None if tiff is None else _position(tiff)
+    except _DAMAGE:
+        return None
+
+
+def orientation_from_exif(exif: bytes) -> int:
+    """Return how a viewer would turn or mirror the picture, 1 to 8; 1 for as it is, and where nothing is said."""
+    try:
+        tiff = open_tiff(exif)
+        value = None if tiff is None else tiff.integer(tiff.directory(tiff.first).get(_ORIENTATION))
+    except _DAMAGE:
+        return 1
+    return value if value is not None and 1 <= value <= 8 else 1
+
+
+def _position(tiff: Tiff) -> tuple[float, float, float] | None:
+    offset = tiff.integer(tiff.directory(tiff.first).get(_GPS_DIRECTORY))
+    gps = {} if offset is None else tiff.directory(offset)
+    latitude = _angle(tiff, gps, _LATITUDE, _LATITUDE_REF, b"S")
+    longitude = _angle(tiff, gps, _LONGITUDE, _LONGITUDE_REF, b"W")
+    altitude = 0.0
+    if _ALTITUDE in gps:
+        heights = tiff.rationals(gps[_ALTITUDE], 1)
+        altitude = math.nan if heights is None else heights[0] * _sign(tiff, gps.get(_ALTITUDE_REF), b"\1")
+    usable = all(map(math.isfinite, (latitude, longitude, altitude))) and abs(latitude) <= 90 and abs(longitude) <= 180
+    return (latitude, longitude, altitude) if usable else None
+
+
+def _angle(tiff: Tiff, gps: Mapping[int, Entry], tag: int, reference: int, negative: bytes) -> float:
+    if tag not in gps or reference not in gps:
+        return math.nan
+    parts = tiff.rationals(gps[tag], 3)
+    if parts is None:
+        return math.nan
+    degrees, minutes, seconds = parts
+    return (degrees + minutes / 60 + seconds / 3600) * _sign(tiff, gps[reference], negative)
+
+
+def _sign(tiff: Tiff, entry: Entry | None, negative: bytes) -> int:
+    return -1 if entry is not None and tiff.raw(entry)[:1] == negative else 1

@@ -1,0 +1,68 @@
+"""Float pictures as OpenEXR files, by the package OpenEXR where it is installed: OpenCV's wheels have none."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.scene.image_files.decoding import MAX_PIXELS
+
+# All that the package OpenEXR raises on damaged files.
+_DAMAGE = (OSError, RuntimeError, ValueError, TypeError, LookupError, OverflowError, MemoryError)
+
+REMEDY = "EXR files need the package OpenEXR: pip install 'pano-mvs[exr]'"
+
+
+def has_exr() -> bool:
+    """Return whether EXR files can be written and read."""
+    return importlib.util.find_spec("OpenEXR") is not None
+
+
+def write_exr(path: Path, channels: dict[str, NDArray[np.float32]]) -> None:
+    """Write channels of one size as a scan-line EXR file, 32-bit float, ZIP compression; no bit is lost.
+
+    Args:
+        path: the file to write.
+        channels: name to (H, W) float32.
+
+    Raises:
+        UsageError: if OpenEXR is not installed, or an array is another.
+    """
+    if not has_exr():
+        raise UsageError(REMEDY)
+    import OpenEXR
+
+    shapes = {array.shape for array in channels.values()}
+    if len(shapes) != 1 or any(array.dtype != np.float32 or array.ndim != 2 for array in channels.values()):
+        raise UsageError(f"channels of an EXR file are (H, W) float32 of one size, got {sorted(shapes)}")
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    arrays = {name: np.ascontiguousarray(array) for name, array in channels.items()}
+    OpenEXR.File(header, arrays).write(str(path))
+
+
+def read_exr(path: Path) -> dict[str, NDArray[np.float32]]:
+    """Return the channels, name to (H, W) float32, of an EXR file.
+
+    Raises:
+        UsageError: if OpenEXR is not installed.
+        InputError: if the file cannot be read, or its header states more pixels than are read of any picture.
+    """
+    if not has_exr():
+        raise UsageError(REMEDY)
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            (left, top), (right, bottom) = file.header()["dataWindow"]
+        width, height = int(right) - int(left) + 1, int(bottom) - int(top) + 1
+        if width * height > MAX_PIXELS:
+            raise ValueError(f"its header states {width}×{height} px, more than the limit of {MAX_PIXELS}")
+        with OpenEXR.File(str(path), separate_channels=True) as file, np.errstate(over="ignore", invalid="ignore"):
+            return {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
+    except _DAMAGE as error:
+        raise InputError(f"{path}: no EXR file that can be read ({str(error) or type(error).__name__}). Write it "
+                         "again")  from error  # fmt: skip

@@ -1,0 +1,163 @@
+"""Videos of panoramas: what they are, and their frames between two times.
+
+Times are the container's own time stamps, so that a frame rate that varies does no harm; a frame is never looked up by
+its number.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import InputError
+from pano_mvs.core.paths import is_file, is_folder, problem_of
+from pano_mvs.io.images.captures import VIDEO_SUFFIXES, files_below, natural_key
+
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # what FFmpeg prints of a damaged video is said better below
+
+_UNSTITCHED_SUFFIXES = frozenset({".insv", ".360", ".lrv", ".osv"})
+_UNSTITCHED = "export it as an equirectangular video with the camera maker's program first"
+_SLACK_S = 0.0015  # containers that count milliseconds round time stamps to them
+
+
+@dataclass(frozen=True)
+class VideoInfo:
+    """What the header of a video says.
+
+    Attributes:
+        size_hw: (height, width) of a frame as stored.
+        frames: how many there are, as the header has it.
+        frames_per_s: on average.
+        is_turned: whether players are told to turn the frames.
+    """
+
+    size_hw: tuple[int, int]
+    frames: int
+    frames_per_s: float
+    is_turned: bool
+
+    @property
+    def duration_s(self) -> float:
+        """How long it lasts."""
+        return self.frames / self.frames_per_s
+
+
+def list_videos(path: Path, notes: list[str] | None = None) -> list[Path]:
+    """Return a video, or all videos in a folder and below it in the order in which people count.
+
+    Args:
+        path: the video, or the folder.
+        notes: as of `files_below`.
+
+    Raises:
+        InputError: if there is none, or only recordings that must be stitched first.
+    """
+    if is_file(path):
+        if path.suffix.lower() in _UNSTITCHED_SUFFIXES:
+            raise InputError(f"{path}: {path.suffix} is what the camera records before stitching; {_UNSTITCHED}")
+        return [path]
+    if not is_folder(path):
+        raise InputError(f"{path}: no such video or folder ({problem_of(path) or 'it is neither'}). Give a video, "
+                         "several, or the folder that holds them")  # fmt: skip
+    files = list(files_below(path, [] if notes is None else notes))
+    videos = [file for file in files if file.suffix.lower() in VIDEO_SUFFIXES]
+    if not videos:
+        raw = [file.name for file in files if file.suffix.lower() in _UNSTITCHED_SUFFIXES]
+        kinds = ", ".join(sorted(suffix.lstrip(".") for suffix in VIDEO_SUFFIXES))
+        raise InputError(f"{path}: {raw[0]} is not stitched; {_UNSTITCHED}" if raw else
+                         f"{path}: no videos here; they may be {kinds}. For pictures use source.folder")  # fmt: skip
+    return sorted(videos, key=lambda file: natural_key(file.relative_to(path).as_posix()))
+
+
+def describe_video(path: Path) -> VideoInfo:
+    """Return what the header of a video says, after checking that it may hold panoramas.
+
+    Raises:
+        InputError: if it cannot be opened, or its frames are not twice as wide as high.
+    """
+    with _opened(path) as capture:
+        height, width = (int(capture.get(key)) for key in (cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_WIDTH))
+        rate, count = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        is_turned = int(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 360 != 0
+    if not (np.isfinite(rate) and rate > 0 and count >= 1):
+        raise InputError(f"{path}: does not say how long it lasts ({count:.0f} frames at {rate:g} a second): the "
+                         "recording was not finished. Copy it into an .mp4 with a video program")  # fmt: skip
+    if width != 2 * height:
+        raise InputError(
+            f"{path}: {width}×{height} px are no equirectangular frames, which are twice as wide as high. If it is "
+            f"straight from the camera (two fisheye images, or cube faces), {_UNSTITCHED}; of a stereo video, export "
+            "one eye"
+        )
+    return VideoInfo((height, width), int(count), float(rate), is_turned)
+
+
+def frames_between(
+    path: Path, begin_s: float, end_s: float, *, threads: int = 1
+) -> Iterator[tuple[float, NDArray[np.uint8]]]:
+    """Yield the frames from one time to another, both included, each with its time in seconds; (H, W, 3) uint8 BGR.
+
+    A frame that is damaged so much that nothing can be decoded ends what is yielded.
+
+    Args:
+        path: the video.
+        begin_s: the earliest time, from the start of the video.
+        end_s: the latest.
+        threads: of the decoder; each of them may hold a frame of its own.
+
+    Raises:
+        InputError: if the video cannot be opened, or its time stamps do not increase.
+    """
+    with _opened(path, threads) as capture:
+        previous = -1.0
+        has_frame = _seek(capture, begin_s)
+        while has_frame:
+            time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+            if time_s <= previous:
+                raise InputError(f"{path}: its time stamps do not increase ({previous:.3f} s, then {time_s:.3f} s). "
+                                 "Copy it into an .mp4 with a video program")  # fmt: skip
+            if time_s > end_s + _SLACK_S:
+                return
+            if time_s >= begin_s - _SLACK_S:
+                is_sound, frame = capture.retrieve()
+                if not is_sound:
+                    return
+                yield time_s, frame
+            previous = time_s
+            has_frame = capture.grab()
+
+
+def _seek(capture: cv2.VideoCapture, time_s: float) -> bool:
+    """Go to a frame at a time or before it; return whether there is one.
+
+    OpenCV counts on an even frame rate when it seeks, and so may land behind the time: then from further ahead.
+    """
+    ahead_s = 0.0
+    while True:
+        begin_s = max(0.0, time_s - ahead_s)
+        capture.set(cv2.CAP_PROP_POS_MSEC, begin_s * 1000)
+        has_frame = capture.grab()
+        if begin_s == 0.0 or (has_frame and capture.get(cv2.CAP_PROP_POS_MSEC) / 1000 <= time_s + _SLACK_S):
+            return bool(has_frame)
+        ahead_s = max(1.0, 4 * ahead_s)
+
+
+@contextmanager
+def _opened(path: Path, threads: int = 1) -> Iterator[cv2.VideoCapture]:
+    if not is_file(path):
+        raise InputError(f"{path}: no such video ({problem_of(path) or 'it is no file'})")
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, threads])
+    try:
+        if not capture.isOpened():
+            raise InputError(f"{path}: cannot be opened as a video: it is none, is damaged, or the recording was not "
+                             "finished. Copy it again from the camera, or repair it with a video program")  # fmt: skip
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+        yield capture
+    finally:
+        capture.release()

@@ -1,0 +1,112 @@
+"""Nerfstudio's transforms.json, as its data parser `nerfstudio-data` reads it.
+
+Cameras are OpenGL's (x right, y up, z backwards), `transform_matrix` is world_from_cam for them; a pixel's centre is at
+(0.5, 0.5), as ours. An EQUIRECTANGULAR camera has fl_x = w / 2 and fl_y = h: its rays are of unit length, so that a
+depth is the distance along the ray. A PINHOLE camera's depth is z, unless the trainer is told `is-euclidean-depth`.
+Depths are 16-bit numbers times `depth_unit_scale_factor`, an option of the data parser (0.001 unless set), in the unit
+of the camera positions; 0 is unknown. Masks are 0 where a pixel is to be ignored; they, and depths, must be there for
+all frames or for none. `applied_transform` says how the file's world came from the one before: it did not change, which
+must be said, since another one is assumed where a COLMAP model lies beside the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pano_mvs.geometry import Rigid3
+from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, Variant
+from pano_mvs.scene.image_files.jpeg import JPEG_FRAMES, JPEG_START, jpeg_segments
+
+_MODELS = {"equirectangular": "EQUIRECTANGULAR", "faces": "PINHOLE"}
+_DEPTHS = {"equirectangular": "distance along the ray", "faces": "z, along the camera's axis"}
+_OPENGL_FROM_CAM = np.diag([1.0, -1.0, -1.0])
+_PNG_START = b"\x89PNG\r\n\x1a\n"
+_PNG_RGB_8_BIT = bytes([8, 2])
+
+
+def transforms_document(
+    variant: Variant,
+    frames: Sequence[tuple[str, Rigid3, NerfstudioFrame]],
+    *,
+    depth_unit: float,
+    about: Mapping[str, Any],
+    seed: str = "",
+) -> dict[str, Any]:
+    """Return the contents of a transforms.json.
+
+    Intrinsics are said once if all frames share them, else for each. Where some frames are masked the others get the
+    mask of `open_mask`. `panorama` is the name of the picture in the capture, by which our own reader knows it.
+
+    Args:
+        variant: which camera model; one file has one.
+        frames: each with its panorama's name and cam_from_world.
+        depth_unit: scene units of one step of the depths.
+        about: further entries for people, which nerfstudio does not read.
+        seed: path of the points to start from, beside the file; empty: none.
+    """
+    masked = any(frame.mask for _, _, frame in frames)
+    with_depth = all(frame.depth for _, _, frame in frames)
+    listed = [_listed(*each, masked=masked, with_depth=with_depth) for each in frames]
+    each_intrinsics = [_intrinsics(frame) for _, _, frame in frames]
+    if all(intrinsics == each_intrinsics[0] for intrinsics in each_intrinsics):
+        common = each_intrinsics[0]
+    else:
+        common = {}
+        listed = [intrinsics | entry for intrinsics, entry in zip(each_intrinsics, listed, strict=True)]
+    document = {"camera_model": _MODELS[variant], **common, "applied_transform": np.eye(4)[:3].tolist(), **about}
+    if with_depth:
+        document |= {"depth_unit_scale_factor": depth_unit, "depth": _DEPTHS[variant]}
+    return document | ({"ply_file_path": seed} if seed else {}) | {"frames": listed}
+
+
+def open_mask(size_wh: tuple[int, int]) -> str:
+    """Return the path of the mask, beside a transforms.json, of frames of a size in which nothing is masked."""
+    return f"masks/none_{size_wh[0]}x{size_wh[1]}.png"
+
+
+def is_common_picture(path: Path) -> bool:
+    """Return whether a file is a JPEG or an 8-bit PNG, either of three channels, which every trainer reads as it is.
+
+    A JPEG of four channels is CMYK, which trainers take for red, green, blue and alpha.
+    """
+    with path.open("rb") as stream:
+        start = stream.read(26)
+        if start[:2] == JPEG_START:
+            return _jpeg_channels(start + stream.read()) == 3
+    return start[:8] == _PNG_START and start[24:26] == _PNG_RGB_8_BIT
+
+
+def _jpeg_channels(data: bytes) -> int:
+    """Return how many channels a JPEG has, as its first start of frame says (ITU-T T.81, B.2.2); 0 if it has none."""
+    for marker, start, _ in jpeg_segments(data):
+        if marker in JPEG_FRAMES:
+            return data[start + 5]
+    return 0
+
+
+def _listed(
+    name: str, cam_from_world: Rigid3, frame: NerfstudioFrame, *, masked: bool, with_depth: bool
+) -> dict[str, Any]:
+    frame_from_cam = Rigid3(np.array(frame.frame_from_cam), np.zeros(3))
+    world_from_frame = (frame_from_cam @ cam_from_world).inverse()
+    matrix = np.eye(4)
+    matrix[:3, :3] = world_from_frame.rotation @ _OPENGL_FROM_CAM
+    matrix[:3, 3] = world_from_frame.translation
+    entry: dict[str, Any] = {"file_path": frame.image.replace("{name}", name)}
+    if masked:
+        entry["mask_path"] = frame.mask.replace("{name}", name) or open_mask(frame.size_wh)
+    if with_depth:
+        entry["depth_file_path"] = frame.depth.replace("{name}", name)
+    return entry | {"panorama": name, "transform_matrix": matrix.tolist()}
+
+
+def _intrinsics(frame: NerfstudioFrame) -> dict[str, Any]:
+    width, height = frame.size_wh
+    return {
+        "w": width, "h": height, "fl_x": frame.focal_xy[0], "fl_y": frame.focal_xy[1], "cx": width / 2,
+        "cy": height / 2,
+    }  # fmt: skip

@@ -1,0 +1,1 @@
+"""Read and write camera poses in every supported format."""

@@ -1,0 +1,158 @@
+"""Poses from whatever file or folder the user has."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from pano_mvs.core.errors import InputError
+from pano_mvs.core.paths import exists, is_file, is_folder
+from pano_mvs.core.text import shortened
+from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
+from pano_mvs.io.colmap.model import is_colmap_model, read_colmap_model
+from pano_mvs.io.poses.json_files import (
+    read_json_value,
+    read_posed_views,
+    read_transforms,
+    require_distinct,
+    require_object,
+    rigid_from_arrays,
+)
+from pano_mvs.io.poses.opensfm import is_opensfm, opensfm_poses
+from pano_mvs.scene import Poses
+from pano_mvs.scene.pose_groups import with_cameras
+
+CSV_HEADER = ("name", "tx", "ty", "tz", "qw", "qx", "qy", "qz")
+_IN_A_FOLDER = ("transforms.json", "poses.json", "truth/poses.json", "poses.csv", "reconstruction.json")
+
+
+def read_poses(path: Path) -> Poses:
+    """Return the poses in a file or folder. Image names are as written there: `match_image_names` pairs them.
+
+    Understood are
+      * a folder with a COLMAP model of EQUIRECTANGULAR cameras (.bin or .txt), or with one in sparse/0; SphereSfM's,
+        with its SPHERE cameras, without its points;
+      * nerfstudio's transforms.json (camera_model EQUIRECTANGULAR);
+      * OpenSfM's reconstruction.json with a spherical camera, of several reconstructions the largest;
+      * our own poses.json: {"metric": true, "views": [{"image": …, "R": 3 × 3, "t": 3}]}, cam_from_world;
+      * a CSV file whose first line is name,tx,ty,tz,qw,qx,qy,qz: cam_from_world as x_in_cam = R(q) x_in_world + t in
+        the camera frame x right, y down, z forward; quaternions of any length; empty lines and lines that begin
+        with # are left out.
+
+    Raises:
+        InputError: naming the file, and the line or the key, that cannot be used.
+    """
+    path = _file_or_model(path)
+    if is_folder(path):
+        return read_colmap_model(path)
+    suffix = path.suffix.lower()
+    if suffix == ".csv":
+        return _from_file(read_csv(path), path, metric=False)
+    if suffix != ".json":
+        raise InputError(f"{path}: poses are read from a COLMAP model (its folder), .json and .csv, not {suffix!r}")
+    value = read_json_value(path)
+    if is_opensfm(value):
+        poses, metric = opensfm_poses(value, path)
+        return _from_file(poses, path, metric=metric)
+    data = require_object(value, path)
+    if "frames" in data:
+        return _from_file(read_transforms(path), path, metric=False)
+    if "views" in data:
+        views, metric = read_posed_views(path)
+        return _from_file({view.name: view.cam_from_world for view in views}, path, metric=metric)
+    raise InputError(f"{path}: neither key 'frames' (nerfstudio) nor key 'views' (pano-mvs), nor a list with 'shots' "
+                     "(OpenSfM): no poses here")  # fmt: skip
+
+
+def read_groups(path: Path) -> list[Poses]:
+    """Return the poses in a file or folder, and those of the further groups beside them.
+
+    Further groups are the models sparse/1, sparse/2 … beside sparse/0, where a folder above these is given. Each is in
+    a world of its own. Images that an earlier group has are left out.
+
+    Raises:
+        InputError: as `read_poses`.
+    """
+    groups = [read_poses(path)]
+    model = _file_or_model(path)
+    number = 1
+    while model != path and model.name == "0" and is_colmap_model(model.with_name(str(number))):
+        group = read_poses(model.with_name(str(number)))
+        known = {name for earlier in groups for name in earlier.names}
+        groups.append(with_cameras(group, np.array([name not in known for name in group.names], np.bool_)))
+        number += 1
+    return groups
+
+
+def recorded_pictures(path: Path) -> dict[str, str]:
+    """Return the SHA-256 of the pictures that poses belong to, by name, as far as a file states them (poses.json).
+
+    Raises:
+        InputError: as `read_poses`.
+    """
+    path = _file_or_model(path)
+    value = read_json_value(path) if path.suffix.lower() == ".json" else None
+    if not isinstance(value, dict) or "views" not in value:
+        return {}
+    return {view.name: view.sha256 for view in read_posed_views(path)[0] if view.sha256 is not None}
+
+
+def read_csv(path: Path) -> dict[str, Rigid3]:
+    """Return the cam_from_world of each image in a CSV file; see `read_poses` for its columns.
+
+    Raises:
+        InputError: naming the line that cannot be used.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not a text file in UTF-8") from error
+    numbered = [(idx, line) for idx, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
+    try:
+        rows = [(idx, [cell.strip() for cell in next(csv.reader([line]))]) for idx, line in numbered]
+    except csv.Error as error:
+        raise InputError(f"{path}: not a CSV file ({error})") from error
+    if not rows or tuple(rows[0][1]) != CSV_HEADER:
+        raise InputError(f"{path}:{rows[0][0] if rows else 1}: the first line must be {','.join(CSV_HEADER)}")
+    poses = [(row[0], _pose_from_row(row, f"{path}:{line}")) for line, row in rows[1:]]
+    require_distinct([name for name, _ in poses], path)
+    return dict(poses)
+
+
+def _file_or_model(path: Path) -> Path:
+    """Return the file with poses, or the folder of a COLMAP model, that a file or folder is or holds."""
+    if not exists(path):
+        raise InputError(f"{path}: no such file or folder. Give a COLMAP model, a transforms.json, a "
+                         "poses.json, a reconstruction.json or a CSV file")  # fmt: skip
+    if not is_folder(path):
+        return path
+    for model in (path, path / "sparse" / "0", path / "colmap" / "sparse" / "0"):
+        if is_colmap_model(model):
+            return model
+    for name in _IN_A_FOLDER:
+        if is_file(path / name):
+            return path / name
+    raise InputError(f"{path}: no poses here. A folder must hold a COLMAP model (cameras, images, points3D), or one "
+                     f"of {', '.join(_IN_A_FOLDER)}")  # fmt: skip
+
+
+def _from_file(poses: dict[str, Rigid3], path: Path, *, metric: bool) -> Poses:
+    scale = "metres, as the file has it" if metric else "the unit of the file"
+    return Poses.without_points(poses, frame=f"the world of {path.name}", scale=scale, metric=metric)
+
+
+def _pose_from_row(row: list[str], where: str) -> Rigid3:
+    if len(row) != len(CSV_HEADER) or not row[0]:
+        raise InputError(f"{where}: expected a name and 7 numbers ({','.join(CSV_HEADER)}), got {len(row)} cells")
+    try:
+        numbers = np.array([float(cell) for cell in row[1:]])
+    except ValueError as error:
+        raise InputError(f"{where}: {shortened(str(error), 200)}") from error
+    quat_wxyz = numbers[3:]
+    if not np.isfinite(numbers).all() or not 1e-6 < np.abs(quat_wxyz).max() < 1e100:
+        raise InputError(f"{where}: the pose of {row[0]} has no finite numbers, or a quaternion of length 0")
+    return rigid_from_arrays(rotation_from_quat_wxyz(quat_wxyz), numbers[:3], where)

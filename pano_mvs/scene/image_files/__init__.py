@@ -1,0 +1,1 @@
+"""Decode image files safely: headers, limits and damage."""

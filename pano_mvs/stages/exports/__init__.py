@@ -1,0 +1,1 @@
+"""Export stages: files that other programs open."""

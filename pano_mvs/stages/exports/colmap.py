@@ -1,0 +1,221 @@
+"""Exports for COLMAP and what reads its files: sparse models, dense workspaces, seeds for splats."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from pano_mvs.algorithms.faces.layout import Face, covers_sphere, default_face_size, panorama_faces
+from pano_mvs.algorithms.faces.render import colmap_depth_view, face_source, render_face
+from pano_mvs.api import All, Context, Each, Files, Names, One, Panorama, Params, Poses, RangeMap, UsageError, stage
+from pano_mvs.core.paths import children
+from pano_mvs.geometry import PinholeView
+from pano_mvs.io.colmap.images import resized_mask, write_picture
+from pano_mvs.io.colmap.model import write_colmap_model
+from pano_mvs.io.colmap.points import ModelForm
+from pano_mvs.io.colmap.rig import CutPanorama, write_rig_model
+from pano_mvs.io.colmap.workspace import WORKSPACE, face_image_name, sparse_targets, write_face, write_stereo_configs
+from pano_mvs.scene.face_files import FaceFiles, FaceLayout
+from pano_mvs.scene.files import item_stems
+from pano_mvs.scene.image_files.image_file import write_png
+from pano_mvs.scene.pose_groups import split_groups
+from pano_mvs.scene.tracked_points import TrackedPoints
+
+
+class ModelParams(Params):
+    """Settings of export.colmap."""
+
+    format: ModelForm = Field(default="bin", description="binary files, text files, or both (COLMAP prefers binary)")
+
+
+@stage("export.colmap")
+def colmap(poses: One[Poses], images: All[Panorama], params: ModelParams, ctx: Context) -> Files:
+    """COLMAP model of EQUIRECTANGULAR cameras, with points and tracks, in colmap/sparse/0.
+
+    Further groups of poses, each in a frame of its own, are the models sparse/1, sparse/2 …
+    """
+    return _sparse_models(poses, images, params.format, ctx, "colmap/sparse")
+
+
+class MasksParams(Params):
+    """Settings of export.colmap_masks."""
+
+    pictures: bool = Field(default=False, description="also the pictures, as whole spheres, for files that are cropped")
+
+
+@stage("export.colmap_masks")
+def colmap_masks(image: Each[Panorama], params: MasksParams, ctx: Context) -> Files:
+    """A mask for each picture where COLMAP looks for it, colmap/masks/<image>.png: 0 is ignored, 255 is used.
+
+    In the size of the model's cameras, and also of pictures of which nothing is masked: COLMAP leaves out a picture
+    whose mask it does not find. With `pictures` the pictures themselves are colmap/images/<image>, in that size, whole
+    spheres, and where masked they show what is around.
+    """
+    mask = image.load_mask()
+    files = {"colmap/masks/{name}.png": ctx.scratch / "mask.png"}
+    write_png(files["colmap/masks/{name}.png"], resized_mask(mask, image.source_size_hw).astype(np.uint8) * 255)
+    if params.pictures:
+        files["colmap/images/{name}"] = ctx.scratch / f"picture{image.image.path.suffix.lower()}"
+        write_picture(files["colmap/images/{name}"], image.load(), image.source_size_hw)
+    ctx.metric("masked_share", float((~mask).mean()))
+    return Files(files)
+
+
+class FacesParams(Params):
+    """Settings of export.colmap_faces."""
+
+    layout: FaceLayout = Field(default="cube", description="cube: 6 faces, octagon: 10, icosahedron: 20")
+    fov_deg: float = Field(default=96.0, ge=30, le=150, description="field of view of a face; 90 and more overlap")
+    size_px: int | None = Field(default=None, ge=4, le=16384, description="width of a face; null: as fine as the image")
+    min_confidence: int = Field(default=64, ge=1, le=255, description="ranges below have no depth (64: seen)")
+    image_format: Literal["jpg", "png"] = Field(default="jpg", description="of the faces' pictures (JPEG: quality 95)")
+
+
+def faces_memory_bytes(params: FacesParams, inputs: Mapping[str, Any]) -> int:
+    """Return what one panorama's faces take: normals are fitted to the whole panorama, one face is held at a time."""
+    height, width = inputs["image"].size_hw
+    size = params.size_px or default_face_size((height, width), fov_deg=params.fov_deg)
+    return int(200_000_000 + 70 * height * width + 60 * size**2)
+
+
+@stage("export.colmap_faces", memory=faces_memory_bytes)
+def colmap_faces(image: Each[Panorama], range_map: Each[RangeMap], params: FacesParams, ctx: Context) -> FaceFiles:
+    """The pinhole faces of each panorama for COLMAP's dense tools: pictures, masks, z-depth and normal maps.
+
+    In colmap_dense/; export.colmap_dense writes the model that goes with them.
+    """
+    picture = image.load()
+    source = face_source(
+        picture, image.load_mask(), range_map, min_confidence=params.min_confidence, threads=ctx.threads
+    )
+    faces = panorama_faces(image.size_hw, layout=params.layout, fov_deg=params.fov_deg, size_px=params.size_px)
+    if not covers_sphere(faces):
+        ctx.note(f"{params.layout} faces of {params.fov_deg:g}° do not cover the sphere: some directions are in none")
+    suffix, depths = f".{params.image_format}", []
+    files: dict[str, Path] = {}
+    for face in faces:
+        seen = render_face(source, face.view, depth_view=colmap_depth_view(face.view), threads=ctx.threads)
+        files |= write_face(
+            ctx.scratch, face.name, suffix, image=seen.image, mask=seen.mask, z_depth=seen.z_depth,
+            normals_in_face=seen.normals_in_face,
+        )  # fmt: skip
+        depths.append(np.isfinite(seen.z_depth).mean())
+    ctx.metric("share_with_depth", float(np.mean(depths)))
+    return FaceFiles(files, params.layout, params.fov_deg, faces[0].view.size_hw[0], suffix)
+
+
+class DenseParams(Params):
+    """Settings of export.colmap_dense."""
+
+    format: ModelForm = Field(default="both", description="of the model; some versions of OpenMVS read text alone")
+
+
+@stage("export.colmap_dense")
+def colmap_dense(
+    poses: One[Poses],
+    faces: All[FaceFiles],
+    images: Names[Panorama],
+    points: One[TrackedPoints] | None,
+    params: DenseParams,
+    ctx: Context,
+) -> Files:
+    """The model of export.colmap_faces' pictures: a dense workspace for COLMAP's fusion, OpenMVS and splat trainers.
+
+    A rig of PINHOLE cameras, a frame for each panorama, points with tracks: in colmap_dense/sparse and, for trainers,
+    in sparse/0; stereo/*.cfg. With points.tracked its points join the sparse ones, so that no face is without.
+    A workspace has one frame, that of the largest group of poses; models of the others are in sparse/1, sparse/2 …
+    """
+    joined = poses if points is None else points.joined_to(poses, keep_points=True)
+    largest, *others = split_groups(joined)
+    cuts = _cuts(largest.names, faces, item_stems(images))
+    if not cuts:
+        raise UsageError("no panorama has both a pose and faces, so there is no workspace to describe")
+    folder = ctx.scratch / "sparse"
+    seen = write_rig_model(folder, largest, cuts, form=params.format)
+    files = sparse_targets(children(folder)) | write_stereo_configs(ctx.scratch, seen)
+    for number, group in enumerate(others, start=1):
+        files |= _other_model(group, number, _cuts(group.names, faces, item_stems(images)), params.format, ctx)
+    _tell_blanks(seen, params.format, ctx)
+    blind = sum(not count for count in seen.values())
+    ctx.metric("faces_without_points", blind)
+    if blind:
+        ctx.note(f"{blind} of {len(seen)} faces see no point of the model: COLMAP fuses none of their depths. Add a "
+                 "stage points.tracked, or raise its count")  # fmt: skip
+    return Files(files)
+
+
+class DenseInitParams(ModelParams):
+    """Settings of export.colmap_dense_init."""
+
+    keep_sfm: bool = Field(default=True, description="also the sparse points that the poses were solved with")
+
+
+@stage("export.colmap_dense_init")
+def colmap_dense_init(
+    poses: One[Poses], points: One[TrackedPoints], images: All[Panorama], params: DenseInitParams, ctx: Context
+) -> Files:
+    """COLMAP model with the many points of points.tracked, in colmap_dense_init/sparse/0: what splats begin with.
+
+    The cameras are those of export.colmap, EQUIRECTANGULAR. Further groups of poses are in sparse/1, sparse/2 …
+    """
+    joined = points.joined_to(poses, keep_points=params.keep_sfm)
+    ctx.metric("points", len(joined.points_in_world))
+    return _sparse_models(joined, images, params.format, ctx, "colmap_dense_init/sparse")
+
+
+def _tell_blanks(names: Iterable[str], form: ModelForm, ctx: Context) -> None:
+    found = next((name for name in names if " " in name), "") if form != "bin" else ""
+    if found:
+        ctx.note(f"{found!r} holds a blank: in the text model COLMAP and OpenMVS read such a name as far as that. Use "
+                 "the binary one, or rename the picture")  # fmt: skip
+
+
+def _sparse_models(poses: Poses, images: Mapping[str, Panorama], form: ModelForm, ctx: Context, target: str) -> Files:
+    """Write a model for each group of poses into the folders 0, 1 … of the target."""
+    files: dict[str, Path] = {}
+    for number, group in enumerate(split_groups(poses)):
+        folder = ctx.scratch / f"model_{number}"
+        sizes_hw = {name: images[name].source_size_hw for name in group.names if name in images}
+        write_colmap_model(folder, group, sizes_hw, form=form)
+        files |= {f"{target}/{number}/{path.name}": path for path in children(folder)}
+    _tell_blanks(poses.names, form, ctx)
+    return Files(files)
+
+
+def _other_model(
+    group: Poses, number: int, cuts: Mapping[str, CutPanorama], form: ModelForm, ctx: Context
+) -> dict[str, Path]:
+    """Write the model of a group that is not the workspace's, and return where its files belong."""
+    shown = ", ".join(group.names[:3]) + (f" … ({len(group.names)} images)" if len(group.names) > 3 else "")
+    if not cuts:
+        ctx.note(f"group {number} of the poses ({shown}) has no faces and so no model in {WORKSPACE}")
+        return {}
+    folder = ctx.scratch / f"sparse_{number}"
+    write_rig_model(folder, group, cuts, form=form)
+    target = f"{WORKSPACE}/sparse/{number}"
+    ctx.note(f"{WORKSPACE}/sparse is the model of the largest group of poses; group {number} ({shown}) has a frame of "
+             f"its own and is in {target}. To fuse it, put that model in the place of sparse")  # fmt: skip
+    return {f"{target}/{path.name}": path for path in children(folder)}
+
+
+def _cuts(names: Iterable[str], faces: Mapping[str, FaceFiles], stems: Mapping[str, str]) -> dict[str, CutPanorama]:
+    """Return how each panorama that has faces was cut; those that were cut alike share their views."""
+    shared: dict[tuple[str, float, int], tuple[Face, ...]] = {}
+    views: dict[tuple[str, float, int], list[PinholeView]] = {}
+    cuts: dict[str, CutPanorama] = {}
+    for name in names:
+        if name not in faces:
+            continue
+        cut = faces[name]
+        way = cut.layout, cut.fov_deg, cut.size_px
+        if way not in shared:
+            shared[way] = panorama_faces((0, 0), layout=cut.layout, fov_deg=cut.fov_deg, size_px=cut.size_px)
+            views[way] = [face.view for face in shared[way]]
+        cuts[name] = CutPanorama(
+            views[way], [face_image_name(face.name, stems[name], cut.suffix) for face in shared[way]]
+        )
+    return cuts

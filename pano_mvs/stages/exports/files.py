@@ -1,0 +1,148 @@
+"""Exports: files that other programs open."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator
+
+from pano_mvs.algorithms.fusion.normals import normals_from_range
+from pano_mvs.api import Context, Each, Files, One, Panorama, Params, PointCloud, RangeMap, stage
+from pano_mvs.io.clouds.ply import write_ply
+from pano_mvs.io.clouds.thinning import Selection, select_points
+from pano_mvs.io.images import exr
+from pano_mvs.io.images.preview import write_preview
+from pano_mvs.io.ranges.files import (
+    write_confidence_png,
+    write_normals_png,
+    write_normals_tiff,
+    write_range_png,
+    write_range_tiff,
+)
+from pano_mvs.scene.files import group_file
+
+
+class PlyParams(Params):
+    """Settings of export.ply."""
+
+    quality: bool = Field(default=False, description="add to each point how many views agree, and its confidence")
+    min_confidence: int = Field(default=0, ge=0, le=255, description="points below are left out")
+    min_views: int = Field(default=0, ge=0, le=255, description="points on which fewer views agree are left out")
+    voxel: float = Field(
+        default=0.0, ge=0, description="keep the best point of each voxel of this edge, scene units; 0: keep all"
+    )
+    max_points: int = Field(
+        default=0, ge=0, description="thin evenly to this number of points or a little fewer; 0: no limit"
+    )
+
+
+@stage("export.ply")
+def ply(cloud: One[PointCloud], params: PlyParams, ctx: Context) -> Files:
+    """The fused cloud as cloud.ply: binary little endian, x y z nx ny nz red green blue.
+
+    Written, and thinned, in chunks: memory does not grow with the cloud. Further groups of poses, each in a frame of
+    its own, are cloud_1.ply, cloud_2.ply …; each file is thinned on its own.
+    """
+    selection = Selection(params.min_confidence, params.min_views, params.voxel, params.max_points)
+    files, points = {}, 0
+    for number, group in enumerate(cloud.groups()):
+        name = group_file("cloud.ply", number)
+        kept = select_points(group, selection, ctx.scratch)
+        files[name] = ctx.scratch / name
+        write_ply(files[name], group, quality=params.quality, kept=kept)
+        points += len(group) if kept is None else kept.count
+        if kept is not None and kept.voxel and not number:
+            ctx.metric("voxel", kept.voxel)
+    ctx.metric("points", points)
+    return Files(files)
+
+
+class RangesParams(Params):
+    """Settings of export.ranges."""
+
+    formats: tuple[Literal["tiff", "png", "exr", "npy"], ...] = Field(
+        default=("tiff",), description="of the ranges: tiff, exr, npy are float32 and NaN is invalid; png is 16 bit"
+    )
+    png_unit: float = Field(default=0.001, gt=0, description="scene units of one step of a 16-bit PNG; 0 is invalid")
+    confidence: bool = Field(default=True, description="write confidence/<image>.png")
+    normals: tuple[Literal["tiff", "png", "exr", "npy"], ...] = Field(
+        default=(), description="of the surface normals in the camera frame (x right, y down, z forward), if any"
+    )
+
+    @field_validator("formats", "normals")
+    @classmethod
+    def _can_be_written(cls, formats: tuple[str, ...]) -> tuple[str, ...]:
+        if "exr" in formats and not exr.has_exr():
+            raise ValueError(exr.REMEDY)
+        return tuple(dict.fromkeys(formats))
+
+
+@stage("export.ranges")
+def ranges(range_map: Each[RangeMap], image: Each[Panorama] | None, params: RangesParams, ctx: Context) -> Files:
+    """Each range map as range/<image>.tiff (float32, NaN invalid) and confidence/<image>.png (8 bit, 0 invalid).
+
+    Other formats, and normals/<image> of them, on request. A 16-bit PNG has its unit beside it in range/<image>.json.
+    """
+    valid = range_map.valid if image is None else range_map.valid & image.load_mask()
+    values = np.where(valid, range_map.range, np.float32(np.nan))
+    files = {f"range/{{item}}.{name}": _write_range(values, name, params, ctx) for name in params.formats}
+    if "png" in params.formats:
+        files["range/{item}.json"] = ctx.scratch / "range.json"
+    if params.confidence:
+        files["confidence/{item}.png"] = ctx.scratch / "confidence.png"
+        write_confidence_png(files["confidence/{item}.png"], np.where(valid, range_map.confidence, np.uint8(0)))
+    if params.normals:
+        known = _normals(range_map, valid, threads=ctx.threads)
+        files |= {f"normals/{{item}}.{name}": _write_normals(known, name, ctx.scratch) for name in params.normals}
+    return Files(files)
+
+
+@stage("export.previews")
+def previews(range_map: Each[RangeMap], image: Each[Panorama], ctx: Context) -> Files:
+    """A picture for each view, preview/<image>.jpg: the panorama beside its colour-mapped range with a scale bar.
+
+    What is masked is grey, like pixels without a range.
+    """
+    path = ctx.scratch / "preview.jpg"
+    write_preview(path, image.load(), range_map.range, mask=image.load_mask())
+    return Files({"preview/{item}.jpg": path})
+
+
+def _write_range(values: NDArray[np.float32], suffix: str, params: RangesParams, ctx: Context) -> Path:
+    path = ctx.scratch / f"range.{suffix}"
+    if suffix == "tiff":
+        write_range_tiff(path, values)
+    elif suffix == "npy":
+        np.save(path, values)
+    elif suffix == "exr":
+        exr.write_exr(path, {"Z": values})
+    else:
+        beyond = write_range_png(path, values, unit=params.png_unit)
+        ctx.metric("beyond_png", beyond / values.size)
+        about = {"quantity": "range along the ray", "unit": params.png_unit, "invalid": 0, "beyond_px": beyond}
+        (ctx.scratch / "range.json").write_text(json.dumps(about, indent=1), encoding="utf-8")
+    return path
+
+
+def _normals(range_map: RangeMap, valid: NDArray[np.bool_], *, threads: int) -> NDArray[np.float32]:
+    """Return the normals of the valid pixels: those that came with the ranges, else planes fitted to the ranges."""
+    given = range_map.normals_in_cam
+    known = normals_from_range(range_map, threads=threads) if given is None else np.asarray(given).astype(np.float32)
+    return np.where(valid[..., None], known, np.float32(np.nan))
+
+
+def _write_normals(normals: NDArray[np.float32], suffix: str, folder: Path) -> Path:
+    path = folder / f"normals.{suffix}"
+    if suffix == "tiff":
+        write_normals_tiff(path, normals)
+    elif suffix == "png":
+        write_normals_png(path, normals)
+    elif suffix == "npy":
+        np.save(path, normals)
+    else:
+        exr.write_exr(path, {name: np.ascontiguousarray(normals[..., idx]) for idx, name in enumerate("RGB")})
+    return path

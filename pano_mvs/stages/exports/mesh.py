@@ -1,0 +1,87 @@
+"""Exports: the scene's surface as a mesh."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from pydantic import Field
+
+from pano_mvs.algorithms.mesh.poisson import FEWEST_POINTS, poisson_depth, solve_poisson
+from pano_mvs.algorithms.mesh.triangles import Mesh, point_spacings, trimmed_mesh, without_crumbs
+from pano_mvs.api import Context, Files, InputError, One, Params, PointCloud, stage
+from pano_mvs.io.clouds.ply import read_ply, write_ply
+from pano_mvs.io.clouds.ply_mesh import read_ply_mesh, write_ply_mesh
+from pano_mvs.io.clouds.thinning import Selection, select_points
+from pano_mvs.scene.files import group_file
+
+
+class MeshParams(Params):
+    """Settings of export.mesh."""
+
+    depth: int = Field(
+        default=0, ge=0, le=14, description="of the octree: cells are the extent / 2^depth wide; 0: as points lie apart"
+    )
+    point_weight: float = Field(default=1.0, ge=0, description="how much the surface is drawn to the points")
+    trim: float = Field(
+        default=4.0, ge=0, description="cut off what is farther from the points than so many of their spacings; 0: keep"
+    )
+    smallest_part: float = Field(
+        default=0.001, ge=0, le=1, description="loose parts with less than this share of the triangles are left out"
+    )
+    max_points: int = Field(default=500_000, ge=0, description="the cloud is thinned evenly to so many; 0: never")
+    min_views: int = Field(default=2, ge=0, le=255, description="points on which fewer views agree are left out")
+    min_confidence: int = Field(default=64, ge=0, le=255, description="points below are left out")
+
+
+@stage("export.mesh", memory="2GB")
+def mesh(cloud: One[PointCloud], params: MeshParams, ctx: Context) -> Files:
+    """The surface through the fused cloud as mesh.ply: coloured triangles, by screened Poisson reconstruction.
+
+    The solver closes everything; what lies away from all points is cut off again. Triangles face the side that was
+    seen. One thread, whatever the run has: with more the result would differ from time to time. Further groups of
+    poses, each in a frame of its own, are mesh_1.ply, mesh_2.ply …
+    """
+    files, faces = {}, 0
+    for number, group in enumerate(cloud.groups()):
+        folder = ctx.scratch / str(number)
+        folder.mkdir()
+        try:
+            solved, depth = _solved(group, params, folder)
+        except InputError as error:
+            if not number:
+                raise
+            ctx.note(f"no {group_file('mesh.ply', number)}: {error}")
+            continue
+        name = group_file("mesh.ply", number)
+        files[name] = ctx.scratch / name
+        write_ply_mesh(files[name], (solved.vertices_in_world, solved.colors_rgb, solved.faces))
+        faces += len(solved.faces)
+        if not number:
+            ctx.metric("depth", depth)
+    ctx.metric("faces", faces)
+    return Files(files)
+
+
+def _solved(cloud: PointCloud, params: MeshParams, folder: Path) -> tuple[Mesh, int]:
+    """Return the mesh of one group, and the depth of its octree.
+
+    Raises:
+        InputError: if too few points are left, or they have no common surface.
+    """
+    source = folder / "points.ply"
+    selection = Selection(params.min_confidence, params.min_views, max_points=params.max_points)
+    write_ply(source, cloud, kept=select_points(cloud, selection, folder))
+    points = read_ply(source).points_in_world
+    if len(points) < FEWEST_POINTS:
+        raise InputError(f"{len(points)} of {len(cloud)} points are left for a mesh; {FEWEST_POINTS} are needed. Lower "
+                         "`min_views` or `min_confidence`, or look at why the cloud is empty")  # fmt: skip
+    spacing = float(np.median(point_spacings(points)))
+    depth = params.depth or poisson_depth(points, spacing)
+    solved = Mesh(*read_ply_mesh(solve_poisson(source, folder, depth=depth, point_weight=params.point_weight)))
+    if params.trim:
+        solved = trimmed_mesh(solved, points, max_spacings=params.trim)
+    solved = without_crumbs(solved, smallest_share=params.smallest_part)
+    if not len(solved.faces):
+        raise InputError("the mesh has no faces: the points have no common surface. Raise `trim` or `max_points`")
+    return solved, depth

@@ -1,0 +1,266 @@
+"""What the viewer does when somebody clicks, drags or presses a key; it knows no window, and is tested without one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import UsageError
+from pano_mvs.io.images.names import match_image_names
+from pano_mvs.viewer.cloud_colors import DrawnCloud
+from pano_mvs.viewer.picking import camera_under, point_under
+from pano_mvs.viewer.pixel_readout import pixel_readout
+from pano_mvs.viewer.shown_scene import ShownScene
+from pano_mvs.viewer.sizes import length_text, outer_box, sphere_radius
+from pano_mvs.viewer.viewpoint import Viewpoint, looking_along, outside_view
+
+FloatArray = NDArray[np.float64]
+
+_PARALLEL_REACH = 0.006
+
+
+@dataclass(frozen=True, eq=False)
+class TourState:
+    """What the window shows.
+
+    Attributes:
+        viewpoint: from where.
+        surface: "cloud", "mesh" or "both".
+        coloring: of the cloud.
+        inside: index of the camera whose panorama is all around, or None.
+        outside: where to come back to from inside.
+        measuring: whether clicks pick points.
+        picked: none, one or two points (3,) in the world.
+        hovered: index of the camera under the pointer, or None.
+        labels: whether all cameras are named.
+        cameras: whether cameras are shown.
+        blended: whether the cloud is shown inside a panorama.
+        backs: whether points, and triangles, that turn their back to the eye are shown; not showing them opens rooms
+            to the eye.
+        all_points: whether all points of the file are drawn.
+        help: whether the keys are listed.
+        message: the latest news.
+    """
+
+    viewpoint: Viewpoint
+    surface: str = "cloud"
+    coloring: str = "rgb"
+    inside: int | None = None
+    outside: Viewpoint | None = None
+    measuring: bool = False
+    picked: tuple[FloatArray, ...] = ()
+    hovered: int | None = None
+    labels: bool = False
+    cameras: bool = True
+    blended: bool = False
+    backs: bool = False
+    all_points: bool = False
+    help: bool = False
+    message: str = ""
+
+
+@dataclass(eq=False)
+class Tour:
+    """A scene, and how it is looked at.
+
+    Attributes:
+        scene: what there is.
+        cloud: the points that are drawn, or None.
+        box: (2, 3) in which nearly all lies.
+        aspect: width of the window as a multiple of its height.
+        corners: (N, 3) of a mesh, to measure between where there is no cloud; None if there is no mesh.
+        state: what is shown now.
+    """
+
+    scene: ShownScene
+    cloud: DrawnCloud | None
+    box: FloatArray
+    aspect: float = 1.5
+    corners: NDArray[np.float32] | None = None
+    state: TourState = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Begin with the overview."""
+        self.centers = self.scene.centers
+        self.radius = sphere_radius(self.centers, self.box)
+        points = self.corners if self.cloud is None else self.cloud.points
+        self._outer_box = self.box if points is None else outer_box(points, self.box)
+        self.state = TourState(self.from_outside("overview"), "cloud" if self.cloud is not None else "mesh")
+
+    def from_outside(self, name: str) -> Viewpoint:
+        """Return the view called "overview", "top" or "front"."""
+        # Perspective leaves room around what it fits; a plan or an elevation has to fit the ends of the cloud itself.
+        box = self.box if name == "overview" else self._outer_box
+        return outside_view(name, box, self.scene.up, self.scene.ahead, aspect=self.aspect)
+
+    def see(self, view: str) -> None:
+        """Go to a view by name: "overview", "top", "front" or "inside:NAME".
+
+        Raises:
+            UsageError: if there is no such view or camera.
+        """
+        kind, _, name = view.partition(":")
+        if kind == "inside":
+            found = self._camera_called(name)
+            self.step_into(found)
+            pose = self.scene.cameras[found].cam_from_world
+            self.moved_to(looking_along(pose.center, pose.rotation[2], self.scene.up))
+        elif view in ("overview", "top", "front"):
+            self._look(self.from_outside(view))
+        else:
+            raise UsageError(f"there is no view {view!r}; there are overview, top, front and inside:NAME")
+
+    def begin(self, **settings: str | bool) -> None:
+        """Begin with other than the usual settings: fields of `TourState` by name."""
+        self.state = replace(self.state, **settings)  # type: ignore[arg-type]
+
+    def step_into(self, camera_idx: int) -> None:
+        """Go to a camera, looking on in the same direction: its panorama is all around."""
+        state = self.state
+        center = self.centers[camera_idx]
+        forward = self.scene.ahead if state.viewpoint.height else state.viewpoint.axes[2]
+        if abs(float(forward @ self.scene.up)) > 0.7 and state.inside is None:
+            forward = self.scene.ahead  # from high above one does not want to look at the floor
+        self.state = replace(
+            state,
+            inside=camera_idx,
+            outside=state.viewpoint if state.inside is None else state.outside,
+            viewpoint=looking_along(center, forward, self.scene.up),
+            hovered=None,
+            message="",
+        )
+
+    def step_out(self) -> None:
+        """Go back to where one stepped in from; elsewhere, give up measuring."""
+        state = self.state
+        if state.inside is None or state.outside is None:
+            self.state = replace(state, measuring=False, picked=(), message="")
+            return
+        self.state = replace(state, inside=None, outside=None, viewpoint=state.outside, message="")
+
+    def click(self, x: float, y: float, size_wh: tuple[int, int]) -> None:
+        """Do what a click at a place in the window asks for: pick a point, step into a camera, or read a pixel."""
+        start, direction = self.state.viewpoint.ray(x, y, size_wh)
+        if self.state.measuring:
+            self._pick(start, direction)
+            return
+        found = self._camera_at(start, direction)
+        if found is not None:
+            self.step_into(found)
+        elif self.state.inside is not None:
+            said = pixel_readout(self.scene.cameras[self.state.inside], direction, self.scene.unit)
+            self.state = replace(self.state, message=said)
+
+    def hover(self, x: float, y: float, size_wh: tuple[int, int]) -> bool:
+        """Note which camera is under the pointer, and return whether that is another one than before."""
+        before = self.state.hovered
+        self.state = replace(self.state, hovered=self._camera_at(*self.state.viewpoint.ray(x, y, size_wh)))
+        return self.state.hovered != before
+
+    def drag(self, dx_px: float, dy_px: float, *, window_height: int) -> None:
+        """Look around."""
+        viewpoint = self.state.viewpoint.turned(dx_px, dy_px, window_height=window_height)
+        self.state = replace(self.state, viewpoint=viewpoint)
+
+    def zoom(self, steps: float) -> None:
+        """See less, or more for negative steps, of what is around."""
+        self.state = replace(self.state, viewpoint=self.state.viewpoint.zoomed(steps))
+
+    def key(self, name: str) -> bool:
+        """Do what a key asks for, and return whether it asks for anything."""
+        action = self._keys.get(name)
+        if action is not None:
+            action()
+        return action is not None
+
+    def moved_to(self, viewpoint: Viewpoint) -> None:
+        """Note where the window's own mouse handling went."""
+        self.state = replace(self.state, viewpoint=viewpoint)
+
+    @property
+    def distance(self) -> float | None:
+        """Between the two picked points in scene units, or None."""
+        if len(self.state.picked) < 2:
+            return None
+        return float(np.linalg.norm(self.state.picked[1] - self.state.picked[0]))
+
+    @property
+    def _keys(self) -> Mapping[str, Callable[[], None]]:
+        return {
+            "Escape": self.step_out,
+            "c": self._next_coloring,
+            "s": self._next_surface,
+            "m": lambda: self._toggle("measuring"),
+            "l": lambda: self._toggle("labels"),
+            "k": lambda: self._toggle("cameras"),
+            "b": lambda: self._toggle("blended"),
+            "x": lambda: self._toggle("backs"),
+            "d": lambda: self._toggle("all_points"),
+            "h": lambda: self._toggle("help"),
+            "Right": lambda: self._next_camera(1),
+            "Left": lambda: self._next_camera(-1),
+            "o": lambda: self._look(self.from_outside("overview")),
+            "t": lambda: self._look(self.from_outside("top")),
+            "y": lambda: self._look(self.from_outside("front")),
+        }
+
+    def _look(self, viewpoint: Viewpoint) -> None:
+        """Look from outside."""
+        self.state = replace(self.state, viewpoint=viewpoint, inside=None, outside=None, message="")
+
+    def _toggle(self, name: str) -> None:
+        self.state = replace(self.state, **{name: not getattr(self.state, name)})  # type: ignore[arg-type]
+        if name == "measuring":
+            message = "measuring: click two points" if self.state.measuring else ""
+            self.state = replace(self.state, picked=(), message=message)
+
+    def _next_coloring(self) -> None:
+        names = self.cloud.colorings if self.cloud is not None else ()
+        if names:
+            place = names.index(self.state.coloring) if self.state.coloring in names else -1
+            self.state = replace(self.state, coloring=names[(place + 1) % len(names)])
+
+    def _next_surface(self) -> None:
+        if self.cloud is not None and self.scene.mesh is not None:
+            following = {"cloud": "mesh", "mesh": "both", "both": "cloud"}
+            self.state = replace(self.state, surface=following[self.state.surface])
+
+    def _next_camera(self, step: int) -> None:
+        if self.scene.cameras:
+            here = self.state.inside if self.state.inside is not None else (-1 if step > 0 else 0)
+            self.step_into((here + step) % len(self.scene.cameras))
+
+    def _camera_at(self, start: FloatArray, direction: FloatArray) -> int | None:
+        if not self.state.cameras or not len(self.centers):
+            return None
+        found = camera_under(start, direction, self.centers, self.radius)
+        return found if found != self.state.inside else None
+
+    def _pick(self, start: FloatArray, direction: FloatArray) -> None:
+        points = self.cloud.points if self.cloud is not None else self.corners
+        if points is None:
+            self.state = replace(self.state, message="there is no cloud to measure in")
+            return
+        height = self.state.viewpoint.height
+        normals = None if self.state.backs or self.cloud is None else self.cloud.normals
+        found = point_under(start, direction, points, normals=normals, parallel_reach=_PARALLEL_REACH * height)
+        if found is None:
+            self.state = replace(self.state, message="no point there: click on the cloud")
+            return
+        point = points[found].astype(np.float64)
+        picked = (*self.state.picked, point) if len(self.state.picked) < 2 else (point,)
+        self.state = replace(self.state, picked=picked)
+        distance = self.distance
+        said = "click the second point" if distance is None else length_text(distance, self.scene.unit)
+        self.state = replace(self.state, message=said)
+
+    def _camera_called(self, name: str) -> int:
+        names = [camera.name for camera in self.scene.cameras]
+        matched = match_image_names([name], names)
+        if name not in matched:
+            shown = ", ".join(names[:6]) + (" …" if len(names) > 6 else "")
+            raise UsageError(f"there is no camera {name!r}; there are: {shown or 'none'}")
+        return names.index(matched[name])

@@ -1,0 +1,97 @@
+"""The vector kernel for descriptors of whole numbers finds what the plain products find."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pano_mvs.algorithms.matching.brute_force import match_features
+from pano_mvs.algorithms.matching.nearest_two import NearestTwo, nearest_two
+from pano_mvs.algorithms.matching.whole_numbers import fits_whole_numbers, nearest_two_whole
+from pano_mvs.algorithms.sweep.kernels_vector import HAS_VECTOR
+from pano_mvs.core.errors import UsageError
+from tests.algorithms.features.test_matching import features
+from tests.oracles.matching import match_one_by_one
+
+needs_vector = pytest.mark.skipif(not HAS_VECTOR, reason="no vector instructions, or numba compiles nothing")
+
+
+def draw(rng, count, size, *, low=0, high=256):
+    return rng.integers(low, high, size=(count, size)).astype(np.float32)
+
+
+def assert_same(found: NearestTwo, expected: NearestTwo):
+    np.testing.assert_array_equal(found.nearest, expected.nearest)
+    np.testing.assert_array_equal(found.squared, expected.squared)
+    np.testing.assert_array_equal(found.next_squared, expected.next_squared)
+    np.testing.assert_array_equal(found.squared_back, expected.squared_back)
+
+
+@pytest.mark.kernel("matching.kernels_vector_match")
+@needs_vector
+@pytest.mark.parametrize("counts", [(1, 2), (6, 64), (7, 65), (5, 63), (130, 517), (401, 129)])
+@pytest.mark.parametrize("size", [128, 33])
+def test_kernel_equals_the_plain_products(counts, size):
+    """Counts at and beside full blocks of rows and columns; an odd number of components."""
+    rng = np.random.default_rng([*counts, size])
+    first, second = (draw(rng, count, size) for count in counts)
+    assert_same(nearest_two_whole(first, second), nearest_two(first, second))
+
+
+@pytest.mark.kernel("matching.kernels_vector_match")
+@needs_vector
+def test_kernel_settles_ties_as_the_plain_products_do():
+    """Hardly any distances differ, so that every row has many nearest ones: the first is taken."""
+    rng = np.random.default_rng(8)
+    first, second = draw(rng, 90, 4, high=3), draw(rng, 300, 4, high=3)
+    expected = nearest_two(first, second)
+    assert np.sum(expected.squared == expected.next_squared) > 60
+    assert_same(nearest_two_whole(first, second), expected)
+
+
+@pytest.mark.kernel("matching.kernels_vector_match")
+@needs_vector
+def test_kernel_is_exact_up_to_the_greatest_numbers_that_fit():
+    """Opposite signs make the products most negative; squared distances are beyond what float32 counts singly."""
+    rng = np.random.default_rng(9)
+    first, second = draw(rng, 40, 128, low=900, high=1025), draw(rng, 70, 128, low=-1024, high=-900)
+    assert fits_whole_numbers(first)
+    found = nearest_two_whole(first, second)
+    exact = ((first[:, None].astype(np.int64) - second.astype(np.int64)) ** 2).sum(axis=2)
+    np.testing.assert_array_equal(found.nearest, exact.argmin(axis=1))
+    np.testing.assert_array_equal(found.squared, exact.min(axis=1).astype(np.float32))
+    np.testing.assert_array_equal(found.next_squared, np.sort(exact, axis=1)[:, 1].astype(np.float32))
+    np.testing.assert_array_equal(found.squared_back, exact.min(axis=0).astype(np.float32))
+
+
+@pytest.mark.parametrize("wrong", [0.5, np.nan, np.inf, 2000.0, 1e30])
+def test_other_numbers_are_left_to_the_plain_products(wrong):
+    descriptors = np.full((3, 128), 7, np.float32)
+    assert fits_whole_numbers(descriptors) == HAS_VECTOR
+    descriptors[1, 5] = wrong
+    assert not fits_whole_numbers(descriptors)
+
+
+@pytest.mark.parametrize("mutual", [True, False])
+@pytest.mark.parametrize("fraction", [0.0, 0.25])
+def test_matches_equal_the_plain_search_with_and_without_whole_numbers(mutual, fraction):
+    rng = np.random.default_rng(10)
+    base = draw(rng, 200, 16, high=120) + np.float32(fraction)
+    noisy = base + rng.integers(-12, 13, size=base.shape).astype(np.float32)
+    second = np.concatenate([noisy[:100], draw(rng, 100, 16, high=120)])
+    found = match_features(features(base), features(second), ratio=0.9, mutual=mutual)
+    assert len(found) > 80
+    assert [tuple(match) for match in found.tolist()] == match_one_by_one(
+        base, second, metric="l2", ratio=0.9, mutual=mutual
+    )
+
+
+@needs_vector
+def test_refuses_what_it_cannot_compare():
+    whole = np.ones((4, 8), np.float32)
+    with pytest.raises(UsageError, match="nearest two among"):
+        nearest_two_whole(whole, whole[:1])
+    with pytest.raises(UsageError, match="nearest two among"):
+        nearest_two_whole(whole, np.ones((4, 6), np.float32))
+    with pytest.raises(UsageError, match="whole numbers"):
+        nearest_two_whole(whole, whole + np.float32(0.5))

@@ -1,0 +1,202 @@
+"""Pair selectors for large sets: by place, by looks, where a walk closes; and the glance that saves matching."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from pano_mvs.algorithms.matching.neighbours import (
+    east_north_m,
+    loop_closing_pairs,
+    nearest_links,
+    position_pairs,
+    retrieval_pairs,
+)
+from pano_mvs.algorithms.matching.pairs import sequential_pairs
+from pano_mvs.algorithms.matching.preemptive import hopeless_reason
+from pano_mvs.algorithms.matching.vlad import vlad_descriptor
+from pano_mvs.core.errors import UsageError
+from pano_mvs.scene import GlobalDescriptor
+from tests.algorithms.features.test_matching import features
+from tests.algorithms.poses.synthetic_path import SIGHT, path_capture
+
+
+@pytest.fixture(scope="module")
+def walk():
+    return path_capture(np.random.default_rng(1), 40, keypoints=300, described=True)
+
+
+@pytest.fixture(scope="module")
+def looks(walk):
+    return {name: vlad_descriptor(found) for name, found in walk.features.items()}
+
+
+def groups(names, pairs):
+    """Number of groups of images that hang together."""
+    group = {name: {name} for name in names}
+    for a, b in pairs:
+        joined = group[a] | group[b]
+        group.update(dict.fromkeys(joined, joined))
+    return len({id(members) for members in group.values()})
+
+
+def test_position_pairs_are_the_nearest_of_either():
+    rng = np.random.default_rng(2)
+    names = [f"{n}" for n in range(30)]
+    places = {name: rng.normal(size=3) for name in names}
+    pairs = position_pairs(names, places, neighbours=4)
+    pairs.check()
+    near = set()
+    for a in names:
+        others = sorted((b for b in names if b != a), key=lambda b: np.linalg.norm(places[a] - places[b]))
+        near |= {tuple(sorted((a, b), key=names.index)) for b in others[:4]}
+    assert near <= set(pairs.pairs)
+    assert len(set(pairs.pairs) - near) == groups(names, near) - 1
+
+
+def test_groups_that_would_be_apart_are_joined_by_the_shortest_link():
+    places = {"a": [0.0, 0], "b": [1.0, 0], "c": [10.0, 0], "d": [11.5, 0]}
+    pairs = position_pairs(list(places), places, neighbours=1)
+    assert pairs.pairs == (("a", "b"), ("b", "c"), ("c", "d"))
+
+
+def test_images_at_one_place_hang_together_too():
+    places = {f"{n}": np.zeros(2) for n in range(12)}
+    pairs = position_pairs(list(places), places, neighbours=2)
+    assert groups(places, pairs.pairs) == 1
+
+
+def test_an_image_without_position_has_its_neighbours_in_the_order():
+    names = [f"{n}" for n in range(8)]
+    places = {name: [100.0 * int(name), 0] for name in names if name != "3"}
+    pairs = position_pairs(names, places, neighbours=1, window=2).pairs
+    assert {pair for pair in pairs if "3" in pair} == {("1", "3"), ("2", "3"), ("3", "4"), ("3", "5")}
+    assert set(position_pairs(names, {}, neighbours=1, window=2).pairs) == set(sequential_pairs(names, window=2).pairs)
+
+
+def test_metres_east_and_north():
+    """A thousandth of a degree of latitude is 110.6 to 111.7 m; heights do not count."""
+    at = east_north_m([(60.0, 10.0, 0.0), (60.001, 10.0, 500.0), (60.0, 10.001, -20.0)])
+    north, east = at[1] - at[0], at[2] - at[0]
+    np.testing.assert_allclose(north, [0, 111.4], atol=0.3)
+    np.testing.assert_allclose(east, [55.8, 0], atol=0.3)
+    assert east_north_m([]).shape == (0, 2)
+
+
+@pytest.mark.parametrize("count", [2, 3, 50])
+def test_links_join_everything_and_are_listed_once(count):
+    rng = np.random.default_rng(count)
+    distances = rng.random((count, count))
+    distances += distances.T
+    np.fill_diagonal(distances, 0)
+    links = nearest_links(distances, 1)
+    assert np.all(links[:, 0] < links[:, 1])
+    assert len(np.unique(links, axis=0)) == len(links)
+    assert groups(range(count), links.tolist()) == 1
+
+
+def test_pictures_of_one_place_are_found_by_their_looks(walk, looks):
+    names = list(walk.poses)
+    pairs = retrieval_pairs(names, looks, neighbours=5).pairs
+    apart = [np.linalg.norm(walk.poses[a].center - walk.poses[b].center) for a, b in pairs]
+    assert np.mean(np.array(apart) < SIGHT) > 0.95  # by chance it would be 0.35
+    assert groups(names, pairs) == 1
+    next_ones = set(pairwise(names))
+    assert len(next_ones & set(pairs)) > 0.6 * len(next_ones)
+
+
+def test_looks_of_a_picture_depend_on_this_picture_alone(walk, looks):
+    name = list(walk.features)[7]
+    again = vlad_descriptor(walk.features[name])
+    again.check()
+    np.testing.assert_array_equal(again.vector, looks[name].vector)
+    np.testing.assert_array_equal(again.vector, np.rint(again.vector))
+    assert np.linalg.norm(again.vector) == pytest.approx(1024, rel=0.01)
+
+
+@pytest.mark.parametrize(("metric", "size"), [("l2", 128), ("hamming", 32), ("l2", 61), ("hamming", 64)])
+def test_common_key_points_make_pictures_alike(metric, size):
+    rng = np.random.default_rng(3)
+
+    def draw(count):
+        if metric == "l2":
+            return rng.integers(0, 200, size=(count, size)).astype(np.float32)
+        return rng.integers(0, 256, size=(count, size), dtype=np.uint8)
+
+    first, common, other = draw(300), draw(300), draw(600)
+    a, b, c = (
+        vlad_descriptor(features(d, metric)).vector.astype(float)
+        for d in (np.concatenate([first, common]), np.concatenate([common, draw(300)]), other)
+    )
+    assert a @ b > 1.5 * max(a @ c, b @ c) + 0.05 * 1024**2
+
+
+@pytest.mark.parametrize(("metric", "dtype"), [("l2", np.float32), ("hamming", np.uint8)])
+def test_a_picture_without_key_points_looks_like_nothing(metric, dtype):
+    empty = vlad_descriptor(features(np.zeros((0, 32), dtype), metric))
+    empty.check()
+    assert not empty.vector.any()
+    some = {"a": empty, "b": GlobalDescriptor(np.ones_like(empty.vector)), "c": empty}
+    assert groups("abc", retrieval_pairs(list(some), some, neighbours=1).pairs) == 1
+    assert retrieval_pairs(["a"], some).pairs == ()
+
+
+def test_a_walk_is_closed_where_it_comes_back(walk, looks):
+    """The same walk twice: the second time its pictures look like those of the first."""
+    names = list(walk.poses)[:10]
+    twice = names + [f"again/{name}" for name in names]
+    both = {name: looks[name.removeprefix("again/")] for name in twice}
+    pairs = loop_closing_pairs(twice, both, window=2, loop_closure=1)
+    pairs.check()
+    window = set(sequential_pairs(twice, window=2).pairs)
+    assert window <= set(pairs.pairs)
+    added = set(pairs.pairs) - window
+    assert {(name, f"again/{name}") for name in names} <= added
+    assert list(pairs.pairs) == sorted(pairs.pairs, key=lambda pair: [twice.index(name) for name in pair])
+
+
+def test_without_loop_closure_only_the_window_counts(looks):
+    names = list(looks)
+    assert (
+        loop_closing_pairs(names, {}, window=3, loop=True).pairs == sequential_pairs(names, window=3, loop=True).pairs
+    )
+
+
+def test_numbers_of_neighbours_are_checked(looks):
+    for wrong in (
+        lambda: position_pairs(["a"], {}, neighbours=0),
+        lambda: position_pairs(["a"], {}, window=0),
+        lambda: retrieval_pairs(list(looks), looks, neighbours=0),
+    ):
+        with pytest.raises(UsageError, match="at least 1"):
+            wrong()
+
+
+@pytest.mark.parametrize("metric", ["l2", "hamming"])
+def test_a_glance_tells_strangers_from_neighbours(metric):
+    rng = np.random.default_rng(4)
+
+    def draw(count):
+        if metric == "l2":
+            return rng.integers(0, 200, size=(count, 64)).astype(np.float32)
+        return rng.integers(0, 256, size=(count, 32), dtype=np.uint8)
+
+    base = draw(600)
+    here = features(base, metric)
+    there = features(np.concatenate([base[:30], draw(570)]), metric)
+    stranger = features(draw(600), metric)
+    assert hopeless_reason(here, there, preemptive=200) == ""
+    reason = hopeless_reason(here, stranger, preemptive=200)
+    assert "200 strongest" in reason
+    assert hopeless_reason(here, stranger) == ""
+    assert hopeless_reason(here, replace(stranger, descriptors=base), preemptive=200) == ""
+
+
+def test_a_glance_at_everything_is_none():
+    """Where a picture has no more key points than the glance looks at, matching all costs the same."""
+    rng = np.random.default_rng(5)
+    a, b = (features(rng.integers(0, 200, size=(50, 16)).astype(np.float32)) for _ in range(2))
+    assert hopeless_reason(a, b, preemptive=50) == ""

@@ -1,0 +1,276 @@
+"""Poses of any origin checked against the images: what is wrong is put right, left out or doubted, the rest stays."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pano_mvs.algorithms.metrics.placements import judge_placements
+from pano_mvs.algorithms.poses.frame.gauge import moved_poses
+from pano_mvs.algorithms.poses.placement.placed_model import pairs_of
+from pano_mvs.algorithms.poses.verification import arbitration
+from pano_mvs.algorithms.poses.verification.arbitration import arbitrate, judge
+from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
+from pano_mvs.algorithms.poses.verification.verify_poses import model_of, verify_poses
+from pano_mvs.geometry import Rigid3, Similarity3, geodesic_angle, rotation_from_rotvec
+from pano_mvs.scene import Features, Poses, TwoView
+from pano_mvs.scene.pose_groups import join_groups, split_groups
+from pano_mvs.testing.room import capture_poses, default_room, render
+from pano_mvs.testing.scenes import white_room
+from tests.algorithms.poses.aliased_capture import same_matches, view_of
+from tests.algorithms.room_pictures import SIZE_HW, WHOLE, Vector, moved, room_capture, room_matches
+
+Matches = tuple[dict[str, Features], dict[tuple[str, str], TwoView]]
+
+POSES, PICTURES = room_capture()
+NAMES = tuple(f"{idx}.png" for idx in range(len(POSES)))
+TRUTH = dict(zip(NAMES, POSES, strict=True))
+AWAY: Vector = (0.5, 0.0, -0.4)
+EXTENT = max(np.linalg.norm(a.center - b.center) for a in POSES for b in POSES)
+
+
+def load(name: str) -> Picture:
+    return PICTURES[NAMES.index(name)], WHOLE
+
+
+def poses_of(cameras: dict[str, Rigid3]) -> Poses:
+    return Poses.without_points(cameras, frame="site", scale="metres", metric=True)
+
+
+def displaced(*names: str, by: Vector = AWAY) -> Poses:
+    return poses_of({name: moved(pose, by) if name in names else pose for name, pose in TRUTH.items()})
+
+
+def verified(poses: Poses, matches: Matches | None = None, **settings: bool) -> Poses:
+    features, two_views = matches or (None, None)
+    found = verify_poses(poses, load, features=features, two_views=two_views, **settings)
+    found.check()
+    return found
+
+
+def bytes_of(poses: Poses, name: str) -> bytes:
+    idx = poses.names.index(name)
+    return poses.rotations[idx].tobytes() + poses.translations[idx].tobytes()
+
+
+def assert_at(poses: Poses, name: str, expected: Rigid3) -> None:
+    found = poses.cam_from_world(poses.names.index(name))
+    assert np.rad2deg(geodesic_angle(found.rotation, expected.rotation)) < 1
+    assert np.linalg.norm(found.center - expected.center) < 0.05 * EXTENT
+
+
+@pytest.fixture(scope="module")
+def matches() -> Matches:
+    return room_matches()
+
+
+@pytest.mark.parametrize("with_matches", [False, True])
+def test_true_poses_stay_and_nobody_is_doubted(matches: Matches, with_matches: bool) -> None:
+    given = displaced()
+    found = verified(given, matches if with_matches else None)
+    assert found.names == NAMES
+    assert found.doubts == {}
+    assert found.rejected == {}
+    assert found.rotations.tobytes() == given.rotations.tobytes()
+    assert found.translations.tobytes() == given.translations.tobytes()
+    assert (found.frame, found.scale, found.metric) == ("site", "metres", True)
+    assert found.confirmed_shares is not None
+    assert found.expected_shares is not None
+    assert (found.confirmed_shares > 0.4).all()
+    np.testing.assert_allclose(found.expected_shares, found.confirmed_shares, atol=0.3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wrong", ["0.png", "2.png", "4.png"])
+def test_a_moved_camera_is_put_back(matches: Matches, wrong: str) -> None:
+    found = verified(displaced(wrong), matches)
+    assert found.names == NAMES
+    assert found.doubts == {}
+    assert found.confirmed_shares is not None
+    assert (found.confirmed_shares > 0.4).all()
+    assert (found.frame, found.scale, found.metric) == ("site", "metres", True)
+    assert len(found.points_in_world) > 20
+    aligned = judge_placements(found, TRUTH, center_limit=0.05)
+    assert aligned.right.all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wrong", ["0.png", "2.png", "4.png"])
+def test_the_cameras_that_stand_right_keep_their_poses_to_the_last_bit(matches: Matches, wrong: str) -> None:
+    given = displaced(wrong)
+    found = verified(given, matches)
+    assert_at(found, wrong, TRUTH[wrong])
+    for name in set(NAMES) - {wrong}:
+        assert bytes_of(found, name) == bytes_of(given, name)
+
+
+@pytest.mark.slow
+def test_a_turned_camera_is_put_back_and_the_others_keep_their_poses_to_the_last_bit(matches: Matches) -> None:
+    turn = rotation_from_rotvec([0.0, 0.3, 0.1])
+    cameras = {**TRUTH, "2.png": Rigid3.from_center(turn @ POSES[2].rotation, POSES[2].center)}
+    given = replace(poses_of(cameras), rejected={"x.png": "no pair"})
+    found = verified(given, matches)
+    assert found.doubts == {}
+    assert found.rejected == {"x.png": "no pair"}
+    assert_at(found, "2.png", TRUTH["2.png"])
+    for name in set(NAMES) - {"2.png"}:
+        assert bytes_of(found, name) == bytes_of(given, name)
+
+
+@pytest.mark.slow
+def test_a_shifted_block_is_put_back_as_a_whole() -> None:
+    """All pairs across the cut agree with the shift; the images do not. Inside the block nothing changes."""
+    block = ("1.png", "4.png")
+    feigned = room_matches({NAMES.index(name): AWAY for name in block}, false=120)
+    given = displaced(*block)
+    assert not judge_placements(given, TRUTH).right.all()
+    found = verified(given, feigned)
+    assert found.rejected == {}
+    assert found.doubts == {}
+    assert judge_placements(found, TRUTH, center_limit=0.05).right.all()
+    inside = [poses.centers[NAMES.index(block[1])] - poses.centers[NAMES.index(block[0])] for poses in (given, found)]
+    np.testing.assert_allclose(inside[1], inside[0], atol=1e-9)
+
+
+@pytest.mark.parametrize("with_matches", [False, True])
+def test_a_moved_camera_is_only_doubted_without_matches_or_permission(matches: Matches, with_matches: bool) -> None:
+    given = displaced("2.png")
+    found = verified(given, matches, correct=False) if with_matches else verified(given)
+    assert set(found.doubts) == {"2.png"}
+    assert "confirm" in found.doubts["2.png"]
+    assert found.rejected == {}
+    assert found.confirmed_shares is not None
+    assert np.argmin(found.confirmed_shares) == 2
+    for name in NAMES:
+        assert bytes_of(found, name) == bytes_of(given, name)
+
+
+def test_key_points_of_some_images_alone_are_not_enough_to_move_any(matches: Matches) -> None:
+    features, two_views = matches
+    given = displaced("2.png")
+    found = verified(given, ({name: features[name] for name in NAMES[:4]}, two_views))
+    assert set(found.doubts) == {"2.png"}
+    assert found.translations.tobytes() == given.translations.tobytes()
+
+
+def test_an_image_of_another_place_is_left_out_with_the_reason(matches: Matches) -> None:
+    """Its pairs contradict the others, and no place that they suggest is confirmed."""
+    features, two_views = matches
+    rng = np.random.default_rng(3)
+    other = render(default_room(seed=9), capture_poses(2, seed=8)[1], SIZE_HW)[0]
+    stranger = (np.roll(other, 40, axis=1), WHOLE)
+    views = dict(two_views)
+    for pair, view in two_views.items():
+        if "3.png" in pair:
+            direction = rng.normal(size=3)
+            false = Rigid3(view.rotation, direction / np.linalg.norm(direction))
+            wrong = np.stack([np.arange(40), rng.permutation(40)], axis=1).astype(np.int32)
+            views[pair] = view_of(false, wrong)
+    given = displaced()
+    found = verify_poses(
+        given, lambda name: stranger if name == "3.png" else load(name), features=features, two_views=views
+    )
+    assert found.names == ("0.png", "1.png", "2.png", "4.png")
+    assert "confirm" in found.rejected["3.png"]
+    assert "of its pairs" in found.rejected["3.png"]
+    assert found.doubts == {}
+    for name in found.names:
+        assert bytes_of(found, name) == bytes_of(given, name)
+
+
+def test_two_cameras_are_judged_and_doubted_only_if_their_pair_is_ambiguous(matches: Matches) -> None:
+    features, two_views = matches
+    pair = NAMES[2], NAMES[3]
+    given = poses_of({name: TRUTH[name] for name in pair})
+    feigned = view_of(moved(POSES[3], AWAY) @ POSES[2].inverse(), same_matches(50))
+    for alternatives, doubted in (([], set()), ([feigned], set(pair))):
+        found = verified(given, (features, {pair: two_views[pair].with_alternatives(alternatives)}))
+        assert found.confirmed_shares is not None
+        assert np.isfinite(found.confirmed_shares).all()
+        assert set(found.doubts) == doubted
+        assert found.translations.tobytes() == given.translations.tobytes()
+
+
+def test_one_camera_or_none_comes_back_as_it_is() -> None:
+    for names in ((), NAMES[:1]):
+        given = poses_of({name: TRUTH[name] for name in names})
+        assert verified(given) is given
+
+
+def test_groups_are_judged_apart() -> None:
+    """The second is the same room in another world: as one group its cameras would contradict the first."""
+    there = Similarity3(3.0, rotation_from_rotvec([0.5, -0.2, 1.0]), np.array([0.2, 0.1, -0.3]))
+    first = poses_of({name: TRUTH[name] for name in NAMES[:3]})
+    whole = displaced("2.png")
+    second = moved_poses(poses_of({f"b{name}": whole.cam_from_world(idx) for idx, name in enumerate(NAMES)}), there)
+    given = join_groups([first, second], order=(*first.names, *second.names), rejected={})
+    found = verify_poses(given, lambda name: load(name.removeprefix("b")))
+    found.check()
+    assert set(found.doubts) == {"b2.png"}
+    assert found.rotations.tobytes() == given.rotations.tobytes()
+    small, alone = split_groups(found)[1], verified(first)
+    assert small.names == alone.names
+    np.testing.assert_allclose(small.confirmed_shares, alone.confirmed_shares, atol=1e-9)
+
+
+def test_plain_walls_are_no_reason_to_doubt_true_poses() -> None:
+    scene = white_room(seed=3, views=4)
+    pictures = {f"{idx}.png": scene.view(idx, SIZE_HW)[0] for idx in range(4)}
+    given = poses_of(dict(zip(pictures, scene.poses, strict=True)))
+    found = verify_poses(given, lambda name: (pictures[name], WHOLE))
+    assert found.names == given.names
+    assert found.doubts == {}
+    assert found.rejected == {}
+
+
+@pytest.mark.slow
+def test_a_group_whose_pairs_contradict_one_another_is_doubted(
+    matches: Matches, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: the limit was defined and nothing read it."""
+    assert verified(displaced(), matches).doubts == {}
+    monkeypatch.setattr(arbitration, "_MIN_EXPLAINED_IN_ALL", 1.01)
+    monkeypatch.setattr(arbitration, "_MIN_EXPLAINED_BY_OTHERS", 1.01)
+    found = verified(displaced(), matches)
+    assert set(found.doubts) == set(NAMES)
+    assert all("agree with one arrangement" in reason for reason in found.doubts.values())
+
+
+def test_pictures_without_any_texture_are_no_reason_to_doubt() -> None:
+    found = verify_poses(displaced(), lambda name: (np.full((*SIZE_HW, 3), 99, np.uint8), WHOLE))
+    assert found.doubts == {}
+    assert found.confirmed_shares is not None
+    assert np.isnan(found.confirmed_shares).all()
+
+
+@pytest.mark.slow
+def test_the_same_bytes_again(matches: Matches) -> None:
+    first, second = (verified(displaced("4.png"), matches) for _ in range(2))
+    assert first.translations.tobytes() == second.translations.tobytes()
+    assert first.confirmed_shares is not None
+    assert second.confirmed_shares is not None
+    assert first.confirmed_shares.tobytes() == second.confirmed_shares.tobytes()
+    assert first.points_in_world.tobytes() == second.points_in_world.tobytes()
+
+
+def test_fixed_images_are_doubted_and_never_moved(matches: Matches) -> None:
+    model = model_of(displaced("2.png"), pairs_of(*matches))
+    before = dict(model.cameras)
+    found = arbitrate(model, Confirmation(lambda image: (PICTURES[image], WHOLE)), fixed=[2])
+    assert 2 in found.doubts
+    assert model.cameras[2] == before[2]
+    assert not found.removed
+
+
+def test_judging_changes_nothing(matches: Matches) -> None:
+    model = model_of(displaced("2.png"), pairs_of(*matches))
+    before, chosen = dict(model.cameras), dict(model.chosen)
+    found = judge(model, Confirmation(lambda image: (PICTURES[image], WHOLE)))
+    assert model.cameras == before
+    assert model.chosen == chosen
+    assert set(found.doubts) == {2}
+    assert not found.moved
+    assert found.shares[2] == min(found.shares.values())
+    assert found.mean_share() == pytest.approx(np.mean(list(found.shares.values())))

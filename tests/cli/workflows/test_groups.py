@@ -1,0 +1,191 @@
+"""Two rooms in one folder of pictures: both are delivered, each in its own frame, and everything says so."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from rich.console import Console
+
+from pano_mvs.cli.run_command import print_summary
+from pano_mvs.geometry import Similarity3, rotation_from_rotvec
+from pano_mvs.io.clouds.ply import read_ply
+from pano_mvs.io.poses.files import read_groups, read_poses
+from pano_mvs.io.ranges.files import read_range_tiff
+from pano_mvs.report.verdict import verdict
+from pano_mvs.scene.image_files.image_file import write_png
+from pano_mvs.testing.room import capture_poses, default_room, render
+from pano_mvs.viewer.shown_scene import open_scene
+from tests.cli.conftest import Command, run_json
+
+SIZE_HW = (96, 192)
+LARGE, SMALL = ("a0.png", "a1.png", "a2.png"), ("b0.png", "b1.png")
+# Another unit and another world than the truth's, as any solver would find.
+WORLDS = {
+    "a": Similarity3(0.5, rotation_from_rotvec([0.05, 0.3, 0.0]), np.array([1.0, 0.0, 2.0])),
+    "b": Similarity3(2.0, rotation_from_rotvec([0.0, -1.0, 0.1]), np.array([0.0, -1.0, 0.0])),
+}
+
+SOLVER = """\
+from pano_mvs.api import All, Context, InputPath, Panorama, Params, Poses, stage
+from pano_mvs.io.poses.files import read_poses
+from pano_mvs.scene.pose_groups import join_groups
+
+
+class TwoRoomsParams(Params):
+    path: InputPath
+
+
+@stage("poses.two_rooms")
+def two_rooms(images: All[Panorama], params: TwoRoomsParams, ctx: Context) -> Poses:
+    rooms = [read_poses(params.path / f"{room}.json") for room in "ba"]
+    return join_groups(rooms, order=tuple(images))
+"""
+
+WORKFLOW = """\
+pano_mvs: 1
+plugins: [two_rooms.py]
+stages:
+  images:   {use: source.folder, path: capture/images}
+  features: {use: features.orb_tangent, max_keypoints: 600}
+  pairs:    {use: pairs.exhaustive}
+  matches:  {use: matches.brute_force}
+  poses:    {use: poses.two_rooms, path: rooms}
+  points:   {use: poses.triangulate}
+  refined:  {use: poses.refine}
+  metres:   {use: poses.scale, baseline: {from: b0.png, to: b1.png, metres: METRES}}
+  views:    {use: views.nearest}
+  depth:    {use: depth.sweep, planes: 32}
+  checked:  {use: filters.consistency}
+  cloud:    {use: fusion.vote}
+  colmap:   {use: export.colmap}
+  ply:      {use: export.ply}
+  ranges:   {use: export.ranges}
+  previews: {use: export.previews}
+  scores:   {use: evaluate.truth, truth: capture/truth}
+"""
+
+
+def write_rooms(folder: Path) -> float:
+    """Write the pictures and the truth of two rooms, and the poses of each in its own world; return b's baseline."""
+    (folder / "capture" / "images").mkdir(parents=True)
+    (folder / "capture" / "truth").mkdir()
+    (folder / "rooms").mkdir()
+    views, depths, ours = [], {}, {"a": [], "b": []}
+    poses = dict(
+        zip(LARGE + SMALL, [*capture_poses(3, spread=0.4), *capture_poses(2, seed=3, spread=0.4)], strict=True)
+    )
+    for name, pose in poses.items():
+        picture, depths[name[:2]] = render(default_room(seed=ord(name[0])), pose, SIZE_HW, supersample=1)
+        write_png(folder / "capture" / "images" / name, picture)
+        views.append({"image": name, "R": pose.rotation.tolist(), "t": pose.translation.tolist()})
+        moved = WORLDS[name[0]].move_camera(pose)
+        ours[name[0]].append({"image": name, "R": moved.rotation.tolist(), "t": moved.translation.tolist()})
+    size = {"width": SIZE_HW[1], "height": SIZE_HW[0]}
+    (folder / "capture" / "truth" / "poses.json").write_text(json.dumps({**size, "metric": True, "views": views}))
+    np.savez(folder / "capture" / "truth" / "depth.npz", **depths)
+    for room, listed in ours.items():
+        (folder / "rooms" / f"{room}.json").write_text(json.dumps({**size, "metric": False, "views": listed}))
+    return float(np.linalg.norm(poses["b0.png"].center - poses["b1.png"].center))
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("rooms")
+    metres = write_rooms(folder)
+    (folder / "two_rooms.py").write_text(SOLVER)
+    (folder / "two.yaml").write_text(WORKFLOW.replace("METRES", f"{metres:.6f}"))
+    return folder
+
+
+@pytest.mark.slow
+def test_both_rooms_are_delivered(pano_mvs: Command, rooms: Path) -> None:
+    result = pano_mvs("run", rooms / "two.yaml", "--out", "out")
+    assert result.code == 0, result.text
+    out = Path("out")
+    poses = run_json(out)["poses"]
+    assert poses["registered"] == list(LARGE + SMALL)
+    assert [group["images"] for group in poses["groups"]] == [list(LARGE), list(SMALL)]
+    assert [group["metric"] for group in poses["groups"]] == [False, True]
+    assert (poses["metric"], poses["scale"]) == (False, poses["groups"][0]["scale"])
+    assert sum(group["points"] for group in poses["groups"]) == poses["points"]
+    first, second, *_ = poses["groups"][1]["nearest_pair"]
+    assert (first in LARGE, second in SMALL) == (True, True)
+    assert "2 groups of panoramas share no reliable connection: each has its own frame and scale" in result.flat
+    assert f"between {first} and {second}" in result.flat
+    assert f"To join them take pictures between {first} and {second}" in (out / "report.html").read_text()
+    _check_models(out, rooms)
+    _check_ranges(out, rooms)
+    _check_clouds(out, rooms)
+    _check_evaluation(pano_mvs, out, rooms)
+    assert "0 units computed" in pano_mvs("run", rooms / "two.yaml", "--out", "out").text
+
+
+def _check_models(out: Path, rooms: Path) -> None:
+    truth = read_poses(rooms / "capture" / "truth")
+    true = dict(zip(truth.names, truth.centers, strict=True))
+    for number, names in enumerate((LARGE, SMALL)):
+        model = pycolmap.Reconstruction(out / f"colmap/sparse/{number}")
+        centers = {image.name: image.projection_center() for image in model.images.values()}
+        assert centers.keys() == set(names)
+        found, wanted = (np.linalg.norm(at[names[1]] - at[names[0]]) for at in (centers, true))
+        assert found == pytest.approx((0.5 if number == 0 else 1.0) * wanted, rel=0.02)
+        assert model.num_points3D() > 20
+    assert [group.names for group in read_groups(out)] == [LARGE, SMALL]
+
+
+def _check_ranges(out: Path, rooms: Path) -> None:
+    """The large room keeps the unit that its poses had, half a metre each; the small one was scaled to metres."""
+    depths = np.load(rooms / "capture" / "truth" / "depth.npz")
+    for name in (*LARGE, *SMALL):
+        found = read_range_tiff(out / f"range/{name[:2]}.tiff")
+        ratios = (found / depths[name[:2]])[np.isfinite(found) & np.isfinite(depths[name[:2]])]
+        assert np.median(ratios) == pytest.approx(0.5 if name in LARGE else 1.0, rel=0.05), name
+        assert (out / f"confidence/{name[:2]}.png").is_file()
+        assert (out / f"preview/{name[:2]}.jpg").is_file()
+
+
+def _check_clouds(out: Path, rooms: Path) -> None:
+    clouds = [read_ply(out / name) for name in ("cloud.ply", "cloud_1.ply")]
+    assert min(map(len, clouds)) > 500
+    for number, cloud in enumerate(clouds):
+        scene = open_scene(out, group=number)
+        assert scene.cloud is not None
+        assert scene.cloud.count == len(cloud)
+        assert [camera.name for camera in scene.cameras] == [list(LARGE), list(SMALL)][number]
+        assert scene.unit == ("scene units", "m")[number]
+        assert f"shown is group {number} of 2" in scene.notes[0]
+
+
+def _check_evaluation(pano_mvs: Command, out: Path, rooms: Path) -> None:
+    scores = run_json(out)["scores"]
+    assert (scores["poses"]["registered"], scores["poses"]["registered_in_one_frame"]) == (5, 3)
+    assert all(view["median_relative_error"] < 0.05 for view in scores["views"].values())
+    told = pano_mvs("evaluate", "run", out, "--truth", rooms / "capture" / "truth")
+    assert told.code == 0, told.text
+    assert "5 of 5 registered (3 in one frame), median pair error" in told.flat
+    assert "the poses are in 2 groups, each with a frame and a scale of its own" in told.flat
+    depth = pano_mvs("evaluate", "depth", out, "--truth", rooms / "capture" / "truth", "--json")
+    views = json.loads(depth.text)["views"]
+    assert views["a0"]["scale"] == pytest.approx(2.0, rel=0.02)
+    assert views["b0"]["scale"] == pytest.approx(1.0, rel=0.02)
+    poses = pano_mvs("evaluate", "poses", out, "--truth", rooms / "capture" / "truth" / "poses.json")
+    assert "1 further groups of 2 images" in poses.flat
+
+
+def test_the_terminal_says_what_the_report_finds_of_groups(capsys: pytest.CaptureFixture[str]) -> None:
+    groups = [{"images": ["a", "b", "c"]}, {"images": ["x", "y"], "nearest_pair": ["b", "x", 0, 31]}]
+    poses = {"registered": [*"abcxy"], "rejected": {}, "points": 7, "scale": "its own", "groups": groups}
+    summary = {"units": {"run": 0, "cached": 3, "failed": 0}, "seconds": 1.0, "failures": [], "blocked": [],
+               "rejected": {}, "poses": poses, "scores": {}, "all_scores": {}, "notes": [], "stopped": "",
+               "left_over": {}, "files": {}}  # fmt: skip
+    print_summary(summary, Path("out"), Console(width=200), written=0, verdict=verdict(summary))
+    told = capsys.readouterr().out
+    assert "Usable, with doubts: see below.\ndoubtful: 2 groups of panoramas share no reliable connection" in told
+    assert "To join them take pictures between b and x (31 candidates)." in told
+    poses["groups"] = groups[:1]
+    print_summary(summary, Path("out"), Console(width=200), written=0, verdict=verdict(summary))
+    assert "reliable connection" not in capsys.readouterr().out

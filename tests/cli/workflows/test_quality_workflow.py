@@ -1,0 +1,26 @@
+"""quality.yaml goes from pictures to a cloud, and its ranges are more precise than the quickstart's."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pano_mvs.io.clouds.ply import read_ply
+from pano_mvs.io.ranges.files import read_range_tiff
+from tests.cli.conftest import SMALL, run_json
+
+
+@pytest.mark.slow
+def test_quality_is_more_precise_than_the_quickstart_on_the_same_pictures(pano_mvs, rendered, tmp_path):
+    errors = {}
+    for preset in ("quickstart", "quality"):
+        out = tmp_path / preset
+        result = pano_mvs(
+            "run", preset, "--images", rendered / "images", "--out", out, "--cache", "cache",
+            "--set", f"scores.truth={rendered / 'truth'}", *SMALL,
+        )  # fmt: skip
+        assert result.code == 0, result.text
+        errors[preset] = np.mean([view["median_relative_error"] for view in run_json(out)["scores"]["views"].values()])
+        assert all(np.isfinite(read_range_tiff(out / f"range/00{view}.tiff")).mean() > 0.95 for view in range(4))
+    assert errors["quality"] < 0.6 * errors["quickstart"]
+    assert len(read_ply(tmp_path / "quality" / "cloud.ply")) > 5000

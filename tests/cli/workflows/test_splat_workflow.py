@@ -1,0 +1,59 @@
+"""splat.yaml goes from pictures to what trainers of splats open; a second run computes nothing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from pano_mvs.io.clouds.ply import read_ply
+from pano_mvs.io.poses.files import read_poses
+from pano_mvs.io.ranges.files import read_confidence_png, read_range_tiff
+from tests.cli.conftest import SMALL, Command
+
+# What makes quality slow is tested with it.
+PLAIN_RANGES = (
+    *("--set", "slanted=null", "--set", "filled=null", "--set", "planes=null", "--set", "smooth=null"),
+    *("--set", "previews=null", "--set", "views.sources=2", "--set", "depth.cost=census", "--set", "depth.planes=16"),
+)
+
+
+@pytest.mark.slow
+def test_splat_writes_panoramas_faces_and_seeds_that_agree(pano_mvs: Command, rendered: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    arguments = ("splat", "--images", rendered / "images", "--out", out, "--executor", "serial", *SMALL, *PLAIN_RANGES,
+                 "--set", f"scores.truth={rendered / 'truth'}", "--set", "images.nadir_deg=20")  # fmt: skip
+    result = pano_mvs("run", *arguments)
+    assert result.code == 0, result.text
+    solved = read_poses(out / "colmap/sparse/0")
+    document = json.loads((out / "nerfstudio/equirectangular/transforms.json").read_text())
+    assert [frame["file_path"] for frame in document["frames"]] == [f"images/{name}.jpg" for name in solved.names]
+    read = read_poses(out / "nerfstudio/equirectangular")
+    assert read.names == solved.names  # though the pictures are written anew, under other names
+    np.testing.assert_allclose(read.translations, solved.translations, atol=1e-9)
+    for name, frame in zip(solved.names, document["frames"], strict=True):
+        stem = Path(name).stem
+        ranges, confidence = (
+            read_range_tiff(out / f"range/{stem}.tiff"),
+            read_confidence_png(out / f"confidence/{stem}.png"),
+        )
+        depth = cv2.imread(str(out / "nerfstudio/equirectangular" / frame["depth_file_path"]), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_allclose(depth[confidence >= 64] / 1000, ranges[confidence >= 64], atol=0.000501)
+        assert not depth[confidence < 64].any()
+        mask = cv2.imread(str(out / "nerfstudio/equirectangular" / frame["mask_path"]), cv2.IMREAD_UNCHANGED)
+        assert not mask[-15:].any()
+        assert not depth[mask == 0].any()
+    faces = json.loads((out / "nerfstudio/faces/transforms.json").read_text())
+    assert len(faces["frames"]) == 6 * len(document["frames"])
+    assert all((out / "nerfstudio/faces" / frame[key]).is_file() for frame in faces["frames"]
+               for key in ("file_path", "mask_path", "depth_file_path"))  # fmt: skip
+    assert len(read_ply(out / "nerfstudio/faces/seed.ply")) > 5000
+    assert len(pycolmap.Reconstruction(str(out / "colmap_dense_init/sparse/0")).points3D) > 1000
+    (out / "nerfstudio/faces/images/000.png.front.jpg").unlink()
+    again = pano_mvs("run", *arguments)
+    assert "0 units computed" in again.flat
+    assert (out / "nerfstudio/faces/images/000.png.front.jpg").is_file()

@@ -1,0 +1,55 @@
+"""Packed references to blobs are those that were packed."""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections.abc import Callable
+
+import pytest
+
+from pano_mvs.engine.cache.blobs import BlobRef
+from pano_mvs.engine.cache.packed_parts import PackedParts
+
+PARTS = {
+    "meta": BlobRef("0" * 32, 0, ".json"),
+    "image": BlobRef("f0" * 16, 123, ".jpg", external=True),
+    "array": BlobRef("0123456789abcdef" * 2, (1 << 50) - 1, ".npy"),
+    "0": BlobRef("1" * 32, 255, ""),
+}
+
+
+@pytest.mark.parametrize("names", [[], ["array"], list(PARTS), list(reversed(PARTS))])
+def test_packed_parts_equal_a_dict_of_the_same(names: list[str]) -> None:
+    parts = {name: PARTS[name] for name in names}
+    packed = PackedParts(parts)
+    assert list(packed.items()) == list(parts.items())
+    assert packed == parts
+    assert parts == packed
+    assert packed == PackedParts(parts)
+    assert repr(packed) == repr(parts)
+
+
+def test_packed_parts_differ_in_any_field() -> None:
+    packed = PackedParts(PARTS)
+    for name, ref in PARTS.items():
+        others = [
+            BlobRef("2" * 32, ref.size_bytes, ref.suffix, ref.external),
+            BlobRef(ref.digest, ref.size_bytes ^ 1, ref.suffix, ref.external),
+            BlobRef(ref.digest, ref.size_bytes, ".other", ref.external),
+            BlobRef(ref.digest, ref.size_bytes, ref.suffix, not ref.external),
+        ]
+        assert all(packed != PackedParts(PARTS | {name: other}) for other in others)
+    with pytest.raises(KeyError, match="nothing"):
+        packed["nothing"]
+
+
+def test_packed_parts_take_a_third_of_the_memory_of_a_dict() -> None:
+    def bytes_of(make: Callable[[dict[str, BlobRef]], object]) -> int:
+        tracemalloc.start()
+        held = [make({name: BlobRef(f"{idx:032x}", 1000 + idx, ".npy") for name in PARTS}) for idx in range(100)]
+        found, _ = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert len(held) == 100
+        return found
+
+    assert 3 * bytes_of(PackedParts) < bytes_of(dict)

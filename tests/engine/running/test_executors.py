@@ -1,0 +1,405 @@
+"""All executors do the same: values, records, failures and their order do not depend on who computes, or when."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from pano_mvs.core.errors import GateError, InputError, PanoMvsError, UsageError
+from pano_mvs.engine.cache.store import Store
+from pano_mvs.engine.executors import choose, worker_process
+from pano_mvs.engine.executors.choose import make_executor
+from pano_mvs.engine.executors.processes import ProcessExecutor
+from pano_mvs.engine.executors.protocol import Executor
+from pano_mvs.engine.executors.serial import SerialExecutor
+from pano_mvs.engine.executors.threads import bound_environment, share_cores
+from pano_mvs.engine.running.events import RunResult, Silent
+from pano_mvs.engine.running.run import Run
+from tests.engine.conftest import Toy, ran
+from tests.engine.running.test_run import ALL_UNITS
+
+Make = Callable[[Store], Executor]
+
+
+def two_processes(store: Store) -> Executor:
+    return ProcessExecutor(store, workers=2, threads=1)
+
+
+def run_with(toy: Toy, make: Make, *overrides: str, name: str = "x", observer: Silent | None = None) -> RunResult:
+    """Run into a folder and a store of the name's own."""
+    session = toy.session(*overrides, cache=toy.folder / f"cache-{name}")
+    store = Store(session.store_root)
+    executor = make(store)
+    try:
+        out = toy.folder / f"out-{name}"
+        return Run(session.workflow, session.graph, store, out, observer=observer, executor=executor).execute()
+    finally:
+        executor.close()
+
+
+def files_below(folder: Path) -> dict[str, bytes]:
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def keys_and_outputs(store: Path) -> dict[str, object]:
+    """Return what the records of a store say, without the times."""
+    found = {}
+    for path in (store / "records").rglob("*.json"):
+        record = json.loads(path.read_bytes().partition(b"\n")[2])
+        found[path.name] = record | {"seconds": 0}
+    return found
+
+
+def told(result: RunResult) -> object:
+    """Return all that a result says, in its order, without the times and the folders."""
+    stages = [(s.name, s.units, s.run, s.failed, s.blocked, s.metrics, s.unit_metrics, s.notes) for s in result.stages]
+    failures = [(f.stage, f.item, f.cause, f.consequence, f.blocked) for f in result.failures]
+    return (
+        stages,
+        failures,
+        result.exit_code,
+        result.stopped,
+        dict(result.published),
+        result.written,
+        [result.rejected, result.doubts],
+    )
+
+
+# Slow tests of dask run before the slow ones here, and its loops are collected late.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize(
+    "workers", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(4, marks=pytest.mark.slow)]
+)
+def test_processes_give_the_bytes_of_serial(toy: Toy, workers: int) -> None:
+    serial = run_with(toy, SerialExecutor, name="serial")
+    side_by_side = run_with(toy, lambda store: ProcessExecutor(store, workers=workers, threads=1), name="processes")
+    assert ran(side_by_side) == ALL_UNITS
+    assert told(side_by_side) == told(serial)
+    assert files_below(toy.folder / "out-processes") == files_below(toy.folder / "out-serial")
+    assert keys_and_outputs(toy.folder / "cache-processes") == keys_and_outputs(toy.folder / "cache-serial")
+
+
+def test_what_fails_is_told_the_same_in_the_same_order(toy: Toy) -> None:
+    toy.number("2.txt", "13")
+    toy.number("4.txt", "not a number")
+    serial = run_with(toy, SerialExecutor, name="serial")
+    side_by_side = run_with(toy, two_processes, name="processes")
+    assert serial.exit_code == 3
+    assert [(f.stage, f.item) for f in serial.failures][:2] == [("images", "4.txt"), ("scaled", "2.txt")]
+    assert told(side_by_side) == told(serial)
+    assert "ValueError" in side_by_side.failures[0].trace
+
+
+def test_unit_starts_before_the_stage_before_it_is_complete(toy: Toy) -> None:
+    """The second stage's first unit is waited for by the last unit of the first: a barrier would stop it for ever."""
+    seen = toy.folder / "seen"
+    toy.edit("plug.py", lambda text: text.replace(
+        '    """Read a number."""',
+        f'''    """Read a number."""
+    import pathlib
+    while item.name == "5.txt" and not pathlib.Path({str(seen)!r}).exists(): time.sleep(0.01)'''))  # fmt: skip
+    touch = f"import pathlib; pathlib.Path({str(seen)!r}).touch()"
+    toy.edit("plug.py", lambda text: text.replace('"""Multiply."""', f'"""Multiply."""\n    {touch}'))
+    result = run_with(toy, two_processes, "images.timeout_s=60")
+    assert result.exit_code == 0
+    assert ran(result) == ALL_UNITS
+
+
+def kill_once(toy: Toy, *, when: str = "x.value == 30", how: str = "os.kill(os.getpid(), 9)") -> None:
+    """Let the worker that multiplies a certain number die the first time."""
+    mark = toy.folder / "died"
+    toy.edit("plug.py", lambda text: text.replace(
+        '    """Multiply."""',
+        f'''    """Multiply."""
+    import pathlib
+    if {when} and not pathlib.Path({str(mark)!r}).exists():
+        pathlib.Path({str(mark)!r}).touch()
+        {how}'''))  # fmt: skip
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
+def test_killed_worker_costs_one_try(toy: Toy) -> None:
+    kill_once(toy)
+    result = run_with(toy, two_processes)
+    assert result.exit_code == 0
+    assert ran(result) == ALL_UNITS
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
+def test_unit_that_kills_its_worker_again_is_listed_and_the_others_go_on(toy: Toy) -> None:
+    toy.edit("plug.py", lambda text: text.replace('    """Multiply."""', '''    """Multiply."""
+    print("about to go")
+    if x.value == 30: os.kill(os.getpid(), 9)'''))  # fmt: skip
+    result = run_with(toy, two_processes)
+    assert result.exit_code == 3
+    failure = next(f for f in result.failures if f.stage == "scaled")
+    assert (failure.item, failure.said) == ("3.txt", ("about to go",))
+    assert "SIGKILL" in failure.cause
+    assert ran(result)["scaled"] == 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("how", "cause"), [("os._exit(0)", "exit code 0"), ("os.abort()", "killed by SIGABRT")])
+def test_a_unit_that_ends_its_process_fails_with_one_worker_too(toy: Toy, how: str, cause: str) -> None:
+    """One worker was no process: os._exit(0) in a stage ended the run with exit code 0 and without a report."""
+    toy.edit("plug.py", lambda text: text.replace('    """Multiply."""', f'''    """Multiply."""
+    if x.value == 30:
+        {how}'''))  # fmt: skip
+    result = run_with(toy, lambda store: make_executor(store, workers=1, threads=1))
+    (failure,) = (f for f in result.failures if f.stage == "scaled")
+    assert (failure.item, result.exit_code) == ("3.txt", 3)
+    assert f"its worker process died ({cause})" in failure.cause
+    assert ran(result)["scaled"] == 4
+
+
+@pytest.mark.parametrize("make", [SerialExecutor, two_processes])
+def test_a_stage_that_calls_sys_exit_is_a_unit_that_failed(toy: Toy, make: Make) -> None:
+    toy.edit("plug.py", lambda text: text.replace('    """Multiply."""', '''    """Multiply."""
+    if x.value == 30: raise SystemExit(0)'''))  # fmt: skip
+    result = run_with(toy, make)
+    failure = next(f for f in result.failures if f.stage == "scaled")
+    assert (failure.item, result.exit_code) == ("3.txt", 3)
+    assert "SystemExit: 0" in failure.cause
+
+
+@pytest.mark.slow
+def test_an_import_that_ends_the_worker_costs_the_units_that_need_it(toy: Toy) -> None:
+    exits = "import os, sys\nif 'pano_mvs.engine.executors.worker' in sys.modules: os._exit(0)\n"
+    toy.edit("plug.py", lambda text: exits + text)
+    with pytest.raises(InputError, match=r"(?s)none of the 5 items.*its worker process died \(exit code 0\)"):
+        run_with(toy, two_processes)
+
+
+@pytest.mark.parametrize("make", [SerialExecutor, two_processes])
+@pytest.mark.parametrize("kind", ["BaseException", "Exception"])
+def test_whatever_a_stage_raises_is_a_unit_that_failed(toy: Toy, make: Make, kind: str) -> None:
+    toy.edit("plug.py", lambda text: text.replace('    """Multiply."""', f'''    """Multiply."""
+    class Odd({kind}):
+        def __str__(self):
+            return 1 / 0
+    if x.value == 30: raise Odd'''))  # fmt: skip
+    result = run_with(toy, make)
+    failure = next(f for f in result.failures if f.stage == "scaled")
+    assert failure.item == "3.txt"
+    assert "Odd: (its message cannot be shown: ZeroDivisionError)" in failure.cause
+    assert ran(result)["scaled"] == 4
+
+
+def test_timeout_ends_the_unit_and_not_the_run(toy: Toy) -> None:
+    kill_once(toy, when="x.value == 20", how="time.sleep(600)")
+    (toy.folder / "died").unlink(missing_ok=True)
+    started = time.monotonic()
+    result = run_with(toy, two_processes, "scaled.timeout_s=1")
+    assert time.monotonic() - started < 60
+    failure = next(f for f in result.failures if f.stage == "scaled")
+    assert failure.item == "2.txt"
+    assert "timeout_s: 1" in failure.cause
+
+
+def test_serial_says_that_it_keeps_no_timeouts(toy: Toy) -> None:
+    result = run_with(toy, SerialExecutor, "scaled.timeout_s=1")
+    assert any("timeout_s of scaled is not kept" in warning for warning in result.warnings)
+
+
+@pytest.mark.slow
+def test_processes_are_replaced_after_so_many_units(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[int] = []
+    start = worker_process.WorkerProcess._start
+
+    def counted(self: worker_process.WorkerProcess) -> object:
+        process = start(self)
+        started.append(process.pid)
+        return process
+
+    monkeypatch.setattr(worker_process.WorkerProcess, "_start", counted)
+    result = run_with(toy, lambda store: ProcessExecutor(store, workers=1, threads=1, units_per_process=10))
+    assert ran(result) == ALL_UNITS
+    assert len(started) == 3  # 28 units
+    assert not any(_runs(pid) for pid in started)
+
+
+def _runs(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except OSError:
+        return False
+    return True
+
+
+def test_damaged_blob_is_reported_and_its_producer_computed_again(toy: Toy) -> None:
+    run_with(toy, SerialExecutor, "scaled.by=5", name="clean")
+    run_with(toy, SerialExecutor)
+    blobs = (toy.folder / "cache-x" / "blobs").rglob("*.json")
+    damaged = next(path for path in blobs if b'"value":40.0' in path.read_bytes())  # read from 4.txt
+    damaged.write_bytes(damaged.read_bytes().replace(b"4", b"6"))
+    again = run_with(toy, two_processes, "scaled.by=5")
+    assert again.exit_code == 0
+    assert any(damaged.name in warning for warning in again.warnings)
+    assert ran(again)["images"] == 1
+    assert files_below(toy.folder / "out-x") == files_below(toy.folder / "out-clean")
+
+
+@pytest.mark.slow
+def test_policies_mean_the_same_in_processes(toy: Toy) -> None:
+    toy.number("3.txt", "13")
+    stopped = run_with(toy, two_processes, "scaled.on_error=stop")
+    assert stopped.exit_code == GateError.exit_code
+    assert "unlucky" in stopped.stopped
+    gated = run_with(toy, two_processes, "scaled.min_success=0.9")
+    assert "min_success is 0.9" in gated.stopped
+    assert not {"difference", "shifted", "mean"} & set(ran(gated)), "nothing follows a stage before it has passed"
+
+
+@pytest.mark.slow
+def test_retries_are_as_many_as_the_workflow_says(toy: Toy) -> None:
+    count = toy.folder / "count"
+    toy.edit("plug.py", lambda text: text.replace(
+        '    """Multiply."""',
+        f'''    """Multiply."""
+    if x.value == 30:
+        with open({str(count)!r}, "a") as file: file.write("x")
+        raise ValueError("again")'''))  # fmt: skip
+    assert run_with(toy, two_processes, "scaled.retries=2").exit_code == 3
+    assert count.read_text() == "xxx"
+
+
+def test_declared_memory_bounds_how_many_run_at_a_time(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = toy.folder / "log"
+    toy.edit("plug.py", lambda text: text.replace(
+        '    """Mean of the neighbours and the own."""',
+        f'''    """Mean of the neighbours and the own."""
+    with open({str(log)!r}, "a") as file: file.write("+")
+    time.sleep(0.05)
+    with open({str(log)!r}, "a") as file: file.write("-")'''))  # fmt: skip
+    monkeypatch.setattr(ProcessExecutor, "free_memory_bytes", lambda self: 3_000_000_000)
+    result = run_with(toy, lambda store: ProcessExecutor(store, workers=3, threads=1), "mean.memory=2GB")
+    assert result.exit_code == 0
+    assert log.read_text() == "+-" * 5
+    monkeypatch.setattr(SerialExecutor, "free_memory_bytes", lambda self: 3_000_000_000)
+    refused = run_with(toy, SerialExecutor, "mean.memory=4 GB", name="y")
+    failure = next(f for f in refused.failures if f.stage == "mean")
+    assert "declares 4.0 GB of memory, and 3.0 GB are free" in failure.cause
+    assert ran(refused)["difference"] == 4
+
+
+def test_stage_may_declare_its_memory(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(SerialExecutor, "free_memory_bytes", lambda self: 1_000_000)
+    toy.edit("plug.py", lambda text: text.replace('@stage("toy.mean")', '@stage("toy.mean", memory="2MB")'))
+    assert run_with(toy, SerialExecutor).exit_code == 3
+    assert run_with(toy, SerialExecutor, "mean.memory=1MB").exit_code == 0
+
+
+def test_memory_may_depend_on_settings_and_inputs(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(SerialExecutor, "free_memory_bytes", lambda self: 1_000_000)
+    toy.edit("plug.py", lambda text: text.replace(
+        '@stage("toy.mean")',
+        'def needed(params, inputs):\n    return 2_000_000 * (inputs["own"].value > 50 and bool(inputs["around"]))\n\n'
+        '@stage("toy.mean", memory=needed)',
+    ))  # fmt: skip
+    result = run_with(toy, SerialExecutor)
+    refused = [failure for failure in result.failures if failure.stage == "mean"]
+    assert all("declares 2 MB of memory, and 1 MB are free" in failure.cause for failure in refused)
+    assert 0 < len(refused) < 5
+    assert not run_with(toy, SerialExecutor, "mean.memory=1MB", name="y").failures
+
+
+def test_what_a_unit_prints_is_kept_whoever_prints_it(toy: Toy) -> None:
+    toy.edit("plug.py", lambda text: text.replace('    """Multiply."""', '''    """Multiply."""
+    import ctypes, logging, sys
+    print("from Python")
+    sys.stderr.write("to the error stream\\n")
+    logging.getLogger("toy").info("from logging")
+    os.write(2, b"from a descriptor\\n")
+    ctypes.CDLL(None).puts(b"from C")'''))  # fmt: skip
+    for name, make in {"serial": SerialExecutor, "processes": two_processes}.items():
+        assert run_with(toy, make, name=name).exit_code == 0
+        text = (toy.folder / f"out-{name}" / "logs" / "scaled" / "3.txt.log").read_text()
+        assert sorted(text.splitlines()) == sorted([
+            "from Python", "to the error stream", "INFO toy: from logging", "from a descriptor", "from C",
+        ])  # fmt: skip
+    assert not list((toy.folder / "cache-processes" / "tmp").iterdir()), "nothing is left in the store"
+
+
+@pytest.mark.slow
+def test_stage_that_changed_meanwhile_is_not_mistaken_for_the_old_one(toy: Toy) -> None:
+    session = toy.session()
+    toy.edit("plug.py", lambda text: text.replace("2 * ", "3 * ").replace("* params.by / 2", "* params.by / 3"))
+    store = Store(session.store_root)
+    executor = two_processes(store)
+    try:
+        with pytest.raises(UsageError, match="not the same in the worker"):
+            Run(session.workflow, session.graph, store, toy.folder / "out", executor=executor).execute()
+    finally:
+        executor.close()
+
+
+def test_workers_that_do_not_start_end_the_run(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker_process, "_BOOT", "raise SystemExit('no room for a worker')")
+    with pytest.raises(PanoMvsError, match="no room for a worker"):
+        run_with(toy, two_processes)
+
+
+def test_workers_times_threads_are_the_cores() -> None:
+    assert share_cores(8) == (8, 1)
+    assert share_cores(8, workers=2) == (2, 4)
+    assert share_cores(8, threads=3) == (2, 3)
+    assert share_cores(2, workers=5) == (5, 1)
+    assert share_cores(4, workers=2, threads=1) == (2, 1)
+
+
+def test_libraries_are_bound_by_the_environment_and_the_user_may_bind_them_further() -> None:
+    environment = {"OMP_NUM_THREADS": "2", "NUMBA_NUM_THREADS": "64"}
+    bound_environment(environment, 4)
+    assert environment["OMP_NUM_THREADS"] == "2"
+    assert environment["NUMBA_NUM_THREADS"] == "4"
+    assert environment["OPENBLAS_NUM_THREADS"] == "1"
+
+
+def test_executors_are_chosen_by_name_and_contradictions_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = Store(tmp_path)
+    assert make_executor(store, "serial").name == "serial"
+    assert make_executor(store, workers=3).capacity == 3
+    one = make_executor(store, workers=1)
+    assert (one.name, one.capacity) == ("processes", 1)
+    monkeypatch.delenv("PANO_MVS_EXECUTOR")
+    monkeypatch.setattr(choose, "available_threads", lambda: 1)
+    assert make_executor(store).name == "processes"
+    with pytest.raises(UsageError, match="there is no executor 'thread'"):
+        make_executor(store, "thread")
+    with pytest.raises(UsageError, match="one unit at a time"):
+        make_executor(store, "serial", workers=2)
+    with pytest.raises(UsageError, match="--scheduler is dask's"):
+        make_executor(store, "processes", scheduler="tcp://somewhere:8786")
+
+
+def test_nothing_of_a_cancelled_run_goes_on(toy: Toy) -> None:
+    """An error in the middle ends the units in flight and the processes."""
+    toy.edit("plug.py", lambda text: text.replace('    """Multiply."""', '''    """Multiply."""
+    if x.value == 10: raise ValueError("stop here")
+    time.sleep(600)'''))  # fmt: skip
+    before = threading.active_count()
+    started = time.monotonic()
+    assert run_with(toy, two_processes, "scaled.on_error=stop").exit_code == GateError.exit_code
+    assert time.monotonic() - started < 60
+    assert threading.active_count() == before
+
+
+@pytest.mark.slow
+def test_same_work_twice_is_done_once(toy: Toy) -> None:
+    """Two pictures of the same content have the same key; side by side they must not both be computed."""
+    shutil.copy(toy.folder / "capture" / "1.txt", toy.folder / "capture" / "0.txt")
+    toy.edit("plug.py", lambda text: text.replace('"""Multiply."""', '"""Multiply."""\n    time.sleep(0.05)'))
+    serial = run_with(toy, SerialExecutor, name="serial")
+    side_by_side = run_with(toy, two_processes, name="processes")
+    assert told(side_by_side) == told(serial)
+    assert keys_and_outputs(toy.folder / "cache-processes") == keys_and_outputs(toy.folder / "cache-serial")

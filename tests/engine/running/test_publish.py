@@ -1,0 +1,162 @@
+"""Where files land: the placeholders of their targets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import permutations
+from pathlib import Path
+
+import pytest
+
+from pano_mvs.core.errors import ContractError
+from pano_mvs.core.files import OUTPUT_MARK
+from pano_mvs.engine.cache.store import Store
+from pano_mvs.engine.running.publish import NameClashError, Publisher
+from pano_mvs.scene import Files
+
+
+def test_item_is_the_name_without_extension_and_name_all_of_it(tmp_path: Path) -> None:
+    """Two images that differ in their extensions alone keep them in both."""
+    store, publisher = Store(tmp_path / "cache"), Publisher(tmp_path / "out", Store(tmp_path / "cache"))
+    names = ["a/1.jpg", "b/{name}.png", "2.jpg", "2.png"]
+    publisher.name_items(names)
+    for name in names:
+        path = tmp_path / "text.txt"
+        path.write_text(name)
+        publisher.publish("toy", name, store.put_value(Files({"short/{item}.txt": path, "long/{name}.txt": path})))
+    assert {path: (tmp_path / "out" / path).read_text() for path in publisher.written} == {
+        "short/a/1.txt": "a/1.jpg", "long/a/1.jpg.txt": "a/1.jpg",
+        "short/2.jpg.txt": "2.jpg", "long/2.jpg.txt": "2.jpg", "short/2.png.txt": "2.png", "long/2.png.txt": "2.png",
+        "short/b/{name}.txt": "b/{name}.png", "long/b/{name}.png.txt": "b/{name}.png",
+    }  # fmt: skip
+
+
+def test_folders_that_stale_files_leave_empty_go_with_them(tmp_path: Path) -> None:
+    """Only these: what holds anything else stays, and so does an empty folder of somebody else's."""
+    out = tmp_path / "out"
+    names = ["gone/deep/1.txt", "gone/2.txt", "kept/deep/3.txt", "edited/4.txt", "top.txt"]
+    for name in names:
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_text(name)
+    publisher = Publisher(out, Store(tmp_path / "cache"))
+    earlier = {name: publisher.store.stat_cache.digest(out / name) for name in names}
+    for folder in ("theirs", "kept/theirs"):
+        (out / folder).mkdir()
+    (out / "edited" / "4.txt").write_text("my own notes")
+    assert publisher.remove_stale(earlier) == [name for name in names if name != "edited/4.txt"]
+    left = {path.relative_to(out).as_posix() for path in out.rglob("*") if path.name != OUTPUT_MARK}
+    assert left == {"kept", "kept/theirs", "theirs", "edited", "edited/4.txt"}
+    assert publisher.remove_stale({"top.txt": earlier["top.txt"]}) == []
+    assert out.is_dir()
+
+
+def test_a_linked_folder_and_what_it_leads_to_stay(tmp_path: Path) -> None:
+    out, outside = tmp_path / "out", tmp_path / "outside"
+    (out / "real").mkdir(parents=True)
+    outside.mkdir()
+    (out / "inner").symlink_to(out / "real", target_is_directory=True)
+    (out / "outer").symlink_to(outside, target_is_directory=True)
+    publisher = Publisher(out, Store(tmp_path / "cache"))
+    for folder in (out / "real", outside):
+        (folder / "1.txt").write_text("1")
+    digest = publisher.store.stat_cache.digest(outside / "1.txt")
+    assert publisher.remove_stale({"inner/1.txt": digest, "outer/1.txt": digest}) == ["inner/1.txt"]
+    assert (out / "inner").is_dir()
+    assert (outside / "1.txt").is_file()
+
+
+def delivered(tmp_path: Path, publisher: Publisher, store: Store, item: str, *targets: str) -> Mapping[str, str]:
+    path = tmp_path / "text.txt"
+    path.write_text(item)
+    return publisher.publish("toy", item, store.put_value(Files(dict.fromkeys(targets, path))))
+
+
+def files_in(out: Path) -> dict[str, str]:
+    files = (path for path in out.rglob("*") if path.is_file() and path.name != OUTPUT_MARK)
+    return {path.relative_to(out).as_posix(): path.read_text() for path in files}
+
+
+@pytest.mark.parametrize("order", list(permutations(["1.jpg", "2.jpg", "10.jpg"])))
+def test_of_two_units_with_one_file_the_first_of_the_capture_has_it(tmp_path: Path, order: tuple[str, ...]) -> None:
+    """Whichever was computed first: the output is the same with any number of workers."""
+    store = Store(tmp_path / "cache")
+    publisher = Publisher(tmp_path / "out", store)
+    publisher.name_items(["1.jpg", "2.jpg", "10.jpg"])
+    failed: dict[str, str] = {}
+    for item in order:
+        own = {"2.jpg": "b.txt", "1.jpg": "fixed.txt", "10.jpg": "fixed.txt"}[item]
+        try:
+            failed |= delivered(tmp_path, publisher, store, item, own, f"more/{item}.txt")
+        except NameClashError as error:
+            failed[item] = str(error)
+    assert failed.keys() == {"10.jpg"}
+    assert "fixed.txt is delivered for 1.jpg too. Rename one of the images" in failed["10.jpg"]
+    expected = {"fixed.txt": "1.jpg", "more/1.jpg.txt": "1.jpg", "b.txt": "2.jpg", "more/2.jpg.txt": "2.jpg"}
+    assert files_in(tmp_path / "out") == expected
+    assert publisher.published.keys() == expected.keys() == set(publisher.written)
+
+
+@pytest.mark.parametrize("order", [["a", "b"], ["b", "a"]])
+def test_a_file_where_another_unit_needs_a_folder_costs_that_unit(tmp_path: Path, order: list[str]) -> None:
+    store = Store(tmp_path / "cache")
+    publisher = Publisher(tmp_path / "out", store)
+    publisher.name_items(["a", "b"])
+    targets, why = {"a": "x.tiff", "b": "x.tiff/y.tiff"}, ""
+    for item in order:
+        try:
+            why += delivered(tmp_path, publisher, store, item, targets[item]).get("b", "")
+        except NameClashError as error:
+            why += str(error)
+    assert "x.tiff, as a file and as a folder, is delivered for a too" in why
+    assert files_in(tmp_path / "out") == {"x.tiff": "a"}
+
+
+@pytest.mark.parametrize(
+    ("targets", "what"),
+    [
+        (("{item}.txt", "./{item}.txt"), r"it delivers a\.txt twice"),
+        (("{item}.txt", "a.txt"), r"it delivers a\.txt twice"),
+        (("b", "b/c.txt"), r"it delivers b as a file and b/c\.txt inside of it"),
+    ],
+)
+def test_a_unit_that_names_a_file_twice_delivers_nothing(tmp_path: Path, targets: tuple[str, str], what: str) -> None:
+    store = Store(tmp_path / "cache")
+    publisher = Publisher(tmp_path / "out", store)
+    publisher.name_items(["a.png"])
+    with pytest.raises(NameClashError, match=what):
+        delivered(tmp_path, publisher, store, "a.png", *targets)
+    assert files_in(tmp_path / "out") == {}
+
+
+def test_an_image_and_a_folder_of_images_called_alike_do_not_clash(tmp_path: Path) -> None:
+    """`000.png` beside `000.tiff/x.png`: a run that wrote TIFF files ended with a message about something else."""
+    store = Store(tmp_path / "cache")
+    publisher = Publisher(tmp_path / "out", store)
+    names = ["000.png", "000.tiff/x.png", "001.png", "b/2.v1.png", "b/2.png/y.png"]
+    publisher.name_items(names)
+    for name in names:
+        assert not delivered(tmp_path, publisher, store, name, "range/{item}.tiff")
+    assert files_in(tmp_path / "out") == {
+        "range/000.png.tiff": "000.png",
+        "range/000.tiff/x.tiff": "000.tiff/x.png",
+        "range/001.tiff": "001.png",
+        "range/b/2.v1.tiff": "b/2.v1.png",
+        "range/b/2.png/y.tiff": "b/2.png/y.png",
+    }
+
+
+@pytest.mark.parametrize("target", ["run.json", "Report.HTML", "logs/{item}.txt", "{item}", ".pano-mvs-output",
+                                    "sub/.pano-mvs-output", ".tmp-1-2-x", "run.json/x"])  # fmt: skip
+def test_what_is_the_runs_own_is_not_delivered(tmp_path: Path, target: str) -> None:
+    store = Store(tmp_path / "cache")
+    publisher = Publisher(tmp_path / "out", store)
+    publisher.name_items(["report.html.png"])
+    path = tmp_path / "text.txt"
+    path.write_text("x")
+    files = store.put_value(Files({"a.txt": path, target: path}))
+    with pytest.raises(ContractError, match="which is the run's own"):
+        publisher.publish("toy", "report.html.png", files)
+    assert publisher.written == []
+    if not target.rpartition("/")[2].startswith("."):  # marks and temporary files are the run's in any folder
+        publisher.publish("toy", "report.html.png", files, to="results")
+        assert len(publisher.written) == 2

@@ -1,0 +1,203 @@
+"""Which pictures a capture has, and which of them are panoramas."""
+
+import struct
+
+import cv2
+import numpy as np
+import pytest
+
+from pano_mvs.core.errors import InputError
+from pano_mvs.core.files import CACHE_MARK
+from pano_mvs.engine.cache.store import Store
+from pano_mvs.io.images import captures
+from pano_mvs.io.images.captures import describe_picture, list_pictures, natural_key
+from pano_mvs.scene import FilePart, Panorama
+from tests.io.images.pictures import by_pillow, full_sphere, picture, sound_files, write_jpeg, write_png, xmp
+from tests.permissions import permissions_hold
+
+
+def test_pictures_come_in_the_order_in_which_people_count(tmp_path):
+    names = ["b/1.jpg", "B10.jpg", "a2.JPG", "a10.png", "A1.tif", "b2.webp", "a2b.jpeg", "a/3.tiff"]
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    for ignored in (".hidden.jpg", ".cache/x.jpg", "masks/a2.png", "b/Masks/1.png", "notes.txt", "masks.txt"):
+        (tmp_path / ignored).parent.mkdir(exist_ok=True)
+        (tmp_path / ignored).touch()
+    (tmp_path / "folder.jpg").mkdir()
+    found = [path.relative_to(tmp_path).as_posix() for path in list_pictures(tmp_path)]
+    assert found == ["A1.tif", "a2.JPG", "a2b.jpeg", "a10.png", "a/3.tiff", "b2.webp", "B10.jpg", "b/1.jpg"]
+
+
+def test_a_folder_under_a_hidden_one_is_not_hidden(tmp_path):
+    inside = tmp_path / ".photos" / "lobby"
+    inside.mkdir(parents=True)
+    (inside / "1.jpg").touch()
+    assert list_pictures(inside) == [inside / "1.jpg"]
+
+
+def test_names_that_differ_only_in_case_or_zeros_keep_one_order():
+    names = ["img_1", "IMG_1", "img_01", "img_²"]
+    assert len({tuple(map(str, natural_key(name))) for name in names}) == 4
+    backwards = ["img_²", "img_01", "IMG_1", "img_1"]
+    assert sorted(names, key=natural_key) == sorted(backwards, key=natural_key)
+
+
+def test_caches_are_no_part_of_the_capture(tmp_path):
+    """Their masks and previews were taken for images on the second run."""
+    Store(tmp_path / "new")
+    Store(tmp_path / "deep" / "old")
+    (tmp_path / "deep" / "old" / CACHE_MARK).unlink()  # as versions without the mark left it
+    for folder in ("blobs", "records"):
+        (tmp_path / "deep" / "old" / folder).mkdir()
+    for name in ("1.jpg", "deep/2.jpg", "new/blobs/ab/3.png", "deep/old/blobs/ab/4.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    assert [path.relative_to(tmp_path).as_posix() for path in list_pictures(tmp_path)] == ["1.jpg", "deep/2.jpg"]
+    with pytest.raises(InputError, match=r"new: this is a cache of pano-mvs.* move them to a folder of their own"):
+        list_pictures(tmp_path / "new")
+
+
+@pytest.mark.parametrize("mode", [0o000, 0o400])
+def test_a_subfolder_that_cannot_be_read_costs_what_it_holds(tmp_path, mode):
+    """A `lost+found` ended the run."""
+    for name in ("1.jpg", "lost+found/2.jpg", "z/3.jpg"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    (tmp_path / "lost+found").chmod(mode)
+    notes = []
+    with permissions_hold():
+        found = [path.relative_to(tmp_path).as_posix() for path in list_pictures(tmp_path, notes)]
+    (tmp_path / "lost+found").chmod(0o700)
+    if mode:  # its names can be listed, and reading the file then says what is wrong
+        assert (found, notes) == (["1.jpg", "lost+found/2.jpg", "z/3.jpg"], [])
+    else:
+        assert found == ["1.jpg", "z/3.jpg"]
+        assert notes == [f"{tmp_path / 'lost+found'}: cannot be listed (Permission denied); what it holds is left out"]
+
+
+def test_a_folder_that_cannot_be_read_is_an_error(tmp_path):
+    (tmp_path / "photos").mkdir(mode=0o000)
+    with permissions_hold(), pytest.raises(InputError, match=r"photos: cannot be listed \(Permission denied\)"):
+        list_pictures(tmp_path / "photos")
+    (tmp_path / "photos").chmod(0o700)
+
+
+@pytest.mark.parametrize(("folder", "what"), [("gone", "no such folder"), ("empty", "no pictures here")])
+def test_a_folder_without_pictures_is_named(tmp_path, folder, what):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=f"{folder}: {what}"):
+        list_pictures(tmp_path / folder)
+
+
+def test_a_panorama_that_says_so_needs_no_warning(tmp_path):
+    info = describe_picture(write_jpeg(tmp_path / "a.jpg", (32, 64), xmp(full_sphere(32, 64))))
+    assert (info.size_hw, info.file_size_hw, info.crop_ltwh, info.warnings) == ((32, 64), (32, 64), None, ())
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tiff", "webp"])
+def test_twice_as_wide_as_high_is_a_panorama_with_a_warning(tmp_path, suffix):
+    path = tmp_path / f"a.{suffix}"
+    cv2.imwrite(str(path), picture((32, 64)))
+    info = describe_picture(path)
+    assert info.size_hw == (32, 64)
+    assert info.gpano is None
+    assert info.warnings == ()
+    assert "no GPano metadata" in info.traits[0]
+
+
+def test_headers_are_read_without_decoding(tmp_path, monkeypatch):
+    monkeypatch.setattr(captures, "decode_image", None)
+    write_jpeg(tmp_path / "a.jpg", (32, 64))
+    write_jpeg(tmp_path / "b.jpg", (32, 64), progressive=True)
+    write_png(tmp_path / "c.png", (32, 64))
+    for number, data in enumerate([*sound_files((32, 64), b""), by_pillow((32, 64), "WEBP"),
+                                   by_pillow((32, 64), "WEBP", lossless=True)]):  # fmt: skip
+        (tmp_path / f"{number}.webp").write_bytes(data)
+    for path in tmp_path.iterdir():
+        assert describe_picture(path).size_hw == (32, 64), path
+
+
+def test_tables_before_the_frame_are_no_frame(tmp_path):
+    """Some encoders write their Huffman tables (marker C4, among the frames' markers) first."""
+    data = write_jpeg(tmp_path / "a.jpg", (32, 64)).read_bytes()
+    table = data[data.index(b"\xff\xc4") :]
+    table = table[: 2 + int.from_bytes(table[2:4], "big")]
+    (tmp_path / "a.jpg").write_bytes(data[:2] + table + data[2:])
+    assert describe_picture(tmp_path / "a.jpg").size_hw == (32, 64)
+
+
+def test_the_output_of_an_earlier_run_is_no_part_of_the_capture(tmp_path):
+    """Its previews lay among the pictures where the output folder was made below the capture."""
+    for name in (
+        "1.jpg",
+        "out/lobby/preview/1.jpg",
+        "out/lobby/.pano-mvs-output",
+        "b/run.json",
+        "b/2.jpg",
+    ):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    assert [path.relative_to(tmp_path).as_posix() for path in list_pictures(tmp_path)] == ["1.jpg", "b/2.jpg"]
+
+
+def test_a_thumbnail_within_the_metadata_is_not_the_picture(tmp_path):
+    thumbnail = bytes(cv2.imencode(".jpg", picture((16, 20)))[1])
+    data = write_jpeg(tmp_path / "a.jpg", (32, 64)).read_bytes()
+    exif = b"\xff\xe1" + struct.pack(">H", len(thumbnail) + 8) + b"Exif\0\0" + thumbnail
+    (tmp_path / "a.jpg").write_bytes(data[:2] + exif + b"\xff" + data[2:])
+    assert describe_picture(tmp_path / "a.jpg").size_hw == (32, 64)
+
+
+def test_a_cropped_panorama_is_placed_on_its_sphere(tmp_path):
+    fields = full_sphere(40, 80) | {
+        "CroppedAreaImageWidthPixels": 60, "CroppedAreaImageHeightPixels": 30,
+        "CroppedAreaLeftPixels": 10, "CroppedAreaTopPixels": 7,
+    }  # fmt: skip
+    path = write_png(tmp_path / "a.png", (30, 60), xmp(fields))
+    info = describe_picture(path)
+    assert (info.size_hw, info.crop_ltwh, info.warnings) == ((40, 80), (10, 7, 60, 30), ())
+    panorama = Panorama(FilePart(path), info.size_hw, info.size_hw, info.crop_ltwh)
+    panorama.check()
+    np.testing.assert_array_equal(panorama.load()[7:37, 10:70, ::-1], picture((30, 60)))
+    assert panorama.load_mask().sum() == 30 * 60
+
+
+def test_a_panorama_made_smaller_keeps_its_place(tmp_path):
+    fields = full_sphere(400, 800) | {
+        "CroppedAreaImageWidthPixels": 600, "CroppedAreaImageHeightPixels": 300,
+        "CroppedAreaLeftPixels": 100, "CroppedAreaTopPixels": 70,
+    }  # fmt: skip
+    info = describe_picture(write_png(tmp_path / "a.png", (30, 60), xmp(fields)))
+    assert (info.size_hw, info.crop_ltwh, info.full_width_px) == ((400, 800), (100, 70, 600, 300), 80)
+    assert "resized from 600×300 to 60×30 px" in info.warnings[0]
+
+
+def test_a_whole_panorama_made_smaller_is_whole(tmp_path):
+    info = describe_picture(write_jpeg(tmp_path / "a.jpg", (512, 1024), xmp(full_sphere(2688, 5376))))
+    assert (info.size_hw, info.crop_ltwh) == ((512, 1024), None)
+
+
+@pytest.mark.parametrize(
+    ("size", "fields", "what"),
+    [
+        ((30, 64), None, "64×30 px is not a full sphere"),
+        ((30, 64), {"PoseHeadingDegrees": 3}, "64×30 px is not a full sphere"),
+        ((32, 64), {"ProjectionType": "cylindrical"}, "it is cylindrical, not equirectangular"),
+        ((20, 64), full_sphere(32, 64), "cut after it was taken"),
+        ((32, 64), full_sphere(32, 64, FullPanoHeightPixels=40), "the full sphere is 64×40 px"),
+    ],
+)
+def test_what_is_no_panorama_is_named_with_the_remedy(tmp_path, size, fields, what):
+    path = write_jpeg(tmp_path / "odd one.jpg", size, None if fields is None else xmp(fields))
+    with pytest.raises(InputError, match=rf"odd one\.jpg: .*{what}.*[.:] "):
+        describe_picture(path)
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"\xff\xd8\xff", b"\xff\xd8\xff\xe1\x00\x00\xff\xd9", b"\x89PNG\r\n\x1a\n", b"hello"]
+)
+def test_what_is_no_picture_is_named(tmp_path, data):
+    (tmp_path / "a.jpg").write_bytes(data)
+    with pytest.raises(InputError, match=r"a\.jpg: "):
+        describe_picture(tmp_path / "a.jpg")

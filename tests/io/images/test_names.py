@@ -1,0 +1,24 @@
+"""The same picture under two names."""
+
+import pytest
+
+from pano_mvs.io.images.names import match_image_names
+
+
+@pytest.mark.parametrize(
+    ("wanted", "available", "found"),
+    [
+        ("1.jpg", ["1.jpg", "a/1.jpg"], "1.jpg"),
+        ("1.jpg", ["images/1.jpg", "2.jpg"], "images/1.jpg"),
+        ("a/1.jpg", ["1.jpg", "2.jpg"], "1.jpg"),
+        ("a/1.jpg", ["x/a/1.jpg", "x/b/1.jpg"], "x/a/1.jpg"),
+        ("1.jpg", ["a/1.jpg", "b/1.jpg"], None),
+        ("a/1.jpg", ["b/1.jpg", "b/2.jpg"], "b/1.jpg"),
+        ("1.jpg", ["./1.png"], "./1.png"),
+        ("1.jpg", ["1.png", "1.tif"], None),
+        ("a/1.jpg", ["a\\1.jpg"], "a\\1.jpg"),
+        ("11.jpg", ["1.jpg", "111.jpg"], None),
+    ],
+)
+def test_one_counterpart_is_found_and_two_are_none(wanted, available, found):
+    assert match_image_names([wanted], available) == ({wanted: found} if found else {})
