@@ -96,7 +96,7 @@ def run(
     """Run a workflow; the same command resumes it."""
     from pano_mvs.cli.run_command import Execution, run_workflow
     from pano_mvs.cli.session import open_session
-    from pano_mvs.engine.running.options import Demands
+    from pano_mvs.engine.planning.run_options import Demands
 
     demands = Demands(tuple(until or ()), tuple(only or ()), tuple(refresh or ()), accept_code, keep_going)
     session = open_session(workflow, overrides=overrides or [], images=images, cache=cache, out=out, demands=demands)
@@ -123,7 +123,7 @@ def plan(
     from pano_mvs.cli.explain import explain_unit
     from pano_mvs.cli.plan_command import show_plan
     from pano_mvs.cli.session import check_output, open_session
-    from pano_mvs.engine.running.options import Demands
+    from pano_mvs.engine.planning.run_options import Demands
 
     demands = Demands(tuple(until or ()), tuple(only or ()), tuple(refresh or ()), accept_code)
     session = open_session(workflow, overrides=overrides or [], images=images, cache=cache, out=out, demands=demands)

@@ -11,8 +11,8 @@ from pano_mvs.cli.session import Session
 from pano_mvs.core.errors import UsageError
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
+from pano_mvs.engine.planning.run_options import Demands
 from pano_mvs.engine.planning.units import Unit, UnitInput
-from pano_mvs.engine.running.options import Demands
 from pano_mvs.engine.running.run import workflow_id
 
 _SHOWN = 8

@@ -30,6 +30,7 @@ from pano_mvs.cli.streams import apart
 from pano_mvs.cli.telling import INTERRUPTED, tell, tell_of_end
 from pano_mvs.core.errors import PanoMvsError, UsageError
 from pano_mvs.core.files import OUTPUT_MARK, set_aside
+from pano_mvs.core.memory import bytes_from_size
 from pano_mvs.core.paths import exists, is_file
 from pano_mvs.core.text import one_line
 from pano_mvs.engine.cache.blobs import DamagedBlobError
@@ -37,7 +38,6 @@ from pano_mvs.engine.cache.store import LEAST_FREE_BYTES, Store
 from pano_mvs.engine.executors.choose import make_executor
 from pano_mvs.engine.executors.protocol import Executor
 from pano_mvs.engine.running.events import Observer, RunResult
-from pano_mvs.engine.running.memory import bytes_from_size
 from pano_mvs.engine.running.output_lock import output_lock
 from pano_mvs.engine.running.run import Run
 from pano_mvs.report.findings import doubts_of

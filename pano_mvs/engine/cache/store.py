@@ -25,10 +25,10 @@ from pano_mvs.core.errors import ContractError, StoreError, UsageError
 from pano_mvs.core.files import CACHE_MARK, clear_abandoned, is_older, remove_whole, write_text
 from pano_mvs.core.paths import children, exists, is_link, reason_of
 from pano_mvs.engine.cache.blobs import BlobRef, BlobStore, DamagedBlobError
+from pano_mvs.engine.cache.disk_guard import Room, is_full_disk
 from pano_mvs.engine.cache.latest_runs import RunBook
 from pano_mvs.engine.cache.packed_parts import PackedParts
 from pano_mvs.engine.cache.stat_cache import StatCache
-from pano_mvs.engine.running.disk_guard import Room, is_full_disk
 from pano_mvs.scene import Record
 
 LAYOUT_VERSION = 2

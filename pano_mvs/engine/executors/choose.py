@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.memory import free_memory_bytes
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.processes import ProcessExecutor
 from pano_mvs.engine.executors.protocol import Executor
 from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.executors.threads import available_threads, share_cores
-from pano_mvs.engine.running.memory import free_memory_bytes
 
 VARIABLE = "PANO_MVS_EXECUTOR"
 _WORKER_BYTES = 3_000_000_000

@@ -17,13 +17,13 @@ from urllib.parse import urlsplit
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.files import temporary_prefix
+from pano_mvs.core.memory import free_memory_bytes
 from pano_mvs.core.paths import children, is_file
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.code.plugin_digest import code_texts
 from pano_mvs.engine.executors.dask_task import differences, end_workers, introduce, run_unit, versions
 from pano_mvs.engine.executors.protocol import Job, Outcome
 from pano_mvs.engine.executors.unit_text import request_to_json
-from pano_mvs.engine.running.memory import free_memory_bytes
 
 _LARGE_BYTES = 200_000
 _CONNECT_S = 20.0

@@ -11,13 +11,12 @@ from pano_mvs.core.text import shortened
 from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.capture import captured
+from pano_mvs.engine.executors.changed_files import changed_items, changed_settings
+from pano_mvs.engine.executors.execute import execute_unit
+from pano_mvs.engine.executors.failure_cause import cause_of
 from pano_mvs.engine.executors.protocol import Outcome
 from pano_mvs.engine.executors.threads import bound_threads
-from pano_mvs.engine.executors.unit_text import input_blobs
 from pano_mvs.engine.planning.units import Unit
-from pano_mvs.engine.running.changed_files import changed_items, changed_settings
-from pano_mvs.engine.running.execute import execute_unit
-from pano_mvs.engine.running.failures import cause_of
 
 
 def perform(unit: Unit, store: Store, *, threads: int, log: Path) -> Outcome:
@@ -53,7 +52,7 @@ def _failed(unit: Unit, store: Store, error: BaseException) -> Outcome:
         return Outcome("failed", cause=reasons[0])
     if isinstance(error, DamagedBlobError):
         return Outcome("damaged", cause=str(error))
-    gone = next((ref for ref in input_blobs(unit) if not store.blobs.exists(ref)), None)
+    gone = next((ref for ref in unit.input_blobs() if not store.blobs.exists(ref)), None)
     if gone is not None:  # somebody has collected it while the stage was about to read it: no fault of the stage
         return Outcome("damaged", cause=str(store.blobs.discard(gone, "is gone")))
     cause, trace = cause_of(unit, error)

@@ -10,11 +10,11 @@ from dataclasses import replace
 from typing import Any
 
 from pano_mvs.core.files import temporary_prefix
+from pano_mvs.core.memory import free_memory_bytes
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.protocol import Job, Outcome
 from pano_mvs.engine.executors.unit_text import request_to_json
 from pano_mvs.engine.executors.worker_process import WorkerProcess
-from pano_mvs.engine.running.memory import free_memory_bytes
 
 UNITS_PER_PROCESS = 500
 """After so many a worker is replaced, so that what libraries leak does not add up."""

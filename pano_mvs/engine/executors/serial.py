@@ -6,11 +6,11 @@ cannot be ended.
 
 from __future__ import annotations
 
+from pano_mvs.core.memory import free_memory_bytes
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.perform import perform
 from pano_mvs.engine.executors.protocol import Job, Outcome
 from pano_mvs.engine.executors.threads import available_threads
-from pano_mvs.engine.running.memory import free_memory_bytes
 
 
 class SerialExecutor:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.engine.cache.blobs import BlobRef
 from pano_mvs.engine.cache.store import ItemRef, Store
-from pano_mvs.engine.code.stage_code import stage_code
 from pano_mvs.engine.executors.protocol import Job
 from pano_mvs.engine.planning.units import PENDING, Unit, UnitInput
 from pano_mvs.engine.stages.params import Params
 from pano_mvs.engine.stages.ports import Cardinality
 from pano_mvs.engine.stages.stage import SourceItem, StageSpec
+from pano_mvs.engine.stages.stage_code import stage_code
 from pano_mvs.engine.workflows.policy import Policy
 from pano_mvs.engine.workflows.workflow import StageEntry
 
@@ -50,7 +49,7 @@ def unit_to_json(unit: Unit, store: Store) -> dict[str, Any]:
         "item": unit.item,
         "members": list(unit.members),
         "inputs": {port: _input_to_json(unit, port, value) for port, value in unit.inputs.items()},
-        "external": {ref.digest: str(store.blobs.path(ref).absolute()) for ref in input_blobs(unit) if ref.external},
+        "external": {ref.digest: str(store.blobs.path(ref).absolute()) for ref in unit.input_blobs() if ref.external},
         "source": None if unit.source is None else _source_to_json(unit.source),
         "key": unit.key,
         "identity": dict(unit.identity),
@@ -148,14 +147,6 @@ def _input_from_json(value: Any) -> UnitInput:
     if "names" in value:
         return dict.fromkeys(value["names"], PENDING)
     return {name: ItemRef.from_json(ref) for name, ref in value["many"].items()}
-
-
-def input_blobs(unit: Unit) -> Iterator[BlobRef]:
-    """Yield every blob that a unit's inputs are made of."""
-    for value in unit.inputs.values():
-        items = [value] if isinstance(value, ItemRef) else (value or {}).values()
-        for item in items:
-            yield from item.parts.values()
 
 
 def _source_to_json(item: SourceItem) -> dict[str, Any]:

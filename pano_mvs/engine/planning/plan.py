@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.planning.reasons import reason_to_run
 from pano_mvs.engine.planning.resolve import resolve
+from pano_mvs.engine.planning.run_options import NO_DEMANDS, Demands
 from pano_mvs.engine.planning.units import StageState, Unit
-from pano_mvs.engine.running.options import NO_DEMANDS, Demands
 from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import Workflow
 

@@ -11,12 +11,12 @@ from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.file_names import item_problem
 from pano_mvs.engine.cache.store import ItemRef, Store
-from pano_mvs.engine.code.stage_code import stage_code
 from pano_mvs.engine.planning.source_listing import Listing
 from pano_mvs.engine.planning.units import PENDING, WHOLE, Resolution, StageState, Unit, UnitInput
 from pano_mvs.engine.stages.params import key_fields
 from pano_mvs.engine.stages.ports import Cardinality
 from pano_mvs.engine.stages.stage import INDEX_PORT
+from pano_mvs.engine.stages.stage_code import stage_code
 from pano_mvs.engine.workflows.wiring import Edge, Graph
 from pano_mvs.engine.workflows.workflow import StageEntry
 from pano_mvs.scene import Axis, Pairs, Record, Views

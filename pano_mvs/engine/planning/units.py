@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
+from pano_mvs.engine.cache.blobs import BlobRef
 from pano_mvs.engine.cache.store import ItemRef
 from pano_mvs.engine.stages.stage import SourceItem
 from pano_mvs.engine.workflows.workflow import StageEntry
@@ -49,6 +50,13 @@ class Unit:
     def label(self) -> str:
         """The unit as it is shown: `stage:item`."""
         return f"{self.entry.name}:{self.item}" if self.item else self.entry.name
+
+    def input_blobs(self) -> Iterator[BlobRef]:
+        """Yield the blobs of all inputs."""
+        for value in self.inputs.values():
+            items = [value] if isinstance(value, ItemRef) else (value or {}).values()
+            for item in items:
+                yield from item.parts.values()
 
 
 @dataclass(slots=True)

@@ -11,14 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pano_mvs.core.files import temporary_prefix
+from pano_mvs.core.memory import size_text
 from pano_mvs.core.paths import exists, resolved
 from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.executors.capture import tail
+from pano_mvs.engine.executors.execute import arguments_of
 from pano_mvs.engine.executors.protocol import Executor, Job, Outcome
 from pano_mvs.engine.planning.units import PENDING, Unit
-from pano_mvs.engine.running.execute import arguments_of
-from pano_mvs.engine.running.memory import size_text
 from pano_mvs.scene import Record
 
 LOG_FOLDER = "logs"

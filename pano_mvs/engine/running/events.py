@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
+from pano_mvs.engine.workflows.workflow import StageEntry
+
 Outcome = Literal["cached", "run", "failed", "blocked"]
 
 
@@ -32,6 +34,12 @@ class Failure:
     blocked: bool = False
     log: str = ""
     said: tuple[str, ...] = ()
+
+
+def consequence_of(entry: StageEntry, item: str) -> str:
+    """Return what the result lacks without a unit."""
+    kind = entry.spec.output.kind_name()
+    return f"there is no {kind} for {item}" if item else f"there is no {kind}"
 
 
 @dataclass(slots=True)

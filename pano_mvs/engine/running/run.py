@@ -16,11 +16,11 @@ from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.executors.protocol import Executor
 from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.planning.ready_queue import Board
+from pano_mvs.engine.planning.run_options import NO_DEMANDS, Demands
 from pano_mvs.engine.planning.source_listing import Listing
 from pano_mvs.engine.planning.units import StageState, Unit
 from pano_mvs.engine.running.dispatcher import Desk
 from pano_mvs.engine.running.events import Observer, RunResult, Silent
-from pano_mvs.engine.running.options import NO_DEMANDS, Demands
 from pano_mvs.engine.running.publish import Publisher
 from pano_mvs.engine.running.scheduler import Scheduler
 from pano_mvs.engine.running.statistics import Tally

@@ -8,12 +8,10 @@ from pano_mvs.core.errors import ContractError, GateError, PanoMvsError, StoreEr
 from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.executors.protocol import Outcome
-from pano_mvs.engine.executors.unit_text import input_blobs
 from pano_mvs.engine.planning.ready_queue import Board
 from pano_mvs.engine.planning.units import Unit
 from pano_mvs.engine.running.dispatcher import Desk, Ended
-from pano_mvs.engine.running.events import Failure
-from pano_mvs.engine.running.failures import lost
+from pano_mvs.engine.running.events import Failure, consequence_of
 from pano_mvs.engine.running.publish import NameClashError, Publisher
 from pano_mvs.engine.running.statistics import Tally
 from pano_mvs.engine.workflows.workflow import StageEntry
@@ -165,14 +163,16 @@ class Scheduler:
     def _give_way(self, entry: StageEntry, item: str, cause: str) -> None:
         """List a unit as failed that had a result: its files clash with those of a unit that comes first."""
         was_computed = self.keys.get(entry.name, {}).get(item) in self.computed
-        self._tally.unit_withdrawn(Failure(entry.name, item, cause, consequence=lost(entry, item)), was_computed)
+        self._tally.unit_withdrawn(
+            Failure(entry.name, item, cause, consequence=consequence_of(entry, item)), was_computed
+        )
         self._board.withdraw(entry.name, item, cause)
         if entry.policy.on_error == "stop":
             raise GateError(f"stage {entry.name!r} has on_error: stop, and {entry.name}:{item} failed: {cause}")
 
     def _doubt(self, unit: Unit) -> None:
         """Have all computed again that could have led a unit to something damaged, lest it leads there again."""
-        for ref in input_blobs(unit):
+        for ref in unit.input_blobs():
             if ref.external:
                 self._store.stat_cache.forget(self._store.blobs.path(ref))
         for producer in self._board.producers(unit.entry.name):
@@ -190,7 +190,7 @@ class Scheduler:
             unit.item,
             outcome.cause,
             outcome.trace,
-            lost(entry, unit.item),
+            consequence_of(entry, unit.item),
             log="" if ended.log is None else str(ended.log),
             said=ended.said,
         )

@@ -9,8 +9,7 @@ from dataclasses import dataclass, field
 from pano_mvs.core.errors import GateError, InputError
 from pano_mvs.engine.cache.store import UnitRecord
 from pano_mvs.engine.planning.units import StageState
-from pano_mvs.engine.running.events import Failure, Observer, Outcome, RunResult, StageSummary
-from pano_mvs.engine.running.failures import lost
+from pano_mvs.engine.running.events import Failure, Observer, Outcome, RunResult, StageSummary, consequence_of
 from pano_mvs.engine.workflows.workflow import StageEntry
 
 _SHOWN_CAUSES = 10
@@ -69,7 +68,7 @@ class Tally:
             failure = Failure(entry.name, item, reason, consequence="the run goes on without this image")
         else:
             summary.blocked += 1
-            failure = Failure(entry.name, item, f"it {reason}", consequence=lost(entry, item), blocked=True)
+            failure = Failure(entry.name, item, f"it {reason}", consequence=consequence_of(entry, item), blocked=True)
         self._result.failures.append(failure)
         self._observer.unit_finished(entry.name, item, "blocked", 0.0)
         if entry.spec.list_items is not None and entry.policy.on_error == "stop":

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from pano_mvs.core.errors import PluginError
-from pano_mvs.engine.running.memory import bytes_from_size
+from pano_mvs.core.memory import bytes_from_size
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.params import Params
 from pano_mvs.engine.stages.ports import Cardinality, Port, port_from_annotation

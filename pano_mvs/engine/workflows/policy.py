@@ -9,7 +9,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from pano_mvs.core.file_names import folder_problem
-from pano_mvs.engine.running.memory import bytes_from_size
+from pano_mvs.core.memory import bytes_from_size
 
 
 class Limits(BaseModel):

@@ -22,9 +22,9 @@ from pano_mvs.cli.app import app
 from pano_mvs.cli.run_command import MIN_FREE_VARIABLE
 from pano_mvs.core import files
 from pano_mvs.core.errors import StoreError
+from pano_mvs.engine.cache import disk_guard
 from pano_mvs.engine.cache.maintenance import verify
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.running import disk_guard as room
 from tests.engine.conftest import Toy
 from tests.stress.captures import deliverables, write_toy
 
@@ -101,7 +101,7 @@ def test_library_that_tells_of_a_full_disk_in_its_own_words_is_understood(
     toy.edit("plug.py", lambda text: text.replace('    """Multiply."""', f'    """Multiply."""\n    raise {how}'))
     code, said = run(toy)
     assert (code, "cannot write" in said or "requested" in said) == (3, True)
-    monkeypatch.setattr(room, "_NOTHING_LEFT_BYTES", 1 << 60)
+    monkeypatch.setattr(disk_guard, "_NOTHING_LEFT_BYTES", 1 << 60)
     code, said = run(toy)
     assert code == 4
     assert "Make room" in said
@@ -109,7 +109,7 @@ def test_library_that_tells_of_a_full_disk_in_its_own_words_is_understood(
 
 def test_what_was_made_on_a_full_disk_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A library that does not look at what became of its writes leaves a short file and says nothing."""
-    monkeypatch.setattr(room, "_NOTHING_LEFT_BYTES", 1 << 60)
+    monkeypatch.setattr(disk_guard, "_NOTHING_LEFT_BYTES", 1 << 60)
     with pytest.raises(StoreError, match="is full"), Store(tmp_path).scratch():
         pass
 

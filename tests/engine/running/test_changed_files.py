@@ -316,7 +316,7 @@ def test_what_is_not_proven_can_be_dropped(texts: Toy, monkeypatch: pytest.Monke
     shutil.rmtree(texts.folder / "cache")
     path = texts.folder / "capture" / "2.txt"
     with monkeypatch.context() as earlier_version:
-        earlier_version.setattr("pano_mvs.engine.running.execute.changed_items", lambda unit, store: {})
+        earlier_version.setattr("pano_mvs.engine.executors.execute.changed_items", lambda unit, store: {})
         run(texts, Meddler("total", "", lambda: path.write_text("77")))  # `late` reads the path, and so other bytes
     path.write_text("20")
     assert run(texts).computed == 0

@@ -4,12 +4,12 @@ import pytest
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.code import stage_code
+from pano_mvs.engine.executors import execute
 from pano_mvs.engine.planning.plan import make_plan
-from pano_mvs.engine.running import execute
+from pano_mvs.engine.planning.run_options import Demands
 from pano_mvs.engine.running.events import RunResult
-from pano_mvs.engine.running.options import Demands
 from pano_mvs.engine.running.run import Run, workflow_id
+from pano_mvs.engine.stages import stage_code
 from pano_mvs.engine.stages.context import Context
 from tests.engine.conftest import Toy, ran
 

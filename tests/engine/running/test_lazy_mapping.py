@@ -4,8 +4,8 @@ import pytest
 
 from pano_mvs.engine.cache.blobs import BlobRef
 from pano_mvs.engine.cache.store import ItemRef
-from pano_mvs.engine.running.execute import kept_items
-from pano_mvs.engine.running.gather import Gather
+from pano_mvs.engine.executors.execute import kept_items
+from pano_mvs.engine.executors.lazy_mapping import Gather
 
 
 @pytest.fixture

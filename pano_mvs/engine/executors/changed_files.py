@@ -6,7 +6,6 @@ from pathlib import Path
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.executors.unit_text import input_blobs
 from pano_mvs.engine.planning.units import Unit
 from pano_mvs.engine.stages.params import key_fields
 from pano_mvs.scene.record import changed_text, vanished_text
@@ -17,7 +16,7 @@ def changed_items(unit: Unit, store: Store) -> dict[str, str]:
 
     A file whose size, time stamps and inode are known is not read for this.
     """
-    listed = {store.blobs.path(ref): ref.digest for ref in input_blobs(unit) if ref.external}
+    listed = {store.blobs.path(ref): ref.digest for ref in unit.input_blobs() if ref.external}
     if unit.source is not None:
         listed |= {unit.source.files[role]: digest for role, digest in unit.source.digests.items()}
     found = {path: _reason(path, digest, store) for path, digest in listed.items()}

@@ -1,4 +1,4 @@
-"""Say of a unit that failed what went wrong, where, and what the result lacks because of it."""
+"""Describe why a unit failed, and where."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import traceback
 from pano_mvs.core.errors import PanoMvsError
 from pano_mvs.core.text import shortened
 from pano_mvs.engine.planning.units import Unit
-from pano_mvs.engine.workflows.workflow import StageEntry
 
 _MAX_TRACE = 20_000  # characters
 
@@ -35,9 +34,3 @@ def _text(error: BaseException) -> str:
         return shortened(str(error))
     except Exception as second:  # the text is a plugin's code too
         return f"(its message cannot be shown: {type(second).__name__})"
-
-
-def lost(entry: StageEntry, item: str) -> str:
-    """Return what the result lacks for want of a unit."""
-    kind = entry.spec.output.kind_name()
-    return f"there is no {kind} for {item}" if item else f"there is no {kind}"

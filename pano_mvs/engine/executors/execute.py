@@ -12,9 +12,9 @@ import numpy as np
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import ChangedFileError, ContractError
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
+from pano_mvs.engine.executors.changed_files import changed_items, changed_settings
+from pano_mvs.engine.executors.lazy_mapping import Gather
 from pano_mvs.engine.planning.units import OF_CODE, Unit, UnitInput
-from pano_mvs.engine.running.changed_files import changed_items, changed_settings
-from pano_mvs.engine.running.gather import Gather
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.ports import Cardinality, Names, Port
 from pano_mvs.scene import Axis

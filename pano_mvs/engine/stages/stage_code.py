@@ -23,10 +23,10 @@ from pano_mvs.engine.stages.stage import StageSpec
 _OURS = pano_mvs.__name__
 _LEFT_OUT = (
     *(f"{_OURS}.{name}" for name in ("cli", "report", "viewer")),  # show results, and make none
-    f"{_OURS}.engine",  # its own part in a key is raised by hand: resolve.KEY_SCHEMA
+    f"{_OURS}.engine",  # its own part in a key is raised by hand: planning.resolve.KEY_SCHEMA
     f"{_OURS}.core.kernel_cache",  # a matter of speed
 )
-_KEPT = (f"{_OURS}.engine.context",)
+_KEPT = (f"{_OURS}.engine.stages.context",)
 
 
 @dataclass(frozen=True, slots=True)
