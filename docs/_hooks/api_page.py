@@ -35,7 +35,7 @@ _GROUPS = {
     "What a stage is given": ("Params", "Context", "SourceItem"),
     "What a stage reads": (*_CARDINALITIES, "Names"),
     "Geometry": ("Rigid3", "Similarity3"),
-    "Settings": ("NOT_IN_KEY", "InputPath", "SourcePath", "PartOf", "Parts"),
+    "Settings": ("NOT_IN_KEY", "InputPath", "SourcePath", "RegisteredIn", "NamedRegistry"),
     "Parts of the sweep": ("register_sweep_cost", "CostWindow", "register_sweep_backend", "SweepInput", "Winners"),
 }
 

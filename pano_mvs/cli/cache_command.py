@@ -14,7 +14,7 @@ from rich.table import Table
 from pano_mvs.cli.session import CACHE_VARIABLE
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.paths import is_denied, is_file
-from pano_mvs.engine.cache.maintenance import Collection, collect, size_on_disk, usage_of, verify
+from pano_mvs.engine.cache.maintenance import GarbageCollection, collect, size_on_disk, usage_of, verify
 from pano_mvs.engine.cache.store import Store
 
 _SHOWN = 10
@@ -92,7 +92,7 @@ def collect_cache(store: Store, console: Console, *, delete: bool, unused: str, 
         console.print("nothing was deleted; --delete does it")
 
 
-def _told(found: Collection, *, delete: bool) -> str:
+def _told(found: GarbageCollection, *, delete: bool) -> str:
     what = f"{len(found.records)} units, {len(found.blobs)} blobs, {size_text(found.size_bytes)}"
     return f"{'deleted' if delete else 'would delete'}: {what}; {size_text(found.kept_bytes)} stay"
 

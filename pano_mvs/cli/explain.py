@@ -11,7 +11,7 @@ from pano_mvs.cli.session import Session
 from pano_mvs.core.errors import UsageError
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
-from pano_mvs.engine.planning.run_options import Demands
+from pano_mvs.engine.planning.run_options import RunOptions
 from pano_mvs.engine.planning.units import Unit, UnitInput
 from pano_mvs.engine.running.run import workflow_id
 
@@ -25,7 +25,7 @@ def explain_unit(session: Session, label: str, console: Console) -> None:
         UsageError: if there is no such stage or unit.
     """
     stage, _, item = label.partition(":")
-    workflow, graph = Demands(until=(stage,)).applied_to(session.workflow, session.graph)
+    workflow, graph = RunOptions(until=(stage,)).applied_to(session.workflow, session.graph)
     store = Store(session.store_root, for_reading=True)
     found: list[tuple[Unit, UnitRecord | None, str]] = []
 

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from pano_mvs.cli.estimate import Estimate
-from pano_mvs.engine.running.events import Failure, Outcome, StageSummary
+from pano_mvs.engine.running.events import Failure, StageSummary, UnitStatus
 
 _LINE_EVERY_S = 30.0
 _SHOWN_LINES = 5
@@ -69,7 +69,7 @@ class ProgressBars:
         for line in failure.said[-_SHOWN_LINES:]:
             self.console.print(f"  | {escape(line)}", highlight=False, soft_wrap=True)
 
-    def unit_finished(self, name: str, item: str, outcome: Outcome, seconds: float) -> None:
+    def unit_finished(self, name: str, item: str, outcome: UnitStatus, seconds: float) -> None:
         """Move the bars on; which unit it was, they do not show."""
         del item
         self._estimate.count(name, seconds, computed=outcome in ("run", "failed"))

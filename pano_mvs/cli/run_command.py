@@ -144,7 +144,7 @@ def _run(
     """Run, and write what there is to say of it into the output folder."""
     started, clock = datetime.now(UTC), time.perf_counter()
     run = Run(session.workflow, session.graph, store, session.out, observer=observer, executor=executor,
-              demands=session.demands)  # fmt: skip
+              options=session.run_options)  # fmt: skip
     with output_lock(session.out):
         return _run_alone(session, run, started, clock)
 

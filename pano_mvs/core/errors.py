@@ -8,7 +8,7 @@
     ├── PluginError (ImportError)          exit 2: a plugin that failed to import or to register
     ├── ContractError (TypeError)          exit 1: a stage returned what it had not declared
     ├── StoreError (OSError)               exit 4: the cache or the output folder cannot be written
-    ├── GateError (RuntimeError)           exit 4: a quality gate stopped the run
+    ├── RunStoppedError (RuntimeError)           exit 4: a quality gate stopped the run
     └── StageFailedError (RuntimeError)    exit 3: a stage's own code failed on a unit
 
 A message says what is wrong, with which item, where, and what to do about it. Expected degeneracy
@@ -74,7 +74,7 @@ class StoreError(PanoMvsError, OSError):
     exit_code = 4
 
 
-class GateError(PanoMvsError, RuntimeError):
+class RunStoppedError(PanoMvsError, RuntimeError):
     """A quality gate stopped the run; what was computed is kept."""
 
     exit_code = 4

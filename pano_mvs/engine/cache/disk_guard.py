@@ -1,4 +1,4 @@
-"""Room on the disk of a store: how much must be free to begin, and how a full disk is told from a fault of a unit."""
+"""DiskGuard on the disk of a store: how much must be free to begin, and how a full disk is told from a fault of a unit."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _FULL = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC), errno.EFBIG}
 _NOTHING_LEFT_BYTES = 1_000_000
 
 
-class Room:
+class DiskGuard:
     """The disk under a store."""
 
     def __init__(self, root: Path, *, least_free_bytes: int) -> None:

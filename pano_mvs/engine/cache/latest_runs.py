@@ -51,7 +51,7 @@ class RunEntry:
         return (datetime.now(UTC) - datetime.fromisoformat(self.when)).total_seconds()
 
 
-class RunBook:
+class RunHistory:
     """The runs and the pins of one store."""
 
     def __init__(self, root: Path) -> None:

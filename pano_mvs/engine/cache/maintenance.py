@@ -44,7 +44,7 @@ class StageUsage:
 
 
 @dataclass(slots=True)
-class Damage:
+class Verification:
     """What a verification found.
 
     Attributes:
@@ -67,7 +67,7 @@ class Damage:
 
 
 @dataclass(slots=True)
-class Collection:
+class GarbageCollection:
     """What a collection would remove, or removed.
 
     Attributes:
@@ -107,7 +107,7 @@ def size_on_disk(store: Store) -> int:
     return sum(stat.st_size for stat in stats if stat is not None)
 
 
-def verify(store: Store, *, drop_unproven: bool = False) -> Damage:
+def verify(store: Store, *, drop_unproven: bool = False) -> Verification:
     """Check every record and every blob against its digest; damaged ones are removed, what is foreign stays.
 
     Runs may go on meanwhile.
@@ -119,7 +119,7 @@ def verify(store: Store, *, drop_unproven: bool = False) -> Damage:
     Raises:
         StoreError: if a file cannot be read or removed.
     """
-    damage, unproven = Damage(), Unproven()
+    damage, unproven = Verification(), Unproven()
     sound: set[str] = set()
     for file in _files(store.root / "blobs"):
         name = _own_name(store, file, _BLOB_NAME)
@@ -152,7 +152,7 @@ def verify(store: Store, *, drop_unproven: bool = False) -> Damage:
 
 
 def _verify_record(
-    store: Store, damage: Damage, sound: set[str], path: str, *, key: str, data: bytes
+    store: Store, damage: Verification, sound: set[str], path: str, *, key: str, data: bytes
 ) -> UnitRecord | None:
     """Enter a record into what was found; return it if it and all its blobs are sound."""
     record = record_from_bytes(data)
@@ -169,7 +169,9 @@ def _verify_record(
     return None
 
 
-def collect(store: Store, *, unused_s: float, forget_after_s: float | None = None, delete: bool = False) -> Collection:
+def collect(
+    store: Store, *, unused_s: float, forget_after_s: float | None = None, delete: bool = False
+) -> GarbageCollection:
     """Find, and if asked remove, what no run and no pin of the book names.
 
     Args:
@@ -182,7 +184,7 @@ def collect(store: Store, *, unused_s: float, forget_after_s: float | None = Non
         StoreError: if an entry of the book is damaged, since what it protects is not known; or a file cannot be read
             or removed.
     """
-    found = Collection()
+    found = GarbageCollection()
     newest = time.time() - unused_s
     kept_keys: set[bytes] = set()
     for entry in store.runs.each():
@@ -213,7 +215,7 @@ def collect(store: Store, *, unused_s: float, forget_after_s: float | None = Non
     return found
 
 
-def _delete(store: Store, found: Collection, newest: float) -> None:
+def _delete(store: Store, found: GarbageCollection, newest: float) -> None:
     """Remove records before the blobs that they name, so that no sound record is left without them."""
     for entry in found.runs:
         store.runs.forget(entry)

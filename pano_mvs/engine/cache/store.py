@@ -25,8 +25,8 @@ from pano_mvs.core.errors import ContractError, StoreError, UsageError
 from pano_mvs.core.files import CACHE_MARK, clear_abandoned, is_older, remove_whole, write_text
 from pano_mvs.core.paths import children, exists, is_link, reason_of
 from pano_mvs.engine.cache.blobs import BlobRef, BlobStore, DamagedBlobError
-from pano_mvs.engine.cache.disk_guard import Room, is_full_disk
-from pano_mvs.engine.cache.latest_runs import RunBook
+from pano_mvs.engine.cache.disk_guard import DiskGuard, is_full_disk
+from pano_mvs.engine.cache.latest_runs import RunHistory
 from pano_mvs.engine.cache.packed_parts import PackedParts
 from pano_mvs.engine.cache.stat_cache import StatCache
 from pano_mvs.scene import Record
@@ -157,11 +157,11 @@ class Store:
         self.least_free_bytes = least_free_bytes
         self.damaged: list[str] = []
         self._records = str(root / "records")
-        self._room = Room(root, least_free_bytes=least_free_bytes)
+        self._disk = DiskGuard(root, least_free_bytes=least_free_bytes)
         self.folder_digits = _FOLDER_DIGITS[LAYOUT_VERSION]
         self._open_layout(for_reading=for_reading)
         self._clear_abandoned()
-        self.runs = RunBook(root)
+        self.runs = RunHistory(root)
         self.stat_cache = StatCache(root / "stat-cache.json")
         self.blobs = BlobStore(root, self.stat_cache, durable=durable, folder_digits=self.folder_digits)
 
@@ -238,7 +238,7 @@ class Store:
 
     def require_room(self) -> None:
         """Raise StoreError if there is too little room on the disk to begin anything."""
-        self._room.require()
+        self._disk.require()
 
     def scratch(self) -> AbstractContextManager[Path]:
         """Return a context with an empty folder inside the store, removed afterwards.
@@ -246,11 +246,11 @@ class Store:
         Raises:
             StoreError: if the disk is too full to begin, or was filled by what was done inside.
         """
-        return self._room.scratch(self.blobs.temporary)
+        return self._disk.scratch(self.blobs.temporary)
 
     def cannot_write(self, error: OSError) -> StoreError:
         """Return the error that says that the store cannot be written, and whether for want of room."""
-        return self._room.cannot_write(error)
+        return self._disk.cannot_write(error)
 
     def record_path(self, key: str) -> Path:
         """Return where the record of a key is or would be."""

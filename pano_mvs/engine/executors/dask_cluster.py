@@ -22,8 +22,8 @@ from pano_mvs.core.paths import children, is_file
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.code.plugin_digest import code_texts
 from pano_mvs.engine.executors.dask_task import differences, end_workers, introduce, run_unit, versions
-from pano_mvs.engine.executors.protocol import Job, Outcome
-from pano_mvs.engine.executors.unit_text import request_to_json
+from pano_mvs.engine.executors.protocol import Job, JobOutcome
+from pano_mvs.engine.executors.unit_json import request_to_json
 
 _LARGE_BYTES = 200_000
 _CONNECT_S = 20.0
@@ -98,7 +98,7 @@ class DaskExecutor:
         self._out[number] = attempt, future
         future.add_done_callback(lambda done: self._ended.put((number, attempt, done)))
 
-    def wait(self, timeout_s: float | None = None) -> tuple[int, Outcome] | None:
+    def wait(self, timeout_s: float | None = None) -> tuple[int, JobOutcome] | None:
         """Return a job that has ended."""
         while self._out:
             try:
@@ -183,12 +183,12 @@ class DaskExecutor:
                              "one with --cache DIR that all hosts share under the same path")  # fmt: skip
 
 
-def _outcome(future: Any) -> Outcome:
+def _outcome(future: Any) -> JobOutcome:
     if future.status == "finished":
-        return Outcome.from_json(json.loads(future.result()))
+        return JobOutcome.from_json(json.loads(future.result()))
     if future.status == "error":
-        return Outcome("failed", cause=f"its dask worker failed: {future.exception()}", died=True)
-    return Outcome("failed", cause=f"the dask cluster lost it ({future.status})", died=True)
+        return JobOutcome("failed", cause=f"its dask worker failed: {future.exception()}", died=True)
+    return JobOutcome("failed", cause=f"the dask cluster lost it ({future.status})", died=True)
 
 
 def _check_address(scheduler: str) -> None:

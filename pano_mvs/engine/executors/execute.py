@@ -13,7 +13,7 @@ from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import ChangedFileError, ContractError
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
 from pano_mvs.engine.executors.changed_files import changed_items, changed_settings
-from pano_mvs.engine.executors.lazy_mapping import Gather
+from pano_mvs.engine.executors.lazy_mapping import LazyMapping
 from pano_mvs.engine.planning.units import OF_CODE, Unit, UnitInput
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.ports import Cardinality, Names, Port
@@ -84,7 +84,7 @@ def _load(port: Port, value: UnitInput, store: Store) -> object:
     if port.cardinality is Cardinality.NAMES:
         return Names(value)
     refs = {_gathered_key(port, name): ref for name, ref in value.items()}
-    return Gather(refs, partial(store.load, kind=port.kind), kept=kept_items(value.values()))
+    return LazyMapping(refs, partial(store.load, kind=port.kind), kept=kept_items(value.values()))
 
 
 def kept_items(refs: Iterable[ItemRef]) -> int:

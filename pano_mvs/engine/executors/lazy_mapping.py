@@ -11,7 +11,7 @@ Ref = TypeVar("Ref")
 Value = TypeVar("Value")
 
 
-class Gather(Mapping[Key, Value], Generic[Key, Ref, Value]):
+class LazyMapping(Mapping[Key, Value], Generic[Key, Ref, Value]):
     """A mapping that loads a value on access and keeps the latest few, so that thousands need not fit in memory.
 
     Names, length and membership load nothing.

@@ -12,8 +12,8 @@ from typing import Any
 from pano_mvs.core.files import temporary_prefix
 from pano_mvs.core.memory import free_memory_bytes
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.executors.protocol import Job, Outcome
-from pano_mvs.engine.executors.unit_text import request_to_json
+from pano_mvs.engine.executors.protocol import Job, JobOutcome
+from pano_mvs.engine.executors.unit_json import request_to_json
 from pano_mvs.engine.executors.worker_process import WorkerProcess
 
 UNITS_PER_PROCESS = 500
@@ -36,7 +36,7 @@ class ProcessExecutor:
         self._store = store
         self._units_per_process = units_per_process
         self._jobs: queue.SimpleQueue[tuple[Job, dict[str, Any]] | None] = queue.SimpleQueue()
-        self._ended: queue.SimpleQueue[tuple[int, Outcome]] = queue.SimpleQueue()
+        self._ended: queue.SimpleQueue[tuple[int, JobOutcome]] = queue.SimpleQueue()
         self._out: set[int] = set()
         self._keepers: list[tuple[threading.Thread, WorkerProcess]] = []
         self._false_starts = 0
@@ -50,7 +50,7 @@ class ProcessExecutor:
         self._out.add(job.number)
         self._jobs.put((job, request))
 
-    def wait(self, timeout_s: float | None = None) -> tuple[int, Outcome] | None:
+    def wait(self, timeout_s: float | None = None) -> tuple[int, JobOutcome] | None:
         """Return a job that has ended."""
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
         while self._out:
@@ -109,14 +109,14 @@ class ProcessExecutor:
             try:
                 outcome = worker.run(request)
             except OSError as error:  # the unit is not to blame
-                outcome = Outcome("stopped", cause=f"a worker cannot be started: {error}. Mend it and run the same "
+                outcome = JobOutcome("stopped", cause=f"a worker cannot be started: {error}. Mend it and run the same "
                                   "command again", error="StoreError", exit_code=4)  # fmt: skip
             self._ended.put((job.number, self._judged(outcome, refused=worker.refused)))
             if worker.served >= self._units_per_process:
                 worker.stop()
         worker.stop()
 
-    def _judged(self, outcome: Outcome, *, refused: bool) -> Outcome:
+    def _judged(self, outcome: JobOutcome, *, refused: bool) -> JobOutcome:
         """Return the outcome; if workers give up while they start, again and again, nothing can go on."""
         self._false_starts = self._false_starts + 1 if refused else 0
         if self._false_starts < _FALSE_STARTS:

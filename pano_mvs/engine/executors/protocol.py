@@ -10,7 +10,7 @@ from typing import Any, Literal, Protocol
 from pano_mvs.engine.cache.store import UnitRecord
 from pano_mvs.engine.planning.units import Unit
 
-Status = Literal["done", "failed", "damaged", "changed", "stopped"]
+JobStatus = Literal["done", "failed", "damaged", "changed", "stopped"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class Job:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class JobOutcome:
     """What became of a job.
 
     Attributes:
@@ -52,7 +52,7 @@ class Outcome:
         changed: the user's files that are not as they were listed, with the reason.
     """
 
-    status: Status
+    status: JobStatus
     record: UnitRecord | None = None
     cause: str = ""
     trace: str = ""
@@ -77,10 +77,10 @@ class Outcome:
         }
 
     @staticmethod
-    def from_json(value: Mapping[str, Any]) -> Outcome:
+    def from_json(value: Mapping[str, Any]) -> JobOutcome:
         """Return the outcome that `to_json` gave."""
         record = None if value["record"] is None else UnitRecord.from_json(value["record"])
-        return Outcome(**{**value, "record": record})
+        return JobOutcome(**{**value, "record": record})
 
 
 class Executor(Protocol):
@@ -103,7 +103,7 @@ class Executor(Protocol):
     def submit(self, job: Job) -> None:
         """Take a job; the caller never has more than `capacity` of them out."""
 
-    def wait(self, timeout_s: float | None = None) -> tuple[int, Outcome] | None:
+    def wait(self, timeout_s: float | None = None) -> tuple[int, JobOutcome] | None:
         """Return the number and the outcome of a job that has ended; None if none has within the time.
 
         Raises:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from pano_mvs.core.memory import free_memory_bytes
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.perform import perform
-from pano_mvs.engine.executors.protocol import Job, Outcome
+from pano_mvs.engine.executors.protocol import Job, JobOutcome
 from pano_mvs.engine.executors.threads import available_threads
 
 
@@ -29,7 +29,7 @@ class SerialExecutor:
         """Take a job."""
         self._jobs.append(job)
 
-    def wait(self, timeout_s: float | None = None) -> tuple[int, Outcome] | None:
+    def wait(self, timeout_s: float | None = None) -> tuple[int, JobOutcome] | None:
         """Compute the job that was taken, however long it takes."""
         if not self._jobs or timeout_s == 0:
             return None

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from pano_mvs.engine.executors.capture import tail
-from pano_mvs.engine.executors.protocol import Outcome
+from pano_mvs.engine.executors.protocol import JobOutcome
 from pano_mvs.engine.executors.threads import bound_environment
 
 _BOOT = (
@@ -52,7 +52,7 @@ class WorkerProcess:
         self._process: subprocess.Popen[bytes] | None = None
         self._too_late = False
 
-    def run(self, request: Mapping[str, Any]) -> Outcome:
+    def run(self, request: Mapping[str, Any]) -> JobOutcome:
         """Compute a unit, and wait for it; a process that dies or takes too long costs this unit and no other."""
         process = self._process or self._start()
         self.served += 1
@@ -105,7 +105,7 @@ class WorkerProcess:
             )
         return self._process
 
-    def _listen(self, process: subprocess.Popen[bytes], timer: threading.Timer | None) -> Outcome | None:
+    def _listen(self, process: subprocess.Popen[bytes], timer: threading.Timer | None) -> JobOutcome | None:
         """Return what the worker answers, or None if it dies first."""
         assert process.stdout is not None
         for line in process.stdout:
@@ -113,7 +113,7 @@ class WorkerProcess:
                 return None
             answer = json.loads(line)
             if "status" in answer:
-                return Outcome.from_json(answer)
+                return JobOutcome.from_json(answer)
             self._ready = True
             if "started" in answer and timer is not None:
                 timer.start()
@@ -123,17 +123,17 @@ class WorkerProcess:
         self._too_late = True
         self.kill()
 
-    def _death(self, process: subprocess.Popen[bytes], timeout_s: float) -> Outcome:
+    def _death(self, process: subprocess.Popen[bytes], timeout_s: float) -> JobOutcome:
         self._process = None
         _close(process)
         if self._too_late:
-            return Outcome(
+            return JobOutcome(
                 "failed", cause=f"it took longer than timeout_s: {timeout_s:g}, and was ended", error="Timeout"
             )
         self.refused = not self._ready and process.returncode >= 0
         said = () if self._ready else tail(self.errors, 3)
         cause = f"its worker process died ({_how(process.returncode)})" + "".join(f"\n  {line}" for line in said)
-        return Outcome("failed", cause=cause, died=True)
+        return JobOutcome("failed", cause=cause, died=True)
 
 
 def _close(process: subprocess.Popen[bytes]) -> None:

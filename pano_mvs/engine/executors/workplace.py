@@ -15,13 +15,13 @@ from pano_mvs.core.paths import resolved
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.code.plugin_digest import code_digest
 from pano_mvs.engine.executors.perform import perform
-from pano_mvs.engine.executors.protocol import Outcome
-from pano_mvs.engine.executors.unit_text import unit_from_json
+from pano_mvs.engine.executors.protocol import JobOutcome
+from pano_mvs.engine.executors.unit_json import unit_from_json
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import StageSpec
 
 
-def run_request(request: Mapping[str, Any]) -> Outcome:
+def run_request(request: Mapping[str, Any]) -> JobOutcome:
     """Compute the unit of a request, see `request_to_json`."""
     try:
         store = _store(*request["store"])
@@ -29,7 +29,7 @@ def run_request(request: Mapping[str, Any]) -> Outcome:
         plugins = {files[path]: digest for path, digest in request["plugins"].items()}
         unit = unit_from_json(request["unit"], _spec(request["unit"]["use"], plugins), store)
     except PanoMvsError as error:
-        return Outcome("stopped", cause=str(error), error="UsageError")
+        return JobOutcome("stopped", cause=str(error), error="UsageError")
     outcome = perform(unit, store, threads=request["threads"], log=Path(request["log"]))
     for path, here in files.items():  # whoever reads of a failure knows the file where it came from
         if here != path:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.planning.reasons import reason_to_run
 from pano_mvs.engine.planning.resolve import resolve
-from pano_mvs.engine.planning.run_options import NO_DEMANDS, Demands
+from pano_mvs.engine.planning.run_options import DEFAULT_OPTIONS, RunOptions
 from pano_mvs.engine.planning.units import StageState, Unit
 from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import Workflow
@@ -42,7 +42,7 @@ def make_plan(
     graph: Graph,
     store: Store,
     workflow_id: str,
-    demands: Demands = NO_DEMANDS,
+    options: RunOptions = DEFAULT_OPTIONS,
     *,
     visit: Callable[[Unit, UnitRecord | None, str], None] | None = None,
 ) -> list[StagePlan]:
@@ -53,7 +53,7 @@ def make_plan(
         graph: wired.
         store: where finished units are.
         workflow_id: under which the latest run is remembered.
-        demands: what is asked of the run.
+        options: what is asked of the run.
         visit: called for each unit whose inputs are known, with its record if it has one, else the reason to run.
 
     Raises:
@@ -68,15 +68,15 @@ def make_plan(
         units, resolution = resolve(entry, graph, states, store)
         for unit in units:
             record = None
-            if not demands.refreshes(unit):
+            if not options.refreshes(unit):
                 last_key = last.get(name, {}).get(unit.item)
-                record = store.find(unit.key) or demands.acceptable(unit, last_key, store)
+                record = store.find(unit.key) or options.acceptable(unit, last_key, store)
             if record is not None:
                 settle(state, unit, record)
                 plan.cached.append(unit.item)
             else:
                 state.pending.add(unit.item)
-                plan.run[unit.item] = _reason(unit, last.get(name, {}), store, demands)
+                plan.run[unit.item] = _reason(unit, last.get(name, {}), store, options)
             if visit is not None:
                 visit(unit, record, plan.run.get(unit.item, ""))
         state.members, state.failed = resolution.members, resolution.blocked
@@ -94,7 +94,7 @@ def settle(state: StageState, unit: Unit, record: UnitRecord) -> None:
     state.exploded.update(record.items)
 
 
-def _reason(unit: Unit, last: Mapping[str, str], store: Store, demands: Demands) -> str:
-    if demands.refreshes(unit):
+def _reason(unit: Unit, last: Mapping[str, str], store: Store, options: RunOptions) -> str:
+    if options.refreshes(unit):
         return "asked for"
     return reason_to_run(unit, last.get(unit.item), store)

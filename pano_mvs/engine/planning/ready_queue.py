@@ -15,7 +15,7 @@ from typing import Protocol, TypeAlias
 
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
 from pano_mvs.engine.planning.resolve import Resolver, resolve_source
-from pano_mvs.engine.planning.source_listing import Listing
+from pano_mvs.engine.planning.source_listing import SourceListing
 from pano_mvs.engine.planning.units import WHOLE, StageState, Unit
 from pano_mvs.engine.stages.ports import Cardinality
 from pano_mvs.engine.stages.stage import INDEX_PORT
@@ -56,7 +56,7 @@ class _Stage:
     unsettled: int = 0
 
 
-class Board:
+class ReadyQueue:
     """What is known of all stages while a run goes on.
 
     Attributes:
@@ -65,9 +65,9 @@ class Board:
     """
 
     def __init__(
-        self, workflow: Workflow, graph: Graph, store: Store, listener: Listener, listing: Listing | None = None
+        self, workflow: Workflow, graph: Graph, store: Store, listener: Listener, listing: SourceListing | None = None
     ) -> None:
-        self.listing = listing or Listing()
+        self.listing = listing or SourceListing()
         self.states = {name: StageState(graph.axes[name], open=True) for name in graph.order}
         self._store = store
         self._only = graph.only

@@ -11,7 +11,7 @@ from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.file_names import item_problem
 from pano_mvs.engine.cache.store import ItemRef, Store
-from pano_mvs.engine.planning.source_listing import Listing
+from pano_mvs.engine.planning.source_listing import SourceListing
 from pano_mvs.engine.planning.units import PENDING, WHOLE, Resolution, StageState, Unit, UnitInput
 from pano_mvs.engine.stages.params import key_fields
 from pano_mvs.engine.stages.ports import Cardinality
@@ -28,7 +28,7 @@ _SHOWN = 20
 
 
 def resolve_source(
-    entry: StageEntry, store: Store, only: frozenset[str] | None = None, listing: Listing | None = None
+    entry: StageEntry, store: Store, only: frozenset[str] | None = None, listing: SourceListing | None = None
 ) -> Resolution:
     """List a source's items and return a unit for each, or for those that are asked for.
 
@@ -41,7 +41,7 @@ def resolve_source(
     Raises:
         InputError: if the list cannot be made, or names an item twice.
     """
-    listing = listing or Listing()
+    listing = listing or SourceListing()
     resolution = Resolution()
     static = _static_identity(entry, store)
     common = digest_from_value(static)

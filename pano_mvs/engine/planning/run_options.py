@@ -15,7 +15,7 @@ from pano_mvs.engine.workflows.workflow import Workflow
 
 
 @dataclass(frozen=True, slots=True)
-class Demands:
+class RunOptions:
     """What is asked of one run.
 
     Attributes:
@@ -72,7 +72,7 @@ class Demands:
         return dataclasses.replace(last, key=unit.key, identity=unit.identity)
 
 
-NO_DEMANDS = Demands()
+DEFAULT_OPTIONS = RunOptions()
 
 
 def _stage(unit: str) -> str:

@@ -25,7 +25,7 @@ class _ListedFile:
 
 
 @dataclass(slots=True)
-class Listing:
+class SourceListing:
     """The items of a run's sources, and the digests under which their files are used.
 
     Attributes:

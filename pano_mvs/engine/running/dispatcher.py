@@ -17,7 +17,7 @@ from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.executors.capture import tail
 from pano_mvs.engine.executors.execute import arguments_of
-from pano_mvs.engine.executors.protocol import Executor, Job, Outcome
+from pano_mvs.engine.executors.protocol import Executor, Job, JobOutcome
 from pano_mvs.engine.planning.units import PENDING, Unit
 from pano_mvs.scene import Record
 
@@ -29,7 +29,7 @@ _NOT_IN_NAMES = re.compile(r'[<>:"\\|?*\x00-\x1f]')
 
 
 @dataclass(frozen=True, slots=True)
-class Ended:
+class FinishedJob:
     """A job that has ended, after all its tries.
 
     Attributes:
@@ -40,7 +40,7 @@ class Ended:
     """
 
     unit: Unit
-    outcome: Outcome
+    outcome: JobOutcome
     log: Path | None
     said: tuple[str, ...]
 
@@ -52,7 +52,7 @@ class _Out:
     tries: int = 1
 
 
-class Desk:
+class Dispatcher:
     """The jobs that are out."""
 
     def __init__(self, executor: Executor, store: Store, out: Path, plugins: Mapping[Path, str]) -> None:
@@ -71,7 +71,7 @@ class Desk:
         return len(self._out)
 
     @property
-    def has_room(self) -> bool:
+    def has_capacity(self) -> bool:
         """Whether the executor takes a further job."""
         return len(self._out) < self._executor.capacity
 
@@ -93,7 +93,7 @@ class Desk:
             f"settings, or say with `memory:` in stage {unit.entry.name!r} what it really needs"
         )
 
-    def hand_out(self, unit: Unit, *, siblings: int) -> None:
+    def submit(self, unit: Unit, *, siblings: int) -> None:
         """Give a unit to the executor; if its stage has few units, each of them may use the more threads."""
         threads = max(self._executor.threads, self._executor.cores // siblings)
         log = self._store.blobs.temporary / f"{temporary_prefix()}log-{uuid.uuid4().hex}.txt"
@@ -102,7 +102,7 @@ class Desk:
         self._out[job.number] = _Out(job, self._memory_of(unit))
         self._executor.submit(job)
 
-    def take(self, timeout_s: float | None = None) -> Ended | None:
+    def take(self, timeout_s: float | None = None) -> FinishedJob | None:
         """Return a job that has ended; one that may be tried again is, and does not count as ended."""
         while self._out and (found := self._executor.wait(timeout_s)) is not None:
             number, outcome = found
@@ -115,7 +115,7 @@ class Desk:
                 continue
             del self._out[number]
             log, said = self._keep_log(out.job)
-            return Ended(out.job.unit, outcome, log, said)
+            return FinishedJob(out.job.unit, outcome, log, said)
         return None
 
     def cancel(self) -> None:

@@ -8,7 +8,7 @@ from typing import Literal, Protocol
 
 from pano_mvs.engine.workflows.workflow import StageEntry
 
-Outcome = Literal["cached", "run", "failed", "blocked"]
+UnitStatus = Literal["cached", "run", "failed", "blocked"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +123,7 @@ class Observer(Protocol):
     def unit_failed(self, failure: Failure) -> None:
         """A unit has failed, after all its tries; `unit_finished` follows."""
 
-    def unit_finished(self, name: str, item: str, outcome: Outcome, seconds: float) -> None:
+    def unit_finished(self, name: str, item: str, outcome: UnitStatus, seconds: float) -> None:
         """A unit is done; `seconds` is how long it took to compute."""
 
     def stage_finished(self, summary: StageSummary) -> None:
@@ -133,7 +133,7 @@ class Observer(Protocol):
         """Something the user should know, though the run goes on."""
 
 
-class Silent:
+class SilentObserver:
     """An observer that says nothing."""
 
     def stage_started(self, name: str, units: int) -> None:
@@ -145,7 +145,7 @@ class Silent:
     def unit_failed(self, failure: Failure) -> None:
         """Say nothing."""
 
-    def unit_finished(self, name: str, item: str, outcome: Outcome, seconds: float) -> None:
+    def unit_finished(self, name: str, item: str, outcome: UnitStatus, seconds: float) -> None:
         """Say nothing."""
 
     def stage_finished(self, summary: StageSummary) -> None:

@@ -9,21 +9,21 @@ from contextlib import suppress
 from pathlib import Path
 
 from pano_mvs.core.digest import digest_from_value
-from pano_mvs.core.errors import GateError, StoreError
+from pano_mvs.core.errors import RunStoppedError, StoreError
 from pano_mvs.core.paths import is_file
 from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.executors.protocol import Executor
 from pano_mvs.engine.executors.serial import SerialExecutor
-from pano_mvs.engine.planning.ready_queue import Board
-from pano_mvs.engine.planning.run_options import NO_DEMANDS, Demands
-from pano_mvs.engine.planning.source_listing import Listing
+from pano_mvs.engine.planning.ready_queue import ReadyQueue
+from pano_mvs.engine.planning.run_options import DEFAULT_OPTIONS, RunOptions
+from pano_mvs.engine.planning.source_listing import SourceListing
 from pano_mvs.engine.planning.units import StageState, Unit
-from pano_mvs.engine.running.dispatcher import Desk
-from pano_mvs.engine.running.events import Observer, RunResult, Silent
+from pano_mvs.engine.running.dispatcher import Dispatcher
+from pano_mvs.engine.running.events import Observer, RunResult, SilentObserver
 from pano_mvs.engine.running.publish import Publisher
 from pano_mvs.engine.running.scheduler import Scheduler
-from pano_mvs.engine.running.statistics import Tally
+from pano_mvs.engine.running.statistics import RunStatistics
 from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import Workflow
 from pano_mvs.scene import Record
@@ -56,28 +56,28 @@ class Run:
         *,
         observer: Observer | None = None,
         executor: Executor | None = None,
-        demands: Demands = NO_DEMANDS,
+        options: RunOptions = DEFAULT_OPTIONS,
     ) -> None:
         """Prepare a run; the executor, by default a serial one with all threads, stays the caller's to close.
 
         Raises:
-            UsageError: if the output folder cannot be written, or demands name a stage that there is not.
+            UsageError: if the output folder cannot be written, or options name a stage that there is not.
         """
-        self.workflow, self.graph = demands.applied_to(workflow, graph)
-        self.demands = demands
+        self.workflow, self.graph = options.applied_to(workflow, graph)
+        self.options = options
         self.store = store
         self.out = out
-        self.observer = observer or Silent()
+        self.observer = observer or SilentObserver()
         self.executor = executor or SerialExecutor(store)
         self.states: dict[str, StageState] = {}
         self.result = RunResult()
         self._publisher = Publisher(out, store)
-        self._desk = Desk(self.executor, store, out, workflow.plugins)
-        self._listing = Listing()
+        self._dispatcher = Dispatcher(self.executor, store, out, workflow.plugins)
+        self._listing = SourceListing()
         self._keys: dict[str, dict[str, str]] = {}
         self._computed: set[str] = set()
         self._refreshed: set[str] = set()
-        self._last_keys = store.runs.last_keys(workflow_id(workflow)) if demands.accept_code else {}
+        self._last_keys = store.runs.last_keys(workflow_id(workflow)) if options.accept_code else {}
 
     def execute(self, *, earlier_files: Mapping[str, str] | None = None) -> RunResult:
         """Run every stage; finished units are kept whatever happens.
@@ -95,7 +95,7 @@ class Run:
         self._warn_of_timeouts()
         try:
             self._execute_healing()
-            for unit in self.demands.refresh:
+            for unit in self.options.refresh:
                 if ":" in unit and unit not in self._refreshed:
                     self._warn(f"--refresh {unit}: nothing was computed again, no unit of that name was reached")
             if self.result.complete and not self.graph.is_part:
@@ -105,7 +105,7 @@ class Run:
             self._let_finish()
             raise
         finally:
-            self._desk.cancel()
+            self._dispatcher.cancel()
             self._remember()
             earlier = dict(self._publisher.earlier)
             for name, aside in self._publisher.set_aside.items():
@@ -153,22 +153,22 @@ class Run:
     def _execute_once(self) -> None:
         result = self.result
         result.stages, result.failures, result.rejected, result.doubts, result.stopped = [], [], {}, {}, ""
-        tally = Tally(result, self.observer, lambda name: self.states[name], self._publisher.name_items)
-        board = Board(self.workflow, self.graph, self.store, tally, self._listing)
-        self.states = board.states
-        self._scheduler = Scheduler(board, tally, self._desk, self._publisher, keys=self._keys,
+        statistics = RunStatistics(result, self.observer, lambda name: self.states[name], self._publisher.name_items)
+        queue = ReadyQueue(self.workflow, self.graph, self.store, statistics, self._listing)
+        self.states = queue.states
+        self._scheduler = Scheduler(queue, statistics, self._dispatcher, self._publisher, keys=self._keys,
                                     computed=self._computed, finder=self._find, warn=self._warn)  # fmt: skip
-        stop: GateError | None = None
+        stop: RunStoppedError | None = None
         self._publisher.begin_pass()
         try:
-            board.start()
+            queue.start()
             with suppress(StoreError):  # so that workers need not read whole files for their digests
                 self.store.stat_cache.save()
             self._scheduler.work()
-        except GateError as error:
+        except RunStoppedError as error:
             stop = error
         finally:
-            tally.put_in_order(board.place, replaced=self._replaced())
+            statistics.put_in_order(queue.place, replaced=self._replaced())
         if stop is not None:
             result.stopped, result.exit_code = str(stop), stop.exit_code
         else:
@@ -187,21 +187,21 @@ class Run:
 
     def _find(self, unit: Unit) -> UnitRecord | None:
         """Return a unit's record if the store has it and nobody asked for it anew."""
-        if self.demands.refreshes(unit):
+        if self.options.refreshes(unit):
             self._refreshed.add(f"{unit.entry.name}:{unit.item}")
             if unit.key not in self._computed:
                 return None
         last = self._last_keys.get(unit.entry.name, {}).get(unit.item)
-        return self.store.find(unit.key) or self.demands.accepted(unit, last, self.store)
+        return self.store.find(unit.key) or self.options.accepted(unit, last, self.store)
 
     def _let_finish(self) -> None:
         """Give units in flight some time after an interrupt; a second interrupt ends it at once."""
         deadline = time.monotonic() + GRACE_S
-        if self._desk and self.executor.enforces_timeouts:  # units run elsewhere, and go on
-            self.observer.warn(f"interrupted: {len(self._desk)} units may finish within {GRACE_S:.0f} s; "
+        if self._dispatcher and self.executor.enforces_timeouts:  # units run elsewhere, and go on
+            self.observer.warn(f"interrupted: {len(self._dispatcher)} units may finish within {GRACE_S:.0f} s; "
                                "interrupt again to stop at once")  # fmt: skip
-            while self._desk and (left := deadline - time.monotonic()) > 0:
-                self._desk.take(left)
+            while self._dispatcher and (left := deadline - time.monotonic()) > 0:
+                self._dispatcher.take(left)
 
     def _warn_of_timeouts(self) -> None:
         names = [name for name, entry in self.workflow.stages.items() if entry.policy.timeout_s]

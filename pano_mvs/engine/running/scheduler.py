@@ -1,26 +1,26 @@
-"""Take units from the board, find them in the store or have them computed, and act on what comes back."""
+"""Take units from the queue, find them in the store or have them computed, and act on what comes back."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-from pano_mvs.core.errors import ContractError, GateError, PanoMvsError, StoreError, UsageError
+from pano_mvs.core.errors import ContractError, PanoMvsError, RunStoppedError, StoreError, UsageError
 from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import Store, UnitRecord
-from pano_mvs.engine.executors.protocol import Outcome
-from pano_mvs.engine.planning.ready_queue import Board
+from pano_mvs.engine.executors.protocol import JobOutcome
+from pano_mvs.engine.planning.ready_queue import ReadyQueue
 from pano_mvs.engine.planning.units import Unit
-from pano_mvs.engine.running.dispatcher import Desk, Ended
+from pano_mvs.engine.running.dispatcher import Dispatcher, FinishedJob
 from pano_mvs.engine.running.events import Failure, consequence_of
 from pano_mvs.engine.running.publish import NameClashError, Publisher
-from pano_mvs.engine.running.statistics import Tally
+from pano_mvs.engine.running.statistics import RunStatistics
 from pano_mvs.engine.workflows.workflow import StageEntry
 from pano_mvs.scene import Axis, Files
 
-_STOPPING = {error.__name__: error for error in (StoreError, GateError, UsageError)}
+_STOPPING = {error.__name__: error for error in (StoreError, RunStoppedError, UsageError)}
 
 
-class StoppedError(GateError):
+class UnusableInputError(RunStoppedError):
     """What the user gave cannot be used by a stage on which all others wait."""
 
     def __init__(self, message: str, exit_code: int) -> None:
@@ -41,9 +41,9 @@ class Scheduler:
 
     def __init__(
         self,
-        board: Board,
-        tally: Tally,
-        desk: Desk,
+        queue: ReadyQueue,
+        statistics: RunStatistics,
+        dispatcher: Dispatcher,
         publisher: Publisher,
         *,
         keys: dict[str, dict[str, str]],
@@ -54,9 +54,9 @@ class Scheduler:
         self.keys = keys
         self.computed = computed
         self.damaged: list[str] = []
-        self._board = board
-        self._tally = tally
-        self._desk = desk
+        self._queue = queue
+        self._statistics = statistics
+        self._dispatcher = dispatcher
         self._publisher = publisher
         self._store: Store = publisher.store
         self._finder = finder
@@ -68,31 +68,31 @@ class Scheduler:
 
         Raises:
             DamagedBlobError: if something stored turned out damaged, once nothing else can be done.
-            GateError: if the workflow says that the run stops here.
+            RunStoppedError: if the workflow says that the run stops here.
             StoreError: if the store or the output folder cannot be written.
             UsageError: if workers know another version of a stage.
         """
         held: Unit | None = None  # waits for memory, and all behind it with it, so that its turn comes
         while True:
             nothing_runs = False
-            if held is None and self._desk.has_room:
-                unit = self._board.next_unit()
+            if held is None and self._dispatcher.has_capacity:
+                unit = self._queue.next_unit()
                 nothing_runs = unit is None
                 held = unit if unit is not None and not self._find(unit) else None
-            if held is not None and self._hand_out(held):
+            if held is not None and self._submit(held):
                 held = None
-            if nothing_runs and not self._desk:
+            if nothing_runs and not self._dispatcher:
                 if self.damaged:
                     raise DamagedBlobError(self.damaged[0])
                 return
-            must_wait = nothing_runs or held is not None or not self._desk.has_room
-            ended = self._desk.take(None if must_wait else 0)
+            must_wait = nothing_runs or held is not None or not self._dispatcher.has_capacity
+            ended = self._dispatcher.take(None if must_wait else 0)
             if ended is not None:
                 self._end(ended)
 
     def drain(self) -> None:
         """Wait for what is being computed; its results are in the store."""
-        while (ended := self._desk.take()) is not None:
+        while (ended := self._dispatcher.take()) is not None:
             if ended.outcome.record is not None:
                 self.computed.add(ended.unit.key)
 
@@ -110,27 +110,27 @@ class Scheduler:
             self._accept(unit, record, was_computed=unit.key in self.computed)
         return record is not None
 
-    def _hand_out(self, unit: Unit) -> bool:
+    def _submit(self, unit: Unit) -> bool:
         """Have a unit computed as soon as there is memory for it; return whether it is off our hands."""
-        if not self._desk.fits(unit):
-            if self._desk:
+        if not self._dispatcher.fits(unit):
+            if self._dispatcher:
                 return False
-            self._tally.unit_started(unit.entry, unit.item)
-            self._fail(Ended(unit, Outcome("failed", cause=self._desk.refusal(unit)), None, ()))
+            self._statistics.unit_started(unit.entry, unit.item)
+            self._fail(FinishedJob(unit, JobOutcome("failed", cause=self._dispatcher.refusal(unit)), None, ()))
             return True
         self._twins[unit.key] = []
-        self._tally.unit_started(unit.entry, unit.item)
-        self._desk.hand_out(unit, siblings=len(self._board.states[unit.entry.name].members))
+        self._statistics.unit_started(unit.entry, unit.item)
+        self._dispatcher.submit(unit, siblings=len(self._queue.states[unit.entry.name].members))
         return True
 
-    def _end(self, ended: Ended) -> None:
+    def _end(self, ended: FinishedJob) -> None:
         outcome, unit = ended.outcome, ended.unit
         twins = self._twins.pop(unit.key)
         if outcome.status == "damaged":
             self._doubt(unit)
             self.damaged.append(outcome.cause)
             return
-        if outcome.status == "changed" and self._board.listing.report(outcome.changed):
+        if outcome.status == "changed" and self._queue.listing.report(outcome.changed):
             self.damaged.append(outcome.cause)
             return
         if outcome.status == "stopped":
@@ -142,14 +142,14 @@ class Scheduler:
             self._fail(ended)
         for twin in twins:
             if not self._find(twin):
-                self._fail(Ended(twin, outcome, ended.log, ended.said))
+                self._fail(FinishedJob(twin, outcome, ended.log, ended.said))
 
     def _accept(self, unit: Unit, record: UnitRecord, *, was_computed: bool) -> None:
         if issubclass(unit.entry.spec.output, Files):
             try:
                 losers = self._publisher.publish(unit.entry.name, unit.item, record.output, to=unit.entry.policy.to)
             except (NameClashError, ContractError) as error:
-                self._fail(Ended(unit, Outcome("failed", cause=str(error), seconds=record.seconds), None, ()))
+                self._fail(FinishedJob(unit, JobOutcome("failed", cause=str(error), seconds=record.seconds), None, ()))
                 return
             except DamagedBlobError as error:
                 self._store.drop(record.key)
@@ -157,31 +157,31 @@ class Scheduler:
                 return
             for item, cause in losers.items():
                 self._give_way(unit.entry, item, cause)
-        self._tally.unit_done(unit.entry, unit.item, record, "run" if was_computed else "cached")
-        self._board.finish(unit, record)
+        self._statistics.unit_done(unit.entry, unit.item, record, "run" if was_computed else "cached")
+        self._queue.finish(unit, record)
 
     def _give_way(self, entry: StageEntry, item: str, cause: str) -> None:
         """List a unit as failed that had a result: its files clash with those of a unit that comes first."""
         was_computed = self.keys.get(entry.name, {}).get(item) in self.computed
-        self._tally.unit_withdrawn(
+        self._statistics.unit_withdrawn(
             Failure(entry.name, item, cause, consequence=consequence_of(entry, item)), was_computed
         )
-        self._board.withdraw(entry.name, item, cause)
+        self._queue.withdraw(entry.name, item, cause)
         if entry.policy.on_error == "stop":
-            raise GateError(f"stage {entry.name!r} has on_error: stop, and {entry.name}:{item} failed: {cause}")
+            raise RunStoppedError(f"stage {entry.name!r} has on_error: stop, and {entry.name}:{item} failed: {cause}")
 
     def _doubt(self, unit: Unit) -> None:
         """Have all computed again that could have led a unit to something damaged, lest it leads there again."""
         for ref in unit.input_blobs():
             if ref.external:
                 self._store.stat_cache.forget(self._store.blobs.path(ref))
-        for producer in self._board.producers(unit.entry.name):
+        for producer in self._queue.producers(unit.entry.name):
             for key in self.keys.get(producer, {}).values():
                 record = self._store.read_record(key)
                 if record is not None and not all(self._store.blobs.exists(ref) for ref in record.blobs()):
                     self._store.drop(key)
 
-    def _fail(self, ended: Ended) -> None:
+    def _fail(self, ended: FinishedJob) -> None:
         """List a unit that failed; stop if the workflow wants it so, or if all others wait for it."""
         unit, outcome = ended.unit, ended.outcome
         entry = unit.entry
@@ -194,9 +194,9 @@ class Scheduler:
             log="" if ended.log is None else str(ended.log),
             said=ended.said,
         )
-        self._tally.unit_failed(failure, outcome.seconds)
-        if outcome.exit_code and self._board.states[entry.name].axis is Axis.ONE:
-            raise StoppedError(f"{entry.name}: {outcome.cause}", outcome.exit_code)
+        self._statistics.unit_failed(failure, outcome.seconds)
+        if outcome.exit_code and self._queue.states[entry.name].axis is Axis.ONE:
+            raise UnusableInputError(f"{entry.name}: {outcome.cause}", outcome.exit_code)
         if entry.policy.on_error == "stop":
-            raise GateError(f"stage {entry.name!r} has on_error: stop, and {unit.label} failed: {outcome.cause}")
-        self._board.fail(unit, outcome.cause)
+            raise RunStoppedError(f"stage {entry.name!r} has on_error: stop, and {unit.label} failed: {outcome.cause}")
+        self._queue.fail(unit, outcome.cause)

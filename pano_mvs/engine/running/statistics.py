@@ -6,10 +6,10 @@ import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
-from pano_mvs.core.errors import GateError, InputError
+from pano_mvs.core.errors import InputError, RunStoppedError
 from pano_mvs.engine.cache.store import UnitRecord
 from pano_mvs.engine.planning.units import StageState
-from pano_mvs.engine.running.events import Failure, Observer, Outcome, RunResult, StageSummary, consequence_of
+from pano_mvs.engine.running.events import Failure, Observer, RunResult, StageSummary, UnitStatus, consequence_of
 from pano_mvs.engine.workflows.workflow import StageEntry
 
 _SHOWN_CAUSES = 10
@@ -27,8 +27,8 @@ class _Count:
     doubts: dict[str, dict[str, str]] = field(default_factory=dict)
 
 
-class Tally:
-    """Hears from the board and from the run, tells the observer, and fills in the result."""
+class RunStatistics:
+    """Hears from the queue and from the run, tells the observer, and fills in the result."""
 
     def __init__(
         self,
@@ -60,7 +60,7 @@ class Tally:
         """Note a unit that cannot run; of a source, it is the image itself that cannot be used.
 
         Raises:
-            GateError: if such an image is to end the run.
+            RunStoppedError: if such an image is to end the run.
         """
         summary = self._counts[entry.name].summary
         if entry.spec.list_items is not None:
@@ -72,7 +72,7 @@ class Tally:
         self._result.failures.append(failure)
         self._observer.unit_finished(entry.name, item, "blocked", 0.0)
         if entry.spec.list_items is not None and entry.policy.on_error == "stop":
-            raise GateError(f"stage {entry.name!r} has on_error: stop, and {item} cannot be used: {reason}")
+            raise RunStoppedError(f"stage {entry.name!r} has on_error: stop, and {item} cannot be used: {reason}")
 
     def unit_started(self, entry: StageEntry, item: str) -> None:
         """Note that a unit is being computed."""
@@ -81,7 +81,7 @@ class Tally:
             count.began = time.perf_counter()
         self._observer.unit_started(entry.name, item)
 
-    def unit_done(self, entry: StageEntry, item: str, record: UnitRecord, outcome: Outcome) -> None:
+    def unit_done(self, entry: StageEntry, item: str, record: UnitRecord, outcome: UnitStatus) -> None:
         """Note a unit with a result."""
         count = self._counts[entry.name]
         if outcome == "run":
@@ -122,7 +122,7 @@ class Tally:
 
         Raises:
             InputError: if a source has nothing to offer; the rest cannot go on.
-            GateError: if the stage does not reach what its entry asks for.
+            RunStoppedError: if the stage does not reach what its entry asks for.
         """
         count, state = self._counts[entry.name], self._states(entry.name)
         summary = count.summary
@@ -165,12 +165,12 @@ class Tally:
 def _check_gates(entry: StageEntry, summary: StageSummary) -> None:
     done = summary.run + summary.cached
     if summary.units and done / summary.units < entry.policy.min_success:
-        raise GateError(f"stage {entry.name!r}: {done} of {summary.units} units succeeded, min_success is "
+        raise RunStoppedError(f"stage {entry.name!r}: {done} of {summary.units} units succeeded, min_success is "
                         f"{entry.policy.min_success}")  # fmt: skip
     for metric, limits in entry.policy.gate.items():
         if metric not in summary.metrics:
             known = ", ".join(summary.metrics) or "none"
-            raise GateError(f"stage {entry.name!r}: gate on {metric!r}, but it reports: {known}")
+            raise RunStoppedError(f"stage {entry.name!r}: gate on {metric!r}, but it reports: {known}")
         if objection := limits.objection(summary.metrics[metric]):
-            raise GateError(f"stage {entry.name!r}: {metric} is {summary.metrics[metric]:.4g}, the gate asks for "
+            raise RunStoppedError(f"stage {entry.name!r}: {metric} is {summary.metrics[metric]:.4g}, the gate asks for "
                             f"{objection}")  # fmt: skip

@@ -17,7 +17,7 @@ from pydantic import (
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
 
-from pano_mvs.core.parts import Parts
+from pano_mvs.core.named_registry import NamedRegistry
 from pano_mvs.core.paths import expanded
 
 
@@ -54,13 +54,13 @@ SourcePath: TypeAlias = Annotated[Path, AfterValidator(_resolve), NOT_IN_KEY]
 
 
 @dataclass(frozen=True)
-class PartOf:
-    """Marks a field that names a part, ours or a plugin's: `cost: Annotated[str, PartOf(SWEEP_COSTS)] = "census"`.
+class RegisteredIn:
+    """Marks a field that names a part, ours or a plugin's: `cost: Annotated[str, RegisteredIn(SWEEP_COSTS)] = "census"`.
 
     A name that there is not is a mistake in the workflow. The code of a plugin's part counts towards the cache key.
     """
 
-    parts: Parts[Any]
+    parts: NamedRegistry[Any]
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         """Return the schema of a name that is checked."""
@@ -88,12 +88,12 @@ def key_fields(params: Params) -> tuple[dict[str, Any], dict[str, list[Path]]]:
     return plain, paths
 
 
-def part_files(params: Params) -> dict[str, Path]:
+def registered_files(params: Params) -> dict[str, Path]:
     """Return every setting that names a plugin's part, with the file that defines the part: its code counts too."""
     found: dict[str, Path] = {}
     for name, field in type(params).model_fields.items():
         for mark in field.metadata:
-            if isinstance(mark, PartOf) and (file := mark.parts.code_file(getattr(params, name))) is not None:
+            if isinstance(mark, RegisteredIn) and (file := mark.parts.code_file(getattr(params, name))) is not None:
                 found[name] = file
     return found
 

@@ -19,7 +19,7 @@ from types import ModuleType
 
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import PluginError
-from pano_mvs.core.parts import PartMark, marks_of, set_unusable_parts
+from pano_mvs.core.named_registry import Registration, registrations_of, set_unavailable
 from pano_mvs.core.paths import is_file, resolved
 from pano_mvs.core.text import shortened
 from pano_mvs.engine.code.plugin_digest import code_digest
@@ -69,7 +69,7 @@ class Registry:
     """
 
     stages: dict[str, StageSpec] = field(default_factory=dict)
-    parts: dict[tuple[str, str], PartMark] = field(default_factory=dict)
+    parts: dict[tuple[str, str], Registration] = field(default_factory=dict)
     origins: dict[str, str] = field(default_factory=dict)
     plugins: list[Plugin] = field(default_factory=list)
     clashes: dict[tuple[str, str], str] = field(default_factory=dict)
@@ -221,7 +221,7 @@ class Registry:
             if kind == "stage":
                 self.stages.pop(name, None)
         missing = {name: plugin.why_broken() for plugin in self.broken for name in plugin.names if name[0] != "stage"}
-        set_unusable_parts(missing | {name: why for name, why in self.clashes.items() if name[0] != "stage"})
+        set_unavailable(missing | {name: why for name, why in self.clashes.items() if name[0] != "stage"})
 
 
 def _broken(origin: str, names: tuple[tuple[str, str], ...], error: BaseException) -> Plugin:
@@ -253,11 +253,11 @@ def _specs(module: ModuleType, *, own_only: bool) -> Iterator[StageSpec]:
             yield spec
 
 
-def _marks(module: ModuleType, *, own_only: bool) -> Iterator[PartMark]:
+def _marks(module: ModuleType, *, own_only: bool) -> Iterator[Registration]:
     """Find what a module, or a helper of it, registers beside stages."""
     for value in vars(module).values():
         if not own_only or getattr(value, "__module__", "") == module.__name__:
-            yield from marks_of(value)
+            yield from registrations_of(value)
 
 
 def _import_file(path: Path) -> ModuleType:

@@ -17,7 +17,7 @@ from pano_mvs.engine.code.plugin_digest import code_digest, code_texts
 from pano_mvs.engine.code.reach import CodeGraph, Reach
 from pano_mvs.engine.code.sources import Sources
 from pano_mvs.engine.code.summary import summarize_module
-from pano_mvs.engine.stages.params import Params, part_files
+from pano_mvs.engine.stages.params import Params, registered_files
 from pano_mvs.engine.stages.stage import StageSpec
 
 _OURS = pano_mvs.__name__
@@ -53,7 +53,7 @@ def stage_code(spec: StageSpec, params: Params) -> StageCode:
     else:
         reached = [_reach_in_package(spec.function.__module__, spec.function.__qualname__)]
     digests: dict[str, str] = {"": reached[0].digest}
-    for setting, path in part_files(params).items():
+    for setting, path in registered_files(params).items():
         reached.append(_reach_of_file(path, code_digest(path)))
         digests[setting] = reached[-1].digest
     libraries = library_versions(name for one in reached for name in one.libraries)

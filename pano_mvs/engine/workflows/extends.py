@@ -21,7 +21,7 @@ TOP_KEYS = ("pano_mvs", "name", "description", "extends", "plugins", "stages")
 
 
 @dataclass(frozen=True, slots=True)
-class Layer:
+class WorkflowFile:
     """One workflow file as it is written.
 
     Attributes:
@@ -69,7 +69,7 @@ def read_text(path: Path) -> str:
 
 
 @dataclass(slots=True)
-class LayerReader:
+class ExtendsReader:
     """Reads a file and all that it extends: each once, those that are extended first.
 
     Attributes:
@@ -80,7 +80,7 @@ class LayerReader:
 
     problems: Problems
     presets: Path | None = None
-    layers: list[Layer] = field(default_factory=list)
+    layers: list[WorkflowFile] = field(default_factory=list)
     _seen: set[Path] = field(default_factory=set)
 
     def read(self, text: str, shown_as: str, base: Path, *, chain: tuple[Path, ...] = ()) -> None:
@@ -100,7 +100,7 @@ class LayerReader:
             path = self._find(item, base)
             if path is not None:
                 self._follow(item, path, chain)
-        self.layers.append(Layer(shown_as, base, text, root))
+        self.layers.append(WorkflowFile(shown_as, base, text, root))
 
     def _extended(self, root: Located) -> Iterator[Located]:
         node = root.value.get("extends")
@@ -163,7 +163,7 @@ class LayerReader:
             self.problems.add((node or root).place, "`stages:` must be a mapping of stage names to {use: …}")
 
 
-def merge_stages(layers: Sequence[Layer], problems: Problems) -> dict[str, Located]:
+def merge_stages(layers: Sequence[WorkflowFile], problems: Problems) -> dict[str, Located]:
     """Lay the stages of files over each other; what comes later holds.
 
     A stage that is given again keeps its place and overrides setting by setting; with another `use` it is a new one;

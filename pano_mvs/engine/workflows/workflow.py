@@ -17,7 +17,7 @@ from pano_mvs.engine.code.plugin_digest import code_digest
 from pano_mvs.engine.stages.params import Params, files_of
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import StageSpec
-from pano_mvs.engine.workflows.extends import Layer, LayerReader, did_you_mean, merge_stages, read_text
+from pano_mvs.engine.workflows.extends import ExtendsReader, WorkflowFile, did_you_mean, merge_stages, read_text
 from pano_mvs.engine.workflows.overrides import apply_overrides
 from pano_mvs.engine.workflows.policy import RESERVED_KEYS, Policy
 from pano_mvs.engine.workflows.yaml_text import Located, Problems
@@ -90,7 +90,7 @@ def load_workflow(
     return reader.read(read_text(path), overrides=overrides, images=images, path=path)
 
 
-class PartialWorkflowError(WorkflowError):
+class InvalidWorkflowError(WorkflowError):
     """A workflow with mistakes; `stages` are its entries where all could be named, for the wiring to be checked too."""
 
     def __init__(self, problems: list[str], stages: dict[str, StageEntry]) -> None:
@@ -125,7 +125,7 @@ class WorkflowReader:
             self.problems.add(layers[-1].root.place, "no stage is left")
         stages = {name: entry for name, node in entries.items() if (entry := self._stage(name, node)) is not None}
         if self.problems.lines:
-            raise PartialWorkflowError(self.problems.lines, stages if len(stages) == len(entries) else {})
+            raise InvalidWorkflowError(self.problems.lines, stages if len(stages) == len(entries) else {})
         root = layers[-1].root
         name = root.value["name"].plain() if "name" in root.value else _name_of(self.shown_as)
         shown = ([f"images.path={images}"] if images else []) + list(overrides)
@@ -144,8 +144,8 @@ class WorkflowReader:
             self._load_plugins(layer.root.value.get("plugins"))
         return merge_stages(layers[:-1], self.problems)
 
-    def _layers(self, text: str, path: Path | None) -> list[Layer]:
-        reader = LayerReader(self.problems, self.presets)
+    def _layers(self, text: str, path: Path | None) -> list[WorkflowFile]:
+        reader = ExtendsReader(self.problems, self.presets)
         reader.read(text, self.shown_as, self.base, chain=(resolved(path),) if path is not None else ())
         self.folders = {layer.shown_as: layer.base for layer in reader.layers}
         return reader.layers
@@ -240,7 +240,7 @@ def _name_of(shown_as: str) -> str:
     return word if is_plain_name(word) else "workflow"
 
 
-def _all_texts(layers: Sequence[Layer]) -> str:
+def _all_texts(layers: Sequence[WorkflowFile]) -> str:
     """Return a workflow's text, with those of the files that it extends behind it."""
     *below, own = layers
     return own.text + "".join(f"\n---\n# extended: {layer.shown_as}\n{layer.text}" for layer in below)

@@ -18,7 +18,7 @@ from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.processes import ProcessExecutor
 from pano_mvs.engine.executors.protocol import Executor
 from pano_mvs.engine.executors.serial import SerialExecutor
-from pano_mvs.engine.running.events import RunResult, Silent
+from pano_mvs.engine.running.events import RunResult, SilentObserver
 from pano_mvs.engine.running.run import Run
 from tests.engine.conftest import Toy, settle
 
@@ -118,7 +118,7 @@ def texts(toy: Toy) -> Toy:
     return toy
 
 
-class Meddler(Silent):
+class Meddler(SilentObserver):
     """Does something once, when a unit has been computed."""
 
     def __init__(self, stage: str, item: str, meddle: Callable[[], object]) -> None:
@@ -135,7 +135,9 @@ class Meddler(Silent):
         self.warnings.append(text)
 
 
-def run(toy: Toy, observer: Silent | None = None, *, executor: str = "serial", cache: str = "cache") -> RunResult:
+def run(
+    toy: Toy, observer: SilentObserver | None = None, *, executor: str = "serial", cache: str = "cache"
+) -> RunResult:
     session = toy.session(cache=toy.folder / cache)
     store = Store(session.store_root)
     made: Executor

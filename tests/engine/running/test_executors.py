@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from pano_mvs.core.errors import GateError, InputError, PanoMvsError, UsageError
+from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError, UsageError
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors import choose, worker_process
 from pano_mvs.engine.executors.choose import make_executor
@@ -21,7 +21,7 @@ from pano_mvs.engine.executors.processes import ProcessExecutor
 from pano_mvs.engine.executors.protocol import Executor
 from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.executors.threads import bound_environment, share_cores
-from pano_mvs.engine.running.events import RunResult, Silent
+from pano_mvs.engine.running.events import RunResult, SilentObserver
 from pano_mvs.engine.running.run import Run
 from tests.engine.conftest import Toy, ran
 from tests.engine.running.test_run import ALL_UNITS
@@ -33,7 +33,9 @@ def two_processes(store: Store) -> Executor:
     return ProcessExecutor(store, workers=2, threads=1)
 
 
-def run_with(toy: Toy, make: Make, *overrides: str, name: str = "x", observer: Silent | None = None) -> RunResult:
+def run_with(
+    toy: Toy, make: Make, *overrides: str, name: str = "x", observer: SilentObserver | None = None
+) -> RunResult:
     """Run into a folder and a store of the name's own."""
     session = toy.session(*overrides, cache=toy.folder / f"cache-{name}")
     store = Store(session.store_root)
@@ -251,7 +253,7 @@ def test_damaged_blob_is_reported_and_its_producer_computed_again(toy: Toy) -> N
 def test_policies_mean_the_same_in_processes(toy: Toy) -> None:
     toy.number("3.txt", "13")
     stopped = run_with(toy, two_processes, "scaled.on_error=stop")
-    assert stopped.exit_code == GateError.exit_code
+    assert stopped.exit_code == RunStoppedError.exit_code
     assert "unlucky" in stopped.stopped
     gated = run_with(toy, two_processes, "scaled.min_success=0.9")
     assert "min_success is 0.9" in gated.stopped
@@ -389,7 +391,7 @@ def test_nothing_of_a_cancelled_run_goes_on(toy: Toy) -> None:
     time.sleep(600)'''))  # fmt: skip
     before = threading.active_count()
     started = time.monotonic()
-    assert run_with(toy, two_processes, "scaled.on_error=stop").exit_code == GateError.exit_code
+    assert run_with(toy, two_processes, "scaled.on_error=stop").exit_code == RunStoppedError.exit_code
     assert time.monotonic() - started < 60
     assert threading.active_count() == before
 

@@ -5,7 +5,7 @@ import pytest
 from pano_mvs.engine.cache.blobs import BlobRef
 from pano_mvs.engine.cache.store import ItemRef
 from pano_mvs.engine.executors.execute import kept_items
-from pano_mvs.engine.executors.lazy_mapping import Gather
+from pano_mvs.engine.executors.lazy_mapping import LazyMapping
 
 
 @pytest.fixture
@@ -19,7 +19,7 @@ def gather(loaded):
         loaded.append(ref)
         return [ref]
 
-    return Gather({f"{idx:03d}": idx for idx in range(200)}, load)
+    return LazyMapping({f"{idx:03d}": idx for idx in range(200)}, load)
 
 
 def test_names_length_and_membership_load_nothing(gather, loaded):
@@ -57,11 +57,11 @@ def test_a_failure_comes_out_of_the_access():
         raise OSError(f"no {ref}")
 
     with pytest.raises(OSError, match="no 1"):
-        Gather({"a": 1}, load)["a"]
+        LazyMapping({"a": 1}, load)["a"]
 
 
 def test_as_many_are_kept_as_are_asked_for(loaded):
-    gather = Gather({idx: idx for idx in range(5)}, lambda ref: loaded.append(ref) or [ref], kept=2)
+    gather = LazyMapping({idx: idx for idx in range(5)}, lambda ref: loaded.append(ref) or [ref], kept=2)
     for key in (0, 1, 0, 2, 0, 1):
         gather[key]
     assert loaded == [0, 1, 2, 1]

@@ -1,4 +1,4 @@
-"""Parts that are chosen by name, and to which plugins add their own: the backends and the costs of a sweep."""
+"""NamedRegistry that are chosen by name, and to which plugins add their own: the backends and the costs of a sweep."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _unusable: dict[tuple[str, str], str] = {}
 
 
 @dataclass(frozen=True, slots=True)
-class PartMark:
+class Registration:
     """What a function was registered as.
 
     Attributes:
@@ -30,7 +30,7 @@ class PartMark:
     origin: str
 
 
-class Parts(Generic[Value]):
+class NamedRegistry(Generic[Value]):
     """All parts of one kind by name: those built in, and those of plugins."""
 
     def __init__(self, kind: str, builtin: Mapping[str, Value]) -> None:
@@ -59,8 +59,8 @@ class Parts(Generic[Value]):
             raise PluginError(f"the {self.kind} {name!r} is built in: register yours under another name")
         self._added[name] = value, function
         code = function.__code__
-        mark = PartMark(self.kind, name, f"{code.co_filename}:{code.co_firstlineno}")
-        setattr(function, _ATTRIBUTE, (*marks_of(function), mark))
+        mark = Registration(self.kind, name, f"{code.co_filename}:{code.co_firstlineno}")
+        setattr(function, _ATTRIBUTE, (*registrations_of(function), mark))
 
     def get(self, name: str) -> Value:
         """Return the part of that name.
@@ -94,13 +94,13 @@ class Parts(Generic[Value]):
         return Path(self._added[name][1].__code__.co_filename) if name in self._added else None
 
 
-def set_unusable_parts(reasons: Mapping[tuple[str, str], str]) -> None:
+def set_unavailable(reasons: Mapping[tuple[str, str], str]) -> None:
     """Say, by kind and name, why parts cannot be had that plugins would give; whatever was said before is forgotten."""
     _unusable.clear()
     _unusable.update(reasons)
 
 
-def marks_of(value: object) -> tuple[PartMark, ...]:
+def registrations_of(value: object) -> tuple[Registration, ...]:
     """Return what an object was registered as; nothing, mostly."""
     marks = getattr(value, _ATTRIBUTE, ())
-    return marks if isinstance(marks, tuple) and all(isinstance(mark, PartMark) for mark in marks) else ()
+    return marks if isinstance(marks, tuple) and all(isinstance(mark, Registration) for mark in marks) else ()
