@@ -13,7 +13,6 @@ from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
 from pano_mvs.engine.planning.run_options import RunOptions
 from pano_mvs.engine.planning.units import Unit, UnitInput
-from pano_mvs.engine.running.run import workflow_id
 
 _SHOWN = 8
 
@@ -33,7 +32,7 @@ def explain_unit(session: Session, label: str, console: Console) -> None:
         if (unit.entry.name, unit.item) == (stage, item):
             found.append((unit, record, reason))
 
-    plan = make_plan(workflow, graph, store, workflow_id(session.workflow), visit=look)[-1]
+    plan = make_plan(workflow, graph, store, visit=look)[-1]
     if not found:
         console.print(escape(f"{label}: {_why_not(plan, item)}"), highlight=False, soft_wrap=True)
         return

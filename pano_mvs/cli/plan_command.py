@@ -17,7 +17,6 @@ from pano_mvs.cli.session import Session
 from pano_mvs.core.errors import StoreError
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
-from pano_mvs.engine.running.run import workflow_id
 
 _SHOWN_REASONS = 5
 
@@ -80,7 +79,7 @@ def _plans(session: Session) -> list[StagePlan]:
     store = Store(session.store_root, for_reading=True)
     workflow, graph = session.run_options.applied_to(session.workflow, session.graph)
     with without_collector():
-        plans = make_plan(workflow, graph, store, workflow_id(session.workflow), session.run_options)
+        plans = make_plan(workflow, graph, store, options=session.run_options)
     with suppress(StoreError):  # a cache that others own may be read all the same
         store.stat_cache.save()
     return plans

@@ -1,4 +1,4 @@
-"""NamedRegistry that are chosen by name, and to which plugins add their own: the backends and the costs of a sweep."""
+"""Registries of values that users choose by name and to which plugins add, such as the costs of a sweep."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from typing import Any, Generic, TypeVar
 from pano_mvs.core.errors import PluginError, UsageError
 
 Value = TypeVar("Value")
-_ATTRIBUTE = "__pano_mvs_parts__"
-_unusable: dict[tuple[str, str], str] = {}
+_ATTRIBUTE = "__pano_mvs_registrations__"
+_unavailable: dict[tuple[str, str], str] = {}
 
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """What a function was registered as.
+    """The name under which a plugin registered a function.
 
     Attributes:
-        kind: what the part is, in words: "sweep cost".
-        name: by which it is chosen.
-        origin: where it was defined, `file:line`.
+        kind: what the registry holds, in words: "sweep cost".
+        name: by which users choose it.
+        origin: where the function is defined, `file:line`.
     """
 
     kind: str
@@ -31,7 +31,7 @@ class Registration:
 
 
 class NamedRegistry(Generic[Value]):
-    """All parts of one kind by name: those built in, and those of plugins."""
+    """Values of one kind by name: the built-in ones, and those of plugins."""
 
     def __init__(self, kind: str, builtin: Mapping[str, Value]) -> None:
         self.kind = kind
@@ -39,19 +39,19 @@ class NamedRegistry(Generic[Value]):
         self._added: dict[str, tuple[Value, Callable[..., Any]]] = {}
 
     def names(self) -> tuple[str, ...]:
-        """Return the names there are, those built in first."""
+        """Return all names, the built-in ones first."""
         return *self._builtin, *sorted(self._added)
 
     def register(self, name: str, value: Value, function: Callable[..., Any]) -> None:
-        """Add a plugin's part, in the place of one of that name that a plugin added before.
+        """Add a plugin's value; it replaces one that a plugin registered before under the same name.
 
         Args:
             name: letters, digits, '-', '_' and '.'.
-            value: the part.
-            function: the plugin's function behind it, which is marked; its file is the part's code.
+            value: what `get` returns.
+            function: the plugin's function behind the value; its file counts as the code of the value.
 
         Raises:
-            PluginError: if the name is none, or that of a part that is built in.
+            PluginError: if the name has other characters, or is that of a built-in value.
         """
         if not name or not all(sign.isalnum() or sign in "-_." for sign in name):
             raise PluginError(f"a {self.kind} cannot be called {name!r}: use letters, digits, '-', '_' and '.'")
@@ -59,21 +59,21 @@ class NamedRegistry(Generic[Value]):
             raise PluginError(f"the {self.kind} {name!r} is built in: register yours under another name")
         self._added[name] = value, function
         code = function.__code__
-        mark = Registration(self.kind, name, f"{code.co_filename}:{code.co_firstlineno}")
-        setattr(function, _ATTRIBUTE, (*registrations_of(function), mark))
+        registration = Registration(self.kind, name, f"{code.co_filename}:{code.co_firstlineno}")
+        setattr(function, _ATTRIBUTE, (*registrations_of(function), registration))
 
     def get(self, name: str) -> Value:
-        """Return the part of that name.
+        """Return the value registered under a name.
 
         Raises:
-            UsageError: if there is none; with those that there are.
+            UsageError: if there is none; the message lists the known names.
         """
         self.check(name)
         return self._builtin[name] if name in self._builtin else self._added[name][0]
 
     def check(self, name: str) -> str:
-        """Return the name if there is such a part, else raise UsageError."""
-        why = _unusable.get((self.kind, name))
+        """Return the name if it is registered, else raise UsageError."""
+        why = _unavailable.get((self.kind, name))
         if name in self._builtin or (name in self._added and why is None):
             return name
         if why is not None:
@@ -81,26 +81,26 @@ class NamedRegistry(Generic[Value]):
         close = get_close_matches(name, self.names(), n=2, cutoff=0.5)
         hint = f"did you mean {' or '.join(map(repr, close))}? " if close else ""
         raise UsageError(
-            f"there is no {self.kind} {name!r}; {hint}known: {', '.join(self.names())}. A plugin's is known once the "
-            "plugin is installed, or its file is listed under `plugins:`"
+            f"there is no {self.kind} {name!r}; {hint}known: {', '.join(self.names())}. If it is a plugin's, install "
+            "the plugin or list its file under `plugins:`"
         )
 
     def is_builtin(self, name: str) -> bool:
-        """Return whether a name is that of a part of our own."""
+        """Return whether a name is that of a built-in value."""
         return name in self._builtin
 
     def code_file(self, name: str) -> Path | None:
-        """Return the file that defines a plugin's part; None for what is built in."""
+        """Return the plugin file behind a name, or None if the value is built in."""
         return Path(self._added[name][1].__code__.co_filename) if name in self._added else None
 
 
 def set_unavailable(reasons: Mapping[tuple[str, str], str]) -> None:
-    """Say, by kind and name, why parts cannot be had that plugins would give; whatever was said before is forgotten."""
-    _unusable.clear()
-    _unusable.update(reasons)
+    """Declare which names of broken plugins cannot be used: kind and name to the reason. Replaces earlier reasons."""
+    _unavailable.clear()
+    _unavailable.update(reasons)
 
 
 def registrations_of(value: object) -> tuple[Registration, ...]:
-    """Return what an object was registered as; nothing, mostly."""
-    marks = getattr(value, _ATTRIBUTE, ())
-    return marks if isinstance(marks, tuple) and all(isinstance(mark, Registration) for mark in marks) else ()
+    """Return the names under which an object is registered; most objects have none."""
+    found = getattr(value, _ATTRIBUTE, ())
+    return found if isinstance(found, tuple) and all(isinstance(one, Registration) for one in found) else ()

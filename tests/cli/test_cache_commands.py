@@ -200,9 +200,8 @@ def test_run_that_did_not_end_keeps_what_its_folder_had(toy: Toy, cache: Cache) 
     run(toy, "other")
     session = toy.session("scaled.by=5")
     store = Store(session.store_root)
-    from pano_mvs.engine.running.run import workflow_id
 
-    store.runs.remember(workflow_id(session.workflow), {}, workflow="toy", out=toy.folder / "mine", finished=False)
+    store.runs.remember(session.workflow.id, {}, workflow="toy", out=toy.folder / "mine", finished=False)
     cache("gc", "--delete", "--unused", "0s")
     assert "(nothing to compute)" in run(toy, "mine", "--set", "scaled.by=5")[1]
 

@@ -239,8 +239,9 @@ class BlobStore:
     @staticmethod
     def _refuse_link(path: Path) -> None:
         if is_link(path.parent):
-            raise StoreError(f"{path.parent} is a link, which no cache has: remove it, or choose another cache "
-                             "with --cache DIR")  # fmt: skip
+            raise StoreError(
+                f"{path.parent} is a link, which no cache has: remove it, or choose another cache with --cache DIR"
+            )
 
 
 def _mapped(path: Path) -> np.ndarray[Any, Any]:

@@ -1,4 +1,4 @@
-"""DiskGuard on the disk of a store: how much must be free to begin, and how a full disk is told from a fault of a unit."""
+"""Free space on the disk of a cache: the minimum for starting a unit, and the recognition of a full disk."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from pano_mvs.core.errors import StoreError
 from pano_mvs.core.files import temporary_prefix
 
 _FULL = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC), errno.EFBIG}
-_NOTHING_LEFT_BYTES = 1_000_000
+_FULL_BELOW_BYTES = 1_000_000
 
 
 class DiskGuard:
-    """The disk under a store."""
+    """Watches the disk that holds a cache."""
 
-    def __init__(self, root: Path, *, least_free_bytes: int) -> None:
-        """Remember which store it is, and below how many free bytes no unit is begun."""
+    def __init__(self, root: Path, *, min_free_bytes: int) -> None:
+        """Watch the disk of the folder `root`; no unit starts with less than `min_free_bytes` free."""
         self._root = root
-        self._least_free_bytes = least_free_bytes
+        self._min_free_bytes = min_free_bytes
 
     def require(self) -> None:
-        """Raise StoreError if there is too little room to begin anything."""
+        """Raise StoreError if there is too little free space to start a unit."""
         free = self._free_bytes()
-        if free < self._least_free_bytes:
+        if free < self._min_free_bytes:
             raise StoreError(
-                f"{free / 1e6:.0f} MB are free where the cache {self._root} is, {self._least_free_bytes / 1e6:.0f} MB "
-                "are kept (--min-free). Make room (`pano-mvs cache gc` shows what can go) and run the same command "
-                "again: what was finished is kept"
+                f"{free / 1e6:.0f} MB are free on the disk of the cache {self._root}, but "
+                f"{self._min_free_bytes / 1e6:.0f} MB must stay free (--min-free). Make room (`pano-mvs cache gc` "
+                "shows what can be deleted) and run the same command again: finished units stay in the cache"
             )
 
     @contextmanager
@@ -39,7 +39,7 @@ class DiskGuard:
         """Yield an empty folder, removed afterwards.
 
         Raises:
-            StoreError: if the disk is too full to begin, or was filled by what was done inside.
+            StoreError: if the disk is too full to start, or becomes full inside the context.
         """
         self.require()
         try:
@@ -49,13 +49,13 @@ class DiskGuard:
             raise self.cannot_write(error) from error
         try:
             yield folder
-            # A library that does not check what it writes may have cut a file short on a full disk: keep nothing.
+            # A library that does not check its writes may have truncated a file on a full disk: keep nothing.
             if self._is_full():
                 raise self._full()
         except StoreError:
             raise
         except Exception as error:
-            # Libraries tell of a full disk in many ways: an error without a number, one of their own, none at all.
+            # Libraries report a full disk in many ways: errors without a number, errors of their own, or not at all.
             if is_full_disk(error) or self._is_full():
                 raise self._full() from error
             raise
@@ -63,28 +63,33 @@ class DiskGuard:
             shutil.rmtree(folder, ignore_errors=True)
 
     def cannot_write(self, error: OSError) -> StoreError:
-        """Return the error that says that the store cannot be written."""
+        """Return the error for a cache that cannot be written."""
         if is_full_disk(error):
             return self._full()
-        return StoreError(f"cache {self._root} cannot be written: {error.strerror or error}. Mend it, or choose "
-                          "another with --cache DIR")  # fmt: skip
+        return StoreError(
+            f"cache {self._root} cannot be written: {error.strerror or error}. Check its permissions, "
+            "or choose another cache with --cache DIR"
+        )
 
     def _is_full(self) -> bool:
-        return self._free_bytes() < _NOTHING_LEFT_BYTES
+        return self._free_bytes() < _FULL_BELOW_BYTES
 
     def _free_bytes(self) -> int:
         try:
             return shutil.disk_usage(self._root).free
         except OSError as error:
-            raise StoreError(f"cache {self._root} cannot be read: {error.strerror}. Mend it, or choose another with "
-                             "--cache DIR")  from error  # fmt: skip
+            raise StoreError(
+                f"cache {self._root} cannot be read: {error.strerror}. Check its permissions, or choose another cache "
+                "with --cache DIR"
+            ) from error
 
     def _full(self) -> StoreError:
-        return StoreError(f"the disk of the cache {self._root} is full, or what you may use of it. Make room "
-                          "(`pano-mvs cache gc` shows what can go) and run the same command again: what was finished "
-                          "is kept")  # fmt: skip
+        return StoreError(
+            f"the disk of the cache {self._root} is full, or your quota is used up. Make room (`pano-mvs cache gc` "
+            "shows what can be deleted) and run the same command again: finished units stay in the cache"
+        )
 
 
 def is_full_disk(error: BaseException | None) -> bool:
-    """Return whether an error of the system says that the disk, or what one may use of it, is full."""
+    """Return whether a system error means that the disk is full or a quota is used up."""
     return isinstance(error, OSError) and error.errno in _FULL

@@ -94,8 +94,10 @@ class RunHistory:
             for path in self._paths(folder, "*.json"):
                 entry = _read(path)
                 if entry is None:
-                    raise StoreError(f"{path} is damaged, so what it keeps is not known. Run its workflow again, or "
-                                     "delete the file if nothing of it is wanted")  # fmt: skip
+                    raise StoreError(
+                        f"{path} is damaged, so what it keeps is not known. Run its workflow again, or "
+                        "delete the file if nothing of it is wanted"
+                    )
                 yield entry
 
     def pin(self, run: str, name: str) -> RunEntry:
@@ -117,8 +119,10 @@ class RunHistory:
             raise UsageError(f"{len(found)} runs are called {run!r}; there are: {known}")
         old = found[0]
         if any(entry.pinned and entry.name == name and entry.keys != old.keys for entry in self.entries()):
-            raise UsageError(f"there is a pin {name!r} already, of other results: choose another name, or give it up "
-                             f"with `cache unpin {name}`")  # fmt: skip
+            raise UsageError(
+                f"there is a pin {name!r} already, of other results: choose another name, or give it up "
+                f"with `cache unpin {name}`"
+            )
         pin = RunEntry(name, old.workflow, old.out, old.when, old.keys, pinned=True)
         self._write("pins", pin)
         return pin
@@ -133,8 +137,9 @@ class RunHistory:
         try:
             path.unlink(missing_ok=True)
         except OSError as error:
-            raise StoreError(f"{path} cannot be deleted: {error.strerror}. Mend the permissions of the "
-                             "cache")  from error  # fmt: skip
+            raise StoreError(
+                f"{path} cannot be deleted: {error.strerror}. Mend the permissions of the cache"
+            ) from error
 
     def _write(self, folder: str, entry: RunEntry) -> None:
         value = {"workflow": entry.workflow, "out": entry.out, "when": entry.when, "keys": entry.keys}

@@ -35,7 +35,7 @@ LAYOUT_VERSION = 2
 _FOLDER_DIGITS = {1: 2, 2: 3}
 """Layout to the number of digits of a key or digest that name its folder. Older caches go on with their 256 folders."""
 
-LEAST_FREE_BYTES = 200_000_000
+MIN_FREE_BYTES = 200_000_000
 _ABANDONED_AFTER_S = 7 * 24 * 3600.0
 _FOLDERS = ("blobs", "records", "runs", "pins", "tmp")
 
@@ -139,14 +139,15 @@ class UnitRecord:
 class Store:
     """The cache of one or many workflows."""
 
-    def __init__(self, root: Path, *, durable: bool = False, least_free_bytes: int = LEAST_FREE_BYTES,
-                 for_reading: bool = False) -> None:  # fmt: skip
+    def __init__(
+        self, root: Path, *, durable: bool = False, min_free_bytes: int = MIN_FREE_BYTES, for_reading: bool = False
+    ) -> None:
         """Open or create a store.
 
         Args:
             root: its folder.
             durable: flush every blob and record to the disk before going on, for machines that lose power.
-            least_free_bytes: room on the disk below which no unit is begun; 0 for no such guard.
+            min_free_bytes: room on the disk below which no unit is begun; 0 for no such guard.
             for_reading: take a folder that cannot be written, or made, for what it holds, instead of refusing it.
 
         Raises:
@@ -154,10 +155,10 @@ class Store:
         """
         self.root = root
         self.durable = durable
-        self.least_free_bytes = least_free_bytes
+        self.min_free_bytes = min_free_bytes
         self.damaged: list[str] = []
         self._records = str(root / "records")
-        self._disk = DiskGuard(root, least_free_bytes=least_free_bytes)
+        self._disk = DiskGuard(root, min_free_bytes=min_free_bytes)
         self.folder_digits = _FOLDER_DIGITS[LAYOUT_VERSION]
         self._open_layout(for_reading=for_reading)
         self._clear_abandoned()
@@ -191,10 +192,12 @@ class Store:
         body = json.dumps(record.to_json(), sort_keys=True)
         path = self.record_path(record.key)
         if is_link(path.parent):
-            raise StoreError(f"{path.parent} is a link, which no cache has: remove it, or choose another cache "
-                             "with --cache DIR")  # fmt: skip
-        write_text(path, f"{digest_from_bytes(body.encode())}\n{body}", temporary_in=self.blobs.temporary,
-                   durable=self.durable)  # fmt: skip
+            raise StoreError(
+                f"{path.parent} is a link, which no cache has: remove it, or choose another cache with --cache DIR"
+            )
+        write_text(
+            path, f"{digest_from_bytes(body.encode())}\n{body}", temporary_in=self.blobs.temporary, durable=self.durable
+        )
 
     def drop(self, key: str) -> None:
         """Remove a record that turned out to be of no use."""
@@ -259,8 +262,10 @@ class Store:
     def _open_layout(self, *, for_reading: bool) -> None:
         for name in _FOLDERS:
             if is_link(self.root / name):
-                raise UsageError(f"cache {self.root}: {name} is a link: what is written there would land elsewhere. "
-                                 "Remove it, or choose another cache with --cache DIR")  # fmt: skip
+                raise UsageError(
+                    f"cache {self.root}: {name} is a link: what is written there would land elsewhere. "
+                    "Remove it, or choose another cache with --cache DIR"
+                )
         path = self.root / "layout.json"
         try:
             layout = json.loads(path.read_bytes())
@@ -272,12 +277,16 @@ class Store:
                     raise
             return
         except OSError as error:
-            raise UsageError(f"cache {self.root} cannot be read ({reason_of(error)}). Mend its permissions, or choose "
-                             "another with --cache DIR")  from error  # fmt: skip
+            raise UsageError(
+                f"cache {self.root} cannot be read ({reason_of(error)}). Mend its permissions, or choose "
+                "another with --cache DIR"
+            ) from error
         except (ValueError, RecursionError) as error:
-            raise UsageError(f"{path} cannot be read ({error}), so it is not known how the cache is laid out. If it "
-                             "is one of this version, delete that file and nothing is lost; else choose another "
-                             "folder with --cache DIR")  from error  # fmt: skip
+            raise UsageError(
+                f"{path} cannot be read ({error}), so it is not known how the cache is laid out. If it "
+                "is one of this version, delete that file and nothing is lost; else choose another "
+                "folder with --cache DIR"
+            ) from error
         version = layout.get("layout") if isinstance(layout, dict) else None
         if type(version) is not int or version not in _FOLDER_DIGITS:
             raise UsageError(
@@ -309,8 +318,9 @@ class Store:
         except StoreError as error:
             if is_full_disk(error.__cause__):
                 raise
-            raise UsageError(f"cache {self.root} cannot be written ({error.__cause__ or error}). Choose another with "
-                             "--cache DIR") from error  # fmt: skip
+            raise UsageError(
+                f"cache {self.root} cannot be written ({error.__cause__ or error}). Choose another with --cache DIR"
+            ) from error
 
 
 def record_from_bytes(data: bytes) -> UnitRecord | None:

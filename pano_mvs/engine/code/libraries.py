@@ -11,12 +11,14 @@ _DISTRIBUTIONS: Mapping[str, tuple[str, ...]] = {
     "PIL": ("pillow",),
 }
 _SHOWN_AS = {"cv2": "OpenCV"}
-_WITHOUT_INFLUENCE = frozenset({
-    "pydantic",  # settings count by their values
-    "pillow_heif",  # reads HEIC alone, and OpenEXR reads EXR: to add or update one must not cost all other captures
-    "OpenEXR",
-    "typing_extensions",
-})  # fmt: skip
+_WITHOUT_INFLUENCE = frozenset(
+    {
+        "pydantic",  # settings count by their values
+        "pillow_heif",  # reads HEIC alone, and OpenEXR reads EXR: to add or update one must not cost all other captures
+        "OpenEXR",
+        "typing_extensions",
+    }
+)
 
 
 def library_versions(modules: Iterable[str]) -> dict[str, str]:

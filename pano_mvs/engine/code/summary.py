@@ -16,10 +16,24 @@ _STAGE_DECORATORS = frozenset(
 )
 """Do not count: what they say of a stage is in its key already, or cannot change its result."""
 
-_PURE_DECORATORS = frozenset({
-    "njit", "jit", "vectorize", "guvectorize", "intrinsic", "dataclass", "cache", "lru_cache", "contextmanager",
-    "total_ordering", "wraps", "runtime_checkable", "final", "unique",
-})  # fmt: skip
+_PURE_DECORATORS = frozenset(
+    {
+        "njit",
+        "jit",
+        "vectorize",
+        "guvectorize",
+        "intrinsic",
+        "dataclass",
+        "cache",
+        "lru_cache",
+        "contextmanager",
+        "total_ordering",
+        "wraps",
+        "runtime_checkable",
+        "final",
+        "unique",
+    }
+)
 """Register nothing anywhere, unlike others for all that is known."""
 
 

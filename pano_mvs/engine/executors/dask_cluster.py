@@ -175,12 +175,16 @@ class DaskExecutor:
         place = f"dask worker {worker} on {answer['host']}"
         others = differences(versions(), answer["versions"])
         if others:
-            raise UsageError(f"{place}: {'; '.join(others)}. Results would depend on who computes them: install the "
-                             "same versions there")  # fmt: skip
+            raise UsageError(
+                f"{place}: {'; '.join(others)}. Results would depend on who computes them: install the "
+                "same versions there"
+            )
         if answer["token"] != token or not is_file(self._store.blobs.temporary / answer["answer"]):
             reason = answer["reason"] or "it is another folder there"
-            raise UsageError(f"{place} does not see the cache {self._store.root.absolute()} ({reason}). Choose "
-                             "one with --cache DIR that all hosts share under the same path")  # fmt: skip
+            raise UsageError(
+                f"{place} does not see the cache {self._store.root.absolute()} ({reason}). Choose "
+                "one with --cache DIR that all hosts share under the same path"
+            )
 
 
 def _outcome(future: Any) -> JobOutcome:

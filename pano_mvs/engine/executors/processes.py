@@ -109,8 +109,12 @@ class ProcessExecutor:
             try:
                 outcome = worker.run(request)
             except OSError as error:  # the unit is not to blame
-                outcome = JobOutcome("stopped", cause=f"a worker cannot be started: {error}. Mend it and run the same "
-                                  "command again", error="StoreError", exit_code=4)  # fmt: skip
+                outcome = JobOutcome(
+                    "stopped",
+                    cause=f"a worker cannot be started: {error}. Mend it and run the same command again",
+                    error="StoreError",
+                    exit_code=4,
+                )
             self._ended.put((job.number, self._judged(outcome, refused=worker.refused)))
             if worker.served >= self._units_per_process:
                 worker.stop()

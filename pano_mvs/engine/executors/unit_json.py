@@ -25,7 +25,7 @@ def request_to_json(job: Job, store: Store) -> dict[str, Any]:
     return {
         "unit": unit_to_json(job.unit, store),
         "plugins": {str(path.absolute()): digest for path, digest in job.plugins.items()},
-        "store": [str(store.root.absolute()), store.durable, store.least_free_bytes],
+        "store": [str(store.root.absolute()), store.durable, store.min_free_bytes],
         "log": str(job.log.absolute()),
         "threads": job.threads,
         "timeout_s": job.timeout_s,
@@ -87,14 +87,18 @@ def require_same_code(spec: StageSpec, params: Params, identity: Mapping[str, An
         raise UsageError(_changed(spec))
     for name, version in identity["libraries"].items():
         if here.libraries.get(name) != version:
-            raise UsageError(f"stage {spec.name!r}: the worker has {name} {here.libraries.get(name, '(none)')}, the "
-                             f"run was started with {version}. Install the same version everywhere, then run the same "
-                             "command again")  # fmt: skip
+            raise UsageError(
+                f"stage {spec.name!r}: the worker has {name} {here.libraries.get(name, '(none)')}, the "
+                f"run was started with {version}. Install the same version everywhere, then run the same "
+                "command again"
+            )
 
 
 def _changed(spec: StageSpec) -> str:
-    return (f"stage {spec.name!r} is not the same in the worker ({spec.origin}): it was changed while the workflow "
-            "ran, or another version is installed there. Run the same command again")  # fmt: skip
+    return (
+        f"stage {spec.name!r} is not the same in the worker ({spec.origin}): it was changed while the workflow "
+        "ran, or another version is installed there. Run the same command again"
+    )
 
 
 def params_to_json(entry: StageEntry) -> dict[str, Any]:
@@ -105,8 +109,10 @@ def params_to_json(entry: StageEntry) -> dict[str, Any]:
     """
     values = _plain(entry.params)
     if _plain(entry.spec.params_type.model_validate(values)) != values:
-        raise UsageError(f"stage {entry.name!r} ({entry.spec.origin}): its settings change when they are validated a "
-                         "second time, so that they cannot be sent to a worker. Use --executor serial")  # fmt: skip
+        raise UsageError(
+            f"stage {entry.name!r} ({entry.spec.origin}): its settings change when they are validated a "
+            "second time, so that they cannot be sent to a worker. Use --executor serial"
+        )
     return values
 
 

@@ -58,8 +58,8 @@ def _written(digest: str, name: str, texts: Mapping[str, str]) -> str:
 
 
 @cache
-def _store(root: str, durable: bool, least_free_bytes: int) -> Store:
-    return Store(Path(root), durable=durable, least_free_bytes=least_free_bytes)
+def _store(root: str, durable: bool, min_free_bytes: int) -> Store:
+    return Store(Path(root), durable=durable, min_free_bytes=min_free_bytes)
 
 
 @cache
@@ -79,8 +79,10 @@ def _of_files(plugins: tuple[tuple[str, str], ...]) -> Registry:
     for path, digest in plugins:
         registry.add_file(Path(path))
         if code_digest(Path(path)) != digest:
-            raise UsageError(f"plugin {path} is not the same in the worker: it was changed while the workflow ran. Run "
-                             "the same command again")  # fmt: skip
+            raise UsageError(
+                f"plugin {path} is not the same in the worker: it was changed while the workflow ran. Run "
+                "the same command again"
+            )
     return registry
 
 

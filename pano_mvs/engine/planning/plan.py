@@ -1,4 +1,4 @@
-"""What a run would do: per unit cached, run (and why), or may run because it waits for an output."""
+"""What a run would do with each unit: find it in the cache, compute it (and why), or decide later."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class StagePlan:
     Attributes:
         name: of the stage in the workflow.
         use: of the stage in the registry.
-        cached: units that would not run.
-        run: unit to the reason why it would.
-        may_run: units that wait for an output, which may turn out the same.
+        cached: units that are in the cache.
+        run: unit that would be computed, to the reason.
+        may_run: units that depend on units that would be computed; they run if these give other results.
         blocked: unit to the reason why it cannot run.
         open: whether the number of units is not known yet.
     """
@@ -41,25 +41,23 @@ def make_plan(
     workflow: Workflow,
     graph: Graph,
     store: Store,
-    workflow_id: str,
-    options: RunOptions = DEFAULT_OPTIONS,
     *,
+    options: RunOptions = DEFAULT_OPTIONS,
     visit: Callable[[Unit, UnitRecord | None, str], None] | None = None,
 ) -> list[StagePlan]:
     """Return what a run would do, stage by stage, without running anything.
 
     Args:
-        workflow: as the run would see it, likewise its graph.
-        graph: wired.
-        store: where finished units are.
-        workflow_id: under which the latest run is remembered.
-        options: what is asked of the run.
-        visit: called for each unit whose inputs are known, with its record if it has one, else the reason to run.
+        workflow: with the options applied.
+        graph: likewise.
+        store: the cache.
+        options: of the run.
+        visit: called for each unit whose inputs are known, with its record or None, and the reason to compute it.
 
     Raises:
         InputError: if the source cannot be listed.
     """
-    last = store.runs.last_keys(workflow_id)
+    last = store.runs.last_keys(workflow.id)
     states: dict[str, StageState] = {}
     plans: list[StagePlan] = []
     for name in graph.order:
@@ -89,12 +87,12 @@ def make_plan(
 
 
 def settle(state: StageState, unit: Unit, record: UnitRecord) -> None:
-    """Enter a unit's stored value into its stage's state."""
+    """Enter a unit's result into the state of its stage."""
     state.items[unit.item] = record.output
     state.exploded.update(record.items)
 
 
 def _reason(unit: Unit, last: Mapping[str, str], store: Store, options: RunOptions) -> str:
     if options.refreshes(unit):
-        return "asked for"
+        return "--refresh"
     return reason_to_run(unit, last.get(unit.item), store)

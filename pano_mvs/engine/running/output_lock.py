@@ -44,8 +44,10 @@ def output_lock(out: Path) -> Iterator[None]:
     except OSError as error:
         if isinstance(error, StoreError):
             raise
-        raise StoreError(f"{path} cannot be written: {error.strerror or error}. Choose another folder with --out DIR, "
-                         "or mend its permissions")  from error  # fmt: skip
+        raise StoreError(
+            f"{path} cannot be written: {error.strerror or error}. Choose another folder with --out DIR, "
+            "or mend its permissions"
+        ) from error
     try:
         yield
     finally:
@@ -66,8 +68,10 @@ def _acquire(path: Path, own: bytes) -> None:
             raise StoreError(_refusal(path, owner))
         elif text is not None:
             time.sleep(_PAUSE_S)  # where links are not possible, it may be half written
-    raise StoreError(f"{path} does not say which run writes into the output folder. If none does, delete that file; "
-                     "else choose another folder with --out DIR")  # fmt: skip
+    raise StoreError(
+        f"{path} does not say which run writes into the output folder. If none does, delete that file; "
+        "else choose another folder with --out DIR"
+    )
 
 
 def _create(path: Path, text: bytes) -> bool:

@@ -60,8 +60,10 @@ def read_text(path: Path) -> str:
         with path.open("rb") as stream:
             return stream.read(MAX_BYTES + 1).decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
-        raise InputError(f"workflow {path} cannot be read: byte {error.start} is not UTF-8. Save it as UTF-8 text, or "
-                         "name another file")  from error  # fmt: skip
+        raise InputError(
+            f"workflow {path} cannot be read: byte {error.start} is not UTF-8. Save it as UTF-8 text, or "
+            "name another file"
+        ) from error
     except (OSError, ValueError) as error:
         if isinstance(error, InputError):
             raise
@@ -148,15 +150,19 @@ class ExtendsReader:
                 self.problems.add(node.key_place, f"unknown key {key[:80]!r}.{did_you_mean(key, TOP_KEYS)}")
         version = root.value.get("pano_mvs")
         if version is None:
-            self.problems.add(root.place, f"the key `pano_mvs: {FORMAT_VERSION}` is missing (the version of the "
-                              "workflow format)")  # fmt: skip
+            self.problems.add(
+                root.place, f"the key `pano_mvs: {FORMAT_VERSION}` is missing (the version of the workflow format)"
+            )
         elif version.value != FORMAT_VERSION or isinstance(version.value, bool):
             shown = repr(version.plain())[:80]
-            self.problems.add(version.place, f"workflow format {shown} is not known; this version reads "
-                              f"{FORMAT_VERSION}")  # fmt: skip
+            self.problems.add(
+                version.place, f"workflow format {shown} is not known; this version reads {FORMAT_VERSION}"
+            )
         if "name" in root.value and not is_plain_name(root.value["name"].plain()):
-            self.problems.add(root.value["name"].place, "name must be a word of letters, digits, '-', '_' and '.' "
-                              "that may name a folder")  # fmt: skip
+            self.problems.add(
+                root.value["name"].place,
+                "name must be a word of letters, digits, '-', '_' and '.' that may name a folder",
+            )
         node = root.value.get("stages")
         missing = node is None and "extends" in root.value
         if not missing and (node is None or not isinstance(node.value, dict) or not node.value):
@@ -193,8 +199,10 @@ def _position(order: Sequence[str], written: Sequence[str], idx: int) -> int:
 
 def _lay(stages: dict[str, Located], name: str, node: Located, problems: Problems) -> None:
     if not is_plain_name(name):
-        problems.add(node.key_place, f"stage name {name[:80]!r} must be a word of letters, digits, '-' and '_' that "
-                     "may name a folder")  # fmt: skip
+        problems.add(
+            node.key_place,
+            f"stage name {name[:80]!r} must be a word of letters, digits, '-' and '_' that may name a folder",
+        )
     elif node.value is None and name in stages:
         del stages[name]
     elif node.value is None:

@@ -94,8 +94,9 @@ def _replace(stages: dict[str, Located], override: _Override) -> None:
     name = _stage_of(override.target, stages)
     node = stages[name]
     kept = node.value if node.value["use"].value == override.value.value else {}
-    stages[name] = Located({**kept, "use": override.value}, node.line, node.column, node.key_line, node.key_column,
-                           node.origin, node.file)  # fmt: skip
+    stages[name] = Located(
+        {**kept, "use": override.value}, node.line, node.column, node.key_line, node.key_column, node.origin, node.file
+    )
 
 
 def _apply(stages: dict[str, Located], override: _Override, problems: Problems) -> None:

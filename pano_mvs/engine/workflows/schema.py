@@ -70,7 +70,7 @@ def _top(specs: Mapping[str, StageSpec], inherited: Mapping[str, Located]) -> Sc
             "properties": known,
             "propertyNames": _NAME,
         },
-    }  # fmt: skip
+    }
 
 
 def _entry(specs: Mapping[str, StageSpec]) -> Schema:

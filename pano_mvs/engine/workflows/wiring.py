@@ -146,8 +146,11 @@ class _Wirer:
         others = [stage.name for stage in candidates[:-1] if stage.name not in self.ancestors.get(nearest.name, set())]
         if others:
             options = ", ".join([*others, nearest.name])
-            self._problem(entry, "use", f"stage {entry.name!r}: port {port} could be fed by {options}; "
-                          f"say which with `in: {{{port.name}: …}}`")  # fmt: skip
+            self._problem(
+                entry,
+                "use",
+                f"stage {entry.name!r}: port {port} could be fed by {options}; say which with `in: {{{port.name}: …}}`",
+            )
             return None
         return Edge(port, nearest.name, bool(_delivers(nearest, port)))
 
@@ -193,8 +196,12 @@ class _Wirer:
         if Axis.PAIR in fed and len(set(fed)) > 1:
             self._problem(entry, "use", f"stage {entry.name!r} mixes Each inputs of pairs and of images")
         if output is not None and (output is Axis.ONE) != (found is Axis.ONE):
-            self._problem(entry, "use", f"stage {entry.spec.name!r} returns {entry.spec.output.kind_name()} (one per "
-                          f"{output}), but its inputs give one unit per {found}")  # fmt: skip
+            self._problem(
+                entry,
+                "use",
+                f"stage {entry.spec.name!r} returns {entry.spec.output.kind_name()} (one per "
+                f"{output}), but its inputs give one unit per {found}",
+            )
         return found
 
     def _problem(self, entry: StageEntry, place: str, message: str) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import PluginError, UsageError, WorkflowError
 from pano_mvs.core.file_names import is_plain_name
 from pano_mvs.core.paths import children, exists, is_denied, is_file, resolved
@@ -63,6 +64,11 @@ class Workflow:
     stages: dict[str, StageEntry]
     overrides: tuple[str, ...] = ()
     plugins: Mapping[Path, str] = field(default_factory=dict)
+
+    @property
+    def id(self) -> str:
+        """Digest under which the cache keys of its latest run are remembered: of its name and its stages' names."""
+        return digest_from_value([self.name, list(self.stages)])
 
 
 def load_workflow(

@@ -154,7 +154,7 @@ def list_items''').replace("import os\n", "import os\nfrom pano_mvs.scene import
     store = Store(session.store_root)
     executor = ProcessExecutor(store, workers=1, threads=1)  # what a worker notices, we have to forget
     try:
-        result = Run(session.workflow, session.graph, store, session.out, executor=executor).execute()
+        result = Run(session.workflow, session.graph, store, out=session.out, executor=executor).execute()
     finally:
         executor.close()
     assert result.exit_code == 0, (result.failures, result.warnings)

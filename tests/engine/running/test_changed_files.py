@@ -143,7 +143,7 @@ def run(
     made: Executor
     made = SerialExecutor(store, threads=1) if executor == "serial" else ProcessExecutor(store, workers=1, threads=1)
     try:
-        return Run(session.workflow, session.graph, store, session.out, observer=observer, executor=made).execute()
+        return Run(session.workflow, session.graph, store, out=session.out, observer=observer, executor=made).execute()
     finally:
         made.close()
 
@@ -155,7 +155,7 @@ def without(toy: Toy, name: str) -> dict[str, bytes]:
     path.unlink(missing_ok=True)
     session = toy.session(cache=toy.folder / "elsewhere")
     out = toy.folder / "clean"
-    assert Run(session.workflow, session.graph, Store(session.store_root), out).execute().exit_code == 0
+    assert Run(session.workflow, session.graph, Store(session.store_root), out=out).execute().exit_code == 0
     if aside is not None:
         path.write_bytes(aside)
     return {path.name: path.read_bytes() for path in out.glob("*.out")}

@@ -102,7 +102,7 @@ def test_plugin_comes_along_as_text(toy: Toy, monkeypatch: pytest.MonkeyPatch) -
     try:
         from pano_mvs.engine.running.run import Run
 
-        result = Run(session.workflow, session.graph, store, toy.folder / "out", executor=executor).execute()
+        result = Run(session.workflow, session.graph, store, out=toy.folder / "out", executor=executor).execute()
     finally:
         executor.close()
     assert hidden.exists()

@@ -29,7 +29,7 @@ def unit_of(function: Any, params: Any, tmp_path: Path, *, memory: str = "0", **
     entry = StageEntry("a", spec, params, Policy(use=spec.name, memory=memory), "w:1:1")
     inputs = {name: store.put_value(value) for name, value in more.pop("values", {}).items()}
     unit = Unit(entry, "x", ("x",), inputs, "0" * 32, {}, more.get("source"))
-    return Dispatcher(SerialExecutor(store), store, tmp_path / "out", {}), unit
+    return Dispatcher(SerialExecutor(store), store, out=tmp_path / "out", plugins={}), unit
 
 
 def stated(path: Path, width: int, height: int) -> Path:

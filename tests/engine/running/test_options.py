@@ -8,7 +8,7 @@ from pano_mvs.engine.executors import execute
 from pano_mvs.engine.planning.plan import make_plan
 from pano_mvs.engine.planning.run_options import RunOptions
 from pano_mvs.engine.running.events import RunResult
-from pano_mvs.engine.running.run import Run, workflow_id
+from pano_mvs.engine.running.run import Run
 from pano_mvs.engine.stages import stage_code
 from pano_mvs.engine.stages.context import Context
 from tests.engine.conftest import Toy, ran
@@ -16,7 +16,7 @@ from tests.engine.conftest import Toy, ran
 
 def run(toy: Toy, options: RunOptions) -> RunResult:
     session = toy.session()
-    return Run(session.workflow, session.graph, Store(session.store_root), session.out, options=options).execute()
+    return Run(session.workflow, session.graph, Store(session.store_root), out=session.out, options=options).execute()
 
 
 def test_until_runs_only_what_the_stage_needs(toy: Toy) -> None:
@@ -38,7 +38,7 @@ def test_part_of_a_run_deletes_no_file_of_the_whole(toy: Toy) -> None:
     files = toy.deliverables()
     session = toy.session()
     options = RunOptions(until=("scaled",))
-    result = Run(session.workflow, session.graph, Store(session.store_root), session.out, options=options).execute(
+    result = Run(session.workflow, session.graph, Store(session.store_root), out=session.out, options=options).execute(
         earlier_files=earlier
     )
     assert not result.removed
@@ -66,9 +66,7 @@ def test_accepted_code_keeps_what_was_computed(toy: Toy) -> None:
     toy.edit("plug.py", lambda text: text.replace("13 == x.value", "x.value in (13,)"))
     options = RunOptions(accept_code=True)
     session = toy.session()
-    plans = make_plan(
-        session.workflow, session.graph, Store(session.store_root), workflow_id(session.workflow), options
-    )
+    plans = make_plan(session.workflow, session.graph, Store(session.store_root), options=options)
     assert sum(len(plan.run) + len(plan.may_run) for plan in plans) == 0
     assert toy.plan()["images"].run, "a plan that accepts keeps nothing"
     assert ran(run(toy, options)) == {}
@@ -134,6 +132,6 @@ def test_plan_says_what_was_asked_for(toy: Toy) -> None:
     session = toy.session()
     options = RunOptions(until=("mean",), refresh=("scaled:1.txt",))
     workflow, graph = options.applied_to(session.workflow, session.graph)
-    plans = make_plan(workflow, graph, Store(session.store_root), workflow_id(session.workflow), options)
-    assert {plan.name: plan.run for plan in plans if plan.run} == {"scaled": {"1.txt": "asked for"}}
+    plans = make_plan(workflow, graph, Store(session.store_root), options=options)
+    assert {plan.name: plan.run for plan in plans if plan.run} == {"scaled": {"1.txt": "--refresh"}}
     assert plans[-1].name == "mean"

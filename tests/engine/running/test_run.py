@@ -153,7 +153,7 @@ def test_on_error_stop_and_gates_stop_with_exit_code_4(toy: Toy) -> None:
     assert toy.run("scaled.min_success=0.9").exit_code == RunStoppedError.exit_code
     gated = toy.run("scaled.gate={value: 1000}")
     assert gated.exit_code == RunStoppedError.exit_code
-    assert "the gate asks for 1000" in gated.stopped
+    assert "`gate` requires 1000" in gated.stopped
     assert "it reports: value" in toy.run("scaled.gate={valu: 1}").stopped
 
 
@@ -251,7 +251,7 @@ def test_store_that_cannot_be_written_still_serves_what_it_has(toy: Toy, monkeyp
     monkeypatch.setattr(RunHistory, "remember", refuse)
     result = toy.run()
     assert result.exit_code == 0
-    assert any("cannot be told why" in warning for warning in result.warnings)
+    assert any("cannot give the reasons" in warning for warning in result.warnings)
 
 
 def test_metric_that_is_not_finite_passes_no_gate(toy: Toy) -> None:
