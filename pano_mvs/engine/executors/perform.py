@@ -1,4 +1,4 @@
-"""Compute one unit here and say what became of it; every executor ends in this function."""
+"""Compute one unit in this process and return the outcome; all executors use this function."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pano_mvs.engine.planning.units import Unit
 
 
 def perform(unit: Unit, store: Store, *, threads: int, log: Path) -> JobOutcome:
-    """Run a unit, with its output in `log`, and put its result into the store."""
+    """Run a unit with its output in `log`, and store its result."""
     started = time.perf_counter()
     try:
         log.parent.mkdir(parents=True, exist_ok=True)
@@ -33,7 +33,7 @@ def perform(unit: Unit, store: Store, *, threads: int, log: Path) -> JobOutcome:
             record = execute_unit(unit, store, threads=threads)
     except KeyboardInterrupt:
         raise
-    except BaseException as error:  # a stage that exits, or raises what is no Exception, is a unit that failed
+    except BaseException as error:  # a unit has also failed if its stage exits, or raises other than Exception
         return replace(_failed(unit, store, error), seconds=time.perf_counter() - started)
     return JobOutcome("done", record, seconds=record.seconds)
 
@@ -45,7 +45,7 @@ def _failed(unit: Unit, store: Store, error: BaseException) -> JobOutcome:
     changed = changed_items(unit, store)
     if isinstance(error, ChangedFileError) and error.path is not None:
         store.stat_cache.forget(error.path)
-        changed.setdefault(str(error.path), str(error))  # it may be as before again
+        changed.setdefault(str(error.path), str(error))  # its content may have been restored
     if changed and unit.source is None:
         return JobOutcome("changed", cause="\n".join(changed.values()), changed=changed)
     if reasons := [*changed.values(), *changed_settings(unit, store)]:
@@ -53,8 +53,8 @@ def _failed(unit: Unit, store: Store, error: BaseException) -> JobOutcome:
     if isinstance(error, DamagedBlobError):
         return JobOutcome("damaged", cause=str(error))
     gone = next((ref for ref in unit.input_blobs() if not store.blobs.exists(ref)), None)
-    if gone is not None:  # somebody has collected it while the stage was about to read it: no fault of the stage
-        return JobOutcome("damaged", cause=str(store.blobs.discard(gone, "is gone")))
+    if gone is not None:  # garbage collection deleted it before the stage read it
+        return JobOutcome("damaged", cause=str(store.blobs.discard(gone, "is missing")))
     cause, trace = cause_of(unit, error)
     exit_code = error.exit_code if isinstance(error, InputError | UsageError) else 0
     return JobOutcome("failed", cause=cause, trace=trace, exit_code=exit_code)
