@@ -111,7 +111,7 @@ class ProcessExecutor:
             except OSError as error:  # not the fault of the unit
                 outcome = JobOutcome(
                     "stopped",
-                    cause=f"a worker cannot be started: {error}. Mend it and run the same command again",
+                    cause=f"a worker cannot be started: {error}. Fix this and run the same command again",
                     error="StoreError",
                     exit_code=4,
                 )

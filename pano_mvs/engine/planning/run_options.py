@@ -48,7 +48,7 @@ class RunOptions:
             }
             workflow = dataclasses.replace(workflow, stages=stages)
         ends = {*self.until, *(_stage(unit) for unit in self.only)}
-        return workflow, graph.confined(ends, _items_by_stage(self.only)) if ends else graph
+        return workflow, graph.limited_to(ends, _items_by_stage(self.only)) if ends else graph
 
     def refreshes(self, unit: Unit) -> bool:
         """Return whether a unit is computed again even if it is cached."""

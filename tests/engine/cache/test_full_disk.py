@@ -120,7 +120,7 @@ def test_guard_stops_before_the_disk_is_full(toy: Toy, monkeypatch: pytest.Monke
         monkeypatch.setenv(MIN_FREE_VARIABLE, "900TB")
     code, said = run(toy, *([] if by_variable else ["--min-free", "900 TB"]))
     assert code == 4
-    assert f"where the cache {toy.folder / 'cache'} is, 900000000 MB are kept (--min-free). Make room" in said
+    assert f"of the cache {toy.folder / 'cache'}, but 900000000 MB must stay free (--min-free). Make room" in said
     monkeypatch.delenv(MIN_FREE_VARIABLE, raising=False)
     assert run(toy, "--min-free", "1MB", "--durable")[0] == 0
 

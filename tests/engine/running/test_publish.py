@@ -183,7 +183,7 @@ def test_what_is_the_runs_own_is_not_delivered(tmp_path: Path, target: str) -> N
     path = tmp_path / "text.txt"
     path.write_text("x")
     files = store.put_value(Files({"a.txt": path, target: path}))
-    with pytest.raises(ContractError, match="which is the run's own"):
+    with pytest.raises(ContractError, match="which the run itself writes"):
         publisher.publish("toy", "report.html.png", files)
     assert publisher.written == []
     if not target.rpartition("/")[2].startswith("."):  # marks and temporary files are the run's in any folder

@@ -154,7 +154,7 @@ def test_on_error_stop_and_gates_stop_with_exit_code_4(toy: Toy) -> None:
     gated = toy.run("scaled.gate={value: 1000}")
     assert gated.exit_code == RunStoppedError.exit_code
     assert "`gate` requires 1000" in gated.stopped
-    assert "it reports: value" in toy.run("scaled.gate={valu: 1}").stopped
+    assert "the stage reports: value" in toy.run("scaled.gate={valu: 1}").stopped
 
 
 def test_empty_source_of_failures_only_is_an_input_error(toy: Toy) -> None:
@@ -202,7 +202,7 @@ def test_a_unit_that_delivers_what_is_the_runs_own_fails_and_nothing_else(toy: T
         result = toy.run()
         assert result.exit_code == 3
         (failure,) = result.failures
-        assert "it delivers Run.json, which is the run's own" in failure.cause
+        assert "it delivers Run.json, which the run itself writes" in failure.cause
         assert not (toy.folder / "out" / "Run.json").exists()
         assert len([name for name in result.published if name.startswith("mean/")]) == 4
     assert not toy.run("each.to=sub").failures

@@ -167,4 +167,4 @@ def test_files_that_extend_two_others_each_do_not_multiply(toy: Toy) -> None:
     assert "scaled" in load(toy, CHILD.replace("wf.yaml", "a19.yaml")).stages
     for number in range(60):
         (toy.folder / f"c{number}.yaml").write_text(f"pano_mvs: 1\nextends: c{number + 1}.yaml\n")
-    assert "50 files are allowed" in problems(toy, CHILD.replace("wf.yaml", "c0.yaml"))[-1]
+    assert "at most 50 files are allowed" in problems(toy, CHILD.replace("wf.yaml", "c0.yaml"))[-1]

@@ -161,7 +161,7 @@ def test_paths_in_files_and_on_the_command_line(
         ("many.use=null", "--set many.use: stage 'many': there is no stage None"),
         ("many.gate.x={min: 2, max: 1}", "min 2 is larger than max 1: nothing would pass"),
         ("many.gate.x={}", "say {min: …}, {max: …} or both"),
-        ("many.gate.x=high", "must be a number (the least value) or {min: …, max: …}"),
+        ("many.gate.x=high", "must be a number (the minimum) or {min: …, max: …}"),
         ("many.gate.x.mim=1", "unknown setting 'gate.x.mim'."),
         ("many.to=../up", "--set many.to: stage 'many': to: must be a folder inside the output folder"),
         ("many.memory=lots", "memory: must be a size such as 500MB"),
