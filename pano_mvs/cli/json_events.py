@@ -58,9 +58,9 @@ class JsonEvents:
         self.write("unit_failed", stage=failure.stage, item=failure.item, cause=failure.cause,
                    consequence=failure.consequence, log=failure.log, said=list(failure.said))  # fmt: skip
 
-    def unit_finished(self, name: str, item: str, outcome: UnitStatus, seconds: float) -> None:
+    def unit_finished(self, name: str, item: str, *, status: UnitStatus, seconds: float) -> None:
         """Write the event."""
-        self.write("unit_finished", stage=name, item=item, outcome=outcome, seconds=round(seconds, 6))
+        self.write("unit_finished", stage=name, item=item, outcome=status, seconds=round(seconds, 6))
 
     def stage_finished(self, summary: StageSummary) -> None:
         """Write the event."""

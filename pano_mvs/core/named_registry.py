@@ -85,10 +85,6 @@ class NamedRegistry(Generic[Value]):
             "the plugin or list its file under `plugins:`"
         )
 
-    def is_builtin(self, name: str) -> bool:
-        """Return whether a name is that of a built-in value."""
-        return name in self._builtin
-
     def code_file(self, name: str) -> Path | None:
         """Return the plugin file behind a name, or None if the value is built in."""
         return Path(self._added[name][1].__code__.co_filename) if name in self._added else None

@@ -139,7 +139,7 @@ def verify(store: Store, *, drop_unproven: bool = False) -> Verification:
         if not key:
             found.foreign.append(file.path)
         elif data is not None:
-            record = _verify_record(store, found, intact, file.path, key=key, data=data)
+            record = _verify_record(store, file.path, found=found, intact=intact, key=key, data=data)
             stat = _stat(file.path)
             if record is not None and stat is not None:
                 unproven.add(file.path, stat.st_mtime, record)
@@ -152,7 +152,7 @@ def verify(store: Store, *, drop_unproven: bool = False) -> Verification:
 
 
 def _verify_record(
-    store: Store, found: Verification, intact: set[str], path: str, *, key: str, data: bytes
+    store: Store, path: str, *, found: Verification, intact: set[str], key: str, data: bytes
 ) -> UnitRecord | None:
     """Check a record and enter it into what was found; return it if it and all its blobs are intact."""
     record = record_from_bytes(data)

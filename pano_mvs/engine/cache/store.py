@@ -239,10 +239,6 @@ class Store:
             self.damaged.append(str(error))
             raise
 
-    def require_room(self) -> None:
-        """Raise StoreError if there is too little free space to start a unit."""
-        self._disk.require()
-
     def scratch(self) -> AbstractContextManager[Path]:
         """Return a context with an empty folder in the cache, which is removed afterwards.
 

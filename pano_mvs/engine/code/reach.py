@@ -177,13 +177,13 @@ class CodeGraph:
             if bound and bound != f"{module}:{name}" and depth < _MAX_DEPTH:
                 return self._targets(_joined(bound, further), libraries, depth + 1)
             if self.sources.summary(f"{module}.{name}") is None:
-                return self._by_other_means(module, summary, name, libraries, depth)
+                return self._targets_of_unbound(module, summary, name, libraries=libraries, depth=depth)
             module, rest = f"{module}.{name}", further
         libraries.add(top)  # such as compiled modules
         return ()
 
-    def _by_other_means(
-        self, module: str, summary: ModuleSummary, name: str, libraries: set[str], depth: int
+    def _targets_of_unbound(
+        self, module: str, summary: ModuleSummary, name: str, *, libraries: set[str], depth: int
     ) -> tuple[str, ...]:
         """Return the nodes of a name that a module neither defines nor imports explicitly."""
         if name in summary.effect_names:

@@ -28,7 +28,6 @@ from pano_mvs.engine.executors.unit_json import request_to_json
 _LARGE_BYTES = 200_000
 _CONNECT_S = 20.0
 _LISTEN_S = 0.5
-_ANSWER_S = 60.0
 
 
 class DaskExecutor:

@@ -63,7 +63,7 @@ def make_plan(
     for name in graph.order:
         entry = workflow.stages[name]
         state, plan = StageState(graph.axes[name]), StagePlan(name, entry.spec.name)
-        units, resolution = resolve(entry, graph, states, store)
+        units, resolution = resolve(entry, graph, states=states, store=store)
         for unit in units:
             record = None
             if not options.refreshes(unit):
@@ -74,7 +74,7 @@ def make_plan(
                 plan.cached.append(unit.item)
             else:
                 state.pending.add(unit.item)
-                plan.run[unit.item] = _reason(unit, last.get(name, {}), store, options)
+                plan.run[unit.item] = _reason(unit, last.get(name, {}), store, is_asked=options.refreshes(unit))
             if visit is not None:
                 visit(unit, record, plan.run.get(unit.item, ""))
         state.members, state.failed = resolution.members, resolution.blocked
@@ -92,7 +92,7 @@ def settle(state: StageState, unit: Unit, record: UnitRecord) -> None:
     state.exploded.update(record.items)
 
 
-def _reason(unit: Unit, last: Mapping[str, str], store: Store, options: RunOptions) -> str:
-    if options.refreshes(unit):
+def _reason(unit: Unit, last: Mapping[str, str], store: Store, *, is_asked: bool) -> str:
+    if is_asked:
         return "--refresh"
     return reason_to_run(unit, last.get(unit.item), store)

@@ -82,7 +82,7 @@ class ReadyQueue:
                 (entry := workflow.stages[name]),
                 position,
                 graph.edges[name],
-                Resolver(entry, graph, self.states, store),
+                Resolver(entry, graph, states=self.states, store=store),
             )
             for position, name in enumerate(graph.order)
         }
@@ -186,7 +186,9 @@ class ReadyQueue:
         self._open_behind(name)
 
     def _list_source(self, stage: _Stage, state: StageState) -> Mapping[str, str]:
-        resolution = resolve_source(stage.entry, self._store, self._only.get(stage.entry.name), self.listing)
+        resolution = resolve_source(
+            stage.entry, self._store, only=self._only.get(stage.entry.name), listing=self.listing
+        )
         stage.found = {unit.item: unit for unit in resolution.units}
         state.members.update(resolution.members)
         notes = {unit.item: unit.source.notes for unit in resolution.units if unit.source}

@@ -77,11 +77,11 @@ def _inputs(unit: Unit, before: Mapping[str, Any], now: Mapping[str, Any]) -> li
         if unit.source is not None:
             changed.extend(f"input {path.name}" for path in unit.source.files.values())
         else:
-            changed.append(f"input {port}: {_changed_items(unit, port, old, new)}")
+            changed.append(f"input {port}: {_changed_items(unit, port, old=old, new=new)}")
     return changed
 
 
-def _changed_items(unit: Unit, port: str, old: Any, new: Any) -> str:
+def _changed_items(unit: Unit, port: str, *, old: Any, new: Any) -> str:
     value = unit.inputs.get(port)
     if value is None or isinstance(value, ItemRef):
         return unit.item or "changed"

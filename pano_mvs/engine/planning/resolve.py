@@ -28,7 +28,7 @@ _MAX_SHOWN = 20
 
 
 def resolve_source(
-    entry: StageEntry, store: Store, only: frozenset[str] | None = None, listing: SourceListing | None = None
+    entry: StageEntry, store: Store, *, only: frozenset[str] | None = None, listing: SourceListing | None = None
 ) -> Resolution:
     """List the items of a source, and return a unit for each.
 
@@ -69,7 +69,7 @@ def resolve_source(
 
 
 def resolve(
-    entry: StageEntry, graph: Graph, states: Mapping[str, StageState], store: Store
+    entry: StageEntry, graph: Graph, *, states: Mapping[str, StageState], store: Store
 ) -> tuple[Iterator[Unit], Resolution]:
     """Return the units of a stage, given the states of the stages that feed it.
 
@@ -79,9 +79,9 @@ def resolve(
         take more memory than everything else.
     """
     if entry.spec.list_items is not None:
-        resolution = resolve_source(entry, store, graph.only.get(entry.name))
+        resolution = resolve_source(entry, store, only=graph.only.get(entry.name))
         return iter(resolution.units), resolution
-    resolver = Resolver(entry, graph, states, store)
+    resolver = Resolver(entry, graph, states=states, store=store)
     return resolver.resolve(), resolver.resolution
 
 
@@ -92,7 +92,7 @@ class Resolver:
         near: unit to its neighbours, if the stage has an index and its unit names are known.
     """
 
-    def __init__(self, entry: StageEntry, graph: Graph, states: Mapping[str, StageState], store: Store) -> None:
+    def __init__(self, entry: StageEntry, graph: Graph, *, states: Mapping[str, StageState], store: Store) -> None:
         self.entry = entry
         self.axis = graph.axes[entry.name]
         self.edges = edges = graph.edges[entry.name]

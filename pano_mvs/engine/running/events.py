@@ -136,7 +136,7 @@ class Observer(Protocol):
     def unit_failed(self, failure: Failure) -> None:
         """A unit has failed, after all its retries; `unit_finished` follows."""
 
-    def unit_finished(self, name: str, item: str, outcome: UnitStatus, seconds: float) -> None:
+    def unit_finished(self, name: str, item: str, *, status: UnitStatus, seconds: float) -> None:
         """A unit is settled; `seconds` is its computing time, 0 if it was not computed."""
 
     def stage_finished(self, summary: StageSummary) -> None:
@@ -158,7 +158,7 @@ class SilentObserver:
     def unit_failed(self, failure: Failure) -> None:
         """Do nothing."""
 
-    def unit_finished(self, name: str, item: str, outcome: UnitStatus, seconds: float) -> None:
+    def unit_finished(self, name: str, item: str, *, status: UnitStatus, seconds: float) -> None:
         """Do nothing."""
 
     def stage_finished(self, summary: StageSummary) -> None:

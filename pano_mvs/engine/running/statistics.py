@@ -81,7 +81,7 @@ class RunStatistics:
             summary.blocked += 1
             failure = Failure(entry.name, item, f"it {reason}", consequence=consequence_of(entry, item), blocked=True)
         self._result.failures.append(failure)
-        self._observer.unit_finished(entry.name, item, "blocked", 0.0)
+        self._observer.unit_finished(entry.name, item, status="blocked", seconds=0.0)
         if entry.spec.list_items is not None and entry.policy.on_error == "stop":
             raise RunStoppedError(f"stage {entry.name!r} has on_error: stop, and {item} cannot be used: {reason}")
 
@@ -108,14 +108,15 @@ class RunStatistics:
             count.rejected[item] = dict(record.rejected)
         if record.doubts:
             count.doubts[item] = dict(record.doubts)
-        self._observer.unit_finished(entry.name, item, status, record.seconds if status == "run" else 0.0)
+        seconds = record.seconds if status == "run" else 0.0
+        self._observer.unit_finished(entry.name, item, status=status, seconds=seconds)
 
     def unit_failed(self, failure: Failure, seconds: float) -> None:
         """Count a unit without a result."""
         self._counts[failure.stage].summary.failed += 1
         self._result.failures.append(failure)
         self._observer.unit_failed(failure)
-        self._observer.unit_finished(failure.stage, failure.item, "failed", seconds)
+        self._observer.unit_finished(failure.stage, failure.item, status="failed", seconds=seconds)
 
     def unit_withdrawn(self, failure: Failure, *, was_computed: bool) -> None:
         """Count a unit as failed that was counted with a result before."""

@@ -131,7 +131,7 @@ def stage(name: str, *, version: int = 1, memory: str | int | MemoryNeeded = 0) 
 
     def decorate(function: Function) -> Function:
         signature = _read_signature(function, name)
-        setattr(function, _ATTRIBUTE, _spec(name, version, function, signature, None, memory))
+        setattr(function, _ATTRIBUTE, _spec(name, function, signature, version=version, memory=memory))
         return function
 
     return decorate
@@ -149,7 +149,11 @@ def source(
 
     def decorate(function: Function) -> Function:
         signature = _read_signature(function, name, leading="item")
-        setattr(function, _ATTRIBUTE, _spec(name, version, function, signature, list_items, memory))
+        setattr(
+            function,
+            _ATTRIBUTE,
+            _spec(name, function, signature, version=version, memory=memory, list_items=list_items),
+        )
         return function
 
     return decorate
@@ -163,11 +167,12 @@ def spec_of(value: object) -> StageSpec | None:
 
 def _spec(
     name: str,
-    version: int,
     function: Callable[..., Any],
     signature: _Signature,
-    list_items: ListItems | None,
-    memory: str | int | MemoryNeeded = 0,
+    *,
+    version: int,
+    memory: str | int | MemoryNeeded,
+    list_items: ListItems | None = None,
 ) -> StageSpec:
     return StageSpec(
         name=name,

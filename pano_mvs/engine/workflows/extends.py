@@ -190,7 +190,7 @@ def merge_stages(files: Sequence[WorkflowFile], problems: Problems) -> dict[str,
             if name not in stages:
                 order.insert(_position(order, written, idx), name)
         for name, node in file.stages.items():
-            _merge_entry(stages, name, node, problems)
+            _merge_entry(stages, name, node, problems=problems)
         stages = {name: stages[name] for name in order if name in stages}
         if len(stages) > MAX_STAGES:
             raise WorkflowError([*problems.lines, f"{file.root.place}: at most {MAX_STAGES} stages are allowed"])
@@ -203,7 +203,7 @@ def _position(order: Sequence[str], written: Sequence[str], idx: int) -> int:
     return next((order.index(name) for name in written[1:] if name in order), len(order))
 
 
-def _merge_entry(stages: dict[str, Located], name: str, node: Located, problems: Problems) -> None:
+def _merge_entry(stages: dict[str, Located], name: str, node: Located, *, problems: Problems) -> None:
     if not is_plain_name(name):
         problems.add(
             node.key_place,

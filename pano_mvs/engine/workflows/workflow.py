@@ -191,9 +191,9 @@ class WorkflowReader:
             self.problems.add(use.place, f"stage {name!r}: there is no stage {shown}; {hint}")
             return None
         values = node.plain()
-        policy = self._validate(Policy, {key: values[key] for key in values if key in RESERVED_KEYS}, node, name)
+        policy = self._validate(Policy, {key: values[key] for key in values if key in RESERVED_KEYS}, node, name=name)
         own = {key: value for key, value in values.items() if key not in RESERVED_KEYS}
-        params = self._validate(spec.params_type, own, node, name)
+        params = self._validate(spec.params_type, own, node, name=name)
         if params is not None:
             self._check_files(params, node, name)
         places = {key: item.place for key, item in node.value.items()}
@@ -210,20 +210,20 @@ class WorkflowReader:
                     why = "cannot be examined (permission denied)" if is_denied(path) else "does not exist"
                     self.problems.add(node.at((key,)).place, f"stage {name!r}: {key}: {path} {why}")
 
-    def _validate(self, model: type[Any], values: dict[str, Any], node: Located, name: str) -> Any:
+    def _validate(self, model: type[Any], values: dict[str, Any], node: Located, *, name: str) -> Any:
         try:
             return model.model_validate(values, context={"base": self.base, "bases": self._bases(node)})
         except ValidationError as error:
             known = [info.alias or field_name for field_name, info in model.model_fields.items()]
             for problem in error.errors(include_url=False):
-                self._report(problem, node, name, known)
+                self._report(problem, node, name=name, known=known)
             return None
 
     def _bases(self, node: Located) -> dict[str, Path]:
         """Return the folder that the paths in each setting start from."""
         return {key: self._folder(item) for key, item in node.value.items()}
 
-    def _report(self, problem: Any, node: Located, name: str, known: list[str]) -> None:
+    def _report(self, problem: Any, node: Located, *, name: str, known: list[str]) -> None:
         path = tuple(problem["loc"])
         found = node.at(path)
         key = ".".join(map(str, path))

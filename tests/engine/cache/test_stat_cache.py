@@ -72,7 +72,7 @@ def test_what_is_learnt_later_holds(tmp_path: Path) -> None:
 
 
 def test_it_does_not_grow_for_ever(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stat_cache, "_MOST_ENTRIES", 10)
+    monkeypatch.setattr(stat_cache, "_MAX_ENTRIES", 10)
     for number in range(25):
         cache = StatCache(tmp_path / "stat.json")
         cache.digest(write(tmp_path, f"{number:02d}", b"x"))

@@ -240,5 +240,5 @@ def test_input_that_is_gone_while_a_stage_reads_it_is_no_fault_of_the_stage(toy:
         raise FileNotFoundError("no such file")'''))  # fmt: skip
     result = toy.run()
     assert (result.exit_code, result.failures) == (0, [])
-    assert any("is gone; the same command computes it again" in text for text in result.warnings)
+    assert any("is missing; the same command computes it again" in text for text in result.warnings)
     assert mark.exists()

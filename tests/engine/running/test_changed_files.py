@@ -126,8 +126,8 @@ class Meddler(SilentObserver):
         self._meddle: Callable[[], object] | None = meddle
         self.warnings: list[str] = []
 
-    def unit_finished(self, stage: str, item: str, outcome: str, seconds: float) -> None:
-        if (stage, item) == self._when and self._meddle is not None:
+    def unit_finished(self, name: str, item: str, *, status: str, seconds: float) -> None:
+        if (name, item) == self._when and self._meddle is not None:
             self._meddle()
             self._meddle = None
 

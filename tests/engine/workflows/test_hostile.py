@@ -63,7 +63,7 @@ BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
         (inside("!!set {a, b}"), "is not allowed"),
         ("!!python/object:os.x {pano_mvs: 1}", "wf.yaml:1:1: tag"),
         ("pano_mvs: 1\n!!python/name:os.x stages: {}", f"wf.yaml:2:1: tag '{PYTHON}/name:os.x' is not"),
-        ("? [a, b]\n: 1", "wf.yaml:1:3: a key must be a plain word"),
+        ("? [a, b]\n: 1", "wf.yaml:1:3: a key must be a plain scalar"),
         (BOMB, "too large; at most 100000 values are allowed"),
         ("a: &a [*a]", "wf.yaml:1:4: too large; at most 40 levels are allowed"),
         ("a: *nothing", "wf.yaml:1:4: found undefined alias"),
