@@ -227,7 +227,7 @@ def test_runs_that_are_too_old_are_forgotten_and_pins_are_not(toy: Toy, cache: C
 def test_pins_are_asked_for_properly(toy: Toy, cache: Cache) -> None:  # noqa: F811
     run(toy, "one")
     run(toy, "two", "--set", "scaled.by=5")
-    for run_name, name, why in (("nothing", "good", "0 runs are called"), ("", "good", "2 runs are called"),
+    for run_name, name, why in (("nothing", "good", "0 runs match"), ("", "good", "2 runs match"),
                                 (str(toy.folder / "one"), "../x", "no name for a pin"),
                                 (str(toy.folder / "one"), "", "no name for a pin")):  # fmt: skip
         code, said = cache("pin", run_name, name)

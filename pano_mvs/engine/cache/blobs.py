@@ -63,7 +63,7 @@ class BlobRef:
 
     @staticmethod
     def from_json(value: list[Any]) -> BlobRef:
-        """Return the reference that `to_json` gave.
+        """Return the reference from the result of `to_json`.
 
         Raises:
             ValueError: if the value is not a reference, as such a path could lead out of the cache.

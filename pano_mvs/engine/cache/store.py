@@ -54,7 +54,7 @@ class ItemRef:
 
     @staticmethod
     def from_json(value: Mapping[str, Any]) -> ItemRef:
-        """Return the reference that `to_json` gave."""
+        """Return the reference from the result of `to_json`."""
         parts = {str(name): BlobRef.from_json(part) for name, part in value["parts"].items()}
         return ItemRef(intern(str(value["kind"])), str(value["digest"]), PackedParts(parts))
 
@@ -104,7 +104,7 @@ class UnitRecord:
 
     @staticmethod
     def from_json(value: Mapping[str, Any]) -> UnitRecord:
-        """Return the record that `to_json` gave.
+        """Return the record from the result of `to_json`.
 
         Raises:
             ValueError, KeyError, TypeError, AttributeError, OverflowError: if the value is not a record.

@@ -125,7 +125,7 @@ class Resolver:
         return self.resolution.units[0] if self.resolution.units else self.resolution.blocked[name]
 
     def unit_names(self) -> Mapping[str, tuple[str, ...]] | None:
-        """Return the stage's units and the images each is about, or None if they are not known yet.
+        """Return the units of the stage and the images that each concerns, or None if they are not known yet.
 
         Raises:
             UsageError: if the run is limited to a unit that does not exist.

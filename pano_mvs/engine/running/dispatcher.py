@@ -89,7 +89,7 @@ class Dispatcher:
         """Return the message for a unit that does not fit although no other one is running."""
         needed, free = size_text(self._memory_of(unit)), size_text(self._free_bytes)
         return (
-            f"it declares {needed} of memory, and {free} are free. Close other programs, use smaller pictures or "
+            f"it declares {needed} of memory, and {free} are free. Close other programs, use smaller images or "
             f"settings, or state with `memory:` in stage {unit.entry.name!r} how much it really needs"
         )
 

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
-from types import MappingProxyType
-from typing import NamedTuple
 
 from pano_mvs.core.errors import ContractError, StoreError, UsageError
 from pano_mvs.core.file_names import is_of_the_run
@@ -17,30 +15,11 @@ from pano_mvs.core.paths import is_file, is_link, resolved
 from pano_mvs.engine.cache.blobs import BlobRef, DamagedBlobError
 from pano_mvs.engine.cache.disk_guard import is_full_disk
 from pano_mvs.engine.cache.store import ItemRef, Store
+from pano_mvs.engine.running.file_claims import FileClaims, NameClashError, Owner, folders_of
 from pano_mvs.scene import Files
 from pano_mvs.scene.files import item_stems
 
 _PLACEHOLDER = re.compile(r"\{(?:item|name)\}")
-
-
-class _Owner(NamedTuple):
-    """The unit that a file belongs to."""
-
-    stage: str
-    item: str
-
-
-class NameClashError(UsageError):
-    """A unit would write the same file as another unit of its stage, or write a file twice.
-
-    Attributes:
-        losers: units of the same stage whose files were withdrawn because they clash with those of this unit: item to
-            the reason.
-    """
-
-    def __init__(self, text: str, losers: Mapping[str, str] = MappingProxyType({})) -> None:
-        self.losers = losers
-        super().__init__(text)
 
 
 class Publisher:
@@ -68,10 +47,7 @@ class Publisher:
         self.published: dict[str, str] = {}
         self.earlier: dict[str, str] = {}
         self.set_aside: dict[str, str] = {}
-        self._owners: dict[str, _Owner] = {}  # file to the first unit that delivers it, published or not
-        self._folders: set[str] = set()
-        self._delivered: set[_Owner] = set()
-        self._lost: dict[_Owner, tuple[str, ...]] = {}  # unit with clashes to the files that it would deliver
+        self._claims = FileClaims(self._order)
         self._stems: dict[str, str] = {}
         self._ranks: dict[str, int] = {}
         try:
@@ -99,7 +75,7 @@ class Publisher:
         """Start a new pass: what was published so far counts as that of an earlier run."""
         self.earlier |= self.published
         self.published = {}
-        self._owners, self._folders, self._delivered, self._lost = {}, set(), set(), {}
+        self._claims = FileClaims(self._order)
 
     def publish(self, stage: str, item: str, ref: ItemRef, *, to: str = "") -> Mapping[str, str]:
         """Write the files of one unit, unless they exist with the right bytes.
@@ -126,7 +102,25 @@ class Publisher:
             DamagedBlobError: if the copy in the cache is damaged.
             ContractError: if a file would replace one of the run itself; nothing is written.
         """
-        owner = _Owner(stage, item)
+        owner = Owner(stage, item)
+        files = self._placed_files(item, ref, to)
+        refusal, losers = self._claims.claim(owner, files)
+        for loser in losers:
+            self._withdraw(self._claims.lost_files(Owner(stage, loser)))
+        if refusal:
+            raise NameClashError(refusal, losers)
+        for name, blob in files.items():
+            self._write(name, blob)
+            self.published[name] = blob.digest
+        self._claims.deliver(owner)
+        return losers
+
+    def refusals(self) -> dict[tuple[str, str], str]:
+        """Return why units of this pass were not published: stage and item to the reason."""
+        return self._claims.refusals()
+
+    def _placed_files(self, item: str, ref: ItemRef, to: str) -> dict[str, BlobRef]:
+        """Return the files of a unit by their path in the output folder, after checking these paths."""
         files: dict[str, BlobRef] = {}
         for target, blob in self._files(ref):
             name = str(PurePosixPath(to) / self._placed(target, item))
@@ -139,69 +133,16 @@ class Publisher:
                 raise NameClashError(f"it delivers {name} twice. Give each of its files a name of its own")
             files[name] = blob
         for name in files:
-            if folder := next((folder for folder in _folders_of(name) if folder in files), ""):
+            if folder := next((folder for folder in folders_of(name) if folder in files), ""):
                 raise NameClashError(f"it delivers {folder} as a file and {name} inside of it. Rename one of them")
-        lost, losers = self._resolved_clashes(owner, files)
-        for loser in losers:
-            self._withdraw(_Owner(stage, loser))
-        for name in files:
-            self._owners[name] = min(owner, self._owners.get(name, owner), key=self._order)
-            self._folders.update(_folders_of(name))
-        if lost:
-            self._lost[owner] = tuple(files)
-            raise NameClashError(lost, losers)
-        for name, blob in files.items():
-            self._write(name, blob)
-            self.published[name] = blob.digest
-        self._delivered.add(owner)
-        return losers
+        return files
 
-    def _resolved_clashes(self, owner: _Owner, files: Mapping[str, BlobRef]) -> tuple[str, dict[str, str]]:
-        """Return why a unit cannot be published ("" if it can), and the published items that it replaces."""
-        lost, losers = "", {}
-        for what, other in self._clashes(owner, files):
-            if other.stage != owner.stage:
-                raise UsageError(
-                    f"stages {other.stage!r} and {owner.stage!r} both write {what}; give one a folder of "
-                    "its own with `to: NAME`"
-                )
-            if self._order(owner) > self._order(other):
-                lost = lost or _clash(what, other.item)
-            elif other in self._delivered:
-                losers[other.item] = _clash(what, owner.item)
-        return lost, losers
-
-    def clash_causes(self) -> dict[tuple[str, str], str]:
-        """Return why units were not published, independent of their order: stage and item to the reason."""
-        return {
-            (owner.stage, owner.item): next(
-                _clash(what, other.item)
-                for what, other in self._clashes(owner, files)
-                if self._order(other) < self._order(owner)
-            )
-            for owner, files in self._lost.items()
-        }
-
-    def _clashes(self, owner: _Owner, files: Iterable[str]) -> Iterator[tuple[str, _Owner]]:
-        """Yield the clashes of some files: a description, and the other unit."""
-        for name in files:
-            if (other := self._owners.get(name)) is not None and other != owner:
-                yield name, other
-            for folder in _folders_of(name):
-                if (other := self._owners.get(folder)) is not None and other != owner:
-                    yield f"{folder}, as a file and as a folder,", other
-            if name in self._folders:
-                inside = {other for path, other in self._owners.items() if path.startswith(f"{name}/")}
-                yield from ((f"{name}, as a file and as a folder,", other) for other in sorted(inside - {owner}))
-
-    def _order(self, owner: _Owner) -> tuple[int, str]:
+    def _order(self, owner: Owner) -> tuple[int, str]:
         return self._ranks.get(owner.item, len(self._ranks)), owner.item
 
-    def _withdraw(self, owner: _Owner) -> None:
-        """Delete the files of a unit from the output folder; they still count as clashes for other units."""
-        self._delivered.remove(owner)
-        self._lost[owner] = tuple(name for name, found in self._owners.items() if found == owner)
-        for name in self._lost[owner]:
+    def _withdraw(self, files: Iterable[str]) -> None:
+        """Delete the files of a unit from the output folder."""
+        for name in files:
             del self.published[name]
             with suppress(ValueError):
                 self.written.remove(name)
@@ -279,18 +220,6 @@ class Publisher:
 
     def _is_stored(self, path: Path, digest: str, suffix: str) -> bool:
         return self.store.blobs.exists(BlobRef(digest, path.stat().st_size, suffix))
-
-
-def _folders_of(name: str) -> list[str]:
-    """Return the folders of a file, inside the output folder."""
-    return [str(folder) for folder in PurePosixPath(name).parents if folder.parts]
-
-
-def _clash(what: str, other: str) -> str:
-    return (
-        f"{what} is delivered for {other} too. Rename one of the images or their folders, or, in the stage, put "
-        "{item} or {name} into the names of the files"
-    )
 
 
 def _is_inside(path: Path, folder: Path) -> bool:

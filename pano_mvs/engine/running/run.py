@@ -33,7 +33,8 @@ from pano_mvs.engine.planning.source_listing import SourceListing
 from pano_mvs.engine.planning.units import StageState, Unit
 from pano_mvs.engine.running.dispatcher import Dispatcher, FinishedJob
 from pano_mvs.engine.running.events import Failure, Observer, RunResult, SilentObserver, consequence_of
-from pano_mvs.engine.running.publish import NameClashError, Publisher
+from pano_mvs.engine.running.file_claims import NameClashError
+from pano_mvs.engine.running.publish import Publisher
 from pano_mvs.engine.running.statistics import RunStatistics
 from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import StageEntry, Workflow
@@ -270,8 +271,8 @@ class RunPass:
         except RunStoppedError as error:
             stop = error
         finally:
-            clashes = self._run.publisher.clash_causes()
-            self._statistics.put_in_order(self.queue.position_of, replaced=self._replaced(), clashes=clashes)
+            refusals = self._run.publisher.refusals()
+            self._statistics.put_in_order(self.queue.position_of, replaced=self._replaced(), refusals=refusals)
         if stop is not None:
             self.result.stopped, self.result.exit_code = str(stop), stop.exit_code
         else:

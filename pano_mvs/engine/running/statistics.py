@@ -158,20 +158,20 @@ class RunStatistics:
         position_of: Callable[[str, str], tuple[int, int]],
         *,
         replaced: Collection[str] = frozenset(),
-        clashes: Mapping[tuple[str, str], str] = MappingProxyType({}),
+        refusals: Mapping[tuple[str, str], str] = MappingProxyType({}),
     ) -> None:
         """Sort the result by workflow and capture, so that it does not depend on which unit ended first.
 
         Args:
             position_of: returns the position of a unit in the workflow and in the capture.
             replaced: stages whose results later stages delivered anew: their doubts do not count any more.
-            clashes: stage and item of units whose files clash with those of another one, to the final reason.
+            refusals: stage and item of units whose files could not be published, to the final reason.
         """
         result = self._result
         result.stages.sort(key=lambda summary: position_of(summary.name, ""))
         result.failures.sort(key=lambda failure: position_of(failure.stage, failure.item))
         result.failures[:] = [
-            replace(failure, cause=clashes.get((failure.stage, failure.item), failure.cause))
+            replace(failure, cause=refusals.get((failure.stage, failure.item), failure.cause))
             for failure in result.failures
         ]
 

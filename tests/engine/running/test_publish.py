@@ -11,7 +11,8 @@ import pytest
 from pano_mvs.core.errors import ContractError
 from pano_mvs.core.files import OUTPUT_MARK
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.running.publish import NameClashError, Publisher
+from pano_mvs.engine.running.file_claims import NameClashError
+from pano_mvs.engine.running.publish import Publisher
 from pano_mvs.scene import Files
 
 
@@ -117,7 +118,7 @@ def test_who_delivers_of_a_chain_of_clashes_does_not_depend_on_the_order(
     assert failed == {"b", "c"}
     assert files_in(tmp_path / "out") == {"ab": "a", "a": "a", "d": "d"}
     assert publisher.published.keys() == {"ab", "a", "d"} == set(publisher.written)
-    causes = publisher.clash_causes()
+    causes = publisher.refusals()
     assert causes.keys() == {("toy", "b"), ("toy", "c")}
     assert "ab is delivered for a too" in causes["toy", "b"]
     assert "bc is delivered for b too" in causes["toy", "c"]
