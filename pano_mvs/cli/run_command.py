@@ -284,8 +284,9 @@ def print_scores(scores: Mapping[str, Any], console: Console) -> None:
     if poses:
         together = poses.get("registered_in_one_frame")
         in_one_frame = "" if together is None else f" ({together} in one frame)"
-        text = (f"{poses['registered']} of {poses['of']} registered{in_one_frame}, median pair error "
-                f"{poses['median_pair_error_deg']:.3f}°")  # fmt: skip
+        error_deg = poses.get("median_pair_error_deg")
+        measured = "no pair to measure" if error_deg is None else f"median pair error {error_deg:.3f}°"
+        text = f"{poses['registered']} of {poses['of']} registered{in_one_frame}, {measured}"
         if "scale_ratio_error_max" in poses:
             text += f", translation scale ratios within {100 * poses['scale_ratio_error_max']:.2f} %"
         console.print(f"against the ground truth: {text}", highlight=False)
