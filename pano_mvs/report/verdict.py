@@ -89,8 +89,9 @@ def verdict(
     """
     code = summary.get("exit_code", 0)
     mood, outcome = _OUTCOMES.get(code, ("bad", f"Ended with code {code}"))
-    if code == _SOME_FAILED and summary.get("doubts") and not (summary.get("failures") or summary.get("rejected")):
-        outcome = "Finished, with doubtful cameras"
+    if code == _SOME_FAILED and not summary.get("failures"):
+        parts = {"rejected": "panoramas left out", "doubts": "doubtful cameras"}
+        outcome = f"Finished, with {' and '.join(parts[key] for key in parts if summary.get(key)) or 'failed items'}"
     residual_deg = residuals.overall.median_deg if residuals else None
     residual_px = residual_deg * image_width / 360 if residual_deg is not None and image_width else None
     tiles = [*_registered(summary), *_residual(residual_deg, residual_px), *_coverage(summary), *_cloud(summary),

@@ -112,6 +112,15 @@ def test_a_run_with_doubtful_cameras_alone_has_no_failed_items():
     assert verdict(failed).outcome == "Finished, with failed items"
 
 
+def test_a_run_with_unregistered_panoramas_alone_has_no_failed_items():
+    rejected = {"x0.png": {"stage": "poses", "reason": "0 matches, 20 needed"}}
+    summary = GOOD | {"exit_code": 3, "poses": rejecting(1), "rejected": rejected}
+    assert verdict(summary).outcome == "Finished, with panoramas left out"
+    doubts = {"0.png": {"stage": "checked", "reason": "confirmed 1 %"}}
+    assert verdict(summary | {"doubts": doubts}).outcome == "Finished, with panoramas left out and doubtful cameras"
+    assert verdict({"exit_code": 3}).outcome == "Finished, with failed items"
+
+
 def test_where_nothing_is_known_nothing_is_judged():
     assert verdict({}).judgement == ""
 
