@@ -11,6 +11,7 @@ from pathlib import Path
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import GateError, StoreError
 from pano_mvs.core.paths import is_file
+from pano_mvs.core.text import plural
 from pano_mvs.engine.blobs import DamagedBlobError
 from pano_mvs.engine.board import Board
 from pano_mvs.engine.demands import NO_DEMANDS, Demands
@@ -198,8 +199,8 @@ class Run:
         """Give units in flight some time after an interrupt; a second interrupt ends it at once."""
         deadline = time.monotonic() + GRACE_S
         if self._desk and self.executor.enforces_timeouts:  # units run elsewhere, and go on
-            self.observer.warn(f"interrupted: {len(self._desk)} units may finish within {GRACE_S:.0f} s; "
-                               "interrupt again to stop at once")  # fmt: skip
+            self.observer.warn(f"interrupted: {len(self._desk)} {plural(len(self._desk), 'unit')} may finish within "
+                               f"{GRACE_S:.0f} s; interrupt again to stop at once")  # fmt: skip
             while self._desk and (left := deadline - time.monotonic()) > 0:
                 self._desk.take(left)
 

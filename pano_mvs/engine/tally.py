@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from pano_mvs.core.errors import GateError, InputError
+from pano_mvs.core.text import plural
 from pano_mvs.engine.events import Failure, Observer, Outcome, RunResult, StageSummary
 from pano_mvs.engine.failures import lost
 from pano_mvs.engine.store import UnitRecord
@@ -138,7 +139,10 @@ class Tally:
         self._observer.stage_finished(summary)
         if entry.spec.list_items is not None and not state.items:
             shown = "".join(f"\n  {cause}" for cause in list(state.failed.values())[:_SHOWN_CAUSES])
-            raise InputError(f"{entry.name}: none of the {len(state.members)} items can be used{shown}")
+            raise InputError(
+                f"{entry.name}: none of the {len(state.members)} {plural(len(state.members), 'item')} "
+                f"can be used{shown}"
+            )
         _check_gates(entry, summary)
 
     def put_in_order(
@@ -166,8 +170,8 @@ class Tally:
 def _check_gates(entry: StageEntry, summary: StageSummary) -> None:
     done = summary.run + summary.cached
     if summary.units and done / summary.units < entry.policy.min_success:
-        raise GateError(f"stage {entry.name!r}: {done} of {summary.units} units succeeded, min_success is "
-                        f"{entry.policy.min_success}")  # fmt: skip
+        raise GateError(f"stage {entry.name!r}: {done} of {summary.units} {plural(summary.units, 'unit')} "
+                        f"succeeded, min_success is {entry.policy.min_success}")  # fmt: skip
     for metric, limits in entry.policy.gate.items():
         if metric not in summary.metrics:
             known = ", ".join(summary.metrics) or "none"

@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from pano_mvs.core.text import plural
 from pano_mvs.report.figures import figure, median, share
 from pano_mvs.report.findings import (
     FAIR_COMPLETE,
@@ -120,8 +121,10 @@ def _sentence(summary: Mapping[str, Any]) -> str:
     if failed:
         parts.append(f"{figure(failed)} failed")
     if not run and not failed:
-        return f"Nothing had changed: all {figure(cached)} units of work were taken from the cache."
-    return f"{figure(run + cached + failed)} units of work: {', '.join(parts)}."
+        units = plural(cached, "the one unit of work was", f"all {figure(cached)} units of work were")
+        return f"Nothing had changed: {units} taken from the cache."
+    total = run + cached + failed
+    return f"{figure(total)} {plural(total, 'unit of work', 'units of work')}: {', '.join(parts)}."
 
 
 def _registered(summary: Mapping[str, Any]) -> list[Tile]:
@@ -162,7 +165,7 @@ def _cloud(summary: Mapping[str, Any]) -> list[Tile]:
     if points is None:
         return []
     text = f"{points / 1e6:.2f} M" if points >= 1_000_000 else figure(points)
-    return [Tile(text, "points in the cloud", "" if points else "bad")]
+    return [Tile(text, f"{plural(points, 'point')} in the cloud", "" if points else "bad")]
 
 
 def _accuracy(summary: Mapping[str, Any]) -> list[Tile]:

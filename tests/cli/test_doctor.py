@@ -216,7 +216,7 @@ def test_the_command_shows_the_remedies_and_ends_with_2_if_a_run_cannot_work(
     monkeypatch.setattr(probes, "run_probe", lambda code: fake(**answers)(code))
     result = pano_mvs("doctor", "--cache", "c", "--out", "o")
     assert result.code == 0, result.text
-    assert "a run can work; 1 warnings" in result.flat
+    assert "a run can work; 1 warning" in result.flat
     assert "warning: PyVista: install the system's OpenGL libraries" in result.flat
     answers["pycolmap"] = "the process died of signal 11"
     result = pano_mvs("doctor", "--json")

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.text import plural
 from pano_mvs.geometry import Rigid3, Similarity3, angle_between, geodesic_angle, nearest_rotation
 
 FloatArray = NDArray[np.float64]
@@ -153,7 +154,10 @@ def align_centers(estimated: Mapping[str, Rigid3], truth: Mapping[str, Rigid3]) 
     """
     names = [name for name in truth if name in estimated]
     if len(names) < 2:
-        raise UsageError(f"only {len(names)} images have both an estimate and truth; two are needed for a scale")
+        raise UsageError(
+            f"only {len(names)} {plural(len(names), 'image has', 'images have')} both an estimate and truth; two are "
+            "needed for a scale"
+        )
     source = np.array([estimated[name].center for name in names])
     target = np.array([truth[name].center for name in names])
     middle, aim = source.mean(axis=0), target.mean(axis=0)
