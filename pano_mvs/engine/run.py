@@ -169,7 +169,8 @@ class Run:
         except GateError as error:
             stop = error
         finally:
-            tally.put_in_order(board.place, replaced=self._replaced())
+            clashes = self._publisher.clash_causes()
+            tally.put_in_order(board.place, replaced=self._replaced(), clashes=clashes)
         if stop is not None:
             result.stopped, result.exit_code = str(stop), stop.exit_code
         else:

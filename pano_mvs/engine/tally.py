@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 
 from pano_mvs.core.errors import GateError, InputError
 from pano_mvs.core.text import plural
@@ -146,16 +147,23 @@ class Tally:
         _check_gates(entry, summary)
 
     def put_in_order(
-        self, place: Callable[[str, str], tuple[int, int]], *, replaced: Collection[str] = frozenset()
+        self,
+        place: Callable[[str, str], tuple[int, int]],
+        *,
+        replaced: Collection[str] = frozenset(),
+        clashes: Mapping[tuple[str, str], str] = MappingProxyType({}),
     ) -> None:
         """Put what is told of the run into the order of the workflow and the capture, whatever came first.
 
         Args:
             place: returns where a unit stands in the workflow and in the capture.
             replaced: stages whose values later stages have made anew: what they doubted does not count any more.
+            clashes: stage and item of units whose files clash with those of another one, to the final reason.
         """
         self._result.stages.sort(key=lambda summary: place(summary.name, ""))
         self._result.failures.sort(key=lambda failure: place(failure.stage, failure.item))
+        self._result.failures[:] = [replace(failure, cause=clashes.get((failure.stage, failure.item), failure.cause))
+                                    for failure in self._result.failures]  # fmt: skip
         for summary in self._result.stages:
             rejected = self._counts[summary.name].rejected
             for item in sorted(rejected, key=lambda item: place(summary.name, item)):

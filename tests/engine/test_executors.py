@@ -98,6 +98,19 @@ def test_what_fails_is_told_the_same_in_the_same_order(toy: Toy) -> None:
     assert "ValueError" in side_by_side.failures[0].trace
 
 
+def test_the_same_units_deliver_where_several_clash(toy: Toy) -> None:
+    """Each clashes with the one before and the one behind it; the first units are done last."""
+    toy.edit("plug.py", lambda text: text.replace(
+        '    return Files({"mean/{item}.txt": path})', """    number = int(path.read_text().partition(".")[0]) // 30
+    time.sleep(0.1 * max(0, 4 - number))
+    return Files({f"{number}.txt": path, f"{number + 1}.txt": path})"""))  # fmt: skip
+    serial = run_with(toy, SerialExecutor, name="serial")
+    side_by_side = run_with(toy, two_processes, name="processes")
+    assert len(serial.failures) > 1
+    assert told(side_by_side) == told(serial)
+    assert files_below(toy.folder / "out-processes") == files_below(toy.folder / "out-serial")
+
+
 def test_unit_starts_before_the_stage_before_it_is_complete(toy: Toy) -> None:
     """The second stage's first unit is waited for by the last unit of the first: a barrier would stop it for ever."""
     seen = toy.folder / "seen"
