@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import rotation_from_two_vectors
+from pano_mvs.report.figures import significant
 
 FloatArray = NDArray[np.float64]
 
@@ -190,7 +191,7 @@ def _drawn(
     cameras = [(float(x), float(y), label, spot) for (x, y), label, spot in zip(placed, labels, spots, strict=True)]
     length = _round_length(110 / scale)
     bar = (14.0, height - 14.0, round(length * scale, 1), _measured(length, unit))
-    wide, deep = (f"{float(size):.3g} {unit}" for size in high - low)
+    wide, deep = (f"{significant(float(size), 3)} {unit}" for size in high - low)
     cameras_text = f"{len(labels)} {plural(len(labels), 'camera')}"
     text = f"{cameras_text} {title.lower()}, {wide} across and {deep} {'deep' if tallest == _HEIGHT else 'high'}"
     dots = "" if named else "".join(f"M{x:g} {y:g}h0" for x, y in placed)

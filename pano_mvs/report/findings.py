@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pano_mvs.core.text import plural
-from pano_mvs.report.figures import figure, median, share
+from pano_mvs.report.figures import figure, median, share, significant
 
 GOOD_REGISTERED, FAIR_REGISTERED = 0.95, 0.5
 # Residuals are compared with a pixel of the panorama: what is measured to within one is measured well.
@@ -205,7 +205,7 @@ def _graph(summary: Mapping[str, Any]) -> list[Finding]:
 def _residual(residual_px: float | None) -> list[Finding]:
     if residual_px is None or (mood := mood_of(residual_px, GOOD_RESIDUAL_PX, FAIR_RESIDUAL_PX)) == "good":
         return []
-    text = f"The points miss the pictures by {residual_px:.2g} pixels in the median: the poses are not sharp."
+    text = f"The points miss the pictures by {significant(residual_px)} pixels in the median: the poses are not sharp."
     return [Finding(mood, text, "Check that the pictures are sharp, unstitched seams aside, and not edited one by one; "
                     "put poses.refine behind the solver if it is not there.")]  # fmt: skip
 

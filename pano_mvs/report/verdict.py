@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pano_mvs.core.text import plural
-from pano_mvs.report.figures import figure, median, share
+from pano_mvs.report.figures import degrees, figure, median, share, significant
 from pano_mvs.report.findings import (
     FAIR_COMPLETE,
     FAIR_CONSISTENT,
@@ -143,8 +143,8 @@ def _residual(residual_deg: float | None, residual_px: float | None) -> list[Til
     if residual_deg is None:
         return []
     mood = mood_of(residual_px, GOOD_RESIDUAL_PX, FAIR_RESIDUAL_PX) if residual_px is not None else ""
-    pixels = f", {residual_px:.2g} px" if residual_px is not None else ""
-    return [Tile(f"{residual_deg:.2g}°", f"median reprojection residual{pixels}", mood)]
+    pixels = f", {significant(residual_px)} px" if residual_px is not None else ""
+    return [Tile(degrees(residual_deg), f"median reprojection residual{pixels}", mood)]
 
 
 def _coverage(summary: Mapping[str, Any]) -> list[Tile]:
@@ -174,9 +174,9 @@ def _accuracy(summary: Mapping[str, Any]) -> list[Tile]:
     tiles = []
     error_deg = median([(scores.get("poses") or {}).get("median_pair_error_deg")])
     if error_deg is not None:
-        tiles.append(Tile(f"{error_deg:.2g}°", "median pose error against the truth"))
+        tiles.append(Tile(degrees(error_deg), "median pose error against the truth"))
     errors = [view.get("median_relative_error") for view in (scores.get("views") or {}).values()]
     relative = median(errors)
     if relative is not None:
-        tiles.append(Tile(f"{100 * relative:.2g} %", "median range error against the truth"))
+        tiles.append(Tile(f"{significant(100 * relative)} %", "median range error against the truth"))
     return tiles
