@@ -163,9 +163,9 @@ def _conditions(report: DepthReport, baseline: str) -> list[str]:
                      "out")  # fmt: skip
     for (size, true_size), views in report.sizes.items():
         if size != true_size:
-            lines.append(f"{views} of the views {plural(views, 'is', 'are')} {size[1]}×{size[0]}, the truth "
-                         f"{true_size[1]}×{true_size[0]}: read at the true pixels, between pixels of one surface "
-                         "alone")  # fmt: skip
+            lines.append(f"{views} of the views {plural(views, 'is', 'are')} {size[1]}×{size[0]}, "
+                         f"{plural(views, 'its', 'their')} truth {true_size[1]}×{true_size[0]}: read at the true "
+                         "pixels, between pixels of one surface alone")  # fmt: skip
     lines.append(f"a missing range is an error as large as the truth in “every pixel”; peak {judging.peak:g}; in "
                  f"brackets {_BASELINE_WORDS[baseline]}")  # fmt: skip
     return lines

@@ -144,8 +144,9 @@ def colmap_dense(
     blind = sum(not count for count in seen.values())
     ctx.metric("faces_without_points", blind)
     if blind:
-        ctx.note(f"{blind} of {len(seen)} faces {plural(blind, 'sees', 'see')} no point of the model: COLMAP fuses no "
-                 "depth of such a face. Add a stage points.tracked, or raise its count")  # fmt: skip
+        ctx.note(f"{blind} of {len(seen)} faces {plural(blind, 'sees', 'see')} no point of the model: COLMAP fuses "
+                 f"none of {plural(blind, 'its', 'their')} depths. Add a stage points.tracked, or raise its "
+                 "count")  # fmt: skip
     return Files(files)
 
 
