@@ -118,9 +118,8 @@ def in_memory(images: Path, steps: Steps, *, neighbours: int = 0, names: tuple[s
     if not refined.other_worlds:
         return cameras_of(refined)
     groups = split_groups(refined)
-    print(
-        f"    {len(groups)} groups, of {', '.join(str(len(group.names)) for group in groups)} cameras; the largest counts"
-    )
+    sizes = ", ".join(str(len(group.names)) for group in groups)
+    print(f"    {len(groups)} groups, of {sizes} cameras; the largest counts")
     return cameras_of(groups[0])
 
 
