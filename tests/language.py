@@ -4,8 +4,8 @@
     python -m tests.language --update    # lower the counts that are allowed in the package to those of today
     python -m tests.language --places    # also list all places in the package
 
-Documentation must not contain the words at all. Comments, docstrings and messages of the package contained them before the
-check was introduced: `language_baseline.json` states how often, and the counts may only shrink.
+Documentation must not contain the words at all. Comments, docstrings and messages of the package contained them before
+the check was introduced: `language_baseline.json` states how often, and the counts may only shrink.
 """
 
 from __future__ import annotations
@@ -108,8 +108,8 @@ def places_in_module(path: Path) -> list[Place]:
 def prose_of(source: str) -> Iterator[tuple[str, int]]:
     """Yield comments and strings of a Python source with the line on which each begins.
 
-    Consecutive lines of comments are joined. Code in backticks, braces of f-strings, and strings without a space (keys and
-    names) are left out.
+    Consecutive lines of comments are joined. Code in backticks, braces of f-strings, and strings without a space (keys
+    and names) are left out.
     """
     comment: list[str] = []
     began = last = 0
