@@ -88,8 +88,8 @@ def documents() -> list[Path]:
 
 
 def modules() -> list[Path]:
-    """Return all modules of the package."""
-    return sorted((ROOT / "pano_mvs").glob("**/*.py"))
+    """Return all modules of the package, and the templates of the report."""
+    return sorted([*ROOT.glob("pano_mvs/**/*.py"), *ROOT.glob("pano_mvs/**/*.j2")])
 
 
 def places_in_document(path: Path) -> list[Place]:
@@ -101,7 +101,9 @@ def places_in_document(path: Path) -> list[Place]:
 
 
 def places_in_module(path: Path) -> list[Place]:
-    """Return the places in comments, docstrings and other strings of a Python file."""
+    """Return the places in comments, docstrings and other strings of a Python file, or in a template."""
+    if path.suffix != ".py":
+        return places_in_document(path)
     return [place for text, line in prose_of(path.read_text(encoding="utf-8")) for place in _places(text, path, line)]
 
 
