@@ -55,6 +55,10 @@ _PATTERNS = {
     name: re.compile(rf"\b(?:{pattern.replace(' ', chr(92) + 's+')})\b", re.IGNORECASE)
     for name, (pattern, _) in WORDS.items()
 }
+_ANY = re.compile(
+    rf"\b(?:{'|'.join(pattern.replace(' ', '[ #' + chr(92) + 'n]+') for pattern, _ in WORDS.values())})\b",
+    re.IGNORECASE,
+)
 _FENCE = re.compile(r"^( *)(```|~~~).*?^ *\2 *$", re.DOTALL | re.MULTILINE)
 _NOT_PROSE = re.compile(r"<!--.*?-->|\$\$.*?\$\$|``.*?``|`[^`]*`|\]\([^)]*\)", re.DOTALL)
 _STRING = re.compile(r"^[a-zA-Z]*('''|\"\"\"|'|\")(.*)\1$", re.DOTALL)
@@ -104,7 +108,10 @@ def places_in_module(path: Path) -> list[Place]:
     """Return the places in comments, docstrings and other strings of a Python file, or in a template."""
     if path.suffix != ".py":
         return places_in_document(path)
-    return [place for text, line in prose_of(path.read_text(encoding="utf-8")) for place in _places(text, path, line)]
+    source = path.read_text(encoding="utf-8")
+    if not _ANY.search(source):  # which saves the time to tokenize most files
+        return []
+    return [place for text, line in prose_of(source) for place in _places(text, path, line)]
 
 
 def prose_of(source: str) -> Iterator[tuple[str, int]]:
