@@ -76,5 +76,5 @@ def test_the_table_of_stages_has_all_of_quickstart_that_the_cloud_needs() -> Non
     workflow = (ROOT / "workflows" / "quickstart.yaml").read_text(encoding="utf-8")
     used = re.findall(r"^  \w+: +\{use: ([\w.]+)", workflow, re.MULTILINE)
     shown = [row[0].strip("`") for row in rows("stages")]
-    assert shown == [name for name in used if name in shown]
-    assert used.index("fusion.vote") + 1 == shown.index("fusion.vote") + 1
+    end = used.index("fusion.vote") + 1
+    assert shown[:end] == used[:end]
