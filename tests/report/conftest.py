@@ -18,14 +18,14 @@ from pano_mvs.testing.tiny_capture import TinyCapture, tiny_capture
 
 
 @pytest.fixture(scope="session")
-def preview_file(tmp_path_factory) -> Path:
+def preview_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("preview") / "1.jpg"
     write_preview(path, *render(default_room(), Rigid3.identity(), (32, 64)))
     return path
 
 
 @pytest.fixture
-def out_dir(tmp_path, preview_file) -> Path:
+def out_dir(tmp_path: Path, preview_file: Path) -> Path:
     """An output folder with the preview of one picture."""
     out = tmp_path / "out"
     (out / "preview" / "a").mkdir(parents=True)
@@ -39,7 +39,7 @@ def tiny() -> TinyCapture:
 
 
 @pytest.fixture
-def results(tmp_path, tiny) -> Results:
+def results(tmp_path: Path, tiny: TinyCapture) -> Results:
     """What a run over the tiny capture might have left in a store; the last two pictures have nothing in common."""
     return stored(Store(tmp_path / "cache"), tiny)
 

@@ -248,7 +248,9 @@ def test_too_few_points_are_told(capture: Capture, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("source_hw", [(256, 512), (600, 1200), (128, 256)])
-def test_masks_are_called_and_sized_as_colmap_wants_them(capture: Capture, tmp_path: Path, source_hw) -> None:
+def test_masks_are_called_and_sized_as_colmap_wants_them(
+    capture: Capture, tmp_path: Path, source_hw: tuple[int, int]
+) -> None:
     image = dataclasses.replace(capture.images[NAMES[1]], source_size_hw=source_hw)
     ctx = context(tmp_path / "scratch")
     files = colmap_masks(image=image, params=MasksParams(), ctx=ctx)
@@ -276,7 +278,7 @@ def test_cropped_pictures_are_written_as_the_spheres_that_the_cameras_are(captur
 
 
 @pytest.mark.parametrize("form", ["bin", "txt", "both"])
-def test_the_sparse_model_has_the_form_that_is_asked_for(capture: Capture, tmp_path: Path, form) -> None:
+def test_the_sparse_model_has_the_form_that_is_asked_for(capture: Capture, tmp_path: Path, form: str) -> None:
     ctx = context(tmp_path / "scratch")
     files = colmap(poses=capture.poses, images=capture.images, params=ModelParams(format=form), ctx=ctx)
     suffixes = {"bin": {"bin"}, "txt": {"txt"}, "both": {"bin", "txt"}}[form]
@@ -288,7 +290,7 @@ def test_the_sparse_model_has_the_form_that_is_asked_for(capture: Capture, tmp_p
 
 @pytest.mark.parametrize(("form", "told"), [("bin", False), ("both", True)])
 def test_names_with_blanks_are_told_where_the_text_cannot_hold_them(
-    capture: Capture, tmp_path: Path, form, told
+    capture: Capture, tmp_path: Path, form: str, told: bool
 ) -> None:
     """COLMAP itself writes such names into images.txt and reads them back as far as the blank."""
     poses = Poses.without_points({"a/1 b.png": capture.poses.cam_from_world(0)}, frame="", scale="", metric=False)
