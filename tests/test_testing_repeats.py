@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -33,7 +34,7 @@ def seen(scene: Scene, places: Sequence[tuple[float, float]], *, down: float = 0
 
 
 @pytest.mark.parametrize("tiles", ["marble", "checker", "motif"])
-def test_the_floor_repeats_after_a_tile_and_not_if_it_is_worn(tiles: str) -> None:
+def test_the_floor_repeats_after_a_tile_and_not_if_it_is_worn(tiles: Literal["marble", "checker", "motif"]) -> None:
     tile = 0.45
     period = tile * (2 if tiles == "checker" else 1)
     steps = np.array([[0.13, -0.21]]) + period * np.array([[0, 0], [1, 0], [0, -2], [3, 1]])
@@ -57,7 +58,7 @@ def test_a_corridor_looks_the_same_from_door_to_door() -> None:
 
 
 @pytest.mark.parametrize("congruence", ["shift", "half_turn"])
-def test_twin_rooms_are_congruent_but_for_unique_things(congruence: str) -> None:
+def test_twin_rooms_are_congruent_but_for_unique_things(congruence: Literal["shift", "half_turn"]) -> None:
     def from_both(unique: float) -> tuple[NDArray[np.float64], float]:
         scene = twin_rooms(congruence=congruence, unique=unique, seed=2)
         home, turn = np.array([-2.3, -1.4, 0.3]), np.diag([-1.0, 1.0, -1.0])
@@ -122,7 +123,7 @@ def test_draws_are_of_all_places_layouts_and_shares() -> None:
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("views", [3, 8, 20])
-def test_cameras_are_a_step_apart(layout: str, views: int) -> None:
+def test_cameras_are_a_step_apart(layout: Literal["unordered", "path", "loop"], views: int) -> None:
     ground = Ground(((-6.0, -9.0, 6.0, 9.0),), ((-0.5, -0.5, 0.5, 0.5),))
     for seed in range(5):
         places = stands(ground, layout, views, np.random.default_rng(seed))

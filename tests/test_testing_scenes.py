@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -16,6 +15,7 @@ from pano_mvs.testing.paint import STEEL
 from pano_mvs.testing.room import Room, range_along, render
 from pano_mvs.testing.scenes import SCENES, courtyard, poles, white_room, write_scene
 from pano_mvs.testing.surfaces import Rod
+from tests.stored import read_picture
 
 SIZE = (64, 128)
 
@@ -138,7 +138,7 @@ def test_a_written_scene_is_read_back_with_its_truth(tmp_path: Path) -> None:
         image, ranges = scene.view(idx, SIZE)
         np.testing.assert_allclose(truth.views[name].cam_from_world.rotation, scene.poses[idx].rotation, atol=1e-12)
         np.testing.assert_array_equal(truth.range_map(truth.views[name]), ranges)
-        read = cv2.imread(str(tmp_path / name))[..., ::-1]
+        read = read_picture(tmp_path / name)[..., ::-1]
         np.testing.assert_array_equal(read, image)
 
 

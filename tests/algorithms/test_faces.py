@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -16,6 +17,7 @@ from pano_mvs.algorithms.faces.render import face_source, render_face
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import PinholeView, Rigid3, ray_grid, roll_panorama, rotation_from_rotvec
 from pano_mvs.scene import RangeMap
+from pano_mvs.scene.face_files import FaceLayout
 from pano_mvs.testing.room import capture_poses, default_room, range_along, render
 from tests.oracles.faces import z_depth as slow_z_depth
 
@@ -37,15 +39,19 @@ def smooth_panorama(size_hw: tuple[int, int] = SIZE) -> NDArray[np.uint8]:
 
 def unit_rays(view: PinholeView) -> NDArray[np.float64]:
     rays = view.rays()
-    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    result: NDArray[np.float64] = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    return result
 
 
 def valid_but_for_a_disc(center: tuple[float, float, float], radius_deg: float = 12.0) -> NDArray[np.bool_]:
-    return ray_grid(SIZE) @ (np.array(center) / np.linalg.norm(center)) < np.cos(np.radians(radius_deg))
+    result: NDArray[np.bool_] = ray_grid(SIZE) @ (np.array(center) / np.linalg.norm(center)) < np.cos(
+        np.radians(radius_deg)
+    )
+    return result
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_faces_are_right_handed_named_and_cover_the_sphere(layout: str) -> None:
+def test_faces_are_right_handed_named_and_cover_the_sphere(layout: FaceLayout) -> None:
     faces = panorama_faces(SIZE, layout=layout)
     assert len({face.name for face in faces}) == len(faces) == {"cube": 6, "octagon": 10, "icosahedron": 20}[layout]
     for face in faces:
@@ -96,13 +102,13 @@ def test_the_default_size_keeps_the_resolution() -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"fov_deg": 20.0}, {"fov_deg": 170.0}, {"fov_deg": np.nan}, {"size_px": 2}])
-def test_faces_that_are_none_are_refused(wrong: dict[str, float]) -> None:
+def test_faces_that_are_none_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match="a face must be"):
         panorama_faces(SIZE, **wrong)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_colors_are_those_of_the_rays(layout: str) -> None:
+def test_colors_are_those_of_the_rays(layout: FaceLayout) -> None:
     image = smooth_panorama()
     for face in panorama_faces(SIZE, layout=layout, fov_deg=100):
         expected = 128 + 100 * unit_rays(face.view)
@@ -142,7 +148,7 @@ def test_z_depths_are_the_true_ones_between_steps(
 @pytest.mark.kernel("faces.kernels_faces")
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_the_compiled_loop_is_the_plain_one(
-    panorama: tuple[NDArray[np.uint8], NDArray[np.float32], Rigid3], layout: str
+    panorama: tuple[NDArray[np.uint8], NDArray[np.float32], Rigid3], layout: FaceLayout
 ) -> None:
     ranges = panorama[1].copy()
     ranges[np.random.default_rng(2).random(SIZE) < 0.02] = np.nan

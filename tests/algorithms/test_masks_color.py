@@ -31,8 +31,9 @@ def test_a_disc_is_found_anywhere_after_compression(
 ) -> None:
     drawn = disc(ray_from_pixel(np.array(pixel), SIZE_HW), 12)
     picture = np.where(drawn[..., None], np.array(color, np.uint8), room)
-    picture = cv2.imdecode(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90])[1], cv2.IMREAD_COLOR)
-    found = areas_of_color(picture, color, tolerance=12)
+    compressed = cv2.imdecode(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90])[1], cv2.IMREAD_COLOR)
+    assert compressed is not None
+    found = areas_of_color(compressed, color, tolerance=12)
     assert found[drawn].mean() > 0.97
     assert not found[~disc(ray_from_pixel(np.array(pixel), SIZE_HW), 30)].any()
 

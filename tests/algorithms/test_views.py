@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,11 @@ from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Poses
 
 
-def _poses(centers: Sequence[Sequence[float]], points: ArrayLike = (), seen_by: Sequence[Sequence[int]] = ()) -> Poses:
+def _poses(
+    centers: Sequence[Sequence[float]] | NDArray[np.float64],
+    points: ArrayLike = (),
+    seen_by: Sequence[Sequence[int]] = (),
+) -> Poses:
     """Return cameras a, b, … at centres, and points each seen by the cameras listed."""
     cameras = {chr(97 + k): Rigid3.from_center(np.eye(3), center) for k, center in enumerate(centers)}
     poses = Poses.without_points(cameras, frame="test", scale="test", metric=False)
@@ -100,6 +105,6 @@ def test_the_order_of_the_tracks_does_not_matter() -> None:
 
 
 @pytest.mark.parametrize("options", [{"count": 0}, {"min_angle_deg": 30.0, "max_angle_deg": 20.0}])
-def test_options_that_cannot_work_are_refused(options: dict[str, float]) -> None:
+def test_options_that_cannot_work_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match="count ≥ 1"):
         select_views(_poses([(0, 0, 0)]), **options)

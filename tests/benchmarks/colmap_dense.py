@@ -13,6 +13,7 @@ import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -43,7 +44,7 @@ def write_workspace(
     ranges: Mapping[str, RangeMap],
     *,
     points: int = 20_000,
-    **faces: object,
+    **faces: Any,
 ) -> Path:
     """Write colmap_dense/ into a folder by the stages themselves, and return it."""
     scratch = out / "scratch"

@@ -131,4 +131,5 @@ def _nearest(
     """Return the ranges of the pixels in which a turned camera's rays arrive, (h, w)."""
     height, width = ranges.shape
     column, row = np.moveaxis(np.floor(pixel_from_ray(ray_grid(size_hw) @ new_from_old, (height, width))), -1, 0)
-    return ranges[np.clip(row, 0, height - 1).astype(int), np.mod(column, width).astype(int)]
+    result: NDArray[np.float32] = ranges[np.clip(row, 0, height - 1).astype(int), np.mod(column, width).astype(int)]
+    return result

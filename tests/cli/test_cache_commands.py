@@ -77,7 +77,8 @@ def unwritable(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def refuse(*, dir: Path, **options: str) -> tuple[int, str]:  # noqa: A002
         if Path(dir).is_relative_to(tmp_path / "cache") or Path(dir).is_relative_to(tmp_path / "none"):
             raise PermissionError(13, "Permission denied")
-        return make(dir=dir, **options)
+        result: tuple[int, str] = make(dir=dir, **options)
+        return result
 
     monkeypatch.setattr(tempfile, "mkstemp", refuse)
 

@@ -39,7 +39,8 @@ def call(*arguments: object) -> Outcome:
 def inspected(*arguments: object) -> dict:
     found = call("inspect", *arguments, "--json")
     assert found.code == 0, found.text
-    return json.loads(found.text)
+    result: dict = json.loads(found.text)
+    return result
 
 
 @pytest.fixture(scope="module")

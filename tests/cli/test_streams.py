@@ -95,8 +95,14 @@ def test_a_stream_apart_is_closed_with_its_own_descriptor_and_shares_the_state()
 
 
 def command(*arguments: str | Path, **options: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "pano_mvs", *map(str, arguments)], stderr=subprocess.PIPE,
-                          text=True, check=False, **options)  # type: ignore[call-overload, no-any-return]  # fmt: skip
+    result: subprocess.CompletedProcess[str] = subprocess.run(
+        [sys.executable, "-m", "pano_mvs", *map(str, arguments)],
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+        **options,
+    )
+    return result  # type: ignore[call-overload, no-any-return]  # fmt: skip
 
 
 def closed_pipe() -> int:

@@ -22,7 +22,7 @@ BOX_AREA = 8 * (HALF[0] * HALF[1] + HALF[1] * HALF[2] + HALF[2] * HALF[0])
 
 def box_view(center: tuple[float, float, float], size_hw: tuple[int, int] = SIZE) -> TrueView:
     """A camera without rotation at a place in the empty box around the world's origin."""
-    ranges, _ = box_range(size_hw, tuple(HALF), tuple(center))
+    ranges, _ = box_range(size_hw, (HALF[0], HALF[1], HALF[2]), center)
     return TrueView(Rigid3.from_center(np.eye(3), center), ranges)
 
 
@@ -31,7 +31,8 @@ VIEWS = [box_view((0.4, -0.3, 0.2)), box_view((-0.5, 0.2, 0.6)), box_view((0.0, 
 
 def distance_to_box(points: NDArray[np.float32]) -> NDArray[np.float64]:
     """From points inside or near the walls of the box."""
-    return np.abs(HALF - np.abs(points)).min(axis=1)
+    result: NDArray[np.float64] = np.abs(HALF - np.abs(points)).min(axis=1)
+    return result
 
 
 class TestSurface:
@@ -128,9 +129,11 @@ class TestScores:
             np.testing.assert_array_equal(whole.of_surface, apart.of_surface)
 
     def test_quantiles_count_points_alike_and_the_surface_by_area(self) -> None:
-        surface = surface_of_cloud(np.float32([[0, 0, 0], [9, 9, 9]]), voxel_size=1)
+        surface = surface_of_cloud(np.array([[0, 0, 0], [9, 9, 9]], np.float32), voxel_size=1)
         weighted = dataclasses.replace(surface, area=np.array([9.0, 1.0]))
-        found = CloudDistances(np.float32([1, 2, 3, np.inf]), np.float32([5, 7])).quantiles(weighted, (0.5, 0.9, 0.95))
+        found = CloudDistances(np.array([1, 2, 3, np.inf], np.float32), np.array([5, 7], np.float32)).quantiles(
+            weighted, (0.5, 0.9, 0.95)
+        )
         assert found == {"accuracy": (2, np.inf, np.inf), "completeness": (5, 5, 7)}
         nothing = CloudDistances(np.zeros(0, np.float32), np.zeros(0, np.float32))
         assert np.isnan(nothing.quantiles(dataclasses.replace(surface, area=np.zeros(0)))["accuracy"]).all()
@@ -148,5 +151,5 @@ class TestScores:
         surface = surface_of_cloud(np.zeros((1, 3), np.float32), voxel_size=1)
         one = np.array([0.5], np.float32)
         assert score_cloud(CloudDistances(one, one), surface, (0.5,))[0].f_score == 1
-        found = cloud_distances(np.float32([[0.5, 0, 0]]), [surface.points_in_world], surface, limit=0.5)
+        found = cloud_distances(np.array([[0.5, 0, 0]], np.float32), [surface.points_in_world], surface, limit=0.5)
         np.testing.assert_array_equal(found.of_points, one)

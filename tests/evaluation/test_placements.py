@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from pano_mvs.scene import Poses
 from tests.algorithms.poses.synthetic_capture import random_poses, random_rotation
 
 
-def poses_of(cameras: dict[str, Rigid3], **more: NDArray[np.int32] | dict[str, str]) -> Poses:
+def poses_of(cameras: dict[str, Rigid3], **more: Any) -> Poses:
     return replace(Poses.without_points(cameras, frame="any", scale="any", metric=False), **more)
 
 
@@ -25,7 +26,7 @@ def moved(cameras: dict[str, Rigid3], rng: np.random.Generator) -> dict[str, Rig
 
 def extent_of(cameras: dict[str, Rigid3]) -> float:
     centers = np.array([pose.center for pose in cameras.values()])
-    return np.linalg.norm(centers[:, None] - centers, axis=-1).max()
+    return float(np.linalg.norm(centers[:, None] - centers, axis=-1).max())
 
 
 def displaced(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -226,7 +226,7 @@ class TestFit:
         assert aligning_scale(judged_pixels(np.full(SIZE, np.nan), truth), "lsq") == 1
 
     @pytest.mark.parametrize("align", ["median", "lsq"])
-    def test_a_factor_is_found_and_undone(self, align: str) -> None:
+    def test_a_factor_is_found_and_undone(self, align: Literal["median", "lsq"]) -> None:
         _, truth, _ = draw(1, hard=0.2)
         found = score_view(truth / 3, truth, judging=Judging(align=align))
         assert found.scale == pytest.approx(3)

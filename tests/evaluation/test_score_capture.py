@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ HALF = {name: Rigid3(pose.rotation, pose.translation / 2) for name, pose in POSE
 
 
 def scored(
-    estimated: NDArray[np.float32],
+    estimated: NDArray[Any],
     truth: NDArray[np.float32],
     confidence: NDArray[np.uint8] | None = None,
     poses: dict[str, Rigid3] = POSES,

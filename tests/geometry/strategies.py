@@ -14,7 +14,8 @@ COMPONENT = st.one_of(TINY, st.floats(-1, 1), st.sampled_from([1.0, -1.0]))
 
 
 def _unit(vector: tuple[float, float, float]) -> NDArray[np.float64]:
-    return np.array(vector) / np.linalg.norm(vector)
+    result: NDArray[np.float64] = np.array(vector) / np.linalg.norm(vector)
+    return result
 
 
 UNITS = st.tuples(COMPONENT, COMPONENT, COMPONENT).filter(lambda v: np.linalg.norm(v) > 1e-3).map(_unit)

@@ -21,8 +21,8 @@ from pano_mvs.geometry import (
 from tests.geometry.strategies import ANGLES, POINTS, ROTATIONS, UNITS
 
 
-def is_rotation(matrix: NDArray[np.float64]) -> np.bool_:
-    return matrix @ matrix.T == pytest.approx(np.eye(3), abs=1e-12) and np.linalg.det(matrix) > 0
+def is_rotation(matrix: NDArray[np.float64]) -> bool:
+    return bool(matrix @ matrix.T == pytest.approx(np.eye(3), abs=1e-12) and np.linalg.det(matrix) > 0)
 
 
 @given(POINTS, POINTS)

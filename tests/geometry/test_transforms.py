@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,7 +14,7 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec, similarity_from_points
 from tests.geometry.strategies import POINTS, RIGIDS, ROTATIONS, SIMILARITIES
 
-CLOSE = {"rel": 1e-9, "abs": 1e-8}
+CLOSE: dict[str, Any] = {"rel": 1e-9, "abs": 1e-8}
 
 
 @given(RIGIDS, POINTS)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -16,7 +14,8 @@ from tests.geometry.strategies import RIGIDS, ROTATIONS, UNITS
 
 
 def bearing(point_in_cam: NDArray[np.float64]) -> NDArray[np.float64]:
-    return point_in_cam / np.linalg.norm(point_in_cam, axis=-1, keepdims=True)
+    result: NDArray[np.float64] = point_in_cam / np.linalg.norm(point_in_cam, axis=-1, keepdims=True)
+    return result
 
 
 @given(ROTATIONS, UNITS, st.floats(0.05, 1e4), st.floats(1e-3, np.pi - 1e-3), st.floats(0, 2 * np.pi))
@@ -29,7 +28,7 @@ def test_ranges_are_recovered_from_beside_the_epipole_to_far_away(
     second_from_first = Rigid3.from_center(rotation, center)
     point = distance * ray
     in_second = second_from_first.apply(point)
-    parallax = np.linalg.norm(np.cross(ray, bearing(point - center)))
+    parallax = float(np.linalg.norm(np.cross(ray, bearing(point - center))))
     if parallax < 1e-6:
         return
     first, second = ranges_from_bearings(ray, bearing(in_second), second_from_first)
@@ -68,11 +67,11 @@ def test_parallel_rays_have_no_range() -> None:
 
 @given(st.lists(RIGIDS, min_size=2, max_size=5), UNITS, st.floats(0.5, 30))
 def test_points_are_recovered_from_many_cameras(
-    cameras: Sequence[Rigid3], direction: NDArray[np.float64], distance: float
+    cameras: list[Rigid3], direction: NDArray[np.float64], distance: float
 ) -> None:
     point = distance * direction
     rays_in_world = [bearing(point - camera.center) for camera in cameras]
-    parallax = max(np.linalg.norm(np.cross(rays_in_world[0], ray)) for ray in rays_in_world)
+    parallax = max(float(np.linalg.norm(np.cross(rays_in_world[0], ray))) for ray in rays_in_world)
     if parallax < 1e-3 or min(np.linalg.norm(point - camera.center) for camera in cameras) < 1e-3:
         return
     found = triangulate_bearings([bearing(camera.apply(point)) for camera in cameras], cameras)

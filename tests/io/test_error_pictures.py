@@ -13,6 +13,7 @@ from pano_mvs.io.cloud_picture import distance_colors
 from pano_mvs.io.clouds.ply_points import open_ply_points
 from pano_mvs.io.error_cloud import write_error_cloud
 from pano_mvs.io.error_picture import error_colored, signed_error, write_error_picture
+from tests.stored import read_picture
 
 GREY, BLACK = (128, 128, 128), (25, 25, 25)
 
@@ -48,7 +49,7 @@ def test_the_picture_holds_four_panels_of_any_size_with_the_seam_and_the_poles(
     image = np.full((10, 20, 3), (200, 30, 30), np.uint8)
     path = tmp_path / "new" / "a.jpg"
     write_error_picture(path, estimated, truth, image=image, unit="m")
-    picture = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB).astype(int)
+    picture = cv2.cvtColor(read_picture(path), cv2.COLOR_BGR2RGB).astype(int)
     assert picture.shape == (2 * (34 + 512 + 60), 2 * 1024 + 8, 3)
     panels = picture[34 : 34 + 512, :1024], picture[34 : 34 + 512, 1032:]
     assert np.abs(panels[0] - (200, 30, 30)).max() < 12
@@ -63,13 +64,13 @@ def test_the_picture_holds_four_panels_of_any_size_with_the_seam_and_the_poles(
 def test_a_picture_without_panorama_or_truth_is_made_too(tmp_path: Path) -> None:
     nothing = np.full((8, 16), np.nan, np.float32)
     write_error_picture(tmp_path / "a.jpg", nothing, nothing, counted=np.zeros((8, 16), bool))
-    picture = cv2.imread(str(tmp_path / "a.jpg"))
+    picture = read_picture(tmp_path / "a.jpg")
     assert tuple(picture[200, 1500]) == GREY
 
 
 def test_a_cloud_carries_its_errors_as_numbers_and_as_colours(tmp_path: Path) -> None:
     points = np.random.default_rng(0).normal(size=(9, 3)).astype(np.float32)
-    distances = np.float32([0.01, 0.03, 0.2, np.inf, 0.01, 0.02, 0.05, 0.06, 0])
+    distances = np.array([0.01, 0.03, 0.2, np.inf, 0.01, 0.02, 0.05, 0.06, 0], np.float32)
     path = tmp_path / "new" / "a.ply"
     write_error_cloud(path, (points[i : i + 4] for i in (0, 4, 8)), distances, limits=(0.02, 0.05), farthest=1.0)
     read = open_ply_points(path)
@@ -85,7 +86,7 @@ def test_pyvista_reads_the_scalar(tmp_path: Path) -> None:
     import pyvista
 
     points = np.eye(3, dtype=np.float32)
-    write_error_cloud(tmp_path / "a.ply", [points], np.float32([0, 0.5, 2]), limits=(1,), farthest=1.5)
+    write_error_cloud(tmp_path / "a.ply", [points], np.array([0, 0.5, 2], np.float32), limits=(1,), farthest=1.5)
     mesh = pyvista.read(tmp_path / "a.ply")
     np.testing.assert_array_equal(mesh.points, points)
     assert mesh.n_points == 3

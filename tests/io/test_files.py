@@ -18,6 +18,7 @@ from pano_mvs.io.images.preview import color_mapped, range_limits, scale_ticks, 
 from pano_mvs.io.ranges.files import read_confidence_png, read_range_tiff, write_confidence_png, write_range_tiff
 from pano_mvs.scene import PointCloud
 from pano_mvs.testing.room import default_room, render
+from tests.stored import read_picture
 
 
 def range_map() -> NDArray[np.float32]:
@@ -63,7 +64,7 @@ def test_another_file_is_no_range_map(tmp_path: Path) -> None:
 def test_a_confidence_map_is_an_8_bit_png(tmp_path: Path) -> None:
     confidence = np.arange(256, dtype=np.uint8).reshape(8, 32)
     write_confidence_png(tmp_path / "a.png", confidence)
-    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED), confidence)
+    np.testing.assert_array_equal(read_picture(tmp_path / "a.png", cv2.IMREAD_UNCHANGED), confidence)
     with pytest.raises(UsageError, match=r"a confidence map is \(H, W\) uint8"):
         write_confidence_png(tmp_path / "a.png", confidence.astype(float))
 
@@ -128,7 +129,7 @@ def test_a_preview_shows_the_panorama_above_its_range(tmp_path: Path) -> None:
     write_preview(tmp_path / "a.jpg", image, ranges)
     write_preview(tmp_path / "b.jpg", image, ranges)
     assert (tmp_path / "a.jpg").read_bytes() == (tmp_path / "b.jpg").read_bytes()
-    shown = cv2.imread(str(tmp_path / "a.jpg"))
+    shown = read_picture(tmp_path / "a.jpg")
     assert shown.shape[1] == 1280
     assert shown.shape[0] > 1280
     small = cv2.resize(shown[:640], (128, 64), interpolation=cv2.INTER_AREA)[..., ::-1]

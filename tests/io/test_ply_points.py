@@ -15,7 +15,7 @@ from pano_mvs.io.clouds.ply_points import open_ply_points, read_ply_points
 from pano_mvs.scene import PointCloud
 from pano_mvs.stages.exports.files import PlyParams, ply
 
-POINTS = np.float32([[1, 2, 3], [-4.5, 0.25, 1e6]])
+POINTS = np.array([[1, 2, 3], [-4.5, 0.25, 1e6]], np.float32)
 
 
 def header(form: str, properties: Sequence[str], count: int | str = 2, more: Sequence[str] = ()) -> bytes:
@@ -47,7 +47,7 @@ def test_text_files(tmp_path: Path) -> None:
 @pytest.mark.parametrize("quality", [False, True])
 def test_our_own_files(tmp_path: Path, quality: bool) -> None:
     one = np.ones((2, 3), np.float32)
-    cloud = PointCloud(POINTS, one, one.astype(np.uint8), np.uint8([2, 9]), np.uint8([130, 255]))
+    cloud = PointCloud(POINTS, one, one.astype(np.uint8), np.array([2, 9], np.uint8), np.array([130, 255], np.uint8))
     write_ply(tmp_path / "a.ply", cloud, quality=quality)
     np.testing.assert_array_equal(read_ply_points(tmp_path / "a.ply"), POINTS)
     back = read_ply(tmp_path / "a.ply")
@@ -85,7 +85,9 @@ def test_damaged_and_strange_files_are_named(tmp_path: Path, data: bytes, what: 
 
 
 def test_the_export_writes_quality_on_demand(tmp_path: Path) -> None:
-    cloud = PointCloud(POINTS, POINTS, POINTS.astype(np.uint8), np.uint8([2, 9]), np.uint8([130, 255]))
+    cloud = PointCloud(
+        POINTS, POINTS, POINTS.astype(np.uint8), np.array([2, 9], np.uint8), np.array([130, 255], np.uint8)
+    )
     context = Context(np.random.default_rng(0), tmp_path)
     for quality, confidence in ((False, None), (True, [130, 255])):
         files = ply(cloud, PlyParams(quality=quality), context)
@@ -96,7 +98,7 @@ def test_the_export_writes_quality_on_demand(tmp_path: Path) -> None:
 def test_a_file_is_read_in_parts_with_its_normals(tmp_path: Path) -> None:
     """Nothing but the part that is asked for comes into memory."""
     points = np.random.default_rng(0).normal(size=(11, 3)).astype(np.float32)
-    normals = np.tile(np.float32([0, 0, -1]), (11, 1))
+    normals = np.tile(np.array([0, 0, -1], np.float32), (11, 1))
     write_ply(tmp_path / "a.ply", PointCloud(points, normals, np.zeros((11, 3), np.uint8), np.ones(11, np.uint8)))
     file = open_ply_points(tmp_path / "a.ply")
     assert (file.count, file.has_normals) == (11, True)

@@ -15,6 +15,7 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.io.ranges.files import write_confidence_png, write_range_tiff
 from pano_mvs.io.ranges.folders import RangeFile, find_ranges, match_pictures, without_extension
 from pano_mvs.io.truth import find_true_ranges
+from tests.stored import write_npz
 
 RANGES = np.random.default_rng(0).uniform(0.5, 60, (4, 8)).astype(np.float32)
 RANGES[1, 2] = np.nan
@@ -50,10 +51,10 @@ def test_every_format_gives_the_same_map(tmp_path: Path, suffix: str) -> None:
 
 @pytest.mark.parametrize("suffix", [".tiff", ".npy", ".npz"])
 def test_what_is_no_range_is_nan_whatever_stands_there(tmp_path: Path, suffix: str) -> None:
-    hard = np.float32([[0, -1, np.inf, np.nan], [1, 2, -np.inf, 3]])
+    hard = np.array([[0, -1, np.inf, np.nan], [1, 2, -np.inf, 3]], np.float32)
     write(tmp_path / f"a{suffix}", hard)
     np.testing.assert_array_equal(
-        find_ranges(tmp_path)["a"].read(), np.float32([[np.nan] * 4, [1, 2, np.nan, 3]])
+        find_ranges(tmp_path)["a"].read(), np.array([[np.nan] * 4, [1, 2, np.nan, 3]], np.float32)
     )  # fmt: skip
 
 
@@ -70,7 +71,7 @@ def test_an_output_folder_is_its_ranges_with_their_confidence(tmp_path: Path) ->
 
 
 def test_an_archive_holds_one_array_for_each_picture(tmp_path: Path) -> None:
-    np.savez(tmp_path / "depth.npz", **{"000": RANGES, "001": 2 * RANGES})
+    write_npz(tmp_path / "depth.npz", {"000": RANGES, "001": 2 * RANGES})
     for path in (tmp_path, tmp_path / "depth.npz"):
         found = find_ranges(path, unit=0.5)
         assert list(found) == ["000", "001"]
@@ -90,7 +91,7 @@ def test_truth_is_found_with_poses_and_without(tmp_path: Path) -> None:
     (tmp_path / "poses.json").write_text(
         '{"views": [{"id": 3, "image": "images/z.png", "R": [[1,0,0],[0,1,0],[0,0,1]], "t": [0,0,0]}]}'
     )
-    np.savez(tmp_path / "depth.npz", **{"003": RANGES, "else": RANGES})
+    write_npz(tmp_path / "depth.npz", {"003": RANGES, "else": RANGES})
     found = find_true_ranges(tmp_path, unit=2.0)
     assert list(found) == ["images/z.png"]
     np.testing.assert_array_equal(found["images/z.png"].read(), 2 * RANGES)

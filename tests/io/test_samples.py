@@ -44,6 +44,7 @@ def test_the_truth_of_the_classroom_is_of_these_very_pictures() -> None:
         view = matched[path.name]
         assert hashlib.sha256(path.read_bytes()).hexdigest() == view.sha256
         range_map = truth.range_map(view)
+        assert range_map is not None
         assert range_map.shape == (512, 1024)
         assert 0.9 < np.isfinite(range_map).mean() < 1
 
@@ -53,11 +54,15 @@ def test_poses_and_ranges_of_the_classroom_agree() -> None:
     truth = read_truth(CLASSROOM / "truth")
     first, *others = truth.views.values()
     grid = ray_grid((512, 1024))[::8, ::8]
-    points = first.cam_from_world.inverse().apply(truth.range_map(first)[::8, ::8, None] * grid)
+    ranges = truth.range_map(first)
+    assert ranges is not None
+    points = first.cam_from_world.inverse().apply(ranges[::8, ::8, None] * grid)
     for other in others:
         in_other = other.cam_from_world.apply(points)
         distance = np.linalg.norm(in_other, axis=-1)
         seen = np.isfinite(distance)
         column, row = pixel_from_ray(in_other[seen], (512, 1024)).astype(int).T
-        there = truth.range_map(other)[np.minimum(row, 511), column % 1024]
+        others_ranges = truth.range_map(other)
+        assert others_ranges is not None
+        there = others_ranges[np.minimum(row, 511), column % 1024]
         assert np.mean(np.abs(there / distance[seen] - 1) < 0.02) > 0.65

@@ -23,7 +23,8 @@ def dense_system(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return A, b and S (V, N) of min λ yᵀ (D_m − D_n B̄ D_n) y + Σ c (Sᵀ y − t)²; `colors` is (H, W, 3) bins."""
     height, width = target.shape
-    numbers, entries = {}, []
+    numbers: dict[tuple[int, ...], int] = {}
+    entries = []
     for row in range(height):
         for column in range(width):
             corners = cells.corners[cells.element_of_pixel[cells.gap_of_row[row], column]]

@@ -10,7 +10,7 @@ from tests.oracles.range_filters import wrap
 
 
 def normals(
-    ranges: NDArray[np.float32], radius: int, max_step: float, columns_per_step: NDArray[np.int32]
+    ranges: NDArray[np.float32], radius: int, max_step: float, columns_per_step: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     height, width = ranges.shape
     rays = ray_grid(ranges.shape)

@@ -24,7 +24,7 @@ def tangents(row: int, column: int, size_hw: tuple[int, int], stretch: float) ->
 
 def weighted_plane(
     rows: NDArray[np.float64], values: NDArray[np.float64], deviations: NDArray[np.float64]
-) -> NDArray[np.float64] | None:
+) -> NDArray[Any] | None:
     """(α, β, γ) of the plane through values at rows (1, u, v), with Tukey's biweight; None if it is ill posed."""
     weight = np.where(np.abs(deviations) < 1, 1 - deviations**2, 0)
     if np.sum(weight**2) < 5 or np.linalg.det(np.cov(rows[:, 1:].T, aweights=weight**2, ddof=0)) < 0.25:
@@ -33,7 +33,7 @@ def weighted_plane(
 
 
 def plane_at(
-    inverse: NDArray[Any], row: int, column: int, columns: Sequence[int], stretch: float, max_step: float
+    inverse: NDArray[Any], row: int, column: int, columns: NDArray[np.int64], stretch: float, max_step: float
 ) -> NDArray[np.float64]:
     """The plane p with p · ray = q around a pixel, by weighted least squares, twice."""
     size, radius = inverse.shape, len(columns) // 2
@@ -50,11 +50,14 @@ def plane_at(
         slopes = slopes if found is None else found
     ray = ray_from_pixel([column + 0.5, row + 0.5], size)
     across, down = tangents(row, column, size, stretch)
-    return q * (slopes[0] * ray + slopes[1] * across / (across @ across) + slopes[2] * down / (down @ down))
+    result: NDArray[np.float64] = q * (
+        slopes[0] * ray + slopes[1] * across / (across @ across) + slopes[2] * down / (down @ down)
+    )
+    return result
 
 
 def window(
-    grey: NDArray[Any], row: int, column: int, rows: Sequence[int], columns: Sequence[int], sigma_color: float
+    grey: NDArray[Any], row: int, column: int, rows: Sequence[int], columns: NDArray[np.int64], sigma_color: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Positions (K, 2) of a window's samples, their values and their weights, which sum to 1."""
     places = np.array([(column + u + 0.5, row + v + 0.5) for v in rows for u in columns])
@@ -88,7 +91,7 @@ def likely_inverse(
             directions = rays @ pose.rotation.T + pose.translation * (rays @ plane + delta)[:, None]
             return sample_panorama(grey, pixel_from_ray(directions, grey.shape))
 
-        step = 1e-7 / np.linalg.norm(pose.translation)
+        step = 1e-7 / float(np.linalg.norm(pose.translation))
         sample = look(0)
         sample = sample - weights @ sample
         slope = ((look(step) - look(-step)) / (2 * step))[:, None] * design
@@ -108,4 +111,4 @@ def likely_inverse(
         normal += information * ((weights[:, None] * change).T @ change - np.outer(along, along))
         right += information * ((weights * wanted) @ change - correlation * along)
     q = plane @ rays[len(rays) // 2]
-    return max(q + np.clip(np.linalg.solve(normal, right)[0], -largest, largest), q / 2)
+    return float(max(q + np.clip(np.linalg.solve(normal, right)[0], -largest, largest), q / 2))

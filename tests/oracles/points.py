@@ -28,5 +28,5 @@ def sees(
     if not abs(found - distance) <= max_error * distance or range_map.confidence[row, column] < min_confidence:
         return None
     there = pose.inverse().apply(in_cam / distance * found)
-    angle = angle_between(point - home, there - home)
+    angle = float(angle_between(point - home, there - home))
     return (in_cam / distance, angle) if angle <= 2 * np.pi / range_map.range.shape[1] else None

@@ -73,7 +73,7 @@ def sample_range(ranges: NDArray[np.float32], pixel: NDArray[np.float64], max_st
             weights[top + d_row, left + d_column] = w_row * w_column
     values = {place: float(ranges[wrap(*place, *ranges.shape)]) for place in weights}
     if np.isfinite(list(values.values())).all() and max(values.values()) <= min(values.values()) * (1 + max_step):
-        return 1 / sum(weights[place] / values[place] for place in weights)
+        return float(1 / sum(weights[place] / values[place] for place in weights))
     return values[max(weights, key=lambda place: weights[place])]
 
 
@@ -126,9 +126,12 @@ def fill(
             for d_column in (-1, 0, 1):
                 place = np.array([row, column])
                 for step in range(1, max_distance_px + 1) if (d_row, d_column) != (0, 0) else ():
-                    place = place + np.array([d_row, d_column * columns_per_step[wrap(*place, height, width)[0]]])
-                    if trusted[wrap(*place, height, width)]:
-                        found.append((1 / ranges[wrap(*place, height, width)], step * np.hypot(d_row, d_column)))
+                    place = place + np.array(
+                        [d_row, d_column * columns_per_step[wrap(place[0], place[1], height, width)[0]]]
+                    )
+                    at = wrap(place[0], place[1], height, width)
+                    if trusted[at]:
+                        found.append((1 / float(ranges[at]), step * np.hypot(d_row, d_column)))
                         break
         if len(found) >= 2:
             second = sorted(found)[1][0]

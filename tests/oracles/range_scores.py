@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.geometry import pixel_solid_angle
 
 
 def pixels(
-    estimated: NDArray[np.float32],
-    truth: NDArray[np.float32],
+    estimated: NDArray[Any],
+    truth: NDArray[Any],
     *,
     scale: float = 1.0,
     valid_only: bool = False,
@@ -37,9 +37,7 @@ def average(values: Sequence[tuple[float, float]]) -> float:
     return sum(value * weight for value, weight in values) / total if total else float("nan")
 
 
-def score(
-    name: str, estimated: NDArray[np.float32], truth: NDArray[np.float32], *, peak: float = 10.0, scale: float = 1.0
-) -> float:
+def score(name: str, estimated: NDArray[Any], truth: NDArray[Any], *, peak: float = 10.0, scale: float = 1.0) -> float:
     """One score by its name in `score_view`."""
     valid_only, weighted = name.startswith("valid_"), "w_" in name[:8]
     base = name.removeprefix("valid_").removeprefix("w_")

@@ -3,6 +3,7 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -46,13 +47,13 @@ def results(tmp_path: Path, tiny: TinyCapture) -> Results:
 
 def stored(store: Store, tiny: TinyCapture) -> Results:
     names = tiny.names
-    pairs = {pair_name(*pair): record for pair, record in tiny.items[TwoView].items()}
+    pairs = {pair_name(*pair): record for pair, record in tiny.each(TwoView).items()}
     pairs[pair_name(names[2], names[3])] = TwoView.failed("only 7 of 31 matches agree", candidates=31)
     refs = {
-        "images": {name: store.put_value(tiny.items[Panorama][name]) for name in names},
+        "images": {name: store.put_value(tiny.each(Panorama)[name]) for name in names},
         "pairs": {name: store.put_value(record) for name, record in pairs.items()},
-        "poses": {"": store.put_value(tiny.wholes[Poses])},
-        "ranges": {name: store.put_value(tiny.items[RangeMap][name]) for name in names},
+        "poses": {"": store.put_value(tiny.whole(Poses))},
+        "ranges": {name: store.put_value(tiny.each(RangeMap)[name]) for name in names},
         "cloud": {"": store.put_value(outward(tiny))},
     }
     return Results(store, refs)
@@ -60,15 +61,14 @@ def stored(store: Store, tiny: TinyCapture) -> Results:
 
 def outward(tiny: TinyCapture) -> PointCloud:
     """Return the true surfaces as a cloud, seen from the first camera."""
-    cloud = tiny.wholes[PointCloud]
-    assert isinstance(cloud, PointCloud)
+    cloud = tiny.whole(PointCloud)
     rng = np.random.default_rng(4)
     return replace(cloud, colors_rgb=rng.integers(0, 255, (len(cloud), 3), np.uint8))
 
 
-def summary_of(tiny: TinyCapture) -> dict:
+def summary_of(tiny: TinyCapture) -> dict[str, Any]:
     """Return what run.json would say of it."""
-    poses = tiny.wholes[Poses]
+    poses = tiny.whole(Poses)
     names = list(tiny.names)
     links = [[a, b, 100, 120, 0.02] for i, a in enumerate(names) for b in names[i + 1 :]]
     links[-1] = [names[2], names[3], 0, 31, None]

@@ -15,8 +15,8 @@ class Page(HTMLParser):
         self.source = source
         self.open: list[str] = []
         self.text: list[str] = []
-        self.attributes: list[tuple[str, str, str | None]] = []
-        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.attributes: list[tuple[str, str, str]] = []
+        self.elements: list[tuple[str, dict[str, str]]] = []
         self.scripts: list[str] = []
         self.feed(source)
         assert not self.open, f"not closed: {self.open}"
@@ -45,13 +45,14 @@ class Page(HTMLParser):
     def _note(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         names = [name for name, _ in attrs]
         assert len(set(names)) == len(names), f"an attribute is given twice: {tag} {names}"
-        self.elements.append((tag, dict(attrs)))
-        self.attributes += [(tag, *attr) for attr in attrs]
+        values = {name: value or "" for name, value in attrs}
+        self.elements.append((tag, values))
+        self.attributes += [(tag, *attr) for attr in values.items()]
 
     @property
     def words(self) -> str:
         return " ".join(" ".join(self.text).split())
 
-    def all(self, tag: str, **wanted: str) -> list[dict[str, str | None]]:
+    def all(self, tag: str, **wanted: str) -> list[dict[str, str]]:
         """Return the attributes of all elements of a tag that have these among them."""
         return [attrs for name, attrs in self.elements if name == tag and wanted.items() <= attrs.items()]

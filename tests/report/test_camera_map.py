@@ -89,13 +89,13 @@ def test_the_map_is_drawn_along_the_direction_up() -> None:
 
 
 @pytest.mark.parametrize("up", [None, [0, 0, 0], [1, 2], [float("nan")] * 3])
-def test_a_direction_up_that_is_none_is_that_of_the_first_camera(up: int | Sequence[int] | None) -> None:
+def test_a_direction_up_that_is_none_is_that_of_the_first_camera(up: Sequence[float] | None) -> None:
     assert up_of({"up": up}).tolist() == [0, -1, 0]
 
 
 def test_north_is_shown_where_the_levelled_frame_says_it(tiny: TinyCapture) -> None:
     """The words are those of poses.level: who changes them learns it here."""
-    poses = tiny.wholes[Poses]
+    poses = tiny.whole(Poses)
     up = {name: tuple(-rotation[:, 1]) for name, rotation in zip(tiny.names, poses.rotations, strict=True)}
     forward = poses.rotations[:, 2]
     headings = dict(zip(tiny.names, np.rad2deg(np.arctan2(forward[:, 0], forward[:, 2])) + 40, strict=True))

@@ -19,7 +19,7 @@ from pano_mvs.report.view_cards import chosen_views
 from tests.report.html_page import Page
 
 NAMES = ["a/1.png", "a/2.png", "a/3.png"]
-SUMMARY = {
+SUMMARY: dict[str, Any] = {
     "workflow": {"name": "lobby", "path": "flows/lobby.yaml", "overrides": ["depth.planes=64"]},
     "version": "1.2.3",
     "started": "2026-11-21 04:17",
@@ -94,6 +94,7 @@ def assert_sound(page: Page) -> None:
         assert "alt" in attrs
         data = base64.b64decode(attrs["src"].partition(",")[2], validate=True)
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        assert picture is not None
         assert picture.shape[:2] == (int(attrs["height"]), int(attrs["width"]))
     for attrs in page.all("svg"):
         assert attrs["role"] == "img"
@@ -142,7 +143,7 @@ def test_of_very_many_views_doubtful_ones_are_always_shown_in_full() -> None:
 def test_any_key_may_be_missing_or_empty(out_dir: Path, key: str | None) -> None:
     without = {name: value for name, value in SUMMARY.items() if name != key}
     assert "pano-mvs" in reported(out_dir, without if key else {}).words
-    if isinstance(SUMMARY.get(key), dict | list):
+    if key is not None and isinstance(SUMMARY[key], dict | list):
         assert_sound(reported(out_dir, without | {key: type(SUMMARY[key])()}))
         assert_sound(reported(out_dir, without | {key: None}))
 

@@ -91,6 +91,7 @@ def test_a_page_that_was_tampered_with_is_no_source_of_markup(
 def test_what_is_damaged_or_gone_is_left_out_and_told(
     out_dir: Path, results: Results, tiny: TinyCapture, role: str
 ) -> None:
+    assert results.store is not None
     for ref in results.refs[role].values():
         for part in ref.parts.values():
             if not part.external:
@@ -104,7 +105,8 @@ def test_what_is_damaged_or_gone_is_left_out_and_told(
 def test_a_folder_and_its_cache_give_the_page_of_the_run(out_dir: Path, results: Results, tiny: TinyCapture) -> None:
     """`Results.of_folder` finds by the book of runs what the run had in its hands."""
     store = results.store
-    keys = {}
+    assert store is not None
+    keys: dict[str, dict[str, str]] = {}
     for role, refs in results.refs.items():
         keys[role] = {item: f"{number:064x}" for number, item in enumerate(refs, start=1000 * len(keys))}
     for role, items in keys.items():
@@ -115,7 +117,9 @@ def test_a_folder_and_its_cache_give_the_page_of_the_run(out_dir: Path, results:
     summary["stages"] = [{"name": "images", "params": {"path": str(tiny.folder / "images")}}]
     again = Results.of_folder(out_dir, summary, Store(store.root))
     assert {role: dict(refs) for role, refs in again.refs.items()} == results.refs
-    assert again.panorama(tiny.names[0]).load().shape == (32, 64, 3)
+    panorama = again.panorama(tiny.names[0])
+    assert panorama is not None
+    assert panorama.load().shape == (32, 64, 3)
     assert again.notes == []
     elsewhere = Results.of_folder(out_dir / "other", summary, store)
     assert "knows no run" in elsewhere.notes[0]
@@ -152,9 +156,11 @@ def test_a_missing_interpreter_is_no_reason_to_fail(
     assert len(made.shown) == 3
 
 
-def decoded(picture: Picture) -> NDArray[np.uint8]:
+def decoded(picture: Picture) -> NDArray[Any]:
     data = base64.b64decode(picture.uri.partition(",")[2])
-    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    image: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    return image
 
 
 @pytest.mark.slow

@@ -11,10 +11,15 @@ from pano_mvs.report.residuals import Histogram, Residuals
 from pano_mvs.report.verdict import verdict
 
 NAMES = [f"{number}.png" for number in range(10)]
+POSES: dict[str, Any] = {
+    "registered": NAMES,
+    "rejected": {},
+    "links": [[a, b, 90] for a in NAMES for b in NAMES if a < b],
+}
 GOOD = {
     "exit_code": 0,
     "stages": [{"name": "depth", "run": 10}],
-    "poses": {"registered": NAMES, "rejected": {}, "links": [[a, b, 90] for a in NAMES for b in NAMES if a < b]},
+    "poses": POSES,
     "views": [{"name": name, "completeness": 0.99, "consistent": 0.45} for name in NAMES],
     "cloud": {"points": 100_000},
     "scores": {"views": {name: {"psnr_db": 30.0, "constant_psnr_db": 18.0} for name in NAMES}},
@@ -32,11 +37,11 @@ def test_a_good_run_is_called_good_and_nothing_is_found() -> None:
 
 def rejecting(count: int) -> dict[str, Any]:
     reasons = {f"x{number}.png": f"{number} matches, 20 needed" for number in range(count)}
-    return GOOD["poses"] | {"rejected": reasons}
+    return POSES | {"rejected": reasons}
 
 
 def doubting(count: int) -> dict[str, Any]:
-    return GOOD["poses"] | {"doubts": dict.fromkeys(NAMES[:count], "confirmed 1 %")}
+    return POSES | {"doubts": dict.fromkeys(NAMES[:count], "confirmed 1 %")}
 
 
 @pytest.mark.parametrize(
@@ -55,12 +60,12 @@ def doubting(count: int) -> dict[str, Any]:
         ({"exit_code": 130, "stopped": "interrupted"}, "fair", "was interrupted"),
         ({"exit_code": 3, "failures": [{"stage": "depth", "item": "1.png"}]}, "fair", "1 in depth"),
         ({"exit_code": 1, "stopped": "division by zero"}, "bad", "division by zero"),
-        ({"poses": GOOD["poses"] | {"links": [[NAMES[0], name, 90] for name in NAMES[1:]]}}, "fair",
+        ({"poses": POSES | {"links": [[NAMES[0], name, 90] for name in NAMES[1:]]}}, "fair",
          "9 cameras share a verified geometry with one other alone"),
         ({"exit_code": 3, "poses": doubting(1)}, "fair", "1 camera is doubtful: 0.png (confirmed 1 %)."),
         ({"poses": doubting(5)}, "fair", "5 cameras are doubtful: 0.png (confirmed 1 %); 1.png"),
         ({"poses": doubting(6)}, "bad", "4.png (confirmed 1 %); and 1 more."),
-        ({"poses": GOOD["poses"] | {"groups": [{"images": NAMES[:7]}, {"images": NAMES[7:]}]}}, "fair",
+        ({"poses": POSES | {"groups": [{"images": NAMES[:7]}, {"images": NAMES[7:]}]}}, "fair",
          "2 groups of panoramas share no reliable connection"),
     ],
 )  # fmt: skip

@@ -70,16 +70,16 @@ def test_from_inside_the_outermost_camera_looks_at_the_others() -> None:
 @pytest.mark.parametrize("centers", [[], [[1, 2, 3]], [[1, 2, 3]] * 3, [[0, 0, 0], [0, 5, 0]]])
 @pytest.mark.parametrize("up", [[0, -1, 0], [0, 0, 1], [1, 0, 0]])
 def test_whatever_lies_where_there_is_a_picture(
-    points: int | Sequence[Sequence[float]], centers: int | Sequence[Sequence[int]], up: Sequence[int]
+    points: Sequence[Sequence[float]], centers: Sequence[Sequence[float]], up: Sequence[float]
 ) -> None:
-    points = np.array(points, np.float32)
-    found = viewpoints(points, np.array(centers, float).reshape(-1, 3), np.array(up, float), aspect=1.6)
+    places = np.array(points, np.float32)
+    found = viewpoints(places, np.array(centers, float).reshape(-1, 3), np.array(up, float), aspect=1.6)
     for viewpoint in found:
         for vector in (viewpoint.eye, viewpoint.target, viewpoint.up):
             assert np.isfinite(vector).all()
         assert np.linalg.norm(viewpoint.target - viewpoint.eye) > 0
         image = draw_cloud(
-            points, np.zeros_like(points), np.full(points.shape, 7, np.uint8), viewpoint, size_hw=SIZE_HW
+            places, np.zeros_like(places), np.full(places.shape, 7, np.uint8), viewpoint, size_hw=SIZE_HW
         )
         assert image.shape == (*SIZE_HW, 3)
 
@@ -96,8 +96,7 @@ def test_the_nearer_point_hides_the_farther_one() -> None:
 
 @pytest.mark.parametrize("up", [[0, -1, 0], [0, 0, 1], [0.6, 0, 0.8], [0, 0, -1]])
 def test_horizontal_axes_are_across_up_with_right_on_the_right(up: Sequence[float]) -> None:
-    up = np.array(up, float)
-    right, forward = horizontal_axes(up)
-    frame = np.stack([right, up, forward])
+    right, forward = horizontal_axes(np.array(up, float))
+    frame = np.stack([right, np.array(up, float), forward])
     assert frame @ frame.T == pytest.approx(np.eye(3), abs=1e-12)
     assert np.linalg.det(frame) == pytest.approx(-1), "seen from above, forward up the page, right is to the right"

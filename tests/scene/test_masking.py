@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.scene.masking import decode_mask, painted_over, placed_mask
+from tests.stored import read_picture
 
 VALID = np.array([[True, True, False, True], [False, True, True, True]])
 
@@ -74,7 +75,7 @@ def test_the_blacks_of_a_jpeg_are_black(tmp_path: Path) -> None:
     drawn = np.full((32, 64), 255, np.uint8)
     drawn[5:19, 7:33] = 0
     path = written(tmp_path / "mask.jpg", drawn, cv2.IMWRITE_JPEG_QUALITY, 60)
-    stored = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    stored = read_picture(path, cv2.IMREAD_GRAYSCALE)
     assert stored[6:18, 8:32].max() > 0  # or the test shows nothing
     np.testing.assert_array_equal(decode_mask(path), drawn > 0)
 

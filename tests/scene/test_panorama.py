@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import pixel_from_ray, ray_from_pixel, ray_grid
 from pano_mvs.scene import FilePart, Panorama
+from pano_mvs.scene.cropping import Crop
 from pano_mvs.scene.image_files.image_file import write_png
 from pano_mvs.scene.record import Record
 
@@ -25,7 +27,7 @@ def panorama(
     mask: NDArray[np.bool_] | None = None,
     whole_hw: tuple[int, int] | None = None,
     crop_ltwh: tuple[int, int, int, int] | None = None,
-    **others: float,
+    **others: Any,
 ) -> Panorama:
     write_png(folder / "a.png", picture)
     if mask is not None:
@@ -48,7 +50,7 @@ def test_nothing_that_is_masked_is_seen_at_any_resolution(
     folder, rng = tmp_path_factory.getbasetemp(), np.random.default_rng(seed)
     whole, working_hw = (half, 2 * half), (2 * min(working, half // 2), 4 * min(working, half // 2))
     left, top = int(rng.integers(0, half)), int(rng.integers(0, half // 2))
-    crop = (left, top, int(rng.integers(1, 2 * half - left)) + 1, int(rng.integers(1, half - top)) + 1)
+    crop: Crop | None = (left, top, int(rng.integers(1, 2 * half - left)) + 1, int(rng.integers(1, half - top)) + 1)
     crop = crop if rng.random() < 0.7 else None
     file_hw = (crop[3], crop[2]) if crop else whole
     mask = np.repeat(np.repeat(rng.random(file_hw) < 0.9, scale, 0), scale, 1)

@@ -93,7 +93,7 @@ def test_no_key_point_of_colmap_is_masked(tmp_path: Path) -> None:
 def test_an_empty_cloud_is_told(tmp_path: Path, blank: bool, why: str) -> None:
     capture = tiny_capture(Variant(blank=blank))
     poses = {name: Pose(pose) for name, pose in zip(capture.names, capture.poses, strict=True)}
-    ranges = {name: capture.items[RangeMap][name] for name in capture.names}
+    ranges = {name: capture.each(RangeMap)[name] for name in capture.names}
     if not blank:  # ranges that nobody else confirms
         ranges = {
             name: RangeMap(ranges[name].range * (3.0**idx), ranges[name].confidence)

@@ -43,6 +43,7 @@ from pano_mvs.stages.patchmatch import PatchMatchParams, patchmatch
 from pano_mvs.stages.points import TrackedParams, tracked
 from pano_mvs.stages.poses import known_poses
 from pano_mvs.testing.tiny_capture import TinyCapture, tiny_capture
+from tests.stored import write_npz
 
 _LARGE = ("000.png", "001.png", "003.png")
 # The smaller room is the same capture's, under other names, in a world that is turned, moved and half as large.
@@ -55,14 +56,14 @@ class Rooms:
     """The values that stages take, of both rooms."""
 
     def __init__(self, tiny: TinyCapture) -> None:
-        whole = tiny.wholes[Poses]
+        whole = tiny.whole(Poses)
         assert isinstance(whole, Poses)
         large, small = (_with(whole, names) for names in (_LARGE, tuple(_SMALL.values())))
         small = replace(moved_poses(small, _MOVED), names=tuple(_SMALL), frame="the small room's", scale="its own")
         self.poses = join_groups([small, large], order=_ORDER)
-        self.images = self._of(tiny.items[Panorama])
-        self.ranges = self._of(tiny.items[RangeMap])
-        self.samples = self._of(tiny.items[SurfaceSamples])
+        self.images = self._of(tiny.each(Panorama))
+        self.ranges = self._of(tiny.each(RangeMap))
+        self.samples = self._of(tiny.each(SurfaceSamples))
         for name in _SMALL:
             own = self.ranges[name]
             self.ranges[name] = replace(own, range=(0.5 * own.range).astype(np.float32))
@@ -95,7 +96,7 @@ def _context(folder: Path) -> Context:
     return Context(np.random.default_rng(0), folder)
 
 
-def _fused(rooms: Rooms, names: tuple[str, ...] = _ORDER, **settings: object) -> PointCloud:
+def _fused(rooms: Rooms, names: tuple[str, ...] = _ORDER, **settings: Any) -> PointCloud:
     chosen = {name: rooms.ranges[name] for name in names}
     poses = {name: Pose(rooms.pose_items[name].cam_from_world, rooms.pose_items[name].group) for name in names}
     if set(names) == set(_SMALL):
@@ -283,7 +284,7 @@ def _truth_of_rooms(tiny: TinyCapture, folder: Path) -> Path:
         for name, idx in of_image.items()
     ]
     (folder / "poses.json").write_text(json.dumps({"width": 64, "height": 32, "metric": True, "views": views}))
-    np.savez(folder / "depth.npz", **{Path(name).stem: tiny.ranges[idx] for name, idx in of_image.items()})
+    write_npz(folder / "depth.npz", {Path(name).stem: tiny.ranges[idx] for name, idx in of_image.items()})
     return folder
 
 
@@ -302,7 +303,7 @@ def _metres(poses: Poses, first: str, second: str) -> float:
     return float(np.linalg.norm(positions[first] - positions[second]))
 
 
-def _scaled(rooms: Rooms, ctx: Context, **settings: object) -> Poses:
+def _scaled(rooms: Rooms, ctx: Context, **settings: Any) -> Poses:
     poses = scale(poses=rooms.poses, images=rooms.images, params=ScaleParams(**settings), ctx=ctx)
     poses.check()
     return poses

@@ -41,9 +41,9 @@ def verified(
 ) -> Poses:
     return verify(
         poses=poses_of(tiny, wrong=wrong),
-        images=tiny.items[Panorama],
-        features=tiny.items[Features] if matched else None,
-        matches=tiny.items[TwoView] if matched else None,
+        images=tiny.each(Panorama),
+        features=tiny.each(Features) if matched else None,
+        matches=tiny.each(TwoView) if matched else None,
         params=VerifyParams(correct=correct),
         ctx=ctx,
     )
@@ -84,7 +84,7 @@ def test_one_pose_is_no_model(tiny: TinyCapture, ctx: Context) -> None:
         {"000.png": tiny.poses[0]}, rejected={"001.png": "no pair"}, frame="x", scale="x", metric=False
     )
     with pytest.raises(GateError, match=r"001\.png: no pair"):
-        verify(poses=alone, images=tiny.items[Panorama], features=None, matches=None, params=VerifyParams(), ctx=ctx)
+        verify(poses=alone, images=tiny.each(Panorama), features=None, matches=None, params=VerifyParams(), ctx=ctx)
     assert ctx.rejected == {"001.png": "no pair"}
 
 
@@ -97,9 +97,9 @@ def test_the_solver_opens_pictures_only_where_it_may(
     load = Panorama.load
     monkeypatch.setattr(Panorama, "load", lambda image: opened.append(image) or load(image))
     poses = scaled_translation(
-        features=tiny.items[Features],
-        matches=tiny.items[TwoView],
-        images=tiny.items[Panorama],
+        features=tiny.each(Features),
+        matches=tiny.each(TwoView),
+        images=tiny.each(Panorama),
         params=ScaledTranslationParams(ask_images=ask_images),
         ctx=ctx,
     )

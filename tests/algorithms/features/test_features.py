@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ from pano_mvs.testing.room import default_room, render
 
 SIZE = (256, 512)
 PIXEL = 2 * np.pi / SIZE[1]
-EXTRACTORS = {"sift": extract_sift, "orb": extract_orb, "sphorb": extract_sphorb}
+EXTRACTORS: dict[str, Callable[..., Features]] = {"sift": extract_sift, "orb": extract_orb, "sphorb": extract_sphorb}
 
 
 def spread_directions(rng: np.random.Generator, count: int, *, apart: float) -> NDArray[np.float64]:
@@ -159,7 +159,7 @@ def test_sift_descriptors_are_whole_numbers_of_one_length(room_image: NDArray[np
 
 def repeated_share(found: Features, other: Features, new_from_old: NDArray[np.float64]) -> float:
     strong = found.bearings[: len(found) // 2] @ new_from_old.T
-    return np.mean(cKDTree(other.bearings).query(strong)[0] < 1.0 * PIXEL)
+    return float(np.mean(cKDTree(other.bearings).query(strong)[0] < 1.0 * PIXEL))
 
 
 @pytest.mark.parametrize("name", EXTRACTORS)

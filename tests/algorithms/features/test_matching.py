@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from pano_mvs.scene import Features
 from tests.oracles.matching import match_one_by_one
 
 
-def features(descriptors: NDArray[Any], metric: str = "l2") -> Features:
+def features(descriptors: NDArray[Any], metric: Literal["l2", "hamming"] = "l2") -> Features:
     count = len(descriptors)
     return Features(
         bearings=np.tile([0.0, 0.0, 1.0], (count, 1)),
@@ -26,7 +26,7 @@ def features(descriptors: NDArray[Any], metric: str = "l2") -> Features:
     )
 
 
-def draw(metric: str, seed: int, count: int = 400) -> tuple[Features, Features]:
+def draw(metric: Literal["l2", "hamming"], seed: int, count: int = 400) -> tuple[Features, Features]:
     """Two sets with a common half, the second's with some noise; more rows than one block."""
     rng = np.random.default_rng(seed)
     if metric == "l2":
@@ -34,10 +34,10 @@ def draw(metric: str, seed: int, count: int = 400) -> tuple[Features, Features]:
         noise = rng.integers(-12, 13, size=base.shape).astype(np.float32)
         other = rng.integers(0, 120, size=(count // 2, 16)).astype(np.float32)
         return features(base), features(np.concatenate([(base + noise)[: count // 2], other]))
-    base = rng.integers(0, 256, size=(count, 8), dtype=np.uint8)
-    noise = (rng.random((count, 8)) < 0.15).astype(np.uint8)
-    other = rng.integers(0, 256, size=(count // 2, 8), dtype=np.uint8)
-    return features(base, metric), features(np.concatenate([(base ^ noise)[: count // 2], other]), metric)
+    bits = rng.integers(0, 256, size=(count, 8), dtype=np.uint8)
+    flips = (rng.random((count, 8)) < 0.15).astype(np.uint8)
+    others = rng.integers(0, 256, size=(count // 2, 8), dtype=np.uint8)
+    return features(bits, metric), features(np.concatenate([(bits ^ flips)[: count // 2], others]), metric)
 
 
 @pytest.mark.parametrize("metric", ["l2", "hamming"])

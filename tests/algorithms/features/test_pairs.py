@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -37,7 +37,7 @@ def looks(walk: PathCapture) -> dict[str, GlobalDescriptor]:
     return {name: vlad_descriptor(found) for name, found in walk.features.items()}
 
 
-def groups(names: Any, pairs: tuple[tuple[str, str], ...] | Sequence[Sequence[int]] | set[tuple[str, str]]) -> int:
+def groups(names: Iterable[Any], pairs: Iterable[Sequence[Any]]) -> int:
     """Number of groups of images that hang together."""
     group = {name: {name} for name in names}
     for a, b in pairs:
@@ -52,7 +52,7 @@ def test_position_pairs_are_the_nearest_of_either() -> None:
     places = {name: rng.normal(size=3) for name in names}
     pairs = position_pairs(names, places, neighbours=4)
     pairs.check()
-    near = set()
+    near: set[tuple[str, ...]] = set()
     for a in names:
         others = sorted((b for b in names if b != a), key=lambda b: np.linalg.norm(places[a] - places[b]))
         near |= {tuple(sorted((a, b), key=names.index)) for b in others[:4]}
@@ -61,7 +61,7 @@ def test_position_pairs_are_the_nearest_of_either() -> None:
 
 
 def test_groups_that_would_be_apart_are_joined_by_the_shortest_link() -> None:
-    places = {"a": [0.0, 0], "b": [1.0, 0], "c": [10.0, 0], "d": [11.5, 0]}
+    places = {name: np.array([x, 0.0]) for name, x in (("a", 0), ("b", 1), ("c", 10), ("d", 11.5))}
     pairs = position_pairs(list(places), places, neighbours=1)
     assert pairs.pairs == (("a", "b"), ("b", "c"), ("c", "d"))
 
@@ -74,7 +74,7 @@ def test_images_at_one_place_hang_together_too() -> None:
 
 def test_an_image_without_position_has_its_neighbours_in_the_order() -> None:
     names = [f"{n}" for n in range(8)]
-    places = {name: [100.0 * int(name), 0] for name in names if name != "3"}
+    places = {name: np.array([100.0 * int(name), 0]) for name in names if name != "3"}
     pairs = position_pairs(names, places, neighbours=1, window=2).pairs
     assert {pair for pair in pairs if "3" in pair} == {("1", "3"), ("2", "3"), ("3", "4"), ("3", "5")}
     assert set(position_pairs(names, {}, neighbours=1, window=2).pairs) == set(sequential_pairs(names, window=2).pairs)

@@ -110,7 +110,7 @@ def test_peak_of_a_paraboloid_is_found_exactly() -> None:
         def value(
             place: NDArray[np.float64], top: NDArray[np.float64] = top, curvature: NDArray[np.float64] = curvature
         ) -> float:
-            return 3.0 - (place - top) @ curvature @ (place - top)
+            return float(3.0 - (place - top) @ curvature @ (place - top))
 
         around = np.array([value(step) for step in steps])
         np.testing.assert_allclose(kernels.hexagon_peak(value(np.zeros(2)), around), top_uv, atol=1e-9)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from tests.oracles import range_filters as oracle
 SIZE = (128, 256)
 POSES = capture_poses(4, seed=1, spread=0.4)
 # At this size true ranges, too, are seen at less parallax than is asked for by default.
-LIMITS = {"max_relative_error": 0.02, "max_reprojection_px": 1.0, "min_motion_px": 0.01}
+LIMITS: dict[str, Any] = {"max_relative_error": 0.02, "max_reprojection_px": 1.0, "min_motion_px": 0.01}
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +29,7 @@ def true_maps() -> list[RangeMap]:
     return [as_map(room_range(room, pose, SIZE)) for pose in POSES]
 
 
-def checked(maps: Sequence[RangeMap], **settings: float) -> RangeMap | None:
+def checked(maps: Sequence[RangeMap], **settings: Any) -> RangeMap:
     return check_consistency(maps[0], POSES[0], maps[1:], POSES[1:], **LIMITS | settings)
 
 

@@ -17,11 +17,12 @@ from pano_mvs.algorithms.filters.speckle import remove_speckles
 from pano_mvs.algorithms.filters.sphere_steps import columns_per_step
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import pixel_solid_angle
+from pano_mvs.scene import RangeMap
 from tests.algorithms.range_scenes import TRUSTED, as_map, box_range, random_map, rolled
 from tests.oracles import range_filters as oracle
 
 SIZE = (24, 48)
-FILTERS = {
+FILTERS: dict[str, Callable[[RangeMap], RangeMap]] = {
     "median": median_range,
     "median_7": lambda range_map: median_range(range_map, window=7),
     "gaussian": gaussian_range,

@@ -15,7 +15,9 @@ from pano_mvs.algorithms.points.selection import spread_points
 from pano_mvs.algorithms.points.tracking import track_points
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import ray_grid
-from pano_mvs.scene import Poses, RangeMap, SurfaceSamples, TrackedPoints
+from pano_mvs.scene import Poses, RangeMap
+from pano_mvs.scene.surface_samples import SurfaceSamples
+from pano_mvs.scene.tracked_points import TrackedPoints
 from pano_mvs.testing.room import capture_poses, default_room, range_along, render
 from tests.oracles.points import sees
 
@@ -42,10 +44,10 @@ def tracked(room: tuple[Poses, dict[str, RangeMap], dict[str, SurfaceSamples]], 
     return track_points(samples, poses, maps.__getitem__, rng=np.random.default_rng(1), **settings)
 
 
-def unevenness(points: NDArray[Any], spacing: float = 1.0) -> float:
+def unevenness(points: NDArray[Any], spacing: float | NDArray[Any] = 1.0) -> float:
     """Standard deviation of the distance to the nearest neighbour in units of its mean; 0.52 if thrown."""
-    nearest = cKDTree(points).query(points, k=2)[0][:, 1] / spacing
-    return nearest.std() / nearest.mean()
+    nearest = np.asarray(cKDTree(points).query(points, k=2)[0])[:, 1] / spacing
+    return float(nearest.std() / nearest.mean())
 
 
 def test_samples_are_even_over_the_sphere_and_on_the_surfaces(

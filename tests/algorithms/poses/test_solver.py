@@ -2,7 +2,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -308,7 +308,7 @@ def test_points_move_by_back_substitution() -> None:
 
 
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])
-def test_adjustment_finds_back_from_a_disturbed_start(loss: str) -> None:
+def test_adjustment_finds_back_from_a_disturbed_start(loss: Literal["huber", "cauchy"]) -> None:
     rng = np.random.default_rng(17)
     true = bundle_of(rng, noise_deg=0.0)
     turns = rotation_from_rotvec(0.01 * rng.normal(size=(4, 3)))
@@ -354,7 +354,7 @@ def test_adjustment_wants_observations_sorted_by_point() -> None:
 
 
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])
-def test_weights_are_the_derivative_of_the_loss(loss: str) -> None:
+def test_weights_are_the_derivative_of_the_loss(loss: Literal["huber", "cauchy"]) -> None:
     for error in (0.001, 0.009, 0.02, 0.3):
         h = 1e-7
         above, below = (robust_cost(np.array([error + s * h]), loss=loss, scale_rad=0.01) for s in (1, -1))

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -24,7 +25,10 @@ from tests.oracles.triangulation_numpy import triangulate_numpy
 
 
 def pair(
-    matches: ArrayLike, residuals: ArrayLike | None = None, pose: Rigid3 | None = None, geometry: str = "general"
+    matches: ArrayLike,
+    residuals: ArrayLike | None = None,
+    pose: Rigid3 | None = None,
+    geometry: Literal["general", "rotation", "none"] = "general",
 ) -> TwoView:
     pose = pose or Rigid3(np.eye(3), np.array([1.0, 0, 0]))
     matches = np.array(matches, np.int32).reshape(-1, 2)
@@ -145,7 +149,7 @@ def test_triangulation_is_that_of_numpy(shuffled: bool) -> None:
     if shuffled:
         order = rng.permutation(len(given[0]))
         given = tuple(column[order] for column in given)
-    limits = {"count": 400, "max_error_rad": 0.01, "min_angle_rad": 0.02}
+    limits: dict[str, Any] = {"count": 400, "max_error_rad": 0.01, "min_angle_rad": 0.02}
     found, expected = triangulate_observations(*given, **limits), triangulate_numpy(*given, **limits)
     assert 150 < expected.valid.sum() < 350
     assert (expected.valid[given[2]] & ~expected.used).sum() > 0
@@ -173,7 +177,7 @@ def test_far_points_and_points_behind_are_no_points(point: tuple[int, int, float
 
 
 @pytest.mark.parametrize("estimator", ["kappa", "log_median", "cauchy"])
-def test_scale_survives_outliers(estimator: str) -> None:
+def test_scale_survives_outliers(estimator: Literal["kappa", "log_median", "cauchy"]) -> None:
     rng = np.random.default_rng(6)
     ratios = np.concatenate([1.7 * np.exp(0.004 * rng.normal(size=100)), rng.uniform(0.1, 5, size=40)])
     scale = estimate_scale(ratios, np.ones(140), estimator=estimator, kappa=0.01)

@@ -78,7 +78,8 @@ def census_like(reference: NDArray[Any], warped: NDArray[Any], window: CostWindo
     """The census cost, as a stranger would write it."""
     pairs = zip(window.neighbours(reference[..., 0]), window.neighbours(warped[..., 0]), strict=True)
     differs = [(ours > reference[..., 0]) != (theirs > warped[..., 0]) for ours, theirs in pairs]
-    return np.sum(differs, axis=0) / (len(differs) - 1)
+    result: NDArray[np.float64] = np.sum(differs, axis=0) / (len(differs) - 1)
+    return result
 
 
 @pytest.mark.parametrize("backend", ["numpy", "opencv"])

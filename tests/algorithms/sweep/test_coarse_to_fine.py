@@ -55,11 +55,12 @@ def _work(height: int, settings: SweepSettings) -> SweepInput:
 
 
 def _good(result: NDArray[np.float32], truth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    return np.abs(result - truth) < 0.05 * truth
+    found: NDArray[np.bool_] = np.abs(result - truth) < 0.05 * truth
+    return found
 
 
 @pytest.mark.parametrize("changes", [{}, {"cost": "sad", "spacing": "log"}, {"combination": "parallax_weighted"}])
-def test_around_a_flat_guide_costs_are_those_of_the_plain_sweep(changes: dict[str, str]) -> None:
+def test_around_a_flat_guide_costs_are_those_of_the_plain_sweep(changes: dict[str, Any]) -> None:
     _compare_with_the_plain_sweep(64, SweepSettings(planes=20, exposure=False, **changes))
 
 

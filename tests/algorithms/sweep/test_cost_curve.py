@@ -111,7 +111,8 @@ def test_a_plugins_cost_has_a_curve_too() -> None:
 
         @register_sweep_cost("darker")
         def darker(reference: NDArray[Any], warped: NDArray[Any], window: CostWindow) -> NDArray[Any]:
-            return np.abs(reference[..., 0] - warped[..., 0]) / 255
+            result: NDArray[Any] = np.abs(reference[..., 0] - warped[..., 0]) / 255
+            return result
 
         case = sweep_case(0)
         settings = SweepSettings(planes=7, cost="darker", support=3, no_match="keep")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -228,7 +229,7 @@ def test_rolling_rolls_guided_and_limited_fill(seed: int, columns: int) -> None:
 
 
 @pytest.mark.parametrize("harm", [{"radius": 0}, {"radius": 12}, {"epsilon": 0.0}])
-def test_bad_settings_are_refused(harm: dict[str, float]) -> None:
+def test_bad_settings_are_refused(harm: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match="guided filter needs"):
         guided_range(as_map(np.ones(SIZE)), COLORS, **harm)
     with pytest.raises(UsageError, match="guide must be"):

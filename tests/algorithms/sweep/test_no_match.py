@@ -21,7 +21,7 @@ SIZE = 96, 192
 
 
 @pytest.fixture(scope="module")
-def outdoors() -> tuple[list[NDArray[np.uint8]], list[Rigid3], NDArray[np.float32]]:
+def outdoors() -> tuple[list[NDArray[np.uint8]], tuple[Rigid3, ...], NDArray[np.float32]]:
     scene = courtyard(seed=3, views=3)
     views = [scene.view(idx, SIZE) for idx in range(3)]
     return [picture for picture, _ in views], scene.poses, views[0][1]

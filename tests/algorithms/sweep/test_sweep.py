@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numba
@@ -15,6 +15,7 @@ from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pixel_solid_angle, roll_panorama, rotate_panorama, rotation_from_rotvec
 from pano_mvs.scene import RangeMap
+from pano_mvs.testing.paint import Texture
 from pano_mvs.testing.room import capture_poses, default_room, render
 
 NEAR, FAR = 0.5, 6.0
@@ -27,7 +28,7 @@ PAPER = SweepSettings(
 
 @functools.cache
 def _capture(
-    height: int, count: int = 3, texture: str = "strong"
+    height: int, count: int = 3, texture: Texture = "strong"
 ) -> tuple[tuple[NDArray[np.uint8], ...], tuple[Rigid3, ...], NDArray[np.float32]]:
     """Return pictures, source_from_reference and the true range of view 0 of a room."""
     poses = capture_poses(count, seed=5)
@@ -101,8 +102,10 @@ def test_a_tiny_sweep_equals_the_readable_one(changes: dict[str, str]) -> None:
 
 
 def _position(ranges: NDArray[np.float32], settings: SweepSettings) -> NDArray[np.float64]:
-    scale = {"inverse": lambda r: 1 / r, "log": np.log, "uniform": lambda r: r}[settings.spacing]
-    return (scale(ranges) - scale(NEAR)) / (scale(FAR) - scale(NEAR)) * (settings.planes - 1)
+    scales: dict[str, Callable[[Any], Any]] = {"inverse": lambda r: 1 / r, "log": np.log, "uniform": lambda r: r}
+    scale = scales[settings.spacing]
+    result: NDArray[np.float64] = (scale(ranges) - scale(NEAR)) / (scale(FAR) - scale(NEAR)) * (settings.planes - 1)
+    return result
 
 
 @pytest.mark.parametrize("settings", [FAST, PAPER, FAST.replace(aggregation="box")])
@@ -192,7 +195,7 @@ def test_masked_pixels_have_no_range_and_no_vote(backend: str) -> None:
     mask[24:] = False
     for picture in spoilt:
         picture[24:] = np.random.default_rng(0).integers(0, 255, picture[24:].shape)
-    masks = {"reference_mask": mask, "source_masks": [mask, None]}
+    masks: dict[str, Any] = {"reference_mask": mask, "source_masks": [mask, None]}
     result = _sweep(spoilt, poses, backend=backend, **masks)
     result.check()
     assert np.isnan(result.range[24:]).all()

@@ -36,10 +36,12 @@ def tiled_hall(
     shift = np.array([TILE, 0.0, 0.0])
     p = [noisy_bearings(rng, Rigid3.identity(), points, noise_deg=noise_deg) for points in (floor, furniture)]
     q = [noisy_bearings(rng, pose, points, noise_deg=noise_deg) for points in (floor + shift, furniture)]
-    rays = [np.concatenate([*seen, noise / np.linalg.norm(noise, axis=1, keepdims=True)])
-            for seen, noise in zip((p, q), elsewhere, strict=True)]  # fmt: skip
+    first, second = (
+        np.concatenate([*seen, noise / np.linalg.norm(noise, axis=1, keepdims=True)])
+        for seen, noise in zip((p, q), elsewhere, strict=True)
+    )
     feigned = Rigid3(pose.rotation, pose.apply(shift[None])[0])
-    return *rays, pose, feigned
+    return first, second, pose, feigned
 
 
 def all_matches(count: int) -> NDArray[np.int32]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -23,7 +25,8 @@ THRESHOLD_RAD = 0.0035
 
 
 def unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    result: NDArray[np.float64] = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return result
 
 
 def paired(
@@ -110,7 +113,7 @@ def test_refinement_kernel_takes_the_steps_of_the_oracle(iterations: int) -> Non
     start = Rigid3(
         rotation_from_rotvec([0.01, -0.02, 0.01]) @ pose.rotation, unit(pose.translation + 0.05 * rng.normal(size=3))
     )
-    settings = {"scale_rad": 0.01, "max_iterations": iterations}
+    settings: dict[str, Any] = {"scale_rad": 0.01, "max_iterations": iterations}
     found, expected = refine_relative_pose(start, p, q, **settings), plain.refine_relative_pose(start, p, q, **settings)
     assert max(errors_deg(found.rotation, found.translation, expected)) < 1e-4
     np.testing.assert_allclose(found.rotation @ found.rotation.T, np.eye(3), atol=1e-12)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -105,7 +103,7 @@ def test_samples_without_a_solution_give_none() -> None:
 
 def test_a_wall_defeats_eight_points_and_not_five() -> None:
     """Many matrices fit a plane in the linear equations; the ten cubic ones leave two, and one is behind a camera."""
-    errors = {solver: [] for solver in SOLVERS}
+    errors: dict[Solver, list[float]] = {solver: [] for solver in SOLVERS}
     for trial in range(3):
         p, q, matches, pose = wall_seen_twice(trial)
         for solver in SOLVERS:
@@ -142,8 +140,9 @@ def test_eight_points_recover_hard_poses_too(name: str) -> None:
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_the_minimal_model_as_it_comes_is_right_but_coarse(solver: Any) -> None:
-    coarse, fine = [], []
+def test_the_minimal_model_as_it_comes_is_right_but_coarse(solver: Solver) -> None:
+    coarse: list[float] = []
+    fine: list[float] = []
     for trial in range(3):
         rng = rng_of(f"coarse {trial}")
         p, q, matches, pose = draw(rng, (0.5, 0, 0.1), (0, 0.5, 0))
@@ -166,7 +165,8 @@ def test_exact_bearings_need_no_refinement() -> None:
 
 def test_a_pair_tells_how_well_it_is_determined() -> None:
     """What the record foretells is as large as the errors, and grows as the baseline shrinks."""
-    actual, foretold = [], {0.5: [], 0.1: []}
+    actual: list[tuple[float, float]] = []
+    foretold: dict[float, list[tuple[float, float]]] = {0.5: [], 0.1: []}
     for trial in range(10):
         for length, found in foretold.items():
             rng = rng_of(f"determined {trial}")
@@ -214,4 +214,4 @@ def test_smaller_samples_are_needed_fewer_times() -> None:
 def test_an_unknown_solver_is_named() -> None:
     p, q, _, _ = draw(rng_of("unknown"), (0.5, 0, 0), (0, 0, 0))
     with pytest.raises(UsageError, match=r"no solver 'six'; choose one of five_point, eight_point"):
-        estimate_two_view(p, q, rng=rng_of("unknown"), threshold_rad=0.01, solver="six")
+        estimate_two_view(p, q, rng=rng_of("unknown"), threshold_rad=0.01, solver=unknown)

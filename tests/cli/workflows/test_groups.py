@@ -20,6 +20,7 @@ from pano_mvs.scene.image_files.image_file import write_png
 from pano_mvs.testing.room import capture_poses, default_room, render
 from pano_mvs.viewer.shown_scene import open_scene
 from tests.cli.conftest import Command, run_json
+from tests.stored import write_npz
 
 SIZE_HW = (96, 192)
 LARGE, SMALL = ("a0.png", "a1.png", "a2.png"), ("b0.png", "b1.png")
@@ -86,7 +87,7 @@ def write_rooms(folder: Path) -> float:
         ours[name[0]].append({"image": name, "R": moved.rotation.tolist(), "t": moved.translation.tolist()})
     size = {"width": SIZE_HW[1], "height": SIZE_HW[0]}
     (folder / "capture" / "truth" / "poses.json").write_text(json.dumps({**size, "metric": True, "views": views}))
-    np.savez(folder / "capture" / "truth" / "depth.npz", **depths)
+    write_npz(folder / "capture" / "truth" / "depth.npz", depths)
     for room, listed in ours.items():
         (folder / "rooms" / f"{room}.json").write_text(json.dumps({**size, "metric": False, "views": listed}))
     return float(np.linalg.norm(poses["b0.png"].center - poses["b1.png"].center))

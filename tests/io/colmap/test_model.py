@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pycolmap
@@ -190,7 +191,9 @@ def test_points_that_no_image_sees_are_kept(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("form", "suffixes"), [("bin", ["bin"]), ("txt", ["txt"]), ("both", ["bin", "txt"])])
-def test_models_are_written_as_text_binary_or_both(tmp_path: Path, form: str, suffixes: Sequence[str]) -> None:
+def test_models_are_written_as_text_binary_or_both(
+    tmp_path: Path, form: Literal["bin", "txt", "both"], suffixes: Sequence[str]
+) -> None:
     write_colmap_model(tmp_path / "model", noisy_poses(), SIZES, form=form)
     files = [f"{name}.{suffix}" for name in FILES for suffix in suffixes]
     assert sorted(path.name for path in (tmp_path / "model").iterdir()) == sorted(files)

@@ -8,12 +8,13 @@ import sys
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import pycolmap
 import pytest
 
-from pano_mvs.algorithms.faces.layout import Face, panorama_faces
+from pano_mvs.algorithms.faces.layout import Face, FaceLayout, panorama_faces
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.io.colmap.images import write_picture
 from pano_mvs.io.colmap.maps import read_colmap_map, write_depth_map, write_normal_map
@@ -22,15 +23,15 @@ from pano_mvs.io.colmap.workspace import write_stereo_configs
 from pano_mvs.scene.image_files.image_file import decode_image
 from tests.io.colmap.test_model import NAMES, noisy_poses
 
-LAYOUTS = ("cube", "icosahedron")
+LAYOUTS: tuple[FaceLayout, ...] = ("cube", "icosahedron")
 
 
 @cache
-def faces_of(layout: str) -> tuple[Face, ...]:
+def faces_of(layout: FaceLayout) -> tuple[Face, ...]:
     return panorama_faces((512, 1024), layout=layout, fov_deg=100, size_px=240)
 
 
-def cuts(layout: str = "cube", names: Sequence[str] = NAMES) -> dict[str, CutPanorama]:
+def cuts(layout: FaceLayout = "cube", names: Sequence[str] = NAMES) -> dict[str, CutPanorama]:
     faces = faces_of(layout)
     views = [face.view for face in faces]
     return {name: CutPanorama(views, [f"{name}_{face.name}.jpg" for face in faces]) for name in names}
@@ -74,15 +75,16 @@ def test_broken_maps_are_named(tmp_path: Path, data: bytes) -> None:
 
 
 def test_other_arrays_are_no_maps(tmp_path: Path) -> None:
+    doubles: Any = np.zeros((3, 4))
     with pytest.raises(UsageError, match="a depth map is"):
-        write_depth_map(tmp_path / "a", np.zeros((3, 4)))
+        write_depth_map(tmp_path / "a", doubles)
     with pytest.raises(UsageError, match="a normal map is"):
         write_normal_map(tmp_path / "a", np.zeros((3, 4), np.float32))
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("form", ["bin", "txt"])
-def test_pycolmap_reads_rigs_frames_and_poses(tmp_path: Path, layout: str, form: str) -> None:
+def test_pycolmap_reads_rigs_frames_and_poses(tmp_path: Path, layout: FaceLayout, form: Literal["bin", "txt"]) -> None:
     poses, faces = noisy_poses(), faces_of(layout)
     write_rig_model(tmp_path, poses, cuts(layout), form=form)
     files = {"cameras", "images", "points3D", "rigs", "frames"}
@@ -105,7 +107,7 @@ def test_pycolmap_reads_rigs_frames_and_poses(tmp_path: Path, layout: str, form:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_tracks_lie_in_the_faces_and_project_onto_their_key_points(tmp_path: Path, layout: str) -> None:
+def test_tracks_lie_in_the_faces_and_project_onto_their_key_points(tmp_path: Path, layout: FaceLayout) -> None:
     poses = noisy_poses()
     seen = write_rig_model(tmp_path, poses, cuts(layout))
     model = pycolmap.Reconstruction(str(tmp_path))

@@ -132,7 +132,7 @@ def sound_files(size_hw: tuple[int, int], packet: bytes) -> list[bytes]:
     """The bytes of a small file in every container, each with the same metadata: XMP and EXIF."""
     jpeg = bytes(cv2.imencode(".jpg", picture(size_hw))[1])
     segments = app1(b"Exif\0\0" + exif()) + app1(b"http://ns.adobe.com/xap/1.0/\0" + packet)
-    webp = {"xmp": packet, "exif": exif(), "lossless": True}
+    webp: dict[str, Any] = {"xmp": packet, "exif": exif(), "lossless": True}
     return [
         jpeg[:2] + segments + jpeg[2:],
         by_pillow(size_hw, "WEBP", **webp),

@@ -68,7 +68,7 @@ def test_a_subfolder_that_cannot_be_read_costs_what_it_holds(tmp_path: Path, mod
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
     (tmp_path / "lost+found").chmod(mode)
-    notes = []
+    notes: list[str] = []
     with permissions_hold():
         found = [path.relative_to(tmp_path).as_posix() for path in list_pictures(tmp_path, notes)]
     (tmp_path / "lost+found").chmod(0o700)
