@@ -43,7 +43,7 @@ def draw(metric: Literal["l2", "hamming"], seed: int, count: int = 400) -> tuple
 @pytest.mark.parametrize("metric", ["l2", "hamming"])
 @pytest.mark.parametrize("mutual", [True, False])
 @pytest.mark.parametrize("ratio", [0.6, 0.9])
-def test_equals_the_plain_search(metric: str, mutual: bool, ratio: float) -> None:
+def test_equals_the_plain_search(metric: Literal["l2", "hamming"], mutual: bool, ratio: float) -> None:
     first, second = draw(metric, 3)
     found = match_features(first, second, ratio=ratio, mutual=mutual)
     expected = match_one_by_one(first.descriptors, second.descriptors, metric=metric, ratio=ratio, mutual=mutual)
@@ -53,7 +53,7 @@ def test_equals_the_plain_search(metric: str, mutual: bool, ratio: float) -> Non
 
 
 @pytest.mark.parametrize("metric", ["l2", "hamming"])
-def test_mutual_matches_are_one_to_one_even_among_twins(metric: str) -> None:
+def test_mutual_matches_are_one_to_one_even_among_twins(metric: Literal["l2", "hamming"]) -> None:
     first, second = draw(metric, 4)
     doubled = features(np.concatenate([first.descriptors, first.descriptors]), metric)
     for a, b in ((doubled, second), (second, doubled), (doubled, doubled)):
@@ -63,7 +63,9 @@ def test_mutual_matches_are_one_to_one_even_among_twins(metric: str) -> None:
 
 
 @pytest.mark.parametrize("metric", ["l2", "hamming"])
-def test_mutual_matching_without_ratio_does_not_depend_on_the_order_of_pictures(metric: str) -> None:
+def test_mutual_matching_without_ratio_does_not_depend_on_the_order_of_pictures(
+    metric: Literal["l2", "hamming"],
+) -> None:
     first, second = draw(metric, 5)
     there = {(a, b) for a, b in match_features(first, second, ratio=1.0).tolist()}
     back = {(a, b) for b, a in match_features(second, first, ratio=1.0).tolist()}
@@ -73,7 +75,7 @@ def test_mutual_matching_without_ratio_does_not_depend_on_the_order_of_pictures(
 
 @pytest.mark.parametrize("metric", ["l2", "hamming"])
 @pytest.mark.parametrize("counts", [(0, 5), (5, 0), (5, 1)])
-def test_too_few_key_points_match_nothing(metric: str, counts: tuple[int, int]) -> None:
+def test_too_few_key_points_match_nothing(metric: Literal["l2", "hamming"], counts: tuple[int, int]) -> None:
     first, second = draw(metric, 6)
     a, b = (features(f.descriptors[:n], metric) for f, n in zip((first, second), counts, strict=True))
     assert match_features(a, b).shape == (0, 2)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -121,7 +121,7 @@ def test_looks_of_a_picture_depend_on_this_picture_alone(walk: PathCapture, look
 
 
 @pytest.mark.parametrize(("metric", "size"), [("l2", 128), ("hamming", 32), ("l2", 61), ("hamming", 64)])
-def test_common_key_points_make_pictures_alike(metric: str, size: int) -> None:
+def test_common_key_points_make_pictures_alike(metric: Literal["l2", "hamming"], size: int) -> None:
     rng = np.random.default_rng(3)
 
     def draw(count: int) -> NDArray[Any]:
@@ -138,7 +138,7 @@ def test_common_key_points_make_pictures_alike(metric: str, size: int) -> None:
 
 
 @pytest.mark.parametrize(("metric", "dtype"), [("l2", np.float32), ("hamming", np.uint8)])
-def test_a_picture_without_key_points_looks_like_nothing(metric: str, dtype: type[Any]) -> None:
+def test_a_picture_without_key_points_looks_like_nothing(metric: Literal["l2", "hamming"], dtype: type[Any]) -> None:
     empty = vlad_descriptor(features(np.zeros((0, 32), dtype), metric))
     empty.check()
     assert not empty.vector.any()
@@ -169,17 +169,18 @@ def test_without_loop_closure_only_the_window_counts(looks: dict[str, GlobalDesc
 
 
 def test_numbers_of_neighbours_are_checked(looks: dict[str, GlobalDescriptor]) -> None:
-    for wrong in (
+    calls: list[Callable[[], object]] = [
         lambda: position_pairs(["a"], {}, neighbours=0),
         lambda: position_pairs(["a"], {}, window=0),
         lambda: retrieval_pairs(list(looks), looks, neighbours=0),
-    ):
+    ]
+    for wrong in calls:
         with pytest.raises(UsageError, match="at least 1"):
             wrong()
 
 
 @pytest.mark.parametrize("metric", ["l2", "hamming"])
-def test_a_glance_tells_strangers_from_neighbours(metric: str) -> None:
+def test_a_glance_tells_strangers_from_neighbours(metric: Literal["l2", "hamming"]) -> None:
     rng = np.random.default_rng(4)
 
     def draw(count: int) -> NDArray[Any]:

@@ -135,8 +135,9 @@ def test_bad_settings_are_refused(
     white: tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_], RangeMap],
 ) -> None:
     image, *_, found = white
-    harm: dict[str, Any]
-    for harm in ({"contrast": 0.0}, {"min_share": 1.5}, {"max_relative_error": 0.0}, {"min_area_deg2": -1.0}):
+    harms = {"contrast": 0.0, "min_share": 1.5, "max_relative_error": 0.0, "min_area_deg2": -1.0}
+    for name, value in harms.items():
+        harm: dict[str, Any] = {name: value}
         with pytest.raises(UsageError, match="must be positive"):
             lay_planes(found, image, rng=rng(), **harm)
     with pytest.raises(UsageError, match="guide must be"):

@@ -164,7 +164,7 @@ def edges_one_by_one(
                     sides = (a, b), (b, c), (a, c)
                     if all(side in left for side in sides):
                         loop = left[b, c].rotation @ left[a, b].rotation
-                        bad = np.rad2deg(geodesic_angle(loop, left[a, c].rotation)) >= max_loop_deg
+                        bad = bool(np.rad2deg(geodesic_angle(loop, left[a, c].rotation)) >= max_loop_deg)
                         for side in sides:
                             share.setdefault(side, []).append(bad)
         worst = max(

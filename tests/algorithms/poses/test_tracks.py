@@ -43,7 +43,7 @@ def any_features(count: int) -> Features:
 
 
 def as_sets(tracks: Tracks) -> list[set[tuple[str, int]]]:
-    found = [set() for _ in range(tracks.count)]
+    found: list[set[tuple[str, int]]] = [set() for _ in range(tracks.count)]
     for track, image, keypoint in zip(tracks.track_idx, tracks.image_idx, tracks.keypoint_idx, strict=True):
         found[track].add((tracks.names[image], int(keypoint)))
     return found
@@ -128,7 +128,7 @@ def test_triangulation_drops_the_wrong_observation_and_keeps_the_point() -> None
 
 def many_tracks(
     rng: np.random.Generator, count: int = 400
-) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int32]]:
     """Observations of tracks of 1 to 6 views with noise, wrong rays, far points and cameras in one place."""
     sizes = rng.integers(1, 7, count)
     point_idx = np.repeat(np.arange(count), sizes).astype(np.int32)
@@ -138,7 +138,8 @@ def many_tracks(
     rays = points[point_idx] - centers
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     rays += rng.normal(0, 0.002, rays.shape) + rng.normal(0, 0.3, rays.shape) * (rng.random((len(rays), 1)) < 0.15)
-    return centers, rays / np.linalg.norm(rays, axis=1, keepdims=True), point_idx
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    return centers, rays, point_idx
 
 
 @pytest.mark.kernel("poses.adjustment.kernels_points")
@@ -148,7 +149,7 @@ def test_triangulation_is_that_of_numpy(shuffled: bool) -> None:
     given = many_tracks(rng)
     if shuffled:
         order = rng.permutation(len(given[0]))
-        given = tuple(column[order] for column in given)
+        given = given[0][order], given[1][order], given[2][order]
     limits: dict[str, Any] = {"count": 400, "max_error_rad": 0.01, "min_angle_rad": 0.02}
     found, expected = triangulate_observations(*given, **limits), triangulate_numpy(*given, **limits)
     assert 150 < expected.valid.sum() < 350

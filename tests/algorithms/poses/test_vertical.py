@@ -34,10 +34,11 @@ def angle_deg(first: ArrayLike, second: ArrayLike) -> float:
 def with_points(poses: list[Rigid3], points: ArrayLike) -> Poses:
     named = {f"{number}.jpg": pose for number, pose in enumerate(poses)}
     bare = Poses.without_points(named, frame="", scale="", metric=False)
-    count = len(points)
+    xyz = np.asarray(points, np.float64)
+    count = len(xyz)
     return replace(
         bare,
-        points_in_world=np.asarray(points, np.float64),
+        points_in_world=xyz,
         point_colors_rgb=np.zeros((count, 3), np.uint8),
         point_errors_rad=np.full(count, 0.001, np.float32),
     )

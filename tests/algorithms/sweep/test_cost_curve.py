@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.sweep import numba_backend
 from pano_mvs.algorithms.sweep.cost_curve import cost_curve
 from pano_mvs.algorithms.sweep.costs import SWEEP_COSTS, CostWindow, register_sweep_cost
+from pano_mvs.algorithms.sweep.kernels_band import sweep_band
 from pano_mvs.algorithms.sweep.numpy_backend import _aggregate, _source_cost, find_winners
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_input, sweep_range
@@ -70,7 +71,7 @@ def test_paths_end_in_the_pixel_with_the_sums_of_the_volume() -> None:
     stored = np.empty((24, 9, 48), np.uint8)
     prepared = numba_backend._band_arguments(work)
     state, planes = numba_backend._fresh_state(24, 48)
-    numba_backend.sweep_band(0, *prepared, stored, state, planes)
+    sweep_band(0, *prepared, stored, state, planes)
     total = _aggregate(stored.astype(np.int64), work)
     for row in (0, 12, 23):
         for column in (3, 19, 35):

@@ -31,7 +31,7 @@ def _picture(seed: int, shape: tuple[int, ...]) -> np.ndarray:
 
 def _warped(
     source: NDArray[np.uint8],
-    translation: NDArray[np.float64],
+    translation: tuple[float, float, float],
     size_hw: tuple[int, int],
     *,
     vector: bool,
@@ -40,7 +40,7 @@ def _warped(
     first: int = 0,
     rows: int | None = None,
     against: NDArray[Any] | None = None,
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+) -> NDArray[Any]:
     height, width = size_hw
     rows = rows or height
     azimuth = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)

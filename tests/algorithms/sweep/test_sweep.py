@@ -224,7 +224,7 @@ def test_another_exposure_does_not_ruin_differences() -> None:
 @pytest.mark.parametrize("settings", [SweepSettings(planes=3, window=15, support=15), FAST, PAPER])
 def test_small_pictures_and_large_windows_work(size_hw: tuple[int, int], settings: SweepSettings) -> None:
     rng = np.random.default_rng(0)
-    pictures = rng.integers(0, 256, (2, *size_hw, 3), dtype=np.uint8)
+    pictures = list(rng.integers(0, 256, (2, *size_hw, 3), dtype=np.uint8))
     result = _sweep(pictures, [Rigid3(np.eye(3), np.array([0.3, 0.1, 0]))], settings.replace(no_match="keep"))
     result.check()
     assert np.isfinite(result.range).all()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -10,7 +12,7 @@ from pano_mvs.algorithms.two_view import estimate_two_view, verify_pair
 from pano_mvs.algorithms.two_view.cheirality import facing_costs, facing_pose
 from pano_mvs.algorithms.two_view.essential import sampson_angles
 from pano_mvs.algorithms.two_view.five_point import essentials_from_five
-from pano_mvs.algorithms.two_view.hypotheses import SOLVERS, draw_samples, samples_needed
+from pano_mvs.algorithms.two_view.hypotheses import SOLVERS, Solver, draw_samples, samples_needed
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, ranges_from_bearings, skew
 from tests.algorithms.poses.synthetic_capture import (
@@ -213,5 +215,6 @@ def test_smaller_samples_are_needed_fewer_times() -> None:
 
 def test_an_unknown_solver_is_named() -> None:
     p, q, _, _ = draw(rng_of("unknown"), (0.5, 0, 0), (0, 0, 0))
+    unknown: Any = "six"
     with pytest.raises(UsageError, match=r"no solver 'six'; choose one of five_point, eight_point"):
         estimate_two_view(p, q, rng=rng_of("unknown"), threshold_rad=0.01, solver=unknown)
