@@ -59,12 +59,14 @@ def exported(
         made = nerfstudio_frames(images[name], everywhere, params, Context(np.random.default_rng(0), scratch))
         ref = store.put_value(made)
         publisher.publish("frames", name, ref)
-        frames[name] = store.load(ref, NerfstudioFrames)
+        read = store.load(ref, NerfstudioFrames)
+        assert isinstance(read, NerfstudioFrames)
+        frames[name] = read
     scratch = folder / "scratch"
     scratch.mkdir()
     poses = capture.whole(Poses)
-    params = NerfstudioParams(seed_points=seed_points)
-    files = nerfstudio(frames, poses, cloud, params, Context(np.random.default_rng(0), scratch))
+    seeds = NerfstudioParams(seed_points=seed_points)
+    files = nerfstudio(frames, poses, cloud, seeds, Context(np.random.default_rng(0), scratch))
     publisher.publish("nerfstudio", "", store.put_value(files))
     return folder / "out" / "nerfstudio"
 
@@ -165,7 +167,7 @@ def test_seed_points_are_in_the_world_of_the_cameras(plain: Path) -> None:
         seed = read_ply(plain / variant / document["ply_file_path"])
         assert 85 <= len(seed) <= 100
         sparse = tiny_capture(PLAIN).points_in_world
-        assert cKDTree(sparse).query(seed.points_in_world)[0].max() < 1e-5
+        assert np.max(cKDTree(sparse).query(seed.points_in_world)[0]) < 1e-5
 
 
 def test_a_picture_is_delivered_as_it_is_and_not_kept_twice(plain: Path) -> None:

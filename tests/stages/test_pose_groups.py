@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pycolmap
@@ -19,10 +19,11 @@ from pano_mvs.engine.stages.ports import Names
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec
 from pano_mvs.io.clouds.ply import read_ply
 from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, NerfstudioFrames
-from pano_mvs.scene import Files, Panorama, PointCloud, Pose, Poses, RangeMap, TrackedPoints
+from pano_mvs.scene import Files, Panorama, PointCloud, Pose, Poses, RangeMap
 from pano_mvs.scene.face_files import FaceFiles
 from pano_mvs.scene.pose_groups import join_groups, split_groups, with_cameras
 from pano_mvs.scene.surface_samples import SurfaceSamples
+from pano_mvs.scene.tracked_points import TrackedPoints
 from pano_mvs.stages.depth import SweepParams, sweep
 from pano_mvs.stages.evaluate import TruthParams, truth
 from pano_mvs.stages.exports.colmap import (
@@ -52,12 +53,14 @@ _ORDER = ("b0.png", "000.png", "001.png", "b1.png", "003.png")
 _MOVED = Similarity3(0.5, rotation_from_rotvec([0.1, 1.0, -0.2]), np.array([3.0, 1.0, -2.0]))
 
 
+Item = TypeVar("Item")
+
+
 class Rooms:
     """The values that stages take, of both rooms."""
 
     def __init__(self, tiny: TinyCapture) -> None:
         whole = tiny.whole(Poses)
-        assert isinstance(whole, Poses)
         large, small = (_with(whole, names) for names in (_LARGE, tuple(_SMALL.values())))
         small = replace(moved_poses(small, _MOVED), names=tuple(_SMALL), frame="the small room's", scale="its own")
         self.poses = join_groups([small, large], order=_ORDER)
@@ -73,7 +76,7 @@ class Rooms:
         self.pose_items: Mapping[str, Pose] = self.poses.explode()
 
     @staticmethod
-    def _of(items: Mapping[str, object]) -> dict:
+    def _of(items: Mapping[str, Item]) -> dict[str, Item]:
         return {name: items[_SMALL.get(name, name)] for name in _ORDER}
 
 
@@ -111,7 +114,9 @@ def test_each_image_knows_its_group(rooms: Rooms) -> None:
     }
     pose = rooms.pose_items["b1.png"]
     assert Pose.from_parts(pose.to_parts()).group == 1
-    assert "group" not in rooms.pose_items["000.png"].to_parts()["meta"]  # as it is stored where there is one group
+    meta = rooms.pose_items["000.png"].to_parts()["meta"]
+    assert isinstance(meta, dict)
+    assert "group" not in meta  # as it is stored where there is one group
 
 
 def test_nothing_of_one_room_enters_the_cloud_of_the_other(rooms: Rooms) -> None:
@@ -310,7 +315,7 @@ def _scaled(rooms: Rooms, ctx: Context, **settings: Any) -> Poses:
 
 
 def test_a_baseline_scales_the_room_that_holds_both_images(rooms: Rooms, ctx: Context) -> None:
-    baseline = BaselineParams(from_image="b0.png", to_image="b1.png", metres=7)
+    baseline = BaselineParams.model_validate({"from": "b0.png", "to": "b1.png", "metres": 7})
     poses = _scaled(rooms, ctx, baseline=baseline)
     assert [world.metric for world in poses.worlds] == [False, True]
     assert _metres(poses, "b0.png", "b1.png") == pytest.approx(7)
@@ -323,7 +328,7 @@ def test_a_baseline_scales_the_room_that_holds_both_images(rooms: Rooms, ctx: Co
 
 
 def test_a_baseline_across_rooms_is_refused(rooms: Rooms, ctx: Context) -> None:
-    baseline = BaselineParams(from_image="000.png", to_image="b1.png", metres=7)
+    baseline = BaselineParams.model_validate({"from": "000.png", "to": "b1.png", "metres": 7})
     with pytest.raises(InputError, match=r"000\.png and b1\.png are in groups 0 and 1 .* Name two images of one group"):
         _scaled(rooms, ctx, baseline=baseline)
 
@@ -364,7 +369,7 @@ def test_a_camera_height_scales_every_room_with_a_floor(rooms: Rooms, ctx: Conte
     ],
 )
 def test_sources_of_another_room_are_refused(
-    function: Callable[..., Any], extras: dict, rooms: Rooms, ctx: Context
+    function: Callable[..., Any], extras: dict[str, Any], rooms: Rooms, ctx: Context
 ) -> None:
     """A view selector of somebody's own may not know of groups."""
     poses = {"pose": rooms.pose_items["000.png"], "source_poses": [rooms.pose_items["b0.png"]]}

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.api import Features, GateError, Panorama, Poses, TwoView
 from pano_mvs.engine.stages.context import Context
@@ -93,9 +94,14 @@ def test_the_solver_opens_pictures_only_where_it_may(
     tiny: TinyCapture, ctx: Context, monkeypatch: pytest.MonkeyPatch, ask_images: bool
 ) -> None:
     """Nothing is ambiguous in the room, so the poses are the same either way."""
-    opened = []
+    opened: list[Panorama] = []
     load = Panorama.load
-    monkeypatch.setattr(Panorama, "load", lambda image: opened.append(image) or load(image))
+
+    def noted(image: Panorama) -> NDArray[np.uint8]:
+        opened.append(image)
+        return load(image)
+
+    monkeypatch.setattr(Panorama, "load", noted)
     poses = scaled_translation(
         features=tiny.each(Features),
         matches=tiny.each(TwoView),

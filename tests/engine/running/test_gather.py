@@ -65,7 +65,11 @@ def test_a_failure_comes_out_of_the_access() -> None:
 
 
 def test_as_many_are_kept_as_are_asked_for(loaded: list[int]) -> None:
-    gather = Gather({idx: idx for idx in range(5)}, lambda ref: loaded.append(ref) or [ref], kept=2)
+    def load(ref: int) -> list[int]:
+        loaded.append(ref)
+        return [ref]
+
+    gather = Gather({idx: idx for idx in range(5)}, load, kept=2)
     for key in (0, 1, 0, 2, 0, 1):
         gather[key]
     assert loaded == [0, 1, 2, 1]
