@@ -181,7 +181,7 @@ def test_picture_without_its_mask_is_noted(pano_mvs: Command, short: Path, captu
 @pytest.mark.skipif(os.name != "posix", reason="names of any bytes exist on POSIX systems only")
 def test_names_that_cannot_be_written_or_look_like_markup(pano_mvs: Command, short: Path, capture: Path) -> None:
     images = capture / "images"
-    shutil.copy(images / "000.png", os.fsencode(images) + b"/gr\xf6sse.png")
+    shutil.copy(os.fsencode(images / "000.png"), os.fsencode(images) + b"/gr\xf6sse.png")
     (images / "a[").mkdir()
     (images / "a[" / "b].jpg").write_bytes(b"broken")
     result = pano_mvs("run", short, "--out", "out")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,10 +37,10 @@ def call(*arguments: object) -> Outcome:
     return Outcome(result.exit_code, result.output)
 
 
-def inspected(*arguments: object) -> dict:
+def inspected(*arguments: object) -> dict[str, Any]:
     found = call("inspect", *arguments, "--json")
     assert found.code == 0, found.text
-    result: dict = json.loads(found.text)
+    result: dict[str, Any] = json.loads(found.text)
     return result
 
 

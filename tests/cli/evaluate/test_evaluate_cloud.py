@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 
 from pano_mvs.algorithms.metrics.surface import TrueView, view_points
 from pano_mvs.cli.evaluate_cloud import CloudRequest, judge_cloud
@@ -23,9 +23,9 @@ from tests.cli.evaluate.test_evaluate_poses import write_json
 from tests.stored import read_picture
 
 
-def save(path: Path, points: np.ndarray, normal: Sequence[float] = (0, -1, 0)) -> Path:
+def save(path: Path, points: np.ndarray, normal: ArrayLike = (0, -1, 0)) -> Path:
     count = len(points)
-    up = np.tile(np.float32(normal), (count, 1))
+    up = np.tile(np.array(normal, np.float32), (count, 1))
     grey = np.full((count, 3), 99, np.uint8)
     write_ply(path, PointCloud(points.astype(np.float32), up, grey, np.ones(count, np.uint8)))
     return path

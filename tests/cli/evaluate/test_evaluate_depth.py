@@ -6,6 +6,7 @@ import csv
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,7 +20,7 @@ from pano_mvs.io.colmap.model import write_colmap_model
 from pano_mvs.io.ranges.files import write_confidence_png, write_range_tiff
 from pano_mvs.io.truth import read_truth
 from pano_mvs.scene import PointCloud, Poses
-from tests.cli.conftest import SIZE_HW, Command
+from tests.cli.conftest import SIZE_HW, Command, Outcome
 from tests.stored import read_picture, write_npz
 
 SCALE = 2.5
@@ -51,10 +52,10 @@ def output(tmp_path: Path, truth: Path) -> Path:
     return folder
 
 
-def told(outcome: object) -> dict:
-    assert outcome.code == 0, outcome.text  # type: ignore[attr-defined]
-    result: dict = json.loads(outcome.text)
-    return result  # type: ignore[attr-defined]
+def told(outcome: Outcome) -> dict[str, Any]:
+    assert outcome.code == 0, outcome.text
+    scores: dict[str, Any] = json.loads(outcome.text)
+    return scores
 
 
 def test_scores_are_those_of_the_library_with_the_scale_of_the_cameras(
