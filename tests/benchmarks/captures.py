@@ -38,10 +38,13 @@ class Capture:
     def first(self, count: int) -> Capture:
         """Return the first few views only."""
         names = list(self.panoramas)[:count]
-        panoramas, poses, ranges = (
-            {name: part[name] for name in names} for part in (self.panoramas, self.poses, self.ranges)
+        return Capture(
+            self.name,
+            {name: self.panoramas[name] for name in names},
+            {name: self.poses[name] for name in names},
+            {name: self.ranges[name] for name in names},
+            self.outdoor,
         )
-        return Capture(self.name, panoramas, poses, ranges, self.outdoor)
 
 
 def read_capture(folder: Path, *, width: int | None = None) -> Capture:

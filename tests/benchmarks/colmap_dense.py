@@ -81,7 +81,7 @@ def deliver(files: Files, out: Path, item: str) -> None:
 def fused_points(workspace: Path, *, min_num_pixels: int = 3, masks: bool = False) -> FloatArray:
     """Return the points, (N, 3), that COLMAP's fusion makes of a workspace."""
     pycolmap.logging.minloglevel = 2
-    options = {"num_threads": 1, "min_num_pixels": min_num_pixels}
+    options: dict[str, Any] = {"num_threads": 1, "min_num_pixels": min_num_pixels}
     if masks:
         options["mask_path"] = str(workspace / "masks")
     target = workspace / "fused.ply"

@@ -35,7 +35,7 @@ def _split(
     index: NDArray[np.int32],
     weight_x: NDArray[np.int32],
     weight_y: NDArray[np.int32],
-) -> None:  # type: ignore[no-untyped-def]
+) -> None:
     for i in range(_U(index.shape[0])):
         column, row = np.int32(x[i]), np.int32(y[i])
         index[i] = np.int32(row * np.int32(stride) + column)
@@ -56,7 +56,7 @@ def _sample(
     weight_x: NDArray[np.int32],
     weight_y: NDArray[np.int32],
     out: NDArray[Any],
-) -> None:  # type: ignore[no-untyped-def]
+) -> None:
     if convert:
         _split(x, y, stride, index, weight_x, weight_y)
     for i in range(0, index.shape[0], PIXELS):

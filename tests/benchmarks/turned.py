@@ -25,7 +25,10 @@ _RAYS_PER_PIXEL = 3
 class Place(Protocol):
     """Where pictures come from, whichever way the cameras are turned."""
 
-    capture: Capture
+    @property
+    def capture(self) -> Capture:
+        """The capture as it is."""
+        ...
 
     def turned(self, turns: Turns, folder: Path) -> Capture:
         """Return the capture with some cameras, by name, turned by new_from_old (3, 3); pictures go to the folder."""
