@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import cv2
 import numpy as np
@@ -19,7 +19,7 @@ def read_picture(path: Path | str, flags: int = cv2.IMREAD_COLOR) -> NDArray[Any
     return picture
 
 
-def write_npz(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+def write_npz(path: Path | IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write arrays under names that need not be identifiers."""
     named: dict[str, Any] = dict(arrays)
     np.savez(path, **named)

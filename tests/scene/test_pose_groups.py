@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -64,9 +65,10 @@ def test_split_gives_back_what_was_joined() -> None:
 def test_groups_survive_the_form_in_which_they_are_stored() -> None:
     joined = _joined()
     _assert_same(Poses.from_parts(joined.to_parts()), joined)
-    meta = dict(joined.to_parts()["meta"])  # type: ignore[arg-type]  # the part is a JSON object
-    meta["other_worlds"] = [list(world) for world in joined.other_worlds]
-    _assert_same(Poses.from_parts({**joined.to_parts(), "meta": meta}), joined)
+    meta = joined.to_parts()["meta"]
+    assert isinstance(meta, dict)
+    as_read = meta | {"other_worlds": [list(world) for world in joined.other_worlds]}
+    _assert_same(Poses.from_parts({**joined.to_parts(), "meta": as_read}), joined)
 
 
 def test_what_only_one_group_knows_is_unknown_of_the_other() -> None:
@@ -132,9 +134,9 @@ def test_groups_that_cannot_be_joined_are_refused() -> None:
         ({"group_idx": np.array([1, 0, 0, 0, 1], np.int32)}, "seen from two groups"),
     ],
 )
-def test_groups_that_do_not_fit_break_the_contract(changes: dict[str, object], message: str) -> None:
+def test_groups_that_do_not_fit_break_the_contract(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ContractError, match=message):
-        replace(_joined(), **changes).check()  # type: ignore[arg-type]  # one field of each kind
+        replace(_joined(), **changes).check()
 
 
 def test_points_that_a_single_camera_is_left_of_go_with_the_others() -> None:

@@ -140,7 +140,7 @@ def test_the_mouse_of_the_window_steps_in_looks_around_and_steps_out(
     before = tour.state.viewpoint.axes[2]
     at(100, 590, "LeftButtonPressEvent")
     at(220, 590, "MouseMoveEvent", "LeftButtonReleaseEvent")
-    assert [tour.state.inside] == [nearest]
+    assert tour.state.inside == nearest
     after, up = tour.state.viewpoint.axes[2], tour.scene.up
     level = [along - up * (along @ up) for along in (before, after)]
     turned = np.rad2deg(np.arctan2(np.cross(*level) @ up, level[0] @ level[1]))
@@ -149,7 +149,7 @@ def test_the_mouse_of_the_window_steps_in_looks_around_and_steps_out(
     at(220, 590, "MouseWheelForwardEvent")
     assert tour.state.viewpoint.angle_deg < angle
     at(220, 590, "RightButtonPressEvent", "RightButtonReleaseEvent")
-    assert tour.state.inside is None
+    assert window.tour.state.inside is None
     np.testing.assert_allclose(window.plotter.camera.position, start.eye, atol=1e-5)
     at(100, 300, "LeftButtonPressEvent")
     at(160, 300, "MouseMoveEvent", "LeftButtonReleaseEvent")  # the trackball turns the scene
