@@ -21,12 +21,14 @@ from pano_mvs.scene.face_files import FaceLayout
 from pano_mvs.testing.room import capture_poses, default_room, range_along, render
 from tests.oracles.faces import z_depth as slow_z_depth
 
+View = tuple[NDArray[np.uint8], NDArray[np.float32], Rigid3]
+
 SIZE = (128, 256)
 LAYOUTS = ("cube", "octagon", "icosahedron")
 
 
 @pytest.fixture(scope="module")
-def panorama() -> tuple[NDArray[np.uint8], NDArray[np.float32], Rigid3]:
+def panorama() -> View:
     """Picture, true ranges and pose of a tilted camera in the room."""
     pose = capture_poses(2, seed=3)[1]
     return *render(default_room(), pose, SIZE), pose
@@ -124,7 +126,7 @@ def test_a_coarse_face_averages_and_does_not_alias() -> None:
     assert np.abs(middle - 127.5).max() < 40
 
 
-def test_colors_roll_with_the_panorama(panorama: tuple[NDArray[np.uint8], NDArray[np.float32], Rigid3]) -> None:
+def test_colors_roll_with_the_panorama(panorama: View) -> None:
     rolled, turn = roll_panorama(panorama[0], 37)
     for face in panorama_faces(SIZE):
         turned = replace(face.view, view_from_cam=face.view.view_from_cam @ turn.T)
@@ -132,9 +134,7 @@ def test_colors_roll_with_the_panorama(panorama: tuple[NDArray[np.uint8], NDArra
         assert np.percentile(difference, 99) <= 2, face.name
 
 
-def test_z_depths_are_the_true_ones_between_steps(
-    panorama: tuple[NDArray[np.uint8], NDArray[np.float32], Rigid3],
-) -> None:
+def test_z_depths_are_the_true_ones_between_steps(panorama: View) -> None:
     _, ranges, pose = panorama
     errors = []
     for face in panorama_faces(SIZE, size_px=64):
@@ -147,9 +147,7 @@ def test_z_depths_are_the_true_ones_between_steps(
 
 @pytest.mark.kernel("faces.kernels_faces")
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_the_compiled_loop_is_the_plain_one(
-    panorama: tuple[NDArray[np.uint8], NDArray[np.float32], Rigid3], layout: FaceLayout
-) -> None:
+def test_the_compiled_loop_is_the_plain_one(panorama: View, layout: FaceLayout) -> None:
     ranges = panorama[1].copy()
     ranges[np.random.default_rng(2).random(SIZE) < 0.02] = np.nan
     turn = rotation_from_rotvec((0.11, 0.23, 0.05))  # so that no ray lies exactly between two pixels
@@ -211,7 +209,7 @@ def test_nothing_masked_is_seen(center: tuple[int, float, int], size_px: int) ->
     assert face_confidence(confidence, face.view).shape == face.view.size_hw
 
 
-def test_doubtful_ranges_have_no_depth(panorama: tuple[NDArray[np.uint8], NDArray[np.float32], Rigid3]) -> None:
+def test_doubtful_ranges_have_no_depth(panorama: View) -> None:
     image, ranges, _ = panorama
     confidence = np.full(SIZE, 200, np.uint8)
     confidence[:, :100] = 40
@@ -221,9 +219,7 @@ def test_doubtful_ranges_have_no_depth(panorama: tuple[NDArray[np.uint8], NDArra
     assert (rendered.confidence == 0).mean() > 0.3
 
 
-def test_normals_are_given_or_fitted_and_face_the_camera(
-    panorama: tuple[NDArray[np.uint8], NDArray[np.float32], Rigid3],
-) -> None:
+def test_normals_are_given_or_fitted_and_face_the_camera(panorama: View) -> None:
     image, ranges, _ = panorama
     valid, view = np.ones(SIZE, np.bool_), panorama_faces(SIZE)[0].view
     confidence = np.full(SIZE, 200, np.uint8)
@@ -235,7 +231,7 @@ def test_normals_are_given_or_fitted_and_face_the_camera(
     assert given.normals_in_face == pytest.approx(np.broadcast_to(turned[0, 0], (*view.size_hw, 3)), abs=1e-3)
 
 
-def test_arrays_that_do_not_fit_are_named(panorama: tuple[NDArray[np.uint8], NDArray[np.float32], Rigid3]) -> None:
+def test_arrays_that_do_not_fit_are_named(panorama: View) -> None:
     image, ranges, _ = panorama
     view = panorama_faces(SIZE)[0].view
     with pytest.raises(UsageError, match="differ in size"):

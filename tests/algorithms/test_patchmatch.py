@@ -26,6 +26,8 @@ from pano_mvs.testing.texture import noise as solid_noise
 from tests.known import known
 from tests.oracles import patchmatch as oracle
 
+Views = tuple[list[NDArray[np.uint8]], list[NDArray[np.float32]], list[Rigid3]]
+
 SIZE = (160, 320)
 FLOOR_Y = 1.3
 LUMA = np.array([0.2126, 0.7152, 0.0722])
@@ -33,7 +35,7 @@ SETTINGS = (0.2, 40.0, 900.0, 10.0, 0.05)
 
 
 @pytest.fixture(scope="module")
-def views() -> tuple[list[NDArray[np.uint8]], list[NDArray[np.float32]], list[Rigid3]]:
+def views() -> Views:
     """Pictures, true ranges and poses of three cameras in the room."""
     poses = capture_poses(3, seed=1, spread=0.4)
     pictures, truth = zip(*(render(default_room(), pose, SIZE) for pose in poses), strict=True)
@@ -41,7 +43,7 @@ def views() -> tuple[list[NDArray[np.uint8]], list[NDArray[np.float32]], list[Ri
 
 
 @pytest.fixture(scope="module")
-def swept(views: tuple[list[NDArray[np.uint8]], list[NDArray[np.float32]], list[Rigid3]]) -> RangeMap:
+def swept(views: Views) -> RangeMap:
     pictures, _, poses = views
     relative = [pose @ poses[0].inverse() for pose in poses[1:]]
     return sweep_range(pictures[0], pictures[1:], relative, near=0.6, far=6, settings=SweepSettings(planes=48))
@@ -58,7 +60,7 @@ def refined(
 
 
 @pytest.fixture(scope="module")
-def result(views: tuple[list[NDArray[np.uint8]], list[NDArray[np.float32]], list[Rigid3]], swept: RangeMap) -> RangeMap:
+def result(views: Views, swept: RangeMap) -> RangeMap:
     return refined(views, swept)
 
 
@@ -150,9 +152,7 @@ def oracle_votes(
     return bool(pad_panorama(mask, 1)[top : top + 2, left : left + 2].all())
 
 
-def test_a_slanted_floor_comes_out_straight_with_its_normal(
-    views: tuple[list[NDArray[np.uint8]], list[NDArray[np.float32]], list[Rigid3]], swept: RangeMap, result: RangeMap
-) -> None:
+def test_a_slanted_floor_comes_out_straight_with_its_normal(views: Views, swept: RangeMap, result: RangeMap) -> None:
     _, truth, poses = views
     floor = floor_of(truth[0], poses[0]) & swept.valid
     assert floor.mean() > 0.1
@@ -165,9 +165,7 @@ def test_a_slanted_floor_comes_out_straight_with_its_normal(
     result.check()
 
 
-def test_everything_else_gets_better_too(
-    views: tuple[list[NDArray[np.uint8]], list[NDArray[np.float32]], list[Rigid3]], swept: RangeMap, result: RangeMap
-) -> None:
+def test_everything_else_gets_better_too(views: Views, swept: RangeMap, result: RangeMap) -> None:
     _, truth, _ = views
     before, after = (np.abs(m.range - truth[0]) / truth[0] for m in (swept, result))
     assert np.median(after) < 0.5 * np.median(before)
@@ -176,16 +174,14 @@ def test_everything_else_gets_better_too(
     np.testing.assert_array_equal(result.confidence, swept.confidence)
 
 
-def test_true_ranges_stay(views: tuple[list[NDArray[np.uint8]], list[NDArray[np.float32]], list[Rigid3]]) -> None:
+def test_true_ranges_stay(views: Views) -> None:
     _, truth, _ = views
     true_map = RangeMap(truth[0], np.full(SIZE, 100, np.uint8))
     after = refined(views, true_map)
     assert np.median(np.abs(after.range - truth[0]) / truth[0]) < 4e-3
 
 
-def test_exposure_changes_little(
-    views: tuple[list[NDArray[np.uint8]], list[NDArray[np.float32]], list[Rigid3]], swept: RangeMap, result: RangeMap
-) -> None:
+def test_exposure_changes_little(views: Views, swept: RangeMap, result: RangeMap) -> None:
     pictures, truth, poses = views
     darker = [pictures[0], *(np.rint(0.8 * p + 10).astype(np.uint8) for p in pictures[1:])]
     other = refined((darker, truth, poses), swept)
@@ -194,7 +190,7 @@ def test_exposure_changes_little(
 
 @pytest.mark.parametrize("columns", [1, 77, 160])
 def test_rolling_all_pictures_rolls_the_result(
-    views: tuple[list[NDArray[np.uint8]], list[NDArray[np.float32]], list[Rigid3]],
+    views: Views,
     swept: RangeMap,
     result: RangeMap,
     columns: int,
@@ -208,9 +204,7 @@ def test_rolling_all_pictures_rolls_the_result(
     assert np.nanquantile(difference, 0.999) < 1e-3
 
 
-def test_any_number_of_threads_gives_the_same_bytes(
-    views: tuple[list[NDArray[np.uint8]], list[NDArray[np.float32]], list[Rigid3]], swept: RangeMap, result: RangeMap
-) -> None:
+def test_any_number_of_threads_gives_the_same_bytes(views: Views, swept: RangeMap, result: RangeMap) -> None:
     numba = pytest.importorskip("numba")
     before = numba.get_num_threads()
     numba.set_num_threads(1)
@@ -222,9 +216,7 @@ def test_any_number_of_threads_gives_the_same_bytes(
     assert known(other.normals_in_cam).tobytes() == known(result.normals_in_cam).tobytes()
 
 
-def test_filled_and_invalid_pixels_stay_as_they_are(
-    views: tuple[list[NDArray[np.uint8]], list[NDArray[np.float32]], list[Rigid3]], swept: RangeMap, result: RangeMap
-) -> None:
+def test_filled_and_invalid_pixels_stay_as_they_are(views: Views, swept: RangeMap, result: RangeMap) -> None:
     ranges, confidence = swept.range.copy(), swept.confidence.copy()
     ranges[40:60, 300:] = np.nan
     confidence[40:60, 300:] = 0
@@ -238,9 +230,7 @@ def test_filled_and_invalid_pixels_stay_as_they_are(
     np.testing.assert_array_equal(after.range[70:90, 100:200], result.range[70:90, 100:200])
 
 
-def test_masked_sources_have_no_vote(
-    views: tuple[list[NDArray[np.uint8]], list[NDArray[np.float32]], list[Rigid3]], swept: RangeMap
-) -> None:
+def test_masked_sources_have_no_vote(views: Views, swept: RangeMap) -> None:
     """A source that shows something else does no harm behind its mask, and does without."""
     pictures, truth, poses = views
     spoilt = pictures[1].copy()
@@ -255,9 +245,7 @@ def test_masked_sources_have_no_vote(
     assert np.mean(np.abs(one.range / plain.range - 1) > 1e-4) > 0.1
 
 
-def test_no_rounds_only_lay_planes_and_no_source_in_sight_changes_little(
-    views: tuple[list[NDArray[np.uint8]], list[NDArray[np.float32]], list[Rigid3]], swept: RangeMap
-) -> None:
+def test_no_rounds_only_lay_planes_and_no_source_in_sight_changes_little(views: Views, swept: RangeMap) -> None:
     planes = refined(views, swept, rounds=0)
     blind = refined(views, swept, rounds=1, source_masks=[np.zeros(SIZE, np.bool_)] * 2)
     assert np.nanmedian(np.abs(planes.range / blind.range - 1)) < 2e-3
@@ -274,7 +262,7 @@ def test_no_rounds_only_lay_planes_and_no_source_in_sight_changes_little(
     ],
 )
 def test_impossible_settings_are_named(
-    views: tuple[list[NDArray[np.uint8]], list[NDArray[np.float32]], list[Rigid3]],
+    views: Views,
     swept: RangeMap,
     change: dict[str, Any],
     said: str,
@@ -283,9 +271,7 @@ def test_impossible_settings_are_named(
         refined(views, swept, **change)
 
 
-def test_impossible_pictures_are_named(
-    views: tuple[list[NDArray[np.uint8]], list[NDArray[np.float32]], list[Rigid3]], swept: RangeMap
-) -> None:
+def test_impossible_pictures_are_named(views: Views, swept: RangeMap) -> None:
     pictures, _, poses = views
     with pytest.raises(UsageError, match="one pose"):
         refine_range(swept, pictures[0], pictures[1:], poses[1:2])

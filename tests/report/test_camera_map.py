@@ -124,11 +124,11 @@ def test_labels_stand_beside_their_cameras_and_cover_no_other() -> None:
 @pytest.mark.parametrize(
     "centers", [[[0, 0, 0]] * 3, [[0, 0, 0], [0, 1e-12, 0], [0, 0, 0]], [[0, 0, 0], [1e6, 0, 0], [2e6, 0, 0]]]
 )
-def test_cameras_in_one_place_or_in_a_row_are_drawn_within_the_map(centers: int | Sequence[Sequence[float]]) -> None:
+def test_cameras_in_one_place_or_in_a_row_are_drawn_within_the_map(centers: Sequence[Sequence[float]]) -> None:
     for drawn in camera_maps({"registered": ["a rather long name of a picture", "b", "c"], "centers": centers}):
         assert np.all((places(drawn) > 0) & (places(drawn) < drawn.size_wh))
 
 
 @pytest.mark.parametrize("centers", [[[0, 0, 0]], [[0, 0, float("nan")]] * 3])
-def test_centres_that_do_not_fit_give_no_map(centers: int | Sequence[Sequence[int]]) -> None:
+def test_centres_that_do_not_fit_give_no_map(centers: Sequence[Sequence[float]]) -> None:
     assert camera_maps({"registered": NAMES, "centers": centers}) == ()

@@ -21,13 +21,15 @@ from tests.algorithms.range_scenes import as_map, rolled
 from tests.benchmarks.depth_metrics import depth_metrics
 from tests.oracles.bilateral import corner_weights, dense_system
 
+View = tuple[NDArray[np.uint8], NDArray[np.float32]]
+
 SIZE = (128, 256)
 
 smooth_all = partial(fast_bilateral_solver, keep_confidence=256, max_hole_deg=0)
 
 
 @pytest.fixture(scope="module")
-def view() -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+def view() -> View:
     image, ranges = render(default_room(), Rigid3.identity(), SIZE)
     return image, ranges
 
@@ -97,9 +99,7 @@ def test_the_solution_is_that_of_the_dense_system(smoothness: float, holes: floa
 
 
 @pytest.mark.parametrize("domain", ["inverse", "range"])
-def test_it_recovers_ranges_from_noise_outliers_and_holes(
-    view: tuple[NDArray[np.uint8], NDArray[np.float32]], domain: Literal["range", "inverse"]
-) -> None:
+def test_it_recovers_ranges_from_noise_outliers_and_holes(view: View, domain: Literal["range", "inverse"]) -> None:
     image, truth = view
     broken = harmed(truth)
     before = depth_metrics(np.nan_to_num(broken.range, nan=2.5), truth)
@@ -145,7 +145,7 @@ def test_a_plane_keeps_its_slant() -> None:
 
 
 @pytest.mark.parametrize("columns", [8, 64, 3, 125])
-def test_rolling_the_input_rolls_the_output(view: tuple[NDArray[np.uint8], NDArray[np.float32]], columns: int) -> None:
+def test_rolling_the_input_rolls_the_output(view: View, columns: int) -> None:
     """Cells begin somewhere, so a roll by part of a cell changes a little; a crack at the seam would be large."""
     image, truth = view
     broken = harmed(truth)
@@ -170,7 +170,7 @@ def test_no_crack_at_the_seam_and_the_poles() -> None:
         assert over.mean() < 2 * np.abs(np.diff(solved, axis=0)).mean()
 
 
-def test_holes_are_filled_and_marked_and_nothing_else_is(view: tuple[NDArray[np.uint8], NDArray[np.float32]]) -> None:
+def test_holes_are_filled_and_marked_and_nothing_else_is(view: View) -> None:
     image, truth = view
     broken = harmed(truth)
     filled = smooth_all(broken, image)
@@ -197,7 +197,7 @@ def test_no_range_anywhere_is_returned_as_it_is() -> None:
     assert smooth_all(empty, np.zeros((16, 32, 3), np.uint8)) is empty
 
 
-def test_units_do_not_matter(view: tuple[NDArray[np.uint8], NDArray[np.float32]]) -> None:
+def test_units_do_not_matter(view: View) -> None:
     image, truth = view
     broken = harmed(truth)
     thousand = RangeMap(broken.range * np.float32(1000), broken.confidence)
@@ -209,7 +209,7 @@ def test_units_do_not_matter(view: tuple[NDArray[np.uint8], NDArray[np.float32]]
         )
 
 
-def test_more_smoothness_is_smoother(view: tuple[NDArray[np.uint8], NDArray[np.float32]]) -> None:
+def test_more_smoothness_is_smoother(view: View) -> None:
     image, truth = view
     broken = harmed(truth)
     rough = [
@@ -227,9 +227,7 @@ def test_weights_follow_the_bands() -> None:
     assert weight[5] > 20 * weight[4] > 20 * 5 * weight[2]
 
 
-def test_a_map_that_nobody_checked_is_solved_as_if_all_were_sure(
-    view: tuple[NDArray[np.uint8], NDArray[np.float32]],
-) -> None:
+def test_a_map_that_nobody_checked_is_solved_as_if_all_were_sure(view: View) -> None:
     image, truth = view
     weak, sure = as_map(harmed(truth).range, 100), as_map(harmed(truth).range, 200)
     np.testing.assert_allclose(smooth_all(weak, image).range, smooth_all(sure, image).range, rtol=1e-4)
@@ -243,14 +241,12 @@ def test_a_map_that_nobody_checked_is_solved_as_if_all_were_sure(
         ({"smoothness": -1}, "smoothness"),
     ],
 )
-def test_impossible_settings_are_named(
-    view: tuple[NDArray[np.uint8], NDArray[np.float32]], settings: dict[str, Any], words: str
-) -> None:
+def test_impossible_settings_are_named(view: View, settings: dict[str, Any], words: str) -> None:
     with pytest.raises(UsageError, match=words):
         smooth_all(as_map(view[1]), view[0], **settings)
 
 
-def test_a_guide_of_another_size_is_refused(view: tuple[NDArray[np.uint8], NDArray[np.float32]]) -> None:
+def test_a_guide_of_another_size_is_refused(view: View) -> None:
     with pytest.raises(UsageError, match="guide must be"):
         smooth_all(as_map(view[1]), view[0][::2, ::2])
 

@@ -16,6 +16,8 @@ from pano_mvs.testing.room import default_room, render
 from pano_mvs.testing.scenes import white_room
 from tests.algorithms.range_scenes import TRUSTED, as_map, rolled
 
+Wall = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_], RangeMap]
+
 SIZE = (128, 256)
 HIDDEN = 90
 
@@ -25,7 +27,7 @@ def rng() -> np.random.Generator:
 
 
 @pytest.fixture(scope="module")
-def white() -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_], RangeMap]:
+def white() -> Wall:
     """A view of the white room, its ranges, and the map that chance makes of plain paint; the outline is seen."""
     image, ranges = white_room(turned=False).view(0, SIZE)
     _, bare = plain_surfaces(image, 8.0)
@@ -55,9 +57,7 @@ def test_a_plane_is_found_among_outliers() -> None:
     assert not degenerate[1].any()
 
 
-def test_the_ceiling_of_a_white_room_is_found_from_its_outline(
-    white: tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_], RangeMap],
-) -> None:
+def test_the_ceiling_of_a_white_room_is_found_from_its_outline(white: Wall) -> None:
     image, truth, bare, found = white
     laid = lay_planes(found, image, rng=rng())
     laid.check()
@@ -85,9 +85,7 @@ def test_it_does_not_matter_how_the_camera_is_turned(turn: tuple[float, float, f
     assert bad_share(laid.range, truth, ceiling) < 0.03
 
 
-def test_rolling_the_input_rolls_the_surfaces(
-    white: tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_], RangeMap],
-) -> None:
+def test_rolling_the_input_rolls_the_surfaces(white: Wall) -> None:
     image, *_, found = white
     laid = lay_planes(found, image, rng=rng())
     again = rolled(lay_planes(rolled(found, 61), np.roll(image, 61, 1), rng=rng()), -61)
@@ -119,9 +117,7 @@ def test_a_wall_is_not_carried_on_into_the_sky() -> None:
     np.testing.assert_allclose(laid.range[sky], wall[sky], rtol=1e-3)
 
 
-def test_small_holes_of_a_plane_are_filled_and_large_ones_only_when_asked(
-    white: tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_], RangeMap],
-) -> None:
+def test_small_holes_of_a_plane_are_filled_and_large_ones_only_when_asked(white: Wall) -> None:
     image, truth, bare, _ = white
     hole = bare & (np.arange(SIZE[0])[:, None] < 25)
     found = as_map(np.where(hole, np.nan, truth), TRUSTED)
@@ -131,9 +127,7 @@ def test_small_holes_of_a_plane_are_filled_and_large_ones_only_when_asked(
     assert np.all(filled.confidence[hole & filled.valid] == 63)
 
 
-def test_bad_settings_are_refused(
-    white: tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_], RangeMap],
-) -> None:
+def test_bad_settings_are_refused(white: Wall) -> None:
     image, *_, found = white
     harms = {"contrast": 0.0, "min_share": 1.5, "max_relative_error": 0.0, "min_area_deg2": -1.0}
     for name, value in harms.items():

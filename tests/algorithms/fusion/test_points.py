@@ -21,12 +21,14 @@ from pano_mvs.scene.tracked_points import TrackedPoints
 from pano_mvs.testing.room import capture_poses, default_room, range_along, render
 from tests.oracles.points import sees
 
+Room = tuple[Poses, dict[str, RangeMap], dict[str, SurfaceSamples]]
+
 SIZE = (128, 256)
 NAMES = ("a/1.png", "a/2.png", "b/1.png")
 
 
 @pytest.fixture(scope="module")
-def room() -> tuple[Poses, dict[str, RangeMap], dict[str, SurfaceSamples]]:
+def room() -> Room:
     """Poses, true range maps and samples of three views."""
     cameras = capture_poses(3, seed=4)
     views = [render(default_room(), camera, SIZE, supersample=1) for camera in cameras]
@@ -39,7 +41,7 @@ def room() -> tuple[Poses, dict[str, RangeMap], dict[str, SurfaceSamples]]:
     return poses, maps, samples
 
 
-def tracked(room: tuple[Poses, dict[str, RangeMap], dict[str, SurfaceSamples]], **settings: Any) -> TrackedPoints:
+def tracked(room: Room, **settings: Any) -> TrackedPoints:
     poses, maps, samples = room
     return track_points(samples, poses, maps.__getitem__, rng=np.random.default_rng(1), **settings)
 
@@ -50,9 +52,7 @@ def unevenness(points: NDArray[Any], spacing: float | NDArray[Any] = 1.0) -> flo
     return float(nearest.std() / nearest.mean())
 
 
-def test_samples_are_even_over_the_sphere_and_on_the_surfaces(
-    room: tuple[Poses, dict[str, RangeMap], dict[str, SurfaceSamples]],
-) -> None:
+def test_samples_are_even_over_the_sphere_and_on_the_surfaces(room: Room) -> None:
     poses, _, samples = room
     sample = samples[NAMES[1]]
     pose = poses.cam_from_world(1)
@@ -117,9 +117,7 @@ def test_wrong_spacings_are_refused() -> None:
         spread_points(np.zeros((3, 3)), np.array([1.0, 0.0, 1.0]), 2, np.random.default_rng(0))
 
 
-def test_points_are_on_the_walls_even_and_seen_where_the_tracks_say(
-    room: tuple[Poses, dict[str, RangeMap], dict[str, SurfaceSamples]],
-) -> None:
+def test_points_are_on_the_walls_even_and_seen_where_the_tracks_say(room: Room) -> None:
     poses, _, _ = room
     found = tracked(room, count=3000)
     found.check()
@@ -144,9 +142,7 @@ def test_points_are_on_the_walls_even_and_seen_where_the_tracks_say(
     assert unevenness(found.points_in_world, np.sqrt(nearest)) < 0.25
 
 
-def test_what_a_view_does_not_see_is_not_in_its_tracks(
-    room: tuple[Poses, dict[str, RangeMap], dict[str, SurfaceSamples]],
-) -> None:
+def test_what_a_view_does_not_see_is_not_in_its_tracks(room: Room) -> None:
     """A view whose ranges are nearer everywhere sees nothing; one that is not sure does not count."""
     poses, maps, samples = room
     nearer = RangeMap(0.8 * maps[NAMES[2]].range, maps[NAMES[2]].confidence)
@@ -158,24 +154,20 @@ def test_what_a_view_does_not_see_is_not_in_its_tracks(
         assert set(found.track_image_idx.tolist()) == {0, 1}
 
 
-def test_few_neighbours_make_short_tracks_that_have_the_own_view(
-    room: tuple[Poses, dict[str, RangeMap], dict[str, SurfaceSamples]],
-) -> None:
+def test_few_neighbours_make_short_tracks_that_have_the_own_view(room: Room) -> None:
     found = tracked(room, count=500, neighbours=2)
     assert np.bincount(found.track_point_idx).max() <= 3
     alone = tracked(room, count=500, neighbours=1, min_views=1)
     assert np.bincount(alone.track_point_idx).min() >= 1
 
 
-def test_the_same_draw_is_the_same_points(room: tuple[Poses, dict[str, RangeMap], dict[str, SurfaceSamples]]) -> None:
+def test_the_same_draw_is_the_same_points(room: Room) -> None:
     one, other = tracked(room, count=700), tracked(room, count=700)
     np.testing.assert_array_equal(one.points_in_world, other.points_in_world)
     np.testing.assert_array_equal(one.track_bearings, other.track_bearings)
 
 
-def test_views_without_samples_or_pose_are_left_out(
-    room: tuple[Poses, dict[str, RangeMap], dict[str, SurfaceSamples]],
-) -> None:
+def test_views_without_samples_or_pose_are_left_out(room: Room) -> None:
     poses, maps, samples = room
     found = tracked((poses, maps, {NAMES[0]: samples[NAMES[0]], "c.png": samples[NAMES[1]]}), count=50, min_views=1)
     assert found.names == NAMES[:1]
@@ -184,9 +176,7 @@ def test_views_without_samples_or_pose_are_left_out(
     assert len(nothing) == 0
 
 
-def test_points_join_poses_behind_or_in_place_of_theirs(
-    room: tuple[Poses, dict[str, RangeMap], dict[str, SurfaceSamples]],
-) -> None:
+def test_points_join_poses_behind_or_in_place_of_theirs(room: Room) -> None:
     poses = room[0]
     found = tracked(room, count=300)
     both = found.joined_to(found.joined_to(poses, keep_points=False), keep_points=True)
@@ -200,15 +190,13 @@ def test_points_join_poses_behind_or_in_place_of_theirs(
 
 
 @pytest.mark.parametrize("wrong", [{"count": 0}, {"min_views": 0}, {"neighbours": 0}, {"max_relative_error": 0.0}])
-def test_settings_out_of_bounds_are_refused(
-    room: tuple[Poses, dict[str, RangeMap], dict[str, SurfaceSamples]], wrong: dict[str, Any]
-) -> None:
+def test_settings_out_of_bounds_are_refused(room: Room, wrong: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match="must be positive"):
         tracked(room, **wrong)
 
 
 @pytest.mark.kernel("points.kernels_seen")
-def test_the_compiled_test_is_the_plain_one(room: tuple[Poses, dict[str, RangeMap], dict[str, SurfaceSamples]]) -> None:
+def test_the_compiled_test_is_the_plain_one(room: Room) -> None:
     """On points of the room, some moved, and a range map with holes and doubtful pixels."""
     poses, maps, samples = room
     rng = np.random.default_rng(6)

@@ -24,6 +24,8 @@ from tests.algorithms.poses.synthetic_capture import random_rotation
 from tests.known import known
 from tests.oracles.alignment import aligned_shift, sampled_patch
 
+Room = tuple[Poses, dict[str, tuple[NDArray[np.uint8], NDArray[np.bool_]]]]
+
 SIZE_HW = (256, 512)
 PIXEL_RAD = 2 * np.pi / SIZE_HW[1]
 
@@ -106,7 +108,7 @@ def test_plain_patches_and_those_that_leave_the_margin_do_not_align() -> None:
 
 
 @pytest.fixture(scope="module")
-def room() -> tuple[Poses, dict[str, tuple[NDArray[np.uint8], NDArray[np.bool_]]]]:
+def room() -> Room:
     """True poses of four cameras, their pictures, and tracks with noise of 0.4 px on textured places."""
     rng = np.random.default_rng(6)
     centers = np.array([[0, 0, 0], [0.4, 0.1, 0.2], [-0.3, -0.1, 0.3], [0.1, 0.2, -0.4]])
@@ -151,9 +153,7 @@ def shown_points(poses: Poses, ranges: NDArray[Any]) -> NDArray[np.float64]:
     return result
 
 
-def test_alignment_places_observations_several_times_as_well_and_says_how_well(
-    room: tuple[Poses, dict[str, tuple[NDArray[np.uint8], NDArray[np.bool_]]]],
-) -> None:
+def test_alignment_places_observations_several_times_as_well_and_says_how_well(room: Room) -> None:
     poses, pictures = room
     aligned = align_tracks(poses, pictures.__getitem__)
     aligned.check()
@@ -171,9 +171,7 @@ def test_alignment_places_observations_several_times_as_well_and_says_how_well(
     assert np.array_equal(aligned.points_in_world, poses.points_in_world)
 
 
-def test_what_the_mask_ignores_is_not_aligned(
-    room: tuple[Poses, dict[str, tuple[NDArray[np.uint8], NDArray[np.bool_]]]],
-) -> None:
+def test_what_the_mask_ignores_is_not_aligned(room: Room) -> None:
     """Observations whose patches reach into a masked area keep their bearings; the others are aligned as before."""
     poses, pictures = room
     mask = np.ones(SIZE_HW, np.bool_)
@@ -194,9 +192,7 @@ def test_what_the_mask_ignores_is_not_aligned(
     assert moved[far].sum() > 0.5 * changed[far].sum() > 10
 
 
-def test_blocks_change_nothing(
-    room: tuple[Poses, dict[str, tuple[NDArray[np.uint8], NDArray[np.bool_]]]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_blocks_change_nothing(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
     poses, pictures = room
     whole = align_tracks(poses, pictures.__getitem__)
     monkeypatch.setattr(alignment, "_AT_ONCE", 500)
@@ -205,9 +201,7 @@ def test_blocks_change_nothing(
     assert known(whole.track_sigmas_rad).tobytes() == known(parts.track_sigmas_rad).tobytes()
 
 
-def test_only_the_longest_tracks_are_aligned_where_there_are_many(
-    room: tuple[Poses, dict[str, tuple[NDArray[np.uint8], NDArray[np.bool_]]]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_the_longest_tracks_are_aligned_where_there_are_many(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
     poses, pictures = room
     monkeypatch.setattr(alignment, "_MOST_PER_IMAGE", 300)
     cut = np.ones(6000, np.bool_)
@@ -224,9 +218,7 @@ def test_only_the_longest_tracks_are_aligned_where_there_are_many(
     assert changed.sum() > 250
 
 
-def test_poses_without_tracks_and_single_observations_stay(
-    room: tuple[Poses, dict[str, tuple[NDArray[np.uint8], NDArray[np.bool_]]]],
-) -> None:
+def test_poses_without_tracks_and_single_observations_stay(room: Room) -> None:
     poses, pictures = room
     nothing = Poses.without_points({"0.png": poses.cam_from_world(0)}, frame="x", scale="x", metric=False)
     assert align_tracks(nothing, pictures.__getitem__) is nothing
@@ -240,9 +232,7 @@ def test_poses_without_tracks_and_single_observations_stay(
     assert np.array_equal(align_tracks(alone, pictures.__getitem__).track_bearings, alone.track_bearings)
 
 
-def test_refinement_with_the_images_is_twice_as_good(
-    room: tuple[Poses, dict[str, tuple[NDArray[np.uint8], NDArray[np.bool_]]]],
-) -> None:
+def test_refinement_with_the_images_is_twice_as_good(room: Room) -> None:
     poses, pictures = room
     bent = replace(poses, rotations=rotation_from_rotvec(np.array([[0, 0, 0], [2, 1, 0], [0, -2, 1], [1, 0, 2]]) * 1e-3)
                    @ poses.rotations)  # fmt: skip
@@ -305,9 +295,7 @@ def test_a_bundle_refuses_impossible_sigmas(sigmas: NDArray[Any]) -> None:
         replace(bundle, sigmas=sigmas).check()
 
 
-def test_groups_are_aligned_one_by_one(
-    room: tuple[Poses, dict[str, tuple[NDArray[np.uint8], NDArray[np.bool_]]]],
-) -> None:
+def test_groups_are_aligned_one_by_one(room: Room) -> None:
     poses, pictures = room
     others = {f"b{name}": picture for name, picture in pictures.items()}
     second = replace(poses, names=tuple(others))

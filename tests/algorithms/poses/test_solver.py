@@ -37,6 +37,8 @@ from tests.algorithms.poses.synthetic_capture import (
 )
 from tests.oracles.bundle import reduced_system_dense
 
+Capture = tuple[dict[str, Rigid3], dict[str, Features], dict[tuple[str, str], TwoView]]
+
 
 def cameras(poses: Poses) -> dict[str, Rigid3]:
     return {name: poses.cam_from_world(idx) for idx, name in enumerate(poses.names)}
@@ -47,7 +49,7 @@ def solve(features: Mapping[str, Features], views: Mapping[tuple[str, str], TwoV
 
 
 @pytest.fixture(scope="module")
-def capture() -> tuple[dict[str, Rigid3], dict[str, Features], dict[tuple[str, str], TwoView]]:
+def capture() -> Capture:
     rng = np.random.default_rng(11)
     truth = random_poses(rng, 5)
     features = synthetic_features(rng, truth)
@@ -55,9 +57,7 @@ def capture() -> tuple[dict[str, Rigid3], dict[str, Features], dict[tuple[str, s
 
 
 @pytest.mark.parametrize("estimator", ["kappa", "log_median", "cauchy"])
-def test_recovers_a_capture_under_noise_and_outliers(
-    capture: tuple[dict[str, Rigid3], dict[str, Features], dict[tuple[str, str], TwoView]], estimator: str
-) -> None:
+def test_recovers_a_capture_under_noise_and_outliers(capture: Capture, estimator: str) -> None:
     truth, features, views = capture
     poses = solve(features, views, scale_estimator=estimator)
     poses.check()
@@ -70,9 +70,7 @@ def test_recovers_a_capture_under_noise_and_outliers(
     assert len(poses.points_in_world) > 300
 
 
-def test_the_chain_alone_is_sound_and_adjustment_better(
-    capture: tuple[dict[str, Rigid3], dict[str, Features], dict[tuple[str, str], TwoView]],
-) -> None:
+def test_the_chain_alone_is_sound_and_adjustment_better(capture: Capture) -> None:
     truth, features, views = capture
     chained, adjusted = (
         relative_pose_errors(cameras(solve(features, views, adjust=adjust)), truth) for adjust in (False, True)
@@ -82,9 +80,7 @@ def test_the_chain_alone_is_sound_and_adjustment_better(
     assert adjusted.median_pair_deg < chained.median_pair_deg
 
 
-def test_world_is_the_first_camera_and_its_first_baseline_is_one(
-    capture: tuple[dict[str, Rigid3], dict[str, Features], dict[tuple[str, str], TwoView]],
-) -> None:
+def test_world_is_the_first_camera_and_its_first_baseline_is_one(capture: Capture) -> None:
     _, features, views = capture
     poses = solve(features, views)
     np.testing.assert_array_equal(poses.rotations[0], np.eye(3))
@@ -96,9 +92,7 @@ def test_world_is_the_first_camera_and_its_first_baseline_is_one(
     assert np.linalg.norm(refined.centers[1]) == pytest.approx(1.0, abs=1e-9)
 
 
-def test_refinement_halves_the_error_and_keeps_the_points(
-    capture: tuple[dict[str, Rigid3], dict[str, Features], dict[tuple[str, str], TwoView]],
-) -> None:
+def test_refinement_halves_the_error_and_keeps_the_points(capture: Capture) -> None:
     truth, features, views = capture
     poses = solve(features, views, scale_estimator="kappa")
     bent = {
@@ -120,18 +114,14 @@ def test_refinement_halves_the_error_and_keeps_the_points(
     assert np.rad2deg(refined.point_errors_rad.max()) < 0.4
 
 
-def test_the_same_bytes_again(
-    capture: tuple[dict[str, Rigid3], dict[str, Features], dict[tuple[str, str], TwoView]],
-) -> None:
+def test_the_same_bytes_again(capture: Capture) -> None:
     _, features, views = capture
     first, second = (refine_poses(solve(features, views)) for _ in range(2))
     assert first.rotations.tobytes() == second.rotations.tobytes()
     assert first.points_in_world.tobytes() == second.points_in_world.tobytes()
 
 
-def test_the_order_of_the_capture_does_not_change_the_scene(
-    capture: tuple[dict[str, Rigid3], dict[str, Features], dict[tuple[str, str], TwoView]],
-) -> None:
+def test_the_order_of_the_capture_does_not_change_the_scene(capture: Capture) -> None:
     truth, features, views = capture
     backwards = {name: features[name] for name in reversed(features)}
     poses = solve(backwards, views)
@@ -155,9 +145,7 @@ def test_no_image_need_see_the_first() -> None:
     assert relative_pose_errors(cameras(poses), truth).median_pair_deg < 0.06
 
 
-def test_an_image_without_pairs_is_rejected_with_its_best_partner(
-    capture: tuple[dict[str, Rigid3], dict[str, Features], dict[tuple[str, str], TwoView]],
-) -> None:
+def test_an_image_without_pairs_is_rejected_with_its_best_partner(capture: Capture) -> None:
     _, features, views = capture
     cut = {
         pair: TwoView.failed("23 matches, 60 needed", candidates=23) if "3.jpg" in pair else view
@@ -169,9 +157,7 @@ def test_an_image_without_pairs_is_rejected_with_its_best_partner(
     assert "23 matches, 60 needed" in poses.rejected["3.jpg"]
 
 
-def test_an_image_with_a_wrong_pair_alone_is_rejected(
-    capture: tuple[dict[str, Rigid3], dict[str, Features], dict[tuple[str, str], TwoView]],
-) -> None:
+def test_an_image_with_a_wrong_pair_alone_is_rejected(capture: Capture) -> None:
     """Its only pair is false (a repeated room, say): the points known from the others speak against it."""
     _, features, views = capture
     rng = np.random.default_rng(13)
@@ -184,9 +170,7 @@ def test_an_image_with_a_wrong_pair_alone_is_rejected(
     assert set(poses.rejected) == {"3.jpg"}
 
 
-def test_an_image_that_fits_a_third_of_the_known_points_is_rejected(
-    capture: tuple[dict[str, Rigid3], dict[str, Features], dict[tuple[str, str], TwoView]],
-) -> None:
+def test_an_image_that_fits_a_third_of_the_known_points_is_rejected(capture: Capture) -> None:
     """Enough to compute a pose from, too few to believe it."""
     _, features, views = capture
     rng = np.random.default_rng(24)
@@ -220,9 +204,7 @@ def test_every_group_is_solved_in_its_own_frame() -> None:
         assert relative_pose_errors(cameras(group), known).median_pair_deg < 0.15
 
 
-def test_two_images_are_a_capture(
-    capture: tuple[dict[str, Rigid3], dict[str, Features], dict[tuple[str, str], TwoView]],
-) -> None:
+def test_two_images_are_a_capture(capture: Capture) -> None:
     truth, features, views = capture
     two = {name: features[name] for name in ("0.jpg", "1.jpg")}
     poses = refine_poses(solve(two, {("0.jpg", "1.jpg"): views["0.jpg", "1.jpg"]}))
@@ -362,9 +344,7 @@ def test_weights_are_the_derivative_of_the_loss(loss: Literal["huber", "cauchy"]
         assert (above - below) / (2 * h) == pytest.approx(2 * weight * error / 0.01**2, rel=1e-4)
 
 
-def test_metric_poses_keep_their_place_and_scale(
-    capture: tuple[dict[str, Rigid3], dict[str, Features], dict[tuple[str, str], TwoView]],
-) -> None:
+def test_metric_poses_keep_their_place_and_scale(capture: Capture) -> None:
     truth, features, views = capture
     there = Similarity3(7.0, random_rotation(np.random.default_rng(21)), np.array([10.0, -4.0, 2.0]))
     known = {name: there.move_camera(pose) for name, pose in truth.items()}
@@ -375,9 +355,7 @@ def test_metric_poses_keep_their_place_and_scale(
     assert len(refined.points_in_world) > 300
 
 
-def test_poses_without_points_come_back_as_they_are(
-    capture: tuple[dict[str, Rigid3], dict[str, Features], dict[tuple[str, str], TwoView]],
-) -> None:
+def test_poses_without_points_come_back_as_they_are(capture: Capture) -> None:
     truth, *_ = capture
     given = Poses.without_points(truth, frame="x", scale="x", metric=False)
     refined = refine_poses(given)
@@ -385,9 +363,7 @@ def test_poses_without_points_come_back_as_they_are(
     np.testing.assert_allclose(refined.translations, given.translations, atol=1e-9)
 
 
-def test_refinement_refuses_senseless_limits(
-    capture: tuple[dict[str, Rigid3], dict[str, Features], dict[tuple[str, str], TwoView]],
-) -> None:
+def test_refinement_refuses_senseless_limits(capture: Capture) -> None:
     truth, *_ = capture
     with pytest.raises(UsageError, match="positive"):
         refine_poses(Poses.without_points(truth, frame="x", scale="x", metric=False), loss_scale_deg=0.0)
@@ -400,9 +376,7 @@ def test_a_camera_beside_the_first_is_no_unit_of_length() -> None:
     assert first_neighbour(np.zeros((0, 3))) == 0
 
 
-def test_gauge_comes_back_after_any_move(
-    capture: tuple[dict[str, Rigid3], dict[str, Features], dict[tuple[str, str], TwoView]],
-) -> None:
+def test_gauge_comes_back_after_any_move(capture: Capture) -> None:
     truth, *_ = capture
     given = Poses.without_points(truth, frame="x", scale="x", metric=True)
     moved = moved_poses(given, Similarity3(2.0, random_rotation(np.random.default_rng(22)), np.ones(3)))

@@ -28,6 +28,8 @@ from pano_mvs.scene import RangeMap
 from pano_mvs.testing.room import capture_poses, default_room, render
 from tests.oracles import sweep as oracle
 
+Capture = tuple[list[NDArray[np.uint8]], list[Rigid3], NDArray[np.float32]]
+
 SIZE = 16, 32
 NAMES = {"cost": tuple(sorted(BUILTIN_COSTS))} | {
     name: get_args(hint) for name, hint in get_type_hints(SweepSettings).items() if get_args(hint)
@@ -35,7 +37,7 @@ NAMES = {"cost": tuple(sorted(BUILTIN_COSTS))} | {
 
 
 @pytest.fixture(scope="module")
-def capture() -> tuple[list[NDArray[np.uint8]], list[Rigid3], NDArray[np.float32]]:
+def capture() -> Capture:
     poses = capture_poses(4, seed=11)
     views = [render(default_room(4), pose, (64, 128)) for pose in poses]
     pictures = [np.clip(picture + np.random.default_rng(3).normal(0, 1, picture.shape), 0, 255).astype(np.uint8)
@@ -132,18 +134,14 @@ def test_census_counts_four_times_as_much_as_grey_levels_at_their_worst(window: 
 
 @pytest.mark.parametrize("cost", NAMES["cost"])
 @pytest.mark.parametrize("aggregation", NAMES["aggregation"])
-def test_every_cost_recovers_the_room(
-    capture: tuple[list[NDArray[np.uint8]], list[Rigid3], NDArray[np.float32]], cost: str, aggregation: str
-) -> None:
+def test_every_cost_recovers_the_room(capture: Capture, cost: str, aggregation: str) -> None:
     assert good_share(swept(capture, cost=cost, aggregation=aggregation), capture[2]) > 0.75
 
 
 @pytest.mark.parametrize(
     ("cost", "exposure"), [("census", False), ("zncc", False), ("sad_gradient", True), ("census_gradient", True)]
 )
-def test_no_cost_minds_another_exposure(
-    capture: tuple[list[NDArray[np.uint8]], list[Rigid3], NDArray[np.float32]], cost: str, exposure: bool
-) -> None:
+def test_no_cost_minds_another_exposure(capture: Capture, cost: str, exposure: bool) -> None:
     pictures, _, truth = capture
     others = [np.clip(np.rint(0.8 * picture + 10), 0, 255).astype(np.uint8) for picture in pictures[1:]]
     usual, changed = swept(capture, cost=cost), swept(capture, sources=others, cost=cost, exposure=exposure)
@@ -152,7 +150,7 @@ def test_no_cost_minds_another_exposure(
 
 
 @pytest.mark.slow
-def test_all_names_go_together(capture: tuple[list[NDArray[np.uint8]], list[Rigid3], NDArray[np.float32]]) -> None:
+def test_all_names_go_together(capture: Capture) -> None:
     tiny = [picture[::4, ::4] for picture in capture[0]], capture[1], None
     for names in itertools.product(*NAMES.values()):
         settings = dict(zip(NAMES, names, strict=True))
@@ -185,18 +183,14 @@ def test_a_source_whose_epipole_lies_in_the_pixel_does_not_decide() -> None:
     assert weights[1, 31:33, 63:65].min() > 0.95
 
 
-def test_sources_turned_first_give_the_same_but_for_resampling(
-    capture: tuple[list[NDArray[np.uint8]], list[Rigid3], NDArray[np.float32]],
-) -> None:
+def test_sources_turned_first_give_the_same_but_for_resampling(capture: Capture) -> None:
     plain, turned = swept(capture), swept(capture, derotate=True)
     assert good_share(turned, plain.range) > 0.85
     assert good_share(turned, capture[2]) > good_share(plain, capture[2]) - 0.05
     assert np.median(np.abs(turned.range / plain.range - 1)) < 0.01
 
 
-def test_sources_that_are_not_turned_give_the_very_same_either_way(
-    capture: tuple[list[NDArray[np.uint8]], list[Rigid3], NDArray[np.float32]],
-) -> None:
+def test_sources_that_are_not_turned_give_the_very_same_either_way(capture: Capture) -> None:
     pictures, poses, _ = capture
     upright = [rotate_panorama(picture, pose.rotation.T) for picture, pose in zip(pictures[1:], poses, strict=True)]
     shifts = [Rigid3(np.eye(3), pose.rotation.T @ pose.translation) for pose in poses]

@@ -13,18 +13,18 @@ from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
 from pano_mvs.geometry import Rigid3, pad_panorama
 from pano_mvs.testing.room import capture_poses, default_room, render
 
+Pair = tuple[NDArray[np.uint8], NDArray[np.uint8], Rigid3, NDArray[np.float32]]
+
 
 @pytest.fixture(scope="module")
-def pair() -> tuple[NDArray[np.uint8], NDArray[np.uint8], Rigid3, NDArray[np.float32]]:
+def pair() -> Pair:
     poses = capture_poses(2, seed=8)
     (first, ranges), (second, _) = (render(default_room(2), pose, (64, 128)) for pose in poses)
     return first, second, poses[1] @ poses[0].inverse(), ranges
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.0), (1.12, 6.0), (0.8, -4.0)])
-def test_the_exposure_is_found_although_a_third_of_the_ranges_is_wrong(
-    pair: tuple[NDArray[np.uint8], NDArray[np.uint8], Rigid3, NDArray[np.float32]], gain: float, offset: float
-) -> None:
+def test_the_exposure_is_found_although_a_third_of_the_ranges_is_wrong(pair: Pair, gain: float, offset: float) -> None:
     first, second, pose, ranges = pair
     reference = np.clip(np.rint(gain * first + offset), 0, 255).astype(np.uint8)
     wrong = np.random.default_rng(0).random(ranges.shape) < 1 / 3
@@ -34,9 +34,7 @@ def test_the_exposure_is_found_although_a_third_of_the_ranges_is_wrong(
     np.testing.assert_allclose(middle, gain * 110 + offset, atol=2.5)
 
 
-def test_the_same_exposure_is_found_to_be_the_same(
-    pair: tuple[NDArray[np.uint8], NDArray[np.uint8], Rigid3, NDArray[np.float32]],
-) -> None:
+def test_the_same_exposure_is_found_to_be_the_same(pair: Pair) -> None:
     """What a lookup between pixels takes of a source's contrast was once taken for a gain of 1.03."""
     first, second, pose, ranges = pair
     rng = np.random.default_rng(0)
@@ -44,9 +42,7 @@ def test_the_same_exposure_is_found_to_be_the_same(
     np.testing.assert_array_equal(match_exposure(first, noisy, pose, ranges).apply(noisy), noisy)
 
 
-def test_an_exposure_that_cannot_be_known_is_left_alone(
-    pair: tuple[NDArray[np.uint8], NDArray[np.uint8], Rigid3, NDArray[np.float32]],
-) -> None:
+def test_an_exposure_that_cannot_be_known_is_left_alone(pair: Pair) -> None:
     first, second, pose, ranges = pair
     nowhere = np.full_like(ranges, np.nan)
     assert match_exposure(first, second, pose, nowhere).gain.tolist() == [1, 1, 1]
@@ -56,9 +52,7 @@ def test_an_exposure_that_cannot_be_known_is_left_alone(
     np.testing.assert_array_equal(match_exposure(first, unrelated, pose, ranges).apply(unrelated), unrelated)
 
 
-def test_a_masked_source_does_not_spoil_the_exposure(
-    pair: tuple[NDArray[np.uint8], NDArray[np.uint8], Rigid3, NDArray[np.float32]],
-) -> None:
+def test_a_masked_source_does_not_spoil_the_exposure(pair: Pair) -> None:
     first, second, pose, ranges = pair
     spoilt, mask = second.copy(), np.ones(second.shape[:2], np.bool_)
     mask[20:] = False
@@ -96,9 +90,7 @@ def test_a_voting_pixels_window_holds_no_masked_pixel() -> None:
             assert padded[row + 16 + rows, column + 16 + offsets[row]].all()
 
 
-def test_census_compares_grey_and_differences_compare_colours(
-    pair: tuple[NDArray[np.uint8], NDArray[np.uint8], Rigid3, NDArray[np.float32]],
-) -> None:
+def test_census_compares_grey_and_differences_compare_colours(pair: Pair) -> None:
     first = pair[0]
     grey = prepare_picture(first, SweepSettings())
     assert grey.shape == (64, 128, 1)
@@ -106,9 +98,7 @@ def test_census_compares_grey_and_differences_compare_colours(
     np.testing.assert_array_equal(prepare_picture(first, SweepSettings(cost="sad")), first)
 
 
-def test_the_prefilter_knows_no_seam(
-    pair: tuple[NDArray[np.uint8], NDArray[np.uint8], Rigid3, NDArray[np.float32]],
-) -> None:
+def test_the_prefilter_knows_no_seam(pair: Pair) -> None:
     settings = SweepSettings(cost="sad", prefilter_diameter=5)
     filtered = prepare_picture(pair[0], settings)
     assert (filtered != pair[0]).any()
