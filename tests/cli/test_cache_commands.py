@@ -229,8 +229,8 @@ def test_pins_are_asked_for_properly(toy: Toy, cache: Cache) -> None:  # noqa: F
     run(toy, "one")
     run(toy, "two", "--set", "scaled.by=5")
     for run_name, name, why in (("nothing", "good", "0 runs match"), ("", "good", "2 runs match"),
-                                (str(toy.folder / "one"), "../x", "no name for a pin"),
-                                (str(toy.folder / "one"), "", "no name for a pin")):  # fmt: skip
+                                (str(toy.folder / "one"), "../x", "not a valid name of a pin"),
+                                (str(toy.folder / "one"), "", "not a valid name of a pin")):  # fmt: skip
         code, said = cache("pin", run_name, name)
         assert code == 2
         assert why in said
