@@ -16,11 +16,11 @@ import typer
 from rich.markup import escape
 
 from pano_mvs import __version__
-from pano_mvs.cli.cache_app import cache_app
+from pano_mvs.cli.cache.app import cache_app
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.doctor.command import doctor
 from pano_mvs.cli.evaluate_app import evaluate_app
-from pano_mvs.cli.guard import guarded, turn_exits_into_errors
+from pano_mvs.cli.guard import guarded
 from pano_mvs.cli.options import (
     AcceptOption,
     CacheOption,
@@ -34,9 +34,10 @@ from pano_mvs.cli.options import (
     UntilOption,
     WorkflowArgument,
 )
-from pano_mvs.cli.plugin_app import plugin_app, plugins, stage_app
+from pano_mvs.cli.plugins.app import plugin_app, plugins, stage_app
 from pano_mvs.cli.streams import protect_standard_streams
 from pano_mvs.engine.executors.threads import available_threads, bound_environment
+from pano_mvs.session.sudden_exit import turn_exits_into_errors
 
 app = typer.Typer(
     name="pano-mvs",
@@ -94,9 +95,9 @@ def run(
     durable: DurableOption = False,
 ) -> None:  # fmt: skip
     """Run a workflow; the same command resumes it."""
-    from pano_mvs.cli.run_command import Execution, run_workflow
-    from pano_mvs.cli.session import open_session
+    from pano_mvs.cli.run.command import Execution, run_workflow
     from pano_mvs.engine.running.options import Demands
+    from pano_mvs.session.session import open_session
 
     demands = Demands(tuple(until or ()), tuple(only or ()), tuple(refresh or ()), accept_code, keep_going)
     session = open_session(workflow, overrides=overrides or [], images=images, cache=cache, out=out, demands=demands)
@@ -120,10 +121,10 @@ def plan(
                                          "what it is made of, where its result is.", show_default=False)] = "",
 ) -> None:  # fmt: skip
     """Show what a run would do, what is cached, and why the rest is not; nothing is written into --out."""
-    from pano_mvs.cli.explain import explain_unit
-    from pano_mvs.cli.plan_command import show_plan
-    from pano_mvs.cli.session import check_output, open_session
+    from pano_mvs.cli.plan.command import show_plan
+    from pano_mvs.cli.plan.explain import explain_unit
     from pano_mvs.engine.running.options import Demands
+    from pano_mvs.session.session import check_output, open_session
 
     demands = Demands(tuple(until or ()), tuple(only or ()), tuple(refresh or ()), accept_code)
     session = open_session(workflow, overrides=overrides or [], images=images, cache=cache, out=out, demands=demands)
@@ -138,7 +139,7 @@ def plan(
 @guarded
 def check(workflow: WorkflowArgument, images: ImagesOption = None, overrides: SetOption = None) -> None:
     """Show every mistake in a workflow at once, with its line and column."""
-    from pano_mvs.cli.session import open_session
+    from pano_mvs.session.session import open_session
 
     session = open_session(workflow, overrides=overrides or [], images=images)
     Console().print(f"{escape(workflow)}: {len(session.workflow.stages)} stages, no mistakes", highlight=False)
@@ -165,8 +166,8 @@ def status(
     workflow: WorkflowArgument, images: ImagesOption = None, out: OutOption = None, cache: CacheOption = None
 ) -> None:
     """Show what the latest run did and what is cached now."""
-    from pano_mvs.cli.plan_command import show_status
-    from pano_mvs.cli.session import open_session
+    from pano_mvs.cli.plan.command import show_status
+    from pano_mvs.session.session import open_session
 
     show_status(open_session(workflow, images=images, out=out, cache=cache), Console())
 
@@ -229,7 +230,7 @@ def inspect_pixel(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:  # fmt: skip
     """Show one pixel: its ray, its range after each stage, what its neighbours see, its cost at every virtual range."""
-    from pano_mvs.cli.inspect_command import PixelWanted, inspect, open_run
+    from pano_mvs.cli.inspect.command import PixelWanted, inspect, open_run
 
     session = open_run(target, overrides=overrides or [], images=images, cache=cache)
     inspect(session, PixelWanted(image, x, y, stage, truth), Console(), plot=plot, as_json=as_json)

@@ -9,7 +9,7 @@ from pano_mvs.algorithms.metrics.view_scores import Judging
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.evaluate_cloud import CloudRequest, evaluate_cloud
 from pano_mvs.cli.evaluate_depth import DepthRequest, evaluate_depth
-from pano_mvs.cli.run_command import print_scores
+from pano_mvs.cli.run.command import print_scores
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.paths import is_file, is_folder
 from pano_mvs.geometry import Rigid3

@@ -10,13 +10,13 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from pano_mvs.cli.session import CACHE_VARIABLE
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import is_file
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.running.output_lock import output_lock
 from pano_mvs.report import write_report
-from pano_mvs.report.results import Results
+from pano_mvs.results.stored_values import StoredValues
+from pano_mvs.session.session import CACHE_VARIABLE
 
 
 def rewrite_report(out: Path, cache: Path | None, console: Console) -> None:
@@ -35,7 +35,7 @@ def rewrite_report(out: Path, cache: Path | None, console: Console) -> None:
         raise InputError(f"there is no cache in {root}, from which the pictures come. Give the one that the run used "
                          "with --cache DIR")  # fmt: skip
     with output_lock(out):
-        write_report(out, summary, Results.of_folder(out, summary, Store(root, for_reading=True)))
+        write_report(out, summary, StoredValues.of_folder(out, summary, Store(root, for_reading=True)))
     console.print(escape(f"{out / 'report.html'} is written"), highlight=False, soft_wrap=True)
 
 

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.report.cloud_renderer import read_pictures, write_scene
-from pano_mvs.report.earlier_page import Kept
+from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.report.pictures import Picture, picture
-from pano_mvs.report.results import Results
 from pano_mvs.report.software_cloud import draw_cloud
 from pano_mvs.report.viewpoints import Viewpoint, inside_camera, viewpoints
+from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.scene import PointCloud
 from pano_mvs.scene.pose_groups import split_groups
 
@@ -51,7 +51,7 @@ class CloudPictures:
 
 
 def cloud_pictures(
-    results: Results, kept: Kept, *, up: NDArray[np.float64], command: Sequence[str] = _COMMAND
+    results: StoredValues, kept: EarlierPage, *, up: NDArray[np.float64], command: Sequence[str] = _COMMAND
 ) -> CloudPictures:
     """Return pictures of the cloud: those of an earlier page, if they are of the same cloud, else new ones.
 

@@ -10,15 +10,15 @@ from typing import Any
 from pano_mvs.report.camera_map import CameraMap, camera_maps, up_of
 from pano_mvs.report.cloud_pictures import CloudPictures, cloud_pictures
 from pano_mvs.report.completeness import Shares
-from pano_mvs.report.earlier_page import Kept
-from pano_mvs.report.figures import score_tables, side_by_side
-from pano_mvs.report.findings import scores_by_stage
+from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.report.panoramas import Row, panorama_rows
-from pano_mvs.report.residuals import Histogram, Residuals, histogram, reprojection_residuals
-from pano_mvs.report.results import Results
 from pano_mvs.report.thumbnails import measured_shares, thumbnails
-from pano_mvs.report.verdict import Verdict, verdict
 from pano_mvs.report.view_cards import ViewCard, chosen_views, view_cards
+from pano_mvs.results.figures import score_tables, side_by_side
+from pano_mvs.results.findings import scores_by_stage
+from pano_mvs.results.residuals import Histogram, Residuals, histogram, reprojection_residuals
+from pano_mvs.results.stored_values import StoredValues
+from pano_mvs.results.verdict import Verdict, verdict
 from pano_mvs.scene.index import pair_name
 
 _MOST_REASONS = 300
@@ -71,7 +71,7 @@ class Content:
     notes: tuple[str, ...]
 
 
-def gather(out_dir: Path, summary: Mapping[str, Any], results: Results, kept: Kept) -> Content:
+def gather(out_dir: Path, summary: Mapping[str, Any], results: StoredValues, kept: EarlierPage) -> Content:
     """Return what the page shows; what is missing or damaged is left out and told.
 
     Args:
@@ -143,7 +143,7 @@ def pose_groups(poses: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:
     return tuple(found)
 
 
-def _rejected_pairs(links: Any, results: Results) -> tuple[tuple[str, str, int | None, str], ...]:
+def _rejected_pairs(links: Any, results: StoredValues) -> tuple[tuple[str, str, int | None, str], ...]:
     """Return the pairs without inliers, those with most candidates first, and why, of the first 300."""
     rejected = [(str(first), str(second), more[0] if more else None) for first, second, inliers, *more in links
                 if not inliers]  # fmt: skip
@@ -160,7 +160,7 @@ def _judged(view: Mapping[str, Any], shares: Mapping[str, Shares]) -> dict[str, 
     return dict(view) | ({"completeness": own.complete, "consistent": own.confirmed} if own else {})
 
 
-def _image_width(results: Results) -> int | None:
+def _image_width(results: StoredValues) -> int | None:
     for name in results.refs.get("images", {}):
         panorama = results.panorama(name)
         return panorama.size_hw[1] if panorama is not None else None

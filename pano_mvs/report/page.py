@@ -15,17 +15,17 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from pano_mvs.core.files import write_text
-from pano_mvs.report import figures
 from pano_mvs.report.content import gather
-from pano_mvs.report.earlier_page import Kept
-from pano_mvs.report.results import Results
-from pano_mvs.report.verdict import Verdict
+from pano_mvs.report.earlier_page import EarlierPage
+from pano_mvs.results import figures
+from pano_mvs.results.stored_values import StoredValues
+from pano_mvs.results.verdict import Verdict
 
 MOST_SHOWN = 200
 """Failures, rejected pairs and the like that the page lists; run.json has all of them."""
 
 
-def write_report(out_dir: Path, summary: Mapping[str, Any], results: Results | None = None) -> Verdict:
+def write_report(out_dir: Path, summary: Mapping[str, Any], results: StoredValues | None = None) -> Verdict:
     """Write `report.html`: no network, every picture within, at most 30 MB; return the verdict that it gives.
 
     Args:
@@ -47,8 +47,8 @@ def write_report(out_dir: Path, summary: Mapping[str, Any], results: Results | N
     Raises:
         StoreError: if the page cannot be written.
     """
-    kept = Kept.of_page(out_dir / "report.html")
-    content = gather(out_dir, summary, results or Results(), kept)
+    kept = EarlierPage.of_page(out_dir / "report.html")
+    content = gather(out_dir, summary, results or StoredValues(), kept)
     script = _resource("report.js")
     page = _environment().get_template("report.html.j2").render(
         run=_with_defaults(summary),

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from pano_mvs.report.completeness import Shares
-from pano_mvs.report.findings import doubts_of
 from pano_mvs.report.pictures import Picture
-from pano_mvs.report.residuals import Residuals
+from pano_mvs.results.findings import doubts_of
+from pano_mvs.results.residuals import Residuals
 
 MOST_ROWS = 5000
 

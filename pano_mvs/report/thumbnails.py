@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from pano_mvs.report.completeness import Shares, fact_of, shares_from_fact, shares_of
-from pano_mvs.report.earlier_page import Kept
+from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.report.pictures import Picture, picture, preview_panels
-from pano_mvs.report.results import Results
 from pano_mvs.report.view_cards import key_of
+from pano_mvs.results.stored_values import StoredValues
 
 MOST_THUMBNAILS = 1000
 MOST_MEASURED = 1000
@@ -23,7 +23,9 @@ _THREADS = 2
 _VERSION = 1
 
 
-def thumbnails(out_dir: Path, views: Sequence[Mapping[str, Any]], results: Results, kept: Kept) -> dict[str, Picture]:
+def thumbnails(
+    out_dir: Path, views: Sequence[Mapping[str, Any]], results: StoredValues, kept: EarlierPage
+) -> dict[str, Picture]:
     """Return image name to a small picture of its preview, of at most 1,000 views, evenly apart."""
     chosen = [views[idx] for idx in _evenly(len(views), MOST_THUMBNAILS)]
     with ThreadPoolExecutor(_THREADS) as pool:
@@ -31,7 +33,7 @@ def thumbnails(out_dir: Path, views: Sequence[Mapping[str, Any]], results: Resul
         return {str(view["name"]): small for view, small in zip(chosen, found, strict=True) if small is not None}
 
 
-def measured_shares(views: Sequence[Mapping[str, Any]], results: Results, kept: Kept) -> dict[str, Shares]:
+def measured_shares(views: Sequence[Mapping[str, Any]], results: StoredValues, kept: EarlierPage) -> dict[str, Shares]:
     """Return image name to its shares of the sphere, of at most 1,000 views, evenly apart; masks are not looked at."""
     found: dict[str, Shares] = {}
     for idx in _evenly(len(views), MOST_MEASURED):
@@ -52,7 +54,7 @@ def _evenly(count: int, most: int) -> list[int]:
     return sorted({round(at) for at in np.linspace(0, count - 1, min(count, most))}) if count else []
 
 
-def _thumbnail(out_dir: Path, view: Mapping[str, Any], results: Results, kept: Kept) -> Picture | None:
+def _thumbnail(out_dir: Path, view: Mapping[str, Any], results: StoredValues, kept: EarlierPage) -> Picture | None:
     key = key_of(results, str(view.get("name", "")), "t", _VERSION)
     known = kept.picture(key) if key else None
     if known is not None:

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.io.images.preview import color_mapped, range_limits, scale_ticks
 from pano_mvs.report.completeness import Shares, fact_of, shares_from_fact, shares_of
-from pano_mvs.report.earlier_page import Kept
+from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.report.pictures import Picture, picture, preview_panels, resized
-from pano_mvs.report.results import Results
+from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, WEAK_CONFIDENCE
 
 VERSION = 2
@@ -73,7 +73,9 @@ def chosen_views(
     return sorted({*worst, *evenly})
 
 
-def view_cards(out_dir: Path, views: Sequence[Mapping[str, Any]], results: Results, kept: Kept) -> tuple[ViewCard, ...]:
+def view_cards(
+    out_dir: Path, views: Sequence[Mapping[str, Any]], results: StoredValues, kept: EarlierPage
+) -> tuple[ViewCard, ...]:
     """Return the cards of views; what an earlier page shows of the same values is taken from there.
 
     Args:
@@ -103,7 +105,7 @@ def confidence_colors(confidence: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return table[confidence]
 
 
-def key_of(results: Results, name: str, what: str, version: int) -> str:
+def key_of(results: StoredValues, name: str, what: str, version: int) -> str:
     """Return the key of something that is made from a view's panorama and range map; "" if it has no range map."""
     digest = results.digest("ranges", name)
     return f"{digest[:24]}.{results.digest('images', name)[:16]}.{what}{version}" if digest else ""
@@ -113,7 +115,7 @@ def _quality(view: Mapping[str, Any]) -> float:
     return float(view.get("completeness") or 0.0) + float(view.get("consistent") or 0.0)
 
 
-def _kept_card(results: Results, kept: Kept, name: str) -> ViewCard | None:
+def _kept_card(results: StoredValues, kept: EarlierPage, name: str) -> ViewCard | None:
     stem = key_of(results, name, "v", VERSION)
     fact = kept.fact(stem) if stem else None
     found = {part: shown for part in _PARTS if (shown := kept.picture(f"{stem}.{part}")) is not None}
@@ -126,7 +128,7 @@ def _kept_card(results: Results, kept: Kept, name: str) -> ViewCard | None:
     return ViewCard(name, found, shares_from_fact(fact.get("shares")), ticks)
 
 
-def _new_card(results: Results, kept: Kept, name: str, out_dir: Path, preview: str) -> ViewCard:
+def _new_card(results: StoredValues, kept: EarlierPage, name: str, out_dir: Path, preview: str) -> ViewCard:
     range_map, panorama = results.range_map(name), results.panorama(name)
     stem = key_of(results, name, "v", VERSION)
     pictures: dict[str, Picture] = {}

@@ -9,8 +9,8 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 
-from pano_mvs.cli import run_command
 from pano_mvs.cli.app import main
+from pano_mvs.cli.run import command as run_command
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
 from pano_mvs.engine.executors.protocol import Executor, Job, Outcome

@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from pano_mvs.cli.estimate import Estimate, duration
-from pano_mvs.cli.progress import ProgressBars
-from pano_mvs.cli.run_command import interrupted_by_termination
+from pano_mvs.cli.run.command import interrupted_by_termination
+from pano_mvs.cli.run.estimate import Estimate, duration
+from pano_mvs.cli.run.progress import ProgressBars
 from pano_mvs.core.processes import start_of
 from tests.engine.conftest import Toy, toy  # noqa: F401 (a fixture)
 from tests.engine.running.test_resume import deliverables, finished_records
@@ -250,7 +250,7 @@ def test_view_is_named_only_where_there_is_something_to_view(toy: Toy) -> None: 
 
 
 def test_a_line_says_which_time_is_the_stages_and_which_the_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pano_mvs.cli.progress._LINE_EVERY_S", -1.0)
+    monkeypatch.setattr("pano_mvs.cli.run.progress._LINE_EVERY_S", -1.0)
     stream = io.StringIO()
     bars = ProgressBars(Console(file=stream, width=100), stages=2)
     bars.stage_started("depth", 4)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from pano_mvs.report.figures import duration, figure, median, score_tables, share, words
+from pano_mvs.results.figures import duration, figure, median, score_tables, share, words
 
 
 @pytest.mark.parametrize(

@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pano_mvs.cli.summary import nearest_pair
 from pano_mvs.report import write_report
 from pano_mvs.report.cloud_pictures import cloud_pictures
 from pano_mvs.report.content import pose_groups
-from pano_mvs.report.earlier_page import Kept
-from pano_mvs.report.findings import findings, pictures_between
-from pano_mvs.report.results import Results
-from pano_mvs.report.verdict import verdict
+from pano_mvs.report.earlier_page import EarlierPage
+from pano_mvs.results.findings import findings, pictures_between
+from pano_mvs.results.stored_values import StoredValues
+from pano_mvs.results.verdict import verdict
 from pano_mvs.scene import PointCloud, Poses
 from pano_mvs.scene.pose_groups import join_groups, with_cameras
+from pano_mvs.session.summarise import nearest_pair
 from pano_mvs.testing.tiny_capture import TinyCapture
 from tests.report.conftest import stored, summary_of
 from tests.report.html_page import Page
@@ -25,7 +25,7 @@ LINKS = [["a", "b", 90, 120, 0.01], ["b", "x", 0, 31, None], ["x", "a", 0, 12, N
 
 
 @pytest.fixture
-def rooms(tmp_path, tiny: TinyCapture) -> tuple[dict, Results]:
+def rooms(tmp_path, tiny: TinyCapture) -> tuple[dict, StoredValues]:
     """What a run over the tiny capture might say had it found two pictures to be of another room."""
     summary, results = summary_of(tiny), stored(_store(tmp_path), tiny)
     large, small = _halves(tiny)
@@ -122,10 +122,12 @@ def test_the_page_draws_each_group_apart_and_says_its_frame(rooms, out_dir):
 def test_the_cloud_of_the_largest_group_is_shown_alone(rooms):
     """The other one is a thousand units away here: with it nothing would be seen of either."""
     _, results = rooms
-    shown = cloud_pictures(results, Kept(), up=np.array([0.0, -1.0, 0.0]))
+    shown = cloud_pictures(results, EarlierPage(), up=np.array([0.0, -1.0, 0.0]))
     assert "shown is group 0" in shown.note
-    alone = Results(results.store, {**results.refs, "cloud": {"": results.store.put_value(results.cloud.groups()[0])}})
+    alone = StoredValues(
+        results.store, {**results.refs, "cloud": {"": results.store.put_value(results.cloud.groups()[0])}}
+    )
     for (_, picture), (_, expected) in zip(
-        shown.shown, cloud_pictures(alone, Kept(), up=np.array([0.0, -1.0, 0.0])).shown, strict=True
+        shown.shown, cloud_pictures(alone, EarlierPage(), up=np.array([0.0, -1.0, 0.0])).shown, strict=True
     ):
         assert picture.uri == expected.uri

@@ -11,8 +11,8 @@ import pytest
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.report import write_report
 from pano_mvs.report.cloud_pictures import RENDERER_VARIABLE, cloud_pictures
-from pano_mvs.report.earlier_page import Kept
-from pano_mvs.report.results import Results
+from pano_mvs.report.earlier_page import EarlierPage
+from pano_mvs.results.stored_values import StoredValues
 from tests.report.conftest import summary_of
 from tests.report.html_page import Page
 from tests.report.test_report import assert_sound
@@ -54,7 +54,7 @@ def test_what_changed_is_drawn_again(out_dir, results, tiny):
     first = reported(out_dir, summary_of(tiny), results)
     names = tiny.names
     ranges = dict(results.refs["ranges"]) | {names[0]: results.refs["ranges"][names[1]]}
-    second = reported(out_dir, summary_of(tiny), Results(results.store, dict(results.refs) | {"ranges": ranges}))
+    second = reported(out_dir, summary_of(tiny), StoredValues(results.store, dict(results.refs) | {"ranges": ranges}))
     pictures = [{attrs["alt"]: attrs["src"] for attrs in page.all("img")} for page in (first, second)]
     changed = {str(alt).partition(":")[0] for alt in pictures[0] if pictures[0][alt] != pictures[1][alt]}
     assert changed == {names[0]}
@@ -83,13 +83,13 @@ def test_what_is_damaged_or_gone_is_left_out_and_told(out_dir, results, tiny, ro
             if not part.external:
                 results.store.blobs.path(part).unlink(missing_ok=True)
     store = Store(results.store.root)  # one that knows no paths of pictures either
-    page = reported(out_dir, summary_of(tiny), Results(store, results.refs))
+    page = reported(out_dir, summary_of(tiny), StoredValues(store, results.refs))
     assert_sound(page)
     assert "Not shown:" in page.words
 
 
 def test_a_folder_and_its_cache_give_the_page_of_the_run(out_dir, results, tiny):
-    """`Results.of_folder` finds by the book of runs what the run had in its hands."""
+    """`StoredValues.of_folder` finds by the book of runs what the run had in its hands."""
     store = results.store
     keys = {}
     for role, refs in results.refs.items():
@@ -100,13 +100,13 @@ def test_a_folder_and_its_cache_give_the_page_of_the_run(out_dir, results, tiny)
     store.runs.remember("f" * 64, keys, workflow="tiny", out=out_dir)
     summary = summary_of(tiny) | {"results": {role: role for role in keys}}
     summary["stages"] = [{"name": "images", "params": {"path": str(tiny.folder / "images")}}]
-    again = Results.of_folder(out_dir, summary, Store(store.root))
+    again = StoredValues.of_folder(out_dir, summary, Store(store.root))
     assert {role: dict(refs) for role, refs in again.refs.items()} == results.refs
     assert again.panorama(tiny.names[0]).load().shape == (32, 64, 3)
     assert again.notes == []
-    elsewhere = Results.of_folder(out_dir / "other", summary, store)
+    elsewhere = StoredValues.of_folder(out_dir / "other", summary, store)
     assert "knows no run" in elsewhere.notes[0]
-    assert "earlier version" in Results.of_folder(out_dir, {}, store).notes[0]
+    assert "earlier version" in StoredValues.of_folder(out_dir, {}, store).notes[0]
 
 
 def drawing(folder: Path, body: str) -> tuple[str, ...]:
@@ -124,14 +124,14 @@ def drawing(folder: Path, body: str) -> tuple[str, ...]:
 )  # fmt: skip
 def test_where_there_is_no_graphics_driver_plainer_pictures_are_drawn(tmp_path, results, monkeypatch, body):
     monkeypatch.setenv(RENDERER_VARIABLE, "")
-    made = cloud_pictures(results, Kept(), up=UP, command=drawing(tmp_path, body))
+    made = cloud_pictures(results, EarlierPage(), up=UP, command=drawing(tmp_path, body))
     assert len(made.shown) == 3
     assert "PyVista could not draw here" in made.note
 
 
 def test_a_missing_interpreter_is_no_reason_to_fail(tmp_path, results, monkeypatch):
     monkeypatch.setenv(RENDERER_VARIABLE, "")
-    made = cloud_pictures(results, Kept(), up=UP, command=(str(tmp_path / "nowhere"),))
+    made = cloud_pictures(results, EarlierPage(), up=UP, command=(str(tmp_path / "nowhere"),))
     assert len(made.shown) == 3
 
 
@@ -144,9 +144,9 @@ def decoded(picture):
 def test_pyvista_draws_the_cloud_as_the_plain_pictures_do(results, monkeypatch):
     """Both show the same points from the same places: their pictures agree but for the size of the points."""
     monkeypatch.setenv(RENDERER_VARIABLE, "")
-    by_pyvista = cloud_pictures(results, Kept(), up=UP)
+    by_pyvista = cloud_pictures(results, EarlierPage(), up=UP)
     monkeypatch.setenv(RENDERER_VARIABLE, "software")
-    plain = cloud_pictures(results, Kept(), up=UP)
+    plain = cloud_pictures(results, EarlierPage(), up=UP)
     assert [title for title, _ in by_pyvista.shown] == [title for title, _ in plain.shown]
     for (_, drawn), (_, expected) in zip(by_pyvista.shown, plain.shown, strict=True):
         marks = [decoded(picture).astype(int).min(axis=-1) < 225 for picture in (drawn, expected)]

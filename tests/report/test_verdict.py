@@ -2,9 +2,9 @@
 
 import pytest
 
-from pano_mvs.report.findings import findings
-from pano_mvs.report.residuals import Histogram, Residuals
-from pano_mvs.report.verdict import verdict
+from pano_mvs.results.findings import findings
+from pano_mvs.results.residuals import Histogram, Residuals
+from pano_mvs.results.verdict import verdict
 
 NAMES = [f"{number}.png" for number in range(10)]
 GOOD = {

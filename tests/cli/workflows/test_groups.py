@@ -10,12 +10,12 @@ import pycolmap
 import pytest
 from rich.console import Console
 
-from pano_mvs.cli.run_command import print_summary
+from pano_mvs.cli.run.command import print_summary
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec
 from pano_mvs.io.clouds.ply import read_ply
 from pano_mvs.io.poses.files import read_groups, read_poses
 from pano_mvs.io.ranges.files import read_range_tiff
-from pano_mvs.report.verdict import verdict
+from pano_mvs.results.verdict import verdict
 from pano_mvs.scene.image_files.image_file import write_png
 from pano_mvs.testing.room import capture_poses, default_room, render
 from pano_mvs.viewer.shown_scene import open_scene

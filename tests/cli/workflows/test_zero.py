@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pano_mvs.cli import evaluate_depth_print, inspect_text, run_command
-from pano_mvs.report.figures import figure
+from pano_mvs.cli import evaluate_depth_print
+from pano_mvs.cli.inspect import text as inspect_text
+from pano_mvs.cli.run import command as run_command
+from pano_mvs.results.figures import figure
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
-from pano_mvs.cli.run_command import MIN_FREE_VARIABLE
+from pano_mvs.cli.run.command import MIN_FREE_VARIABLE
 from pano_mvs.core import files
 from pano_mvs.core.errors import StoreError
 from pano_mvs.engine.cache.maintenance import verify

@@ -6,8 +6,8 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from pano_mvs.report.figures import figure, median, share
-from pano_mvs.report.findings import (
+from pano_mvs.results.figures import figure, median, share
+from pano_mvs.results.findings import (
     FAIR_COMPLETE,
     FAIR_CONSISTENT,
     FAIR_REGISTERED,
@@ -22,7 +22,7 @@ from pano_mvs.report.findings import (
     findings,
     mood_of,
 )
-from pano_mvs.report.residuals import Residuals
+from pano_mvs.results.residuals import Residuals
 
 _SOME_FAILED, _INTERRUPTED = 3, 130
 _OUTCOMES = {

@@ -27,7 +27,7 @@ FileOption = Annotated[
 @guarded
 def plugins(workflow: WorkflowOption = None, files: FileOption = None) -> None:
     """List all plugins, where they come from, whether they are sound, and their stages."""
-    from pano_mvs.cli.show import show_plugins
+    from pano_mvs.cli.plugins.show import show_plugins
 
     show_plugins(Console(), workflow=workflow, files=files or [])
 
@@ -42,7 +42,7 @@ def stage_show(
     files: FileOption = None,
 ) -> None:
     """Show a stage's ports, settings and documentation; of a broken one, why it cannot be loaded."""
-    from pano_mvs.cli.show import show_stage
+    from pano_mvs.cli.plugins.show import show_stage
 
     show_stage(name, Console(), workflow=workflow, files=files or [])
 
@@ -60,7 +60,7 @@ def plugin_new(
     folder: Annotated[Path, typer.Option("--dir", help="Where to write the file and its test.")] = Path(),
 ) -> None:
     """Write a working plugin of a kind, NAME.py, and its test, test_NAME.py."""
-    from pano_mvs.cli.plugin_new import write_plugin
+    from pano_mvs.cli.plugins.new import write_plugin
 
     write_plugin(kind, name, folder, Console())
 
@@ -69,6 +69,6 @@ def plugin_new(
 @guarded
 def plugin_kinds() -> None:
     """List the kinds of plugins that `plugin new` writes."""
-    from pano_mvs.cli.plugin_new import show_kinds
+    from pano_mvs.cli.plugins.new import show_kinds
 
     show_kinds(Console())

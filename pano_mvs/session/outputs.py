@@ -9,15 +9,15 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from pano_mvs.cli.guard import exit_text
-from pano_mvs.cli.judgement import add_dense_doubts
-from pano_mvs.cli.summary import summarise
 from pano_mvs.core.errors import PanoMvsError
 from pano_mvs.core.files import replacing
 from pano_mvs.engine.running.run import Run
 from pano_mvs.report.page import write_report
-from pano_mvs.report.results import Results
-from pano_mvs.report.verdict import Verdict
+from pano_mvs.results.stored_values import StoredValues
+from pano_mvs.results.verdict import Verdict
+from pano_mvs.session.dense_doubts import add_dense_doubts
+from pano_mvs.session.sudden_exit import exit_text
+from pano_mvs.session.summarise import summarise
 
 INTERRUPTED = 130
 """The exit code of a run that was interrupted."""
@@ -30,7 +30,7 @@ def tell(out: Path, run: Run, *, started: datetime, clock: float) -> tuple[dict[
     with replacing(out / "run.json") as temporary, temporary.open("w", encoding="utf-8", newline="\n") as stream:
         stream.writelines(json.JSONEncoder(indent=1, allow_nan=False).iterencode(summary))
         stream.write("\n")
-    return summary, write_report(out, summary, Results.of_run(run, summary["results"]))
+    return summary, write_report(out, summary, StoredValues.of_run(run, summary["results"]))
 
 
 def tell_of_end(run: Run, error: BaseException, tell: Callable[[], object]) -> None:

@@ -23,11 +23,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from pano_mvs.cli.console import Console
-from pano_mvs.cli.json_events import SCHEMA, JsonEvents
-from pano_mvs.cli.progress import ProgressBars
-from pano_mvs.cli.session import Session, check_output
+from pano_mvs.cli.run.json_events import SCHEMA, JsonEvents
+from pano_mvs.cli.run.progress import ProgressBars
 from pano_mvs.cli.streams import apart
-from pano_mvs.cli.telling import INTERRUPTED, tell, tell_of_end
 from pano_mvs.core.errors import PanoMvsError, UsageError
 from pano_mvs.core.files import OUTPUT_MARK, set_aside
 from pano_mvs.core.paths import exists, is_file
@@ -40,8 +38,10 @@ from pano_mvs.engine.running.events import Observer, RunResult
 from pano_mvs.engine.running.memory import bytes_from_size
 from pano_mvs.engine.running.output_lock import output_lock
 from pano_mvs.engine.running.run import Run
-from pano_mvs.report.findings import doubts_of
-from pano_mvs.report.verdict import Verdict
+from pano_mvs.results.findings import doubts_of
+from pano_mvs.results.verdict import Verdict
+from pano_mvs.session.outputs import INTERRUPTED, tell, tell_of_end
+from pano_mvs.session.session import Session, check_output
 from pano_mvs.viewer.shown_scene import is_to_see
 
 MIN_FREE_VARIABLE = "PANO_MVS_MIN_FREE"

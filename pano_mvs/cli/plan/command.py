@@ -13,11 +13,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from pano_mvs.cli.session import Session
 from pano_mvs.core.errors import StoreError
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
 from pano_mvs.engine.running.run import workflow_id
+from pano_mvs.session.session import Session
 
 _SHOWN_REASONS = 5
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pano_mvs.report.figures import figure, median, share
+from pano_mvs.results.figures import figure, median, share
 
 GOOD_REGISTERED, FAIR_REGISTERED = 0.95, 0.5
 # Residuals are compared with a pixel of the panorama: what is measured to within one is measured well.

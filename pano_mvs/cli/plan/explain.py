@@ -7,13 +7,13 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
-from pano_mvs.cli.session import Session
 from pano_mvs.core.errors import UsageError
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
 from pano_mvs.engine.planning.units import Unit, UnitInput
 from pano_mvs.engine.running.options import Demands
 from pano_mvs.engine.running.run import workflow_id
+from pano_mvs.session.session import Session
 
 _SHOWN = 8
 

@@ -19,7 +19,7 @@ cache_app = typer.Typer(
 @guarded
 def usage(cache: CacheOption = None) -> None:
     """Show how much each stage takes."""
-    from pano_mvs.cli.cache_command import open_cache, show_usage
+    from pano_mvs.cli.cache.command import open_cache, show_usage
 
     show_usage(open_cache(cache), Console())
 
@@ -28,7 +28,7 @@ def usage(cache: CacheOption = None) -> None:
 @guarded
 def runs(cache: CacheOption = None) -> None:
     """List the runs and pins whose results are kept."""
-    from pano_mvs.cli.cache_command import open_cache, show_runs
+    from pano_mvs.cli.cache.command import open_cache, show_runs
 
     show_runs(open_cache(cache), Console())
 
@@ -45,7 +45,7 @@ def verify(
 
     Results of earlier versions that may be of images that changed during a run are listed as not proven.
     """
-    from pano_mvs.cli.cache_command import open_cache, verify_cache
+    from pano_mvs.cli.cache.command import open_cache, verify_cache
 
     raise typer.Exit(verify_cache(open_cache(cache), Console(), drop_unproven=drop_unproven))
 
@@ -63,7 +63,7 @@ def collect(
     ] = "",
 ) -> None:
     """Show what no latest run of a workflow into a folder, and no pin, needs."""
-    from pano_mvs.cli.cache_command import collect_cache, open_cache
+    from pano_mvs.cli.cache.command import collect_cache, open_cache
 
     collect_cache(open_cache(cache), Console(), delete=delete, unused=unused, older_than=older_than)
 
@@ -76,7 +76,7 @@ def pin(
     cache: CacheOption = None,
 ) -> None:
     """Keep what a run used, whatever runs after it."""
-    from pano_mvs.cli.cache_command import open_cache, pin_run
+    from pano_mvs.cli.cache.command import open_cache, pin_run
 
     pin_run(open_cache(cache), Console(), run, name)
 
@@ -85,6 +85,6 @@ def pin(
 @guarded
 def unpin(name: Annotated[str, typer.Argument(help="The pin's name.")], cache: CacheOption = None) -> None:
     """Give up a pin."""
-    from pano_mvs.cli.cache_command import open_cache, unpin_run
+    from pano_mvs.cli.cache.command import open_cache, unpin_run
 
     unpin_run(open_cache(cache), Console(), name)

@@ -72,7 +72,7 @@ def rendered(kind: str, name: str) -> tuple[str, str]:
     if name in sys.stdlib_module_names or name in packages_distributions():
         raise UsageError(f"a plugin cannot be called {name!r}: its file would hide the Python package of that name")
     environment = Environment(
-        loader=PackageLoader("pano_mvs.cli", "plugin_templates"),
+        loader=PackageLoader("pano_mvs.cli.plugins", "templates"),
         undefined=StrictUndefined,
         keep_trailing_newline=True,
         autoescape=False,  # noqa: S701  # it writes Python, and the name is checked

@@ -11,12 +11,12 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from pano_mvs.cli.session import presets_folder
 from pano_mvs.core.errors import UsageError, WorkflowError
 from pano_mvs.engine.stages.registry import Plugin, Registry
 from pano_mvs.engine.stages.stage import StageSpec
 from pano_mvs.engine.workflows.policy import RESERVED_KEYS
 from pano_mvs.engine.workflows.workflow import find_workflow, load_workflow
+from pano_mvs.session.session import presets_folder
 
 
 def show_plugins(console: Console, *, workflow: str | None = None, files: Sequence[Path] = ()) -> None:

@@ -23,7 +23,7 @@ _Kind = TypeVar("_Kind", bound=Record)
 
 
 @dataclass(frozen=True)
-class Results:
+class StoredValues:
     """The values of one run.
 
     Attributes:
@@ -37,7 +37,7 @@ class Results:
     notes: list[str] = field(default_factory=list)
 
     @staticmethod
-    def of_run(run: Run, stages: Mapping[str, str]) -> Results:
+    def of_run(run: Run, stages: Mapping[str, str]) -> StoredValues:
         """Return what a run in this process made.
 
         Args:
@@ -45,10 +45,10 @@ class Results:
             stages: role to the stage that made it.
         """
         refs = {role: run.states[stage].items for role, stage in stages.items() if stage in run.states}
-        return Results(run.store, refs)
+        return StoredValues(run.store, refs)
 
     @staticmethod
-    def of_folder(out: Path, summary: Mapping[str, Any], store: Store) -> Results:
+    def of_folder(out: Path, summary: Mapping[str, Any], store: Store) -> StoredValues:
         """Return what the latest run into a folder made, by the store's book of runs.
 
         Args:
@@ -62,13 +62,15 @@ class Results:
         own = str(resolved(out))
         entry = next((run for run in store.runs.entries() if run.out == own and not run.pinned), None)
         if entry is None:
-            return Results(notes=[f"the cache {store.root} knows no run into {out}, so pictures are missing"])
+            return StoredValues(notes=[f"the cache {store.root} knows no run into {out}, so pictures are missing"])
         stages = {role: str(stage) for role, stage in (summary.get("results") or {}).items() if role in ROLES}
         if not stages:
-            return Results(notes=["run.json is of an earlier version and names no results: run again to see pictures"])
+            return StoredValues(
+                notes=["run.json is of an earlier version and names no results: run again to see pictures"]
+            )
         refs = {role: _Recorded(store, entry.keys.get(stage, {})) for role, stage in stages.items()}
         _find_pictures(store, summary, stages.get("images", ""), refs.get("images", {}))
-        return Results(store, refs)
+        return StoredValues(store, refs)
 
     @property
     def poses(self) -> Poses | None:

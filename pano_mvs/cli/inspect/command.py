@@ -12,8 +12,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
-from pano_mvs.cli.inspect_text import as_json_value, print_inspection
-from pano_mvs.cli.session import CACHE_VARIABLE, Session, open_session
+from pano_mvs.cli.inspect.text import as_json_value, print_inspection
 from pano_mvs.core.errors import InputError, StoreError, UsageError
 from pano_mvs.core.paths import is_file, is_folder
 from pano_mvs.engine.cache.store import Store, UnitRecord
@@ -23,6 +22,7 @@ from pano_mvs.engine.running.run import workflow_id
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.io.truth import read_truth
 from pano_mvs.scene import RangeMap
+from pano_mvs.session.session import CACHE_VARIABLE, Session, open_session
 from pano_mvs.stages.depth import SweepParams
 from pano_mvs.viewer.inspect.inspection import Inspection
 from pano_mvs.viewer.inspect.pixel import UnitFound, inspect_pixel

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from pano_mvs.cli.estimate import Estimate
+from pano_mvs.cli.run.estimate import Estimate
 from pano_mvs.engine.running.events import Failure, Outcome, StageSummary
 
 _LINE_EVERY_S = 30.0

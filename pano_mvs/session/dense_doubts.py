@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from pano_mvs.algorithms.filters.view_doubts import Agreement, view_doubts
-from pano_mvs.cli.summary import chain_of, latest
 from pano_mvs.engine.running.run import Run
 from pano_mvs.scene import Poses, RangeMap
+from pano_mvs.session.summarise import chain_of, latest
 
 _FIGURES = tuple(Agreement.__dataclass_fields__)
 
