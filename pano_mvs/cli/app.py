@@ -95,14 +95,15 @@ def run(
     durable: DurableOption = False,
 ) -> None:  # fmt: skip
     """Run a workflow; the same command resumes it."""
-    from pano_mvs.cli.run.command import Execution, run_workflow
+    from pano_mvs.cli.run.command import run_workflow
     from pano_mvs.engine.running.options import Demands
+    from pano_mvs.session.running import Execution
     from pano_mvs.session.session import open_session
 
     demands = Demands(tuple(until or ()), tuple(only or ()), tuple(refresh or ()), accept_code, keep_going)
     session = open_session(workflow, overrides=overrides or [], images=images, cache=cache, out=out, demands=demands)
-    execution = Execution(executor, workers, threads, scheduler, as_json, min_free, durable)
-    raise typer.Exit(run_workflow(session, execution))
+    execution = Execution(executor, workers, threads, scheduler, min_free, durable)
+    raise typer.Exit(run_workflow(session, execution, as_json=as_json))
 
 
 @app.command()

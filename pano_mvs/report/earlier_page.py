@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pano_mvs.report.pictures import Picture
+from pano_mvs.results.pictures import Picture
 
 _PICTURE = re.compile(
     r'<img data-key="([0-9a-z.]{1,80})" src="(data:image/jpeg;base64,[A-Za-z0-9+/=]+)" width="(\d{1,5})" '
@@ -31,7 +31,7 @@ class EarlierPage:
         self.facts: dict[str, Any] = {}
 
     @staticmethod
-    def of_page(path: Path) -> EarlierPage:
+    def of_file(path: Path) -> EarlierPage:
         """Return what a page holds; nothing if it is not there or no page of ours."""
         try:
             text = path.read_text(encoding="utf-8") if path.stat().st_size <= _LARGEST_BYTES else ""

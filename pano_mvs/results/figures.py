@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from pano_mvs.results.records import ScoresSummary
+
 # What a person looks at first; other scores follow as they come.
 _FIRST = ("psnr_db", "w_mae", "w_delta_105", "median_relative_error", "completeness")
 # The figures of the scores, in words; others are spelt out from their names.
@@ -85,21 +87,21 @@ def words(name: str) -> str:
     return f"{' '.join(parts)}, {_UNITS[last]}" if parts and last in _UNITS else name.replace("_", " ")
 
 
-def score_tables(scores: Mapping[str, Any]) -> dict[str, Any]:
+def score_tables(scores: ScoresSummary) -> dict[str, Any]:
     """Return the scores of the poses as rows, and those of the views as a table with one column for each metric.
 
     What a constant range map scores (`best_constant_…`, or in older runs `constant_…`) stands in brackets beside.
     """
-    views = scores.get("views") or {}
+    views = scores.views
     known = [metric for metric in _metrics(views) if not metric.startswith(_CONSTANTS)]
     columns = [metric for metric in _FIRST if metric in known] + [metric for metric in known if metric not in _FIRST]
     middle = {metric: median([view.get(metric) for view in views.values()]) for metric in _metrics(views)}
     return {
-        "poses": list((scores.get("poses") or {}).items()),
+        "poses": list(scores.poses.items()),
         "columns": columns,
         "views": [(name, [_beside_constant(values, metric) for metric in columns]) for name, values in views.items()],
         "median": [_beside_constant(middle, metric) for metric in columns] if len(views) > 1 else [],
-        "notes": [*([_BRACKETS] if len(_metrics(views)) > len(columns) else []), *(scores.get("notes") or [])],
+        "notes": [*([_BRACKETS] if len(_metrics(views)) > len(columns) else []), *scores.notes],
     }
 
 

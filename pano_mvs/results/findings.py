@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
 
 from pano_mvs.results.figures import figure, median, share
+from pano_mvs.results.records import Finding, PoseGroup, PosesSummary
+from pano_mvs.results.summary import RunSummary
 
 GOOD_REGISTERED, FAIR_REGISTERED = 0.95, 0.5
 # Residuals are compared with a pixel of the panorama: what is measured to within one is measured well.
@@ -24,21 +24,6 @@ _SHOWN_DOUBTS = 5
 FAIR_UNDOUBTED = 0.5
 
 
-@dataclass(frozen=True)
-class Finding:
-    """One thing to know.
-
-    Attributes:
-        mood: "bad" or "fair"; "" for what is only worth knowing.
-        text: what it is.
-        remedy: what to do, "" if nothing.
-    """
-
-    mood: str
-    text: str
-    remedy: str = ""
-
-
 def mood_of(value: float, good: float, fair: float) -> str:
     """Return "good", "fair" or "bad": limits that fall from good to fair are lower ones, else upper ones."""
     if good > fair:
@@ -46,11 +31,11 @@ def mood_of(value: float, good: float, fair: float) -> str:
     return "good" if value <= good else "fair" if value <= fair else "bad"
 
 
-def findings(summary: Mapping[str, Any], *, residual_px: float | None = None) -> tuple[Finding, ...]:
+def findings(summary: RunSummary, *, residual_px: float | None = None) -> tuple[Finding, ...]:
     """Return what is wrong or doubtful in a run, the worst first.
 
     Args:
-        summary: what run.json holds; every key may be missing.
+        summary: of the run.
         residual_px: median reprojection residual in pixels of the panoramas, if known.
     """
     found = [
@@ -68,8 +53,8 @@ def findings(summary: Mapping[str, Any], *, residual_px: float | None = None) ->
     return tuple(sorted(found, key=lambda finding: ("bad", "fair", "").index(finding.mood)))
 
 
-def _stopped(summary: Mapping[str, Any]) -> list[Finding]:
-    stopped = str(summary.get("stopped") or "")
+def _stopped(summary: RunSummary) -> list[Finding]:
+    stopped = summary.stopped
     if not stopped:
         return []
     if stopped == "interrupted":
@@ -79,92 +64,74 @@ def _stopped(summary: Mapping[str, Any]) -> list[Finding]:
     return [Finding("bad", f"The run stopped early: {stopped}", "Mend this and run the same command again.")]
 
 
-def _failures(summary: Mapping[str, Any]) -> list[Finding]:
-    failures, blocked = summary.get("failures") or [], summary.get("blocked") or []
+def _failures(summary: RunSummary) -> list[Finding]:
+    failures, blocked = summary.failures, summary.blocked
     if not failures:
         return []
-    stages = Counter(str(failure.get("stage", "")) for failure in failures)
+    stages = Counter(failure.stage for failure in failures)
     where = ", ".join(f"{count} in {stage}" for stage, count in stages.most_common(3))
     more = f"; {_units(len(blocked))} could not run because of them" if blocked else ""
     verb = "unit of work failed" if len(failures) == 1 else "units of work failed"
     return [Finding("fair", f"{figure(len(failures))} {verb} ({where}){more}.", "Each is listed with its cause.")]
 
 
-def _registration(summary: Mapping[str, Any]) -> list[Finding]:
-    poses = summary.get("poses") or {}
-    registered = len(poses.get("registered") or [])
-    rejected = poses.get("rejected") or {}
+def _registration(summary: RunSummary) -> list[Finding]:
+    registered, rejected = len(summary.poses.registered), summary.poses.rejected
     total = registered + len(rejected)
     if not total or not rejected:
         return []
     mood = mood_of(registered / total, GOOD_REGISTERED, FAIR_REGISTERED)
-    text = f"{len(rejected)} of {total} panoramas have no pose: {_commonest(list(map(str, rejected.values())))}."
+    text = f"{len(rejected)} of {total} panoramas have no pose: {_commonest(list(rejected.values()))}."
     if mood == "good":
         return [Finding("", text)]
     return [Finding(mood, text, "Take more pictures between those, 0.5–1 m apart indoors, each seeing much of what the "
                     "next one sees.")]  # fmt: skip
 
 
-def doubts_of(summary: Mapping[str, Any]) -> dict[str, str]:
-    """Return the doubted images with the reasons: those of the final poses, and what other stages doubt besides."""
-    doubts = {str(name): str(reason) for name, reason in ((summary.get("poses") or {}).get("doubts") or {}).items()}
-    others = {str(name): str(doubt.get("reason", "")) for name, doubt in (summary.get("doubts") or {}).items()}
-    return doubts | {name: reason for name, reason in others.items() if name not in doubts}
-
-
-def doubt_mood(poses: Mapping[str, Any]) -> str:
+def doubt_mood(poses: PosesSummary) -> str:
     """Return "fair" if some registered cameras are doubtful, "bad" if more than half are, else "good"."""
-    registered, doubts = len(poses.get("registered") or []), len(poses.get("doubts") or {})
-    return mood_of(1 - doubts / max(1, registered), 1.0, FAIR_UNDOUBTED)
+    return mood_of(1 - len(poses.doubts) / max(1, len(poses.registered)), 1.0, FAIR_UNDOUBTED)
 
 
-def _doubts(summary: Mapping[str, Any]) -> list[Finding]:
-    doubts = doubts_of(summary)
+def _doubts(summary: RunSummary) -> list[Finding]:
+    doubts, poses = summary.doubtful_images, summary.poses
     if not doubts:
         return []
-    poses = summary.get("poses") or {}
     reasons = [f"{name} ({reason})" for name, reason in doubts.items()]
     more = f"; and {len(reasons) - _SHOWN_DOUBTS} more" if len(reasons) > _SHOWN_DOUBTS else ""
-    what = "camera" if poses.get("doubts") else "image"
+    what = "camera" if poses.doubts else "image"
     count = f"1 {what} is doubtful" if len(reasons) == 1 else f"{len(reasons)} {what}s are doubtful"
     them = "it and its" if len(reasons) == 1 else "them and their"
-    mood = doubt_mood(poses) if poses.get("doubts") else "fair"
+    mood = doubt_mood(poses) if poses.doubts else "fair"
     return [Finding(mood, f"{count}: {'; '.join(reasons[:_SHOWN_DOUBTS])}{more}.",
                     f"Take panoramas between {them} neighbours, with things in view that occur only once, or leave "
                     f"{'it' if len(reasons) == 1 else 'these images'} out.")]  # fmt: skip
 
 
-def _groups(summary: Mapping[str, Any]) -> list[Finding]:
-    poses = summary.get("poses") or {}
-    groups = poses.get("groups") or []
+def _groups(summary: RunSummary) -> list[Finding]:
+    groups = summary.poses.groups
     if len(groups) < 2:
         return []
     sizes = [f"group {number} has {_named(group)}" for number, group in enumerate(groups[1:], start=1)]
     more = f"; and {len(sizes) - _SHOWN_GROUPS} more" if len(sizes) > _SHOWN_GROUPS else ""
     text = (f"{len(groups)} groups of panoramas share no reliable connection: each has its own frame and scale. The "
-            f"largest has {len(groups[0].get('images') or [])} panoramas; "
+            f"largest has {len(groups[0].images)} panoramas; "
             f"{'; '.join(sizes[:_SHOWN_GROUPS])}{more}.")  # fmt: skip
-    return [Finding("fair", text, pictures_between(poses))]
+    return [Finding("fair", text, pictures_between(groups))]
 
 
-def _named(group: Mapping[str, Any]) -> str:
-    names = [str(name) for name in group.get("images") or []]
+def _named(group: PoseGroup) -> str:
+    names = group.images
     return f"{len(names)} ({', '.join(names[:3])}{' …' if len(names) > 3 else ''})"
 
 
-def pictures_between(poses: Mapping[str, Any]) -> str:
-    """Return which pictures to take so that the smaller groups join the largest one.
-
-    Args:
-        poses: as in run.json; `groups` holds two or more.
-    """
+def pictures_between(groups: Sequence[PoseGroup]) -> str:
+    """Return which images to take so that the smaller groups join the largest one, the first of two or more."""
     found = []
-    for group in (poses.get("groups") or [])[1:]:
-        pair = group.get("nearest_pair")
+    for pair in (group.nearest_pair for group in groups[1:]):
         if pair:
-            first, second, matches, candidates = pair
-            known = f"{matches} matches" if matches else f"{candidates} candidates"
-            found.append(f"{first} and {second} ({known})")
+            known = f"{pair.matches} matches" if pair.matches else f"{pair.candidates} candidates"
+            found.append(f"{pair.first} and {pair.second} ({known})")
     if not found:
         return "Take pictures between the groups, 0.5–1 m apart, and compare them with both."
     more = " …" if len(found) > _SHOWN_GROUPS else ""
@@ -179,14 +146,13 @@ def _commonest(reasons: Sequence[str]) -> str:
     return example if len(reasons) == 1 else f"{count} times such as “{example}”"
 
 
-def _graph(summary: Mapping[str, Any]) -> list[Finding]:
+def _graph(summary: RunSummary) -> list[Finding]:
     """Return which registered cameras are linked to one other alone, where there are cameras enough to tell."""
-    poses = summary.get("poses") or {}
-    names, links = poses.get("registered") or [], poses.get("links") or []
+    names, links = summary.poses.registered, summary.poses.links
     if len(names) < 4 or not links:
         return []
-    count = Counter(name for first, second, inliers, *_ in links if inliers for name in (first, second))
-    loose = [str(name) for name in names if 0 < count[name] < _FEW_LINKS]
+    count = Counter(name for link in links if link.inliers for name in link[:2])
+    loose = [name for name in names if 0 < count[name] < _FEW_LINKS]
     if not loose:
         return []
     shown = ", ".join(loose[:3]) + (" …" if len(loose) > 3 else "")
@@ -204,16 +170,16 @@ def _residual(residual_px: float | None) -> list[Finding]:
                     "put poses.refine behind the solver if it is not there.")]  # fmt: skip
 
 
-def compares_views(summary: Mapping[str, Any]) -> bool:
+def compares_views(summary: RunSummary) -> bool:
     """Return whether any stage compared the views: where none did, no pixel is confirmed, and that says nothing."""
-    compared = any("consistency" in str(stage.get("use")) for stage in summary.get("stages") or [])
-    return compared or any(view.get("consistent") for view in summary.get("views") or [])
+    compared = any("consistency" in stage.use for stage in summary.stages)
+    return compared or any(view.consistent for view in summary.views)
 
 
-def _views(summary: Mapping[str, Any]) -> list[Finding]:
+def _views(summary: RunSummary) -> list[Finding]:
     found = []
-    views = summary.get("views") or []
-    complete, consistent = (median([view.get(key) for view in views]) for key in ("completeness", "consistent"))
+    complete = median([view.completeness for view in summary.views])
+    consistent = median([view.consistent for view in summary.views])
     if complete is not None and (mood := mood_of(complete, GOOD_COMPLETE, FAIR_COMPLETE)) != "good":
         found.append(Finding(mood, f"Half of the views have a range for less than {share(complete)} of their pixels.",
                              "Sky and masks have none; elsewhere look at the views in the report."))  # fmt: skip
@@ -227,31 +193,24 @@ def _views(summary: Mapping[str, Any]) -> list[Finding]:
     return found
 
 
-def _cloud(summary: Mapping[str, Any]) -> list[Finding]:
-    if (summary.get("cloud") or {}).get("points") == 0:
+def _cloud(summary: RunSummary) -> list[Finding]:
+    if summary.cloud.points == 0:
         return [Finding("bad", "The cloud has no points: no two views agree on any surface.",
                         "Look at the ranges in the report; if they are right, the poses are wrong.")]  # fmt: skip
     return []
 
 
-def _baseline(summary: Mapping[str, Any]) -> list[Finding]:
+def _baseline(summary: RunSummary) -> list[Finding]:
     """Return whether a constant range would have scored as well."""
     found = []
-    for stage, scores in scores_by_stage(summary).items():
-        views = (scores.get("views") or {}).values()
+    for stage, scores in summary.scores_by_stage.items():
+        views = scores.views.values()
         ours = median([view.get("psnr_db") for view in views])
         constant = median([view.get("best_constant_psnr_db", view.get("constant_psnr_db")) for view in views])
         if ours is not None and constant is not None and ours <= constant:
             text = f"Against the truth ({stage}), one constant range for all pixels does as well"
             found.append(Finding("bad", f"{text}: {ours:z.1f} dB to {constant:z.1f} dB."))
     return found
-
-
-def scores_by_stage(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the scores of every branch that has some, by the stage that scored it."""
-    several = summary.get("all_scores") or {}
-    single = summary.get("scores") or {}
-    return dict(several) if several else {"scores": single} if single else {}
 
 
 def _units(count: int) -> str:

@@ -1,4 +1,4 @@
-"""What a run left in the store, as far as the report shows it: nothing is computed again, what is gone is missing."""
+"""The values that a run left in the cache. Nothing is computed again; what is gone is missing."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from pano_mvs.core.errors import InputError, StoreError
 from pano_mvs.core.paths import is_file, resolved
 from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.running.run import Run
+from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene import Panorama, PointCloud, Poses, RangeMap, Record
 
 ROLES = ("images", "pairs", "poses", "ranges", "cloud")
-"""Of which values the report speaks; run.json says which stage made each."""
+"""The final values of a run by role; run.json says which stage made each."""
 
 _Kind = TypeVar("_Kind", bound=Record)
 
@@ -27,9 +28,9 @@ class StoredValues:
     """The values of one run.
 
     Attributes:
-        store: where they are; None if it is not known or not there any more.
-        refs: role to item to the stored value; see `ROLES`. The items of what there is one of are called "".
-        notes: what could not be had, and why; grows while the page is made.
+        store: the cache; None if it is not known or gone.
+        refs: role to item to the stored value; see `ROLES`. The only item of a role such as `poses` is called "".
+        notes: what could not be read, and why; grows with each value that is asked for.
     """
 
     store: Store | None = None
@@ -48,28 +49,27 @@ class StoredValues:
         return StoredValues(run.store, refs)
 
     @staticmethod
-    def of_folder(out: Path, summary: Mapping[str, Any], store: Store) -> StoredValues:
-        """Return what the latest run into a folder made, by the store's book of runs.
+    def of_folder(out: Path, summary: RunSummary, store: Store) -> StoredValues:
+        """Return what the latest run into a folder made, by the cache's list of runs.
 
         Args:
             out: the output folder.
             summary: its run.json.
-            store: the store that the run used.
+            store: the cache that the run used.
 
         Raises:
-            StoreError: if the book is damaged.
+            StoreError: if the list of runs is damaged.
         """
         own = str(resolved(out))
         entry = next((run for run in store.runs.entries() if run.out == own and not run.pinned), None)
         if entry is None:
             return StoredValues(notes=[f"the cache {store.root} knows no run into {out}, so pictures are missing"])
-        stages = {role: str(stage) for role, stage in (summary.get("results") or {}).items() if role in ROLES}
+        stages = {role: stage for role, stage in summary.results.items() if role in ROLES}
         if not stages:
-            return StoredValues(
-                notes=["run.json is of an earlier version and names no results: run again to see pictures"]
-            )
+            note = "run.json is of an earlier version and names no results: run again to see pictures"
+            return StoredValues(notes=[note])
         refs = {role: _Recorded(store, entry.keys.get(stage, {})) for role, stage in stages.items()}
-        _find_pictures(store, summary, stages.get("images", ""), refs.get("images", {}))
+        _find_images(store, summary, refs.get("images", {}))
         return StoredValues(store, refs)
 
     @property
@@ -151,10 +151,10 @@ class _Recorded(Mapping[str, ItemRef]):
         return sum(1 for _ in self)
 
 
-def _find_pictures(store: Store, summary: Mapping[str, Any], stage: str, refs: Mapping[str, ItemRef]) -> None:
-    """Tell the store where the user's own pictures are: it knows them by their digests alone."""
-    entries = [entry for entry in summary.get("stages") or [] if entry.get("name") == stage]
-    folder = (entries[0].get("params") or {}).get("path") if entries else None
+def _find_images(store: Store, summary: RunSummary, refs: Mapping[str, ItemRef]) -> None:
+    """Tell the store where the user's own images are: it knows them by their digests alone."""
+    source = next((stage for stage in summary.stages if stage.name == summary.results.get("images")), None)
+    folder = source.params.get("path") if source else None
     for name, ref in refs.items() if folder else ():
         path = Path(str(folder)) / name
         if any(part.external for part in ref.parts.values()) and is_file(path):

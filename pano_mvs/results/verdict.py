@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Collection
 
 from pano_mvs.results.figures import figure, median, share
 from pano_mvs.results.findings import (
@@ -16,13 +14,14 @@ from pano_mvs.results.findings import (
     GOOD_CONSISTENT,
     GOOD_REGISTERED,
     GOOD_RESIDUAL_PX,
-    Finding,
     compares_views,
     doubt_mood,
     findings,
     mood_of,
 )
+from pano_mvs.results.records import Tile, Verdict
 from pano_mvs.results.residuals import Residuals
+from pano_mvs.results.summary import RunSummary
 
 _SOME_FAILED, _INTERRUPTED = 3, 130
 _OUTCOMES = {
@@ -41,55 +40,17 @@ _JUDGEMENTS = {
 }
 
 
-@dataclass(frozen=True)
-class Tile:
-    """One headline figure.
-
-    Attributes:
-        value: the figure.
-        label: what it counts.
-        mood: "good", "fair", "bad" or "" where no judgement is due.
-    """
-
-    value: str
-    label: str
-    mood: str = ""
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """The head of the report.
-
-    Attributes:
-        mood: "good", "fair" or "bad".
-        outcome: how the run ended.
-        judgement: whether the result can be relied on, in a sentence; empty where there is nothing to judge.
-        sentence: what was done, in one sentence.
-        tiles: the headline figures.
-        findings: what is wrong or doubtful, the worst first.
-    """
-
-    mood: str
-    outcome: str
-    judgement: str
-    sentence: str
-    tiles: tuple[Tile, ...]
-    findings: tuple[Finding, ...]
-
-
-def verdict(
-    summary: Mapping[str, Any], *, residuals: Residuals | None = None, image_width: int | None = None
-) -> Verdict:
+def verdict(summary: RunSummary, *, residuals: Residuals | None = None, image_width: int | None = None) -> Verdict:
     """Return the verdict on a run; figures that are not known are left out.
 
     Args:
-        summary: what run.json holds; every key may be missing.
+        summary: of the run.
         residuals: of the points, if known.
         image_width: of the panoramas in pixels, if known.
     """
-    code = summary.get("exit_code", 0)
+    code = summary.exit_code
     mood, outcome = _OUTCOMES.get(code, ("bad", f"Ended with code {code}"))
-    if code == _SOME_FAILED and summary.get("doubts") and not (summary.get("failures") or summary.get("rejected")):
+    if code == _SOME_FAILED and summary.doubts and not (summary.failures or summary.rejected):
         outcome = "Finished, with doubtful cameras"
     residual_deg = residuals.overall.median_deg if residuals else None
     residual_px = residual_deg * image_width / 360 if residual_deg is not None and image_width else None
@@ -109,10 +70,8 @@ def _worst(moods: Collection[str]) -> str:
     return next((name for name in ("bad", "fair", "good") if name in moods), "good")
 
 
-def _sentence(summary: Mapping[str, Any]) -> str:
-    stages = summary.get("stages") or []
-    run, cached = (sum(stage.get(key) or 0 for stage in stages) for key in ("run", "cached"))
-    failed = sum(stage.get("failed") or 0 for stage in stages)
+def _sentence(summary: RunSummary) -> str:
+    run, cached, failed = (sum(getattr(s, key) for s in summary.stages) for key in ("run", "cached", "failed"))
     if not run + cached + failed:
         return "No unit of work was due."
     parts = [f"{figure(run)} computed", f"{figure(cached)} taken from the cache"]
@@ -123,13 +82,13 @@ def _sentence(summary: Mapping[str, Any]) -> str:
     return f"{figure(run + cached + failed)} units of work: {', '.join(parts)}."
 
 
-def _registered(summary: Mapping[str, Any]) -> list[Tile]:
-    poses = summary.get("poses") or {}
-    registered, rejected = len(poses.get("registered") or []), len(poses.get("rejected") or {})
+def _registered(summary: RunSummary) -> list[Tile]:
+    poses = summary.poses
+    registered, rejected = len(poses.registered), len(poses.rejected)
     if not registered + rejected:
         return []
     moods = {mood_of(registered / (registered + rejected), GOOD_REGISTERED, FAIR_REGISTERED), doubt_mood(poses)}
-    groups, doubts = len(poses.get("groups") or []), len(poses.get("doubts") or {})
+    groups, doubts = len(poses.groups), len(poses.doubts)
     label = "panoramas registered" + (f", in {groups} groups" if groups > 1 else "")
     label += f", {doubts} doubtful" if doubts else ""
     return [Tile(f"{registered} of {registered + rejected}", label, _worst(moods))]
@@ -143,35 +102,34 @@ def _residual(residual_deg: float | None, residual_px: float | None) -> list[Til
     return [Tile(f"{residual_deg:.2g}°", f"median reprojection residual{pixels}", mood)]
 
 
-def _coverage(summary: Mapping[str, Any]) -> list[Tile]:
-    views = summary.get("views") or []
+def _coverage(summary: RunSummary) -> list[Tile]:
     tiles = []
     for key, label, limits in (
         ("completeness", "of pixels have a range", (GOOD_COMPLETE, FAIR_COMPLETE)),
         ("consistent", "of pixels agree with other views", (GOOD_CONSISTENT, FAIR_CONSISTENT)),
     ):
-        value = median([view.get(key) for view in views])
+        value = median([getattr(view, key) for view in summary.views])
         if value is not None and (key != "consistent" or compares_views(summary)):
             tiles.append(Tile(share(value), label, mood_of(value, *limits)))
     return tiles
 
 
-def _cloud(summary: Mapping[str, Any]) -> list[Tile]:
-    points = (summary.get("cloud") or {}).get("points")
+def _cloud(summary: RunSummary) -> list[Tile]:
+    points = summary.cloud.points
     if points is None:
         return []
     text = f"{points / 1e6:.2f} M" if points >= 1_000_000 else figure(points)
     return [Tile(text, "points in the cloud", "" if points else "bad")]
 
 
-def _accuracy(summary: Mapping[str, Any]) -> list[Tile]:
+def _accuracy(summary: RunSummary) -> list[Tile]:
     """Return how far the result is from the truth, where that is known."""
-    scores = summary.get("scores") or {}
+    scores = summary.scores
     tiles = []
-    error_deg = median([(scores.get("poses") or {}).get("median_pair_error_deg")])
+    error_deg = median([scores.poses.get("median_pair_error_deg")])
     if error_deg is not None:
         tiles.append(Tile(f"{error_deg:.2g}°", "median pose error against the truth"))
-    errors = [view.get("median_relative_error") for view in (scores.get("views") or {}).values()]
+    errors = [view.get("median_relative_error") for view in scores.views.values()]
     relative = median(errors)
     if relative is not None:
         tiles.append(Tile(f"{100 * relative:.2g} %", "median range error against the truth"))

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pano_mvs.algorithms.filters.view_doubts import Agreement, view_doubts
 from pano_mvs.engine.running.run import Run
 from pano_mvs.scene import Poses, RangeMap
-from pano_mvs.session.summarise import chain_of, latest
+from pano_mvs.session.final_stages import chain_of, latest
 
 _FIGURES = tuple(Agreement.__dataclass_fields__)
 
@@ -20,7 +20,7 @@ def add_dense_doubts(run: Run) -> None:
     """
     poses = latest(run, Poses)
     stage = _compared_stage(run)
-    if isinstance(poses, Poses) and stage:
+    if poses is not None and stage:
         name, figures = stage
         groups, centers = poses.groups, poses.centers
         for group in range(len(poses.worlds)):

@@ -15,8 +15,7 @@ from pano_mvs.engine.stages.params import files_of
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.wiring import Graph, wire, wiring_problems
 from pano_mvs.engine.workflows.workflow import PartialWorkflowError, Workflow, find_workflow, load_workflow
-
-CACHE_VARIABLE = "PANO_MVS_CACHE"
+from pano_mvs.results.summary import CACHE_VARIABLE
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +15,7 @@ from pano_mvs.core.paths import is_file, is_folder, resolved
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.clouds.ply_points import PlyPoints, open_ply_points
 from pano_mvs.io.poses.files import read_poses
+from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene.files import group_file
 
 FloatArray = NDArray[np.float64]
@@ -105,14 +104,14 @@ def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> Sho
         return ShownScene(path.name, cloud, mesh, (), "scene units", *_frame(()))
     if not is_folder(path):
         raise InputError(f"{path}: no such file or folder. Give the output folder of a run, or a .ply file")
-    run = _run_json(path)
+    run = _summary(path)
     notes: list[str] = []
-    groups = (run.get("poses") or {}).get("groups") or [run.get("poses") or {}]
+    groups = run.poses.by_group()
     if group >= len(groups):
         raise UsageError(f"--group {group}: {path} has {len(groups)} {'groups' if len(groups) > 1 else 'group'}, "
                          f"numbered from 0")  # fmt: skip
     if len(groups) > 1:
-        others = ", ".join(f"{number} ({len(groups[number].get('images') or ())} images)"
+        others = ", ".join(f"{number} ({len(groups[number].registered)} images)"
                            for number in range(len(groups)) if number != group)  # fmt: skip
         notes.append(f"shown is group {group} of {len(groups)}, each with a frame and a scale of its own; --group N "
                      f"shows another: {others}")  # fmt: skip
@@ -131,7 +130,7 @@ def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> Sho
     if cloud is None and mesh_file is None and not cameras:
         raise InputError(f"{path}: holds no {cloud_name} with points, no {mesh_name} and no {model}. Give the output "
                          "folder of a run; its report.html tells what became of it")  # fmt: skip
-    metric = bool(groups[group].get("metric"))
+    metric = groups[group].metric
     return ShownScene(
         name=resolved(path).name,
         cloud=cloud,
@@ -159,32 +158,30 @@ def has_faces(path: Path) -> bool:
     return counted is not None and int(counted[1]) > 0
 
 
-def _run_json(folder: Path) -> Mapping[str, Any]:
-    """Return what run.json says; nothing if there is none, or it is no object: the files speak for themselves."""
+def _summary(folder: Path) -> RunSummary:
+    """Return what run.json says; an empty summary if there is none that can be read: the files are enough."""
     try:
-        value = json.loads((folder / "run.json").read_bytes())
-    except (OSError, ValueError):
-        return {}
-    return value if isinstance(value, dict) else {}
+        return RunSummary.read(folder)
+    except InputError:
+        return RunSummary()
 
 
-def _written(folder: Path, run: Mapping[str, Any], name: str) -> Path | None:
+def _written(folder: Path, run: RunSummary, name: str) -> Path | None:
     """Return the file of that name in the folder, or the first that the run wrote below it."""
-    names = [name, *(written for written in run.get("files") or () if PurePosixPath(written).name == name)]
+    names = [name, *(written for written in run.files if PurePosixPath(written).name == name)]
     return next((folder / found for found in names if is_file(folder / found)), None)
 
 
 def _cameras(
-    folder: Path, model_name: str, run: Mapping[str, Any], images: Path | None, notes: list[str]
+    folder: Path, model_name: str, run: RunSummary, images: Path | None, notes: list[str]
 ) -> tuple[ShownCamera, ...]:
     model = folder / model_name
     if not is_folder(model):
         notes.append(f"no {model_name}: the workflow has no export.colmap, or the run did not get there; no cameras")
         return ()
     poses = read_poses(model)
-    source = images or _source_folder(run)
-    previews = {str(view.get("name")): str(view.get("preview") or "") for view in run.get("views") or ()}
-    doubts = (run.get("poses") or {}).get("doubts") or {}
+    source = images or run.source_folder
+    previews = {view.name: view.preview for view in run.views}
     cameras = []
     for idx, name in enumerate(poses.names):
         picture = source / name if source is not None else None
@@ -196,7 +193,7 @@ def _cameras(
             preview=preview if is_file(preview) else None,
             range_file=_map_of(folder, "range", name, ".tiff"),
             confidence_file=_map_of(folder, "confidence", name, ".png"),
-            doubtful=name in doubts,
+            doubtful=name in run.poses.doubts,
         ))  # fmt: skip
     if any(camera.picture is None for camera in cameras):
         where = source if source is not None else "the place from which the run read them"
@@ -208,14 +205,6 @@ def _map_of(folder: Path, kind: str, name: str, suffix: str) -> Path | None:
     """Return the file of an image in range/ or confidence/, called with its extension where need be, else without."""
     candidates = (folder / kind / f"{name}{suffix}", folder / kind / PurePosixPath(name).with_suffix(suffix))
     return next((path for path in candidates if is_file(path)), None)
-
-
-def _source_folder(run: Mapping[str, Any]) -> Path | None:
-    """Return the folder from which the run read its pictures."""
-    for stage in run.get("stages") or ():
-        if str(stage.get("use", "")).startswith("source.") and (stage.get("params") or {}).get("path"):
-            return Path(stage["params"]["path"])
-    return None
 
 
 def _frame(cameras: tuple[ShownCamera, ...]) -> tuple[FloatArray, FloatArray]:

@@ -16,11 +16,11 @@ import tempfile
 import time
 from pathlib import Path
 
-from pano_mvs.cli.plan.command import without_collector
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
 from pano_mvs.engine.running.run import Run, workflow_id
+from pano_mvs.session.planning import without_collector
 from pano_mvs.session.session import open_session
 
 ITEMS = 5000

@@ -19,6 +19,7 @@ from pano_mvs.geometry import Rigid3
 from pano_mvs.io.images.preview import write_preview
 from pano_mvs.report import write_report
 from pano_mvs.results.stored_values import StoredValues
+from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene import Poses, RangeMap
 from pano_mvs.testing.room import default_room, render
 
@@ -87,7 +88,9 @@ def main(count: int) -> None:
         summary, results = made(folder, count)
         for what in ("first", "again"):
             passed, worked = time.perf_counter(), time.process_time()
-            write_report(folder / "out", summary, StoredValues(Store(folder / "cache"), results.refs))
+            write_report(
+                folder / "out", RunSummary.from_json(summary), StoredValues(Store(folder / "cache"), results.refs)
+            )
             size = (folder / "out" / "report.html").stat().st_size
             print(f"{count} views, {what}: {time.process_time() - worked:.2f} s of work, "
                   f"{time.perf_counter() - passed:.2f} s passed, {size / 1e6:.1f} MB")  # fmt: skip

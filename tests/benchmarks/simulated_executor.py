@@ -10,12 +10,12 @@ import os
 from dataclasses import replace
 
 from pano_mvs.cli.app import main
-from pano_mvs.cli.run import command as run_command
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
 from pano_mvs.engine.executors.protocol import Executor, Job, Outcome
 from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.running.execute import execute_unit
+from pano_mvs.session import running
 
 STOP_VARIABLE = "SIMULATED_STOP_AFTER"
 """After so many units the run is interrupted."""
@@ -58,5 +58,5 @@ def _simulated(store: Store, *_name: str, **_settings: object) -> Executor:
 
 
 if __name__ == "__main__":
-    run_command.make_executor = _simulated  # type: ignore[assignment]
+    running.make_executor = _simulated  # type: ignore[assignment]
     main()

@@ -3,6 +3,7 @@
 import pytest
 
 from pano_mvs.results.figures import duration, figure, median, score_tables, share, words
+from pano_mvs.results.records import ScoresSummary
 
 
 @pytest.mark.parametrize(
@@ -53,12 +54,12 @@ def test_a_score_stands_beside_what_a_constant_scores():
         "b": {"psnr_db": 20.0, "constant_psnr_db": 10.0},
         "c": {"psnr_db": None},
     }
-    tables = score_tables({"poses": {"of": 3}, "views": views, "notes": ["a note"]})
+    tables = score_tables(ScoresSummary(poses={"of": 3}, views=views, notes=("a note",)))
     assert tables["columns"] == ["psnr_db", "ause"]
     assert tables["views"] == [("a", ["30 (19)", "0.02"]), ("b", ["20 (10)", "–"]), ("c", ["–", "–"])]
     assert tables["median"] == ["25 (19)", "0.02"]
     assert "best for the very score" in tables["notes"][0]
     assert tables["notes"][1:] == ["a note"]
-    assert score_tables({"views": {"a": {"psnr_db": 1.0}}}) == {
+    assert score_tables(ScoresSummary(views={"a": {"psnr_db": 1.0}})) == {
         "poses": [], "columns": ["psnr_db"], "views": [("a", ["1"])], "median": [], "notes": [],
     }  # fmt: skip

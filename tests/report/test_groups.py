@@ -9,10 +9,11 @@ import pytest
 
 from pano_mvs.report import write_report
 from pano_mvs.report.cloud_pictures import cloud_pictures
-from pano_mvs.report.content import pose_groups
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.results.findings import findings, pictures_between
+from pano_mvs.results.records import NearestPair, PairLink, PoseGroup, PosesSummary
 from pano_mvs.results.stored_values import StoredValues
+from pano_mvs.results.summary import RunSummary
 from pano_mvs.results.verdict import verdict
 from pano_mvs.scene import PointCloud, Poses
 from pano_mvs.scene.pose_groups import join_groups, with_cameras
@@ -21,7 +22,12 @@ from pano_mvs.testing.tiny_capture import TinyCapture
 from tests.report.conftest import stored, summary_of
 from tests.report.html_page import Page
 
-LINKS = [["a", "b", 90, 120, 0.01], ["b", "x", 0, 31, None], ["x", "a", 0, 12, None], ["x", "y", 80, 90, 0.02]]
+LINKS = [
+    PairLink("a", "b", 90, 120, 0.01),
+    PairLink("b", "x", 0, 31),
+    PairLink("x", "a", 0, 12),
+    PairLink("x", "y", 80),
+]
 
 
 @pytest.fixture
@@ -60,14 +66,14 @@ def _halves(tiny: TinyCapture) -> tuple[Poses, Poses]:
 
 
 def test_the_pair_that_comes_closest_to_joining_two_groups_has_most_matches_or_else_candidates():
-    assert nearest_pair(("a", "b"), ("x", "y"), LINKS) == ["b", "x", 0, 31]
-    assert nearest_pair(("a", "b"), ("x", "y"), [*LINKS, ["a", "y", 5]]) == ["a", "y", 5, 0]
+    assert nearest_pair(("a", "b"), ("x", "y"), LINKS) == ("b", "x", 0, 31)
+    assert nearest_pair(("a", "b"), ("x", "y"), [*LINKS, PairLink("a", "y", 5)]) == ("a", "y", 5, 0)
     assert nearest_pair(("a", "b"), ("x", "y"), LINKS[:1]) is None
 
 
 def test_groups_are_a_doubt_and_the_pictures_to_take_are_named(rooms):
     summary, _ = rooms
-    found = verdict(summary)
+    found = verdict(RunSummary.from_json(summary))
     assert found.mood == "fair"
     assert found.tiles[0].label == "panoramas registered, in 2 groups"
     told = next(finding for finding in found.findings if "groups of panoramas" in finding.text)
@@ -80,30 +86,35 @@ def test_groups_are_a_doubt_and_the_pictures_to_take_are_named(rooms):
 def test_one_group_is_no_finding(rooms):
     summary, _ = rooms
     one = {**summary, "poses": {**summary["poses"], "groups": summary["poses"]["groups"][:1]}}
-    assert not any("groups" in finding.text for finding in findings(one))
-    assert pose_groups(one["poses"]) == (one["poses"],)
+    assert not any("groups" in finding.text for finding in findings(RunSummary.from_json(one)))
+    poses = RunSummary.from_json(one).poses
+    assert poses.by_group() == (poses,)
 
 
 def test_of_groups_that_were_never_compared_nothing_is_guessed():
-    text = pictures_between({"groups": [{"images": ["a"]}, {"images": ["x"], "nearest_pair": None}]})
+    text = pictures_between([PoseGroup(images=("a",)), PoseGroup(images=("x",))])
     assert text.startswith("Take pictures between the groups")
 
 
 def test_of_many_groups_a_few_are_named():
     groups = [
-        {"images": ["a"]},
-        *({"images": [f"x{n}", f"y{n}"], "nearest_pair": ["a", f"x{n}", n, 9]} for n in range(9)),
+        PoseGroup(images=("a",)),
+        *(PoseGroup(images=(f"x{n}", f"y{n}"), nearest_pair=NearestPair("a", f"x{n}", n, 9)) for n in range(9)),
     ]
-    text = pictures_between({"groups": groups})
+    text = pictures_between(groups)
     assert text.count("between") == 5
     assert text.endswith(" ….")
-    (told,) = (finding for finding in findings({"poses": {"groups": groups}}) if "groups" in finding.text)
+    (told,) = (
+        finding
+        for finding in findings(RunSummary(poses=PosesSummary(groups=tuple(groups))))
+        if "groups" in finding.text
+    )
     assert "and 4 more" in told.text
 
 
 def test_the_page_draws_each_group_apart_and_says_its_frame(rooms, out_dir):
     summary, results = rooms
-    write_report(out_dir, summary, results)
+    write_report(out_dir, RunSummary.from_json(summary), results)
     page = Page((out_dir / "report.html").read_text(encoding="utf-8"))
     text = " ".join(" ".join(page.text).split())
     assert "Group 0: 2 panoramas" in text

@@ -13,6 +13,7 @@ from pano_mvs.report import write_report
 from pano_mvs.report.cloud_pictures import RENDERER_VARIABLE, cloud_pictures
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.results.stored_values import StoredValues
+from pano_mvs.results.summary import RunSummary
 from tests.report.conftest import summary_of
 from tests.report.html_page import Page
 from tests.report.test_report import assert_sound
@@ -21,7 +22,7 @@ UP = np.array([0.0, -1.0, 0.0])
 
 
 def reported(out_dir, summary, results):
-    write_report(out_dir, summary, results)
+    write_report(out_dir, RunSummary.from_json(summary), results)
     return Page((out_dir / "report.html").read_text(encoding="utf-8"))
 
 
@@ -41,11 +42,11 @@ def test_views_are_shown_with_panorama_range_and_confidence(out_dir, results, ti
 
 def test_nothing_is_drawn_again_where_nothing_changed(out_dir, results, tiny, monkeypatch):
     """The second page is the first, byte for byte, and decodes no picture."""
-    write_report(out_dir, summary_of(tiny), results)
+    write_report(out_dir, RunSummary.from_json(summary_of(tiny)), results)
     before = (out_dir / "report.html").read_bytes()
     for decoder in ("pano_mvs.report.view_cards.color_mapped", "pano_mvs.report.cloud_pictures.draw_cloud"):
         monkeypatch.setattr(decoder, lambda *_, **__: pytest.fail("drawn again"))
-    write_report(out_dir, summary_of(tiny), results)
+    write_report(out_dir, RunSummary.from_json(summary_of(tiny)), results)
     assert (out_dir / "report.html").read_bytes() == before
 
 
@@ -61,7 +62,7 @@ def test_what_changed_is_drawn_again(out_dir, results, tiny):
 
 
 def test_a_page_that_was_tampered_with_is_no_source_of_markup(out_dir, results, tiny):
-    write_report(out_dir, summary_of(tiny), results)
+    write_report(out_dir, RunSummary.from_json(summary_of(tiny)), results)
     path = out_dir / "report.html"
     text = path.read_text()
     facts = text.index('id="facts">') + len('id="facts">')
@@ -100,13 +101,13 @@ def test_a_folder_and_its_cache_give_the_page_of_the_run(out_dir, results, tiny)
     store.runs.remember("f" * 64, keys, workflow="tiny", out=out_dir)
     summary = summary_of(tiny) | {"results": {role: role for role in keys}}
     summary["stages"] = [{"name": "images", "params": {"path": str(tiny.folder / "images")}}]
-    again = StoredValues.of_folder(out_dir, summary, Store(store.root))
+    again = StoredValues.of_folder(out_dir, RunSummary.from_json(summary), Store(store.root))
     assert {role: dict(refs) for role, refs in again.refs.items()} == results.refs
     assert again.panorama(tiny.names[0]).load().shape == (32, 64, 3)
     assert again.notes == []
-    elsewhere = StoredValues.of_folder(out_dir / "other", summary, store)
+    elsewhere = StoredValues.of_folder(out_dir / "other", RunSummary.from_json(summary), store)
     assert "knows no run" in elsewhere.notes[0]
-    assert "earlier version" in StoredValues.of_folder(out_dir, {}, store).notes[0]
+    assert "earlier version" in StoredValues.of_folder(out_dir, RunSummary(), store).notes[0]
 
 
 def drawing(folder: Path, body: str) -> tuple[str, ...]:

@@ -3,7 +3,9 @@
 import pytest
 
 from pano_mvs.results.findings import findings
+from pano_mvs.results.records import Verdict
 from pano_mvs.results.residuals import Histogram, Residuals
+from pano_mvs.results.summary import RunSummary
 from pano_mvs.results.verdict import verdict
 
 NAMES = [f"{number}.png" for number in range(10)]
@@ -17,12 +19,16 @@ GOOD = {
 }
 
 
+def judged(summary: dict, **known) -> Verdict:
+    return verdict(RunSummary.from_json(summary), **known)
+
+
 def residuals(median_deg):
     return Residuals(Histogram((1,), 1.0, median_deg, 2 * median_deg, 1), {}, sampled=False)
 
 
 def test_a_good_run_is_called_good_and_nothing_is_found():
-    found = verdict(GOOD, residuals=residuals(0.04), image_width=1024)
+    found = judged(GOOD, residuals=residuals(0.04), image_width=1024)
     assert (found.mood, found.judgement, found.findings) == ("good", "The result looks reliable.", ())
 
 
@@ -61,7 +67,7 @@ def doubting(count):
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_found_and_named(change, mood, words):
-    found = verdict(GOOD | change)
+    found = judged(GOOD | change)
     assert found.mood == mood
     assert any(words in finding.text for finding in found.findings), found.findings
     assert found.judgement != "The result looks reliable."
@@ -70,24 +76,24 @@ def test_what_is_wrong_is_found_and_named(change, mood, words):
 @pytest.mark.parametrize(("median_deg", "mood"), [(0.3, "good"), (0.5, "fair"), (1.0, "bad")])
 def test_residuals_are_judged_by_the_pixels_of_the_pictures(median_deg, mood):
     """In pictures 1,024 wide a pixel is 0.35°; in larger ones the same angle is worse."""
-    assert verdict(GOOD, residuals=residuals(median_deg), image_width=1024).mood == mood
-    assert verdict(GOOD, residuals=residuals(median_deg), image_width=8192).mood == "bad"
-    assert verdict(GOOD, residuals=residuals(median_deg)).mood == "good", "not judged where that is not known"
+    assert judged(GOOD, residuals=residuals(median_deg), image_width=1024).mood == mood
+    assert judged(GOOD, residuals=residuals(median_deg), image_width=8192).mood == "bad"
+    assert judged(GOOD, residuals=residuals(median_deg)).mood == "good", "not judged where that is not known"
 
 
 def test_where_no_stage_compares_the_views_nothing_is_held_against_them():
     """The paper's workflow has no such stage: all its pixels are weak, however right they are."""
     views = [{"name": name, "completeness": 0.99, "consistent": 0.0} for name in NAMES]
-    found = verdict(GOOD | {"views": views})
+    found = judged(GOOD | {"views": views})
     assert found.mood == "good"
     assert "nothing is known of their agreement" in found.findings[0].text
     assert not any("agree" in tile.label for tile in found.tiles)
     checked = [{"name": "checked", "use": "filters.consistency", "run": 10}]
-    assert verdict(GOOD | {"views": views, "stages": checked}).mood == "bad", "it compared, and nothing agrees"
+    assert judged(GOOD | {"views": views, "stages": checked}).mood == "bad", "it compared, and nothing agrees"
 
 
 def test_the_worst_comes_first():
-    found = verdict(GOOD | {"exit_code": 3, "failures": [{"stage": "depth"}], "cloud": {"points": 0}})
+    found = judged(GOOD | {"exit_code": 3, "failures": [{"stage": "depth"}], "cloud": {"points": 0}})
     assert [finding.mood for finding in found.findings] == ["bad", "fair"]
 
 
@@ -97,7 +103,7 @@ def test_the_worst_comes_first():
      (130, "Interrupted", "fair"), (77, "Ended with code 77", "bad")],
 )  # fmt: skip
 def test_the_outcome_is_that_of_the_exit_code(code, text, mood):
-    found = verdict({"exit_code": code})
+    found = judged({"exit_code": code})
     assert text in found.outcome
     assert found.mood == mood
 
@@ -105,28 +111,30 @@ def test_the_outcome_is_that_of_the_exit_code(code, text, mood):
 def test_a_run_with_doubtful_cameras_alone_has_no_failed_items():
     doubts = {"0.png": {"stage": "checked", "reason": "confirmed 1 %"}}
     doubtful = GOOD | {"exit_code": 3, "poses": doubting(1), "doubts": doubts}
-    found = verdict(doubtful)
+    found = judged(doubtful)
     assert found.outcome == "Finished, with doubtful cameras"
     assert (found.tiles[0].label, found.tiles[0].mood) == ("panoramas registered, 1 doubtful", "fair")
     failed = doubtful | {"failures": [{"stage": "depth", "item": "1.png"}]}
-    assert verdict(failed).outcome == "Finished, with failed items"
+    assert judged(failed).outcome == "Finished, with failed items"
 
 
 def test_where_nothing_is_known_nothing_is_judged():
-    assert verdict({}).judgement == ""
+    assert judged({}).judgement == ""
 
 
 def test_a_run_that_computed_nothing_says_so():
     stages = [{"name": "depth", "cached": 7}, {"name": "ply", "cached": 1}]
-    assert "Nothing had changed: all 8 units" in verdict({"stages": stages}).sentence
+    assert "Nothing had changed: all 8 units" in judged({"stages": stages}).sentence
 
 
 def test_doubts_of_a_run_without_poses_are_findings_too() -> None:
     """The run ended with exit code 3 and said nothing."""
     doubts = {"0.png": {"stage": "judge", "reason": "the lens is dirty"}}
     summary = {"exit_code": 3, "poses": {}, "doubts": doubts}
-    (finding,) = [finding for finding in findings(summary) if "doubtful" in finding.text]
+    (finding,) = [finding for finding in findings(RunSummary.from_json(summary)) if "doubtful" in finding.text]
     assert finding.mood == "fair"
     assert "1 image is doubtful: 0.png (the lens is dirty)" in finding.text
     both = GOOD | {"poses": doubting(1), "doubts": doubts | {"9.png": {"stage": "judge", "reason": "dark"}}}
-    assert "9.png (dark)" in next(finding.text for finding in findings(both) if "doubtful" in finding.text)
+    assert "9.png (dark)" in next(
+        finding.text for finding in findings(RunSummary.from_json(both)) if "doubtful" in finding.text
+    )

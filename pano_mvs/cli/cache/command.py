@@ -15,7 +15,7 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.core.paths import is_denied, is_file
 from pano_mvs.engine.cache.maintenance import Collection, collect, size_on_disk, usage_of, verify
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.session.session import CACHE_VARIABLE
+from pano_mvs.results.summary import CACHE_VARIABLE
 
 _SHOWN = 10
 _UNITS_S = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0, "w": 604800.0}

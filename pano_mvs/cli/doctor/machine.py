@@ -14,7 +14,7 @@ from pano_mvs.core.paths import below
 from pano_mvs.engine.executors.threads import available_threads
 from pano_mvs.engine.running.memory import free_memory_bytes, size_text
 from pano_mvs.engine.stages.plugin_files import PLUGINS_VARIABLE
-from pano_mvs.session.session import CACHE_VARIABLE
+from pano_mvs.results.summary import CACHE_VARIABLE
 
 KNOWN_VARIABLES = (CACHE_VARIABLE, PLUGINS_VARIABLE, "PANO_MVS_EXECUTOR", "PANO_MVS_MIN_FREE", "PANO_MVS_RENDERER")
 _THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")

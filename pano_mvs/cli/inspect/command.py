@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,8 +20,9 @@ from pano_mvs.engine.planning.units import Unit
 from pano_mvs.engine.running.run import workflow_id
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.io.truth import read_truth
+from pano_mvs.results.summary import RunSummary, cache_of
 from pano_mvs.scene import RangeMap
-from pano_mvs.session.session import CACHE_VARIABLE, Session, open_session
+from pano_mvs.session.session import Session, open_session
 from pano_mvs.stages.depth import SweepParams
 from pano_mvs.viewer.inspect.inspection import Inspection
 from pano_mvs.viewer.inspect.pixel import UnitFound, inspect_pixel
@@ -77,22 +77,16 @@ def open_run(target: str, *, overrides: Sequence[str], images: Path | None, cach
     out = Path(target)
     if not is_folder(out):
         return open_session(target, overrides=overrides, images=images, cache=cache)
-    try:
-        summary = json.loads((out / "run.json").read_bytes())
-        workflow = Path(summary["workflow"]["path"])
-        given = [str(override) for override in summary["workflow"]["overrides"]]
-        read = {str(stage["name"]): dict(stage["params"]) for stage in summary["stages"]}
-        store = str(summary.get("cache", ""))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{out}: holds no run.json of a run ({error}). Give the output folder of a run, or its "
-                         "workflow") from error  # fmt: skip
+    summary = RunSummary.read(out)
+    workflow = Path(summary.workflow.path)
     if not is_file(workflow):
         raise InputError(f"{out}: its workflow {workflow} is gone. Give another: pano-mvs inspect WORKFLOW IMAGE X Y")
     # A relative folder was meant from where the run was started; what it was is in the settings.
-    given = [f"images.path={json.dumps(read['images']['path'])}" if one.startswith("images.path=") else one
-             for one in given]  # fmt: skip
-    if cache is None and store and CACHE_VARIABLE not in os.environ:
-        cache = Path(store)
+    folder = next((stage.params.get("path") for stage in summary.stages if stage.name == "images"), None)
+    given = [f"images.path={json.dumps(folder)}" if one.startswith("images.path=") and folder else one
+             for one in summary.workflow.overrides]  # fmt: skip
+    if cache is None and summary.cache:
+        cache = cache_of(summary)
     return open_session(str(workflow), overrides=[*given, *overrides], images=images, cache=cache, out=out)
 
 

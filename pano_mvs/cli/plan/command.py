@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import gc
-import json
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from pano_mvs.core.errors import StoreError
-from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.planning.plan import StagePlan, make_plan
-from pano_mvs.engine.running.run import workflow_id
+from pano_mvs.core.errors import InputError
+from pano_mvs.core.paths import is_file
+from pano_mvs.engine.planning.plan import StagePlan
+from pano_mvs.results.summary import RUN_JSON, RunSummary
+from pano_mvs.session.planning import plan_session
 from pano_mvs.session.session import Session
 
 _SHOWN_REASONS = 5
@@ -24,7 +20,8 @@ _SHOWN_REASONS = 5
 
 def show_plan(session: Session, console: Console) -> None:
     """Print per stage how many units are cached, would run, or may run, and why."""
-    plans = _plans(session)
+    run_plan = plan_session(session)
+    plans = run_plan.stages
     table = Table("stage", "use", "cached", "run", "may run", "cannot run")
     for plan in plans:
         waiting = "all (units not known yet)" if plan.open else str(len(plan.may_run) or "")
@@ -33,57 +30,29 @@ def show_plan(session: Session, console: Console) -> None:
     console.print(table)
     for plan in plans:
         _print_reasons(plan, console)
-    total = sum(len(plan.run) for plan in plans)
-    may = sum(len(plan.may_run) for plan in plans) + sum(plan.open for plan in plans)
-    text = "nothing to compute" if not total and not may else f"{total} units would run"
-    console.print(text + (", more may follow" if may else ""), highlight=False)
+    nothing = not run_plan.units and not run_plan.may_follow
+    text = "nothing to compute" if nothing else f"{run_plan.units} units would run"
+    console.print(text + (", more may follow" if run_plan.may_follow else ""), highlight=False)
 
 
 def show_status(session: Session, console: Console) -> None:
     """Print what the latest run into the output folder said, then what is cached now."""
-    path = session.out / "run.json"
-    try:
-        last = json.loads(path.read_bytes())
-    except OSError:
+    if not is_file(session.out / RUN_JSON):
         console.print(f"no finished run in {escape(str(session.out))}", highlight=False)
-    except ValueError:
-        console.print(f"{escape(str(path))} is damaged; run again to write it anew", highlight=False)
     else:
         try:
-            _print_last(last, console)
-        except (KeyError, TypeError):
-            console.print(f"{escape(str(path))} is not of this version; run again to write it anew", highlight=False)
+            _print_last(RunSummary.read(session.out), console)
+        except InputError as error:
+            console.print(escape(str(error)), highlight=False, soft_wrap=True)
     show_plan(session, console)
 
 
-def _print_last(last: Any, console: Console) -> None:
-    units = last["units"]
-    console.print(f"latest run {last['started']}: exit code {last['exit_code']}, {units['run']} computed, "
-                  f"{units['cached']} cached, {units['failed']} failed", highlight=False)  # fmt: skip
-    for failure in last["failures"]:
-        console.print(escape(f"  {failure['stage']}:{failure['item']}: {failure['cause']}"), highlight=False)
-
-
-@contextmanager
-def without_collector() -> Iterator[None]:
-    """Hold back Python's search for cycles: a plan builds a million objects that all stay, and has none."""
-    was_on = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_on:
-            gc.enable()
-
-
-def _plans(session: Session) -> list[StagePlan]:
-    store = Store(session.store_root, for_reading=True)
-    workflow, graph = session.demands.applied_to(session.workflow, session.graph)
-    with without_collector():
-        plans = make_plan(workflow, graph, store, workflow_id(session.workflow), session.demands)
-    with suppress(StoreError):  # a cache that others own may be read all the same
-        store.stat_cache.save()
-    return plans
+def _print_last(last: RunSummary, console: Console) -> None:
+    units = last.units
+    text = f"exit code {last.exit_code}, {units.run} computed, {units.cached} cached, {units.failed} failed"
+    console.print(f"latest run {last.started}: {text}", highlight=False)
+    for failure in last.failures:
+        console.print(escape(f"  {failure.stage}:{failure.item}: {failure.cause}"), highlight=False)
 
 
 def _print_reasons(plan: StagePlan, console: Console) -> None:

@@ -21,54 +21,31 @@ process is killed. Fields may be added to a schema; none changes its meaning.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import time
 from typing import Any, TextIO
 
 from pano_mvs.core.text import json_without_controls
-from pano_mvs.engine.running.events import Failure, Outcome, StageSummary
+from pano_mvs.session.progress import Event, RunFinished, RunStarted
 
 SCHEMA = 1
 
 
 class JsonEvents:
-    """An observer of a run that writes it down."""
+    """A progress callback that writes the events of a run as JSON lines."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
 
-    def write(self, event: str, **fields: Any) -> None:
+    def __call__(self, event: Event) -> None:
         """Write one event."""
-        line = json.dumps(
-            {"event": event, "time": round(time.time(), 3), **fields}, ensure_ascii=False, allow_nan=False
-        )
+        fields: dict[str, Any] = {"event": event.kind, "time": round(time.time(), 3)}
+        if isinstance(event, RunStarted):
+            fields["schema"] = SCHEMA
+        fields |= dataclasses.asdict(event)
+        if isinstance(event, RunFinished) and event.verdict is None:
+            del fields["verdict"], fields["doubts"]
+        line = json.dumps(fields, ensure_ascii=False, allow_nan=False, default=str)
         self._stream.write(json_without_controls(line) + "\n")
         self._stream.flush()
-
-    def stage_started(self, name: str, units: int) -> None:
-        """Write the event."""
-        self.write("stage_started", stage=name, units=units)
-
-    def unit_started(self, name: str, item: str) -> None:
-        """Write the event."""
-        self.write("unit_started", stage=name, item=item)
-
-    def unit_failed(self, failure: Failure) -> None:
-        """Write the event."""
-        self.write("unit_failed", stage=failure.stage, item=failure.item, cause=failure.cause,
-                   consequence=failure.consequence, log=failure.log, said=list(failure.said))  # fmt: skip
-
-    def unit_finished(self, name: str, item: str, outcome: Outcome, seconds: float) -> None:
-        """Write the event."""
-        self.write("unit_finished", stage=name, item=item, outcome=outcome, seconds=round(seconds, 6))
-
-    def stage_finished(self, summary: StageSummary) -> None:
-        """Write the event."""
-        self.write("stage_finished", stage=summary.name, use=summary.use, units=summary.units, run=summary.run,
-                   cached=summary.cached, failed=summary.failed, blocked=summary.blocked,
-                   seconds=round(summary.seconds, 6), unit_seconds=round(summary.unit_seconds, 6),
-                   metrics=summary.metrics)  # fmt: skip
-
-    def warn(self, text: str) -> None:
-        """Write the event."""
-        self.write("warning", text=text)

@@ -10,19 +10,27 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from pano_mvs.cli.run.estimate import Estimate
-from pano_mvs.engine.running.events import Failure, Outcome, StageSummary
+from pano_mvs.session.progress import (
+    Event,
+    RunStarted,
+    StageFinished,
+    StageStarted,
+    UnitFailed,
+    UnitFinished,
+    Warned,
+)
 
 _LINE_EVERY_S = 30.0
 _SHOWN_LINES = 5
 
 
 class ProgressBars:
-    """An observer of a run that draws it."""
+    """A progress callback that draws the progress of a run."""
 
-    def __init__(self, console: Console, *, stages: int = 0, workers: int = 1) -> None:
+    def __init__(self, console: Console) -> None:
         self.console = console
-        self._stages = stages
-        self._estimate = Estimate(workers)
+        self._stages = 0
+        self._estimate = Estimate()
         self._tasks: dict[str, TaskID] = {}
         self._run: TaskID | None = None
         self._progress: Progress | None = None
@@ -45,8 +53,26 @@ class ProgressBars:
         if self._progress is not None:
             self._progress.stop()
 
-    def stage_started(self, name: str, units: int) -> None:
-        """Add a bar, or begin it anew."""
+    def __call__(self, event: Event) -> None:
+        """Show an event."""
+        match event:
+            case RunStarted(stages=stages, workers=workers):
+                self._stages, self._estimate = len(stages), Estimate(workers)
+            case StageStarted():
+                self._start_stage(event.stage, event.units)
+            case UnitFailed():
+                self._show_failure(event)
+            case UnitFinished():
+                self._count_unit(event)
+            case StageFinished():
+                self._finish_stage(event)
+            case Warned(text=text):
+                self.console.print(f"[yellow]warning:[/] {escape(text)}", highlight=False)
+            case _:
+                pass  # the bars show what is done
+
+    def _start_stage(self, name: str, units: int) -> None:
+        """Add a bar, or reset it."""
         self._estimate.start(name, units)
         if self._progress is None or self._run is None:
             return
@@ -59,20 +85,17 @@ class ProgressBars:
             self._run, total=sum(clock.units for clock in known), completed=sum(c.done for c in known)
         )
 
-    def unit_started(self, name: str, item: str) -> None:
-        """Say nothing: the bars show what is done."""
-
-    def unit_failed(self, failure: Failure) -> None:
-        """Say at once what failed, and what it printed last."""
+    def _show_failure(self, failure: UnitFailed) -> None:
+        """Print what failed, and the last lines that it printed."""
         label = f"{failure.stage}:{failure.item}" if failure.item else failure.stage
         self.console.print(f"[red]failed[/] {escape(label)}", highlight=False, soft_wrap=True)
         for line in failure.said[-_SHOWN_LINES:]:
             self.console.print(f"  | {escape(line)}", highlight=False, soft_wrap=True)
 
-    def unit_finished(self, name: str, item: str, outcome: Outcome, seconds: float) -> None:
-        """Move the bars on; which unit it was, they do not show."""
-        del item
-        self._estimate.count(name, seconds, computed=outcome in ("run", "failed"))
+    def _count_unit(self, unit: UnitFinished) -> None:
+        """Advance the bars, or print a line now and then."""
+        name = unit.stage
+        self._estimate.count(name, unit.seconds, computed=unit.outcome in ("run", "failed"))
         if self._progress is not None and self._run is not None:
             self._progress.update(self._tasks[name], advance=1, state=self._estimate.of_stage(name))
             self._progress.update(self._run, advance=1, state=self._estimate.of_run(self._stages))
@@ -83,18 +106,14 @@ class ProgressBars:
             left = ", ".join(f"{whose}: {text}" for whose, text in times.items() if text)
             self.console.print(f"{name:<14} {clock.done} of {clock.units}  {left}", highlight=False)
 
-    def stage_finished(self, summary: StageSummary) -> None:
-        """Say what the stage did."""
+    def _finish_stage(self, summary: StageFinished) -> None:
+        """Show what the stage did."""
         parts = [f"{summary.run} run", f"{summary.cached} cached"]
         parts += [
             f"{count} {what}" for what, count in (("failed", summary.failed), ("blocked", summary.blocked)) if count
         ]
         text = ", ".join(parts)
         if self._progress is not None:
-            self._progress.update(self._tasks[summary.name], state=text)
+            self._progress.update(self._tasks[summary.stage], state=text)
         else:
-            self.console.print(f"{summary.name:<14} {text}  {summary.seconds:.1f} s", highlight=False)
-
-    def warn(self, text: str) -> None:
-        """Show a warning."""
-        self.console.print(f"[yellow]warning:[/] {escape(text)}", highlight=False)
+            self.console.print(f"{summary.stage:<14} {text}  {summary.seconds:.1f} s", highlight=False)

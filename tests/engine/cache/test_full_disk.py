@@ -19,12 +19,12 @@ import pytest
 from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
-from pano_mvs.cli.run.command import MIN_FREE_VARIABLE
 from pano_mvs.core import files
 from pano_mvs.core.errors import StoreError
 from pano_mvs.engine.cache.maintenance import verify
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.running import disk_guard as room
+from pano_mvs.session.running import MIN_FREE_VARIABLE
 from tests.engine.conftest import Toy
 from tests.stress.captures import deliverables, write_toy
 
