@@ -10,7 +10,7 @@ import faulthandler
 import os
 import sys
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 from rich.markup import escape
@@ -150,10 +150,10 @@ def check(workflow: WorkflowArgument, images: ImagesOption = None, overrides: Se
 @guarded
 def schema(
     workflow: Annotated[
-        Optional[str],  # noqa: UP045
+        str | None,
         typer.Argument(metavar="[WORKFLOW]", help="With its plugins, and the stages of what it extends."),
     ] = None,
-    out: Annotated[Optional[Path], typer.Option("--out", help="A file; else the standard output.")] = None,  # noqa: UP045
+    out: Annotated[Path | None, typer.Option("--out", help="A file; else the standard output.")] = None,
 ) -> None:
     """Write the JSON Schema of workflows, with which an editor completes and checks them."""
     from pano_mvs.cli.schema_command import show_schema
@@ -190,7 +190,7 @@ app.command()(doctor)
 @guarded
 def view_results(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="The output folder of a run, or a .ply file.")],
-    screenshot: Annotated[Optional[Path], typer.Option("--screenshot", metavar="FILE", help="Write a picture instead "  # noqa: UP045
+    screenshot: Annotated[Path | None, typer.Option("--screenshot", metavar="FILE", help="Write a picture instead "
                                                        "of opening a window; needs no display.")] = None,
     view: Annotated[str, typer.Option("--view", help="overview, top, front or inside:NAME of an image.")] = "overview",
     color: Annotated[str, typer.Option("--color", help="rgb, confidence, views, normals or height.")] = "rgb",
@@ -198,7 +198,7 @@ def view_results(
                                          "one.", show_default=False)] = "",
     points: Annotated[int, typer.Option("--points", min=0, help="Draw at most so many points; 0: all.")] = 2_000_000,
     size: Annotated[str, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Of the window in pixels.")] = "1280x860",
-    images: Annotated[Optional[Path], typer.Option("--images", help="Folder of the panoramas, if they "  # noqa: UP045
+    images: Annotated[Path | None, typer.Option("--images", help="Folder of the panoramas, if they "
                                                    "have moved.")] = None,
     labels: Annotated[bool, typer.Option("--labels", help="Name the cameras.")] = False,
     blended: Annotated[bool, typer.Option("--blend", help="Show the cloud within a panorama.")] = False,
@@ -225,9 +225,9 @@ def inspect_pixel(
     overrides: SetOption = None,
     images: ImagesOption = None,
     cache: CacheOption = None,
-    truth: Annotated[Optional[Path], typer.Option("--truth", help="Folder with poses.json and depth.npz; else the "  # noqa: UP045
+    truth: Annotated[Path | None, typer.Option("--truth", help="Folder with poses.json and depth.npz; else the "
                                                   "workflow's own.")] = None,
-    plot: Annotated[Optional[Path], typer.Option("--plot", metavar="FILE.png", help="Draw the curve there.")] = None,  # noqa: UP045
+    plot: Annotated[Path | None, typer.Option("--plot", metavar="FILE.png", help="Draw the curve there.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:  # fmt: skip
     """Show one pixel: its ray, its range after each stage, what its neighbours see, its cost at every virtual range."""

@@ -8,13 +8,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from inspect import signature
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from pano_mvs.core.errors import PanoMvsError
 from pano_mvs.core.paths import children, is_folder
-from pano_mvs.engine.workflows.workflow import StageEntry
+
+if TYPE_CHECKING:
+    from pano_mvs.engine.workflows.workflow import StageEntry
 
 Offer = tuple[str, str]
 """What may be put there, and what it is."""

@@ -141,7 +141,7 @@ class RunSummary(Entry):
             raise InputError(f"{path} is no run.json ({error}). Run again to write it anew") from error
 
     def to_json(self) -> dict[str, Any]:
-        """Return the content of run.json as plain JSON values."""
+        """Return the content of run.json, as values that `json.dumps` takes."""
         return self.model_dump(by_alias=True)
 
     def write(self, out: Path) -> None:

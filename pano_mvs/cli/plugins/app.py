@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
@@ -15,11 +15,11 @@ plugin_app = typer.Typer(help="Write plugins.", no_args_is_help=True)
 stage_app = typer.Typer(help="Look at one stage.", no_args_is_help=True)
 
 WorkflowOption = Annotated[
-    Optional[str],  # noqa: UP045
+    str | None,
     typer.Option("--workflow", help="Also what the plugin files of this workflow define.", show_default=False),
 ]
 FileOption = Annotated[
-    Optional[list[Path]],  # noqa: UP045
+    list[Path] | None,
     typer.Option("--plugin", metavar="FILE", help="Also what a plugin file defines; may be given repeatedly."),
 ]
 
