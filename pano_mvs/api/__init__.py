@@ -1,4 +1,4 @@
-"""The one import that the author of a plugin needs.
+"""Everything that a plugin needs of pano_mvs; `pano_mvs.api.sweep` adds what backends of the sweep are made of.
 
 from pano_mvs.api import Context, Each, Near, Panorama, Params, Pose, RangeMap, stage
 
@@ -10,17 +10,32 @@ def my_sweep(ref: Each[Panorama], pose: Each[Pose], sources: Near[Panorama], sou
              params: MySweepParams, ctx: Context) -> RangeMap: ...
 """
 
+from pano_mvs.algorithms.poses.frame.geodesy import lla_from_local
+from pano_mvs.algorithms.poses.frame.georeference import origin_of_frame
 from pano_mvs.algorithms.sweep.backends import register_sweep_backend
 from pano_mvs.algorithms.sweep.costs import CostWindow, register_sweep_cost
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.winner import Winners
+from pano_mvs.algorithms.two_view.verification import verify_pair
 from pano_mvs.core.errors import GateError, InputError, PanoMvsError, UsageError
 from pano_mvs.core.parts import Parts
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.params import NOT_IN_KEY, InputPath, Params, PartOf, SourcePath
 from pano_mvs.engine.stages.ports import All, Each, Names, Near, One
 from pano_mvs.engine.stages.stage import SourceItem, source, stage
-from pano_mvs.geometry import Rigid3, Similarity3
+from pano_mvs.geometry import (
+    Rigid3,
+    Similarity3,
+    pad_panorama,
+    pixel_from_ray,
+    ray_from_pixel,
+    ray_grid,
+    roll_panorama,
+    sample_panorama,
+)
+from pano_mvs.io.clouds.thinning import CHUNK_POINTS, chunks, select_points
+from pano_mvs.io.clouds.thinning import Kept as KeptPoints
+from pano_mvs.io.clouds.thinning import Selection as PointSelection
 from pano_mvs.scene import (
     Axis,
     Features,
@@ -38,10 +53,12 @@ from pano_mvs.scene import (
     TwoView,
     Views,
 )
+from pano_mvs.scene.files import group_file
 from pano_mvs.scene.image_files.image_file import decode_image, write_png
 from pano_mvs.scene.pose_groups import join_groups, per_group, split_groups
 
 __all__ = [
+    "CHUNK_POINTS",
     "NOT_IN_KEY",
     "All",
     "Axis",
@@ -55,6 +72,7 @@ __all__ = [
     "GlobalDescriptor",
     "InputError",
     "InputPath",
+    "KeptPoints",
     "Names",
     "Near",
     "One",
@@ -65,6 +83,7 @@ __all__ = [
     "PartOf",
     "Parts",
     "PointCloud",
+    "PointSelection",
     "Pose",
     "Poses",
     "RangeMap",
@@ -79,13 +98,25 @@ __all__ = [
     "UsageError",
     "Views",
     "Winners",
+    "chunks",
     "decode_image",
+    "group_file",
     "join_groups",
+    "lla_from_local",
+    "origin_of_frame",
+    "pad_panorama",
     "per_group",
+    "pixel_from_ray",
+    "ray_from_pixel",
+    "ray_grid",
     "register_sweep_backend",
     "register_sweep_cost",
+    "roll_panorama",
+    "sample_panorama",
+    "select_points",
     "source",
     "split_groups",
     "stage",
+    "verify_pair",
     "write_png",
 ]
