@@ -27,7 +27,12 @@ def imported(text: str) -> Iterator[str]:
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}/{path.name}")
 def test_shipped_plugins_import_the_api_alone(path: Path) -> None:
-    assert set(imported(path.read_text(encoding="utf-8"))) <= ALLOWED
+    text = path.read_text(encoding="utf-8")
+    assert set(imported(text)) <= ALLOWED
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.ImportFrom) and node.module in ALLOWED:
+            module = sweep if node.module.endswith("sweep") else api
+            assert {alias.name for alias in node.names} <= set(module.__all__)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -142,7 +142,9 @@ def _string_after(name: str) -> str:
 
 
 def _modules() -> list[ModuleType]:
-    return [module for name, module in sorted(sys.modules.items()) if name.startswith(("pano_mvs.engine.", "pano_mvs.io."))]
+    return [
+        module for name, module in sorted(sys.modules.items()) if name.startswith(("pano_mvs.engine.", "pano_mvs.io."))
+    ]
 
 
 def _assigned(statement: ast.stmt) -> list[str]:
