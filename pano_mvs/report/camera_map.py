@@ -10,7 +10,9 @@ from pathlib import PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.text import plural
 from pano_mvs.geometry import rotation_from_two_vectors
+from pano_mvs.results.figures import significant
 from pano_mvs.results.records import PairLink, PosesSummary
 
 FloatArray = NDArray[np.float64]
@@ -140,8 +142,11 @@ def _chosen(
     for link in links:
         if link.first in position and link.second in position:
             a, b = position[link.first], position[link.second]
-            of = f" of {link.candidates} candidates" if link.candidates is not None else ""
-            words = f"{link.inliers} matches{of}" if link.inliers else f"rejected{of and f', none{of}'}"
+            of = ""
+            if link.candidates is not None:
+                of = f" of {link.candidates} {plural(link.candidates, 'candidate')}"
+            matches = f"{link.inliers} {plural(link.inliers, 'match', 'matches')}{of}"
+            words = matches if link.inliers else f"rejected{of and f', none{of}'}"
             why = reasons.get((link.first, link.second), "")
             text = f"{labels[a]} – {labels[b]}: {words}{why and f'; {why}'}"
             found.append(_Joined(a, b, link.inliers, link.candidates or 0, text))
@@ -185,8 +190,9 @@ def _drawn(
     cameras = [(float(x), float(y), label, spot) for (x, y), label, spot in zip(placed, labels, spots, strict=True)]
     length = _round_length(110 / scale)
     bar = (14.0, height - 14.0, round(length * scale, 1), _measured(length, unit))
-    wide, deep = (f"{float(size):.3g} {unit}" for size in high - low)
-    text = f"{len(labels)} cameras {title.lower()}, {wide} across and {deep} {'deep' if tallest == _HEIGHT else 'high'}"
+    wide, deep = (f"{significant(float(size), 3)} {unit}" for size in high - low)
+    cameras_text = f"{len(labels)} {plural(len(labels), 'camera')}"
+    text = f"{cameras_text} {title.lower()}, {wide} across and {deep} {'deep' if tallest == _HEIGHT else 'high'}"
     dots = "" if named else "".join(f"M{x:g} {y:g}h0" for x, y in placed)
     text += f", {len(doubts)} of them doubtful" if doubts else ""
     doubtful = tuple((float(placed[idx, 0]), float(placed[idx, 1]), labels[idx], why) for idx, why in doubts.items())

@@ -14,6 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from pano_mvs.core.files import write_text
+from pano_mvs.core.text import plural
 from pano_mvs.report.content import Content, gather
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.results import figures
@@ -84,7 +85,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters |= {"share": figures.share, "duration": figures.duration, "figure": figures.figure,
-                            "words": figures.words, "degrees": figures.degrees}  # fmt: skip
+                            "words": figures.words, "degrees": figures.degrees, "plural": plural}  # fmt: skip
     return environment
 
 

@@ -3,7 +3,7 @@
 import pytest
 
 from pano_mvs.results.findings import findings
-from pano_mvs.results.records import Verdict
+from pano_mvs.results.records import Finding, Verdict
 from pano_mvs.results.residuals import Histogram, Residuals
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.results.verdict import verdict
@@ -21,6 +21,10 @@ GOOD = {
 
 def judged(summary: dict, **known) -> Verdict:
     return verdict(RunSummary.from_json(summary), **known)
+
+
+def found_in(summary: dict) -> tuple[Finding, ...]:
+    return findings(RunSummary.from_json(summary))
 
 
 def residuals(median_deg):
@@ -118,6 +122,32 @@ def test_a_run_with_doubtful_cameras_alone_has_no_failed_items():
     assert judged(failed).outcome == "Finished, with failed items"
 
 
+def test_a_run_with_unregistered_panoramas_alone_has_no_failed_items():
+    rejected = {"x0.png": {"stage": "poses", "reason": "0 matches, 20 needed"}}
+    summary = GOOD | {"exit_code": 3, "poses": rejecting(1), "rejected": rejected}
+    assert judged(summary).outcome == "Finished, with panoramas left out"
+    doubts = {"0.png": {"stage": "checked", "reason": "confirmed 1 %"}}
+    assert judged(summary | {"doubts": doubts}).outcome == "Finished, with panoramas left out and doubtful cameras"
+    assert judged({"exit_code": 3}).outcome == "Finished, with failed items"
+
+
+def test_one_of_anything_is_not_named_as_several():
+    (finding,) = [one for one in found_in({"poses": rejecting(1)}) if "no pose" in one.text]
+    assert finding.text == "1 of 11 panoramas has no pose: 0 matches, 20 needed."
+    failed = {"failures": [{"stage": "depth"}], "blocked": [{}]}
+    assert found_in(failed)[0].text == "1 unit of work failed (1 in depth); 1 further unit could not run because of it."
+    assert judged({"stages": [{"run": 1}]}).sentence.startswith("1 unit of work: 1 computed")
+    assert "the one unit of work was taken" in judged({"stages": [{"cached": 1}]}).sentence
+    assert judged({"cloud": {"points": 1}}).tiles[0].label == "point in the cloud"
+
+
+def test_reasons_that_differ_in_figures_and_endings_alone_are_counted_together():
+    reasons = {"a": "1 match, 20 needed", "b": "7 matches, 20 needed", "c": "1 of its points is known",
+               "d": "2 of its points are known", "e": "3 of its points are known"}  # fmt: skip
+    (finding,) = found_in({"poses": {"registered": NAMES, "rejected": reasons}})
+    assert "3 times such as “1 of its points is known”" in finding.text
+
+
 def test_where_nothing_is_known_nothing_is_judged():
     assert judged({}).judgement == ""
 
@@ -131,10 +161,8 @@ def test_doubts_of_a_run_without_poses_are_findings_too() -> None:
     """The run ended with exit code 3 and said nothing."""
     doubts = {"0.png": {"stage": "judge", "reason": "the lens is dirty"}}
     summary = {"exit_code": 3, "poses": {}, "doubts": doubts}
-    (finding,) = [finding for finding in findings(RunSummary.from_json(summary)) if "doubtful" in finding.text]
+    (finding,) = [finding for finding in found_in(summary) if "doubtful" in finding.text]
     assert finding.mood == "fair"
     assert "1 image is doubtful: 0.png (the lens is dirty)" in finding.text
     both = GOOD | {"poses": doubting(1), "doubts": doubts | {"9.png": {"stage": "judge", "reason": "dark"}}}
-    assert "9.png (dark)" in next(
-        finding.text for finding in findings(RunSummary.from_json(both)) if "doubtful" in finding.text
-    )
+    assert "9.png (dark)" in next(finding.text for finding in found_in(both) if "doubtful" in finding.text)

@@ -10,6 +10,7 @@ from rich.table import Table
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import is_file
+from pano_mvs.core.text import plural
 from pano_mvs.engine.planning.plan import StagePlan
 from pano_mvs.results.summary import RUN_JSON, RunSummary
 from pano_mvs.session.planning import plan_session
@@ -31,7 +32,7 @@ def show_plan(session: Session, console: Console) -> None:
     for plan in plans:
         _print_reasons(plan, console)
     nothing = not run_plan.units and not run_plan.may_follow
-    text = "nothing to compute" if nothing else f"{run_plan.units} units would run"
+    text = "nothing to compute" if nothing else f"{run_plan.units} {plural(run_plan.units, 'unit')} would run"
     console.print(text + (", more may follow" if run_plan.may_follow else ""), highlight=False)
 
 
@@ -62,6 +63,7 @@ def _print_reasons(plan: StagePlan, console: Console) -> None:
         which = f":{items[0]}" + (f" and {count - 1} more" if count > 1 else "") if items else ""
         console.print(escape(f"{plan.name}{which}: {reason}"), highlight=False, soft_wrap=True)
     if len(by_reason) > _SHOWN_REASONS:
-        console.print(f"{plan.name}: … and {len(by_reason) - _SHOWN_REASONS} other reasons", highlight=False)
+        more = len(by_reason) - _SHOWN_REASONS
+        console.print(f"{plan.name}: … and {more} other {plural(more, 'reason')}", highlight=False)
     for item, reason in list(plan.blocked.items())[:_SHOWN_REASONS]:
         console.print(escape(f"{plan.name}:{item}: cannot run: {reason}"), highlight=False, soft_wrap=True)

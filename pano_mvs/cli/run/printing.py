@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from pano_mvs.cli.console import Console
-from pano_mvs.core.text import one_line
+from pano_mvs.core.text import one_line, plural
 from pano_mvs.results.records import Number, ScoresSummary, Verdict
 from pano_mvs.results.run_output import RunOutput
 from pano_mvs.results.summary import RunSummary
@@ -25,7 +25,7 @@ def print_summary(output: RunOutput, console: Console) -> None:
     units = summary.units
     failed = f", {units.failed} failed" if units.failed else ""
     cached = " (nothing to compute)" if not units.run and not units.failed else ""
-    counts = f"{units.run} units computed, {units.cached} cached{failed}"
+    counts = f"{units.run} {plural(units.run, 'unit')} computed, {units.cached} cached{failed}"
     console.print(f"\n{counts} in {summary.seconds or 0:.1f} s{cached}", highlight=False)
     _print_failures(summary, console)
     _print_poses(summary, console)
@@ -35,12 +35,12 @@ def print_summary(output: RunOutput, console: Console) -> None:
         console.print(f"note: {escape(note)}", highlight=False, soft_wrap=True)
     if summary.left_over:
         count = len(summary.left_over)
-        console.print(
-            f"{count} files of an earlier run, which this one did not write, are still there", highlight=False
-        )
+        text = f"{count} {plural(count, 'file')} of an earlier run, which this one did not write,"
+        console.print(f"{text} {plural(count, 'is', 'are')} still there", highlight=False)
     _print_verdict(output.verdict, console)
     look = f", or look around with pano-mvs view {escape(shlex.quote(out))}" if is_to_see(summary.files) else ""
-    files = f"{len(summary.files)} files, {len(output.written)} written now"
+    count = len(summary.files)
+    files = f"{count} {plural(count, 'file')}, {len(output.written)} written now"
     console.print(
         f"results in {escape(out)} ({files}): open report.html{look}",
         highlight=False,
@@ -66,7 +66,8 @@ def _print_poses(summary: RunSummary, console: Console) -> None:
     poses = summary.poses
     if poses:
         total = len(poses.registered) + len(poses.rejected)
-        text = f"poses: {len(poses.registered)} of {total} registered, {poses.points} points; scale: {poses.scale}"
+        points = f"{poses.points} {plural(poses.points, 'point')}"
+        text = f"poses: {len(poses.registered)} of {total} registered, {points}; scale: {poses.scale}"
         console.print(escape(text), highlight=False)
 
 
@@ -92,8 +93,9 @@ def print_scores(scores: ScoresSummary, console: Console) -> None:
     if poses:
         together = poses.get("registered_in_one_frame")
         in_one_frame = "" if together is None else f" ({together} in one frame)"
-        text = (f"{poses['registered']} of {poses['of']} registered{in_one_frame}, median pair error "
-                f"{poses['median_pair_error_deg']:.3f}°")  # fmt: skip
+        error_deg = poses.get("median_pair_error_deg")
+        measured = "no pair to measure" if error_deg is None else f"median pair error {error_deg:.3f}°"
+        text = f"{poses['registered']} of {poses['of']} registered{in_one_frame}, {measured}"
         if "scale_ratio_error_max" in poses:
             text += f", translation scale ratios within {100 * poses['scale_ratio_error_max']:.2f} %"
         console.print(f"against the ground truth: {text}", highlight=False)
