@@ -183,8 +183,10 @@ class RunView:
 def load(out: str | Path, *, cache: str | Path | None = None) -> RunOutput:
     """Return the output of the latest run into a folder.
 
-        run = pano_mvs.load("out")
-        print(run.summary.poses.registered, run.cloud)
+    >>> import pano_mvs
+    >>> run = pano_mvs.load("out")
+    >>> run.verdict.outcome, run.views["000.png"].image.shape
+    ('Finished', (512, 1024, 3))
 
     Args:
         out: the output folder.

@@ -59,8 +59,10 @@ def plan(
 ) -> RunPlan:
     """Return what `run` would compute with the same arguments; nothing is computed or written.
 
-        plan = pano_mvs.plan("quickstart", images="photos")
-        print(plan.units, plan["depth"].run)     # 12 {"a.jpg": "never computed", …}
+    >>> import pano_mvs
+    >>> plan = pano_mvs.plan("quickstart", out="out", settings={"depth.planes": 192})
+    >>> list(plan["depth"].run)  # after the run of `pano_mvs.run`'s example, which had other planes
+    ['000.png', '001.png', '002.png', '003.png']
 
     Raises:
         UsageError: if the workflow, a setting or a folder cannot be used.

@@ -77,11 +77,14 @@ def run(
     Units that fail do not raise an error: they are in `summary.failures`, and `summary.ok` is False. The same holds
     for a quality threshold that stops the run (`summary.stopped`).
 
-        import pano_mvs
+    Without `images`, presets run on their samples:
 
-        run = pano_mvs.run("quickstart", images="photos", out="out", settings={"images.nadir_deg": 30})
-        print(run.verdict.judgement)
-        range_map = run.views["a.jpg"].range_map    # (H, W) float32, NaN where there is none
+    >>> import pano_mvs
+    >>> run = pano_mvs.run("quickstart", out="out", settings={"depth.planes": 96})
+    >>> run.ok, run.summary.poses.registered
+    (True, ('000.png', '001.png', '002.png', '003.png'))
+    >>> run.views["000.png"].range_map.shape
+    (512, 1024)
 
     Args:
         workflow: name of a preset, or a workflow file.
