@@ -76,25 +76,44 @@ def run(
     out: OutOption = None,
     overrides: SetOption = None,
     cache: CacheOption = None,
-    executor: Annotated[str, typer.Option("--executor", help="processes (the default), dask, or serial: one unit "
-                                          "after another in this process, for a debugger; a crash ends the run.",
-                                          show_default=False)] = "",
-    workers: Annotated[int, typer.Option("--workers", min=0, help="Units at a time, each in a process of its own; 0: "
-                                         "as many as there are cores for.")] = 0,
-    threads: Annotated[int, typer.Option("--threads-per-worker", min=0, help="Threads of each; 0: an equal share of "
-                                         "the cores.")] = 0,
-    scheduler: Annotated[str, typer.Option("--scheduler", metavar="ADDRESS", help="An existing dask scheduler, such as "
-                                           "tcp://host:8786, whose workers see the cache.", show_default=False)] = "",
+    executor: Annotated[
+        str,
+        typer.Option(
+            "--executor",
+            help="processes (the default), dask, or serial: one unit "
+            "after another in this process, for a debugger; a crash ends the run.",
+            show_default=False,
+        ),
+    ] = "",
+    workers: Annotated[
+        int,
+        typer.Option(
+            "--workers", min=0, help="Units at a time, each in a process of its own; 0: as many as there are cores for."
+        ),
+    ] = 0,
+    threads: Annotated[
+        int, typer.Option("--threads-per-worker", min=0, help="Threads of each; 0: an equal share of the cores.")
+    ] = 0,
+    scheduler: Annotated[
+        str,
+        typer.Option(
+            "--scheduler",
+            metavar="ADDRESS",
+            help="An existing dask scheduler, such as tcp://host:8786, whose workers see the cache.",
+            show_default=False,
+        ),
+    ] = "",
     as_json: Annotated[bool, typer.Option("--json", help="Print events, one JSON object in a line.")] = False,
     until: UntilOption = None,
     only: OnlyOption = None,
     refresh: RefreshOption = None,
     accept_code: AcceptOption = False,
-    keep_going: Annotated[bool, typer.Option("-k", "--keep-going", help="Go on after failures even where a stage "
-                                             "says on_error: stop.")] = False,
+    keep_going: Annotated[
+        bool, typer.Option("-k", "--keep-going", help="Go on after failures even where a stage says on_error: stop.")
+    ] = False,
     min_free: MinFreeOption = "",
     durable: DurableOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Run a workflow; the same command resumes it."""
     from pano_mvs.cli.run.command import run_workflow
     from pano_mvs.engine.running.options import Demands
@@ -119,9 +138,16 @@ def plan(
     only: OnlyOption = None,
     refresh: RefreshOption = None,
     accept_code: AcceptOption = False,
-    explain: Annotated[str, typer.Option("--explain", metavar="STAGE:ITEM", help="All about one unit: what it reads, "
-                                         "what it is made of, where its result is.", show_default=False)] = "",
-) -> None:  # fmt: skip
+    explain: Annotated[
+        str,
+        typer.Option(
+            "--explain",
+            metavar="STAGE:ITEM",
+            help="All about one unit: what it reads, what it is made of, where its result is.",
+            show_default=False,
+        ),
+    ] = "",
+) -> None:
     """Show what a run would do, what is cached, and why the rest is not; nothing is written into --out."""
     from pano_mvs.cli.plan.command import show_plan
     from pano_mvs.cli.plan.explain import explain_unit
@@ -192,22 +218,37 @@ app.command()(doctor)
 @guarded
 def view_results(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="The output folder of a run, or a .ply file.")],
-    screenshot: Annotated[Path | None, typer.Option("--screenshot", metavar="FILE", help="Write a picture instead "
-                                                       "of opening a window; needs no display.")] = None,
+    screenshot: Annotated[
+        Path | None,
+        typer.Option(
+            "--screenshot", metavar="FILE", help="Write a picture instead of opening a window; needs no display."
+        ),
+    ] = None,
     view: Annotated[str, typer.Option("--view", help="overview, top, front or inside:NAME of an image.")] = "overview",
     color: Annotated[str, typer.Option("--color", help="rgb, confidence, views, normals or height.")] = "rgb",
-    surface: Annotated[str, typer.Option("--show", metavar="cloud|mesh|both", help="By default the cloud, if there is "
-                                         "one.", show_default=False)] = "",
+    surface: Annotated[
+        str,
+        typer.Option(
+            "--show", metavar="cloud|mesh|both", help="By default the cloud, if there is one.", show_default=False
+        ),
+    ] = "",
     points: Annotated[int, typer.Option("--points", min=0, help="Draw at most so many points; 0: all.")] = 2_000_000,
     size: Annotated[str, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Of the window in pixels.")] = "1280x860",
-    images: Annotated[Path | None, typer.Option("--images", help="Folder of the panoramas, if they "
-                                                   "have moved.")] = None,
+    images: Annotated[
+        Path | None, typer.Option("--images", help="Folder of the panoramas, if they have moved.")
+    ] = None,
     labels: Annotated[bool, typer.Option("--labels", help="Name the cameras.")] = False,
     blended: Annotated[bool, typer.Option("--blend", help="Show the cloud within a panorama.")] = False,
     backs: Annotated[bool, typer.Option("--backs", help="Show points that turn their back to the eye too.")] = False,
-    group: Annotated[int, typer.Option("--group", min=0, help="Which group of panoramas, where no reliable pair "
-                                       "connects all of them; 0 is the largest.")] = 0,
-) -> None:  # fmt: skip
+    group: Annotated[
+        int,
+        typer.Option(
+            "--group",
+            min=0,
+            help="Which group of panoramas, where no reliable pair connects all of them; 0 is the largest.",
+        ),
+    ] = 0,
+) -> None:
     """Look at cloud, mesh and cameras, and step inside the panoramas."""
     from pano_mvs.cli.view_command import ViewOptions, view_scene
 
@@ -218,8 +259,12 @@ def view_results(
 @app.command("inspect")
 @guarded
 def inspect_pixel(
-    target: Annotated[str, typer.Argument(metavar="WORKFLOW|OUT", help="A workflow file, the name of a preset, or the "
-                                          "output folder of a run.")],
+    target: Annotated[
+        str,
+        typer.Argument(
+            metavar="WORKFLOW|OUT", help="A workflow file, the name of a preset, or the output folder of a run."
+        ),
+    ],
     image: Annotated[str, typer.Argument(help="Name of the image, or a part of it that fits one alone.")],
     x: Annotated[float, typer.Argument(help="Column from the left edge at the swept size; fractions are dropped.")],
     y: Annotated[float, typer.Argument(help="Row from the upper edge, likewise.")],
@@ -227,11 +272,12 @@ def inspect_pixel(
     overrides: SetOption = None,
     images: ImagesOption = None,
     cache: CacheOption = None,
-    truth: Annotated[Path | None, typer.Option("--truth", help="Folder with poses.json and depth.npz; else the "
-                                                  "workflow's own.")] = None,
+    truth: Annotated[
+        Path | None, typer.Option("--truth", help="Folder with poses.json and depth.npz; else the workflow's own.")
+    ] = None,
     plot: Annotated[Path | None, typer.Option("--plot", metavar="FILE.png", help="Draw the curve there.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
-) -> None:  # fmt: skip
+) -> None:
     """Show one pixel: its ray, its range after each stage, what its neighbours see, its cost at every virtual range."""
     from pano_mvs.cli.inspect.command import PixelWanted, inspect, open_run
 

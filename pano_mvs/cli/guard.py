@@ -40,8 +40,12 @@ def guarded(command: Command) -> Command:
             raise
         except SystemExit as end:  # a plugin's code; ours raises typer.Exit
             traceback.print_exc()
-            errors.print(f"[red]error:[/] the code above called {escape(exit_text(end))}, which a plugin must not do; "
-                         "what was finished is kept", highlight=False, soft_wrap=True)  # fmt: skip
+            errors.print(
+                f"[red]error:[/] the code above called {escape(exit_text(end))}, which a plugin must not do; "
+                "what was finished is kept",
+                highlight=False,
+                soft_wrap=True,
+            )
             raise typer.Exit(1) from None
         except Exception as error:
             if isinstance(error, OSError) and error.filename is not None:  # where no better message was foreseen

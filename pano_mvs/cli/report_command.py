@@ -28,8 +28,10 @@ def rewrite_report(out: Path, cache: Path | None, console: Console) -> None:
     summary = RunSummary.read(out)
     root = cache_of(summary, cache)
     if not is_file(root / "layout.json"):
-        raise InputError(f"there is no cache in {root}, from which the pictures come. Give the one that the run used "
-                         "with --cache DIR")  # fmt: skip
+        raise InputError(
+            f"there is no cache in {root}, from which the pictures come. Give the one that the run used "
+            "with --cache DIR"
+        )
     with output_lock(out):
         write_report(out, summary, StoredValues.of_folder(out, summary, Store(root, for_reading=True)))
     console.print(escape(f"{out / 'report.html'} is written"), highlight=False, soft_wrap=True)

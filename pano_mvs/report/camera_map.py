@@ -97,10 +97,18 @@ def camera_maps(poses: PosesSummary, reasons: Mapping[tuple[str, str], str] | No
     north = bool(_ALONG_NORTH.search(poses.frame))
     doubts = {idx: poses.doubts[name] for idx, name in enumerate(names) if name in poses.doubts}
     return tuple(
-        _drawn(title, np.stack([sign * centers[:, axis] for axis, sign in axes], axis=-1), labels, links, doubts,
-               unit=unit, tallest=tallest, north=north and title == "From above")
+        _drawn(
+            title,
+            np.stack([sign * centers[:, axis] for axis, sign in axes], axis=-1),
+            labels,
+            links,
+            doubts,
+            unit=unit,
+            tallest=tallest,
+            north=north and title == "From above",
+        )
         for title, axes, tallest in (("From above", _ABOVE, _HEIGHT), ("From the side", _SIDE, _SIDE_HEIGHT))
-    )  # fmt: skip
+    )
 
 
 def up_of(poses: PosesSummary) -> FloatArray:
@@ -181,10 +189,14 @@ def _drawn(
     placed = np.round((flat - (low + high) / 2) * scale + (_WIDTH / 2, height / 2 - 6), 1)
     most = max((link.inliers for link in links), default=1) or 1
     lines = tuple(
-        Link((*map(float, (*placed[link.first], *placed[link.second])),), link.inliers / most, link.text,  # type: ignore[arg-type]
-             not link.inliers)
+        Link(
+            (*map(float, (*placed[link.first], *placed[link.second])),),
+            link.inliers / most,
+            link.text,  # type: ignore[arg-type]
+            not link.inliers,
+        )
         for link in links
-    )  # fmt: skip
+    )
     named = len(labels) <= _MAX_NAMED
     spots = _label_spots(placed, labels)
     cameras = [(float(x), float(y), label, spot) for (x, y), label, spot in zip(placed, labels, spots, strict=True)]

@@ -84,8 +84,13 @@ def cloud_pictures(
     seen_from = viewpoints(arrays[0], centers, up, aspect=_SIZE_HW[1] / _SIZE_HW[0], place=place)
     images, note = _drawn(arrays, seen_from, software=software, command=command)
     if whole.group_sizes:
-        note = "; ".join([*filter(None, [note]), "shown is group 0 of the poses, the largest; the clouds of the others "
-                          "are cloud_1.ply … (pano-mvs view OUT --group 1)"])  # fmt: skip
+        note = "; ".join(
+            [
+                *filter(None, [note]),
+                "shown is group 0 of the poses, the largest; the clouds of the others "
+                "are cloud_1.ply … (pano-mvs view OUT --group 1)",
+            ]
+        )
     titles = [view.title for view in seen_from]
     kept.keep(stem, {"titles": titles, "note": note})
     return CloudPictures(
@@ -100,8 +105,11 @@ def cloud_pictures(
 def _thinned(cloud: PointCloud) -> Arrays:
     """Return every n-th point of a cloud, so that no more are drawn than a picture can show."""
     step = -(-len(cloud) // _MAX_POINTS)
-    return (np.ascontiguousarray(cloud.points_in_world[::step]), np.ascontiguousarray(cloud.normals_in_world[::step]),
-            np.ascontiguousarray(cloud.colors_rgb[::step]))  # fmt: skip
+    return (
+        np.ascontiguousarray(cloud.points_in_world[::step]),
+        np.ascontiguousarray(cloud.normals_in_world[::step]),
+        np.ascontiguousarray(cloud.colors_rgb[::step]),
+    )
 
 
 def _drawn(

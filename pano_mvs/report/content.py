@@ -87,8 +87,9 @@ def gather(out_dir: Path, summary: RunSummary, values: StoredValues, earlier: Ea
     residuals = reprojection_residuals(record) if record is not None else None
     cards = view_cards(out_dir, [views[idx] for idx in chosen_views(views, always=poses.doubts)], values, earlier)
     shares = measured_shares(views, values, earlier) | {card.name: card.shares for card in cards if card.shares}
-    rows = panorama_rows(summary, shares=shares, residuals=residuals,
-                         thumbnails=thumbnails(out_dir, views, values, earlier))  # fmt: skip
+    rows = panorama_rows(
+        summary, shares=shares, residuals=residuals, thumbnails=thumbnails(out_dir, views, values, earlier)
+    )
     scores = tuple((stage, score_tables(scored)) for stage, scored in summary.scores_by_stage.items())
     judged = summary.model_copy(update={"views": tuple(_judged(view, shares) for view in views)})
     return Content(
@@ -117,10 +118,14 @@ def _rejected_pairs(links: Sequence[PairLink], values: StoredValues) -> tuple[tu
     """Return the pairs without inliers, those with most candidates first, and why, of the first 300."""
     rejected = sorted((link for link in links if not link.inliers), key=lambda link: -(link.candidates or 0))
     return tuple(
-        (link.first, link.second, link.candidates,
-         values.pair_reason(pair_name(link.first, link.second)) if idx < _MAX_REASONS else "")
+        (
+            link.first,
+            link.second,
+            link.candidates,
+            values.pair_reason(pair_name(link.first, link.second)) if idx < _MAX_REASONS else "",
+        )
         for idx, link in enumerate(rejected)
-    )  # fmt: skip
+    )
 
 
 def _judged(view: ViewSummary, shares: Mapping[str, Shares]) -> ViewSummary:

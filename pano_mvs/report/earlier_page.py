@@ -19,7 +19,7 @@ _PICTURE = re.compile(
     r'height="(\d{1,5})"'
 )
 _FACTS = re.compile(r'<script type="application/json" id="facts">([^<]*)</script>')
-_LARGEST_BYTES = 100_000_000
+_MAX_BYTES = 100_000_000
 
 
 class EarlierPage:
@@ -34,7 +34,7 @@ class EarlierPage:
     def of_file(path: Path) -> EarlierPage:
         """Return what a page holds; nothing if it is not there or no page of ours."""
         try:
-            text = path.read_text(encoding="utf-8") if path.stat().st_size <= _LARGEST_BYTES else ""
+            text = path.read_text(encoding="utf-8") if path.stat().st_size <= _MAX_BYTES else ""
         except (OSError, UnicodeDecodeError):
             return EarlierPage()
         pictures = {

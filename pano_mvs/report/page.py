@@ -84,8 +84,14 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"share": figures.share, "duration": figures.duration, "figure": figures.figure,
-                            "words": figures.words, "degrees": figures.degrees, "plural": plural}  # fmt: skip
+    environment.filters |= {
+        "share": figures.share,
+        "duration": figures.duration,
+        "figure": figures.figure,
+        "words": figures.words,
+        "degrees": figures.degrees,
+        "plural": plural,
+    }
     return environment
 
 

@@ -84,8 +84,19 @@ def panorama_rows(
         median, p95, _ = (residuals.views.get(name) if residuals else None) or (None, None, 0)
         view = figures.get(name, ViewSummary())
         rows.append(
-            Row(name, name in registered if poses else None, rejected.get(name, ""), doubts.get(name, ""),
-                shares.get(name), view.completeness, view.consistent, links[name],
-                median, p95, thumbnails.get(name), group_of.get(name))
-        )  # fmt: skip
+            Row(
+                name,
+                name in registered if poses else None,
+                rejected.get(name, ""),
+                doubts.get(name, ""),
+                shares.get(name),
+                view.completeness,
+                view.consistent,
+                links[name],
+                median,
+                p95,
+                thumbnails.get(name),
+                group_of.get(name),
+            )
+        )
     return tuple(rows)

@@ -25,9 +25,11 @@ _WORDS = {
     "of": "of panoramas with truth",
 }
 _CONSTANTS = "best_constant_", "constant_"
-_BRACKETS = ("In brackets: what one constant range for all pixels scores, the constant that is best for the very score "
-             "(in runs of earlier versions the median of the true ranges).")  # fmt: skip
-_LEAST_SHOWN = 0.0001
+_BRACKETS = (
+    "In brackets: what one constant range for all pixels scores, the constant that is best for the very score "
+    "(in runs of earlier versions the median of the true ranges)."
+)
+_MIN_SHOWN = 0.0001
 _UNITS = {"deg": "°", "rad": "rad", "px": "px", "s": "s", "db": "dB", "mb": "MB"}
 
 
@@ -63,8 +65,8 @@ def degrees(value: Any) -> str:
 
 def significant(value: float, digits: int = 2) -> str:
     """Return a number with at least so many significant digits, and never with an exponent."""
-    if 0 < abs(value) < _LEAST_SHOWN:
-        return f"< {_LEAST_SHOWN}"
+    if 0 < abs(value) < _MIN_SHOWN:
+        return f"< {_MIN_SHOWN}"
     return f"{value:z.0f}" if abs(value) >= 10**digits - 0.5 else f"{value:z.{digits}g}"
 
 

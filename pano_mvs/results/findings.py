@@ -61,8 +61,13 @@ def _stopped(summary: RunSummary) -> list[Finding]:
     if not stopped:
         return []
     if stopped == "interrupted":
-        return [Finding("fair", "The run was interrupted: what is shown is what it had finished.",
-                        "Run the same command again; what is finished is not computed again.")]  # fmt: skip
+        return [
+            Finding(
+                "fair",
+                "The run was interrupted: what is shown is what it had finished.",
+                "Run the same command again; what is finished is not computed again.",
+            )
+        ]
     stopped = stopped if stopped.endswith((".", "!", "?")) else f"{stopped}."
     return [Finding("bad", f"The run stopped early: {stopped}", "Mend this and run the same command again.")]
 
@@ -84,12 +89,19 @@ def _registration(summary: RunSummary) -> list[Finding]:
     if not total or not rejected:
         return []
     mood = mood_of(registered / total, GOOD_REGISTERED, FAIR_REGISTERED)
-    text = (f"{len(rejected)} of {total} {plural(total, 'panorama')} {plural(len(rejected), 'has', 'have')} no pose: "
-            f"{_commonest(list(rejected.values()))}.")  # fmt: skip
+    text = (
+        f"{len(rejected)} of {total} {plural(total, 'panorama')} {plural(len(rejected), 'has', 'have')} no pose: "
+        f"{_commonest(list(rejected.values()))}."
+    )
     if mood == "good":
         return [Finding("", text)]
-    return [Finding(mood, text, "Take more pictures between those, 0.5–1 m apart indoors, each seeing much of what the "
-                    "next one sees.")]  # fmt: skip
+    return [
+        Finding(
+            mood,
+            text,
+            "Take more pictures between those, 0.5–1 m apart indoors, each seeing much of what the next one sees.",
+        )
+    ]
 
 
 def doubt_mood(poses: PosesSummary) -> str:
@@ -107,9 +119,14 @@ def _doubts(summary: RunSummary) -> list[Finding]:
     count = f"{len(reasons)} {plural(len(reasons), f'{what} is', f'{what}s are')} doubtful"
     them = plural(len(reasons), "it and its", "them and their")
     mood = doubt_mood(poses) if poses.doubts else "fair"
-    return [Finding(mood, f"{count}: {'; '.join(reasons[:_SHOWN_DOUBTS])}{more}.",
-                    f"Take panoramas between {them} neighbours, with things in view that occur only once, or leave "
-                    f"{plural(len(reasons), 'it', 'these images')} out.")]  # fmt: skip
+    return [
+        Finding(
+            mood,
+            f"{count}: {'; '.join(reasons[:_SHOWN_DOUBTS])}{more}.",
+            f"Take panoramas between {them} neighbours, with things in view that occur only once, or leave "
+            f"{plural(len(reasons), 'it', 'these images')} out.",
+        )
+    ]
 
 
 def _groups(summary: RunSummary) -> list[Finding]:
@@ -119,9 +136,11 @@ def _groups(summary: RunSummary) -> list[Finding]:
     sizes = [f"group {number} has {_named(group)}" for number, group in enumerate(groups[1:], start=1)]
     more = f"; and {len(sizes) - _SHOWN_GROUPS} more" if len(sizes) > _SHOWN_GROUPS else ""
     largest = len(groups[0].images)
-    text = (f"{len(groups)} groups of panoramas share no reliable connection: each has its own frame and scale. The "
-            f"largest has {largest} {plural(largest, 'panorama')}; "
-            f"{'; '.join(sizes[:_SHOWN_GROUPS])}{more}.")  # fmt: skip
+    text = (
+        f"{len(groups)} groups of panoramas share no reliable connection: each has its own frame and scale. The "
+        f"largest has {largest} {plural(largest, 'panorama')}; "
+        f"{'; '.join(sizes[:_SHOWN_GROUPS])}{more}."
+    )
     return [Finding("fair", text, pictures_between(groups))]
 
 
@@ -168,16 +187,27 @@ def _graph(summary: RunSummary) -> list[Finding]:
     shown = ", ".join(loose[:3]) + (" …" if len(loose) > 3 else "")
     mood = "fair" if len(loose) > len(names) / 4 else ""
     sharing = plural(len(loose), "camera shares", "cameras share")
-    return [Finding(mood, f"{len(loose)} {sharing} a verified geometry with one other alone ({shown}): unless their "
-                          "poses were given, nothing confirms them.")]  # fmt: skip
+    return [
+        Finding(
+            mood,
+            f"{len(loose)} {sharing} a verified geometry with one other alone ({shown}): unless their "
+            "poses were given, nothing confirms them.",
+        )
+    ]
 
 
 def _residual(residual_px: float | None) -> list[Finding]:
     if residual_px is None or (mood := mood_of(residual_px, GOOD_RESIDUAL_PX, FAIR_RESIDUAL_PX)) == "good":
         return []
     text = f"The points miss the pictures by {significant(residual_px)} pixels in the median: the poses are not sharp."
-    return [Finding(mood, text, "Check that the pictures are sharp, unstitched seams aside, and not edited one by one; "
-                    "put poses.refine behind the solver if it is not there.")]  # fmt: skip
+    return [
+        Finding(
+            mood,
+            text,
+            "Check that the pictures are sharp, unstitched seams aside, and not edited one by one; "
+            "put poses.refine behind the solver if it is not there.",
+        )
+    ]
 
 
 def compares_views(summary: RunSummary) -> bool:
@@ -191,22 +221,42 @@ def _views(summary: RunSummary) -> list[Finding]:
     complete = median([view.completeness for view in summary.views])
     consistent = median([view.consistent for view in summary.views])
     if complete is not None and (mood := mood_of(complete, GOOD_COMPLETE, FAIR_COMPLETE)) != "good":
-        found.append(Finding(mood, f"Half of the views have a range for less than {share(complete)} of their pixels.",
-                             "Sky and masks have none; elsewhere look at the views in the report."))  # fmt: skip
+        found.append(
+            Finding(
+                mood,
+                f"Half of the views have a range for less than {share(complete)} of their pixels.",
+                "Sky and masks have none; elsewhere look at the views in the report.",
+            )
+        )
     if consistent is not None and not compares_views(summary):
-        found.append(Finding("", "No stage compared the views with each other, so nothing is known of their agreement.",
-                             "filters.consistency does it."))  # fmt: skip
+        found.append(
+            Finding(
+                "",
+                "No stage compared the views with each other, so nothing is known of their agreement.",
+                "filters.consistency does it.",
+            )
+        )
     elif consistent is not None and (mood := mood_of(consistent, GOOD_CONSISTENT, FAIR_CONSISTENT)) != "good":
-        found.append(Finding(mood, f"Other views confirm only {share(consistent)} of the pixels in the median view.",
-                             "Plain walls cannot be confirmed; if textured ones are not either, the cameras are too "
-                             "far apart or the poses are wrong."))  # fmt: skip
+        found.append(
+            Finding(
+                mood,
+                f"Other views confirm only {share(consistent)} of the pixels in the median view.",
+                "Plain walls cannot be confirmed; if textured ones are not either, the cameras are too "
+                "far apart or the poses are wrong.",
+            )
+        )
     return found
 
 
 def _cloud(summary: RunSummary) -> list[Finding]:
     if summary.cloud.points == 0:
-        return [Finding("bad", "The cloud has no points: no two views agree on any surface.",
-                        "Look at the ranges in the report; if they are right, the poses are wrong.")]  # fmt: skip
+        return [
+            Finding(
+                "bad",
+                "The cloud has no points: no two views agree on any surface.",
+                "Look at the ranges in the report; if they are right, the poses are wrong.",
+            )
+        ]
     return []
 
 

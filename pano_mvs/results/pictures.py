@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.paths import is_file, resolved
 
 _QUALITIES = (82, 70, 55, 40)
-_SMALLEST_PX = 32
+_MIN_PX = 32
 _LINE_PX = 4
 
 
@@ -46,7 +46,7 @@ def picture(image: NDArray[np.uint8], *, width: int, most_bytes: int, key: str =
         bgr = cv2.cvtColor(shown, cv2.COLOR_RGB2BGR)
         for quality in _QUALITIES:
             data = bytes(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
-            if len(data) <= most_bytes or (min(shown.shape[:2]) <= _SMALLEST_PX and quality == _QUALITIES[-1]):
+            if len(data) <= most_bytes or (min(shown.shape[:2]) <= _MIN_PX and quality == _QUALITIES[-1]):
                 size_hw = int(shown.shape[0]), int(shown.shape[1])
                 return Picture(f"data:image/jpeg;base64,{base64.b64encode(data).decode('ascii')}", size_hw, key)
         shown = resized(shown, shown.shape[1] * 3 // 4)

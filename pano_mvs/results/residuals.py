@@ -13,7 +13,7 @@ from pano_mvs.scene import Poses
 
 FloatArray = NDArray[np.float64]
 
-_MOST_OBSERVATIONS = 2_000_000
+_MAX_OBSERVATIONS = 2_000_000
 _BLOCK = 250_000
 _BINS = 30
 
@@ -77,7 +77,7 @@ def reprojection_residuals(poses: Poses) -> Residuals | None:
     total = len(poses.track_point_idx)
     if not total:
         return None
-    step = -(-total // _MOST_OBSERVATIONS)
+    step = -(-total // _MAX_OBSERVATIONS)
     image_idx = np.asarray(poses.track_image_idx[::step])
     residuals_deg = _residuals_deg(poses, step)
     overall = histogram(residuals_deg)

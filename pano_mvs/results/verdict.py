@@ -56,8 +56,13 @@ def verdict(summary: RunSummary, *, residuals: Residuals | None = None, image_wi
         outcome = f"Finished, with {' and '.join(text for text, found in parts.items() if found) or 'failed items'}"
     residual_deg = residuals.overall.median_deg if residuals else None
     residual_px = residual_deg * image_width / 360 if residual_deg is not None and image_width else None
-    tiles = [*_registered(summary), *_residual(residual_deg, residual_px), *_coverage(summary), *_cloud(summary),
-             *_accuracy(summary)]  # fmt: skip
+    tiles = [
+        *_registered(summary),
+        *_residual(residual_deg, residual_px),
+        *_coverage(summary),
+        *_cloud(summary),
+        *_accuracy(summary),
+    ]
     found = findings(summary, residual_px=residual_px)
     moods = {mood, *(tile.mood for tile in tiles), *(finding.mood for finding in found)}
     overall = _worst(moods)

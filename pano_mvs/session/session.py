@@ -61,8 +61,11 @@ def open_session(
     if images is not None and not is_folder(images):
         if exists(images):
             raise InputError(f"--images {images}: this is a file; give the folder with the pictures")
-        raise InputError(f"--images {images}: there is no such folder that you may look at ({problem_of(images)})"
-                         if is_denied(images) else f"--images {images}: there is no such folder")  # fmt: skip
+        raise InputError(
+            f"--images {images}: there is no such folder that you may look at ({problem_of(images)})"
+            if is_denied(images)
+            else f"--images {images}: there is no such folder"
+        )
     registry = Registry.installed()
     try:
         workflow = load_workflow(path, registry, overrides=overrides, images=images, presets=presets_folder())
@@ -76,8 +79,10 @@ def open_session(
     session = Session(workflow, graph, registry, root, out or Path("out") / workflow.name, demands)
     if name := _reader_of(root, session):
         option = "--cache" if cache or not variable else f"${CACHE_VARIABLE}"
-        raise UsageError(f"{option} {root}: stage {name!r} reads this very folder, and the cache's files would lie "
-                         "among its own. Choose another folder")  # fmt: skip
+        raise UsageError(
+            f"{option} {root}: stage {name!r} reads this very folder, and the cache's files would lie "
+            "among its own. Choose another folder"
+        )
     return session
 
 

@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 _CLOUD, _MESH, _MODELS = "cloud.ply", "mesh.ply", "colmap/sparse"
 _HEAD_BYTES = 1 << 14
 # The cameras' own directions up must agree this well to count as the scene's.
-_LEAST_AGREEMENT = 0.5
+_MIN_AGREEMENT = 0.5
 _NAMED_DOUBTS = 5
 
 
@@ -108,13 +108,17 @@ def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> Sho
     notes: list[str] = []
     groups = run.poses.by_group()
     if group >= len(groups):
-        raise UsageError(f"--group {group}: {path} has {len(groups)} {'groups' if len(groups) > 1 else 'group'}, "
-                         f"numbered from 0")  # fmt: skip
+        raise UsageError(
+            f"--group {group}: {path} has {len(groups)} {'groups' if len(groups) > 1 else 'group'}, numbered from 0"
+        )
     if len(groups) > 1:
-        others = ", ".join(f"{number} ({len(groups[number].registered)} images)"
-                           for number in range(len(groups)) if number != group)  # fmt: skip
-        notes.append(f"shown is group {group} of {len(groups)}, each with a frame and a scale of its own; --group N "
-                     f"shows another: {others}")  # fmt: skip
+        others = ", ".join(
+            f"{number} ({len(groups[number].registered)} images)" for number in range(len(groups)) if number != group
+        )
+        notes.append(
+            f"shown is group {group} of {len(groups)}, each with a frame and a scale of its own; --group N "
+            f"shows another: {others}"
+        )
     cloud_name, mesh_name, model = group_file(_CLOUD, group), group_file(_MESH, group), f"{_MODELS}/{group}"
     cloud_file, mesh_file = _written(path, run, cloud_name), _written(path, run, mesh_name)
     cameras = _cameras(path, model, run, images, notes)
@@ -128,8 +132,10 @@ def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> Sho
         cloud = None
         notes.append(f"{cloud_name} holds no points: report.html tells why")
     if cloud is None and mesh_file is None and not cameras:
-        raise InputError(f"{path}: holds no {cloud_name} with points, no {mesh_name} and no {model}. Give the output "
-                         "folder of a run; its report.html tells what became of it")  # fmt: skip
+        raise InputError(
+            f"{path}: holds no {cloud_name} with points, no {mesh_name} and no {model}. Give the output "
+            "folder of a run; its report.html tells what became of it"
+        )
     metric = groups[group].metric
     return ShownScene(
         name=resolved(path).name,
@@ -186,15 +192,17 @@ def _cameras(
     for idx, name in enumerate(poses.names):
         picture = source / name if source is not None else None
         preview = folder / (previews.get(name) or f"preview/{PurePosixPath(name).with_suffix('.jpg')}")
-        cameras.append(ShownCamera(
-            name=name,
-            cam_from_world=poses.cam_from_world(idx),
-            picture=picture if picture is not None and is_file(picture) else None,
-            preview=preview if is_file(preview) else None,
-            range_file=_map_of(folder, "range", name, ".tiff"),
-            confidence_file=_map_of(folder, "confidence", name, ".png"),
-            doubtful=name in run.poses.doubts,
-        ))  # fmt: skip
+        cameras.append(
+            ShownCamera(
+                name=name,
+                cam_from_world=poses.cam_from_world(idx),
+                picture=picture if picture is not None and is_file(picture) else None,
+                preview=preview if is_file(preview) else None,
+                range_file=_map_of(folder, "range", name, ".tiff"),
+                confidence_file=_map_of(folder, "confidence", name, ".png"),
+                doubtful=name in run.poses.doubts,
+            )
+        )
     if any(camera.picture is None for camera in cameras):
         where = source if source is not None else "the place from which the run read them"
         notes.append(f"panoramas are not in {where}: shown by their previews; give --images DIR for the pictures")
@@ -212,7 +220,7 @@ def _frame(cameras: tuple[ShownCamera, ...]) -> tuple[FloatArray, FloatArray]:
     ups = np.array([-camera.cam_from_world.rotation[1] for camera in cameras]).reshape(-1, 3)
     mean = ups.mean(axis=0) if len(ups) else np.zeros(3)
     length = float(np.linalg.norm(mean))
-    up = mean / length if length > _LEAST_AGREEMENT else np.array([0.0, -1.0, 0.0])
+    up = mean / length if length > _MIN_AGREEMENT else np.array([0.0, -1.0, 0.0])
     ahead = cameras[0].cam_from_world.rotation[2] if cameras else np.array([0.0, 0.0, 1.0])
     ahead = ahead - up * float(ahead @ up)
     if np.linalg.norm(ahead) < 1e-6:

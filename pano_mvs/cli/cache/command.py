@@ -21,8 +21,10 @@ from pano_mvs.results.summary import CACHE_VARIABLE
 _SHOWN = 10
 _UNITS_S = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0, "w": 604800.0}
 _FAILED_ITEMS = 3
-_UNPROVEN = ("{} of an earlier version, which did not check the images that it read, {} not proven: images "
-             "were changed, moved or deleted since, perhaps while they were being read")  # fmt: skip
+_UNPROVEN = (
+    "{} of an earlier version, which did not check the images that it read, {} not proven: images "
+    "were changed, moved or deleted since, perhaps while they were being read"
+)
 
 
 def open_cache(cache: Path | None) -> Store:
@@ -36,8 +38,10 @@ def open_cache(cache: Path | None) -> Store:
     if not is_file(root / "layout.json"):
         if is_denied(root / "layout.json"):
             raise UsageError(f"{root}: you may not look into this folder (permission denied). Mend its permissions")
-        raise UsageError(f"{root} is no cache of pano-mvs; name one with --cache DIR (it lies beside the workflow file "
-                         "as .pano-mvs, or where you ran a preset by its name)")  # fmt: skip
+        raise UsageError(
+            f"{root} is no cache of pano-mvs; name one with --cache DIR (it lies beside the workflow file "
+            "as .pano-mvs, or where you ran a preset by its name)"
+        )
     return Store(root)
 
 
@@ -63,16 +67,22 @@ def show_runs(store: Store, console: Console) -> None:
 def verify_cache(store: Store, console: Console, *, drop_unproven: bool = False) -> int:
     """Check every file of the cache; return the exit code."""
     damage = verify(store, drop_unproven=drop_unproven)
-    for what, paths in (("removed, damaged", damage.removed), ("incomplete", damage.incomplete),
-                        ("not proven", damage.unproven), ("not of the cache", damage.foreign),
-                        ("temporary", damage.temporary)):  # fmt: skip
+    for what, paths in (
+        ("removed, damaged", damage.removed),
+        ("incomplete", damage.incomplete),
+        ("not proven", damage.unproven),
+        ("not of the cache", damage.foreign),
+        ("temporary", damage.temporary),
+    ):
         for path in paths[:_SHOWN]:
             console.print(f"{what}: {escape(path)}", highlight=False, soft_wrap=True)
         if len(paths) > _SHOWN:
             console.print(f"{what}: … and {len(paths) - _SHOWN} more")
-    console.print(f"{damage.records} {plural(damage.records, 'record')} and {damage.blobs} "
-                  f"{plural(damage.blobs, 'blob')} are sound, {len(damage.removed)} damaged",
-                  highlight=False)  # fmt: skip
+    console.print(
+        f"{damage.records} {plural(damage.records, 'record')} and {damage.blobs} "
+        f"{plural(damage.blobs, 'blob')} are sound, {len(damage.removed)} damaged",
+        highlight=False,
+    )
     if damage.unproven:
         count = len(damage.unproven)
         unproven = _UNPROVEN.format(f"{count} {plural(count, 'result')}", plural(count, "is", "are"))
@@ -99,16 +109,18 @@ def collect_cache(store: Store, console: Console, *, delete: bool, unused: str, 
 
 def _told(found: Collection, *, delete: bool) -> str:
     records, blobs = len(found.records), len(found.blobs)
-    what = (f"{records} {plural(records, 'unit')}, {blobs} {plural(blobs, 'blob')}, "
-            f"{size_text(found.size_bytes)}")  # fmt: skip
+    what = f"{records} {plural(records, 'unit')}, {blobs} {plural(blobs, 'blob')}, {size_text(found.size_bytes)}"
     return f"{'deleted' if delete else 'would delete'}: {what}; {size_text(found.kept_bytes)} stay"
 
 
 def pin_run(store: Store, console: Console, run: str, name: str) -> None:
     """Keep what a run used whatever runs after it."""
     pin = store.runs.pin(run, name)
-    console.print(f"{escape(pin.name)}: {pin.units} {plural(pin.units, 'unit')} of {escape(pin.workflow)} "
-                  f"{plural(pin.units, 'is', 'are')} kept until `cache unpin`", highlight=False)  # fmt: skip
+    console.print(
+        f"{escape(pin.name)}: {pin.units} {plural(pin.units, 'unit')} of {escape(pin.workflow)} "
+        f"{plural(pin.units, 'is', 'are')} kept until `cache unpin`",
+        highlight=False,
+    )
 
 
 def unpin_run(store: Store, console: Console, name: str) -> None:

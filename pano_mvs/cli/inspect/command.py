@@ -84,8 +84,10 @@ def open_run(target: str, *, overrides: Sequence[str], images: Path | None, cach
         raise InputError(f"{out}: its workflow {workflow} is gone. Give another: pano-mvs inspect WORKFLOW IMAGE X Y")
     # A relative folder was meant from where the run was started; what it was is in the settings.
     folder = next((stage.params.get("path") for stage in summary.stages if stage.name == "images"), None)
-    given = [f"images.path={json.dumps(folder)}" if one.startswith("images.path=") and folder else one
-             for one in summary.workflow.overrides]  # fmt: skip
+    given = [
+        f"images.path={json.dumps(folder)}" if one.startswith("images.path=") and folder else one
+        for one in summary.workflow.overrides
+    ]
     if cache is None and summary.cache:
         cache = cache_of(summary)
     return open_session(str(workflow), overrides=[*given, *overrides], images=images, cache=cache, out=out)
@@ -123,8 +125,7 @@ def _inspection(session: Session, wanted: PixelWanted) -> Inspection:
 
 
 def _sweep_stage(session: Session, name: str) -> str:
-    sweeps = [stage for stage in session.graph.order
-              if isinstance(session.workflow.stages[stage].params, SweepParams)]  # fmt: skip
+    sweeps = [stage for stage in session.graph.order if isinstance(session.workflow.stages[stage].params, SweepParams)]
     if not sweeps:
         raise UsageError("this workflow has no depth.sweep: only sweeps have cost curves")
     if name and name not in sweeps:
@@ -140,8 +141,10 @@ def _image(wanted: str, names: Sequence[str]) -> str:
     if len(fitting) == 1:
         return fitting[0]
     shown = fitting or list(names)
-    raise UsageError(f"{len(fitting) or 'no'} images are called {wanted!r}; there are: {', '.join(shown[:_SHOWN])}"
-                     f"{' …' if len(shown) > _SHOWN else ''}")  # fmt: skip
+    raise UsageError(
+        f"{len(fitting) or 'no'} images are called {wanted!r}; there are: {', '.join(shown[:_SHOWN])}"
+        f"{' …' if len(shown) > _SHOWN else ''}"
+    )
 
 
 def _why_not(plans: Sequence[StagePlan], sweep: str, image: str, session: Session) -> str:
@@ -149,10 +152,11 @@ def _why_not(plans: Sequence[StagePlan], sweep: str, image: str, session: Sessio
     if image in plan.blocked:
         return f"{sweep}:{image} cannot be swept: {plan.blocked[image]}"
     if plan.open or plan.may_run:
-        return (f"{sweep}:{image} reads what the cache {session.store_root} does not hold, with these settings, "
-                f"pictures and version. Inspect the output folder of a run in place of the workflow, or run the "
-                f"workflow with these settings first, or just that: {_run_command(session, f'{sweep}:{image}')}"
-                )  # fmt: skip
+        return (
+            f"{sweep}:{image} reads what the cache {session.store_root} does not hold, with these settings, "
+            f"pictures and version. Inspect the output folder of a run in place of the workflow, or run the "
+            f"workflow with these settings first, or just that: {_run_command(session, f'{sweep}:{image}')}"
+        )
     return f"{sweep} has no view of {image}: it was not registered, or has no neighbours; see report.html"
 
 

@@ -30,19 +30,32 @@ def as_json_value(found: Inspection) -> dict[str, Any]:
         "ray_in_cam": found.ray_in_cam.tolist(),
         "ray_in_world": found.ray_in_world.tolist(),
         "center_in_world": found.center_in_world.tolist(),
-        "stages": [{"stage": one.stage, "use": one.use, "range": _number(one.range), "confidence": one.confidence}
-                   for one in found.stages],
+        "stages": [
+            {"stage": one.stage, "use": one.use, "range": _number(one.range), "confidence": one.confidence}
+            for one in found.stages
+        ],
         "true_range": _number(found.true_range),
-        "sources": [{"name": one.name, "baseline": one.baseline, "parallax_deg": one.parallax_deg,
-                     "pixel_px": list(one.pixel_px), "color_rgb": list(one.color_rgb), "masked": one.masked,
-                     "cost": _number(one.cost)} for one in found.sources],
+        "sources": [
+            {
+                "name": one.name,
+                "baseline": one.baseline,
+                "parallax_deg": one.parallax_deg,
+                "pixel_px": list(one.pixel_px),
+                "color_rgb": list(one.color_rgb),
+                "masked": one.masked,
+                "cost": _number(one.cost),
+            }
+            for one in found.sources
+        ],
         "sweep": found.sweep,
         "curve": {
             "ranges": curve.ranges.tolist(),
             "raw": curve.raw.tolist(),
             "aggregated": None if curve.aggregated is None else curve.aggregated.tolist(),
-            "by_source": {one.name: [_number(cost) for cost in costs]
-                          for one, costs in zip(found.sources, curve.by_source.tolist(), strict=True)},
+            "by_source": {
+                one.name: [_number(cost) for cost in costs]
+                for one, costs in zip(found.sources, curve.by_source.tolist(), strict=True)
+            },
             "winner": curve.winner,
             "runner_up": curve.runner_up,
             "range": _number(curve.range),
@@ -50,7 +63,7 @@ def as_json_value(found: Inspection) -> dict[str, Any]:
             "uniqueness": curve.uniqueness,
         },
         "notes": list(found.notes),
-    }  # fmt: skip
+    }
 
 
 def _number(value: float) -> float | None:
@@ -63,17 +76,23 @@ def print_inspection(found: Inspection, console: Console) -> None:
     def say(text: str) -> None:
         console.print(escape(text), highlight=False, soft_wrap=True)
 
-    say(f"{found.image}, pixel ({found.column}, {found.row}) of {found.size_hw[1]}×{found.size_hw[0]}: "
+    say(
+        f"{found.image}, pixel ({found.column}, {found.row}) of {found.size_hw[1]}×{found.size_hw[0]}: "
         f"azimuth {found.azimuth_deg:z.2f}°, elevation {found.elevation_deg:z.2f}°, "
-        f"colour {_hex(found.color_rgb)}")  # fmt: skip
-    say(f"ray in the camera {_vector(found.ray_in_cam)}, in the world {_vector(found.ray_in_world)} from "
-        f"{_vector(found.center_in_world)}")  # fmt: skip
+        f"colour {_hex(found.color_rgb)}"
+    )
+    say(
+        f"ray in the camera {_vector(found.ray_in_cam)}, in the world {_vector(found.ray_in_world)} from "
+        f"{_vector(found.center_in_world)}"
+    )
     console.print(_stage_table(found))
     console.print(_source_table(found))
     settings, curve = found.settings, found.curve
     said = [settings.cost, f"window {settings.window}", settings.combination, settings.aggregation]
-    say(f"cost curve of {found.sweep}: {settings.planes} ranges from {curve.ranges[0]:.4g} to {curve.ranges[-1]:.4g} "
-        f"({settings.spacing}), {', '.join(said)}")  # fmt: skip
+    say(
+        f"cost curve of {found.sweep}: {settings.planes} ranges from {curve.ranges[0]:.4g} to {curve.ranges[-1]:.4g} "
+        f"({settings.spacing}), {', '.join(said)}"
+    )
     for line in curve_text(
         curve, true_range=found.true_range, width=min(console.width, 140), plain=not _has_blocks(console)
     ):

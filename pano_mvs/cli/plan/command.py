@@ -26,8 +26,14 @@ def show_plan(session: Session, console: Console) -> None:
     table = Table("stage", "use", "cached", "run", "may run", "cannot run")
     for plan in plans:
         waiting = "all (units not known yet)" if plan.open else str(len(plan.may_run) or "")
-        table.add_row(plan.name, plan.use, str(len(plan.cached) or ""), str(len(plan.run) or ""), waiting,
-                      str(len(plan.blocked) or ""))  # fmt: skip
+        table.add_row(
+            plan.name,
+            plan.use,
+            str(len(plan.cached) or ""),
+            str(len(plan.run) or ""),
+            waiting,
+            str(len(plan.blocked) or ""),
+        )
     console.print(table)
     for plan in plans:
         _print_reasons(plan, console)
