@@ -188,14 +188,9 @@ def _drawn(
     height = int(np.clip(extent[1] * scale + 2 * _BORDER, 150, tallest))
     placed = np.round((flat - (low + high) / 2) * scale + (_WIDTH / 2, height / 2 - 6), 1)
     most = max((link.inliers for link in links), default=1) or 1
+    at = [(float(x), float(y)) for x, y in placed]
     lines = tuple(
-        Link(
-            (*map(float, (*placed[link.first], *placed[link.second])),),
-            link.inliers / most,
-            link.text,  # type: ignore[arg-type]
-            not link.inliers,
-        )
-        for link in links
+        Link((*at[link.first], *at[link.second]), link.inliers / most, link.text, not link.inliers) for link in links
     )
     named = len(labels) <= _MAX_NAMED
     spots = _label_spots(placed, labels)

@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.paths import is_file, is_folder, resolved
+from pano_mvs.core.text import plural
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.clouds.ply_points import PlyPoints, open_ply_points
 from pano_mvs.io.poses.files import read_poses
+from pano_mvs.results.records import PosesSummary
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene.files import group_file
 
@@ -98,54 +100,66 @@ def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> Sho
         UsageError: if there is no such group.
     """
     if is_file(path):
-        cloud, mesh = (None, path) if has_faces(path) else (open_ply_points(path), None)
-        if cloud is not None and not cloud.count:
-            raise InputError(f"{path}: holds no points, so there is nothing to show. Look at what wrote it")
-        return ShownScene(path.name, cloud, mesh, (), "scene units", *_frame(()))
+        return _scene_of_ply(path)
     if not is_folder(path):
         raise InputError(f"{path}: no such file or folder. Give the output folder of a run, or a .ply file")
     run = _summary(path)
     notes: list[str] = []
-    groups = run.poses.by_group()
-    if group >= len(groups):
-        raise UsageError(
-            f"--group {group}: {path} has {len(groups)} {'groups' if len(groups) > 1 else 'group'}, numbered from 0"
-        )
-    if len(groups) > 1:
-        others = ", ".join(
-            f"{number} ({len(groups[number].registered)} images)" for number in range(len(groups)) if number != group
-        )
-        notes.append(
-            f"shown is group {group} of {len(groups)}, each with a frame and a scale of its own; --group N "
-            f"shows another: {others}"
-        )
+    chosen = _group_of(run, group, path, notes)
     cloud_name, mesh_name, model = group_file(_CLOUD, group), group_file(_MESH, group), f"{_MODELS}/{group}"
-    cloud_file, mesh_file = _written(path, run, cloud_name), _written(path, run, mesh_name)
+    mesh_file = _written(path, run, mesh_name)
     cameras = _cameras(path, model, run, images, notes)
     if doubtful := [camera.name for camera in cameras if camera.doubtful]:
         shown = ", ".join(doubtful[:_NAMED_DOUBTS]) + (" …" if len(doubtful) > _NAMED_DOUBTS else "")
         notes.append(f"doubtful: {shown}; the ranges of these cameras may be in the wrong place, see report.html")
-    cloud = None if cloud_file is None else open_ply_points(cloud_file)
-    if cloud is None:
-        notes.append(f"no {cloud_name}: the workflow has no export.ply, or the run did not get there")
-    elif not cloud.count:
-        cloud = None
-        notes.append(f"{cloud_name} holds no points: report.html tells why")
+    cloud = _cloud(_written(path, run, cloud_name), cloud_name, notes)
     if cloud is None and mesh_file is None and not cameras:
         raise InputError(
             f"{path}: holds no {cloud_name} with points, no {mesh_name} and no {model}. Give the output "
             "folder of a run; its report.html tells what became of it"
         )
-    metric = groups[group].metric
     return ShownScene(
         name=resolved(path).name,
         cloud=cloud,
         mesh=mesh_file,
         cameras=cameras,
-        unit="m" if metric else "scene units",
+        unit="m" if chosen.metric else "scene units",
         **dict(zip(("up", "ahead"), _frame(cameras), strict=True)),
         notes=tuple(notes),
     )
+
+
+def _scene_of_ply(path: Path) -> ShownScene:
+    cloud, mesh = (None, path) if has_faces(path) else (open_ply_points(path), None)
+    if cloud is not None and not cloud.count:
+        raise InputError(f"{path}: holds no points, so there is nothing to show. Look at what wrote it")
+    return ShownScene(path.name, cloud, mesh, (), "scene units", *_frame(()))
+
+
+def _group_of(run: RunSummary, group: int, path: Path, notes: list[str]) -> PosesSummary:
+    """Return the poses of a group; if there are several groups, a note names the others."""
+    groups = run.poses.by_group()
+    if group >= len(groups):
+        raise UsageError(f"--group {group}: {path} has {len(groups)} {plural(len(groups), 'group')}, numbered from 0")
+    if len(groups) > 1:
+        sizes = [f"{number} ({len(poses.registered)} images)" for number, poses in enumerate(groups)]
+        notes.append(
+            f"shown is group {group} of {len(groups)}, each with a frame and a scale of its own; --group N "
+            f"shows another: {', '.join(sizes[:group] + sizes[group + 1 :])}"
+        )
+    return groups[group]
+
+
+def _cloud(path: Path | None, name: str, notes: list[str]) -> PlyPoints | None:
+    """Return the vertices of a cloud; None, with a note, if there is no file or it holds no points."""
+    cloud = None if path is None else open_ply_points(path)
+    if cloud is not None and cloud.count:
+        return cloud
+    if cloud is None:
+        notes.append(f"no {name}: the workflow has no export.ply, or the run did not get there")
+    else:
+        notes.append(f"{name} holds no points: report.html tells why")
+    return None
 
 
 def is_to_see(files: Iterable[str]) -> bool:
