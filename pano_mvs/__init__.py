@@ -12,7 +12,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pano_mvs.core.errors import GateError, InputError, PanoMvsError, StoreError, UsageError, WorkflowError
+    from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError, StoreError, UsageError, WorkflowError
     from pano_mvs.results.run_output import RunOutput, RunView, load
     from pano_mvs.results.summary import RunSummary
     from pano_mvs.session.planning import RunPlan, plan
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
-    "GateError",
     "InputError",
     "PanoMvsError",
     "RunOutput",
     "RunPlan",
+    "RunStoppedError",
     "RunSummary",
     "RunView",
     "StoreError",
@@ -39,11 +39,11 @@ __all__ = [
 
 # Where each name is; imported when it is first used, since the libraries behind it take a second to load.
 _HOMES = {
-    "GateError": "core.errors",
     "InputError": "core.errors",
     "PanoMvsError": "core.errors",
     "RunOutput": "results.run_output",
     "RunPlan": "session.planning",
+    "RunStoppedError": "core.errors",
     "RunSummary": "results.summary",
     "RunView": "results.run_output",
     "StoreError": "core.errors",

@@ -17,10 +17,10 @@ from pano_mvs.algorithms.sweep.costs import CostWindow, register_sweep_cost
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.winner import Winners
 from pano_mvs.algorithms.two_view.verification import verify_pair
-from pano_mvs.core.errors import GateError, InputError, PanoMvsError, UsageError
-from pano_mvs.core.parts import Parts
+from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError, UsageError
+from pano_mvs.core.named_registry import NamedRegistry
 from pano_mvs.engine.stages.context import Context
-from pano_mvs.engine.stages.params import NOT_IN_KEY, InputPath, Params, PartOf, SourcePath
+from pano_mvs.engine.stages.params import NOT_IN_KEY, InputPath, Params, RegisteredIn, SourcePath
 from pano_mvs.engine.stages.ports import All, Each, Names, Near, One
 from pano_mvs.engine.stages.stage import SourceItem, source, stage
 from pano_mvs.geometry import (
@@ -68,11 +68,11 @@ __all__ = [
     "Features",
     "FilePart",
     "Files",
-    "GateError",
     "GlobalDescriptor",
     "InputError",
     "InputPath",
     "KeptPoints",
+    "NamedRegistry",
     "Names",
     "Near",
     "One",
@@ -80,15 +80,15 @@ __all__ = [
     "PanoMvsError",
     "Panorama",
     "Params",
-    "PartOf",
-    "Parts",
     "PointCloud",
     "PointSelection",
     "Pose",
     "Poses",
     "RangeMap",
     "Record",
+    "RegisteredIn",
     "Rigid3",
+    "RunStoppedError",
     "Scores",
     "Similarity3",
     "SourceItem",

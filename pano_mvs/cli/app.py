@@ -116,12 +116,14 @@ def run(
 ) -> None:
     """Run a workflow; the same command resumes it."""
     from pano_mvs.cli.run.command import run_workflow
-    from pano_mvs.engine.running.options import Demands
+    from pano_mvs.engine.planning.run_options import RunOptions
     from pano_mvs.session.running import Execution
     from pano_mvs.session.session import open_session
 
-    demands = Demands(tuple(until or ()), tuple(only or ()), tuple(refresh or ()), accept_code, keep_going)
-    session = open_session(workflow, overrides=overrides or [], images=images, cache=cache, out=out, demands=demands)
+    run_options = RunOptions(tuple(until or ()), tuple(only or ()), tuple(refresh or ()), accept_code, keep_going)
+    session = open_session(
+        workflow, overrides=overrides or [], images=images, cache=cache, out=out, run_options=run_options
+    )
     execution = Execution(executor, workers, threads, scheduler, min_free, durable)
     raise typer.Exit(run_workflow(session, execution, as_json=as_json))
 
@@ -151,11 +153,13 @@ def plan(
     """Show what a run would do, what is cached, and why the rest is not; nothing is written into --out."""
     from pano_mvs.cli.plan.command import show_plan
     from pano_mvs.cli.plan.explain import explain_unit
-    from pano_mvs.engine.running.options import Demands
+    from pano_mvs.engine.planning.run_options import RunOptions
     from pano_mvs.session.session import check_output, open_session
 
-    demands = Demands(tuple(until or ()), tuple(only or ()), tuple(refresh or ()), accept_code)
-    session = open_session(workflow, overrides=overrides or [], images=images, cache=cache, out=out, demands=demands)
+    run_options = RunOptions(tuple(until or ()), tuple(only or ()), tuple(refresh or ()), accept_code)
+    session = open_session(
+        workflow, overrides=overrides or [], images=images, cache=cache, out=out, run_options=run_options
+    )
     check_output(session)
     if explain:
         explain_unit(session, explain, Console())

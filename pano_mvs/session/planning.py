@@ -11,8 +11,7 @@ from pathlib import Path
 from pano_mvs.core.errors import StoreError
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
-from pano_mvs.engine.running.options import Demands
-from pano_mvs.engine.running.run import workflow_id
+from pano_mvs.engine.planning.run_options import RunOptions
 from pano_mvs.session.session import Session, check_output, open_session
 from pano_mvs.session.settings import overrides_from_settings
 
@@ -74,7 +73,7 @@ def plan(
         images=Path(images) if images is not None else None,
         cache=Path(cache) if cache is not None else None,
         out=Path(out) if out is not None else None,
-        demands=Demands(tuple(until), tuple(only), tuple(refresh)),
+        run_options=RunOptions(tuple(until), tuple(only), tuple(refresh)),
     )
     check_output(session)
     return plan_session(session)
@@ -83,9 +82,9 @@ def plan(
 def plan_session(session: Session) -> RunPlan:
     """Return what the run of an open session would compute."""
     store = Store(session.store_root, for_reading=True)
-    workflow, graph = session.demands.applied_to(session.workflow, session.graph)
+    workflow, graph = session.run_options.applied_to(session.workflow, session.graph)
     with without_collector():
-        plans = make_plan(workflow, graph, store, workflow_id(session.workflow), session.demands)
+        plans = make_plan(workflow, graph, store, options=session.run_options)
     with suppress(StoreError):  # a cache of other users can be read, not written
         store.stat_cache.save()
     return RunPlan(tuple(plans))

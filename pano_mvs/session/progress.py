@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
 
-from pano_mvs.engine.running.events import Failure, Outcome, StageSummary
+from pano_mvs.engine.running.events import Failure, StageSummary, UnitStatus
 from pano_mvs.results.records import Verdict
 
 
@@ -85,7 +85,7 @@ class UnitFinished:
     kind: ClassVar[str] = "unit_finished"
     stage: str
     item: str
-    outcome: Outcome
+    outcome: UnitStatus
     seconds: float
 
 
@@ -184,9 +184,9 @@ class EventObserver:
         names = ("stage", "item", "cause", "consequence", "log", "said")
         self._progress(UnitFailed(**{name: getattr(failure, name) for name in names}))
 
-    def unit_finished(self, name: str, item: str, outcome: Outcome, seconds: float) -> None:
+    def unit_finished(self, name: str, item: str, *, status: UnitStatus, seconds: float) -> None:
         """Pass the event on."""
-        self._progress(UnitFinished(name, item, outcome, round(seconds, 6)))
+        self._progress(UnitFinished(name, item, status, round(seconds, 6)))
 
     def stage_finished(self, summary: StageSummary) -> None:
         """Pass the event on."""

@@ -10,12 +10,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from pano_mvs.core.errors import PanoMvsError, UsageError
+from pano_mvs.core.memory import bytes_from_size
 from pano_mvs.engine.cache.blobs import DamagedBlobError
-from pano_mvs.engine.cache.store import LEAST_FREE_BYTES, Store
+from pano_mvs.engine.cache.store import MIN_FREE_BYTES, Store
 from pano_mvs.engine.executors.choose import make_executor
 from pano_mvs.engine.executors.protocol import Executor
-from pano_mvs.engine.running.memory import bytes_from_size
-from pano_mvs.engine.running.options import Demands
+from pano_mvs.engine.planning.run_options import RunOptions
 from pano_mvs.engine.running.output_lock import output_lock
 from pano_mvs.engine.running.run import Run
 from pano_mvs.results.run_output import RunOutput
@@ -106,14 +106,14 @@ def run(
         InputError: if the images cannot be read.
         StoreError: if the cache or the output folder cannot be written.
     """
-    demands = Demands(tuple(until), tuple(only), tuple(refresh), accept_code=False, keep_going=keep_going)
+    run_options = RunOptions(tuple(until), tuple(only), tuple(refresh), accept_code=False, keep_going=keep_going)
     session = open_session(
         str(workflow),
         overrides=overrides_from_settings(settings or {}),
         images=Path(images) if images is not None else None,
         cache=Path(cache) if cache is not None else None,
         out=Path(out) if out is not None else None,
-        demands=demands,
+        run_options=run_options,
     )
     return run_session(session, Execution(executor, workers or 0), progress or ignore)
 
@@ -123,7 +123,7 @@ def run_session(session: Session, execution: Execution = Execution(), progress: 
     check_output(session)
     set_aside_foreign_files(session.out)
     min_free = min_free_bytes(execution.min_free)
-    store = Store(session.store_root, durable=execution.durable, least_free_bytes=min_free)
+    store = Store(session.store_root, durable=execution.durable, min_free_bytes=min_free)
     executor = make_executor(
         store,
         execution.executor,
@@ -172,10 +172,10 @@ def _run_locked(session: Session, store: Store, executor: Executor, progress: Pr
         session.workflow,
         session.graph,
         store,
-        session.out,
+        out=session.out,
         observer=EventObserver(progress),
         executor=executor,
-        demands=session.demands,
+        options=session.run_options,
     )
     with output_lock(session.out):
         summary, values = _execute(run, started, clock)
@@ -220,6 +220,6 @@ def min_free_bytes(size: str = "") -> int:
     """
     size = size or os.environ.get(MIN_FREE_VARIABLE, "")
     try:
-        return bytes_from_size(size) if size else LEAST_FREE_BYTES
+        return bytes_from_size(size) if size else MIN_FREE_BYTES
     except ValueError as error:
         raise UsageError(f"--min-free (or ${MIN_FREE_VARIABLE}) {size!r}: {error}") from error

@@ -86,14 +86,17 @@ def test_settings_are_python_values_or_strings_as_on_the_command_line(toy: Toy) 
 
 
 def test_a_plan_names_the_units_that_a_run_would_compute(toy: Toy) -> None:
-    arguments = {"out": toy.folder / "out", "cache": toy.folder / "cache"}
-    before = pano_mvs.plan(toy.folder / "wf.yaml", **arguments)
+    def planned(settings: dict[str, object] | None = None) -> pano_mvs.RunPlan:
+        out, cache = toy.folder / "out", toy.folder / "cache"
+        return pano_mvs.plan(toy.folder / "wf.yaml", out=out, cache=cache, settings=settings)
+
+    before = planned()
     assert (len(before["images"].run), before.may_follow) == (5, True)
     assert not (toy.folder / "out").exists()
     run_toy(toy)
-    after = pano_mvs.plan(toy.folder / "wf.yaml", **arguments)
+    after = planned()
     assert (after.units, after.may_follow) == (0, False)
-    changed = pano_mvs.plan(toy.folder / "wf.yaml", settings={"scaled.by": 5}, **arguments)
+    changed = planned({"scaled.by": 5})
     assert len(changed["scaled"].run) == 5
 
 

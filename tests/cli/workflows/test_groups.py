@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.printing import print_summary
@@ -22,6 +24,7 @@ from pano_mvs.scene.image_files.image_file import write_png
 from pano_mvs.testing.room import capture_poses, default_room, render
 from pano_mvs.viewer.shown_scene import open_scene
 from tests.cli.conftest import Command, run_json
+from tests.stored import write_npz
 
 SIZE_HW = (96, 192)
 LARGE, SMALL = ("a0.png", "a1.png", "a2.png"), ("b0.png", "b1.png")
@@ -76,7 +79,9 @@ def write_rooms(folder: Path) -> float:
     (folder / "capture" / "images").mkdir(parents=True)
     (folder / "capture" / "truth").mkdir()
     (folder / "rooms").mkdir()
-    views, depths, ours = [], {}, {"a": [], "b": []}
+    views: list[dict[str, Any]] = []
+    depths: dict[str, NDArray[np.float32]] = {}
+    ours: dict[str, list[dict[str, Any]]] = {"a": [], "b": []}
     poses = dict(
         zip(LARGE + SMALL, [*capture_poses(3, spread=0.4), *capture_poses(2, seed=3, spread=0.4)], strict=True)
     )
@@ -88,7 +93,7 @@ def write_rooms(folder: Path) -> float:
         ours[name[0]].append({"image": name, "R": moved.rotation.tolist(), "t": moved.translation.tolist()})
     size = {"width": SIZE_HW[1], "height": SIZE_HW[0]}
     (folder / "capture" / "truth" / "poses.json").write_text(json.dumps({**size, "metric": True, "views": views}))
-    np.savez(folder / "capture" / "truth" / "depth.npz", **depths)
+    write_npz(folder / "capture" / "truth" / "depth.npz", depths)
     for room, listed in ours.items():
         (folder / "rooms" / f"{room}.json").write_text(json.dumps({**size, "metric": False, "views": listed}))
     return float(np.linalg.norm(poses["b0.png"].center - poses["b1.png"].center))
