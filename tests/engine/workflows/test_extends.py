@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from pano_mvs.cli.session import open_session, presets_folder
 from pano_mvs.core.errors import WorkflowError
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.workflow import Workflow, load_workflow
+from pano_mvs.session.session import open_session, presets_folder
 from tests.engine.conftest import Toy, ran
 
 CHILD = "pano_mvs: 1\nname: child\nextends: wf.yaml\n"
