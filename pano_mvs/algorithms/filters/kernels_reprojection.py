@@ -1,18 +1,23 @@
-"""Compiled: what a source view says about the points of a reference view."""
+"""Compiled: consistency of the points of a reference view with the range map of a source view."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-# What a source says of a point: it cannot tell, it sees the same surface, it sees through the point to something
-# farther away, or something nearer hides the point.
+FloatArray = NDArray[np.float64]
+Triple = FloatArray | tuple[float, float, float]
+
+# Verdicts of a source on a point: no information; it sees the same surface; it sees something farther away through
+# the point; something nearer hides the point.
 UNKNOWN, AGREES, CONTRADICTS, HIDDEN = 0, 1, 2, 3
 
 
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
-def wrapped_column(row, column, height, width):  # type: ignore[no-untyped-def]
+def wrapped_column(row: int, column: int, height: int, width: int) -> int:
     """Return the column, in the picture, of a pixel at most one picture height outside of it."""
     if row < 0 or row >= height:
         column += width // 2
@@ -20,7 +25,7 @@ def wrapped_column(row, column, height, width):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
-def wrapped_row(row, height):  # type: ignore[no-untyped-def]
+def wrapped_row(row: int, height: int) -> int:
     """Return the row, in the picture, of a pixel at most one picture height outside of it."""
     if row < 0:
         return -1 - row
@@ -30,8 +35,8 @@ def wrapped_row(row, height):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def sample_range(ranges, x, y, max_step):  # type: ignore[no-untyped-def]
-    """Return the range between pixels: bilinear in 1/range where the four are one surface, else the nearest."""
+def sample_range(ranges: NDArray[np.float32], x: float, y: float, max_step: float) -> float:
+    """Return the range between pixels: bilinear in 1/range if the four lie on one surface, else that of the nearest."""
     height, width = ranges.shape
     left, top = math.floor(x - 0.5), math.floor(y - 0.5)
     weight_x, weight_y = x - 0.5 - left, y - 0.5 - top
@@ -45,14 +50,16 @@ def sample_range(ranges, x, y, max_step):  # type: ignore[no-untyped-def]
     if math.isfinite(r00 + r01 + r10 + r11) and far <= near * (1 + max_step):
         upper = (1 - weight_x) / r00 + weight_x / r01
         lower = (1 - weight_x) / r10 + weight_x / r11
-        return 1.0 / ((1 - weight_y) * upper + weight_y * lower)
+        return float(1.0 / ((1 - weight_y) * upper + weight_y * lower))
     if weight_y < 0.5:
         return float(r00) if weight_x < 0.5 else float(r01)
     return float(r10) if weight_x < 0.5 else float(r11)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def project(point, rotation, translation, height, width):  # type: ignore[no-untyped-def]
+def project(
+    point: Triple, rotation: FloatArray, translation: FloatArray, height: int, width: int
+) -> tuple[float, float, float]:
     """Return (x, y, distance) of a point (3 numbers) of the reference frame in a source panorama."""
     a = rotation[0, 0] * point[0] + rotation[0, 1] * point[1] + rotation[0, 2] * point[2] + translation[0]
     b = rotation[1, 0] * point[0] + rotation[1, 1] * point[1] + rotation[1, 2] * point[2] + translation[1]
@@ -63,8 +70,8 @@ def project(point, rotation, translation, height, width):  # type: ignore[no-unt
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def reprojection_angle(point, baseline, ratio):  # type: ignore[no-untyped-def]
-    """Return the angle, at the reference, between a point and where the source puts it along its own ray.
+def reprojection_angle(point: Triple, baseline: FloatArray, ratio: float) -> float:
+    """Return the angle, at the reference, between a point and the source's point along its own ray.
 
     `baseline` is the source's centre in the reference frame; the source puts the point at
     baseline + ratio (point − baseline).
@@ -80,11 +87,18 @@ def reprojection_angle(point, baseline, ratio):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def judge_point(point, rotation, translation, baseline, ranges, limits):  # type: ignore[no-untyped-def]
-    """Return (verdict, relative error, x, y, the source's range) of one source on one point.
+def judge_point(
+    point: Triple,
+    rotation: FloatArray,
+    translation: FloatArray,
+    baseline: FloatArray,
+    ranges: NDArray[np.float32],
+    limits: Triple,
+) -> tuple[int, float, float, float, float]:
+    """Return (verdict, relative error, x, y, source range) of one source on one point.
 
-    `limits` holds the largest relative error, the largest reprojection angle in radians, and the largest relative
-    step between neighbours that still count as one surface.
+    `limits` holds the maximum relative error, the maximum reprojection angle in radians, and the maximum relative
+    step between neighbours on one surface.
     """
     x, y, distance = project(point, rotation, translation, ranges.shape[0], ranges.shape[1])
     if not distance > 0:
@@ -103,24 +117,36 @@ def judge_point(point, rotation, translation, baseline, ranges, limits):  # type
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def squared_motion(point, distance, baseline):  # type: ignore[no-untyped-def]
-    """Return the square of how far, in radians at the source, a point moves for its relative change of range.
+def squared_motion(point: Triple, distance: float, baseline: FloatArray) -> float:
+    """Return the squared motion of a point, in radians at the source, per relative change of its range.
 
-    That is (sin γ r / d)², γ the angle at the point between the two rays, r and d its distances from the two cameras.
+    It is (sin γ r / d)², where γ is the angle between the two rays and r and d are the distances of the cameras.
     """
     square = point[0] * point[0] + point[1] * point[1] + point[2] * point[2]
     along = point[0] * baseline[0] + point[1] * baseline[1] + point[2] * baseline[2]
     length = baseline[0] * baseline[0] + baseline[1] * baseline[1] + baseline[2] * baseline[2]
-    return max(square * length - along * along, 0.0) / distance**4
+    motion: float = max(square * length - along * along, 0.0) / distance**4
+    return motion
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def judge_rows(first, rows, ranges, rays, view, source_ranges, limits, verdicts, supports, motions):  # type: ignore[no-untyped-def]
-    """Write what one source says of the pixels of some rows.
+def judge_rows(
+    first: int,
+    rows: int,
+    ranges: NDArray[np.float32],
+    rays: FloatArray,
+    view: tuple[FloatArray, FloatArray],
+    source_ranges: NDArray[np.float32],
+    limits: FloatArray,
+    verdicts: NDArray[np.uint8],
+    supports: FloatArray,
+    motions: FloatArray,
+) -> None:
+    """Write the verdicts of one source on the pixels of some rows.
 
     Args:
         first: the first row.
-        rows: how many.
+        rows: number of rows.
         ranges: (H, W) float32 of the reference.
         rays: (H, W, 3) its rays.
         view: rotation (3, 3) and translation (3,) source_from_reference.
