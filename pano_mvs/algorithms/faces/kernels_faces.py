@@ -1,21 +1,32 @@
-"""Compiled: a pinhole view's z-depth from the range map of a panorama."""
+"""Compiled: z-depth of a pinhole view from the range map of a panorama."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.kernels_reprojection import sample_range
 
+FloatArray = NDArray[np.float64]
+
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def z_depth_rows(first, rows, ranges, view, max_step, z_depth):  # type: ignore[no-untyped-def]
+def z_depth_rows(
+    first: int,
+    rows: int,
+    ranges: NDArray[np.float32],
+    view: tuple[FloatArray, float, float, float],
+    max_step: float,
+    z_depth: NDArray[np.float32],
+) -> None:
     """Write the z-depths of some rows of a view.
 
     Args:
         first: the first row.
-        rows: how many.
+        rows: number of rows.
         ranges: (H, W) float32 of the panorama, NaN invalid.
         view: (rotation view_from_cam (3, 3), focal length in px, principal point x, y).
         max_step: as in `sample_range`.
