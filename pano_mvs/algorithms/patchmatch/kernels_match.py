@@ -1,14 +1,21 @@
-"""Compiled: how well planes through the pixels of a stretch of a row match the sources, and which way is better.
+"""Compiled: match planes through the pixels of part of a row with the sources, with the slopes of the match.
 
 A plane p holds the points X with p · X = 1, so that a ray d meets it at 1 / range = p · d, and a source sees the ray in
-the direction (R + t pᵀ) d: a homography of rays. Pixels of a stretch are computed together, one window sample at a
-time, in short separate loops (project, gather, blend, sum), as in the sweep.
+the direction (R + t pᵀ) d: a homography of rays. The pixels of a stretch are computed together, one window sample at
+a time, in short separate loops (project, gather, blend, sum), as in the sweep.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+Place = tuple[int, int, int, float, int, NDArray[np.int64], NDArray[np.int64]]
+Sources = tuple[
+    NDArray[np.uint64], NDArray[np.int64], NDArray[np.int64], FloatArray, NDArray[np.uint8], NDArray[np.int64]
+]
 
 _F = np.float32
 _U = np.uint64
@@ -26,7 +33,7 @@ SUMS = 18
 
 
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
-def _atan_unit(a):  # type: ignore[no-untyped-def]
+def _atan_unit(a: np.float32) -> np.float32:
     """Return atan of a number in [0, 1], float32."""
     s = a * a
     tail = _A8 + s * (_A10 + s * (_A12 + s * (_A14 + s * _A16)))
@@ -34,8 +41,15 @@ def _atan_unit(a):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def weigh_window(grey, place, color_scale, weights, centred, moments):  # type: ignore[no-untyped-def]
-    """Weigh the window samples of a stretch of pixels by likeness to the window's centre.
+def weigh_window(
+    grey: NDArray[np.float32],
+    place: Place,
+    color_scale: np.float32,
+    weights: NDArray[np.float32],
+    centred: NDArray[np.float32],
+    moments: NDArray[np.float32],
+) -> None:
+    """Weight the window samples of a stretch of pixels by their similarity to the window's centre.
 
     Args:
         grey: (H + 2 pad, W + 2 pad) float32.
@@ -73,7 +87,14 @@ def weigh_window(grey, place, color_scale, weights, centred, moments):  # type: 
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def inverse_ranges(planes, azimuth, first, level, dip, inverse):  # type: ignore[no-untyped-def]
+def inverse_ranges(
+    planes: NDArray[np.float32],
+    azimuth: NDArray[np.float32],
+    first: int,
+    level: np.float32,
+    dip: np.float32,
+    inverse: NDArray[np.float32],
+) -> None:
     """Write q = p · d, (n,), for planes (3, n) and rays of one row: sin θ and cos θ from column `first` on."""
     start = _U(first)
     for i in range(_U(inverse.shape[0])):
@@ -82,10 +103,17 @@ def inverse_ranges(planes, azimuth, first, level, dip, inverse):  # type: ignore
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def project_samples(  # type: ignore[no-untyped-def]
-    azimuth, first, inverse, matrix, shape, index, weights, slopes
-):
-    """Find where rays of one row, of inverse ranges q, arrive in a packed source, and how fast that moves with q.
+def project_samples(
+    azimuth: NDArray[np.float32],
+    first: int,
+    inverse: NDArray[np.float32],
+    matrix: NDArray[np.float32],
+    shape: NDArray[np.int64],
+    index: NDArray[np.int32],
+    weights: NDArray[np.float32],
+    slopes: NDArray[np.float32],
+) -> None:
+    """Project rays of one row, at inverse ranges q, into a packed source, with the derivative by q.
 
     Args:
         azimuth: (2, ·) float32 sin θ and cos θ of the columns.
@@ -137,7 +165,9 @@ def project_samples(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def gather_samples(packed, start, index, patches):  # type: ignore[no-untyped-def]
+def gather_samples(
+    packed: NDArray[np.uint64], start: int, index: NDArray[np.int32], patches: NDArray[np.uint64]
+) -> None:
     """Fetch the 2×2 patches, four numbers of 16 bits each, at `start + index`; all (n,) but `packed`."""
     base = _U(start)
     for i in range(_U(index.shape[0])):
@@ -145,7 +175,14 @@ def gather_samples(packed, start, index, patches):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def blend_samples(patches, weights, slopes, means, samples, gradients):  # type: ignore[no-untyped-def]
+def blend_samples(
+    patches: NDArray[np.uint64],
+    weights: NDArray[np.float32],
+    slopes: NDArray[np.float32],
+    means: NDArray[np.float32],
+    samples: NDArray[np.float32],
+    gradients: NDArray[np.float32],
+) -> None:
     """Blend 2×2 patches into samples less `means`, and their slopes along the epipolar curve against q; all (n,)."""
     for i in range(_U(patches.shape[0])):
         patch = patches[i]
@@ -162,7 +199,12 @@ def blend_samples(patches, weights, slopes, means, samples, gradients):  # type:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def add_samples(samples, window_weights, reference, sums):  # type: ignore[no-untyped-def]
+def add_samples(
+    samples: NDArray[np.float32],
+    window_weights: NDArray[np.float32],
+    reference: NDArray[np.float32],
+    sums: NDArray[np.float32],
+) -> None:
     """Add one window sample of each pixel to the sums of one source; (n,) each, sums (SUMS, n)."""
     for i in range(_U(samples.shape[0])):
         b = samples[i]
@@ -173,7 +215,15 @@ def add_samples(samples, window_weights, reference, sums):  # type: ignore[no-un
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def add_gradients(samples, gradients, window_weights, reference, u, v, sums):  # type: ignore[no-untyped-def]
+def add_gradients(
+    samples: NDArray[np.float32],
+    gradients: NDArray[np.float32],
+    window_weights: NDArray[np.float32],
+    reference: NDArray[np.float32],
+    u: np.float32,
+    v: np.float32,
+    sums: NDArray[np.float32],
+) -> None:
     """Add the slopes of one window sample, at columns u and rows v from the centre, to the sums of one source."""
     for i in range(_U(samples.shape[0])):
         g = gradients[i]
@@ -197,7 +247,7 @@ def add_gradients(samples, gradients, window_weights, reference, u, v, sums):  #
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def row_matrix(pose, elevation, matrix):  # type: ignore[no-untyped-def]
+def row_matrix(pose: FloatArray, elevation: float, matrix: NDArray[np.float32]) -> None:
     """Write the (3, 4) matrix that takes (sin θ, cos θ, 1, q) of a row to directions in a source of pose (3, 4)."""
     level, dip = np.cos(elevation), -np.sin(elevation)
     for a in range(3):
@@ -208,7 +258,15 @@ def row_matrix(pose, elevation, matrix):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def sum_windows(planes, place, azimuth, window, sources, sums, votes):  # type: ignore[no-untyped-def]
+def sum_windows(
+    planes: NDArray[np.float32],
+    place: Place,
+    azimuth: NDArray[np.float32],
+    window: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
+    sources: Sources,
+    sums: NDArray[np.float32],
+    votes: NDArray[np.bool_],
+) -> None:
     """Sum up the windows of a stretch of pixels, on their planes, over each source.
 
     Args:
@@ -219,7 +277,7 @@ def sum_windows(planes, place, azimuth, window, sources, sums, votes):  # type: 
         sources: (·,) uint64 packed pictures, (S,) where each begins, (S, 2) their sizes, (S, 3, 4) float64
             source_from_reference, (·,) uint8 which patches may vote, empty if all may, and (S,) where each begins.
         sums: (S, SUMS, n) float32, written.
-        votes: (S, n) bool, written: whether the source may vote on the pixel.
+        votes: (S, n) bool, written: True where the source may vote on the pixel.
     """
     row, first, height, stretch, pad, rows, columns = place
     weights, centred, means = window
