@@ -13,12 +13,12 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.rendering.cloud import draw_cloud
+from pano_mvs.algorithms.rendering.viewpoints import Viewpoint, inside_camera, viewpoints
 from pano_mvs.report.cloud_renderer import read_pictures, write_scene
 from pano_mvs.report.earlier_page import Kept
 from pano_mvs.report.pictures import Picture, picture
 from pano_mvs.report.results import Results
-from pano_mvs.report.software_cloud import draw_cloud
-from pano_mvs.report.viewpoints import Viewpoint, inside_camera, viewpoints
 from pano_mvs.scene import PointCloud
 from pano_mvs.scene.pose_groups import split_groups
 

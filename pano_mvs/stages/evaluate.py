@@ -7,9 +7,9 @@ from functools import partial
 
 from pydantic import Field
 
-from pano_mvs.algorithms.metrics.score import score_capture
 from pano_mvs.api import All, InputPath, One, Panorama, Params, Poses, RangeMap, Scores, stage
-from pano_mvs.io.truth import read_truth
+from pano_mvs.evaluation.capture import score_capture
+from pano_mvs.evaluation.truth import read_truth
 
 
 class TruthParams(Params):

@@ -24,11 +24,11 @@ from typing import Any
 
 import numpy as np
 
-from pano_mvs.algorithms.metrics.placements import judge_placements
 from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.poses.verification.confirmation import Picture
 from pano_mvs.algorithms.poses.verification.verify_poses import verify_poses
+from pano_mvs.evaluation.poses.placements import judge_placements
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.image_files.image_file import decode_image, write_png

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.metrics.judged import has_range, judged_pixels
-from pano_mvs.algorithms.metrics.view_scores import Judging, pixel_scores
+from pano_mvs.evaluation.ranges.pixels import has_range, judged_pixels
+from pano_mvs.evaluation.ranges.view_scores import Judging, pixel_scores
 
 
 @dataclass(frozen=True, slots=True)

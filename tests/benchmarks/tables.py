@@ -17,9 +17,9 @@ import argparse
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from pano_mvs.algorithms.metrics.poses import align_centers
 from pano_mvs.algorithms.poses.unit_translations import unit_translations
 from pano_mvs.cli.session import presets_folder
+from pano_mvs.evaluation.poses.errors import align_centers
 from pano_mvs.scene import Poses
 from tests.benchmarks.captures import Capture, read_capture
 from tests.benchmarks.dense_chain import DenseChain, score_view

@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.metrics import cloud
-from pano_mvs.algorithms.metrics.cloud import CloudDistances, PointChunks, cloud_distances, score_cloud
-from pano_mvs.algorithms.metrics.surface import TrueView, surface_of_cloud, surface_of_views, view_points
 from pano_mvs.core.errors import UsageError
+from pano_mvs.evaluation.clouds import distances as cloud
+from pano_mvs.evaluation.clouds.distances import CloudDistances, PointChunks, cloud_distances, score_cloud
+from pano_mvs.evaluation.clouds.true_surface import TrueView, surface_of_cloud, surface_of_views, view_points
 from pano_mvs.geometry import Rigid3, ray_grid
 from tests.algorithms.range_scenes import box_range
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.metrics.placements import judge_placements
+from pano_mvs.evaluation.poses.placements import judge_placements
 from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec
 from pano_mvs.scene import Poses
 from tests.algorithms.poses.synthetic_capture import random_poses, random_rotation

@@ -6,11 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
-from pano_mvs.algorithms.metrics.best_constant import best_constant_errors, best_constant_median
-from pano_mvs.algorithms.metrics.judged import aligning_scale, judged_pixels, weighted_median, weighted_quantile
-from pano_mvs.algorithms.metrics.range_errors import BadLimit, range_errors
-from pano_mvs.algorithms.metrics.view_scores import PROTOCOLS, Judging, mean_scores, score_view
 from pano_mvs.core.errors import UsageError
+from pano_mvs.evaluation.ranges.best_constant import best_constant_errors, best_constant_median
+from pano_mvs.evaluation.ranges.errors import BadLimit, range_errors
+from pano_mvs.evaluation.ranges.pixels import aligning_scale, judged_pixels, weighted_median, weighted_quantile
+from pano_mvs.evaluation.ranges.view_scores import PROTOCOLS, Judging, mean_scores, score_view
 from pano_mvs.geometry import pixel_solid_angle
 from tests.oracles import range_scores as oracle
 

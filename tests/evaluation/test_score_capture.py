@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.metrics.score import KEPT, KEPT_OF_CONFIDENCE, score_capture
-from pano_mvs.algorithms.metrics.view_scores import score_view
+from pano_mvs.evaluation.capture import KEPT, KEPT_OF_CONFIDENCE, score_capture
+from pano_mvs.evaluation.ranges.view_scores import score_view
 from pano_mvs.geometry import Rigid3
 from tests.algorithms.range_scenes import box_range
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.metrics.score import score_capture
-from pano_mvs.algorithms.metrics.sparsification import sparsify
 from pano_mvs.core.errors import UsageError
+from pano_mvs.evaluation.capture import score_capture
+from pano_mvs.evaluation.ranges.sparsification import sparsify
 from pano_mvs.geometry import Rigid3
 
 SIZE = (16, 32)

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.metrics.poses import align_centers
 from pano_mvs.algorithms.sweep.cost_curve import CostCurve, cost_curve
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
 from pano_mvs.algorithms.sweep.settings import SweepSettings
@@ -21,8 +20,9 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.planning.units import Unit
 from pano_mvs.engine.running.execute import arguments_of
+from pano_mvs.evaluation.poses.errors import align_centers
+from pano_mvs.evaluation.truth import read_truth
 from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_from_pixel
-from pano_mvs.io.truth import read_truth
 from pano_mvs.scene import Panorama, Pose, RangeMap
 from pano_mvs.stages.depth import SweepParams
 from pano_mvs.viewer.inspect.inspection import Inspection, SourceSight, StageRange

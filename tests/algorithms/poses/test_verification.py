@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.metrics.placements import judge_placements
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.algorithms.poses.placement.placed_model import pairs_of
 from pano_mvs.algorithms.poses.verification import arbitration
 from pano_mvs.algorithms.poses.verification.arbitration import arbitrate, judge
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
 from pano_mvs.algorithms.poses.verification.verify_poses import model_of, verify_poses
+from pano_mvs.evaluation.poses.placements import judge_placements
 from pano_mvs.geometry import Rigid3, Similarity3, geodesic_angle, rotation_from_rotvec
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import join_groups, split_groups

@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.metrics.surface import TrueView, view_points
-from pano_mvs.cli.evaluate_cloud import CloudRequest, judge_cloud
+from pano_mvs.cli.evaluate.cloud import CloudRequest, judge_cloud
+from pano_mvs.evaluation.clouds.true_surface import TrueView, view_points
+from pano_mvs.evaluation.truth import read_truth
 from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec
 from pano_mvs.io.clouds.ply import write_ply
 from pano_mvs.io.clouds.ply_points import open_ply_points
-from pano_mvs.io.truth import read_truth
 from pano_mvs.scene import PointCloud
 from tests.algorithms.poses.synthetic_capture import random_rotation
 from tests.cli.conftest import Command

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.metrics.best_constant import best_constant_errors, best_constant_median
-from pano_mvs.algorithms.metrics.judged import Align, JudgedPixels, aligning_scale, judged_pixels, weighted_median
-from pano_mvs.algorithms.metrics.range_errors import DEFAULT_BAD, BadLimit, range_errors, weighted_mean
-from pano_mvs.algorithms.metrics.sparsification import sparsify
 from pano_mvs.core.errors import UsageError
+from pano_mvs.evaluation.ranges.best_constant import best_constant_errors, best_constant_median
+from pano_mvs.evaluation.ranges.errors import DEFAULT_BAD, BadLimit, range_errors, weighted_mean
+from pano_mvs.evaluation.ranges.pixels import Align, JudgedPixels, aligning_scale, judged_pixels, weighted_median
+from pano_mvs.evaluation.ranges.sparsification import sparsify
 
 PROTOCOLS = "", "w_", "valid_", "valid_w_"
 """Prefixes of scores: every pixel with truth, the same by solid angle, pixels with an estimate, the same likewise."""

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pano_mvs.algorithms.metrics.score import score_capture
-from pano_mvs.algorithms.metrics.view_scores import Judging
 from pano_mvs.cli.console import Console
-from pano_mvs.cli.evaluate_cloud import CloudRequest, evaluate_cloud
-from pano_mvs.cli.evaluate_depth import DepthRequest, evaluate_depth
+from pano_mvs.cli.evaluate.cloud import CloudRequest, evaluate_cloud
+from pano_mvs.cli.evaluate.depth import DepthRequest, evaluate_depth
 from pano_mvs.cli.run_command import print_scores
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.paths import is_file, is_folder
+from pano_mvs.evaluation.capture import score_capture
+from pano_mvs.evaluation.ranges.folders import find_ranges, match_pictures
+from pano_mvs.evaluation.ranges.view_scores import Judging
+from pano_mvs.evaluation.truth import find_true_ranges
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.colmap.model import is_colmap_model
 from pano_mvs.io.poses.files import read_groups, read_poses
-from pano_mvs.io.ranges.folders import find_ranges, match_pictures
-from pano_mvs.io.truth import find_true_ranges
 
 MODEL_ABOVE, MODEL, CLOUD, RANGES = "colmap", "colmap/sparse/0", "cloud.ply", "range"
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.io.cloud_picture import caption, distance_colors, distance_legend
-from pano_mvs.report.software_cloud import draw_cloud
-from pano_mvs.report.viewpoints import viewpoints
+from pano_mvs.algorithms.rendering.cloud import draw_cloud
+from pano_mvs.algorithms.rendering.viewpoints import viewpoints
+from pano_mvs.evaluation.clouds.overview import caption, distance_colors, distance_legend
 from pano_mvs.scene.image_files.image_file import write_png
 
 _SIZE_HW = (640, 1024)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.report.viewpoints import Viewpoint, facing
+from pano_mvs.algorithms.rendering.viewpoints import Viewpoint, facing
 
 _PAPER = (238, 241, 244)
 _LARGEST_PX = 5

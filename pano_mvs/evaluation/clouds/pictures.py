@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.metrics.cloud import PointChunks
-from pano_mvs.cli.evaluate_cloud import JudgedCloud
-from pano_mvs.cli.evaluate_cloud_views import write_cloud_views
-from pano_mvs.io.cloud_picture import write_cloud_picture
-from pano_mvs.io.error_cloud import write_error_cloud
+from pano_mvs.cli.evaluate.cloud import JudgedCloud
+from pano_mvs.evaluation.clouds.distances import PointChunks
+from pano_mvs.evaluation.clouds.error_cloud import write_error_cloud
+from pano_mvs.evaluation.clouds.overview import write_cloud_picture
+from pano_mvs.evaluation.clouds.views import write_cloud_views
 
 _MOST_POINTS, _MOST_VIEWS = 2_000_000, 12
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from pano_mvs.algorithms.metrics.pose_report import PoseReport, report_poses, summary
 from pano_mvs.core.errors import InputError
+from pano_mvs.evaluation.poses.report import PoseReport, report_poses, summary
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.io.poses.files import read_groups, read_poses
 from pano_mvs.scene import Poses

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.io.cloud_picture import distance_colors
+from pano_mvs.evaluation.clouds.overview import distance_colors
 
 _VERTEX = np.dtype([
     ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("distance", "<f4"),

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.metrics.judged import has_range
 from pano_mvs.core.errors import UsageError
+from pano_mvs.evaluation.ranges.pixels import has_range
 from pano_mvs.geometry import pixel_solid_angle
 
 # A range that is wrong by more than itself is simply wrong; without a limit a few pixels at the far end decide alone.

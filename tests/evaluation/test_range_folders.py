@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.evaluation.ranges.folders import RangeFile, find_ranges, match_pictures, without_extension
+from pano_mvs.evaluation.truth import find_true_ranges
 from pano_mvs.io.ranges.files import write_confidence_png, write_range_tiff
-from pano_mvs.io.ranges.folders import RangeFile, find_ranges, match_pictures, without_extension
-from pano_mvs.io.truth import find_true_ranges
 
 RANGES = np.random.default_rng(0).uniform(0.5, 60, (4, 8)).astype(np.float32)
 RANGES[1, 2] = np.nan

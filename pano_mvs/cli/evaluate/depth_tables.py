@@ -15,11 +15,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from pano_mvs.algorithms.metrics.range_errors import DELTAS
-from pano_mvs.algorithms.metrics.view_scores import BASELINES, PROTOCOLS, Judging, ViewScores, mean_scores
-from pano_mvs.cli.evaluate_depth_inputs import FoundScale
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.files import write_text
+from pano_mvs.evaluation.ranges.errors import DELTAS
+from pano_mvs.evaluation.ranges.inputs import FoundScale
+from pano_mvs.evaluation.ranges.view_scores import BASELINES, PROTOCOLS, Judging, ViewScores, mean_scores
 
 _PROTOCOL_HEADINGS = ("every pixel", "… on sphere", "estimated", "… on sphere")
 _LABELS = {"psnr_db": "PSNR dB", "mse": "MSE ×10⁻²", "rmse": "RMSE", "mae": "MAE", "abs_rel": "AbsRel %"} | dict(

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.io.cloud_picture import distance_colors
+from pano_mvs.evaluation.clouds.error_cloud import write_error_cloud
+from pano_mvs.evaluation.clouds.overview import distance_colors
+from pano_mvs.evaluation.ranges.error_picture import error_colored, signed_error, write_error_picture
 from pano_mvs.io.clouds.ply_points import open_ply_points
-from pano_mvs.io.error_cloud import write_error_cloud
-from pano_mvs.io.error_picture import error_colored, signed_error, write_error_picture
 
 GREY, BLACK = (128, 128, 128), (25, 25, 25)
 

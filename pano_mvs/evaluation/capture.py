@@ -8,10 +8,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.metrics.poses import align_centers, relative_pose_errors
-from pano_mvs.algorithms.metrics.resize import resized_labels, resized_range
-from pano_mvs.algorithms.metrics.view_scores import score_view
 from pano_mvs.core.errors import UsageError
+from pano_mvs.evaluation.poses.errors import align_centers, relative_pose_errors
+from pano_mvs.evaluation.ranges.resize import resized_labels, resized_range
+from pano_mvs.evaluation.ranges.view_scores import score_view
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Scores
 

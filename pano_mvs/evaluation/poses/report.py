@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.metrics.poses import CenterErrors, PoseErrors, center_errors, relative_pose_errors
 from pano_mvs.core.errors import UsageError
+from pano_mvs.evaluation.poses.errors import CenterErrors, PoseErrors, center_errors, relative_pose_errors
 from pano_mvs.geometry import Rigid3
 
 

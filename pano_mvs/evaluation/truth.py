@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import exists, is_file
+from pano_mvs.evaluation.ranges.folders import RangeFile, find_ranges
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.io.poses.json_files import PosedView, read_posed_views
-from pano_mvs.io.ranges.folders import RangeFile, find_ranges
 from pano_mvs.io.ranges.npy import keys_of_npz, read_npz
 
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pano_mvs.algorithms.metrics.judged import weighted_quantile
-from pano_mvs.algorithms.metrics.surface import TrueSurface
 from pano_mvs.core.errors import UsageError
+from pano_mvs.evaluation.clouds.true_surface import TrueSurface
+from pano_mvs.evaluation.ranges.pixels import weighted_quantile
 
 DEFAULT_THRESHOLDS = 0.05, 0.02
 CHUNK_POINTS = 2_000_000

@@ -27,7 +27,7 @@ def evaluate_run(
     truth: Annotated[Path, typer.Option("--truth", help="Folder with poses.json and depth.npz, or a part of that.")],
 ) -> None:
     """Compare a run's poses, range maps and cloud with the truth, as far as both are there."""
-    from pano_mvs.cli.evaluate import evaluate_folder
+    from pano_mvs.cli.evaluate.run import evaluate_folder
 
     evaluate_folder(out, truth, Console())
 
@@ -40,7 +40,7 @@ def evaluate_model(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Compare the poses in any file with the truth, whatever their frames and units."""
-    from pano_mvs.cli.evaluate_poses import evaluate_poses
+    from pano_mvs.cli.evaluate.poses import evaluate_poses
 
     evaluate_poses(model, truth, Console(), as_json=as_json)
 
@@ -72,7 +72,7 @@ def evaluate_points(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Compare a cloud with the true surface: accuracy, completeness, F-score."""
-    from pano_mvs.cli.evaluate_cloud import CloudRequest, evaluate_cloud
+    from pano_mvs.cli.evaluate.cloud import CloudRequest, evaluate_cloud
 
     request = CloudRequest(cloud, truth, poses, true_poses, tuple(thresholds))
     evaluate_cloud(request, Console(), out=out, picture=picture, as_json=as_json)
@@ -136,9 +136,9 @@ def evaluate_ranges(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:  # fmt: skip
     """Compare range maps with the truth: MSE, PSNR, MAE, RMSE, AbsRel, δ, bad pixels, completeness, AUSE."""
-    from pano_mvs.algorithms.metrics.range_errors import BadLimit
-    from pano_mvs.algorithms.metrics.view_scores import Judging
-    from pano_mvs.cli.evaluate_depth import DepthRequest, evaluate_depth
+    from pano_mvs.cli.evaluate.depth import DepthRequest, evaluate_depth
+    from pano_mvs.evaluation.ranges.errors import BadLimit
+    from pano_mvs.evaluation.ranges.view_scores import Judging
 
     judging = Judging(peak, tuple(BadLimit.from_text(text) for text in bad), align, min_confidence)
     request = DepthRequest(

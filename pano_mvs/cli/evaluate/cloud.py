@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from pano_mvs.algorithms.metrics.cloud import (
+from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.core.paths import is_file, is_folder
+from pano_mvs.evaluation.clouds.distances import (
     DEFAULT_THRESHOLDS,
     CloudDistances,
     CloudScore,
@@ -20,16 +22,20 @@ from pano_mvs.algorithms.metrics.cloud import (
     cloud_distances,
     score_cloud,
 )
-from pano_mvs.algorithms.metrics.poses import align_centers
-from pano_mvs.algorithms.metrics.surface import TrueSurface, TrueView, surface_of_cloud, surface_of_views, view_points
-from pano_mvs.core.errors import InputError, UsageError
-from pano_mvs.core.paths import is_file, is_folder
+from pano_mvs.evaluation.clouds.true_surface import (
+    TrueSurface,
+    TrueView,
+    surface_of_cloud,
+    surface_of_views,
+    view_points,
+)
+from pano_mvs.evaluation.poses.errors import align_centers
+from pano_mvs.evaluation.ranges.folders import match_pictures
+from pano_mvs.evaluation.truth import find_true_ranges
 from pano_mvs.geometry import Rigid3, Similarity3
 from pano_mvs.io.clouds.ply_points import PlyPoints, open_ply_points
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.io.poses.files import read_poses
-from pano_mvs.io.ranges.folders import match_pictures
-from pano_mvs.io.truth import find_true_ranges
 
 _CLOUD, _MODEL = "cloud.ply", "colmap/sparse/0"
 # Distances are told apart up to this many times the largest tolerance; for quantiles and files, not for scores.
@@ -131,7 +137,7 @@ def evaluate_cloud(
     scores = score_cloud(judged.distances, judged.compared.surface, request.thresholds)
     if picture is not None or out is not None:
         # The modules that draw are needed here alone.
-        from pano_mvs.cli.evaluate_cloud_pictures import write_error_clouds, write_overview
+        from pano_mvs.evaluation.clouds.pictures import write_error_clouds, write_overview
 
         if picture is not None:
             write_overview(picture, judged)

@@ -10,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from pano_mvs.algorithms.metrics.resize import resized_labels, resized_range
-from pano_mvs.algorithms.metrics.view_scores import Judging, ViewScores, score_view
-from pano_mvs.cli.evaluate_depth_inputs import (
+from pano_mvs.cli.evaluate.depth_tables import DepthReport, print_report, report_json, write_csv
+from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.core.files import write_text
+from pano_mvs.evaluation.ranges.error_picture import write_error_picture
+from pano_mvs.evaluation.ranges.inputs import (
     DepthInputs,
     FoundScale,
     find_inputs,
@@ -21,10 +23,8 @@ from pano_mvs.cli.evaluate_depth_inputs import (
     picture_reader,
     views_without_mask,
 )
-from pano_mvs.cli.evaluate_depth_print import DepthReport, print_report, report_json, write_csv
-from pano_mvs.core.errors import InputError, UsageError
-from pano_mvs.core.files import write_text
-from pano_mvs.io.error_picture import write_error_picture
+from pano_mvs.evaluation.ranges.resize import resized_labels, resized_range
+from pano_mvs.evaluation.ranges.view_scores import Judging, ViewScores, score_view
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,14 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.metrics.poses import align_centers
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.paths import children, is_file, is_folder
+from pano_mvs.evaluation.poses.errors import align_centers
+from pano_mvs.evaluation.ranges.folders import RangeFile, find_ranges, match_pictures, without_extension
+from pano_mvs.evaluation.truth import find_true_ranges
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.images.captures import PICTURE_SUFFIXES, describe_picture, list_pictures
 from pano_mvs.io.poses.files import read_groups, read_poses
-from pano_mvs.io.ranges.folders import RangeFile, find_ranges, match_pictures, without_extension
-from pano_mvs.io.truth import find_true_ranges
 from pano_mvs.scene import FilePart, Panorama
 from pano_mvs.scene.masking import decode_mask, placed_mask
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.metrics.judged import weighted_median
-from pano_mvs.algorithms.metrics.range_errors import DEFAULT_BAD, DELTAS, BadLimit, mse_scores, weighted_mean
+from pano_mvs.evaluation.ranges.errors import DEFAULT_BAD, DELTAS, BadLimit, mse_scores, weighted_mean
+from pano_mvs.evaluation.ranges.pixels import weighted_median
 
 
 @dataclass(frozen=True, slots=True, eq=False)

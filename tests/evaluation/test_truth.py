@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.evaluation.truth import read_truth
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.poses.files import read_poses
-from pano_mvs.io.truth import read_truth
 from pano_mvs.testing.room import Room, capture_poses, default_room, render, write_capture
 from pano_mvs.testing.surfaces import Ball
 

@@ -1,0 +1,1 @@
+"""Comparison of poses, range maps and clouds with ground truth."""
