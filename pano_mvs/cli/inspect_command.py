@@ -20,7 +20,7 @@ from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
 from pano_mvs.engine.planning.units import Unit
 from pano_mvs.engine.running.run import workflow_id
-from pano_mvs.evaluation.truth import read_truth
+from pano_mvs.evaluation.inputs.truth import read_truth
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.scene import RangeMap
 from pano_mvs.stages.depth import SweepParams

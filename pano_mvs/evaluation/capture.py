@@ -1,4 +1,4 @@
-"""Poses and range maps of a capture against the truth, by the protocol of the paper's tables."""
+"""Scores of a capture's poses and range maps, by the protocol of the paper's tables."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.evaluation.poses.errors import align_centers, relative_pose_errors
+from pano_mvs.evaluation.poses.alignment import align_centers
+from pano_mvs.evaluation.poses.errors import PoseErrors, relative_pose_errors
 from pano_mvs.evaluation.ranges.resize import resized_labels, resized_range
 from pano_mvs.evaluation.ranges.view_scores import score_view
 from pano_mvs.geometry import Rigid3
@@ -33,50 +34,39 @@ def score_capture(
 ) -> Scores:
     """Return pose and depth scores.
 
-    Ranges are multiplied by the scale of the similarity that aligns the estimated camera centres, of the view's group,
-    with the true ones; they are never fitted to the true ranges. Pixels without true surface are left out; a pixel
-    without an estimate counts as an error equal to the truth. Names of scores are those of `score_view`; `constant_`
-    before one is what the median of the view's true ranges scores in its place, `best_constant_` what the constant that
-    is best for it does.
+    Ranges are multiplied by the scale of the similarity that aligns the camera centres of the view's group with the
+    true ones; they are never fitted to the true ranges. Pixels without true surface are ignored; a pixel without an
+    estimate has an error equal to the truth. Scores are named as in `score_view`. The prefix `constant_` marks the
+    score of the median of the view's true ranges, `best_constant_` that of the best constant for the score.
 
     Args:
         estimated_poses: cam_from_world by image.
         true_poses: cam_from_world by image, in the truth's unit.
-        estimated_ranges: (H, W) by image, NaN invalid; of another size than the truth they are read at its pixels.
-        true_ranges: image to a function that returns its (H, W) true range, or None where it is not known.
-        confidences: (H, W) by image: how well they rank the errors is scored too where they are given.
-        masks: (H, W) by image, False is left out of the scores: nothing was to be estimated there.
-        groups: number of each estimated pose's group, where they have different worlds; None: all have one.
+        estimated_ranges: (H, W) by image, NaN invalid; resampled to the truth's size if needed.
+        true_ranges: image to a function that returns its (H, W) true range, or None if unknown.
+        confidences: (H, W) by image; if given, their ranking of the errors is scored too.
+        masks: (H, W) by image, False excludes a pixel from the scores.
+        groups: group number of each estimated pose, if the groups have different worlds; None: all share one.
     """
     if len(true_poses) < 2:
         return Scores({}, {}, ("no ground truth is known for these pictures",))
+    group_of = groups or {}
     notes: list[str] = []
     errors = relative_pose_errors(estimated_poses, true_poses, groups=groups)
-    poses: dict[str, float] = {
-        "registered": errors.registered,
-        "of": errors.expected,
-        "median_pair_error_deg": errors.median_pair_deg,
-        "median_rotation_error_deg": float(np.median(errors.rotation_deg)),
-        "median_direction_error_deg": float(np.median(errors.direction_deg)),
-        **{f"auc_{limit:g}_deg": value for limit, value in errors.auc.items()},
-    }
-    if np.isfinite(errors.scale_ratio_max):
-        poses |= {
-            "scale_ratio_error_median": errors.scale_ratio_median,
-            "scale_ratio_error_max": errors.scale_ratio_max,
-        }
-    if groups is not None and len(set(groups.values())) > 1:
+    poses = _pose_scores(errors)
+    if len(numbers := set(group_of.values())) > 1:
         poses["registered_in_one_frame"] = errors.in_one_frame
-        notes.append(f"the poses are in {len(set(groups.values()))} groups, each with a frame and a scale of its own: "
-                     "pairs across groups cannot be measured and count as not registered; each group is aligned with "
-                     "the truth on its own")  # fmt: skip
-    scales, refused = _scales(estimated_poses, true_poses, groups or {})
+        notes.append(
+            f"the poses are in {len(numbers)} groups, each with a frame and a scale of its own: pairs across groups "
+            "cannot be measured and count as not registered; each group is aligned with the truth on its own"
+        )
+    scales, refused = _scales(estimated_poses, true_poses, group_of)
     if not scales:
         return Scores(poses, {}, (*notes, *(f"ranges are not scored: {why}" for why in refused.values())))
     notes += [f"the ranges of group {number} are not scored: {why}" for number, why in refused.items()]
     views: dict[str, dict[str, float]] = {}
     for name, estimated in estimated_ranges.items():
-        scale = scales.get((groups or {}).get(name, 0))
+        scale = scales.get(group_of.get(name, 0))
         if scale is None:
             continue
         truth = true_ranges[name]() if name in true_ranges else None
@@ -94,10 +84,25 @@ def score_capture(
     return Scores(poses, views, tuple(notes))
 
 
+def _pose_scores(errors: PoseErrors) -> dict[str, float]:
+    scores: dict[str, float] = {
+        "registered": errors.registered,
+        "of": errors.expected,
+        "median_pair_error_deg": errors.median_pair_deg,
+        "median_rotation_error_deg": float(np.median(errors.rotation_deg)),
+        "median_direction_error_deg": float(np.median(errors.direction_deg)),
+        **{f"auc_{limit:g}_deg": value for limit, value in errors.auc.items()},
+    }
+    if np.isfinite(errors.scale_ratio_max):
+        scores["scale_ratio_error_median"] = errors.scale_ratio_median
+        scores["scale_ratio_error_max"] = errors.scale_ratio_max
+    return scores
+
+
 def _scales(
     estimated: Mapping[str, Rigid3], truth: Mapping[str, Rigid3], groups: Mapping[str, int]
 ) -> tuple[dict[int, float], dict[int, str]]:
-    """Return the truth's units per unit of each group, or why that cannot be known."""
+    """Return the scale from each group to the truth, and the groups without a scale with the reason."""
     scales, refused = {}, {}
     for number in sorted({groups.get(name, 0) for name in estimated}) or [0]:
         own = {name: pose for name, pose in estimated.items() if groups.get(name, 0) == number}
@@ -120,9 +125,9 @@ def _view_scores(
     confidence: NDArray[np.uint8] | None,
     mask: NDArray[np.bool_] | None,
 ) -> dict[str, float]:
-    """Return the scores that are kept with a run, then what constants score under each of these names.
+    """Return the scores that a run records, then those of constants by the same names.
 
-    What is no finite number (the median of nothing, the PSNR of no error) is left out: records hold none.
+    Scores that are not finite (the median of no pixels, the PSNR of no error) are omitted.
     """
     found = score_view(estimated, truth, scale=scale, confidence=confidence, mask=mask)
     scores = {name: found.scores[name] for name in (*KEPT, *KEPT_OF_CONFIDENCE) if name in found.scores}

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from pano_mvs.api import All, InputPath, One, Panorama, Params, Poses, RangeMap, Scores, stage
 from pano_mvs.evaluation.capture import score_capture
-from pano_mvs.evaluation.truth import read_truth
+from pano_mvs.evaluation.inputs.truth import read_truth
 
 
 class TruthParams(Params):
@@ -34,9 +34,8 @@ def truth(images: All[Panorama], poses: One[Poses], ranges: All[RangeMap], param
             matched[name] = view
         else:
             notes.append(f"{name} is not the picture that the truth in {params.truth.name} belongs to")
-    estimated = {name: poses.cam_from_world(idx) for idx, name in enumerate(poses.names)}
     scores = score_capture(
-        estimated,
+        poses.cameras,
         {name: view.cam_from_world for name, view in matched.items()},
         {name: ranges[name].range for name in matched if name in ranges},
         {name: partial(known.range_map, view) for name, view in matched.items()},

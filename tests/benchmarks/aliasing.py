@@ -28,7 +28,6 @@ from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.poses.verification.confirmation import Picture
 from pano_mvs.algorithms.poses.verification.verify_poses import verify_poses
-from pano_mvs.evaluation.poses.placements import judge_placements
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.image_files.image_file import decode_image, write_png
@@ -36,6 +35,7 @@ from pano_mvs.testing import paint, room, surfaces
 from pano_mvs.testing.repeating import drawings, fittings, prints
 from pano_mvs.testing.repeating.places import draw_arguments, draw_capture
 from pano_mvs.testing.scenes import Scene
+from tests.benchmarks.placements import judge_placements
 from tests.benchmarks.poses import MAPPERS, SEED, Cameras, Pictures, matched, native
 
 OURS = "ours"

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from pano_mvs.algorithms.poses.unit_translations import unit_translations
 from pano_mvs.cli.session import presets_folder
-from pano_mvs.evaluation.poses.errors import align_centers
+from pano_mvs.evaluation.poses.alignment import align_centers
 from pano_mvs.scene import Poses
 from tests.benchmarks.captures import Capture, read_capture
 from tests.benchmarks.dense_chain import DenseChain, score_view

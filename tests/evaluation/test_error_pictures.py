@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.evaluation.clouds.error_cloud import write_error_cloud
-from pano_mvs.evaluation.clouds.overview import distance_colors
+from pano_mvs.evaluation.clouds.error_clouds import distance_colors, write_error_cloud
 from pano_mvs.evaluation.ranges.error_picture import error_colored, signed_error, write_error_picture
 from pano_mvs.io.clouds.ply_points import open_ply_points
 

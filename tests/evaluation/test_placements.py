@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pano_mvs.evaluation.poses.placements import judge_placements
 from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec
 from pano_mvs.scene import Poses
 from tests.algorithms.poses.synthetic_capture import random_poses, random_rotation
+from tests.benchmarks.placements import judge_placements
 
 
 def poses_of(cameras, **more):

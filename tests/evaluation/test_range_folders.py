@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.evaluation.ranges.folders import RangeFile, find_ranges, match_pictures, without_extension
-from pano_mvs.evaluation.truth import find_true_ranges
+from pano_mvs.evaluation.inputs.names import match_images, without_extension
+from pano_mvs.evaluation.inputs.range_files import RangeFile, find_ranges
+from pano_mvs.evaluation.inputs.truth import find_true_ranges
 from pano_mvs.io.ranges.files import write_confidence_png, write_range_tiff
 
 RANGES = np.random.default_rng(0).uniform(0.5, 60, (4, 8)).astype(np.float32)
@@ -88,7 +89,7 @@ def test_truth_is_found_with_poses_and_without(tmp_path):
     assert list(found) == ["images/z.png"]
     np.testing.assert_array_equal(found["images/z.png"].read(), 2 * RANGES)
     np.savez(tmp_path / "depth.npz", nothing=RANGES)
-    with pytest.raises(InputError, match="no array called like a picture"):
+    with pytest.raises(InputError, match="no array named like an image"):
         find_true_ranges(tmp_path)
     (tmp_path / "poses.json").unlink()
     assert list(find_true_ranges(tmp_path)) == ["nothing"]
@@ -108,7 +109,7 @@ def test_truth_is_found_with_poses_and_without(tmp_path):
     ],
 )
 def test_pictures_are_matched_by_their_paths_without_extension(ours, theirs, expected):
-    assert match_pictures(ours, theirs) == expected
+    assert match_images(ours, theirs) == expected
 
 
 def test_only_extensions_of_pictures_are_dropped():

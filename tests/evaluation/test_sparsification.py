@@ -5,10 +5,16 @@ import pytest
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.evaluation.capture import score_capture
-from pano_mvs.evaluation.ranges.sparsification import sparsify
+from pano_mvs.evaluation.ranges.pixels import scored_pixels
+from pano_mvs.evaluation.ranges.sparsification import Sparsification
+from pano_mvs.evaluation.ranges.sparsification import sparsify as sparsify_pixels
 from pano_mvs.geometry import Rigid3
 
 SIZE = (16, 32)
+
+
+def sparsify(estimated: np.ndarray, confidence: np.ndarray, truth: np.ndarray, scale: float = 1.0) -> Sparsification:
+    return sparsify_pixels(scored_pixels(estimated, truth, confidence=confidence, scale=scale))
 
 
 def noisy(seed=0):

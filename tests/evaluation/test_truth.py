@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.evaluation.truth import read_truth
+from pano_mvs.evaluation.inputs.truth import read_truth
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.testing.room import Room, capture_poses, default_room, render, write_capture
@@ -78,7 +78,7 @@ def test_ranges_are_found_by_the_views_number(capture, tmp_path):
     folder = edited(capture, tmp_path, lambda data: data["views"][1].update(image="images/lobby.png"))
     np.savez(folder / "depth.npz", **{"001": np.full(SIZE, 2, np.float32)})
     truth = read_truth(folder)
-    assert truth.views["images/lobby.png"].range_key == "001"
+    assert truth.views["images/lobby.png"].range_file.key == "001"
 
 
 def test_damaged_ranges_are_named(capture, tmp_path):
@@ -93,7 +93,7 @@ def test_damaged_ranges_are_named(capture, tmp_path):
         truth.range_map(truth.views["images/000.png"])
     np.savez(folder / "depth.npz", **{"000": np.zeros(3, np.float32)})
     truth = read_truth(folder)
-    with pytest.raises(InputError, match=r"000 has shape \(3,\)"):
+    with pytest.raises(InputError, match=r"depth\.npz: 000 holds \(3,\) float32, not a map of ranges"):
         truth.range_map(truth.views["images/000.png"])
 
 
@@ -146,4 +146,7 @@ class TestPicturesOfOneNameInTwoFolders:
 
     def test_a_whole_name_goes_before_a_stem(self, tmp_path):
         views = read_truth(self.written(tmp_path, ["b/1.png", "1.png"], ["1"])).views
-        assert {name: view.range_key for name, view in views.items()} == {"b/1.png": None, "1.png": "1"}
+        assert {name: view.range_file and view.range_file.key for name, view in views.items()} == {
+            "b/1.png": None,
+            "1.png": "1",
+        }

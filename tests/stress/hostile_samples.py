@@ -16,8 +16,8 @@ import numpy as np
 from pano_mvs.cli.session import presets_folder
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.workflow import load_workflow
-from pano_mvs.evaluation.ranges.folders import find_ranges
-from pano_mvs.evaluation.truth import read_truth
+from pano_mvs.evaluation.inputs.range_files import find_ranges
+from pano_mvs.evaluation.inputs.truth import read_truth
 from pano_mvs.io.clouds.ply import read_ply, write_ply
 from pano_mvs.io.clouds.ply_mesh import read_ply_mesh, write_ply_mesh
 from pano_mvs.io.clouds.ply_points import open_ply_points

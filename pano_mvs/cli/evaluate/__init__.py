@@ -1,1 +1,1 @@
-"""The commands `pano-mvs evaluate …`: options and printing; the work is done in `pano_mvs.evaluation`."""
+"""The commands `pano-mvs evaluate …`: options and printing; `pano_mvs.evaluation` does the work."""

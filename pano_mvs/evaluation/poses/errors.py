@@ -1,4 +1,4 @@
-"""How good camera poses are, against ground truth."""
+"""Errors of camera poses: relative poses of all pairs, and camera centres."""
 
 from __future__ import annotations
 
@@ -10,32 +10,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import Rigid3, Similarity3, angle_between, geodesic_angle, nearest_rotation
+from pano_mvs.evaluation.poses.alignment import align_centers, camera_extent
+from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle
 
 FloatArray = NDArray[np.float64]
 
 AUC_LIMITS_DEG = (0.1, 0.5, 1.0, 5.0)
-# Centres that are closer than this share of the capture's extent coincide: a picture that is there twice.
+# Centres closer than this share of the capture's extent coincide: an image that occurs twice.
 _COINCIDENT_SHARE = 1e-6
-# How much orientations say of the turn between two worlds, against the centres' own spread. Enough where the centres
-# lie on a line and leave the turn about it open; nothing elsewhere.
-_ORIENTATION_SHARE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class PoseErrors:
-    """Errors of relative poses, over all pairs of the images that have truth.
+    """Errors of relative poses, over all pairs of images with ground truth.
 
     Attributes:
         pairs: (P) the pairs of image names.
-        rotation_deg: (P,) error of second_from_first's rotation; 180 where an image is not registered.
-        direction_deg: (P,) error of the direction of its translation; 180 likewise.
+        rotation_deg: (P,) error of second_from_first's rotation; 180 if an image is not registered.
+        direction_deg: (P,) error of the direction of its translation; 180 if an image is not registered.
         pair_deg: (P,) the larger of the two.
         median_pair_deg: median of `pair_deg`.
         auc: limit in degrees to the area under the recall curve of `pair_deg` up to it, in [0, 1].
-        registered: number of images that have an estimate.
-        in_one_frame: number of those in the largest group, which share a world frame.
-        expected: number of images that have truth.
+        registered: number of images with an estimate.
+        in_one_frame: number of those in the largest group, which shares one world frame.
+        expected: number of images with ground truth.
         scale_ratio_median: median of |baseline ratio − 1| after division by the median ratio; NaN below 3 images.
         scale_ratio_max: largest of them.
     """
@@ -55,10 +53,10 @@ class PoseErrors:
 
 @dataclass(frozen=True, eq=False)
 class CenterErrors:
-    """Distances of camera centres from the true ones, after the similarity that brings them closest.
+    """Distances of camera centres from the true ones after similarity alignment.
 
     Attributes:
-        names: (N) images that have both.
+        names: (N) images with both poses.
         distances: (N,) in the truth's unit.
         extent: largest distance between two true centres, in the truth's unit.
         scale: truth's units per unit of the estimate.
@@ -73,13 +71,13 @@ class CenterErrors:
 def relative_pose_errors(
     estimated: Mapping[str, Rigid3], truth: Mapping[str, Rigid3], *, groups: Mapping[str, int] | None = None
 ) -> PoseErrors:
-    """Return the errors of all pairs of the truth's images; they depend on no choice of world frame or scale.
+    """Return the errors of all pairs of the truth's images, which do not depend on the world frame or the scale.
 
     Args:
-        estimated: cam_from_world by image name; names without truth are left out.
-        truth: true cam_from_world by image name, two at least.
-        groups: number of each estimate's group, where they have different worlds: a pair across groups cannot be
-            measured and counts as one with an image that is not registered. None: all have one world.
+        estimated: cam_from_world by image name; names without truth are ignored.
+        truth: true cam_from_world of at least two images.
+        groups: group number of each estimate, if the groups have different worlds. A pair across groups cannot be
+            measured and counts as not registered. None: all share one world.
 
     Raises:
         UsageError: if the truth holds fewer than two images.
@@ -92,8 +90,8 @@ def relative_pose_errors(
     worlds = {
         number: {name: known[name] for name in known if group_of[name] == number} for number in set(group_of.values())
     }
-    true_limit = _COINCIDENT_SHARE * _extent(truth)
-    limits = {number: (_COINCIDENT_SHARE * _extent(world), true_limit) for number, world in worlds.items()}
+    true_limit = _COINCIDENT_SHARE * camera_extent(truth)
+    limits = {number: (_COINCIDENT_SHARE * camera_extent(world), true_limit) for number, world in worlds.items()}
     errors = np.array([
         _pair_error_deg(first, second, known, truth, limits[group_of[first]])
         if first in known and second in known and group_of[first] == group_of[second]
@@ -120,56 +118,21 @@ def relative_pose_errors(
 
 
 def center_errors(estimated: Mapping[str, Rigid3], truth: Mapping[str, Rigid3]) -> CenterErrors:
-    """Return how far the estimated camera centres are from the true ones after similarity alignment.
+    """Return the distances of the camera centres from the true ones after similarity alignment.
 
     Args:
-        estimated: cam_from_world by image name; names without truth are left out.
+        estimated: cam_from_world by image name; names without truth are ignored.
         truth: true cam_from_world by image name.
 
     Raises:
-        UsageError: as `align_centers`.
+        UsageError: if the poses determine no alignment (see `align_centers`).
     """
     truth_from_estimated = align_centers(estimated, truth)
     names = tuple(name for name in truth if name in estimated)
     moved = truth_from_estimated.apply([estimated[name].center for name in names])
     distances = np.linalg.norm(moved - [truth[name].center for name in names], axis=1)
-    return CenterErrors(names, distances, _extent({name: truth[name] for name in names}), truth_from_estimated.scale)
-
-
-def align_centers(estimated: Mapping[str, Rigid3], truth: Mapping[str, Rigid3]) -> Similarity3:
-    """Return the similarity world_truth from world_estimated that brings the camera centres together.
-
-    Umeyama 1991, with the cameras' orientations added to the covariance at a weight that matters only where the
-    centres alone leave a turn open: two images, images on a line, a picture that is there twice.
-
-    Args:
-        estimated: cam_from_world by image name.
-        truth: true cam_from_world by image name; two common names at different places determine it.
-
-    Raises:
-        UsageError: if fewer than two images are common, or their centres coincide in either.
-    """
-    names = [name for name in truth if name in estimated]
-    if len(names) < 2:
-        raise UsageError(f"only {len(names)} images have both an estimate and truth; two are needed for a scale")
-    source = np.array([estimated[name].center for name in names])
-    target = np.array([truth[name].center for name in names])
-    middle, aim = source.mean(axis=0), target.mean(axis=0)
-    spread, true_spread = float(np.linalg.norm(source - middle)), float(np.linalg.norm(target - aim))
-    for what, length, centers in (("estimated", spread, source), ("true", true_spread, target)):
-        if length <= 1e-12 * max(1.0, float(np.abs(centers).max())):
-            raise UsageError(f"the {what} centres of all {len(names)} images coincide, so no scale can be estimated")
-    covariance = (target - aim).T @ (source - middle) / (spread * true_spread)
-    turns = [truth[name].rotation.T @ estimated[name].rotation for name in names]
-    rotation = nearest_rotation(covariance + _ORIENTATION_SHARE * np.mean(turns, axis=0))
-    scale = float(np.trace(rotation.T @ covariance)) * true_spread / spread
-    return Similarity3(scale, rotation, aim - scale * rotation @ middle)
-
-
-def _extent(poses: Mapping[str, Rigid3]) -> float:
-    """Return the largest distance between two camera centres; 0 below two."""
-    centers = np.array([pose.center for pose in poses.values()]).reshape(-1, 3)
-    return max((float(np.linalg.norm(centers - center, axis=1).max()) for center in centers), default=0.0)
+    extent = camera_extent({name: truth[name] for name in names})
+    return CenterErrors(names, distances, extent, truth_from_estimated.scale)
 
 
 def _pair_error_deg(
@@ -179,7 +142,7 @@ def _pair_error_deg(
     truth: Mapping[str, Rigid3],
     limits: tuple[float, float],
 ) -> tuple[float, float]:
-    """Return the errors of rotation and of direction; a pair truly taken from one place has no direction."""
+    """Return the errors of rotation and direction; a pair taken from the same place has no direction error."""
     guess = estimated[second] @ estimated[first].inverse()
     true = truth[second] @ truth[first].inverse()
     rotation_deg = float(np.rad2deg(geodesic_angle(guess.rotation, true.rotation)))
@@ -193,7 +156,7 @@ def _pair_error_deg(
 def _baseline_ratios(
     estimated: Mapping[str, Rigid3], truth: Mapping[str, Rigid3], limits: tuple[float, float]
 ) -> FloatArray:
-    """Return estimated over true baseline length of every pair that has both."""
+    """Return the ratio of estimated to true baseline of every pair whose images lie apart on both sides."""
     true = {name: truth[name].center for name in estimated}
     guess = {name: pose.center for name, pose in estimated.items()}
     lengths = [

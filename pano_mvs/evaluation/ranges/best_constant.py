@@ -1,4 +1,4 @@
-"""What the best range map without any content scores: one constant, chosen for each score by the truth itself."""
+"""The best score that a constant range map reaches: each score has its own best constant."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.evaluation.ranges.errors import DEFAULT_BAD, DELTAS, BadLimit, mse_scores, weighted_mean
-from pano_mvs.evaluation.ranges.pixels import weighted_median
+from pano_mvs.evaluation.ranges.errors import DEFAULT_BAD, DELTAS, BadLimit, mse_scores
+from pano_mvs.evaluation.ranges.pixels import weighted_mean, weighted_median
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sorted:
-    """True ranges in rising order, and the weight up to each, the first at 0."""
+    """True ranges in rising order, and the weight before each and in all."""
 
     true: NDArray[np.float64]
     reached: NDArray[np.float64]
 
     def best_share(self, ends: NDArray[np.intp]) -> float:
-        """Return the largest share of the weight in any window that begins at a pixel and ends before `ends`."""
+        """Return the largest share of the weight in a window that begins at a pixel and ends before `ends`."""
         inside = self.reached[ends] - self.reached[:-1]
         return float(min(inside.max() / self.reached[-1], 1.0))
 
@@ -32,15 +32,16 @@ def best_constant_errors(
     peak: float = 10.0,
     bad: Sequence[BadLimit] = DEFAULT_BAD,
 ) -> dict[str, float]:
-    """Return, for each score of `range_errors`, the best that any one constant reaches; NaN of no pixels.
+    """Return the best value that any constant reaches in each score of `range_errors`; NaN of no pixels.
 
-    mse, psnr_db and rmse: the weighted mean of the truth. mae: its weighted median. abs_rel: its median by weight over
-    truth. A delta t: the constant c with the most weight in c / t < true < c t, which is the best window of ratio t² in
-    the sorted truth. A bad b: likewise, of true in [c / (1 + b), c / (1 − b)], or in [c − b, c + b] for a length.
+    The best constants are: for mse, psnr_db and rmse the weighted mean of the truth; for mae its weighted median; for
+    abs_rel its median weighted by weight / truth; for a delta t the c with the most weight in c / t < true < c t, the
+    best window of ratio t² in the sorted truth; for a bad b likewise with true in [c / (1 + b), c / (1 − b)], or in
+    [c − b, c + b] for a length.
 
     Args:
         true: (N,) true ranges, positive.
-        weight: (N,) what each pixel counts.
+        weight: (N,) weight of each pixel.
         peak: as in `range_errors`.
         bad: limits of bad pixels.
     """
@@ -58,10 +59,10 @@ def best_constant_errors(
 
 
 def best_constant_median(true: NDArray[np.float64], weight: NDArray[np.float64]) -> float:
-    """Return the least weighted median of |c − true| / true that any one constant c reaches; NaN of no pixels.
+    """Return the least weighted median of |c − true| / true that any constant c reaches; NaN of no pixels.
 
-    Half the weight must lie in a window [c / (1 + m), c / (1 − m)]: of all windows with that weight the one of least
-    ratio r gives m = (r − 1) / (r + 1).
+    A median of m requires half the weight in [c / (1 + m), c / (1 − m)]. Of all windows with that weight, the one with
+    the least ratio r of its ends gives m = (r − 1) / (r + 1).
     """
     if not len(true):
         return float("nan")
@@ -77,7 +78,7 @@ def best_constant_median(true: NDArray[np.float64], weight: NDArray[np.float64])
 def _in_order(
     true: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return true ranges in rising order and the weight of each: the very arrays if they are so."""
+    """Return true ranges in rising order with their weights: the same arrays if they are sorted already."""
     if np.all(true[1:] >= true[:-1]):
         return true, weight
     order = np.argsort(true, kind="stable")
@@ -85,9 +86,9 @@ def _in_order(
 
 
 def _bad_ends(ranges: NDArray[np.float64], limit: BadLimit) -> NDArray[np.intp]:
-    """Return, for the window that begins at each sorted range, the first position that no constant spans with it."""
+    """Return, for each sorted range, the position of the first range that no constant covers together with it."""
     if not limit.relative:
         return np.searchsorted(ranges, ranges + 2 * limit.value, "right")
-    if limit.value >= 1:  # c − true is never more than c: the nearest range as constant is within 100 % of all
+    if limit.value >= 1:  # c − true is at most c: the smallest range as constant is within 100 % of all
         return np.full(len(ranges), len(ranges), np.intp)
     return np.searchsorted(ranges, ranges * (1 + limit.value) / (1 - limit.value), "right")

@@ -1,4 +1,4 @@
-"""Averages of range errors over pixels, under the names that every command and file uses."""
+"""Averages of range errors over pixels, by the names that all commands and files use."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import UsageError
+from pano_mvs.evaluation.ranges.pixels import weighted_mean
 
 DELTAS = {"delta_105": 1.05, "delta_125": 1.25, "delta_125_2": 1.25**2, "delta_125_3": 1.25**3}
-"""Name of a score to the ratio of estimate and truth, either way round, below which a pixel counts as right."""
+"""Name of a score to the largest ratio of estimate and truth, either way round, of a correct pixel."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,7 +21,7 @@ class BadLimit:
 
     Attributes:
         value: the limit, a share of the truth or a length in its unit.
-        relative: whether it is a share.
+        relative: whether the limit is a share.
     """
 
     value: float
@@ -59,16 +60,16 @@ def range_errors(
     peak: float = 10.0,
     bad: Sequence[BadLimit] = DEFAULT_BAD,
 ) -> dict[str, float]:
-    """Return the weighted averages of the errors of some pixels; NaN of none.
+    """Return the weighted averages of the errors of pixels; NaN of no pixels.
 
     With e = |found − true|: mse is the mean of (e / peak)², psnr_db −10 log10 of it, rmse its root times the peak, mae
-    the mean of e, abs_rel that of e / true, a delta the share of max(found / true, true / found) below its limit, and a
-    bad the share of e / true (or of e) above its limit.
+    the mean of e, and abs_rel the mean of e / true. A delta is the share of pixels with max(found / true, true / found)
+    below its limit, a bad the share with e / true (or e) above its limit.
 
     Args:
-        found: (N,) estimates; where NaN, e is the truth itself, and the pixel fails every delta and is bad.
+        found: (N,) estimates; where NaN, e is the truth itself, and the pixel is bad and fails every delta.
         true: (N,) true ranges, positive.
-        weight: (N,) what each pixel counts.
+        weight: (N,) weight of each pixel.
         peak: the range that counts as 1 in mse, in the truth's unit.
         bad: limits of bad pixels.
     """
@@ -87,12 +88,6 @@ def range_errors(
 
 
 def mse_scores(mse: float, peak: float) -> dict[str, float]:
-    """Return a mean of squared errors, in units of the squared peak, in its three forms."""
+    """Return a mean of squared errors, in units of the squared peak, as mse, psnr_db and rmse."""
     with np.errstate(divide="ignore"):
         return {"mse": mse, "psnr_db": float(-10 * np.log10(mse)), "rmse": float(peak * np.sqrt(mse))}
-
-
-def weighted_mean(values: NDArray[np.float64] | NDArray[np.bool_], weight: NDArray[np.float64]) -> float:
-    """Return the weighted mean, NaN of nothing."""
-    total = float(weight.sum())
-    return float((values * weight).sum()) / total if total > 0 else float("nan")

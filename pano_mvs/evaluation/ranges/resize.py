@@ -1,4 +1,4 @@
-"""Range maps at the pixels of another size, without ranges that lie between two surfaces."""
+"""Resampling of range maps to another size without ranges between two surfaces."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from pano_mvs.geometry import pad_panorama
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
-# Four neighbours whose largest range exceeds the smallest by more than this share need not lie on one surface.
+# Largest relative difference of four neighbouring ranges on one surface.
 _ONE_SURFACE = 0.1
 
 
 def resized_range(ranges: NDArray[np.float32], size_hw: tuple[int, int]) -> NDArray[np.float32]:
     """Return a range map at the pixel centres of another size.
 
-    Where the four pixels around a place lie on one surface, all with a range and these within 10 % of each other, 1 /
-    range is taken bilinearly between them: on a plane it is all but linear. Elsewhere, at the edges of objects and of
-    holes, the pixel counts that holds the place, so that no range between two surfaces arises and no hole shrinks.
+    If the four pixels around a place lie on one surface (all have a range, within 10 % of each other), 1 / range is
+    interpolated bilinearly: on a plane it is nearly linear. Elsewhere, at edges of objects and holes, the pixel that
+    contains the place is used, so that no range between two surfaces arises and no hole shrinks.
 
     Args:
         ranges: (H, W) float32 of a full sphere, NaN invalid, even W.
-        size_hw: (height, width) wanted, of the same shape.
+        size_hw: (height, width) of the result, of the same aspect ratio.
 
     Returns:
-        size_hw float32; the map itself if it has that size.
+        (height, width) float32; the map itself if it has that size.
 
     Raises:
-        UsageError: if one is of another shape than the other (ratio of width to height).
+        UsageError: if the aspect ratios differ.
     """
     if ranges.shape == size_hw:
         return ranges
@@ -49,14 +49,14 @@ def resized_range(ranges: NDArray[np.float32], size_hw: tuple[int, int]) -> NDAr
 
 
 def resized_labels(labels: NDArray[Scalar], size_hw: tuple[int, int]) -> NDArray[Scalar]:
-    """Return a map of anything at the pixel centres of another size: of each, the pixel that holds it.
+    """Return a map of labels at the pixel centres of another size: the pixel that contains each centre.
 
     Args:
         labels: (H, W) of a full sphere.
-        size_hw: (height, width) wanted, of the same shape.
+        size_hw: (height, width) of the result, of the same aspect ratio.
 
     Raises:
-        UsageError: if one is of another shape than the other (ratio of width to height).
+        UsageError: if the aspect ratios differ.
     """
     height, width = labels.shape
     if height * size_hw[1] != width * size_hw[0]:

@@ -1,4 +1,4 @@
-"""Whether confidence knows where the errors are."""
+"""Sparsification: how well confidence predicts the errors of a range map."""
 
 from __future__ import annotations
 
@@ -8,26 +8,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.evaluation.ranges.pixels import has_range
-from pano_mvs.geometry import pixel_solid_angle
+from pano_mvs.evaluation.ranges.pixels import ScoredPixels
 
-# A range that is wrong by more than itself is simply wrong; without a limit a few pixels at the far end decide alone.
-_LARGEST_ERROR = 1.0
+# Larger relative errors count as this one; otherwise a few far pixels would decide the area.
+_MAX_ERROR = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class Sparsification:
-    """The mean error of the surest pixels against the share of the pixels that is kept.
+    """Mean error of the most confident pixels against the share of pixels that is kept.
 
     Pixels of the same confidence are kept or left out together; between two confidences the curve is that of a random
-    order. Errors are |error| / truth, at most 1; pixels count by their solid angle, or all
-    alike.
+    order. Errors are |error| / truth, at most 1.
 
     Attributes:
-        kept: (N,) float64 share of all pixels with truth and estimate that is kept, growing to 1.
-        error: (N,) float64 mean relative error of those.
-        oracle_error: (N,) float64 the same if the pixels were ordered by their true errors.
-        area: under the curve: the mean over all shares.
+        kept: (N,) share of the pixels with truth and estimate that is kept, growing to 1.
+        error: (N,) mean relative error of those.
+        oracle_error: (N,) mean relative error if the pixels were ordered by their true errors.
+        area: under the curve, the mean over all shares.
         oracle_area: under the oracle's.
     """
 
@@ -39,50 +37,36 @@ class Sparsification:
 
     @property
     def ause(self) -> float:
-        """The area between the two curves: 0 if confidence orders the pixels like their errors; less is better."""
+        """Area between the two curves: 0 if confidence orders the pixels like their errors; less is better."""
         return self.area - self.oracle_area
 
     @property
     def unranked_area(self) -> float:
-        """The area if all pixels were of one confidence: the mean error."""
+        """The area if all pixels had the same confidence: the mean error."""
         return float(self.error[-1]) if len(self.error) else float("nan")
 
 
-def sparsify(
-    estimated: NDArray[np.floating],
-    confidence: NDArray[np.integer],
-    truth: NDArray[np.floating],
-    *,
-    scale: float = 1.0,
-    by_solid_angle: bool = True,
-) -> Sparsification:
-    """Return the sparsification curve of a range map, NaN areas and an empty curve if no pixel can be judged.
+def sparsify(pixels: ScoredPixels, *, by_solid_angle: bool = True) -> Sparsification:
+    """Return the sparsification curve of a range map; an empty curve with NaN areas if no pixel has an estimate.
 
     E. Ilg et al., "Uncertainty estimates and multi-hypotheses networks for optical flow", ECCV 2018, section 5.1.
 
     Args:
-        estimated: (H, W) ranges in scene units, NaN invalid.
-        confidence: (H, W), larger is surer.
-        truth: (H, W) true ranges; infinite or NaN where there is no surface.
-        scale: factor from scene units to the truth's unit.
-        by_solid_angle: whether pixels count by their solid angle; else all alike.
+        pixels: estimates, truth and confidence of the pixels.
+        by_solid_angle: whether pixels count by their solid angle; otherwise all count the same.
 
     Raises:
-        UsageError: if the shapes differ or the scale is not positive.
+        UsageError: if the pixels have no confidence.
     """
-    if not estimated.shape == confidence.shape == truth.shape or truth.ndim != 2 or not scale > 0:
-        raise UsageError(f"estimated {estimated.shape}, confidence {confidence.shape} and truth {truth.shape} must be "
-                         f"(H, W) of one size, and the scale {scale} positive")  # fmt: skip
-    judged = has_range(truth) & has_range(estimated)
-    weight = np.broadcast_to(pixel_solid_angle((truth.shape[0], truth.shape[1]))[:, None], truth.shape)[judged]
-    if not by_solid_angle:
-        weight = np.ones_like(weight)
+    both = pixels.only_valid()
+    if both.confidence is None:
+        raise UsageError("sparsification needs the confidence of the pixels")
+    weight = both.weight if by_solid_angle else np.ones_like(both.weight)
     if len(weight) == 0:
         nothing = np.zeros(0)
         return Sparsification(nothing, nothing, nothing, float("nan"), float("nan"))
-    true = truth[judged].astype(np.float64)
-    error = np.minimum(np.abs(scale * estimated[judged] - true) / true, _LARGEST_ERROR)
-    kept, mean, area = _curve(confidence[judged].astype(np.float64), error, weight)
+    error = np.minimum(np.abs(both.found - both.true) / both.true, _MAX_ERROR)
+    kept, mean, area = _curve(both.confidence.astype(np.float64), error, weight)
     oracle_kept, oracle_mean, oracle_area = _curve(-error, error, weight)
     return Sparsification(kept, mean, np.interp(kept, oracle_kept, oracle_mean), area, oracle_area)
 
@@ -90,7 +74,7 @@ def sparsify(
 def _curve(
     sureness: NDArray[np.float64], error: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Return the shares kept, the mean errors of them, and the area under the curve."""
+    """Return the shares kept, their mean errors, and the area under the curve."""
     levels, level = np.unique(-sureness, return_inverse=True)
     added = np.bincount(level, weight, len(levels)) / weight.sum()
     lost = np.bincount(level, weight * error, len(levels)) / weight.sum()

@@ -13,7 +13,6 @@ from pano_mvs.algorithms.poses.verification import arbitration
 from pano_mvs.algorithms.poses.verification.arbitration import arbitrate, judge
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
 from pano_mvs.algorithms.poses.verification.verify_poses import model_of, verify_poses
-from pano_mvs.evaluation.poses.placements import judge_placements
 from pano_mvs.geometry import Rigid3, Similarity3, geodesic_angle, rotation_from_rotvec
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import join_groups, split_groups
@@ -21,6 +20,7 @@ from pano_mvs.testing.room import capture_poses, default_room, render
 from pano_mvs.testing.scenes import white_room
 from tests.algorithms.poses.aliased_capture import same_matches, view_of
 from tests.algorithms.room_pictures import SIZE_HW, WHOLE, Vector, moved, room_capture, room_matches
+from tests.benchmarks.placements import judge_placements
 
 Matches = tuple[dict[str, Features], dict[tuple[str, str], TwoView]]
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from pano_mvs.evaluation.clouds.true_surface import TrueView, view_points
+from pano_mvs.evaluation.inputs.truth import read_truth
 from pano_mvs.evaluation.ranges.view_scores import score_view
-from pano_mvs.evaluation.truth import read_truth
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.clouds.ply import write_ply
 from pano_mvs.io.colmap.model import write_colmap_model
@@ -208,10 +208,10 @@ def test_masks_and_confidence_leave_out_what_they_say(
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--min-confidence", "128"), "so --min-confidence cannot be kept"),
+        (("--min-confidence", "128"), "so --min-confidence cannot be applied"),
         (("--scale", "big"), "'big' is no scale"),
         (("--bad", "often"), "no limit for bad pixels"),
-        (("--unit", "0"), "--unit must be a positive number"),
+        (("--unit", "0"), "unit must be a positive number"),
         (("--peak", "0"), "peak must be a positive length"),
         (("--masks", "none"), "masks must be a folder"),
         (("--masks", "."), "no mask in it belongs to a view"),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.cli import inspect_text, run_command
-from pano_mvs.cli.evaluate import depth_tables
+from pano_mvs.evaluation.ranges import tables as depth_tables
 from pano_mvs.report.figures import figure
 
 
