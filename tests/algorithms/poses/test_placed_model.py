@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.poses.placement.growth import grown_models, ranked_seeds
+from pano_mvs.algorithms.poses.growth import grown_models, ranked_seeds
 from pano_mvs.algorithms.poses.placement.placed_model import (
     Pairs,
     PlacedModel,
