@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.paths import is_file, is_folder
@@ -20,6 +21,7 @@ from pano_mvs.io.colmap.model import is_colmap_model
 from pano_mvs.scene import Scores
 
 _RANGES = "range"
+Evaluation = TypeVar("Evaluation")
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,25 +56,21 @@ def evaluate_run(out: Path, truth: Path) -> RunEvaluation:
         InputError: if nothing can be compared, with the reason for each result, or a file is damaged.
     """
     reasons: dict[str, str] = {}
-    poses = depth = cloud = None
-    try:
-        poses = _poses(out, truth)
-    except _NotComparedError as reason:
-        reasons["poses"] = str(reason)
-    try:
-        depth = _ranges(out, truth)
-    except _NotComparedError as reason:
-        reasons["ranges"] = str(reason)
-    try:
-        cloud = _cloud(out, truth)
-    except _NotComparedError as reason:
-        reasons["cloud"] = str(reason)
+
+    def attempt(result: str, compare: Callable[[Path, Path], Evaluation]) -> Evaluation | None:
+        try:
+            return compare(out, truth)
+        except _NotComparedError as reason:
+            reasons[result] = str(reason)
+            return None
+
+    found = attempt("poses", _poses), attempt("ranges", _ranges), attempt("cloud", _cloud)
     if len(reasons) == 3:
         raise InputError(
             f"{out}: nothing here can be compared with {truth}: {'; '.join(reasons.values())}. Give the output folder "
             "of a finished run, and a truth of its images"
         )
-    return RunEvaluation(poses, depth, cloud, reasons)
+    return RunEvaluation(*found, reasons)
 
 
 def _poses(out: Path, truth: Path) -> Scores:

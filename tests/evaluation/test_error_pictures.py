@@ -40,7 +40,7 @@ def test_the_picture_holds_four_panels_of_any_size_with_the_seam_and_the_poles(t
     estimated[-size[0] // 4 :] = np.nan
     image = np.full((10, 20, 3), (200, 30, 30), np.uint8)
     path = tmp_path / "new" / "a.jpg"
-    write_error_picture(path, estimated, truth, image=image, unit="m")
+    write_error_picture(path, estimated, truth, image=image)
     picture = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB).astype(int)
     assert picture.shape == (2 * (34 + 512 + 60), 2 * 1024 + 8, 3)
     panels = picture[34 : 34 + 512, :1024], picture[34 : 34 + 512, 1032:]

@@ -1,9 +1,9 @@
-"""How far a cloud is from the true surface, and how much of it it covers."""
+"""Distances between a cloud and the true surface, and the scores that follow from them."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,22 +11,22 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pano_mvs.core.errors import UsageError
+from pano_mvs.evaluation.clouds import points as point_source
+from pano_mvs.evaluation.clouds.points import PointSource
 from pano_mvs.evaluation.clouds.true_surface import TrueSurface
 from pano_mvs.evaluation.ranges.pixels import weighted_quantile
 
 DEFAULT_THRESHOLDS = 0.05, 0.02
-CHUNK_POINTS = 2_000_000
-"""How many points of a cloud are in memory, and in a search tree, at a time."""
 
 
 @dataclass(frozen=True, slots=True)
 class CloudScore:
-    """How good a cloud is at one tolerance.
+    """Scores of a cloud at one tolerance.
 
     Attributes:
         threshold: the tolerance t, in the truth's unit.
         accuracy: share of the cloud's points within t of the true surface.
-        completeness: share, by area, of the true surface that should be found within t of the cloud.
+        completeness: share, by area, of the surface to be covered that is within t of the cloud.
         f_score: harmonic mean of the two (Knapitsch et al., "Tanks and Temples", 2017, section 5).
     """
 
@@ -42,18 +42,18 @@ class CloudScore:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CloudDistances:
-    """Distances between a cloud and the true surface; infinite where larger than any that had to be told apart.
+    """Distances between a cloud and the true surface; infinite beyond the limit of the search.
 
     Attributes:
         of_points: (N,) float32, from each point of the cloud to the nearest sample of the whole true surface.
-        of_surface: (M,) float32, from each sample of the surface that should be found to the nearest point.
+        of_surface: (M,) float32, from each sample of the surface to be covered to the nearest point.
     """
 
     of_points: NDArray[np.float32]
     of_surface: NDArray[np.float32]
 
     def quantiles(self, surface: TrueSurface, shares: Sequence[float] = (0.5, 0.9)) -> dict[str, tuple[float, ...]]:
-        """Return the quantiles of both: "accuracy" of all points alike, "completeness" by area; NaN of nothing."""
+        """Return quantiles: "accuracy" over the points, "completeness" by area of the surface; NaN of nothing."""
         count = len(self.of_points)
         at = [max(0, int(np.ceil(share * count - 1e-9)) - 1) for share in shares]
         ordered = np.partition(self.of_points, at) if count else np.full(1, np.nan)
@@ -63,56 +63,32 @@ class CloudDistances:
         }
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PointChunks:
-    """A cloud that need not fit in memory.
-
-    Attributes:
-        count: number of points.
-        read: begins anew to give the points in chunks (K, 3) float32, in one order.
-    """
-
-    count: int
-    read: Callable[[], Iterable[NDArray[np.float32]]]
-
-    @classmethod
-    def of(cls, points: NDArray[np.float32]) -> PointChunks:
-        """Return the chunks of points (N, 3) that are in memory."""
-        starts = range(0, len(points), CHUNK_POINTS)
-        return cls(len(points), lambda: (points[start : start + CHUNK_POINTS] for start in starts))
-
-
 def cloud_distances(
-    points_in_world: NDArray[np.float32] | PointChunks,
-    true_points: Iterable[NDArray[np.float32]],
-    surface: TrueSurface,
-    *,
-    limit: float,
+    cloud: PointSource, true_points: Iterable[NDArray[np.float32]], surface: TrueSurface, *, limit: float
 ) -> CloudDistances:
     """Return the distances from a cloud to the truth and back.
 
-    Search trees are built of one piece of the truth, or of one chunk of the cloud, at a time: memory is that of one of
-    either, and four bytes for each point and sample.
+    Search trees are built of one piece of the truth, or one chunk of the cloud, at a time. Memory is that of one of
+    them, and four bytes per point and sample.
 
     Args:
-        points_in_world: (N, 3) the cloud, in the truth's frame and unit.
-        true_points: the whole true surface in pieces (K, 3), one in memory at a time: all that any view sees.
-        surface: what should be found.
-        limit: larger distances need not be told apart.
+        cloud: the points, in the truth's frame and unit.
+        true_points: the whole true surface in pieces (K, 3): everything that any view sees.
+        surface: the part to be covered.
+        limit: larger distances count as infinite.
 
     Raises:
         UsageError: if the limit is not positive.
     """
     if not limit > 0:
-        raise UsageError(f"the largest distance to be told must be positive, got {limit}")
-    cloud = points_in_world if isinstance(points_in_world, PointChunks) else PointChunks.of(points_in_world)
+        raise UsageError(f"the largest distance to measure must be positive, got {limit}")
     of_points = np.full(cloud.count, np.inf, np.float32)
     for piece in true_points:
         tree = _tree(piece)
-        for part, chunk in _placed(cloud):
+        for part, chunk in _parts(cloud):
             np.minimum(of_points[part], _nearest(chunk, tree, limit), out=of_points[part])
     of_surface = np.full(len(surface.points_in_world), np.inf, np.float32)
-    for _, chunk in _placed(cloud):
+    for _, chunk in _parts(cloud):
         np.minimum(of_surface, _nearest(surface.points_in_world, _tree(chunk), limit), out=of_surface)
     return CloudDistances(of_points, of_surface)
 
@@ -123,35 +99,35 @@ def score_cloud(
     """Return the scores at each tolerance; an empty cloud scores 0.
 
     Args:
-        distances: as of `cloud_distances`, with a limit of at least the largest tolerance.
-        surface: what should be found.
+        distances: measured up to the largest tolerance at least.
+        surface: the part to be covered.
         thresholds: tolerances, in the truth's unit.
     """
-    area = surface.area.sum()
+    area = float(surface.area.sum())
     scores = []
     for threshold in thresholds:
         accuracy = float((distances.of_points <= threshold).mean()) if len(distances.of_points) else 0.0
         found = float(surface.area[distances.of_surface <= threshold].sum())
-        completeness = found / float(area) if area > 0 else 0.0
+        completeness = found / area if area > 0 else 0.0
         both = accuracy + completeness
         f_score = 2 * accuracy * completeness / both if both > 0 else 0.0
         scores.append(CloudScore(threshold, accuracy, completeness, f_score))
     return tuple(scores)
 
 
-def _placed(cloud: PointChunks) -> Iterator[tuple[slice, NDArray[np.float32]]]:
-    """Return the chunks of a cloud, none larger than `CHUNK_POINTS`, with where they lie in it."""
-    start = 0
-    for chunk in cloud.read():
-        for first in range(0, len(chunk), CHUNK_POINTS):
-            part = chunk[first : first + CHUNK_POINTS]
+def _parts(cloud: PointSource) -> Iterator[tuple[slice, NDArray[np.float32]]]:
+    """Return the points in chunks of at most `CHUNK_POINTS`, with their positions in the cloud."""
+    start, size = 0, point_source.CHUNK_POINTS
+    for chunk in cloud.chunks():
+        for first in range(0, len(chunk), size):
+            part = chunk[first : first + size]
             yield slice(start, start + len(part)), part
             start += len(part)
 
 
 def _tree(points: NDArray[np.float32]) -> cKDTree | None:
-    """Return what finds the nearest of some points; None without points."""
-    # Split in the middle of the box, not at the median: as good for points on surfaces, and built in half the time.
+    """Return a search tree of points; None without points."""
+    # Split in the middle of the box, not at the median: as fast for points on surfaces, and built in half the time.
     return cKDTree(points, balanced_tree=False, compact_nodes=False) if len(points) else None
 
 

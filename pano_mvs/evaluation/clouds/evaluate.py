@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +15,10 @@ from pano_mvs.evaluation.clouds.distances import (
     DEFAULT_THRESHOLDS,
     CloudDistances,
     CloudScore,
-    PointChunks,
     cloud_distances,
     score_cloud,
 )
+from pano_mvs.evaluation.clouds.points import MovedPoints, Points, PointsInMemory, PointSource
 from pano_mvs.evaluation.clouds.true_surface import (
     TrueSurface,
     TrueView,
@@ -44,44 +43,8 @@ _MAX_SAMPLES = 4_000_000
 # Least length of the mean of the cameras' vertical axes from which they agree on where up is.
 _MIN_AGREEMENT = 0.5
 
-Points = NDArray[np.float32]
 CloudInput = Path | PointCloud | Points
 """A PLY file or the output folder of a run, a record, or points (N, 3)."""
-
-
-class PointSource(Protocol):
-    """Points that need not fit in memory, as `PlyPoints` has them."""
-
-    @property
-    def count(self) -> int:
-        """Number of points."""
-
-    def chunks(self) -> Iterator[Points]:
-        """Return the positions in chunks (K, 3)."""
-
-    def some(self, step: int) -> tuple[Points, Points]:
-        """Return position and normal, both (K, 3), of every step-th point; unknown normals are 0."""
-
-
-@dataclass(frozen=True, eq=False)
-class PointsInMemory:
-    """Points (N, 3) in memory, with normals (N, 3) that are 0 if unknown."""
-
-    positions: Points
-    normals: Points
-
-    @property
-    def count(self) -> int:
-        """Number of points."""
-        return len(self.positions)
-
-    def chunks(self) -> Iterator[Points]:
-        """Return the positions in chunks (K, 3)."""
-        return iter(PointChunks.of(self.positions).read())
-
-    def some(self, step: int) -> tuple[Points, Points]:
-        """Return position and normal of every step-th point."""
-        return self.positions[::step], self.normals[::step]
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,8 +78,8 @@ class CloudEvaluation:
         source: name of the cloud's source.
         truth: name of the truth's source.
         scores: accuracy, completeness and F-score at each tolerance.
-        cloud: the points, in their own frame.
-        truth_from_cloud: the transform into the truth's frame; None if the cloud is in it already.
+        cloud: the points, in the truth's frame.
+        is_aligned: whether poses brought the cloud into the truth's frame; otherwise it was taken to lie in it.
         compared: the truth.
         distances: from cloud to truth and back, measured up to `farthest`.
         limits: the tolerances in rising order.
@@ -127,15 +90,11 @@ class CloudEvaluation:
     truth: str
     scores: tuple[CloudScore, ...]
     cloud: PointSource
-    truth_from_cloud: Similarity3 | None
+    is_aligned: bool
     compared: CloudTruth
     distances: CloudDistances
     limits: tuple[float, ...]
     farthest: float
-
-    def points(self) -> Iterator[Points]:
-        """Return the cloud's points in chunks (K, 3), in the truth's frame."""
-        return _in_truth(self.cloud, self.truth_from_cloud)
 
     def to_json(self) -> dict[str, object]:
         """Return all figures as JSON values; None stands for a distance beyond those measured."""
@@ -164,7 +123,7 @@ class CloudEvaluation:
                 f"{len(compared.used)} cameras see"
             )
         lines: list[str | TextTable] = [f"{self.cloud.count} points against {against}"]
-        if not compared.used and self.truth_from_cloud is None:
+        if not compared.used and not self.is_aligned:
             lines.append(
                 "both clouds are taken to lie in one frame; if they do not, give --true-poses, those in the frame of "
                 "the reference cloud"
@@ -219,7 +178,7 @@ def evaluate_cloud(
     of_run = isinstance(cloud, Path) and is_folder(cloud)
     model = cloud / MODEL_FOLDER if isinstance(cloud, Path) and of_run and poses is None else poses
     known, is_metric = _true_cameras(truth, true_poses)
-    used, truth_from_cloud = list(known), None
+    used = list(known)
     if model is not None and (known or poses is not None):
         if not known:
             raise InputError(
@@ -227,16 +186,16 @@ def evaluate_cloud(
                 f"{source_name(model)} into its frame"
             )
         truth_from_cloud, used = _alignment(model, known)
+        points = MovedPoints(points, truth_from_cloud)
     compared = _compared(truth, used, known, voxel_size=limits[0], unit=length_unit(metric=is_metric))
     farthest = _FARTHEST * limits[-1]
-    chunks = PointChunks(points.count, lambda: _in_truth(points, truth_from_cloud))
-    distances = cloud_distances(chunks, compared.pieces(), compared.surface, limit=farthest)
+    distances = cloud_distances(points, compared.pieces(), compared.surface, limit=farthest)
     return CloudEvaluation(
         source=source_name(cloud),
         truth=source_name(truth),
         scores=score_cloud(distances, compared.surface, thresholds),
         cloud=points,
-        truth_from_cloud=truth_from_cloud,
+        is_aligned=isinstance(points, MovedPoints),
         compared=compared,
         distances=distances,
         limits=limits,
@@ -252,12 +211,7 @@ def _open(cloud: CloudInput) -> PointSource:
     points = np.asarray(cloud, np.float32)
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
         raise UsageError(f"points must be finite and of shape (N, 3), got {points.shape}")
-    return PointsInMemory(points, np.zeros_like(points))
-
-
-def _in_truth(points: PointSource, truth_from_cloud: Similarity3 | None) -> Iterator[Points]:
-    for chunk in points.chunks():
-        yield chunk if truth_from_cloud is None else truth_from_cloud.apply(chunk).astype(np.float32)
+    return PointsInMemory(points)
 
 
 def _true_cameras(truth: CloudInput, true_poses: Cameras | None) -> tuple[Mapping[str, Rigid3], bool]:

@@ -6,19 +6,16 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from pano_mvs.algorithms.rendering.cloud import draw_cloud
 from pano_mvs.algorithms.rendering.viewpoints import viewpoints
-from pano_mvs.evaluation.clouds.distances import PointChunks
 from pano_mvs.evaluation.clouds.error_clouds import distance_colors, write_error_cloud
 from pano_mvs.evaluation.clouds.evaluate import CloudEvaluation
+from pano_mvs.evaluation.clouds.points import Points, PointsInMemory
 from pano_mvs.evaluation.drawing import WIDTH, Picture, put_text, strip, write_stack
 
 _MAX_POINTS, _MAX_VIEWS = 2_000_000, 12
 _LINE, _SIZE_HW = 28, (640, WIDTH)
-
-Points = NDArray[np.float32]
 
 
 def write_error_clouds(folder: Path, evaluation: CloudEvaluation) -> None:
@@ -30,9 +27,9 @@ def write_error_clouds(folder: Path, evaluation: CloudEvaluation) -> None:
     surface, distances = evaluation.compared.surface, evaluation.distances
     limits, farthest = evaluation.limits, evaluation.farthest
     write_error_cloud(
-        folder / "accuracy.ply", evaluation.points(), distances.of_points, limits=limits, farthest=farthest
+        folder / "accuracy.ply", evaluation.cloud.chunks(), distances.of_points, limits=limits, farthest=farthest
     )
-    samples = PointChunks.of(surface.points_in_world).read()
+    samples = PointsInMemory(surface.points_in_world).chunks()
     write_error_cloud(folder / "completeness.ply", samples, distances.of_surface, limits=limits, farthest=farthest)
     title = "cloud by its distance from the true surface"
     _write_views(folder / "accuracy.png", *_some_points(evaluation), title=title, evaluation=evaluation)
@@ -99,12 +96,7 @@ def _write_views(
 def _some_points(evaluation: CloudEvaluation) -> tuple[Points, Points, Points]:
     """Return positions and normals (0 if unknown) in the truth's frame, and distances, of at most `_MAX_POINTS`."""
     step = -(-evaluation.cloud.count // _MAX_POINTS) or 1
-    points, normals = evaluation.cloud.some(step)
-    moved = evaluation.truth_from_cloud
-    if moved is not None:
-        points = moved.apply(points).astype(np.float32)
-        normals = (normals @ moved.rotation.T).astype(np.float32)
-    return points, normals, evaluation.distances.of_points[::step]
+    return *evaluation.cloud.some(step), evaluation.distances.of_points[::step]
 
 
 def _towards_cameras(evaluation: CloudEvaluation, step: int) -> Points:

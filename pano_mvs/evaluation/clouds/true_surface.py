@@ -11,16 +11,15 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, pixel_solid_angle, ray_grid
 
-# A sample is seen by another view if its distance lies between the four true ranges around it there, or beside them by
-# no more than this share.
+# A view sees a sample if the sample's distance lies within the four true ranges around it, give or take this share.
 _SEEN_WITHIN = 0.01
-# Surfaces seen at a flatter angle than this have no sound area.
+# Surfaces seen at a flatter angle than this have no reliable area.
 _MIN_COSINE = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrueView:
-    """A view whose true range is known.
+    """A view with true ranges.
 
     Attributes:
         cam_from_world: its true pose.
@@ -33,7 +32,7 @@ class TrueView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrueSurface:
-    """Samples of a surface, each with the area that it stands for.
+    """Samples of a surface, each with the area that it represents.
 
     Attributes:
         points_in_world: (N, 3) float32.
@@ -49,9 +48,9 @@ class TrueSurface:
 
 
 def view_points(view: TrueView) -> NDArray[np.float32]:
-    """Return the surface points, (N, 3) in the world, of a view's pixels in row-major order; missing ones left out.
+    """Return the surface points, (N, 3) in the world, of a view's pixels with a range, in row-major order.
 
-    Rows away from the equator are thinned to an even number of points per solid angle.
+    Rows away from the equator are thinned to an even density per solid angle.
     """
     rows, columns = np.nonzero(np.isfinite(view.range) & _even_columns(view.range.shape))
     return _points(view, rows, columns)
@@ -60,14 +59,14 @@ def view_points(view: TrueView) -> NDArray[np.float32]:
 def surface_of_views(views: Sequence[TrueView], *, min_views: int = 2, max_samples: int = 1_000_000) -> TrueSurface:
     """Return the part of the true surface that at least `min_views` of the views see.
 
-    A pixel of range r that meets the surface at the angle α to its normal stands for Ω r² / cos α of it, Ω its solid
-    angle. What k views see is sampled k times and each sample stands for one k-th, so that every piece of the surface
-    counts by its area, however near or often it was seen.
+    A pixel of range r and solid angle Ω that meets the surface at the angle α to its normal represents the area
+    Ω r² / cos α. Surface that k views see is sampled k times, with a k-th of the area each, so that it counts by its
+    area, however near or often it was seen.
 
     Args:
-        views: the views whose pictures were used; with fewer than `min_views` all must see it.
-        min_views: how many must see a sample, the one it comes from included.
-        max_samples: pixels are left out evenly to have no more.
+        views: the views that were used; if they are fewer than `min_views`, all must see the surface.
+        min_views: number of views that must see a sample, including the one it comes from.
+        max_samples: pixels are skipped evenly to have at most this many samples.
 
     Raises:
         UsageError: if there are no views, or a range map is not (H, W) with even W.
@@ -81,11 +80,11 @@ def surface_of_views(views: Sequence[TrueView], *, min_views: int = 2, max_sampl
 
 
 def surface_of_cloud(points_in_world: NDArray[np.float32], *, voxel_size: float) -> TrueSurface:
-    """Return a reference cloud as a surface: the points of a voxel share a weight of one.
+    """Return a reference cloud as a surface: the points of a voxel share the weight 1.
 
     Args:
         points_in_world: (N, 3).
-        voxel_size: edge of a voxel, about the tolerance with which the surface is to be found.
+        voxel_size: edge of a voxel, about the smallest tolerance.
     """
     voxels = np.floor(points_in_world.astype(np.float64) / voxel_size).astype(np.int64)
     _, group, count = np.unique(voxels, axis=0, return_inverse=True, return_counts=True)
@@ -115,8 +114,8 @@ def _samples(
 def _cosines(ranges: NDArray[np.float32]) -> NDArray[np.float64]:
     """Return |cos| of the angle, (H, W), at which each ray meets the surface, of ranges without noise.
 
-    The surface is spanned by the steps to one neighbour in the row and one in the column; where it has none the ray
-    counts as meeting it head-on.
+    The surface is spanned by the steps to a neighbour in the row and one in the column; without neighbours, the ray
+    counts as perpendicular.
     """
     rays = ray_grid((ranges.shape[0], ranges.shape[1]))
     points = pad_panorama(rays * ranges[..., None], 2)
@@ -130,9 +129,9 @@ def _cosines(ranges: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def _step_on_surface(points: NDArray[np.float64], inverse: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the step, (H, W, 3), to the neighbour in the row on the side on which the surface goes on.
+    """Return the step, (H, W, 3), to the neighbour in the row on the side where the surface continues.
 
-    On a plane the inverse range all but lies on a straight line: that side on which it does so better.
+    On a plane the inverse range is nearly linear: the side where it is more linear is chosen.
 
     Args:
         points: (H, W + 4, 3), two columns of margin on either side.
@@ -141,7 +140,7 @@ def _step_on_surface(points: NDArray[np.float64], inverse: NDArray[np.float64]) 
     bend = np.abs(inverse[:, 2:] - 2 * inverse[:, 1:-1] + inverse[:, :-2])
     before, after = bend[:, :-2], bend[:, 2:]
     middle = points[:, 2:-2]
-    # A side with a hole bends by NaN, and is taken only where the other has one too.
+    # A side with a hole has a bend of NaN, and is chosen only if the other side has a hole too.
     use_before = (before <= after) | np.isnan(after)
     return np.where(use_before[..., None], middle - points[:, 1:-3], points[:, 3:-1] - middle)
 
@@ -153,7 +152,7 @@ def _points(view: TrueView, rows: NDArray[np.int64], columns: NDArray[np.int64])
 
 
 def _is_seen(points_in_world: NDArray[np.float32], view: TrueView) -> NDArray[np.bool_]:
-    """Return whether a view sees each point, (N,): whether its own surface lies there."""
+    """Return whether a view sees each point, (N,): whether the view's own surface lies there."""
     height, width = view.range.shape
     in_cam = view.cam_from_world.apply(points_in_world.astype(np.float64))
     distance = np.linalg.norm(in_cam, axis=-1)
@@ -170,7 +169,7 @@ def _is_seen(points_in_world: NDArray[np.float32], view: TrueView) -> NDArray[np
 
 
 def _even_columns(size_hw: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Return the pixels, (H, W), of which a row at elevation φ has the share cos φ."""
+    """Return a mask (H, W) that keeps the share cos φ of the pixels in a row at elevation φ."""
     height, width = size_hw
     samples = np.maximum(1, np.rint(width * np.sin(np.pi * (np.arange(height) + 0.5) / height)))
     number = np.floor(np.arange(width) * samples[:, None] / width)

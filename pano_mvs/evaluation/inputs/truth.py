@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -99,9 +99,7 @@ def find_true_ranges(truth: RangeMaps, *, unit: float = 1.0) -> dict[str, Stored
     if isinstance(truth, Mapping) or not (is_file(truth / "poses.json") and is_file(truth / "depth.npz")):
         return find_ranges(truth, unit=unit)
     files = {view.name: view.range_file for view in read_truth(truth).views.values()}
-    found: dict[str, StoredRange] = {
-        name: RangeFile(file.path, file.key, unit, what=file.what) for name, file in files.items() if file is not None
-    }
+    found: dict[str, StoredRange] = {name: replace(file, unit=unit) for name, file in files.items() if file}
     if not found:
         raise InputError(f"{truth / 'depth.npz'}: holds no array named like an image of poses.json, or like its id")
     return found

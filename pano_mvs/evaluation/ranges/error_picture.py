@@ -71,7 +71,6 @@ def write_error_picture(
     image: Picture | None = None,
     counted: NDArray[np.bool_] | None = None,
     limit: float = 0.1,
-    unit: str = "",
 ) -> None:
     """Write a JPEG with panorama and signed error above, estimated and true range below, each with its scale.
 
@@ -85,14 +84,12 @@ def write_error_picture(
         image: (h, w, 3) uint8 RGB, the panorama; None leaves its place empty.
         counted: (H, W), False where an error does not count; None: counts wherever the truth is known.
         limit: the error at the ends of the scale; larger ones have the colour of the end.
-        unit: of the ranges, for the captions.
     """
     counted = np.isfinite(truth) if counted is None else counted & np.isfinite(truth)
     near, far = range_limits(np.where(np.isfinite(truth), truth, estimated).astype(np.float32))
     error = error_colored(signed_error(estimated, truth), limit, counted=counted)
     empty = np.full((_HEIGHT, WIDTH, 3), 240, np.uint8)
     shown = empty if image is None else cv2.resize(image, (WIDTH, _HEIGHT), interpolation=cv2.INTER_AREA)
-    lengths = f", {unit}" if unit else ""
     panorama = "panorama" if image is not None else "panorama: not given (--images)"
     top = (
         [strip(_CAPTION, panorama), np.asarray(shown, np.uint8), strip(_FOOT)],
@@ -100,7 +97,7 @@ def write_error_picture(
     )
     bottom = [
         [
-            strip(_CAPTION, f"{what} range{lengths}"),
+            strip(_CAPTION, f"{what} range"),
             _fitted(color_mapped(ranges.astype(np.float32), near, far)),
             _range_bar(near, far),
         ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.evaluation.inputs.cameras import Cameras, source_name
 from pano_mvs.evaluation.inputs.range_files import RangeMaps
-from pano_mvs.evaluation.ranges.pairs import RangePairs, ViewMaps, ViewMasks, pair_ranges, read_view
+from pano_mvs.evaluation.ranges.pairs import RangePairs, ViewMaps, ViewMasks, pair_ranges
 from pano_mvs.evaluation.ranges.scale import FoundScale, find_scale
 from pano_mvs.evaluation.ranges.view_scores import BASELINES, ScoreSettings, ViewScores, mean_scores, score_view
 from pano_mvs.evaluation.tables import finite_values
@@ -33,7 +33,6 @@ class DepthEvaluation:
         scale: factor from the estimates' unit to the truth's, before any fit.
         views: scores by image name.
         pairs: the range maps that were compared.
-        masks: the masks that were used.
         sizes: number of views by (height, width) of the estimate and of the truth.
     """
 
@@ -43,7 +42,6 @@ class DepthEvaluation:
     scale: FoundScale
     views: Mapping[str, ViewScores]
     pairs: RangePairs
-    masks: ViewMasks
     sizes: Mapping[Sizes, int]
 
     @cached_property
@@ -59,7 +57,7 @@ class DepthEvaluation:
     @property
     def without_mask(self) -> tuple[str, ...]:
         """The views without a mask in the folder of masks."""
-        return self.masks.missing(list(self.views))
+        return self.pairs.masks.missing(list(self.views))
 
     def read_maps(self, name: str) -> ViewMaps:
         """Return the maps of a scored view: confident estimates alone, with the scale and the fit applied.
@@ -67,12 +65,11 @@ class DepthEvaluation:
         Raises:
             InputError: if a file can no longer be read.
         """
-        maps = read_view(self.pairs, name, self.masks)
+        maps = self.pairs.read(name)
         estimated: NDArray[np.float32] = maps.estimated
         if self.settings.min_confidence and maps.confidence is not None:
             estimated = np.where(maps.confidence >= self.settings.min_confidence, estimated, np.float32(np.nan))
-        scaled = (estimated * self.views[name].scale).astype(np.float32)
-        return ViewMaps(scaled, maps.truth, maps.confidence, maps.counted, maps.size_hw)
+        return replace(maps, estimated=(estimated * self.views[name].scale).astype(np.float32))
 
     def to_json(self) -> dict[str, object]:
         """Return all figures as JSON values; None stands for what is no finite number (the PSNR of no error)."""
@@ -144,14 +141,12 @@ def evaluate_depth(
     for what, value in (("unit", unit), ("truth unit", truth_unit)):
         if not 0 < value < float("inf"):
             raise UsageError(f"the {what} must be a positive number, got {value}")
-    pairs = pair_ranges(estimates, truth, unit=unit, truth_unit=truth_unit)
+    pairs = pair_ranges(estimates, truth, unit=unit, truth_unit=truth_unit, masks=ViewMasks(masks, mask))
     found_scale = find_scale(estimates, truth, scale=scale, poses=poses, true_poses=true_poses)
-    view_masks = ViewMasks(masks, mask)
-    view_masks.require_some(list(pairs.truths))
     views: dict[str, ViewScores] = {}
     sizes: dict[Sizes, int] = {}
     for name, factor in found_scale.of_views(pairs.truths).items():
-        maps = read_view(pairs, name, view_masks)
+        maps = pairs.read(name)
         if settings.min_confidence and maps.confidence is None:
             raise InputError(
                 f"{pairs.estimates[name]}: no confidence/{name}.png beside it, so --min-confidence cannot be applied. "
@@ -172,6 +167,4 @@ def evaluate_depth(
             f"{source_name(truth)}: no pixel of any view has a true range that counts. Check its files and the masks: "
             "zero, negative, infinite and NaN are no range"
         )
-    return DepthEvaluation(
-        source_name(estimates), source_name(truth), settings, found_scale, views, pairs, view_masks, sizes
-    )
+    return DepthEvaluation(source_name(estimates), source_name(truth), settings, found_scale, views, pairs, sizes)

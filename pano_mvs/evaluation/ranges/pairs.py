@@ -20,27 +20,6 @@ from pano_mvs.evaluation.ranges.resize import resized_labels, resized_range
 from pano_mvs.scene.masking import decode_mask, placed_mask
 
 
-@dataclass(frozen=True)
-class RangePairs:
-    """Range maps and their ground truth.
-
-    Attributes:
-        estimates: the estimates with ground truth, by image name.
-        truths: their true range maps.
-        true_names: the truth's names of the images.
-        truth_path: folder or file with the truth, or None.
-        without_truth: names of the estimates without truth.
-        without_estimate: the truth's names of images without an estimate.
-    """
-
-    estimates: Mapping[str, StoredRange]
-    truths: Mapping[str, StoredRange]
-    true_names: Mapping[str, str]
-    truth_path: Path | None = None
-    without_truth: tuple[str, ...] = ()
-    without_estimate: tuple[str, ...] = ()
-
-
 @dataclass(frozen=True, eq=False)
 class ViewMaps:
     """The maps of one view, all of the truth's size.
@@ -58,31 +37,6 @@ class ViewMaps:
     confidence: NDArray[np.uint8] | None
     counted: NDArray[np.bool_] | None
     size_hw: tuple[int, int]
-
-
-def pair_ranges(source: RangeMaps, truth: RangeMaps, *, unit: float, truth_unit: float) -> RangePairs:
-    """Return estimated and true range maps, paired by image name.
-
-    Raises:
-        InputError: if either side has no range maps, or they have no image in common.
-    """
-    estimates, truths = find_ranges(source, unit=unit), find_true_ranges(truth, unit=truth_unit)
-    matched = match_images(estimates, truths)
-    if not matched:
-        raise InputError(
-            f"{source_name(source)} and {source_name(truth)} have no picture in common: the one has "
-            f"{shortened_list(estimates)}, the other {shortened_list(truths)}. Range maps are paired by their paths "
-            "without extension"
-        )
-    names = {name: matched[name] for name in estimates if name in matched}
-    return RangePairs(
-        {name: estimates[name] for name in names},
-        {name: truths[other] for name, other in names.items()},
-        names,
-        truth if isinstance(truth, Path) else None,
-        tuple(name for name in estimates if name not in names),
-        tuple(name for name in truths if name not in set(names.values())),
-    )
 
 
 @dataclass(frozen=True)
@@ -129,26 +83,71 @@ class ViewMasks:
         return np.asarray(np.logical_and.reduce(counted)) if counted else None
 
 
-def read_view(pairs: RangePairs, name: str, masks: ViewMasks) -> ViewMaps:
-    """Return the maps of one view at the truth's size.
+@dataclass(frozen=True)
+class RangePairs:
+    """Range maps and their ground truth.
+
+    Attributes:
+        estimates: the estimates with ground truth, by image name.
+        truths: their true range maps.
+        true_names: the truth's names of the images.
+        masks: which pixels count.
+        truth_path: folder or file with the truth, or None.
+        without_truth: names of the estimates without truth.
+        without_estimate: the truth's names of images without an estimate.
+    """
+
+    estimates: Mapping[str, StoredRange]
+    truths: Mapping[str, StoredRange]
+    true_names: Mapping[str, str]
+    masks: ViewMasks
+    truth_path: Path | None = None
+    without_truth: tuple[str, ...] = ()
+    without_estimate: tuple[str, ...] = ()
+
+    def read(self, name: str) -> ViewMaps:
+        """Return the maps of one view at the truth's size.
+
+        Raises:
+            InputError: if a file cannot be read, or the maps are not of one aspect ratio.
+        """
+        file, true_file = self.estimates[name], self.truths[name]
+        truth, found, confidence = true_file.read(), file.read(), file.read_confidence()
+        size_hw = truth.shape[0], truth.shape[1]
+        try:
+            estimated = resized_range(found, size_hw)
+            confidence = None if confidence is None else resized_labels(confidence, size_hw)
+            counted = self.masks.read(name, size_hw)
+        except UsageError as error:
+            raise InputError(f"{file} against {true_file}: {error}") from error
+        return ViewMaps(estimated, truth, confidence, counted, (found.shape[0], found.shape[1]))
+
+
+def pair_ranges(source: RangeMaps, truth: RangeMaps, *, unit: float, truth_unit: float, masks: ViewMasks) -> RangePairs:
+    """Return estimated and true range maps, paired by image name.
 
     Raises:
-        InputError: if a file cannot be read, or the maps are not of one aspect ratio.
+        InputError: if either side has no range maps, they have no image in common, or no mask is of any of them.
     """
-    file, true_file = pairs.estimates[name], pairs.truths[name]
-    truth, found, confidence = true_file.read(), file.read(), file.read_confidence()
-    size_hw = truth.shape[0], truth.shape[1]
-    try:
-        return ViewMaps(
-            resized_range(found, size_hw),
-            truth,
-            None if confidence is None else resized_labels(confidence, size_hw),
-            masks.read(name, size_hw),
-            (found.shape[0], found.shape[1]),
+    estimates, truths = find_ranges(source, unit=unit), find_true_ranges(truth, unit=truth_unit)
+    matched = match_images(estimates, truths)
+    if not matched:
+        raise InputError(
+            f"{source_name(source)} and {source_name(truth)} have no picture in common: the one has "
+            f"{shortened_list(estimates)}, the other {shortened_list(truths)}. Range maps are paired by their paths "
+            "without extension"
         )
-    except UsageError as error:
-        error.add_note(f"view {name}: {file} against {true_file}")
-        raise InputError(f"{file} against {true_file}: {error}") from error
+    names = {name: matched[name] for name in estimates if name in matched}
+    masks.require_some(list(names))
+    return RangePairs(
+        {name: estimates[name] for name in names},
+        {name: truths[other] for name, other in names.items()},
+        names,
+        masks,
+        truth if isinstance(truth, Path) else None,
+        tuple(name for name in estimates if name not in names),
+        tuple(name for name in truths if name not in set(names.values())),
+    )
 
 
 def _mask_of(folder: Path, name: str) -> Path | None:

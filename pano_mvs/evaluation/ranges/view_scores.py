@@ -107,8 +107,10 @@ def score_view(
     # Sorted by the truth once: each of the constants needs that order.
     groups = _groups(confident.scaled(fitted).at(np.argsort(pixels.true, kind="stable")))
     scores = _scores(groups, settings)
+    true = pixels.true
+    middles = {"median": np.median(true), "mean": true.mean()} if len(true) else {"median": np.nan, "mean": np.nan}
     constants = {"best": _best(groups, settings)} | {
-        name: _scores(_constant(groups, float(value)), settings) for name, value in _middles(pixels.true).items()
+        name: _scores(_constant(groups, float(constant)), settings) for name, constant in middles.items()
     }
     if confidence is not None:
         curve = sparsify(pixels.scaled(fitted))
@@ -138,11 +140,6 @@ def _confident(pixels: ScoredPixels, least: int) -> ScoredPixels:
     if pixels.confidence is None:
         raise UsageError("a least confidence is set, but there is no confidence")
     return replace(pixels, found=np.where(pixels.confidence >= least, pixels.found, np.nan))
-
-
-def _middles(true: NDArray[np.float64]) -> dict[str, np.floating]:
-    nothing = np.float64("nan")
-    return {"median": np.median(true) if len(true) else nothing, "mean": np.mean(true) if len(true) else nothing}
 
 
 def _groups(pixels: ScoredPixels) -> dict[str, ScoredPixels]:
