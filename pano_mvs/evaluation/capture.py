@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TypeVar
+from types import MappingProxyType
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,15 +22,17 @@ KEPT_OF_CONFIDENCE = "sparsification_area", "sparsification_oracle_area", "ause"
 Scalar = TypeVar("Scalar", bound=np.generic)
 RangeReader = Callable[[], "NDArray[np.float32] | None"]
 
+_NOTHING: Mapping[str, Any] = MappingProxyType({})
+
 
 def score_capture(
     estimated_poses: Mapping[str, Rigid3],
     true_poses: Mapping[str, Rigid3],
-    estimated_ranges: Mapping[str, NDArray[np.float32]],
-    true_ranges: Mapping[str, RangeReader],
     *,
-    confidences: Mapping[str, NDArray[np.uint8]] | None = None,
-    masks: Mapping[str, NDArray[np.bool_]] | None = None,
+    estimated_ranges: Mapping[str, NDArray[np.float32]] = _NOTHING,
+    true_ranges: Mapping[str, RangeReader] = _NOTHING,
+    confidences: Mapping[str, NDArray[np.uint8]] = _NOTHING,
+    masks: Mapping[str, NDArray[np.bool_]] = _NOTHING,
     groups: Mapping[str, int] | None = None,
 ) -> Scores:
     """Return pose and depth scores.
@@ -78,8 +81,8 @@ def score_capture(
             resized_range(np.asarray(estimated), size_hw),
             truth,
             scale,
-            confidence=_of_size((confidences or {}).get(name), size_hw),
-            mask=_of_size((masks or {}).get(name), size_hw),
+            confidence=_of_size(confidences.get(name), size_hw),
+            mask=_of_size(masks.get(name), size_hw),
         )
     return Scores(poses, views, tuple(notes))
 

@@ -90,7 +90,7 @@ def _poses(out: Path, truth: Path) -> Scores:
         raise _NotComparedError(f"the truth knows none of its images ({', '.join(list(estimated)[:3])})")
     # An image of the truth that the run did not register keeps the truth's name, and counts as not registered.
     renamed = {ours.get(name, name): pose for name, pose in known.items()}
-    scores = score_capture(estimated, renamed, {}, {}, groups=groups)
+    scores = score_capture(estimated, renamed, groups=groups)
     if not scores.poses:
         raise _NotComparedError("; ".join(scores.notes))
     return scores

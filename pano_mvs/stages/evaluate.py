@@ -39,8 +39,8 @@ def truth(images: All[Panorama], poses: One[Poses], ranges: All[RangeMap], param
     scores = score_capture(
         poses.cameras,
         {name: view.cam_from_world for name, view in matched.items()},
-        {name: ranges[name].range for name in scored},
-        {name: partial(known.range_map, view) for name, view in matched.items()},
+        estimated_ranges={name: ranges[name].range for name in scored},
+        true_ranges={name: partial(known.range_map, view) for name, view in matched.items()},
         confidences={name: ranges[name].confidence for name in scored},
         masks={name: images[name].load_mask() for name in scored},
         groups=dict(zip(poses.names, poses.groups.tolist(), strict=True)),

@@ -15,8 +15,9 @@ HALF = {name: Rigid3(pose.rotation, pose.translation / 2) for name, pose in POSE
 
 
 def scored(estimated, truth, confidence=None, poses=POSES):
-    confidences = {"a": confidence} if confidence is not None else None
-    return score_capture(poses, POSES, {"a": estimated}, {"a": lambda: truth}, confidences=confidences)
+    confidences = {"a": confidence} if confidence is not None else {}
+    maps = {"estimated_ranges": {"a": estimated}, "true_ranges": {"a": lambda: truth}}
+    return score_capture(poses, POSES, **maps, confidences=confidences)
 
 
 def test_each_score_stands_beside_what_constants_score():
@@ -50,9 +51,9 @@ def test_what_is_masked_is_not_judged():
     truth, _ = box_range((32, 64))
     estimated, mask = truth.copy(), np.ones((16, 32), bool)
     estimated[16:], mask[8:] = np.nan, False
-    views = {"a": estimated}, {"a": lambda: truth}
-    assert score_capture(POSES, POSES, *views, masks={"a": mask}).views["a"]["completeness"] == 1
-    assert score_capture(POSES, POSES, *views).views["a"]["completeness"] == 0.5
+    views = {"estimated_ranges": {"a": estimated}, "true_ranges": {"a": lambda: truth}}
+    assert score_capture(POSES, POSES, **views, masks={"a": mask}).views["a"]["completeness"] == 1
+    assert score_capture(POSES, POSES, **views).views["a"]["completeness"] == 0.5
 
 
 def test_what_cannot_be_judged_has_no_score():
@@ -61,7 +62,7 @@ def test_what_cannot_be_judged_has_no_score():
     assert found["completeness"] == 0
     assert not {"ause", "median_relative_error", "best_constant_median_relative_error"} & set(found)
     assert all(np.isfinite(value) for value in found.values())
-    missing = score_capture(POSES, POSES, {"a": nothing}, {"a": lambda: None})
+    missing = score_capture(POSES, POSES, estimated_ranges={"a": nothing}, true_ranges={"a": lambda: None})
     assert (missing.views, missing.notes) == ({}, ("a: no true range map",))
     flat = np.full((8, 16), 2.0, np.float32)
     perfect = scored(flat, flat)

@@ -78,9 +78,11 @@ def test_scores_of_a_capture_tell_how_confidence_ranks_if_it_is_given():
     truth, estimated, rng = noisy()
     confidence = rng.integers(1, 255, SIZE).astype(np.uint8)
     poses = {name: Rigid3(np.eye(3), np.array([x, 0.0, 0.0])) for name, x in (("a", 0.0), ("b", 1.0))}
-    known = {"a": lambda: truth.astype(np.float32)}
-    ranges = {"a": estimated.astype(np.float32)}
-    told = score_capture(poses, poses, ranges, known, confidences={"a": confidence}).views["a"]
+    maps = {
+        "estimated_ranges": {"a": estimated.astype(np.float32)},
+        "true_ranges": {"a": lambda: truth.astype(np.float32)},
+    }
+    told = score_capture(poses, poses, **maps, confidences={"a": confidence}).views["a"]
     assert told["ause"] == pytest.approx(sparsify(estimated, confidence, truth).ause, rel=1e-3)
     assert told["ause"] == pytest.approx(told["sparsification_area"] - told["sparsification_oracle_area"])
-    assert "ause" not in score_capture(poses, poses, ranges, known).views["a"]
+    assert "ause" not in score_capture(poses, poses, **maps).views["a"]

@@ -75,7 +75,7 @@ def surface_of_views(views: Sequence[TrueView], *, min_views: int = 2, max_sampl
         raise UsageError("no view with truth: the surface to be found is not known")
     pixels = sum(view.range.size for view in views)
     step = max(1, int(np.ceil(np.sqrt(pixels / max_samples))))
-    parts = [_samples(idx, views, step, min(min_views, len(views))) for idx in range(len(views))]
+    parts = [_samples(idx, views, step=step, min_views=min(min_views, len(views))) for idx in range(len(views))]
     return TrueSurface(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
@@ -93,7 +93,7 @@ def surface_of_cloud(points_in_world: NDArray[np.float32], *, voxel_size: float)
 
 
 def _samples(
-    view_idx: int, views: Sequence[TrueView], step: int, min_views: int
+    view_idx: int, views: Sequence[TrueView], *, step: int, min_views: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
     """Return points, areas, view and pixel positions of one view's share of the surface."""
     view = views[view_idx]
@@ -158,12 +158,9 @@ def _is_seen(points_in_world: NDArray[np.float32], view: TrueView) -> NDArray[np
     distance = np.linalg.norm(in_cam, axis=-1)
     pixel = pixel_from_ray(in_cam, (height, width)) - 0.5
     left, top = np.floor(pixel[:, 0]).astype(np.int64), np.floor(pixel[:, 1]).astype(np.int64)
-    nearest, farthest = np.full(len(distance), np.inf), np.full(len(distance), -np.inf)
-    for row, column in ((top, left), (top, left + 1), (top + 1, left), (top + 1, left + 1)):
-        beyond = (row < 0) | (row >= height)
-        inside = np.where(row < 0, -1 - row, np.where(row >= height, 2 * height - 1 - row, row))
-        ranges = view.range[inside, (column + beyond * (width // 2)) % width]
-        nearest, farthest = np.fmin(nearest, ranges), np.fmax(farthest, ranges)
+    padded = pad_panorama(view.range, 1)
+    corners = [padded[top + 1 + below, left + 1 + beside] for below in (0, 1) for beside in (0, 1)]
+    nearest, farthest = np.fmin.reduce(corners), np.fmax.reduce(corners)
     seen: NDArray[np.bool_] = (nearest * (1 - _SEEN_WITHIN) <= distance) & (distance <= farthest * (1 + _SEEN_WITHIN))
     return seen
 

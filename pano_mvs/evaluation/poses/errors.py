@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ FloatArray = NDArray[np.float64]
 AUC_LIMITS_DEG = (0.1, 0.5, 1.0, 5.0)
 # Centres closer than this share of the capture's extent coincide: an image that occurs twice.
 _COINCIDENT_SHARE = 1e-6
+_ROUNDING = 1e-12  # of a centre's coordinates
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +70,15 @@ class CenterErrors:
     scale: float
 
 
+class _RelativePoses(NamedTuple):
+    """Rotations (P, 3, 3), translations (P, 3), their lengths (P,), and whether the centres lie apart (P,)."""
+
+    rotations: FloatArray
+    translations: FloatArray
+    lengths: FloatArray
+    apart: NDArray[np.bool_]
+
+
 def relative_pose_errors(
     estimated: Mapping[str, Rigid3], truth: Mapping[str, Rigid3], *, groups: Mapping[str, int] | None = None
 ) -> PoseErrors:
@@ -84,24 +95,23 @@ def relative_pose_errors(
     """
     if len(truth) < 2:
         raise UsageError(f"relative poses need the truth of at least two images, got {len(truth)}")
-    pairs = tuple(combinations(truth, 2))
-    known = {name: estimated[name] for name in truth if name in estimated}
-    group_of = {name: 0 if groups is None else groups[name] for name in known}
-    worlds = {
-        number: {name: known[name] for name in known if group_of[name] == number} for number in set(group_of.values())
-    }
-    true_limit = _COINCIDENT_SHARE * camera_extent(truth)
-    limits = {number: (_COINCIDENT_SHARE * camera_extent(world), true_limit) for number, world in worlds.items()}
-    errors = np.array([
-        _pair_error_deg(first, second, known, truth, limits[group_of[first]])
-        if first in known and second in known and group_of[first] == group_of[second]
-        else (180.0, 180.0)
-        for first, second in pairs
-    ])  # fmt: skip
+    position = {name: idx for idx, name in enumerate(truth)}
+    worlds: dict[int, list[str]] = {}
+    for name in truth:
+        if name in estimated:
+            worlds.setdefault(0 if groups is None else groups[name], []).append(name)
+    pairs, true_extent = tuple(combinations(truth, 2)), camera_extent(truth)
+    errors = np.full((len(pairs), 2), 180.0)
+    deviations = [np.zeros(0)]
+    for _, names in sorted(worlds.items()):
+        first, second = np.array([position[name] for name in names])[np.stack(np.triu_indices(len(names), 1))]
+        place = first * (2 * len(truth) - first - 1) // 2 + second - first - 1  # in `pairs`
+        true, found = _relative(truth, names, true_extent), _relative(estimated, names)
+        errors[place], ratios = _world_errors(found, true)
+        if len(ratios) > 1:
+            deviations.append(np.abs(ratios / np.median(ratios) - 1))
     pair_deg = errors.max(axis=1)
-    ratios = [_baseline_ratios(world, truth, limits[number]) for number, world in sorted(worlds.items())]
-    found = [np.abs(own / np.median(own) - 1) for own in ratios if len(own) > 1]
-    deviations = np.concatenate(found) if found else np.array([np.nan])
+    deviation = np.concatenate(deviations) if len(deviations) > 1 else np.array([np.nan])
     return PoseErrors(
         pairs=pairs,
         rotation_deg=errors[:, 0],
@@ -109,11 +119,11 @@ def relative_pose_errors(
         pair_deg=pair_deg,
         median_pair_deg=float(np.median(pair_deg)),
         auc={limit: float(np.clip(1 - pair_deg / limit, 0, 1).mean()) for limit in AUC_LIMITS_DEG},
-        registered=len(known),
+        registered=sum(map(len, worlds.values())),
         in_one_frame=max(map(len, worlds.values()), default=0),
         expected=len(truth),
-        scale_ratio_median=float(np.median(deviations)),
-        scale_ratio_max=float(deviations.max()),
+        scale_ratio_median=float(np.median(deviation)),
+        scale_ratio_max=float(deviation.max()),
     )
 
 
@@ -135,31 +145,31 @@ def center_errors(estimated: Mapping[str, Rigid3], truth: Mapping[str, Rigid3]) 
     return CenterErrors(names, distances, extent, truth_from_estimated.scale)
 
 
-def _pair_error_deg(
-    first: str,
-    second: str,
-    estimated: Mapping[str, Rigid3],
-    truth: Mapping[str, Rigid3],
-    limits: tuple[float, float],
-) -> tuple[float, float]:
-    """Return the errors of rotation and direction; a pair taken from the same place has no direction error."""
-    guess = estimated[second] @ estimated[first].inverse()
-    true = truth[second] @ truth[first].inverse()
-    rotation_deg = float(np.rad2deg(geodesic_angle(guess.rotation, true.rotation)))
-    if np.linalg.norm(true.translation) <= limits[1]:
-        return rotation_deg, 0.0
-    if np.linalg.norm(guess.translation) <= limits[0]:
-        return rotation_deg, 180.0
-    return rotation_deg, float(np.rad2deg(angle_between(guess.translation, true.translation)))
+def _relative(poses: Mapping[str, Rigid3], names: Sequence[str], extent: float | None = None) -> _RelativePoses:
+    """Return second_from_first of all pairs of some images.
+
+    Args:
+        poses: cam_from_world by image name, in one world.
+        names: the images.
+        extent: largest distance between two centres of the capture; None: between two of these images.
+    """
+    rotations = np.array([poses[name].rotation for name in names])
+    centers = np.array([poses[name].center for name in names])
+    first, second = np.triu_indices(len(names), 1)
+    translations = np.einsum("pij,pj->pi", rotations[second], centers[first] - centers[second])
+    lengths = np.linalg.norm(translations, axis=1)
+    extent = float(lengths.max(initial=0)) if extent is None else extent
+    apart = lengths > max(_COINCIDENT_SHARE * extent, _ROUNDING * float(np.abs(centers).max()))
+    return _RelativePoses(rotations[second] @ rotations[first].swapaxes(1, 2), translations, lengths, apart)
 
 
-def _baseline_ratios(
-    estimated: Mapping[str, Rigid3], truth: Mapping[str, Rigid3], limits: tuple[float, float]
-) -> FloatArray:
-    """Return the ratio of estimated to true baseline of every pair whose images lie apart on both sides."""
-    true = {name: truth[name].center for name in estimated}
-    guess = {name: pose.center for name, pose in estimated.items()}
-    lengths = [
-        (np.linalg.norm(guess[b] - guess[a]), np.linalg.norm(true[b] - true[a])) for a, b in combinations(guess, 2)
-    ]
-    return np.array([g / t for g, t in lengths if g > limits[0] and t > limits[1]])
+def _world_errors(found: _RelativePoses, true: _RelativePoses) -> tuple[FloatArray, FloatArray]:
+    """Return errors of rotation and direction in degrees (P, 2), and the ratios of baselines that are not 0 (Q,).
+
+    A pair that was truly taken from one place has no direction error.
+    """
+    both = found.apart & true.apart
+    direction_deg = np.where(true.apart, 180.0, 0.0)
+    direction_deg[both] = np.rad2deg(angle_between(found.translations[both], true.translations[both]))
+    rotation_deg = np.rad2deg(geodesic_angle(found.rotations, true.rotations))
+    return np.stack([rotation_deg, direction_deg], axis=1), found.lengths[both] / true.lengths[both]

@@ -85,7 +85,7 @@ def find_scale(
             reason += f"; those of group {number}, which has a unit of its own, × {factor:.6g}"
         except UsageError as error:
             factor = float("nan")
-            reason += f"; the {len(cameras)} of group {number} are not judged: {error}"
+            reason += f"; the {len(cameras)} of group {number} are not scored: {error}"
         others |= dict.fromkeys(cameras, factor)
     return FoundScale(value, reason, others)
 
