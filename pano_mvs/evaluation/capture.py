@@ -40,7 +40,9 @@ def score_capture(
     Ranges are multiplied by the scale of the similarity that aligns the camera centres of the view's group with the
     true ones; they are never fitted to the true ranges. Pixels without true surface are ignored; a pixel without an
     estimate has an error equal to the truth. Scores are named as in `score_view`. The prefix `constant_` marks the
-    score of the median of the view's true ranges, `best_constant_` that of the best constant for the score.
+    score of the median of the view's true ranges, `best_constant_` that of the best constant for the score. Median
+    errors of poses are those of the pairs that can be measured, and are missing if there are none; in the areas under
+    the recall curve the other pairs count as 180° off.
 
     Args:
         estimated_poses: cam_from_world by image.
@@ -91,11 +93,12 @@ def _pose_scores(errors: PoseErrors) -> dict[str, float]:
     scores: dict[str, float] = {
         "registered": errors.registered,
         "of": errors.expected,
-        "median_pair_error_deg": errors.median_pair_deg,
-        "median_rotation_error_deg": float(np.median(errors.rotation_deg)),
-        "median_direction_error_deg": float(np.median(errors.direction_deg)),
-        **{f"auc_{limit:g}_deg": value for limit, value in errors.auc.items()},
     }
+    if errors.measured.any():
+        of_kind = {"pair": errors.pair_deg, "rotation": errors.rotation_deg, "direction": errors.direction_deg}
+        for kind, error_deg in of_kind.items():
+            scores[f"median_{kind}_error_deg"] = float(np.median(error_deg[errors.measured]))
+    scores |= {f"auc_{limit:g}_deg": value for limit, value in errors.auc.items()}
     if np.isfinite(errors.scale_ratio_max):
         scores["scale_ratio_error_median"] = errors.scale_ratio_median
         scores["scale_ratio_error_max"] = errors.scale_ratio_max

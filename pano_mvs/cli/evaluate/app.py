@@ -11,6 +11,7 @@ from pano_mvs.cli.console import Console
 from pano_mvs.cli.default_command import RunByDefault
 from pano_mvs.cli.guard import guarded
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.text import plural
 
 evaluate_app = typer.Typer(
     cls=RunByDefault,
@@ -184,7 +185,9 @@ def depth(
     print_summary(depth_summary(evaluation, baseline=baseline), Console())
     if out is not None:
         count = len(evaluation.views)
-        print_line(f"{count} pictures of the errors, scores.json and scores.csv are in {out}", Console())
+        print_line(
+            f"{count} {plural(count, 'picture')} of the errors, scores.json and scores.csv are in {out}", Console()
+        )
 
 
 def _scale(text: str) -> float | Literal["auto"]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.paths import is_file, is_folder
+from pano_mvs.core.text import plural
 from pano_mvs.evaluation.clouds.distances import (
     DEFAULT_THRESHOLDS,
     CloudDistances,
@@ -118,11 +119,11 @@ class CloudEvaluation:
         compared, unit = self.compared, self.compared.unit
         against = "a reference cloud"
         if compared.used:
+            see = f"{compared.views} {plural(compared.views, 'view sees', 'views see')}"
             against = (
-                f"the surface that {compared.views} views see; of it to be found is what at least 2 of "
-                f"{len(compared.used)} cameras see"
+                f"the surface that {see}; of it to be found is what at least 2 of {len(compared.used)} cameras see"
             )
-        lines: list[str | TextTable] = [f"{self.cloud.count} points against {against}"]
+        lines: list[str | TextTable] = [f"{self.cloud.count} {plural(self.cloud.count, 'point')} against {against}"]
         if not compared.used and not self.is_aligned:
             lines.append(
                 "both clouds are taken to lie in one frame; if they do not, give --true-poses, those in the frame of "

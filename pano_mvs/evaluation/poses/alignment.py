@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.text import plural
 from pano_mvs.geometry import Rigid3, Similarity3, nearest_rotation
 
 # Weight of the cameras' orientations against the spread of their centres. Enough to fix the turn about a line on which
@@ -37,7 +38,8 @@ def align_centers(estimated: Mapping[str, Rigid3], truth: Mapping[str, Rigid3]) 
     """
     names = [name for name in truth if name in estimated]
     if len(names) < 2:
-        raise UsageError(f"only {len(names)} images have both an estimate and truth; two are needed for a scale")
+        have = plural(len(names), "image has", "images have")
+        raise UsageError(f"only {len(names)} {have} both an estimate and truth; two are needed for a scale")
     source = np.array([estimated[name].center for name in names])
     target = np.array([truth[name].center for name in names])
     middle, aim = source.mean(axis=0), target.mean(axis=0)

@@ -31,6 +31,7 @@ class PoseErrors:
         rotation_deg: (P,) error of second_from_first's rotation; 180 if an image is not registered.
         direction_deg: (P,) error of the direction of its translation; 180 if an image is not registered.
         pair_deg: (P,) the larger of the two.
+        measured: (P,) False if an image is not registered, or the two are in different groups.
         median_pair_deg: median of `pair_deg`.
         auc: limit in degrees to the area under the recall curve of `pair_deg` up to it, in [0, 1].
         registered: number of images with an estimate.
@@ -44,6 +45,7 @@ class PoseErrors:
     rotation_deg: FloatArray
     direction_deg: FloatArray
     pair_deg: FloatArray
+    measured: NDArray[np.bool_]
     median_pair_deg: float
     auc: dict[float, float]
     registered: int
@@ -101,12 +103,13 @@ def relative_pose_errors(
         if name in estimated:
             worlds.setdefault(0 if groups is None else groups[name], []).append(name)
     pairs, true_extent = tuple(combinations(truth, 2)), camera_extent(truth)
-    errors = np.full((len(pairs), 2), 180.0)
+    errors, measured = np.full((len(pairs), 2), 180.0), np.zeros(len(pairs), np.bool_)
     deviations = [np.zeros(0)]
     for _, names in sorted(worlds.items()):
         first, second = np.array([position[name] for name in names])[np.stack(np.triu_indices(len(names), 1))]
         place = first * (2 * len(truth) - first - 1) // 2 + second - first - 1  # in `pairs`
         true, found = _relative(truth, names, true_extent), _relative(estimated, names)
+        measured[place] = True
         errors[place], ratios = _world_errors(found, true)
         if len(ratios) > 1:
             deviations.append(np.abs(ratios / np.median(ratios) - 1))
@@ -117,6 +120,7 @@ def relative_pose_errors(
         rotation_deg=errors[:, 0],
         direction_deg=errors[:, 1],
         pair_deg=pair_deg,
+        measured=measured,
         median_pair_deg=float(np.median(pair_deg)),
         auc={limit: float(np.clip(1 - pair_deg / limit, 0, 1).mean()) for limit in AUC_LIMITS_DEG},
         registered=sum(map(len, worlds.values())),

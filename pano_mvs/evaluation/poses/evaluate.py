@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.core.text import plural
 from pano_mvs.evaluation.inputs.cameras import Cameras, camera_groups, length_unit, read_cameras, source_name
 from pano_mvs.evaluation.inputs.names import match_images, shortened_list
 from pano_mvs.evaluation.poses.errors import CenterErrors, PoseErrors, center_errors, relative_pose_errors
@@ -91,7 +92,7 @@ class PoseEvaluation:
             rows.append(_row(f"camera centre, {self.unit}", centers.distances, ".5g"))
             rows.append(_row("camera centre, % of extent", 100 * centers.distances / centers.extent, ".4f"))
         auc = ", ".join(f"{100 * value:.1f} @ {limit:g}°" for limit, value in pairs.auc.items())
-        lines = [f"AUC over all {len(pairs.pairs)} pairs, %: {auc}"]
+        lines = [f"AUC over {plural(len(pairs.pairs), 'one pair', f'all {len(pairs.pairs)} pairs')}, %: {auc}"]
         if np.isfinite(some.scale_ratio_max):
             lines.append(
                 f"translation scale ratios: median {100 * some.scale_ratio_median:.3f} %, largest "
@@ -104,13 +105,15 @@ class PoseEvaluation:
             lines.append(f"camera centres are not compared: {self.no_centers}")
         if self.other_groups:
             lines.append(
-                f"{len(self.other_groups)} further groups of {sum(self.other_groups)} images in {self.model}, each "
+                f"{len(self.other_groups)} further {plural(len(self.other_groups), 'group')} of "
+                f"{sum(self.other_groups)} {plural(sum(self.other_groups), 'image')} in {self.model}, each "
                 "with a frame of its own, count as not registered"
             )
         if self.without_truth:
             lines.append(f"no truth for {shortened_list(self.without_truth)}")
-        headings = (f"over {len(some.pairs)} pairs of registered images", "median", "mean", "max")
-        return (f"{pairs.registered} of {pairs.expected} images registered", TextTable(headings, tuple(rows)), *lines)
+        over = f"over {len(some.pairs)} {plural(len(some.pairs), 'pair')} of registered images"
+        registered = f"{pairs.registered} of {pairs.expected} {plural(pairs.expected, 'image')} registered"
+        return (registered, TextTable((over, "median", "mean", "max"), tuple(rows)), *lines)
 
 
 def evaluate_poses(model: Cameras, truth: Cameras) -> PoseEvaluation:
@@ -138,8 +141,9 @@ def evaluate_poses(model: Cameras, truth: Cameras) -> PoseEvaluation:
     ours = {name: match for match, name in match_images(estimated, known).items()}
     if len(ours) < 2:
         raise InputError(
-            f"{source_name(model)} and {source_name(truth)} have {len(ours) or 'no'} images in common, two are needed "
-            f"to compare poses. The model has {shortened_list(estimated)}, the truth {shortened_list(known)}"
+            f"{source_name(model)} and {source_name(truth)} have {len(ours) or 'no'} {plural(len(ours), 'image')} in "
+            f"common, two are needed to compare poses. The model has {shortened_list(estimated)}, the truth "
+            f"{shortened_list(known)}"
         )
     found: dict[str, Rigid3] = {name: estimated[ours[name]] for name in known if name in ours}
     centers, reason = _centers(found, known)

@@ -12,6 +12,7 @@ import numpy as np
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.files import write_text
+from pano_mvs.core.text import plural
 from pano_mvs.evaluation.inputs.names import shortened_list
 from pano_mvs.evaluation.ranges.errors import DELTAS
 from pano_mvs.evaluation.ranges.evaluate import DepthEvaluation
@@ -96,7 +97,7 @@ def _conditions(evaluation: DepthEvaluation, baseline: str) -> list[str]:
     """Return how the range maps were scored."""
     settings, views, scale = evaluation.settings, evaluation.views, evaluation.scale
     lines = [
-        f"{len(views)} view{'s' if len(views) != 1 else ''} of {evaluation.source} against {evaluation.truth}",
+        f"{len(views)} {plural(len(views), 'view')} of {evaluation.source} against {evaluation.truth}",
         f"estimates × {scale.value:.6g}: {scale.reason}",
     ]
     if settings.align == "none":
@@ -112,14 +113,15 @@ def _conditions(evaluation: DepthEvaluation, baseline: str) -> list[str]:
         lines.append(f"ranges of a confidence below {settings.min_confidence} count as missing")
     if missing := evaluation.without_mask:
         lines.append(
-            f"no mask in --masks for {len(missing)} of {len(views)} views, {missing[0]} first: all their pixels count "
-            "unless --mask excludes them"
+            f"no mask in --masks for {len(missing)} of {len(views)} {plural(len(views), 'view')}, {missing[0]} first: "
+            "all their pixels count unless --mask excludes them"
         )
     for (size, true_size), count in evaluation.sizes.items():
         if size != true_size:
             lines.append(
-                f"{count} of the views are {size[1]}×{size[0]}, their truth {true_size[1]}×{true_size[0]}: read at the "
-                "true pixels, interpolated only between pixels of one surface"
+                f"{count} of the views {plural(count, 'is', 'are')} {size[1]}×{size[0]}, "
+                f"{plural(count, 'its', 'their')} truth {true_size[1]}×{true_size[0]}: read at the true pixels, "
+                "interpolated only between pixels of one surface"
             )
     lines.append(
         f"a missing range is an error as large as the truth in “every pixel”; peak {settings.peak:g}; in brackets "
