@@ -1,4 +1,4 @@
-"""Draw a cloud without a graphics library: points, the nearest in front."""
+"""Drawing of a cloud without a graphics library: as points, the nearest in front."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.rendering.viewpoints import Viewpoint, facing
 
 _PAPER = (238, 241, 244)
-_LARGEST_PX = 5
+_MAX_POINT_PX = 5
 
 
 def draw_cloud(
@@ -19,13 +19,13 @@ def draw_cloud(
     *,
     size_hw: tuple[int, int],
 ) -> NDArray[np.uint8]:
-    """Return a picture (H, W, 3) RGB of a cloud; each point is a square, larger where points are few.
+    """Return a picture (H, W, 3) RGB of a cloud; points are squares, the larger the fewer they are.
 
     Args:
         points: (N, 3) in the world.
-        normals: (N, 3) in the world.
+        normals: (N, 3) in the world; points seen from behind are not drawn.
         colors_rgb: (N, 3) uint8.
-        viewpoint: from where.
+        viewpoint: the camera of the picture.
         size_hw: (height, width) of the picture.
     """
     shown = facing(points, normals, viewpoint)
@@ -33,10 +33,10 @@ def draw_cloud(
     column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
     inside = (depth > 0) & (column >= 0) & (column < size_hw[1]) & (row >= 0) & (row < size_hw[0])
     pixel = (row * size_hw[1] + column)[inside]
-    # Far ones first: of several writes to a pixel, the last one stays.
+    # Far points first: of several writes to a pixel, the last one stays.
     order = np.argsort(-depth[inside], kind="stable")
     image = np.full((size_hw[0] * size_hw[1], 3), _PAPER, np.uint8)
-    side = int(np.clip(np.sqrt(image.shape[0] / max(1, len(pixel))) * 2, 1, _LARGEST_PX))
+    side = int(np.clip(np.sqrt(image.shape[0] / max(1, len(pixel))) * 2, 1, _MAX_POINT_PX))
     nearest = np.full(image.shape[0], np.inf)
     nearest[pixel[order]] = depth[inside][order]
     image[pixel[order]] = colors_rgb[shown][inside][order]
@@ -46,7 +46,7 @@ def draw_cloud(
 def _projected(
     points: NDArray[np.float64], viewpoint: Viewpoint, size_hw: tuple[int, int]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return x, y in pixels and the depth of points; those behind the eye have none (0)."""
+    """Return x, y in pixels and the depth of points; points behind the eye have depth 0."""
     height, width = size_hw
     ahead = viewpoint.target - viewpoint.eye
     ahead = ahead / np.linalg.norm(ahead)

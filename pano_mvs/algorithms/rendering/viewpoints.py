@@ -1,4 +1,4 @@
-"""From where a cloud is shown: from above, from outside at an angle, and from where a camera stood."""
+"""Viewpoints for pictures of a cloud: from above, from outside at an angle, and from the place of a camera."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ FloatArray = NDArray[np.float64]
 
 _OUTSIDE_AZIMUTH_RAD, _OUTSIDE_ELEVATION_RAD = np.deg2rad(35.0), np.deg2rad(42.0)
 _OUTSIDE_FOV_DEG, _INSIDE_FOV_DEG = 36.0, 90.0
-_AWAY = -0.05  # cosine: surfaces seen nearly edge-on stay, noise in normals would tear them
+_AWAY = -0.05  # cosine: surfaces seen nearly edge-on stay, because noisy normals would tear them
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,12 +19,12 @@ class Viewpoint:
     """One camera of a renderer.
 
     Attributes:
-        title: what is seen, for people.
+        title: description for display.
         eye: (3,) in the world.
         target: (3,) in the world, in the middle of the picture.
         up: (3,) unit vector in the world, upwards in the picture.
         fov_deg: vertical field of view; 0 for a parallel projection.
-        height: of what a parallel projection shows, in scene units; 0 for a perspective one.
+        height: height of the view of a parallel projection, in scene units; 0 for a perspective one.
     """
 
     title: str
@@ -38,14 +38,14 @@ class Viewpoint:
 def viewpoints(
     points_in_world: NDArray[np.float32], centers: FloatArray, up: FloatArray, *, aspect: float, place: str = ""
 ) -> tuple[Viewpoint, ...]:
-    """Return the three places from where to look at a cloud: above, outside, inside.
+    """Return three viewpoints of a cloud: above, outside, inside.
 
     Args:
         points_in_world: (N, 3), N > 0.
         centers: (M, 3) of the cameras; M may be 0.
         up: (3,) unit vector away from the ground.
         aspect: width over height of the pictures.
-        place: name of the camera from where the inside is seen, for its title; see `inside_camera`.
+        place: name of the camera that shows the inside, for the title; see `inside_camera`.
     """
     right, forward = horizontal_axes(up)
     level = np.asarray(points_in_world, np.float64) @ np.stack([right, up, forward], axis=1)
@@ -63,12 +63,12 @@ def viewpoints(
 
 
 def inside_camera(centers: FloatArray) -> int:
-    """Return the position of the camera that is farthest from all others' middle."""
+    """Return the index of the camera that is farthest from the median of all centres."""
     return int(np.argmax(np.linalg.norm(centers - np.median(centers, axis=0), axis=1)))
 
 
 def horizontal_axes(up: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return two unit vectors across `up`: to the right and forward, z as far as that can be."""
+    """Return two unit vectors perpendicular to `up`: to the right, and forward (along z as far as possible)."""
     axis = np.array([0.0, 0.0, 1.0]) if abs(up[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
     forward = axis - (axis @ up) * up
     forward /= np.linalg.norm(forward)
@@ -76,7 +76,7 @@ def horizontal_axes(up: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def facing(points: NDArray[np.float32], normals: NDArray[np.float32], viewpoint: Viewpoint) -> NDArray[np.bool_]:
-    """Return which points (N,) show their front: from above no ceiling hides the room, and no wall from outside."""
+    """Return the points (N,) that show their front, so that no ceiling or wall hides the inside of a room."""
     if viewpoint.height:
         towards = np.broadcast_to((viewpoint.eye - viewpoint.target).astype(np.float32), points.shape)
     else:
@@ -87,7 +87,7 @@ def facing(points: NDArray[np.float32], normals: NDArray[np.float32], viewpoint:
 
 
 def _inside(centers: FloatArray, middle: FloatArray, up: FloatArray, place: str) -> Viewpoint:
-    """Return the view from the outermost camera towards the others, or along the longest way where there is one."""
+    """Return the view from the outermost camera towards the others; forward if there is only one camera."""
     eye = centers[inside_camera(centers)] if len(centers) else middle
     _, forward = horizontal_axes(up)
     towards = (np.median(centers, axis=0) if len(centers) else middle) - eye
