@@ -4,8 +4,8 @@ import pytest
 
 from pano_mvs.engine.cache.blobs import BlobRef
 from pano_mvs.engine.cache.store import ItemRef
-from pano_mvs.engine.running.execute import kept_items
-from pano_mvs.engine.running.gather import Gather
+from pano_mvs.engine.executors.execute import max_kept_items
+from pano_mvs.engine.executors.lazy_mapping import LazyMapping
 
 
 @pytest.fixture
@@ -19,7 +19,7 @@ def gather(loaded):
         loaded.append(ref)
         return [ref]
 
-    return Gather({f"{idx:03d}": idx for idx in range(200)}, load)
+    return LazyMapping({f"{idx:03d}": idx for idx in range(200)}, load)
 
 
 def test_names_length_and_membership_load_nothing(gather, loaded):
@@ -57,11 +57,11 @@ def test_a_failure_comes_out_of_the_access():
         raise OSError(f"no {ref}")
 
     with pytest.raises(OSError, match="no 1"):
-        Gather({"a": 1}, load)["a"]
+        LazyMapping({"a": 1}, load)["a"]
 
 
 def test_as_many_are_kept_as_are_asked_for(loaded):
-    gather = Gather({idx: idx for idx in range(5)}, lambda ref: loaded.append(ref) or [ref], kept=2)
+    gather = LazyMapping({idx: idx for idx in range(5)}, lambda ref: loaded.append(ref) or [ref], max_kept=2)
     for key in (0, 1, 0, 2, 0, 1):
         gather[key]
     assert loaded == [0, 1, 2, 1]
@@ -72,6 +72,6 @@ def ref_of(*sizes):
 
 
 def test_how_many_are_kept_depends_on_open_files_and_on_memory():
-    assert kept_items([ref_of(1_000, 9_000), ref_of(10)]) == 12_800
-    assert kept_items([ref_of(1_000), ref_of(10_000_000, 10_000_000)]) == 64
-    assert kept_items([ref_of(*[200_000] * 100)]) == 6
+    assert max_kept_items([ref_of(1_000, 9_000), ref_of(10)]) == 12_800
+    assert max_kept_items([ref_of(1_000), ref_of(10_000_000, 10_000_000)]) == 64
+    assert max_kept_items([ref_of(*[200_000] * 100)]) == 6
