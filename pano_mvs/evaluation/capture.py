@@ -54,7 +54,7 @@ def score_capture(
         groups: group number of each estimated pose, if the groups have different worlds; None: all share one.
     """
     if len(true_poses) < 2:
-        return Scores({}, {}, ("no ground truth is known for these pictures",))
+        return Scores({}, {}, ("no ground truth is known for these images",))
     group_of = groups or {}
     notes: list[str] = []
     errors = relative_pose_errors(estimated_poses, true_poses, groups=groups)

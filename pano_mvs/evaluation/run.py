@@ -105,7 +105,7 @@ def _ranges(out: Path, truth: Path) -> DepthEvaluation:
     except InputError as error:
         raise _NotComparedError(f"the truth has none ({error})") from error
     if not match_images(estimates, true):
-        raise _NotComparedError(f"the truth knows none of their pictures ({', '.join(list(estimates)[:3])})")
+        raise _NotComparedError(f"the truth knows none of their images ({', '.join(list(estimates)[:3])})")
     return evaluate_depth(out, truth)
 
 

@@ -34,7 +34,7 @@ def truth(images: All[Panorama], poses: One[Poses], ranges: All[RangeMap], param
         if view.sha256 is None or hashlib.sha256(images[name].image.read_bytes()).hexdigest() == view.sha256:
             matched[name] = view
         else:
-            notes.append(f"{name} is not the picture that the truth in {params.truth.name} belongs to")
+            notes.append(f"{name} is not the image that the truth in {params.truth.name} belongs to")
     scored = [name for name in matched if name in ranges]
     scores = score_capture(
         poses.cameras,

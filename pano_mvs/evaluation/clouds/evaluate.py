@@ -53,7 +53,7 @@ class CloudTruth:
     """What a cloud is compared with.
 
     Attributes:
-        pieces: returns the whole true surface anew, in pieces (K, 3) of which one is in memory at a time.
+        pieces: returns the whole true surface at each call, in pieces (K, 3) of which one is in memory at a time.
         surface: the part that should be covered.
         used: the views that show it, by name; none of a reference cloud.
         views: number of views with truth.

@@ -166,7 +166,7 @@ def _in_memory(name: str, given: RangeMap | NDArray[np.floating], unit: float) -
 def _in_archive(path: Path, unit: float) -> dict[str, StoredRange]:
     keys = keys_of_npz(path)
     if not keys:
-        raise InputError(f"{path}: holds no arrays. Give a file with one range map for each picture")
+        raise InputError(f"{path}: holds no arrays. Give a file with one range map per image")
     return {key: RangeFile(path, key, unit) for key in keys}
 
 
@@ -189,7 +189,7 @@ def _read_image(path: Path) -> NDArray[Any]:
         raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
     array = decode_picture(data, path, cv2.IMREAD_UNCHANGED)
     if array is None:
-        raise InputError(f"{path}: not a picture that can be decoded ({len(data)} bytes). Write it again")
+        raise InputError(f"{path}: not an image that can be decoded ({len(data)} bytes). Write it again")
     return np.asarray(array)
 
 

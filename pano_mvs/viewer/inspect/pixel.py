@@ -188,7 +188,7 @@ def _true_range(
     matched = truth.match(list(estimated))
     views = {name: view for name, view in matched.items() if view.sha256 in (None, _sha256(pictures[name]))}
     if image in matched and image not in views:
-        return np.nan, (f"{image} is not the picture that the truth in {folder.name} belongs to",)
+        return np.nan, (f"{image} is not the image that the truth in {folder.name} belongs to",)
     ranges = truth.range_map(views[image]) if image in views else None
     if ranges is None or ranges.shape != read.reference.size_hw:
         return np.nan, (f"the truth in {folder.name} has no range map of {image} at the size that was swept",)

@@ -235,7 +235,7 @@ def test_strangers_are_named_with_what_either_has(pano_mvs: Command, output: Pat
     np.savez(tmp_path / "other.npz", zebra=np.ones((4, 8), np.float32))
     result = pano_mvs("evaluate", "depth", output, "--truth", tmp_path / "other.npz")
     assert result.code == 2
-    assert "no picture in common: the one has 000, 001, 002, the other zebra" in result.flat
+    assert "no image in common: the one has 000, 001, 002, the other zebra" in result.flat
     np.savez(tmp_path / "shape.npz", **{"001": np.ones((30, 50), np.float32)})
     result = pano_mvs("evaluate", "depth", output, "--truth", tmp_path / "shape.npz")
     assert result.code == 2
@@ -288,5 +288,5 @@ class TestRun:
         np.savez(tmp_path / "other.npz", zebra=np.ones((4, 8), np.float32))
         result = pano_mvs("evaluate", "run", output, "--truth", tmp_path / "other.npz")
         assert result.code == 2
-        for words in ("the truth has no poses", "knows none of their pictures", "there is no cloud.ply"):
+        for words in ("the truth has no poses", "knows none of their images", "there is no cloud.ply"):
             assert words in result.flat
