@@ -45,7 +45,7 @@ class _NotComparedError(Exception):
     """A result has no counterpart in the truth; the text is the reason."""
 
 
-def evaluate_run(out: Path, truth: Path) -> RunEvaluation:
+def evaluate_run(out: Path | str, truth: Path | str) -> RunEvaluation:
     """Compare the poses, the range maps and the cloud in an output folder with the truth, as far as both are there.
 
     Args:
@@ -59,7 +59,7 @@ def evaluate_run(out: Path, truth: Path) -> RunEvaluation:
 
     def attempt(result: str, compare: Callable[[Path, Path], Evaluation]) -> Evaluation | None:
         try:
-            return compare(out, truth)
+            return compare(Path(out), Path(truth))
         except _NotComparedError as reason:
             reasons[result] = str(reason)
             return None

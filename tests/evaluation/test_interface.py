@@ -42,7 +42,7 @@ def test_poses_may_be_records_files_or_transforms(tmp_path: Path) -> None:
     views = [{"image": n, "R": p.rotation.tolist(), "t": p.translation.tolist()} for n, p in POSES.items()]
     (tmp_path / "poses.json").write_text(json.dumps({"metric": True, "views": views}))
     turned = POSES | {"c": Rigid3(np.diag([-1.0, 1, -1]), POSES["c"].translation)}
-    found = [evaluate_poses(turned, truth) for truth in (record, tmp_path / "poses.json", POSES)]
+    found = [evaluate_poses(turned, truth) for truth in (record, str(tmp_path / "poses.json"), POSES)]
     assert [one.unit for one in found] == ["m", "m", "units of the truth"]
     for one in found:
         assert one.pairs.rotation_deg.max() == pytest.approx(180)
@@ -55,7 +55,7 @@ def test_ranges_in_memory_score_like_those_in_files(tmp_path: Path) -> None:
     estimates = {name: (1.1 * ranges).astype(np.float32) for name, ranges in truth.items()}
     np.savez(tmp_path / "found.npz", **estimates)
     np.savez(tmp_path / "true.npz", **truth)
-    of_files = evaluate_depth(tmp_path / "found.npz", tmp_path / "true.npz")
+    of_files = evaluate_depth(str(tmp_path / "found.npz"), tmp_path / "true.npz")
     in_memory = evaluate_depth(estimates, truth)
     assert in_memory.views == of_files.views
     confidence = np.full((8, 16), 200, np.uint8)
@@ -71,9 +71,9 @@ def test_clouds_in_memory_score_like_those_in_files(tmp_path: Path) -> None:
     up, grey = np.tile(np.float32([0, -1, 0]), (200, 1)), np.full((200, 3), 9, np.uint8)
     cloud = PointCloud(points, up, grey, np.ones(200, np.uint8))
     write_ply(tmp_path / "a.ply", cloud)
-    given = (points, cloud, tmp_path / "a.ply")
+    given = (points, cloud, tmp_path / "a.ply", str(tmp_path / "a.ply"))
     scores = [evaluate_cloud(one, points + 0.03, thresholds=(0.06, 0.04)).scores for one in given]
-    assert scores[0] == scores[1] == scores[2]
+    assert scores[0] == scores[1] == scores[2] == scores[3]
     assert scores[0][1].accuracy < scores[0][0].accuracy == 1
     with pytest.raises(UsageError, match=r"of shape \(N, 3\)"):
         evaluate_cloud(np.ones((4, 2)), points)

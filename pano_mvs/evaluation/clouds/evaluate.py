@@ -27,8 +27,9 @@ from pano_mvs.evaluation.clouds.true_surface import (
     surface_of_views,
     view_points,
 )
-from pano_mvs.evaluation.inputs.cameras import Cameras, camera_groups, length_unit, read_cameras, source_name
+from pano_mvs.evaluation.inputs.cameras import Cameras, camera_groups, length_unit, read_cameras
 from pano_mvs.evaluation.inputs.names import match_images
+from pano_mvs.evaluation.inputs.sources import as_path, source_name
 from pano_mvs.evaluation.inputs.truth import find_true_ranges
 from pano_mvs.evaluation.poses.alignment import align_centers
 from pano_mvs.evaluation.tables import Summary, TextTable, finite_or_none
@@ -142,11 +143,11 @@ class CloudEvaluation:
 
 
 def evaluate_cloud(
-    cloud: CloudInput,
-    truth: CloudInput,
+    cloud: CloudInput | str,
+    truth: CloudInput | str,
     *,
-    poses: Cameras | None = None,
-    true_poses: Cameras | None = None,
+    poses: Cameras | str | None = None,
+    true_poses: Cameras | str | None = None,
     thresholds: Sequence[float] = DEFAULT_THRESHOLDS,
 ) -> CloudEvaluation:
     """Compare a cloud with the true surface: accuracy, completeness and F-score.
@@ -172,28 +173,32 @@ def evaluate_cloud(
         >>> score.accuracy, round(score.completeness, 4)
         (1.0, 0.6667)
     """
+    source: CloudInput = as_path(cloud)
+    target: CloudInput = as_path(truth)
+    given: Cameras | None = as_path(poses)
     limits = tuple(sorted(thresholds))
     if not limits or not limits[0] > 0:
         raise UsageError(f"tolerances must be positive, got {', '.join(map(str, limits)) or 'none'}")
-    points = _open(cloud)
-    of_run = isinstance(cloud, Path) and is_folder(cloud)
-    model = cloud / MODEL_FOLDER if isinstance(cloud, Path) and of_run and poses is None else poses
-    known, is_metric = _true_cameras(truth, true_poses)
+    points = _open(source)
+    model = given
+    if isinstance(source, Path) and is_folder(source) and given is None:
+        model = source / MODEL_FOLDER
+    known, is_metric = _true_cameras(target, as_path(true_poses))
     used = list(known)
-    if model is not None and (known or poses is not None):
+    if model is not None and (known or given is not None):
         if not known:
             raise InputError(
-                f"{source_name(truth)}: a reference cloud has no cameras: give --true-poses to bring the cloud of "
+                f"{source_name(target)}: a reference cloud has no cameras: give --true-poses to bring the cloud of "
                 f"{source_name(model)} into its frame"
             )
         truth_from_cloud, used = _alignment(model, known)
         points = MovedPoints(points, truth_from_cloud)
-    compared = _compared(truth, used, known, voxel_size=limits[0], unit=length_unit(metric=is_metric))
+    compared = _compared(target, used, known, voxel_size=limits[0], unit=length_unit(metric=is_metric))
     farthest = _FARTHEST * limits[-1]
     distances = cloud_distances(points, compared.pieces(), compared.surface, limit=farthest)
     return CloudEvaluation(
-        source=source_name(cloud),
-        truth=source_name(truth),
+        source=source_name(source),
+        truth=source_name(target),
         scores=score_cloud(distances, compared.surface, thresholds),
         cloud=points,
         is_aligned=isinstance(points, MovedPoints),

@@ -40,8 +40,3 @@ def read_cameras(source: Cameras) -> tuple[Mapping[str, Rigid3], bool]:
 def length_unit(*, metric: bool) -> str:
     """Return the unit of lengths for display."""
     return "m" if metric else "units of the truth"
-
-
-def source_name(source: object) -> str:
-    """Return the name of an input for display: its path, or what it is in memory."""
-    return str(source) if isinstance(source, Path) else f"{type(source).__name__} in memory"

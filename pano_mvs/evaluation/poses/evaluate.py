@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.text import plural
-from pano_mvs.evaluation.inputs.cameras import Cameras, camera_groups, length_unit, read_cameras, source_name
+from pano_mvs.evaluation.inputs.cameras import Cameras, camera_groups, length_unit, read_cameras
 from pano_mvs.evaluation.inputs.names import match_images, shortened_list
+from pano_mvs.evaluation.inputs.sources import as_path, source_name
 from pano_mvs.evaluation.poses.errors import CenterErrors, PoseErrors, center_errors, relative_pose_errors
 from pano_mvs.evaluation.tables import Summary, TextTable, finite_or_none
 from pano_mvs.geometry import Rigid3
@@ -116,7 +117,7 @@ class PoseEvaluation:
         return (registered, TextTable((over, "median", "mean", "max"), tuple(rows)), *lines)
 
 
-def evaluate_poses(model: Cameras, truth: Cameras) -> PoseEvaluation:
+def evaluate_poses(model: Cameras | str, truth: Cameras | str) -> PoseEvaluation:
     """Compare poses with the truth, whatever their world frames and units.
 
     Args:
@@ -136,20 +137,22 @@ def evaluate_poses(model: Cameras, truth: Cameras) -> PoseEvaluation:
         >>> evaluation.pairs.registered, evaluation.pairs.median_pair_deg
         (2, 0.0)
     """
-    estimated, *others = camera_groups(model)
-    known, metric = read_cameras(truth)
+    source: Cameras = as_path(model)
+    target: Cameras = as_path(truth)
+    estimated, *others = camera_groups(source)
+    known, metric = read_cameras(target)
     ours = {name: match for match, name in match_images(estimated, known).items()}
     if len(ours) < 2:
         raise InputError(
-            f"{source_name(model)} and {source_name(truth)} have {len(ours) or 'no'} {plural(len(ours), 'image')} in "
+            f"{source_name(source)} and {source_name(target)} have {len(ours) or 'no'} {plural(len(ours), 'image')} in "
             f"common, two are needed to compare poses. The model has {shortened_list(estimated)}, the truth "
             f"{shortened_list(known)}"
         )
     found: dict[str, Rigid3] = {name: estimated[ours[name]] for name in known if name in ours}
     centers, reason = _centers(found, known)
     return PoseEvaluation(
-        model=source_name(model),
-        truth=source_name(truth),
+        model=source_name(source),
+        truth=source_name(target),
         unit=length_unit(metric=metric),
         pairs=relative_pose_errors(found, known),
         registered_pairs=relative_pose_errors(found, {name: known[name] for name in found}),

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, UsageError
-from pano_mvs.evaluation.inputs.cameras import Cameras, source_name
+from pano_mvs.evaluation.inputs.cameras import Cameras
 from pano_mvs.evaluation.inputs.range_files import RangeMaps
+from pano_mvs.evaluation.inputs.sources import as_path, source_name
 from pano_mvs.evaluation.ranges.pairs import RangePairs, ViewMaps, ViewMasks, pair_ranges
 from pano_mvs.evaluation.ranges.scale import FoundScale, find_scale
 from pano_mvs.evaluation.ranges.view_scores import BASELINES, ScoreSettings, ViewScores, mean_scores, score_view
@@ -99,17 +100,17 @@ class DepthEvaluation:
 
 
 def evaluate_depth(
-    estimates: RangeMaps,
-    truth: RangeMaps,
+    estimates: RangeMaps | str,
+    truth: RangeMaps | str,
     *,
     settings: ScoreSettings | None = None,
     unit: float = 1.0,
     truth_unit: float = 1.0,
     scale: float | Literal["auto"] = "auto",
-    poses: Cameras | None = None,
-    true_poses: Cameras | None = None,
-    masks: Path | None = None,
-    mask: Path | None = None,
+    poses: Cameras | str | None = None,
+    true_poses: Cameras | str | None = None,
+    masks: Path | str | None = None,
+    mask: Path | str | None = None,
 ) -> DepthEvaluation:
     """Compare range maps with the truth.
 
@@ -138,11 +139,14 @@ def evaluate_depth(
         (0.2, ('b',))
     """
     settings = settings or ScoreSettings()
+    source: RangeMaps = as_path(estimates)
+    target: RangeMaps = as_path(truth)
     for what, value in (("unit", unit), ("truth unit", truth_unit)):
         if not 0 < value < float("inf"):
             raise UsageError(f"the {what} must be a positive number, got {value}")
-    pairs = pair_ranges(estimates, truth, unit=unit, truth_unit=truth_unit, masks=ViewMasks(masks, mask))
-    found_scale = find_scale(estimates, truth, scale=scale, poses=poses, true_poses=true_poses)
+    view_masks = ViewMasks(as_path(masks), as_path(mask))
+    pairs = pair_ranges(source, target, unit=unit, truth_unit=truth_unit, masks=view_masks)
+    found_scale = find_scale(source, target, scale=scale, poses=as_path(poses), true_poses=as_path(true_poses))
     views: dict[str, ViewScores] = {}
     sizes: dict[Sizes, int] = {}
     for name, factor in found_scale.of_views(pairs.truths).items():
@@ -164,7 +168,7 @@ def evaluate_depth(
         sizes[size] = sizes.get(size, 0) + 1
     if not any(view.pixels for view in views.values()):
         raise InputError(
-            f"{source_name(truth)}: no pixel of any view has a true range that counts. Check its files and the masks: "
+            f"{source_name(target)}: no pixel of any view has a true range that counts. Check its files and the masks: "
             "zero, negative, infinite and NaN are no range"
         )
-    return DepthEvaluation(source_name(estimates), source_name(truth), settings, found_scale, views, pairs, sizes)
+    return DepthEvaluation(source_name(source), source_name(target), settings, found_scale, views, pairs, sizes)

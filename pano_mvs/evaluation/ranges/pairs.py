@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.paths import children, is_file, is_folder
-from pano_mvs.evaluation.inputs.cameras import source_name
 from pano_mvs.evaluation.inputs.names import match_images, shortened_list, without_extension
 from pano_mvs.evaluation.inputs.range_files import RangeMaps, StoredRange, find_ranges
+from pano_mvs.evaluation.inputs.sources import source_name
 from pano_mvs.evaluation.inputs.truth import find_true_ranges
 from pano_mvs.evaluation.ranges.resize import resized_labels, resized_range
 from pano_mvs.scene.masking import decode_mask, placed_mask
