@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
+from unittest.mock import patch
 
-from pano_mvs.cli import run_command
 from pano_mvs.cli.app import main
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
@@ -58,5 +58,5 @@ def _simulated(store: Store, *_name: str, **_settings: object) -> Executor:
 
 
 if __name__ == "__main__":
-    run_command.make_executor = _simulated  # type: ignore[assignment]
-    main()
+    with patch("pano_mvs.cli.run_command.make_executor", _simulated):
+        main()

@@ -43,8 +43,8 @@ class SparseChain:
         pairs = list(combinations(names, 2))
         for pair in pairs:
             if pair not in self._pairs:
-                ports = {port.name: [self._features[name] for name in pair] for port in self.matcher.spec.ports}
-                self._pairs[pair] = _call(self.matcher, ports)
+                both = {port.name: [self._features[name] for name in pair] for port in self.matcher.spec.ports}
+                self._pairs[pair] = _call(self.matcher, both)
         poses = None
         for solver in self.solvers:
             poses = _call(solver, self._given(solver, capture, pairs, poses))

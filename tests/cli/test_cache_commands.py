@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -74,10 +75,10 @@ def unwritable(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Let nothing be written below the caches `cache` and `none`; for root, permissions would not."""
     make = tempfile.mkstemp
 
-    def refuse(*, dir: Path, **options: str) -> tuple[int, str]:  # noqa: A002
+    def refuse(*, dir: Path, **options: Any) -> tuple[int, str]:  # noqa: A002
         if Path(dir).is_relative_to(tmp_path / "cache") or Path(dir).is_relative_to(tmp_path / "none"):
             raise PermissionError(13, "Permission denied")
-        return make(dir=dir, **options)
+        return make(dir=os.fspath(dir), **options)
 
     monkeypatch.setattr(tempfile, "mkstemp", refuse)
 
@@ -364,10 +365,10 @@ def test_blob_that_a_run_came_to_use_is_not_swept(toy: Toy, monkeypatch: pytest.
 
     delete = upkeep._delete
 
-    def after_a_use(*arguments: object) -> None:
+    def after_a_use(*arguments: Any) -> None:
         for path in (*root.rglob("*.json"), *root.rglob("*.txt")):
             os.utime(path)
-        delete(*arguments)  # type: ignore[arg-type]
+        delete(*arguments)
 
     before = files_of(root)
     monkeypatch.setattr(upkeep, "_delete", after_a_use)

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -80,7 +81,7 @@ def test_this_installation_has_what_it_needs() -> None:
     assert not [finding for finding in found.values() if finding.state == "failed"]
 
 
-GOOD = {
+GOOD: dict[str, dict[str, Any]] = {
     "numba": {"version": "1", "seconds": 1.0, "disabled": False},
     "pycolmap": {"version": "2", "cuda": False},
     "cv2": {"version": "3", "missing": [], "video": True, "avif": True},
@@ -89,7 +90,7 @@ GOOD = {
 }
 
 
-def fake(**answers: object) -> probes.Try:
+def fake(**answers: Any) -> probes.Try:
     def attempt(code: str) -> Outcome:
         name = next(name for name in ("numba", "pycolmap", "cv2", "pyvista", "torch") if f"import {name}" in code
                     or f", {name}" in code)  # fmt: skip

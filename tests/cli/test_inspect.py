@@ -6,6 +6,7 @@ import json
 import shlex
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,10 +38,11 @@ def call(*arguments: object) -> Outcome:
     return Outcome(result.exit_code, result.output)
 
 
-def inspected(*arguments: object) -> dict:
+def inspected(*arguments: object) -> dict[str, Any]:
     found = call("inspect", *arguments, "--json")
     assert found.code == 0, found.text
-    return json.loads(found.text)
+    result: dict[str, Any] = json.loads(found.text)
+    return result
 
 
 @pytest.fixture(scope="module")

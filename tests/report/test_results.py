@@ -1,18 +1,25 @@
 """What the page takes from the store: pictures of views and cloud, residuals, reasons; and what it keeps for later."""
 
+from __future__ import annotations
+
 import base64
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.report import write_report
 from pano_mvs.report.cloud_pictures import RENDERER_VARIABLE, cloud_pictures
 from pano_mvs.report.earlier_page import Kept
+from pano_mvs.report.pictures import Picture
 from pano_mvs.report.results import Results
+from pano_mvs.testing.tiny_capture import TinyCapture
 from tests.report.conftest import summary_of
 from tests.report.html_page import Page
 from tests.report.test_report import assert_sound
@@ -20,12 +27,12 @@ from tests.report.test_report import assert_sound
 UP = np.array([0.0, -1.0, 0.0])
 
 
-def reported(out_dir, summary, results):
+def reported(out_dir: Path, summary: Mapping[str, Any], results: Results | None) -> Page:
     write_report(out_dir, summary, results)
     return Page((out_dir / "report.html").read_text(encoding="utf-8"))
 
 
-def test_views_are_shown_with_panorama_range_and_confidence(out_dir, results, tiny):
+def test_views_are_shown_with_panorama_range_and_confidence(out_dir: Path, results: Results, tiny: TinyCapture) -> None:
     page = reported(out_dir, summary_of(tiny), results)
     assert_sound(page)
     for name in tiny.names:
@@ -39,7 +46,9 @@ def test_views_are_shown_with_panorama_range_and_confidence(out_dir, results, ti
     assert "Not shown" not in page.words
 
 
-def test_nothing_is_drawn_again_where_nothing_changed(out_dir, results, tiny, monkeypatch):
+def test_nothing_is_drawn_again_where_nothing_changed(
+    out_dir: Path, results: Results, tiny: TinyCapture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The second page is the first, byte for byte, and decodes no picture."""
     write_report(out_dir, summary_of(tiny), results)
     before = (out_dir / "report.html").read_bytes()
@@ -49,7 +58,7 @@ def test_nothing_is_drawn_again_where_nothing_changed(out_dir, results, tiny, mo
     assert (out_dir / "report.html").read_bytes() == before
 
 
-def test_what_changed_is_drawn_again(out_dir, results, tiny):
+def test_what_changed_is_drawn_again(out_dir: Path, results: Results, tiny: TinyCapture) -> None:
     """A view whose range map is another shows it; the others' pictures stay."""
     first = reported(out_dir, summary_of(tiny), results)
     names = tiny.names
@@ -60,7 +69,9 @@ def test_what_changed_is_drawn_again(out_dir, results, tiny):
     assert changed == {names[0]}
 
 
-def test_a_page_that_was_tampered_with_is_no_source_of_markup(out_dir, results, tiny):
+def test_a_page_that_was_tampered_with_is_no_source_of_markup(
+    out_dir: Path, results: Results, tiny: TinyCapture
+) -> None:
     write_report(out_dir, summary_of(tiny), results)
     path = out_dir / "report.html"
     text = path.read_text()
@@ -77,7 +88,10 @@ def test_a_page_that_was_tampered_with_is_no_source_of_markup(out_dir, results, 
 
 
 @pytest.mark.parametrize("role", ["images", "pairs", "poses", "ranges", "cloud"])
-def test_what_is_damaged_or_gone_is_left_out_and_told(out_dir, results, tiny, role):
+def test_what_is_damaged_or_gone_is_left_out_and_told(
+    out_dir: Path, results: Results, tiny: TinyCapture, role: str
+) -> None:
+    assert results.store is not None
     for ref in results.refs[role].values():
         for part in ref.parts.values():
             if not part.external:
@@ -88,10 +102,11 @@ def test_what_is_damaged_or_gone_is_left_out_and_told(out_dir, results, tiny, ro
     assert "Not shown:" in page.words
 
 
-def test_a_folder_and_its_cache_give_the_page_of_the_run(out_dir, results, tiny):
+def test_a_folder_and_its_cache_give_the_page_of_the_run(out_dir: Path, results: Results, tiny: TinyCapture) -> None:
     """`Results.of_folder` finds by the book of runs what the run had in its hands."""
     store = results.store
-    keys = {}
+    assert store is not None
+    keys: dict[str, dict[str, str]] = {}
     for role, refs in results.refs.items():
         keys[role] = {item: f"{number:064x}" for number, item in enumerate(refs, start=1000 * len(keys))}
     for role, items in keys.items():
@@ -102,7 +117,9 @@ def test_a_folder_and_its_cache_give_the_page_of_the_run(out_dir, results, tiny)
     summary["stages"] = [{"name": "images", "params": {"path": str(tiny.folder / "images")}}]
     again = Results.of_folder(out_dir, summary, Store(store.root))
     assert {role: dict(refs) for role, refs in again.refs.items()} == results.refs
-    assert again.panorama(tiny.names[0]).load().shape == (32, 64, 3)
+    panorama = again.panorama(tiny.names[0])
+    assert panorama is not None
+    assert panorama.load().shape == (32, 64, 3)
     assert again.notes == []
     elsewhere = Results.of_folder(out_dir / "other", summary, store)
     assert "knows no run" in elsewhere.notes[0]
@@ -122,26 +139,32 @@ def drawing(folder: Path, body: str) -> tuple[str, ...]:
      "for n in range(3): numpy.save(Path(sys.argv[1]) / f'picture{n}.npy', numpy.zeros((600, 960, 3), 'uint8'))"],
     ids=["fails", "crashes", "draws nothing", "draws black"],
 )  # fmt: skip
-def test_where_there_is_no_graphics_driver_plainer_pictures_are_drawn(tmp_path, results, monkeypatch, body):
+def test_where_there_is_no_graphics_driver_plainer_pictures_are_drawn(
+    tmp_path: Path, results: Results, monkeypatch: pytest.MonkeyPatch, body: str
+) -> None:
     monkeypatch.setenv(RENDERER_VARIABLE, "")
     made = cloud_pictures(results, Kept(), up=UP, command=drawing(tmp_path, body))
     assert len(made.shown) == 3
     assert "PyVista could not draw here" in made.note
 
 
-def test_a_missing_interpreter_is_no_reason_to_fail(tmp_path, results, monkeypatch):
+def test_a_missing_interpreter_is_no_reason_to_fail(
+    tmp_path: Path, results: Results, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv(RENDERER_VARIABLE, "")
     made = cloud_pictures(results, Kept(), up=UP, command=(str(tmp_path / "nowhere"),))
     assert len(made.shown) == 3
 
 
-def decoded(picture):
+def decoded(picture: Picture) -> NDArray[Any]:
     data = base64.b64decode(picture.uri.partition(",")[2])
-    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    image: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    return image
 
 
 @pytest.mark.slow
-def test_pyvista_draws_the_cloud_as_the_plain_pictures_do(results, monkeypatch):
+def test_pyvista_draws_the_cloud_as_the_plain_pictures_do(results: Results, monkeypatch: pytest.MonkeyPatch) -> None:
     """Both show the same points from the same places: their pictures agree but for the size of the points."""
     monkeypatch.setenv(RENDERER_VARIABLE, "")
     by_pyvista = cloud_pictures(results, Kept(), up=UP)

@@ -1,7 +1,11 @@
 """The page stays below 30 MB, whatever it shows."""
 
+from __future__ import annotations
+
 import base64
 import re
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +18,7 @@ MOST_BYTES = 30_000_000
 NAMES = [f"a folder with a rather long name/and another/picture {number:05d}.jpg" for number in range(5000)]
 
 
-def large(count):
+def large(count: int) -> dict[str, Any]:
     names = NAMES[:count]
     links = [[names[i], names[(i + k) % count], 50 * (k % 3), 99, 0.03] for i in range(count) for k in range(1, 9)]
     return {
@@ -30,17 +34,17 @@ def large(count):
 
 
 @pytest.mark.parametrize(("width", "most_bytes"), [(768, 80_000), (160, 9_000), (960, 300_000)])
-def test_a_picture_takes_no_more_than_its_share_though_it_be_noise(width, most_bytes):
+def test_a_picture_takes_no_more_than_its_share_though_it_be_noise(width: int, most_bytes: int) -> None:
     noise = np.random.default_rng(0).integers(0, 255, (width // 2, width, 3), np.uint8)
     made = picture(noise, width=width, most_bytes=most_bytes)
     assert len(base64.b64decode(made.uri.partition(",")[2])) <= most_bytes
 
 
-def test_tiny_pictures_end_too():
+def test_tiny_pictures_end_too() -> None:
     assert picture(np.zeros((1, 1, 3), np.uint8), width=8, most_bytes=1).size_hw == (1, 1)
 
 
-def test_five_thousand_views_fit_with_all_their_pictures(tmp_path):
+def test_five_thousand_views_fit_with_all_their_pictures(tmp_path: Path) -> None:
     """The text of the largest page, and all pictures at the largest size that each may have, base64 and all."""
     write_report(tmp_path, large(5000))
     text = (tmp_path / "report.html").stat().st_size
@@ -49,7 +53,7 @@ def test_five_thousand_views_fit_with_all_their_pictures(tmp_path):
     assert text + (cards + small + 3 * cloud_pictures.MOST_BYTES) * 4 / 3 + 1000 * 300 < MOST_BYTES
 
 
-def test_of_many_views_the_worst_and_some_others_are_shown_in_full(tmp_path):
+def test_of_many_views_the_worst_and_some_others_are_shown_in_full(tmp_path: Path) -> None:
     views = [{"name": f"view {idx}", "completeness": 0.2 if idx in (400, 411) else 0.9} for idx in range(1000)]
     write_report(tmp_path, {"views": views})
     page = Page((tmp_path / "report.html").read_text())
@@ -62,7 +66,7 @@ def test_of_many_views_the_worst_and_some_others_are_shown_in_full(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_thousand_views_of_noise_fit(tmp_path, monkeypatch):
+def test_a_thousand_views_of_noise_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(1)
     monkeypatch.setattr(thumbnails, "preview_panels", lambda *_, **__: tuple(
         rng.integers(0, 255, (80, 160, 3), np.uint8) for _ in range(2)))  # fmt: skip
@@ -74,7 +78,7 @@ def test_a_thousand_views_of_noise_fit(tmp_path, monkeypatch):
     assert len(page) < MOST_BYTES
 
 
-def test_previews_of_other_shapes_are_none_of_ours(tmp_path):
+def test_previews_of_other_shapes_are_none_of_ours(tmp_path: Path) -> None:
     (tmp_path / "1.jpg").write_bytes(b"")
     assert preview_panels(tmp_path, "1.jpg") == ()
     assert preview_panels(tmp_path, "") == ()

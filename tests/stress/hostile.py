@@ -96,7 +96,7 @@ def _extreme(data: bytes, rng: random.Random) -> bytes:
     size, value = rng.choice([1, 2, 4, 8]), rng.choice(_EXTREMES)
     place = _place(data, rng)
     number = (value & (256**size - 1)).to_bytes(size, rng.choice(["little", "big"]))
-    return data[:place] + number + data[place + size :]
+    return bytes(data[:place] + number + data[place + size :])
 
 
 def _text(data: bytes, rng: random.Random) -> bytes:

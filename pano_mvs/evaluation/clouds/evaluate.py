@@ -45,7 +45,7 @@ _MAX_SAMPLES = 4_000_000
 # Least length of the mean of the cameras' vertical axes from which they agree on where up is.
 _MIN_AGREEMENT = 0.5
 
-CloudInput = Path | PointCloud | Points
+CloudInput = Path | PointCloud | NDArray[np.floating]
 """A PLY file or the output folder of a run, a record, or points (N, 3)."""
 
 

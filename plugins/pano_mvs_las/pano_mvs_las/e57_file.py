@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import uuid
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -116,7 +117,7 @@ def _write_points(
     writer.close()
 
 
-def _structure(file: libe57.ImageFile, values: dict[str, float | int]) -> libe57.StructureNode:
+def _structure(file: libe57.ImageFile, values: Mapping[str, float]) -> libe57.StructureNode:
     node = libe57.StructureNode(file)
     for name, value in values.items():
         node.set(name, (libe57.FloatNode if isinstance(value, float) else libe57.IntegerNode)(file, value))

@@ -36,7 +36,7 @@ class Placement:
         """Return points (N, 3) as coordinates of the file."""
         world = points_in_world.astype(np.float64)
         if self.crs is None or self.origin_lla is None:
-            return world @ _UP_FROM_WORLD.T
+            return np.asarray(world @ _UP_FROM_WORLD.T)
         latitude, longitude, altitude = lla_from_local(world, self.origin_lla).T
         return np.stack(self._on_map.transform(longitude, latitude, altitude), axis=-1)
 

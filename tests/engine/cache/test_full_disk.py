@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -37,7 +38,7 @@ class Disk:
         self.calls = 0
         self._number = number
         for place, name in ((tempfile, "mkstemp"), (tempfile, "mkdtemp"), (Path, "write_bytes"), (Path, "write_text"),
-                            (Path, "mkdir"), (Path, "touch"), (files.shutil, "copyfile"), (os, "open")):  # fmt: skip
+                            (Path, "mkdir"), (Path, "touch"), (shutil, "copyfile"), (os, "open")):  # fmt: skip
             monkeypatch.setattr(place, name, self._metered(getattr(place, name), creates=name == "open"))
 
     def _metered(self, function: Callable[..., Any], *, creates: bool) -> Callable[..., Any]:

@@ -60,7 +60,7 @@ def with_header(text: str) -> bytes:
     return npy.magic(1, 0) + len(header).to_bytes(2, "little") + header + bytes(64)
 
 
-PLANTED = {
+PLANTED: dict[str, Callable[[Path], bytes]] = {
     "pickle": lambda trace: pickle.dumps(Bomb(trace)),
     "array of objects": pickled_array,
     "zip of arrays": zipped_arrays,
@@ -302,7 +302,7 @@ def blob_refs(wrong: bool) -> st.SearchStrategy[Any]:
 
 def nearly_records(wrong: bool) -> st.SearchStrategy[Any]:
     names = st.text(max_size=4)
-    parts = st.dictionaries(names, blob_refs(False), min_size=1, max_size=2)
+    parts: st.SearchStrategy[Any] = st.dictionaries(names, blob_refs(False), min_size=1, max_size=2)
     if wrong:
         parts = parts.flatmap(lambda some: blob_refs(True).map(lambda one: {**some, "wrong": one})) | anything
     refs = st.fixed_dictionaries({"kind": names, "digest": digests, "parts": parts})

@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import pytest
 
 from pano_mvs.core.errors import UsageError
@@ -96,9 +99,12 @@ def test_random_numbers_are_those_of_before_when_only_the_code_has_changed(
     toy: Toy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seeds: list[int] = []
-    monkeypatch.setattr(
-        execute, "Context", lambda rng, *others: (seeds.append(rng.integers(2**60)), Context(rng, *others))[1]
-    )
+
+    def noted(rng: np.random.Generator, *others: Any) -> Context:
+        seeds.append(int(rng.integers(2**60)))
+        return Context(rng, *others)
+
+    monkeypatch.setattr(execute, "Context", noted)
     toy.run()
     before = sorted(seeds)
     seeds.clear()

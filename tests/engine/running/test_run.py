@@ -295,8 +295,8 @@ def test_helpers_of_one_plugin_are_not_those_of_another(toy: Toy) -> None:
     registry = Registry()
     for name in ("first", "second"):
         registry.add_file(toy.folder / name / "plugin.py")
-    assert registry.stages["first.pairs"].function(()) == 1
-    assert registry.stages["second.pairs"].function(()) == 50
+    values: list[object] = [registry.stages[f"{name}.pairs"].function(()) for name in ("first", "second")]
+    assert values == [1, 50]
 
 
 def test_stage_that_a_plugin_only_imports_is_not_its_own(toy: Toy) -> None:
