@@ -62,8 +62,11 @@ def _projected(
         x, y = width / 2 + across * scale, height / 2 - upwards * scale
     valid = (depth > 0) & np.isfinite(x) & np.isfinite(y)
     limit = 10.0 * (width + height)
-    return (np.where(valid, x, -1.0).clip(-limit, limit), np.where(valid, y, -1.0).clip(-limit, limit),
-            np.where(valid, depth, 0.0))  # fmt: skip
+    return (
+        np.where(valid, x, -1.0).clip(-limit, limit),
+        np.where(valid, y, -1.0).clip(-limit, limit),
+        np.where(valid, depth, 0.0),
+    )
 
 
 def _spread(image: NDArray[np.uint8], nearest: NDArray[np.float64], side: int) -> NDArray[np.uint8]:

@@ -32,12 +32,12 @@ def write_error_clouds(folder: Path, evaluation: CloudEvaluation) -> None:
     samples = PointsInMemory(surface.points_in_world).chunks()
     write_error_cloud(folder / "completeness.ply", samples, distances.of_surface, limits=limits, farthest=farthest)
     title = "cloud by its distance from the true surface"
-    _write_views(folder / "accuracy.png", *_some_points(evaluation), title=title, evaluation=evaluation)
+    _write_views(folder / "accuracy.png", _some_points(evaluation), title=title, evaluation=evaluation)
     step = -(-len(surface.points_in_world) // _MAX_POINTS) or 1
     points = surface.points_in_world[::step]
     normals, title = _towards_cameras(evaluation, step), "true surface by its distance from the cloud"
     some = distances.of_surface[::step]
-    _write_views(folder / "completeness.png", points, normals, some, title=title, evaluation=evaluation)
+    _write_views(folder / "completeness.png", (points, normals, some), title=title, evaluation=evaluation)
     write_overview(folder / "errors.png", evaluation)
 
 
@@ -70,19 +70,17 @@ def write_overview(path: Path, evaluation: CloudEvaluation) -> None:
     write_stack(path, [*parts, _top_view(points, of_points, evaluation)])
 
 
-def _write_views(
-    path: Path, points: Points, normals: Points, distances: Points, *, title: str, evaluation: CloudEvaluation
-) -> None:
-    """Write a PNG of points (N, 3) coloured by their distances, seen from three places, with a legend.
+def _write_views(path: Path, cloud: tuple[Points, Points, Points], *, title: str, evaluation: CloudEvaluation) -> None:
+    """Write a PNG of points coloured by their distances, seen from three places, with a legend.
 
     Args:
         path: the file to write.
-        points: (N, 3) in the truth's frame.
-        normals: (N, 3) towards the visible side, or 0; points seen from behind are left out.
-        distances: (N,).
+        cloud: points (N, 3) in the truth's frame, their normals (N, 3) towards the visible side, or 0, and their
+            distances (N,); points seen from behind are left out.
         title: what is shown.
         evaluation: whose limits and cameras are used.
     """
+    points, normals, distances = cloud
     parts = [_legend(evaluation)]
     if len(points):
         cameras, up = evaluation.compared.cameras, evaluation.compared.up

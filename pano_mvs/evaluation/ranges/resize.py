@@ -60,8 +60,11 @@ def resized_labels(labels: NDArray[Scalar], size_hw: tuple[int, int]) -> NDArray
     """
     height, width = labels.shape
     if height * size_hw[1] != width * size_hw[0]:
-        raise UsageError(f"a map of {width}×{height} px cannot be compared with one of {size_hw[1]}×{size_hw[0]}: "
-                         "both must be full panoramas, twice as wide as high")  # fmt: skip
-    rows, columns = (((np.arange(new) + 0.5) * old / new).astype(np.intp)
-                     for new, old in zip(size_hw, labels.shape, strict=True))  # fmt: skip
+        raise UsageError(
+            f"a map of {width}×{height} px cannot be compared with one of {size_hw[1]}×{size_hw[0]}: "
+            "both must be full panoramas, twice as wide as high"
+        )
+    rows, columns = (
+        ((np.arange(new) + 0.5) * old / new).astype(np.intp) for new, old in zip(size_hw, labels.shape, strict=True)
+    )
     return labels[np.ix_(rows, columns)]
