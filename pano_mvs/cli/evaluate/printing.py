@@ -9,9 +9,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from pano_mvs.cli.console import Console
-from pano_mvs.cli.run_command import print_scores
+from pano_mvs.cli.run.printing import print_scores
 from pano_mvs.evaluation import RunEvaluation, depth_summary
 from pano_mvs.evaluation.tables import Summary, TextTable
+from pano_mvs.results.records import ScoresSummary
 
 
 def print_summary(summary: Summary, console: Console) -> None:
@@ -26,9 +27,9 @@ def print_summary(summary: Summary, console: Console) -> None:
 def print_run(evaluation: RunEvaluation, console: Console) -> None:
     """Print all scores of a run, and why some are missing."""
     if (poses := evaluation.poses) is not None:
-        print_scores({"poses": poses.poses, "views": {}}, console)
-        for note in poses.notes:
-            print_line(note, console)
+        print_scores(ScoresSummary(poses=poses.poses), console)
+        if "registered_in_one_frame" in poses.poses:
+            print_line(poses.notes[0], console)
     if evaluation.depth is not None:
         print_summary(depth_summary(evaluation.depth), console)
     if evaluation.cloud is not None:
