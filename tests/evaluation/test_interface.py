@@ -1,11 +1,8 @@
-"""The Python interface of evaluation: examples of the docstrings, and inputs in memory."""
+"""The Python interface of evaluation: its names, and inputs in memory."""
 
 from __future__ import annotations
 
-import doctest
-import importlib
 import json
-import pkgutil
 from pathlib import Path
 
 import numpy as np
@@ -20,18 +17,7 @@ from pano_mvs.io.clouds.ply import write_ply
 from pano_mvs.scene import PointCloud, Poses, RangeMap
 from tests.stored import write_npz
 
-MODULES = [
-    module.name
-    for module in pkgutil.walk_packages(pano_mvs.evaluation.__path__, "pano_mvs.evaluation.")
-    if not module.ispkg
-]
 POSES = {name: Rigid3(np.eye(3), np.array([x, 0.0, z])) for name, x, z in (("a", 0, 0), ("b", 1, 0), ("c", 0, 2))}
-
-
-def test_examples_in_docstrings_are_correct() -> None:
-    results = [doctest.testmod(importlib.import_module(name)) for name in MODULES]
-    assert sum(result.failed for result in results) == 0
-    assert sum(result.attempted for result in results) > 15
 
 
 def test_everything_that_is_exported_exists() -> None:
