@@ -14,10 +14,10 @@ from pano_mvs.algorithms.sweep.backends import register_sweep_backend
 from pano_mvs.algorithms.sweep.costs import CostWindow, register_sweep_cost
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.winner import Winners
-from pano_mvs.core.errors import GateError, InputError, PanoMvsError, UsageError
-from pano_mvs.core.parts import Parts
+from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError, UsageError
+from pano_mvs.core.named_registry import NamedRegistry
 from pano_mvs.engine.stages.context import Context
-from pano_mvs.engine.stages.params import NOT_IN_KEY, InputPath, Params, PartOf, SourcePath
+from pano_mvs.engine.stages.params import NOT_IN_KEY, InputPath, Params, RegisteredIn, SourcePath
 from pano_mvs.engine.stages.ports import All, Each, Names, Near, One
 from pano_mvs.engine.stages.stage import SourceItem, source, stage
 from pano_mvs.geometry import Rigid3, Similarity3
@@ -51,10 +51,10 @@ __all__ = [
     "Features",
     "FilePart",
     "Files",
-    "GateError",
     "GlobalDescriptor",
     "InputError",
     "InputPath",
+    "NamedRegistry",
     "Names",
     "Near",
     "One",
@@ -62,14 +62,14 @@ __all__ = [
     "PanoMvsError",
     "Panorama",
     "Params",
-    "PartOf",
-    "Parts",
     "PointCloud",
     "Pose",
     "Poses",
     "RangeMap",
     "Record",
+    "RegisteredIn",
     "Rigid3",
+    "RunStoppedError",
     "Scores",
     "Similarity3",
     "SourceItem",

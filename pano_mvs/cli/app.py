@@ -97,10 +97,12 @@ def run(
     """Run a workflow; the same command resumes it."""
     from pano_mvs.cli.run_command import Execution, run_workflow
     from pano_mvs.cli.session import open_session
-    from pano_mvs.engine.running.options import Demands
+    from pano_mvs.engine.planning.run_options import RunOptions
 
-    demands = Demands(tuple(until or ()), tuple(only or ()), tuple(refresh or ()), accept_code, keep_going)
-    session = open_session(workflow, overrides=overrides or [], images=images, cache=cache, out=out, demands=demands)
+    run_options = RunOptions(tuple(until or ()), tuple(only or ()), tuple(refresh or ()), accept_code, keep_going)
+    session = open_session(
+        workflow, overrides=overrides or [], images=images, cache=cache, out=out, run_options=run_options
+    )
     execution = Execution(executor, workers, threads, scheduler, as_json, min_free, durable)
     raise typer.Exit(run_workflow(session, execution))
 
@@ -124,10 +126,12 @@ def plan(
     from pano_mvs.cli.explain import explain_unit
     from pano_mvs.cli.plan_command import show_plan
     from pano_mvs.cli.session import check_output, open_session
-    from pano_mvs.engine.running.options import Demands
+    from pano_mvs.engine.planning.run_options import RunOptions
 
-    demands = Demands(tuple(until or ()), tuple(only or ()), tuple(refresh or ()), accept_code)
-    session = open_session(workflow, overrides=overrides or [], images=images, cache=cache, out=out, demands=demands)
+    run_options = RunOptions(tuple(until or ()), tuple(only or ()), tuple(refresh or ()), accept_code)
+    session = open_session(
+        workflow, overrides=overrides or [], images=images, cache=cache, out=out, run_options=run_options
+    )
     check_output(session)
     if explain:
         explain_unit(session, explain, Console())

@@ -15,7 +15,7 @@ from pano_mvs.cli.session import CACHE_VARIABLE
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.paths import is_denied, is_file
 from pano_mvs.core.text import plural
-from pano_mvs.engine.cache.maintenance import Collection, collect, size_on_disk, usage_of, verify
+from pano_mvs.engine.cache.maintenance import GarbageCollection, collect, size_on_disk, usage_of, verify
 from pano_mvs.engine.cache.store import Store
 
 _SHOWN = 10
@@ -97,7 +97,7 @@ def collect_cache(store: Store, console: Console, *, delete: bool, unused: str, 
         console.print("nothing was deleted; --delete does it")
 
 
-def _told(found: Collection, *, delete: bool) -> str:
+def _told(found: GarbageCollection, *, delete: bool) -> str:
     records, blobs = len(found.records), len(found.blobs)
     what = (f"{records} {plural(records, 'unit')}, {blobs} {plural(blobs, 'blob')}, "
             f"{size_text(found.size_bytes)}")  # fmt: skip

@@ -11,9 +11,8 @@ from pano_mvs.cli.session import Session
 from pano_mvs.core.errors import UsageError
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
+from pano_mvs.engine.planning.run_options import RunOptions
 from pano_mvs.engine.planning.units import Unit, UnitInput
-from pano_mvs.engine.running.options import Demands
-from pano_mvs.engine.running.run import workflow_id
 
 _SHOWN = 8
 
@@ -25,7 +24,7 @@ def explain_unit(session: Session, label: str, console: Console) -> None:
         UsageError: if there is no such stage or unit.
     """
     stage, _, item = label.partition(":")
-    workflow, graph = Demands(until=(stage,)).applied_to(session.workflow, session.graph)
+    workflow, graph = RunOptions(until=(stage,)).applied_to(session.workflow, session.graph)
     store = Store(session.store_root, for_reading=True)
     found: list[tuple[Unit, UnitRecord | None, str]] = []
 
@@ -33,7 +32,7 @@ def explain_unit(session: Session, label: str, console: Console) -> None:
         if (unit.entry.name, unit.item) == (stage, item):
             found.append((unit, record, reason))
 
-    plan = make_plan(workflow, graph, store, workflow_id(session.workflow), visit=look)[-1]
+    plan = make_plan(workflow, graph, store, visit=look)[-1]
     if not found:
         console.print(escape(f"{label}: {_why_not(plan, item)}"), highlight=False, soft_wrap=True)
         return

@@ -20,7 +20,6 @@ from pano_mvs.core.paths import is_file, is_folder
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
 from pano_mvs.engine.planning.units import Unit
-from pano_mvs.engine.running.run import workflow_id
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.io.truth import read_truth
 from pano_mvs.scene import RangeMap
@@ -118,7 +117,7 @@ def _inspection(session: Session, wanted: PixelWanted) -> Inspection:
     sweep = _sweep_stage(session, wanted.stage)
     store = Store(session.store_root, for_reading=True)
     found = _Found()
-    plans = make_plan(session.workflow, session.graph, store, workflow_id(session.workflow), visit=found.look)
+    plans = make_plan(session.workflow, session.graph, store, visit=found.look)
     image = _image(wanted.image, found.images)
     unit = found.units.get(sweep, {}).get(image)
     if unit is None:

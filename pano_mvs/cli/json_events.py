@@ -26,7 +26,7 @@ import time
 from typing import Any, TextIO
 
 from pano_mvs.core.text import json_without_controls
-from pano_mvs.engine.running.events import Failure, Outcome, StageSummary
+from pano_mvs.engine.running.events import Failure, StageSummary, UnitStatus
 
 SCHEMA = 1
 
@@ -58,9 +58,9 @@ class JsonEvents:
         self.write("unit_failed", stage=failure.stage, item=failure.item, cause=failure.cause,
                    consequence=failure.consequence, log=failure.log, said=list(failure.said))  # fmt: skip
 
-    def unit_finished(self, name: str, item: str, outcome: Outcome, seconds: float) -> None:
+    def unit_finished(self, name: str, item: str, *, status: UnitStatus, seconds: float) -> None:
         """Write the event."""
-        self.write("unit_finished", stage=name, item=item, outcome=outcome, seconds=round(seconds, 6))
+        self.write("unit_finished", stage=name, item=item, outcome=status, seconds=round(seconds, 6))
 
     def stage_finished(self, summary: StageSummary) -> None:
         """Write the event."""

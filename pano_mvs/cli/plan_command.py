@@ -18,7 +18,6 @@ from pano_mvs.core.errors import StoreError
 from pano_mvs.core.text import plural
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
-from pano_mvs.engine.running.run import workflow_id
 
 _SHOWN_REASONS = 5
 
@@ -79,9 +78,9 @@ def without_collector() -> Iterator[None]:
 
 def _plans(session: Session) -> list[StagePlan]:
     store = Store(session.store_root, for_reading=True)
-    workflow, graph = session.demands.applied_to(session.workflow, session.graph)
+    workflow, graph = session.run_options.applied_to(session.workflow, session.graph)
     with without_collector():
-        plans = make_plan(workflow, graph, store, workflow_id(session.workflow), session.demands)
+        plans = make_plan(workflow, graph, store, options=session.run_options)
     with suppress(StoreError):  # a cache that others own may be read all the same
         store.stat_cache.save()
     return plans

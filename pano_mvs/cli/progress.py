@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from pano_mvs.cli.estimate import Estimate
-from pano_mvs.engine.running.events import Failure, Outcome, StageSummary
+from pano_mvs.engine.running.events import Failure, StageSummary, UnitStatus
 
 _LINE_EVERY_S = 30.0
 _SHOWN_LINES = 5
@@ -69,10 +69,10 @@ class ProgressBars:
         for line in failure.said[-_SHOWN_LINES:]:
             self.console.print(f"  | {escape(line)}", highlight=False, soft_wrap=True)
 
-    def unit_finished(self, name: str, item: str, outcome: Outcome, seconds: float) -> None:
+    def unit_finished(self, name: str, item: str, *, status: UnitStatus, seconds: float) -> None:
         """Move the bars on; which unit it was, they do not show."""
         del item
-        self._estimate.count(name, seconds, computed=outcome in ("run", "failed"))
+        self._estimate.count(name, seconds, computed=status in ("run", "failed"))
         if self._progress is not None and self._run is not None:
             self._progress.update(self._tasks[name], advance=1, state=self._estimate.of_stage(name))
             self._progress.update(self._run, advance=1, state=self._estimate.of_run(self._stages))

@@ -30,14 +30,14 @@ from pano_mvs.cli.streams import apart
 from pano_mvs.cli.telling import INTERRUPTED, tell, tell_of_end
 from pano_mvs.core.errors import PanoMvsError, UsageError
 from pano_mvs.core.files import OUTPUT_MARK, set_aside
+from pano_mvs.core.memory import bytes_from_size
 from pano_mvs.core.paths import exists, is_file
 from pano_mvs.core.text import one_line, plural
 from pano_mvs.engine.cache.blobs import DamagedBlobError
-from pano_mvs.engine.cache.store import LEAST_FREE_BYTES, Store
+from pano_mvs.engine.cache.store import MIN_FREE_BYTES, Store
 from pano_mvs.engine.executors.choose import make_executor
 from pano_mvs.engine.executors.protocol import Executor
 from pano_mvs.engine.running.events import Observer, RunResult
-from pano_mvs.engine.running.memory import bytes_from_size
 from pano_mvs.engine.running.output_lock import output_lock
 from pano_mvs.engine.running.run import Run
 from pano_mvs.report.findings import doubts_of
@@ -76,7 +76,7 @@ def run_workflow(session: Session, execution: Execution = Execution()) -> int:
     """Run a workflow, write run.json and report.html, print what came out, and return the exit code."""
     check_output(session)
     _keep_what_is_not_ours(session.out)
-    store = Store(session.store_root, durable=execution.durable, least_free_bytes=least_free_bytes(execution.min_free))
+    store = Store(session.store_root, durable=execution.durable, min_free_bytes=min_free_bytes(execution.min_free))
     executor = make_executor(store, execution.executor, workers=execution.workers, threads=execution.threads,
                              scheduler=execution.scheduler)  # fmt: skip
     stream = apart(sys.stdout)
@@ -91,7 +91,7 @@ def run_workflow(session: Session, execution: Execution = Execution()) -> int:
             stream.close()
 
 
-def least_free_bytes(size: str = "") -> int:
+def min_free_bytes(size: str = "") -> int:
     """Return the bytes of `--min-free`, else of $PANO_MVS_MIN_FREE, else the default.
 
     Raises:
@@ -99,7 +99,7 @@ def least_free_bytes(size: str = "") -> int:
     """
     size = size or os.environ.get(MIN_FREE_VARIABLE, "")
     try:
-        return bytes_from_size(size) if size else LEAST_FREE_BYTES
+        return bytes_from_size(size) if size else MIN_FREE_BYTES
     except ValueError as error:
         raise UsageError(f"--min-free (or ${MIN_FREE_VARIABLE}) {size!r}: {error}") from error
 
@@ -143,8 +143,8 @@ def _run(
 ) -> tuple[RunResult, dict[str, Any], Verdict]:
     """Run, and write what there is to say of it into the output folder."""
     started, clock = datetime.now(UTC), time.perf_counter()
-    run = Run(session.workflow, session.graph, store, session.out, observer=observer, executor=executor,
-              demands=session.demands)  # fmt: skip
+    run = Run(session.workflow, session.graph, store, out=session.out, observer=observer, executor=executor,
+              options=session.run_options)  # fmt: skip
     with output_lock(session.out):
         return _run_alone(session, run, started, clock)
 

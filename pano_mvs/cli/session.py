@@ -10,11 +10,11 @@ from pathlib import Path
 import pano_mvs
 from pano_mvs.core.errors import InputError, UsageError, WorkflowError
 from pano_mvs.core.paths import exists, is_denied, is_folder, problem_of, resolved
-from pano_mvs.engine.running.options import NO_DEMANDS, Demands
+from pano_mvs.engine.planning.run_options import DEFAULT_OPTIONS, RunOptions
 from pano_mvs.engine.stages.params import files_of
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.wiring import Graph, wire, wiring_problems
-from pano_mvs.engine.workflows.workflow import PartialWorkflowError, Workflow, find_workflow, load_workflow
+from pano_mvs.engine.workflows.workflow import InvalidWorkflowError, Workflow, find_workflow, load_workflow
 
 CACHE_VARIABLE = "PANO_MVS_CACHE"
 
@@ -28,7 +28,7 @@ class Session:
     registry: Registry
     store_root: Path
     out: Path
-    demands: Demands = NO_DEMANDS
+    run_options: RunOptions = DEFAULT_OPTIONS
 
 
 def presets_folder() -> Path:
@@ -45,7 +45,7 @@ def open_session(
     images: Path | None = None,
     cache: Path | None = None,
     out: Path | None = None,
-    demands: Demands = NO_DEMANDS,
+    run_options: RunOptions = DEFAULT_OPTIONS,
 ) -> Session:
     """Find, validate and wire a workflow.
 
@@ -67,14 +67,14 @@ def open_session(
     registry = Registry.installed()
     try:
         workflow = load_workflow(path, registry, overrides=overrides, images=images, presets=presets_folder())
-    except PartialWorkflowError as error:
+    except InvalidWorkflowError as error:
         raise WorkflowError([*error.problems, *wiring_problems(error.stages)]) from None
     workflow = replace(workflow, plugins=_all_plugins(workflow, registry))
     graph = wire(workflow)
     variable = os.environ.get(CACHE_VARIABLE)
     beside = resolved(Path()) if is_preset else path.parent
     root = cache or (Path(variable) if variable else beside / ".pano-mvs")
-    session = Session(workflow, graph, registry, root, out or Path("out") / workflow.name, demands)
+    session = Session(workflow, graph, registry, root, out or Path("out") / workflow.name, run_options)
     if name := _reader_of(root, session):
         option = "--cache" if cache or not variable else f"${CACHE_VARIABLE}"
         raise UsageError(f"{option} {root}: stage {name!r} reads this very folder, and the cache's files would lie "

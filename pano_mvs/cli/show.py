@@ -37,7 +37,7 @@ def show_plugins(console: Console, *, workflow: str | None = None, files: Sequen
         doc = spec.doc.splitlines()[0] if spec.doc else ""
         table.add_row(name, str(spec.version), escape(registry.origins[name]), escape(doc))
     console.print(table)
-    for (kind, name), mark in sorted(registry.parts.items()):
+    for (kind, name), mark in sorted(registry.registrations.items()):
         console.print(f"{kind} [bold]{escape(name)}[/] from {escape(mark.origin)}", highlight=False)
     for clash in registry.clashes.values():
         console.print(f"[red]twice:[/] {escape(clash)}", highlight=False, soft_wrap=True)

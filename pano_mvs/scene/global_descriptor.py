@@ -18,7 +18,7 @@ class GlobalDescriptor(Record):
     Attributes:
         vector: (D,) float32 of about the same length for all panoramas; zero for a panorama without key points.
         sample: (S, B) int16 descriptors of a few key points in whole numbers; matching them against the sample of
-            another panorama tells neighbours from strangers far better than the vectors do. May be empty.
+            another panorama identifies neighbours far better than the vectors do. May be empty.
     """
 
     axis: ClassVar[Axis | None] = Axis.IMAGE

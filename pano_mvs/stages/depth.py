@@ -12,7 +12,7 @@ from pano_mvs.algorithms.sweep.costs import SWEEP_COSTS
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.sweep import sweep_range
-from pano_mvs.api import NOT_IN_KEY, Context, Each, Near, Panorama, Params, PartOf, Pose, RangeMap, stage
+from pano_mvs.api import NOT_IN_KEY, Context, Each, Near, Panorama, Params, Pose, RangeMap, RegisteredIn, stage
 from pano_mvs.core.errors import UsageError
 from pano_mvs.scene.pose_groups import require_one_group
 from pano_mvs.stages.fields import Odd
@@ -23,7 +23,7 @@ _NOT_SETTINGS = {"backend", "device", "near", "far"}
 class SweepParams(Params):
     """Settings of depth.sweep."""
 
-    backend: Annotated[str, PartOf(SWEEP_BACKENDS)] = Field(
+    backend: Annotated[str, RegisteredIn(SWEEP_BACKENDS)] = Field(
         default="numba", description="numpy is the slow, readable reference; opencv; a plugin's"
     )
     device: Annotated[str, NOT_IN_KEY] = Field(
@@ -37,7 +37,7 @@ class SweepParams(Params):
         default=None, gt=0, description="nearest virtual range, scene units; else found by small sweeps"
     )
     far: float | None = Field(default=None, gt=0, description="farthest virtual range, likewise")
-    cost: Annotated[str, PartOf(SWEEP_COSTS)] = Field(
+    cost: Annotated[str, RegisteredIn(SWEEP_COSTS)] = Field(
         default="census",
         description="census, census_gradient (with grey levels and their gradients), zncc (correlation), sad (the "
         "paper's sum of absolute differences), sad_gradient (colours with their gradients), or a plugin's",

@@ -113,7 +113,7 @@ def _names(kind: str, part: Path | str) -> list[str]:
         return [part]
     registry = Registry()
     registry.add_file(part)
-    names = [name for known, name in registry.parts if known == kind]
+    names = [name for known, name in registry.registrations if known == kind]
     if not names:
         raise UsageError(f"{part} registers no {kind}")
     return names

@@ -145,7 +145,7 @@ def _run(folder: Path, workflow: str, make: Callable[[Store], Executor], cache: 
     store = Store(session.store_root)
     executor = make(store)
     try:
-        return Run(session.workflow, session.graph, store, session.out, executor=executor).execute()
+        return Run(session.workflow, session.graph, store, out=session.out, executor=executor).execute()
     finally:
         executor.close()
 

@@ -201,9 +201,8 @@ def test_run_that_did_not_end_keeps_what_its_folder_had(toy: Toy, cache: Cache) 
     run(toy, "other")
     session = toy.session("scaled.by=5")
     store = Store(session.store_root)
-    from pano_mvs.engine.running.run import workflow_id
 
-    store.runs.remember(workflow_id(session.workflow), {}, workflow="toy", out=toy.folder / "mine", finished=False)
+    store.runs.remember(session.workflow.id, {}, workflow="toy", out=toy.folder / "mine", finished=False)
     cache("gc", "--delete", "--unused", "0s")
     assert "(nothing to compute)" in run(toy, "mine", "--set", "scaled.by=5")[1]
 
@@ -229,7 +228,7 @@ def test_runs_that_are_too_old_are_forgotten_and_pins_are_not(toy: Toy, cache: C
 def test_pins_are_asked_for_properly(toy: Toy, cache: Cache) -> None:  # noqa: F811
     run(toy, "one")
     run(toy, "two", "--set", "scaled.by=5")
-    for run_name, name, why in (("nothing", "good", "0 runs are called"), ("", "good", "2 runs are called"),
+    for run_name, name, why in (("nothing", "good", "0 runs match"), ("", "good", "2 runs match"),
                                 (str(toy.folder / "one"), "../x", "no name for a pin"),
                                 (str(toy.folder / "one"), "", "no name for a pin")):  # fmt: skip
         code, said = cache("pin", run_name, name)

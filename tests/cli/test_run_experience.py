@@ -254,9 +254,9 @@ def test_a_line_says_which_time_is_the_stages_and_which_the_runs(monkeypatch: py
     stream = io.StringIO()
     bars = ProgressBars(Console(file=stream, width=100), stages=2)
     bars.stage_started("depth", 4)
-    bars.unit_finished("depth", "1.jpg", "run", 17.0)
+    bars.unit_finished("depth", "1.jpg", status="run", seconds=17.0)
     assert stream.getvalue().split("  ")[-1] == "stage: 51 s left, run: more than 51 s left\n"
-    bars.unit_finished("depth", "2.jpg", "cached", 0.0)
+    bars.unit_finished("depth", "2.jpg", status="cached", seconds=0.0)
     assert stream.getvalue().endswith("2 of 4  stage: 34 s left, run: more than 34 s left\n")
 
 

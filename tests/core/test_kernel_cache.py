@@ -55,10 +55,10 @@ def test_kernels_that_others_could_have_written_are_not_used(tmp_path: Path, mon
     folder = kernel_cache._own_temporary_folder()
     assert kernel_cache._own_temporary_folder() == folder
     folder.chmod(0o770)
-    with pytest.raises(OSError, match="no folder for caches"):
+    with pytest.raises(OSError, match="no writable folder for caches"):
         kernel_cache._own_temporary_folder()
     folder.rmdir()
     (tmp_path / "elsewhere").mkdir(mode=0o700)
     folder.symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(OSError, match="no folder for caches"):
+    with pytest.raises(OSError, match="no writable folder for caches"):
         kernel_cache._own_temporary_folder()

@@ -56,7 +56,7 @@ def doubting(count: int) -> dict[str, Any]:
         ({"scores": {"views": {"1": {"psnr_db": 17.0, "constant_psnr_db": 18.0}}}}, "bad", "17.0 dB to 18.0 dB"),
         ({"all_scores": {"a": GOOD["scores"], "b": {"views": {"1": {"psnr_db": 9.0, "constant_psnr_db": 18.0}}}}},
          "bad", "(b)"),
-        ({"exit_code": 4, "stopped": "registered is 0.2, the gate asks for 0.8"}, "bad", "the gate asks for 0.8"),
+        ({"exit_code": 4, "stopped": "registered is 0.2, but `gate` requires 0.8"}, "bad", "but `gate` requires 0.8"),
         ({"exit_code": 130, "stopped": "interrupted"}, "fair", "was interrupted"),
         ({"exit_code": 3, "failures": [{"stage": "depth", "item": "1.png"}]}, "fair", "1 in depth"),
         ({"exit_code": 1, "stopped": "division by zero"}, "bad", "division by zero"),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.api import Features, GateError, Panorama, Poses, TwoView
+from pano_mvs.api import Features, Panorama, Poses, RunStoppedError, TwoView
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.stages.poses import ScaledTranslationParams, VerifyParams, scaled_translation, verify
@@ -84,7 +84,7 @@ def test_one_pose_is_no_model(tiny: TinyCapture, ctx: Context) -> None:
     alone = Poses.without_points(
         {"000.png": tiny.poses[0]}, rejected={"001.png": "no pair"}, frame="x", scale="x", metric=False
     )
-    with pytest.raises(GateError, match=r"001\.png: no pair"):
+    with pytest.raises(RunStoppedError, match=r"001\.png: no pair"):
         verify(poses=alone, images=tiny.each(Panorama), features=None, matches=None, params=VerifyParams(), ctx=ctx)
     assert ctx.rejected == {"001.png": "no pair"}
 

@@ -50,10 +50,10 @@ class Patient:
 
     def run(self) -> RunResult:
         session = open_session(str(self.folder / "wf.yaml"), cache=self.root, out=self.out)
-        store = Store(session.store_root, least_free_bytes=0)
+        store = Store(session.store_root, min_free_bytes=0)
         executor = make_executor(store, self.executor, workers=0 if self.executor == "serial" else 2)
         try:
-            return Run(session.workflow, session.graph, store, session.out, executor=executor).execute()
+            return Run(session.workflow, session.graph, store, out=session.out, executor=executor).execute()
         finally:
             executor.close()
 

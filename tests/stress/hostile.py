@@ -216,10 +216,10 @@ def faults_of_run(count: int, seed: int, folder: Path) -> tuple[int, list[str]]:
     workflow = folder / "w.yaml"
     workflow.write_text(f"pano_mvs: 1\nstages:\n  images: {{use: source.folder, path: {images}}}\n")
     session = open_session(str(workflow), cache=folder / "cache", out=folder / "out")
-    store = Store(session.store_root, least_free_bytes=0)
+    store = Store(session.store_root, min_free_bytes=0)
     executor = SerialExecutor(store)
     try:
-        result = Run(session.workflow, session.graph, store, session.out, executor=executor).execute()
+        result = Run(session.workflow, session.graph, store, out=session.out, executor=executor).execute()
     finally:
         executor.close()
     wrong = [f"{failure.item}: {failure.trace}" for failure in result.failures if failure.trace]

@@ -19,7 +19,7 @@ def sample_matches(
 ) -> NDArray[np.float64]:
     """Return how many key points of two samples match, for the pairs on the shortlist of either image.
 
-    Matching a few key points of coarse scales tells overlapping images from others before the rest is matched (Wu,
+    Matching a few key points of coarse scales separates overlapping images from others before the rest is matched (Wu,
     "Towards linear-time incremental structure from motion", 2013, section 3.1). A match is mutual and passes the ratio
     test. Time is linear in the number of images once that exceeds the length of a shortlist.
 

@@ -15,7 +15,7 @@ from pano_mvs.algorithms.sweep.costs import BUILTIN_COSTS, SWEEP_COSTS
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.winner import Winners
 from pano_mvs.core.errors import UsageError
-from pano_mvs.core.parts import Parts
+from pano_mvs.core.named_registry import NamedRegistry
 
 # By which cost the small sweeps run that find limits and match exposures.
 _HELPER_COST, _HELPER_BACKEND = "census", "numba"
@@ -59,7 +59,7 @@ def _numba(work: SweepInput) -> Winners:
     return numba_backend.find_winners(work)
 
 
-SWEEP_BACKENDS = Parts(
+SWEEP_BACKENDS = NamedRegistry(
     "sweep backend",
     {
         "numba": SweepBackend(_numba, BUILTIN_COSTS),

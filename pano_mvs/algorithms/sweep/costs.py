@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.windows import column_offsets, neighbours
 from pano_mvs.core.errors import ContractError
-from pano_mvs.core.parts import Parts
+from pano_mvs.core.named_registry import NamedRegistry
 
 BUILTIN_COSTS = frozenset({"census", "census_gradient", "zncc", "sad", "sad_gradient"})
 
@@ -78,7 +78,7 @@ class PluginCost:
     colors: bool = False
 
 
-SWEEP_COSTS: Parts[PluginCost | None] = Parts("sweep cost", dict.fromkeys(sorted(BUILTIN_COSTS)))
+SWEEP_COSTS: NamedRegistry[PluginCost | None] = NamedRegistry("sweep cost", dict.fromkeys(sorted(BUILTIN_COSTS)))
 """All costs; None stands for a built-in one, of which every backend has a version of its own."""
 
 

@@ -17,7 +17,7 @@ from pano_mvs.core.errors import ContractError, UsageError
 from pano_mvs.core.files import CACHE_MARK
 from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.running.events import Silent
+from pano_mvs.engine.running.events import SilentObserver
 from pano_mvs.scene import RangeMap, Record
 from tests.engine.conftest import Toy, ran, settle
 from tests.permissions import permissions_hold
@@ -221,7 +221,7 @@ def test_much_damage_takes_few_passes(toy: Toy, monkeypatch: pytest.MonkeyPatch)
             record.unlink()
     passes: list[str] = []
     with monkeypatch.context() as listening:
-        listening.setattr(Silent, "stage_started", lambda self, name, units: passes.append(name))
+        listening.setattr(SilentObserver, "stage_started", lambda self, name, units: passes.append(name))
         result = toy.run()
     assert result.exit_code == 0
     assert toy.deliverables() == clean
@@ -240,5 +240,5 @@ def test_input_that_is_gone_while_a_stage_reads_it_is_no_fault_of_the_stage(toy:
         raise FileNotFoundError("no such file")'''))  # fmt: skip
     result = toy.run()
     assert (result.exit_code, result.failures) == (0, [])
-    assert any("is gone; the same command computes it again" in text for text in result.warnings)
+    assert any("is missing; the same command computes it again" in text for text in result.warnings)
     assert mark.exists()

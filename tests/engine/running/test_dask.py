@@ -16,11 +16,11 @@ import pytest
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.code import stage_code
 from pano_mvs.engine.code.plugin_digest import code_texts
 from pano_mvs.engine.executors import dask_cluster, dask_task
 from pano_mvs.engine.executors.dask_cluster import DaskExecutor
 from pano_mvs.engine.executors.serial import SerialExecutor
+from pano_mvs.engine.stages import stage_code
 from tests.engine.conftest import Toy, ran
 from tests.engine.running.test_executors import files_below, keys_and_outputs, run_with, told
 from tests.engine.running.test_run import ALL_UNITS
@@ -110,7 +110,7 @@ def test_plugin_comes_along_as_text(toy: Toy, monkeypatch: pytest.MonkeyPatch) -
     try:
         from pano_mvs.engine.running.run import Run
 
-        result = Run(session.workflow, session.graph, store, toy.folder / "out", executor=executor).execute()
+        result = Run(session.workflow, session.graph, store, out=toy.folder / "out", executor=executor).execute()
     finally:
         executor.close()
     assert hidden.exists()

@@ -143,10 +143,10 @@ def test_mistakes_are_told_with_the_place_in_their_own_file(toy: Toy) -> None:
 @pytest.mark.parametrize(
     ("extends", "what"),
     [
-        ("7", "child.yaml:3:10: extends: name a workflow file or a preset"),
-        ("{a: b}", "child.yaml:3:10: extends: name a workflow file or a preset"),
-        ("[wf.yaml, 7]", "child.yaml:3:20: extends: name a workflow file or a preset"),
-        ("''", "extends: name a workflow file or a preset"),
+        ("7", "child.yaml:3:10: extends: must be a workflow file or a preset"),
+        ("{a: b}", "child.yaml:3:10: extends: must be a workflow file or a preset"),
+        ("[wf.yaml, 7]", "child.yaml:3:20: extends: must be a workflow file or a preset"),
+        ("''", "extends: must be a workflow file or a preset"),
         ("wf.yml", "child.yaml:3:10: extends: there is no file wf.yml and no preset 'wf.yml'. Did you mean 'wf.yaml'"),
         ("../../../no/such", "child.yaml:3:10: extends: there is no file"),
         ("capture", "child.yaml:3:10: extends: workflow capture is a folder"),
@@ -167,4 +167,4 @@ def test_files_that_extend_two_others_each_do_not_multiply(toy: Toy) -> None:
     assert "scaled" in load(toy, CHILD.replace("wf.yaml", "a19.yaml")).stages
     for number in range(60):
         (toy.folder / f"c{number}.yaml").write_text(f"pano_mvs: 1\nextends: c{number + 1}.yaml\n")
-    assert "50 files are allowed" in problems(toy, CHILD.replace("wf.yaml", "c0.yaml"))[-1]
+    assert "at most 50 files are allowed" in problems(toy, CHILD.replace("wf.yaml", "c0.yaml"))[-1]

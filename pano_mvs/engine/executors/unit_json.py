@@ -1,20 +1,19 @@
-"""A unit of work as JSON, for workers that share nothing with us but the store; and back."""
+"""Convert units of work to JSON and back, for workers that share only the cache with the main process."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.engine.cache.blobs import BlobRef
 from pano_mvs.engine.cache.store import ItemRef, Store
-from pano_mvs.engine.code.stage_code import stage_code
 from pano_mvs.engine.executors.protocol import Job
 from pano_mvs.engine.planning.units import PENDING, Unit, UnitInput
 from pano_mvs.engine.stages.params import Params
 from pano_mvs.engine.stages.ports import Cardinality
 from pano_mvs.engine.stages.stage import SourceItem, StageSpec
+from pano_mvs.engine.stages.stage_code import stage_code
 from pano_mvs.engine.workflows.policy import Policy
 from pano_mvs.engine.workflows.workflow import StageEntry
 
@@ -22,11 +21,11 @@ TEXT_VERSION = 2
 
 
 def request_to_json(job: Job, store: Store) -> dict[str, Any]:
-    """Return what a worker is asked: the unit, and where its plugins, its store and its log are."""
+    """Return the request to a worker: the unit, and the paths of its plugins, the cache and the log."""
     return {
         "unit": unit_to_json(job.unit, store),
         "plugins": {str(path.absolute()): digest for path, digest in job.plugins.items()},
-        "store": [str(store.root.absolute()), store.durable, store.least_free_bytes],
+        "store": [str(store.root.absolute()), store.durable, store.min_free_bytes],
         "log": str(job.log.absolute()),
         "threads": job.threads,
         "timeout_s": job.timeout_s,
@@ -34,10 +33,10 @@ def request_to_json(job: Job, store: Store) -> dict[str, Any]:
 
 
 def unit_to_json(unit: Unit, store: Store) -> dict[str, Any]:
-    """Return everything that a worker needs to compute a unit, beside the store; paths are absolute.
+    """Return everything beside the cache that a worker needs to compute a unit; paths are absolute.
 
     Raises:
-        UsageError: if the stage's settings do not survive being written as JSON.
+        UsageError: if the settings of the stage change when they are written as JSON and read back.
     """
     spec = unit.entry.spec
     return {
@@ -50,7 +49,7 @@ def unit_to_json(unit: Unit, store: Store) -> dict[str, Any]:
         "item": unit.item,
         "members": list(unit.members),
         "inputs": {port: _input_to_json(unit, port, value) for port, value in unit.inputs.items()},
-        "external": {ref.digest: str(store.blobs.path(ref).absolute()) for ref in input_blobs(unit) if ref.external},
+        "external": {ref.digest: str(store.blobs.path(ref).absolute()) for ref in unit.input_blobs() if ref.external},
         "source": None if unit.source is None else _source_to_json(unit.source),
         "key": unit.key,
         "identity": dict(unit.identity),
@@ -58,10 +57,10 @@ def unit_to_json(unit: Unit, store: Store) -> dict[str, Any]:
 
 
 def unit_from_json(text: Mapping[str, Any], spec: StageSpec, store: Store) -> Unit:
-    """Return the unit that `unit_to_json` described, and make the user's own files that it reads findable.
+    """Return the unit that `unit_to_json` described, and register its input files with the store.
 
     Raises:
-        UsageError: if it was written by another version, or for another version of the stage.
+        UsageError: if another version wrote it, or it is for another version of the stage.
     """
     found = (text["version"], text["code"], text["text_version"])
     if found != (spec.version, spec.code_digest, TEXT_VERSION):
@@ -82,32 +81,38 @@ def unit_from_json(text: Mapping[str, Any], spec: StageSpec, store: Store) -> Un
 
 
 def require_same_code(spec: StageSpec, params: Params, identity: Mapping[str, Any]) -> None:
-    """Raise UsageError if a worker computes by other code, or other libraries, than the key of its unit says."""
+    """Raise UsageError if this process has other code or libraries than the key of a unit says."""
     here = stage_code(spec, params)
     if here.digest != identity["code"]:
         raise UsageError(_changed(spec))
     for name, version in identity["libraries"].items():
         if here.libraries.get(name) != version:
-            raise UsageError(f"stage {spec.name!r}: the worker has {name} {here.libraries.get(name, '(none)')}, the "
-                             f"run was started with {version}. Install the same version everywhere, then run the same "
-                             "command again")  # fmt: skip
+            raise UsageError(
+                f"stage {spec.name!r}: the worker has {name} {here.libraries.get(name, '(none)')}, the "
+                f"run was started with {version}. Install the same version everywhere, then run the same "
+                "command again"
+            )
 
 
 def _changed(spec: StageSpec) -> str:
-    return (f"stage {spec.name!r} is not the same in the worker ({spec.origin}): it was changed while the workflow "
-            "ran, or another version is installed there. Run the same command again")  # fmt: skip
+    return (
+        f"stage {spec.name!r} is not the same in the worker ({spec.origin}): it was changed during the "
+        "run, or another version is installed there. Run the same command again"
+    )
 
 
 def params_to_json(entry: StageEntry) -> dict[str, Any]:
-    """Return a stage's settings as JSON values that make the same settings again.
+    """Return a stage's settings as JSON values from which the same settings can be made again.
 
     Raises:
-        UsageError: if they do not.
+        UsageError: if that is impossible.
     """
     values = _plain(entry.params)
     if _plain(entry.spec.params_type.model_validate(values)) != values:
-        raise UsageError(f"stage {entry.name!r} ({entry.spec.origin}): its settings change when they are validated a "
-                         "second time, so that they cannot be sent to a worker. Use --executor serial")  # fmt: skip
+        raise UsageError(
+            f"stage {entry.name!r} ({entry.spec.origin}): its settings change when they are validated a "
+            "second time, so that they cannot be sent to a worker. Use --executor serial"
+        )
     return values
 
 
@@ -118,7 +123,7 @@ def _plain(params: Params) -> dict[str, Any]:
 
 
 def _with_absolute_paths(value: Any, as_json: Any) -> Any:
-    """Return the JSON form of a value in which all paths hold wherever they are read."""
+    """Return the JSON form of a value with all paths made absolute."""
     if isinstance(value, Path):
         return str(value.absolute())
     if isinstance(as_json, dict) and isinstance(value, dict):
@@ -148,14 +153,6 @@ def _input_from_json(value: Any) -> UnitInput:
     if "names" in value:
         return dict.fromkeys(value["names"], PENDING)
     return {name: ItemRef.from_json(ref) for name, ref in value["many"].items()}
-
-
-def input_blobs(unit: Unit) -> Iterator[BlobRef]:
-    """Yield every blob that a unit's inputs are made of."""
-    for value in unit.inputs.values():
-        items = [value] if isinstance(value, ItemRef) else (value or {}).values()
-        for item in items:
-            yield from item.parts.values()
 
 
 def _source_to_json(item: SourceItem) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What a user asks of one run beyond the workflow: a part of it, some of it anew, old results under new code."""
+"""What a user asks of one run beyond the workflow: to run a part of it, or to compute some units again."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from pano_mvs.engine.workflows.workflow import Workflow
 
 
 @dataclass(frozen=True, slots=True)
-class Demands:
-    """What is asked of one run.
+class RunOptions:
+    """The options of one run.
 
     Attributes:
-        until: stages behind which the run ends; empty for none.
-        only: `STAGE:ITEM`, units to which the run is confined with all that they need; empty for none.
-        refresh: `STAGE` or `STAGE:ITEM`, what is computed again though it is cached.
-        accept_code: take what was computed before code or libraries changed for what would be computed now.
-        keep_going: go on after a failed unit, whatever a stage's on_error says.
+        until: the run ends after these stages; empty to run all.
+        only: units, as `STAGE:ITEM`; the run is limited to them and what they need. Empty to run all.
+        refresh: stages and units, as `STAGE` or `STAGE:ITEM`, that are computed again although they are cached.
+        accept_code: reuse results that differ from what is needed only in the code or the libraries that computed them.
+        keep_going: go on after a failed unit even if its stage says `on_error: stop`.
     """
 
     until: tuple[str, ...] = ()
@@ -33,10 +33,10 @@ class Demands:
     keep_going: bool = False
 
     def applied_to(self, workflow: Workflow, graph: Graph) -> tuple[Workflow, Graph]:
-        """Return the workflow and the graph as this run sees them.
+        """Return the workflow and the graph with the options applied.
 
         Raises:
-            UsageError: if a stage is named that the workflow does not have.
+            UsageError: if an option names a stage that the workflow does not have.
         """
         for name in (*self.until, *(_stage(unit) for unit in (*self.only, *self.refresh))):
             if name not in graph.edges:
@@ -48,31 +48,28 @@ class Demands:
             }
             workflow = dataclasses.replace(workflow, stages=stages)
         ends = {*self.until, *(_stage(unit) for unit in self.only)}
-        return workflow, graph.confined(ends, _items_by_stage(self.only)) if ends else graph
+        return workflow, graph.limited_to(ends, _items_by_stage(self.only)) if ends else graph
 
     def refreshes(self, unit: Unit) -> bool:
-        """Return whether a unit is to be computed again though it is cached."""
+        """Return whether a unit is computed again even if it is cached."""
         return unit.entry.name in self.refresh or f"{unit.entry.name}:{unit.item}" in self.refresh
 
     def accepted(self, unit: Unit, last_key: str | None, store: Store) -> UnitRecord | None:
-        """Return the record of a unit of which only the code or the libraries have changed, if that is accepted.
-
-        It is stored under the new key, so that the next run finds it without being asked.
-        """
+        """Return what `acceptable` returns, and store it under the new key, so that the next run finds it."""
         record = self.acceptable(unit, last_key, store)
         if record is not None:
             store.put(record)
         return record
 
     def acceptable(self, unit: Unit, last_key: str | None, store: Store) -> UnitRecord | None:
-        """Return what `accepted` does, and store nothing."""
+        """Return the record of the last run for a unit if only code or libraries changed and `accept_code` is set."""
         last = store.find(last_key) if self.accept_code and last_key else None
         if last is None or not only_the_code_differs(last.identity, unit.identity):
             return None
         return dataclasses.replace(last, key=unit.key, identity=unit.identity)
 
 
-NO_DEMANDS = Demands()
+DEFAULT_OPTIONS = RunOptions()
 
 
 def _stage(unit: str) -> str:

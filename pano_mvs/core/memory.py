@@ -1,4 +1,4 @@
-"""How much memory this host has free, in bytes, and sizes as people write them."""
+"""Free memory of this host, and sizes such as "2GB"."""
 
 from __future__ import annotations
 
@@ -9,8 +9,18 @@ import subprocess
 import sys
 from pathlib import Path
 
-_UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12,
-          "KIB": 2**10, "MIB": 2**20, "GIB": 2**30, "TIB": 2**40}  # fmt: skip
+_UNITS = {
+    "": 1,
+    "B": 1,
+    "KB": 10**3,
+    "MB": 10**6,
+    "GB": 10**9,
+    "TB": 10**12,
+    "KIB": 2**10,
+    "MIB": 2**20,
+    "GIB": 2**30,
+    "TIB": 2**40,
+}
 _SIZE = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([a-zA-Z]*)\s*")
 
 
@@ -18,7 +28,7 @@ def bytes_from_size(size: str | int) -> int:
     """Return the bytes of a size such as `2GB`, `1.5 GiB` or a number of bytes.
 
     Raises:
-        ValueError: if it is none.
+        ValueError: if the text is not a size.
     """
     match = _SIZE.fullmatch(str(size))
     if match is None or match[2].upper() not in _UNITS:
@@ -27,12 +37,12 @@ def bytes_from_size(size: str | int) -> int:
 
 
 def size_text(size_bytes: int) -> str:
-    """Return bytes as a person reads them."""
+    """Return a size as text, in MB or GB."""
     return f"{size_bytes / 1e9:.1f} GB" if size_bytes >= 1e9 else f"{size_bytes / 1e6:.0f} MB"
 
 
 def free_memory_bytes() -> int:
-    """Return what may still be used without swapping, within a container's limit; 0 if it cannot be told."""
+    """Return the memory that can be used without swapping, within the limit of a container; 0 if unknown."""
     found = [size for size in (_free_of_system(), _free_of_container()) if size]
     return min(found, default=0)
 
@@ -41,7 +51,7 @@ def _free_of_system() -> int:
     if sys.platform == "win32":
         return _free_of_windows()
     if sys.platform == "darwin":
-        # What macOS calls free says little, as it keeps files there: most of what is installed can be had.
+        # macOS fills free memory with cached files, so that its figure says little: most of the memory is available.
         found = subprocess.run(["/usr/sbin/sysctl", "-n", "hw.memsize"], capture_output=True, check=False).stdout
         return int(found) * 3 // 4 if found.strip().isdigit() else 0
     try:
@@ -59,7 +69,7 @@ def _free_of_container() -> int:
             return 0
         lines = (folder / "memory.stat").read_text(encoding="ascii").splitlines()
         files = sum(int(line.split()[1]) for line in lines if line.startswith("inactive_file "))
-        return max(1, int(limit) - int(used) + files)  # what files take there is given back when it is needed
+        return max(1, int(limit) - int(used) + files)  # memory of cached files is released when needed
     except (OSError, ValueError):
         return 0
 

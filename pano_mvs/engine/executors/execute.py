@@ -12,26 +12,26 @@ import numpy as np
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import ChangedFileError, ContractError
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
+from pano_mvs.engine.executors.changed_files import changed_items, changed_settings
+from pano_mvs.engine.executors.lazy_mapping import LazyMapping
 from pano_mvs.engine.planning.units import OF_CODE, Unit, UnitInput
-from pano_mvs.engine.running.changed_files import changed_items, changed_settings
-from pano_mvs.engine.running.gather import Gather
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.ports import Cardinality, Names, Port
 from pano_mvs.scene import Axis
 from pano_mvs.scene.index import pair_from_name
 
-# A process may open no more than about a thousand files, and a stage may gather several kinds.
-_MOST_OPEN = 128
-_MOST_BYTES = 128_000_000
+# A process may open only about a thousand files, and a stage may read several kinds.
+_MAX_OPEN_FILES = 128
+_MAX_BYTES = 128_000_000
 
 
 def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
     """Run a unit and store its result; the record is written last.
 
     Raises:
-        ChangedFileError: if a user's file that it reads is not the one that its key stands for.
+        ChangedFileError: if an input file is not the one whose digest is in the key.
         ContractError: if the stage returns something other than what it declared.
-        Exception: whatever the stage raises.
+        Exception: any exception of the stage.
     """
     started = time.perf_counter()
     with store.scratch() as scratch:
@@ -64,12 +64,12 @@ def execute_unit(unit: Unit, store: Store, *, threads: int) -> UnitRecord:
 
 
 def _seed(unit: Unit) -> int:
-    """Return a number made of a unit's stage, settings and inputs: code that does the same draws the same."""
+    """Return a seed from a unit's stage, settings and inputs, but not its code: seeds do not change with code."""
     return int(digest_from_value({name: part for name, part in unit.identity.items() if name not in OF_CODE}), 16)
 
 
 def arguments_of(unit: Unit, store: Store) -> dict[str, Any]:
-    """Return what a unit reads, by port; arrays are memory-mapped, and those of All are loaded on access."""
+    """Return the inputs of a unit by port; large arrays are memory-mapped, and All ports load items on access."""
     ports = {port.name: port for port in unit.entry.spec.ports}
     return {name: _load(ports[name], value, store) for name, value in unit.inputs.items()}
 
@@ -84,17 +84,17 @@ def _load(port: Port, value: UnitInput, store: Store) -> object:
     if port.cardinality is Cardinality.NAMES:
         return Names(value)
     refs = {_gathered_key(port, name): ref for name, ref in value.items()}
-    return Gather(refs, partial(store.load, kind=port.kind), kept=kept_items(value.values()))
+    return LazyMapping(refs, partial(store.load, kind=port.kind), max_kept=max_kept_items(value.values()))
 
 
-def kept_items(refs: Iterable[ItemRef]) -> int:
-    """Return how many loaded items are kept: few enough for open files and memory, though the largest came together."""
+def max_kept_items(refs: Iterable[ItemRef]) -> int:
+    """Return how many loaded items to keep, so that even the largest ones respect the limits on files and memory."""
     opened, read = 0, 1
     for ref in refs:
         opened = max(opened, sum(part.is_mapped for part in ref.parts.values()))
         read = max(read, sum(part.size_bytes for part in ref.parts.values() if not part.is_mapped))
-    by_memory = max(1, _MOST_BYTES // read)
-    return min(by_memory, max(1, _MOST_OPEN // opened)) if opened else by_memory
+    by_memory = max(1, _MAX_BYTES // read)
+    return min(by_memory, max(1, _MAX_OPEN_FILES // opened)) if opened else by_memory
 
 
 def _gathered_key(port: Port, name: str) -> str | tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Whether the user's own files that a unit reads are still those under whose digests it is stored."""
+"""Check that the input files of a unit are still those whose digests are in its cache key."""
 
 from __future__ import annotations
 
@@ -6,18 +6,17 @@ from pathlib import Path
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.executors.unit_text import input_blobs
 from pano_mvs.engine.planning.units import Unit
 from pano_mvs.engine.stages.params import key_fields
 from pano_mvs.scene.record import changed_text, vanished_text
 
 
 def changed_items(unit: Unit, store: Store) -> dict[str, str]:
-    """Return the files of a capture that a unit reads and that are not as they were listed, each with the reason.
+    """Return the files of a capture that a unit reads and that have changed since they were listed, with the reasons.
 
-    A file whose size, time stamps and inode are known is not read for this.
+    Files whose size, time stamps and inode are unchanged are not read.
     """
-    listed = {store.blobs.path(ref): ref.digest for ref in input_blobs(unit) if ref.external}
+    listed = {store.blobs.path(ref): ref.digest for ref in unit.input_blobs() if ref.external}
     if unit.source is not None:
         listed |= {unit.source.files[role]: digest for role, digest in unit.source.digests.items()}
     found = {path: _reason(path, digest, store) for path, digest in listed.items()}
@@ -25,7 +24,7 @@ def changed_items(unit: Unit, store: Store) -> dict[str, str]:
 
 
 def changed_settings(unit: Unit, store: Store) -> list[str]:
-    """Return the reasons why files that a unit's settings name are not those that its key stands for."""
+    """Return a reason for each file in a unit's settings that has changed since the key was made."""
     digests = unit.identity["params"]
     pairs = [
         pair
@@ -39,7 +38,7 @@ def _reason(path: Path, digest: str, store: Store) -> str:
     try:
         if store.stat_cache.digest(path) == digest:
             return ""
-        store.stat_cache.forget(path)  # it may be damaged
+        store.stat_cache.forget(path)  # its entry may be damaged
         return "" if store.stat_cache.digest(path) == digest else changed_text(path)
     except InputError:
         return vanished_text(path)

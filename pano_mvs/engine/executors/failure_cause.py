@@ -1,4 +1,4 @@
-"""Say of a unit that failed what went wrong, where, and what the result lacks because of it."""
+"""Describe why a unit failed, and where."""
 
 from __future__ import annotations
 
@@ -7,37 +7,30 @@ import traceback
 from pano_mvs.core.errors import PanoMvsError
 from pano_mvs.core.text import shortened
 from pano_mvs.engine.planning.units import Unit
-from pano_mvs.engine.workflows.workflow import StageEntry
 
-_MAX_TRACE = 20_000  # characters
+_MAX_TRACE_CHARACTERS = 20_000
 
 
 def cause_of(unit: Unit, error: BaseException) -> tuple[str, str]:
-    """Return what went wrong, and the traceback if it is the code's fault.
+    """Return what went wrong, and the traceback if the code failed.
 
-    Errors raised on purpose speak for themselves, others get the line they came from.
+    The messages of our own errors are used as they are; for other errors the line that raised them is added.
     """
     notes = shortened("".join(f" ({note})" for note in getattr(error, "__notes__", [])))
     if isinstance(error, PanoMvsError):
         return f"{shortened(str(error))}{notes}", ""
     frames = traceback.extract_tb(error.__traceback__)
-    # The author of a plugin wants the line in the plugin; we want ours wherever it is.
+    # For a plugin, name the line in the plugin; otherwise the line that raised the error.
     own = unit.entry.spec.origin.rpartition(":")[0] if unit.entry.spec.code_digest else ""
     if own and isinstance(error, ModuleNotFoundError):
         notes += " (a plugin imports the files beside it at its top, not inside functions)"
     frame = next((f for f in reversed(frames) if f.filename == own), frames[-1])
     cause = f"{frame.filename}:{frame.lineno}: {type(error).__name__}: {_text(error)}{notes}"
-    return cause, shortened("".join(traceback.format_exception(error)), _MAX_TRACE)
+    return cause, shortened("".join(traceback.format_exception(error)), _MAX_TRACE_CHARACTERS)
 
 
 def _text(error: BaseException) -> str:
     try:
         return shortened(str(error))
-    except Exception as second:  # the text is a plugin's code too
+    except Exception as second:  # a plugin's exception may fail to make its text
         return f"(its message cannot be shown: {type(second).__name__})"
-
-
-def lost(entry: StageEntry, item: str) -> str:
-    """Return what the result lacks for want of a unit."""
-    kind = entry.spec.output.kind_name()
-    return f"there is no {kind} for {item}" if item else f"there is no {kind}"
