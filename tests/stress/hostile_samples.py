@@ -13,7 +13,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pano_mvs.cli.session import presets_folder
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.workflow import load_workflow
 from pano_mvs.io.clouds.ply import read_ply, write_ply
@@ -30,6 +29,7 @@ from pano_mvs.io.truth import read_truth
 from pano_mvs.scene import PointCloud
 from pano_mvs.scene.image_files.image_file import decode_image
 from pano_mvs.scene.masking import decode_mask
+from pano_mvs.session.session import presets_folder
 from pano_mvs.testing.room import capture_poses
 from pano_mvs.viewer.shown_scene import has_faces
 from tests.io.colmap.test_model import SIZES, noisy_poses
