@@ -1,6 +1,7 @@
 """Measure how many small faults in the code the tests notice: python -m tests.mutation [GROUP ...].
 
-Each group's score is that of a sample of its faults, the same each time. Faults that survive are printed with their ids.
+Each group's score is that of a sample of its faults, the same each time. Each fault is printed with its id and what
+came of it.
 """
 
 import argparse
@@ -22,7 +23,7 @@ def main() -> None:
     """Run the faults of some groups and print the scores."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("group", nargs="*", choices=[[], *GROUPS], help="all groups if none is named")
-    parser.add_argument("--sample", type=int, default=100, help="faults per group; 0 for all")
+    parser.add_argument("--sample", type=int, default=60, help="faults per group; 0 for all")
     parser.add_argument("--ids", nargs="+", default=(), help="only these faults")
     parser.add_argument("--tests", nargs="+", default=(), help="these tests instead of the group's")
     arguments = parser.parse_args()
@@ -42,7 +43,7 @@ def main() -> None:
 
 def _chosen(tree: Path, group: Group, sample: int, ids: Sequence[str]) -> list[Mutant]:
     """Return the faults with the smallest ids, which are digests, so that other faults do not change the sample."""
-    paths = [path for source in group.sources for path in sorted(tree.glob(source))]
+    paths = [path for one in group.sources for path in sorted(tree.glob(one)) if path.name != "__init__.py"]
     mutants = [one for path in paths for one in mutants_of(path.relative_to(tree).as_posix(), path.read_text("utf-8"))]
     if ids:
         return [one for one in mutants if one.id in ids]

@@ -38,7 +38,9 @@ GROUPS = {
 }
 
 SLOW_TESTS = (
+    "tests/engine/test_dask.py",
     "tests/engine/test_large_plans.py",
+    "tests/engine/test_resume.py",
     "tests/engine/test_workflow_hostile.py",
 )
-"""Left out: they take long, and test other modules."""
+"""Left out: they take long, and test other modules or other processes."""

@@ -90,11 +90,9 @@ def _faults(body: list[ast.stmt], where: str) -> Iterator[tuple[ast.stmt, str, a
 
 
 def _is_for_types(statement: ast.stmt) -> bool:
-    named = isinstance(statement, ast.If) and isinstance(statement.test, ast.Name)
-    return (named and statement.test.id == "TYPE_CHECKING") or (
-        isinstance(statement, ast.AnnAssign)
-        and (statement.value is None or "TypeAlias" in ast.dump(statement.annotation))
-    )
+    if isinstance(statement, ast.AnnAssign):
+        return statement.value is None or "TypeAlias" in ast.dump(statement.annotation)
+    return isinstance(statement, ast.If) and ast.unparse(statement.test) == "TYPE_CHECKING"
 
 
 def _in_statement(statement: ast.stmt, where: str) -> Iterator[tuple[ast.AST, str]]:

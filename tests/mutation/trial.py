@@ -5,7 +5,6 @@ import os
 import resource
 import shutil
 import signal
-import subprocess
 import sys
 import time
 import traceback
@@ -149,9 +148,9 @@ def _in_child(tree: Path, work: Callable[[], int], limit_s: float) -> int | None
 def _pytest(arguments: Sequence[str], plugins: Sequence[object] = ()) -> int:
     import pytest
 
-    log = open(LOG, "w", encoding="utf-8")
+    log = os.open(LOG, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
     for number in (1, 2):
-        os.dup2(log.fileno(), number)
+        os.dup2(log, number)
     options = ["-q", "-p", "no:cacheprovider", "-p", "no:xdist", "--assert=plain", "--hypothesis-seed=0"]
     return int(pytest.main([*options, *arguments], [_WithoutShrinking(), *plugins]))
 
