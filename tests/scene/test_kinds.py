@@ -89,7 +89,7 @@ def test_an_array_of_another_shape_is_refused(title: str, field: str) -> None:
     if field != "vector":
         others.append(array[:-1])
     for other in others:
-        with pytest.raises(ContractError, match="must have shape|do not make up"):
+        with pytest.raises(ContractError, match=r"must have shape|do not make up"):
             replace(KINDS[title], **{field: other}).check()  # type: ignore[type-var]
 
 
