@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,7 +18,8 @@ from pano_mvs.core.errors import ChangedFileError, ContractError, StoreError, Us
 from pano_mvs.core.files import CACHE_MARK
 from pano_mvs.engine import store as store_module
 from pano_mvs.engine.blobs import BlobRef, DamagedBlobError
-from pano_mvs.engine.store import ItemRef, Store, UnitRecord, record_from_bytes
+from pano_mvs.engine.stat_cache import StatCache
+from pano_mvs.engine.store import LEAST_FREE_BYTES, ItemRef, Store, UnitRecord, record_from_bytes
 from pano_mvs.scene import FilePart, Record
 from tests.engine.conftest import settle
 
@@ -405,3 +407,78 @@ def test_records_and_blobs_behind_links_are_neither_written_nor_removed(tmp_path
         assert path.read_bytes() == before
         path.parent.unlink()
         outside.rename(path.parent)
+
+
+def test_a_digest_that_was_remembered_of_a_users_file_goes_with_what_turned_out_wrong(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(b"abc")
+    body = json.dumps({str(path.resolve()): [*(StatCache.state(path) or ()), "0" * 32]})
+    Store(tmp_path / "store")
+    (tmp_path / "store" / "stat-cache.json").write_text(f"{digest_from_bytes(body.encode())}\n{body}")
+    blobs = Store(tmp_path / "store").blobs
+    ref = BlobRef(blobs.register_external(path), 3, "", external=True)
+    assert ref.digest == "0" * 32
+    blobs.discard(ref, "is of no use")
+    assert path.read_bytes() == b"abc"
+    assert blobs.register_external(path) == digest_from_bytes(b"abc")
+
+
+def test_a_blob_that_is_not_there_is_damage(tmp_path: Path) -> None:
+    blobs = Store(tmp_path).blobs
+    for ref in (BlobRef(KEY, 3, ".npy"), BlobRef(KEY, 3, ".json")):
+        with pytest.raises(DamagedBlobError, match="is damaged or gone"):
+            blobs.verified_path(ref)
+
+
+@pytest.mark.parametrize("shape", [(1,) * 70, (0, -1), (-1, -1)])
+def test_an_array_of_a_shape_that_there_cannot_be_is_damage(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    blobs = Store(tmp_path).blobs
+    header = f"{{'descr': '|u1', 'fortran_order': False, 'shape': {shape}}}\n".encode()
+    data = npy.magic(1, 0) + len(header).to_bytes(2, "little") + header + bytes(0 if 0 in shape else 1)
+    ref = BlobRef(digest_from_bytes(data), len(data), ".npy")
+    blobs.path(ref).parent.mkdir(exist_ok=True, parents=True)
+    blobs.path(ref).write_bytes(data)
+    with pytest.raises(DamagedBlobError, match="holds nothing that pano_mvs writes"):
+        blobs.get(ref)
+
+
+@pytest.mark.parametrize(("days", "goes"), [(6.9, False), (7.1, True)])
+def test_what_has_another_name_goes_from_the_scratch_folder_after_seven_days(
+    tmp_path: Path, days: float, goes: bool
+) -> None:
+    with Store(tmp_path).scratch() as young:
+        old = young.parent / "old"
+    old.mkdir()
+    then = time.time() - days * 24 * 3600
+    os.utime(old, (then, then))
+    Store(tmp_path)
+    assert old.exists() is not goes
+
+
+def test_a_store_has_the_settings_that_it_was_opened_with(tmp_path: Path) -> None:
+    plain, other = Store(tmp_path), Store(tmp_path, durable=True, least_free_bytes=5)
+    assert (plain.durable, plain.least_free_bytes, plain.blobs.durable) == (False, LEAST_FREE_BYTES, False)
+    assert (other.durable, other.least_free_bytes, other.blobs.durable) == (True, 5, True)
+    greedy = Store(tmp_path, least_free_bytes=1 << 62)
+    with pytest.raises(StoreError, match="MB are free where the cache"):
+        greedy.require_room()
+    with pytest.raises(StoreError, match="MB are free where the cache"), greedy.scratch():
+        pass
+    other.require_room()
+    assert "is full" in str(plain.cannot_write(OSError(errno.ENOSPC, "no")))
+    assert "cannot be written: no" in str(plain.cannot_write(OSError(errno.EROFS, "no")))
+
+
+def test_with_durable_every_blob_and_record_is_flushed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flushed: list[int] = []
+    monkeypatch.setattr(os, "fsync", flushed.append)
+    store = Store(tmp_path / "plain")
+    store.put(record_of(store))
+    assert flushed == []
+    durable = Store(tmp_path / "durable", durable=True)
+    for number, part in enumerate(({"a": 1}, np.arange(3)), 1):
+        durable.blobs.put(part)  # type: ignore[arg-type]
+        assert len(flushed) >= number
+    before = len(flushed)
+    durable.put(record_of(store))
+    assert len(flushed) > before

@@ -8,6 +8,7 @@ import ast
 import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TypeAlias
 
 SWAPS: dict[type[ast.AST], str] = {
     ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">", ast.Eq: "!=", ast.NotEq: "==", ast.Is: "is not",
@@ -21,6 +22,8 @@ SIGNS = {operator: SWAPS[other] for other, operator in [
 ]}  # fmt: skip
 MESSAGE_CALLS = frozenset({"require", "_problem", "_warn", "warn", "isinstance", "issubclass"})
 
+Fault: TypeAlias = "tuple[ast.stmt, str, bool, ast.AST, str]"
+
 
 @dataclass(frozen=True)
 class Mutant:
@@ -30,6 +33,7 @@ class Mutant:
         path: the module, from the root of the repository.
         lines: first and last line of the statement that is changed, and so of what a test has to run.
         where: name of the function or class around it; empty at the top of the module.
+        on_import: whether the statement runs when the module is imported.
         what: old text and new text.
         text: the whole module with the fault.
         id: does not change when code moves to another file or line.
@@ -38,6 +42,7 @@ class Mutant:
     path: str
     lines: tuple[int, int]
     where: str
+    on_import: bool
     what: str
     text: str
     id: str
@@ -50,7 +55,7 @@ def mutants_of(path: str, text: str) -> list[Mutant]:
     for line in encoded.splitlines(keepends=True):
         starts.append(starts[-1] + len(line))
     found = []
-    for statement, where, node, new in _faults(ast.parse(text).body, ""):
+    for statement, where, on_import, node, new in _faults(ast.parse(text).body, "", on_import=True):
         begin, end = starts[node.lineno - 1] + node.col_offset, starts[node.end_lineno - 1] + node.end_col_offset
         old = encoded[begin:end].decode()
         if isinstance(node, ast.stmt | ast.expr):
@@ -60,7 +65,7 @@ def mutants_of(path: str, text: str) -> list[Mutant]:
         name = f"{path.rpartition('/')[2]} {where}: {what}"
         seen[name] = seen.get(name, 0) + 1
         identity = hashlib.sha256(f"{name} {seen[name]}".encode()).hexdigest()[:8]
-        found.append(Mutant(path, _lines(statement), where, what, mutated, identity))
+        found.append(Mutant(path, _lines(statement), where, on_import, what, mutated, identity))
     return found
 
 
@@ -70,23 +75,23 @@ def _lines(statement: ast.stmt) -> tuple[int, int]:
     return statement.lineno, max(statement.lineno, last or statement.lineno)
 
 
-def _faults(body: list[ast.stmt], where: str) -> Iterator[tuple[ast.stmt, str, ast.AST, str]]:
-    """Yield statement, place, node to replace, and the new text, in which {} stands for the old."""
+def _faults(body: list[ast.stmt], where: str, *, on_import: bool) -> Iterator[Fault]:
+    """Yield statement, place, whether it runs on import, node to replace, and the new text: {} stands for the old."""
     for statement in body:
         if isinstance(statement, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
             name = f"{where}.{statement.name}".lstrip(".")
             if not isinstance(statement, ast.ClassDef):
                 for default in (*statement.args.defaults, *filter(None, statement.args.kw_defaults)):
-                    yield from ((statement, name, node, new) for node, new in _in_expression(default))
-            yield from _faults(statement.body, name)
+                    yield from ((statement, name, True, node, new) for node, new in _in_expression(default))
+            yield from _faults(statement.body, name, on_import=on_import and isinstance(statement, ast.ClassDef))
             continue
         if isinstance(statement, ast.Assert | ast.Import | ast.ImportFrom) or _is_for_types(statement):
             continue
-        yield from ((statement, where, node, new) for node, new in _in_statement(statement, where))
+        yield from ((statement, where, on_import, node, new) for node, new in _in_statement(statement, where))
         for part in ("body", "orelse", "finalbody"):
-            yield from _faults(getattr(statement, part, []), where)
+            yield from _faults(getattr(statement, part, []), where, on_import=on_import)
         for handler in (*getattr(statement, "handlers", ()), *getattr(statement, "cases", ())):
-            yield from _faults(handler.body, where)
+            yield from _faults(handler.body, where, on_import=on_import)
 
 
 def _is_for_types(statement: ast.stmt) -> bool:

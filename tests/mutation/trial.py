@@ -43,7 +43,7 @@ class Baseline:
         lines = self.tests.get(mutant.path, {})
         first, last = mutant.lines
         found = {test for line in range(first, last + 1) for test in lines.get(line, ())}
-        if not mutant.where:  # runs when the module is imported
+        if mutant.on_import:
             found |= set(lines.get(0, ()))
         chosen, total = [], 0.0
         for test in sorted(found, key=lambda one: (self.seconds[one], one)):
@@ -80,7 +80,7 @@ def measure(tree: Path, sources: Sequence[str], tests: Sequence[str], left_out: 
         with suppress(Exception):
             import_module(name)
     control = next(iter(baseline.tests))
-    unchanged = Mutant(control, (0, 0), "", "", (tree / control).read_text("utf-8"), "")
+    unchanged = Mutant(control, (0, 0), "", True, "", (tree / control).read_text("utf-8"), "")
     if outcome_of(tree, unchanged, baseline) != "survived":
         raise RuntimeError(f"a fork of the tests fails without any fault:\n{(tree / LOG).read_text('utf-8')}")
     return baseline
