@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from tests.mutation.equivalent import EQUIVALENT
-from tests.mutation.groups import GROUPS, SLOW_TESTS, Group
+from tests.mutation.groups import GROUPS, Group
 from tests.mutation.mutants import Mutant, mutants_of
 from tests.mutation.trial import Baseline, copy_tree, measure, outcome_of
 
@@ -36,7 +36,7 @@ def main() -> None:
             group = GROUPS[title]
             tests = tuple(arguments.tests) or group.tests
             if tests not in known:
-                known[tests] = measure(tree, sources, tests, SLOW_TESTS)
+                known[tests] = measure(tree, sources, tests)
             chosen = _chosen(tree, group, arguments.sample, arguments.ids)
             _report(title, _tried(tree, chosen, known[tests]))
 
