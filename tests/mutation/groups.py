@@ -32,7 +32,7 @@ GROUPS = {
             "pano_mvs/engine/stage_code.py",
             "pano_mvs/engine/units.py",
         ),
-        _engine("digests", "plugin_digest", "code_digest", "code_reach", "stage_code", "gather", "run", "plugins"),
+        _engine("digests", "plugin_digest", "code_digest", "code_summary", "code_reach", "stage_code", "run"),
     ),
     "store": Group(
         ("pano_mvs/engine/store.py", "pano_mvs/engine/blobs.py"),
@@ -41,7 +41,7 @@ GROUPS = {
     "wiring": Group(("pano_mvs/engine/wiring.py",), _engine("wiring", "workflow", "run")),
     "scheduler": Group(
         ("pano_mvs/engine/scheduler.py",),
-        _engine("run", "executors", "changed_files", "store", "publish", "set_aside", "full_disk", "demands"),
+        _engine("scheduler", "run", "store"),
     ),
 }
 """`__init__.py` is left out: it says what is public, which a test of its own checks."""

@@ -78,7 +78,7 @@ def measure(tree: Path, sources: Sequence[str], tests: Sequence[str]) -> Baselin
     for name in baseline.libraries:
         with suppress(Exception):
             import_module(name)
-    control = next(iter(baseline.tests))
+    control = max(baseline.tests, key=lambda path: len(baseline.tests[path][0]))
     unchanged = Mutant(control, (0, 0), "", True, "", (tree / control).read_text("utf-8"), "")
     if outcome_of(tree, unchanged, baseline) != "survived":
         raise RuntimeError(f"a fork of the tests fails without any fault:\n{(tree / LOG).read_text('utf-8')}")
