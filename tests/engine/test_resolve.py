@@ -187,7 +187,8 @@ def test_a_key_is_made_of_the_identity_and_nothing_else(resolved: Resolved) -> N
     code = stage_code(entry.spec, entry.params)
     assert units["a"].identity == {
         "schema": KEY_SCHEMA, "stage": "toy.scale", "version": 1, "code": code.digest,
-        "libraries": dict(code.libraries), "params": {"by": 3.0}, "kinds": {"Number": 1}, "inputs": {"x": "digest of a"},
+        "libraries": dict(code.libraries), "params": {"by": 3.0}, "kinds": {"Number": 1},
+        "inputs": {"x": "digest of a"},
     }  # fmt: skip
     same = images("c", "a")
     same.items["c"] = ref("a")

@@ -32,7 +32,9 @@ GROUPS = {
             "pano_mvs/engine/stage_code.py",
             "pano_mvs/engine/units.py",
         ),
-        _engine("digests", "plugin_digest", "code_digest", "code_summary", "code_reach", "stage_code", "run"),
+        _engine(
+            "digests", "plugin_digest", "code_digest", "code_summary", "code_reach", "stage_code", "resolve", "run"
+        ),
     ),
     "store": Group(
         ("pano_mvs/engine/store.py", "pano_mvs/engine/blobs.py"),
