@@ -10,7 +10,19 @@ import pytest
 
 from pano_mvs.core.errors import ChangedFileError, ContractError, InputError
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
-from pano_mvs.scene import Features, Files, GlobalDescriptor, Pairs, PointCloud, Pose, Poses, RangeMap, TwoView, Views
+from pano_mvs.scene import (
+    Features,
+    Files,
+    GlobalDescriptor,
+    Pairs,
+    Panorama,
+    PointCloud,
+    Pose,
+    Poses,
+    RangeMap,
+    TwoView,
+    Views,
+)
 from pano_mvs.scene.face_files import FaceFiles
 from pano_mvs.scene.files import group_file, item_stems
 from pano_mvs.scene.index import pair_from_name, pair_name
@@ -355,3 +367,31 @@ def test_the_first_group_s_file_has_the_plain_name() -> None:
 )
 def test_images_have_names_without_extension_where_these_are_unique(names: list[str], stems: list[str]) -> None:
     assert list(item_stems(names).values()) == stems
+
+
+def test_what_nobody_states_is_not_known() -> None:
+    """The values of a field that is left out."""
+    pair = TwoView(GENERAL.matches_idx, np.eye(3), UNITS[0], FLOATS, "general")
+    assert (pair.reason, pair.candidates, pair.parallax_deg) == ("", 0, 0.0)
+    assert (pair.rotation_std_deg, pair.direction_std_deg, pair.alternatives) == (0.0, 0.0, ())
+    faces = FaceFiles({})
+    assert (faces.layout, faces.fov_deg, faces.suffix) == ("cube", 96.0, ".jpg")
+    image = Panorama(FilePart(Path("a")), (2, 4), (2, 4))
+    assert (image.crop_ltwh, image.mask_file, image.nadir_deg, image.zenith_deg) == (None, None, 0.0, 0.0)
+    assert (image.up_in_cam, image.heading_deg, image.position_lla) == (None, None, None)
+    assert FilePart(Path("a")) == FilePart(Path("a"), external=False, digest="")
+    assert Pose(Rigid3.identity()).group == 0
+    poses = drawn_group(("a",), seed=1)
+    plain = Poses(*(getattr(poses, field.name) for field in fields(Poses)[:10]))
+    assert plain.frame == "the first registered camera"
+    assert (plain.metric, plain.doubts, plain.other_worlds) == (False, {}, ())
+
+
+def test_kinds_have_the_axes_that_users_read_of() -> None:
+    assert [str(axis) for axis in Axis] == ["one", "image", "pair", "view"]
+    kinds = {Axis.IMAGE: (Panorama, Features, GlobalDescriptor, Pose), Axis.PAIR: (TwoView,),
+             Axis.VIEW: (RangeMap, SurfaceSamples, FaceFiles), None: (Files,),
+             Axis.ONE: (Poses, PointCloud, Pairs, Views, Scores, TrackedPoints)}  # fmt: skip
+    for axis, those in kinds.items():
+        assert {kind.axis for kind in those} == {axis}
+    assert Poses.explodes_into is Pose
