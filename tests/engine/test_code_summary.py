@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import ast
 import json
 from pathlib import Path
 
 import pytest
 
 from pano_mvs.engine.code import libraries, sources
+from pano_mvs.engine.code.canonical import canonical_text
 from pano_mvs.engine.code.libraries import library_versions
 from pano_mvs.engine.code.reach import CodeGraph
 from pano_mvs.engine.code.sources import Sources
@@ -398,3 +400,19 @@ def test_versions_of_libraries_are_those_of_what_is_installed(monkeypatch: pytes
     finally:
         libraries._version.cache_clear()
     assert found == {"OpenCV": "2 and 3", "PIL": "4", "gone": "not installed", "numpy": "1", "x": "5"}
+
+
+def test_pieces_of_text_in_an_f_string_are_one_however_python_splits_them() -> None:
+    """As versions of Python do, each in its own way."""
+
+    def text_of(*pieces: str | ast.expr) -> str:
+        values = [ast.Constant(one) if isinstance(one, str) else one for one in pieces]
+        return canonical_text(ast.JoinedStr(values=values))
+
+    name = ast.FormattedValue(ast.Name("x", ast.Load()), -1)
+    assert text_of("a", "b", name, "c", "", "d") == text_of("ab", name, "cd")
+    assert text_of("", name, "") == text_of(name)
+    assert text_of("a", name, "b") != text_of("ab", name)
+    assert text_of("a", name) != text_of(name, "a")
+    assert text_of(name, name) != text_of(name)
+    assert text_of("a") != text_of("b")
