@@ -24,6 +24,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("group", nargs="*", choices=[[], *GROUPS], help="all groups if none is named")
     parser.add_argument("--sample", type=int, default=60, help="faults per group; 0 for all")
+    parser.add_argument("--skip", type=int, default=0, help="another sample: the faults after so many")
     parser.add_argument("--ids", nargs="+", default=(), help="only these faults")
     parser.add_argument("--tests", nargs="+", default=(), help="these tests instead of the group's")
     arguments = parser.parse_args()
@@ -37,17 +38,18 @@ def main() -> None:
             tests = tuple(arguments.tests) or group.tests
             if tests not in known:
                 known[tests] = measure(tree, sources, tests)
-            chosen = _chosen(tree, group, arguments.sample, arguments.ids)
+            chosen = _chosen(tree, group, arguments)
             _report(title, _tried(tree, chosen, known[tests]))
 
 
-def _chosen(tree: Path, group: Group, sample: int, ids: Sequence[str]) -> list[Mutant]:
+def _chosen(tree: Path, group: Group, arguments: argparse.Namespace) -> list[Mutant]:
     """Return the faults with the smallest ids, which are digests, so that other faults do not change the sample."""
     paths = [path for one in group.sources for path in sorted(tree.glob(one)) if path.name != "__init__.py"]
     mutants = [one for path in paths for one in mutants_of(path.relative_to(tree).as_posix(), path.read_text("utf-8"))]
-    if ids:
-        return [one for one in mutants if one.id in ids]
-    chosen = sorted(mutants, key=lambda one: one.id)[: sample or None]
+    if arguments.ids:
+        return [one for one in mutants if one.id in arguments.ids]
+    first, number = arguments.skip, arguments.sample or len(mutants)
+    chosen = sorted(mutants, key=lambda one: one.id)[first : first + number]
     return sorted(chosen, key=lambda one: (one.path, one.lines))
 
 

@@ -395,3 +395,4 @@ def test_kinds_have_the_axes_that_users_read_of() -> None:
     for axis, those in kinds.items():
         assert {kind.axis for kind in those} == {axis}
     assert Poses.explodes_into is Pose
+    assert {kind.kind_name() for kind in kinds[Axis.IMAGE]} == {"Panorama", "Features", "GlobalDescriptor", "Pose"}
