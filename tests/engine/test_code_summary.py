@@ -152,6 +152,7 @@ def uses(text: str, name: str = "f") -> set[str]:
         ("class f:\n    x: Annotated[int, 'of the grid'] = 1", {"Annotated", "int"}),
         ("f: a = b", {"b", "f"}),
         ("def f():\n    x: a = b\n    return x", {"b"}),
+        ("def f():\n    class g: ...\n    x: a = b\n    return x", {"b"}),
     ],
 )
 def test_names_that_a_definition_uses(text: str, expected: set[str]) -> None:
@@ -232,6 +233,16 @@ def test_definitions_and_what_a_module_does_on_import(
     assert set(found.definitions) == names
     assert (found.effects is not None) == effects
     assert sorted(found.effect_names) == effect_names
+
+
+@pytest.mark.parametrize("decorator", [
+    "njit", "jit", "vectorize", "guvectorize", "intrinsic", "dataclass", "cache", "lru_cache", "contextmanager",
+    "total_ordering", "wraps", "runtime_checkable", "final", "unique",
+])  # fmt: skip
+def test_decorators_that_register_nothing_cost_no_other_stage_its_cache(decorator: str) -> None:
+    for spelling in (decorator, f"{decorator}(1)", f"lib.sub.{decorator}"):
+        assert summarize_module(f"@{spelling}\ndef f(): ...", "m").effects is None
+    assert summarize_module(f"@{decorator}.register\ndef f(): ...", "m").effects is not None
 
 
 def test_all_definitions_of_a_name_count() -> None:
@@ -360,6 +371,17 @@ def test_summaries_are_kept_on_the_disk_for_the_same_text_and_the_same_python(
     read()
     assert made == ["alone"] * 4
     assert len(list((tmp_path / "kept").iterdir())) == 2
+
+
+def test_summaries_are_written_only_where_there_are_new_ones(tmp_path: Path) -> None:
+    (tmp_path / "alone.py").write_text("x = 1")
+    some = Sources({"alone": tmp_path / "alone.py"}, tmp_path / "kept")
+    some.summary("alone")
+    some.save()
+    (kept,) = (tmp_path / "kept").iterdir()
+    kept.unlink()
+    some.save()
+    assert not kept.exists()
 
 
 def test_modules_that_cannot_be_read_are_none(tmp_path: Path) -> None:

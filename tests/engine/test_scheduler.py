@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from pano_mvs.core.errors import GateError, InputError, PanoMvsError, StoreError, UsageError
-from pano_mvs.engine.events import RunResult
+from pano_mvs.engine.events import RunResult, Silent
 from pano_mvs.engine.executors.protocol import Job, Outcome
 from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.run import Run
@@ -184,6 +184,33 @@ def test_a_unit_that_needs_more_memory_than_there_is_fails_and_the_others_go_on(
     assert summary(result)["scaled"] == (5, 0, 0, 0)
     assert summary(result)["pairs"] == (0, 0, 1, 0)
     assert "pairs" not in shelf.submitted
+
+
+class Heard(Silent):
+    """Notes what it hears of units."""
+
+    def __init__(self) -> None:
+        self.started: list[str] = []
+        self.finished: list[tuple[str, str]] = []
+
+    def unit_started(self, stage: str, item: str) -> None:
+        self.started.append(f"{stage}:{item}")
+
+    def unit_finished(self, stage: str, item: str, outcome: str, seconds: float) -> None:  # type: ignore[override]
+        self.finished.append((f"{stage}:{item}", outcome))
+
+
+@pytest.mark.parametrize("memory", ["1MB", "5MB"])
+def test_whatever_is_computed_or_refused_is_heard_of_as_begun_and_ended(toy: Toy, shelf: Shelf, memory: str) -> None:
+    shelf.memory_bytes = 3_000_000
+    session, heard = toy.session(f"pairs.memory={memory}"), Heard()
+    Run(
+        session.workflow, session.graph, Store(session.store_root), session.out, executor=shelf, observer=heard
+    ).execute()
+    assert [name for name in heard.started if name.startswith("pairs")] == ["pairs:"]
+    assert [one for one in heard.finished if one[0] == "pairs:"] == [("pairs:", "run" if memory == "1MB" else "failed")]
+    blocked = {name for name, outcome in heard.finished if outcome == "blocked"}
+    assert sorted(heard.started) == sorted(name for name, _ in heard.finished if name not in blocked)
 
 
 def test_units_wait_for_memory_and_nothing_overtakes_them(toy: Toy, shelf: Shelf) -> None:
