@@ -288,6 +288,28 @@ def test_a_damaged_input_is_left_for_the_next_pass(toy: Toy, shelf: Shelf) -> No
     assert shelf.submitted.count("scaled:5.txt") == 1
 
 
+def test_an_image_that_changed_is_left_out_and_the_run_goes_over_its_stages_again(toy: Toy, shelf: Shelf) -> None:
+    path = toy.folder / "capture" / "3.txt"
+    reason = f"{path} changed during the run"
+    shelf.answers["scaled:3.txt"] = Outcome("changed", cause=reason, changed={str(path): reason})
+    result = run_with(toy, shelf)
+    assert result.exit_code == 3
+    assert result.warnings == [reason]
+    assert [(one.stage, one.item, one.cause) for one in result.failures] == [("images", "3.txt", reason)]
+    assert "mean/3.txt" not in result.published
+    assert "mean/2.txt" in result.published
+
+
+def test_a_change_of_a_file_that_no_source_listed_is_a_failure_of_the_unit(toy: Toy, shelf: Shelf) -> None:
+    reason = "settings.csv changed during the run"
+    shelf.answers["scaled:3.txt"] = Outcome("changed", cause=reason, changed={str(toy.folder / "settings.csv"): reason})
+    result = run_with(toy, shelf)
+    assert (result.exit_code, result.warnings) == (3, [])
+    assert [(one.stage, one.item, one.cause) for one in result.failures if not one.blocked] == [
+        ("scaled", "3.txt", reason)
+    ]
+
+
 def test_results_that_come_after_the_end_of_a_pass_count_as_computed() -> None:
     record = UnitRecord("a", {}, ItemRef("K", "d", {}))
     outcomes = [Outcome("done", record), Outcome("failed"), Outcome("done", record)]
