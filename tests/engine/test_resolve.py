@@ -42,7 +42,7 @@ class Resolved:
     def __init__(self, toy: Toy) -> None:
         toy.edit("plug.py", lambda text: text + MORE)
         toy.edit("wf.yaml", lambda text: text + "  plus: {use: toy.plus, in: {x: scaled}}\n"
-                 "  again: {use: toy.scale, in: {x: shifted}}\n")  # fmt: skip
+                 "  again: {use: toy.scale, in: {x: shifted}}\n  seen: {use: toy.view, in: {mean: mean, x: shifted}}\n")  # fmt: skip
         self.toy = toy
         self.session = toy.session()
         self.store = Store(toy.folder / "cache")
@@ -162,6 +162,17 @@ def test_items_of_a_collection_are_known_once_it_is_there(resolved: Resolved) ->
     assert {name: unit.inputs["x"] for name, unit in units.items()} == {"a": ref("a"), "b": ref("b")}
     assert units["a"].members == ("a",)
     assert resolved("again", shifted=OPEN)[1].open
+
+
+def test_units_that_read_an_item_of_a_collection_wait_for_it(resolved: Resolved) -> None:
+    collection = whole(ref("all"))
+    collection.exploded = {"a": ref("a in all")}
+    units, rest = resolved("seen", mean=images("a", "b"), shifted=collection)
+    assert units["a"].inputs == {"mean": ref("a"), "x": ref("a in all")}
+    assert rest.blocked == {"b": "needs shifted:b, which has no result"}
+    for state in (whole(None, pending=True), OPEN):
+        units, rest = resolved("seen", mean=images("a", "b"), shifted=state)
+        assert (units, rest.blocked, rest.waiting) == ({}, {}, ["a", "b"])
 
 
 def test_a_stage_reads_several_producers(resolved: Resolved) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from pathlib import Path
 
@@ -144,6 +145,13 @@ def test_of_a_file_no_more_is_read_than_is_needed(tmp_path: Path) -> None:
     path.write_bytes(b"nothing" * 20_000)
     assert stated_size_of_file(path) is None
     assert stated_size_of_file(tmp_path / "none") is None
+
+
+def test_a_file_that_states_its_size_at_once_is_not_read_whole(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(webp_of(LOSSY))
+    os.truncate(path, 1 << 36)  # takes no room on the disk, and more than there is in memory
+    assert stated_size_of_file(path) == (200, 300)
 
 
 def tiff_of(*entries: tuple[int, int, int, bytes], order: str = "<", big: bool = False, tail: bytes = b"") -> bytes:

@@ -369,6 +369,11 @@ def test_images_have_names_without_extension_where_these_are_unique(names: list[
     assert list(item_stems(names).values()) == stems
 
 
+def test_a_group_may_be_of_one_camera() -> None:
+    poses = drawn_group(("a", "b", "c"), seed=3, points=0)
+    replace(poses, group_idx=np.array([0, 1, 0], np.int32), other_worlds=poses.worlds).check()
+
+
 def test_what_nobody_states_is_not_known() -> None:
     """The values of a field that is left out."""
     pair = TwoView(GENERAL.matches_idx, np.eye(3), UNITS[0], FLOATS, "general")
