@@ -266,6 +266,11 @@ def test_of_units_that_deliver_one_file_the_first_of_the_capture_stays(toy: Toy,
     assert [one.item for one in result.failures] == ["2.txt", "3.txt", "4.txt", "5.txt"]
     assert summary(result)["each"] == (1, 0, 4, 0)
     assert toy.deliverables()["mean/fixed.txt"] == b"45.0"
+    session = toy.session()
+    run = Run(session.workflow, session.graph, Store(session.store_root), session.out, executor=shelf)
+    run.execute()
+    assert list(run.states["each"].items) == ["1.txt"]
+    assert list(run.states["each"].failed) == ["2.txt", "3.txt", "4.txt", "5.txt"]
     cached = run_with(toy, shelf)
     assert summary(cached)["each"] == (0, 1, 4, 0)
 
@@ -286,6 +291,20 @@ def test_a_damaged_input_is_left_for_the_next_pass(toy: Toy, shelf: Shelf) -> No
     assert summary(result)["scaled"] == (5, 0, 0, 0)  # what the first pass computed does not count as found
     assert shelf.submitted.count("scaled:4.txt") == 2
     assert shelf.submitted.count("scaled:5.txt") == 1
+
+
+def test_a_file_whose_stored_bytes_are_damaged_is_computed_and_delivered_again(toy: Toy, shelf: Shelf) -> None:
+    toy.run()
+    files = toy.deliverables()
+    shutil.rmtree(toy.folder / "out")
+    damaged = sorted((toy.folder / "cache" / "blobs").rglob("*.txt"))
+    for blob in damaged:
+        blob.write_bytes(b"x" * blob.stat().st_size)
+    result = run_with(toy, shelf)
+    assert result.exit_code == 0
+    assert toy.deliverables() == files
+    assert len(result.warnings) == len(damaged)
+    assert {name: counts[0] for name, counts in summary(result).items() if counts[0]} == {"each": 5, "all": 1}
 
 
 def test_an_image_that_changed_is_left_out_and_the_run_goes_over_its_stages_again(toy: Toy, shelf: Shelf) -> None:

@@ -43,7 +43,7 @@ GROUPS = {
     "wiring": Group(("pano_mvs/engine/wiring.py",), _engine("wiring", "workflow", "run")),
     "scheduler": Group(
         ("pano_mvs/engine/scheduler.py",),
-        _engine("scheduler", "run", "store", "stat_cache", "changed_files"),
+        _engine("scheduler", "run", "store", "hostile_store", "stat_cache", "changed_files"),
     ),
 }
 """`__init__.py` is left out: it says what is public, which a test of its own checks."""
