@@ -276,3 +276,26 @@ def test_a_stage_that_a_function_made_counts_with_all_of_its_module(tmp_path: Pa
     whole_module = reach_of_function("pack.m", "made.<locals>.stage", graph)
     assert whole_module.definitions.keys() == {"pack:top", "pack.m:made", "pack.m:other", "pack.m:K"}
     assert reach_of_function("pack.m", "made", graph).definitions.keys() == {"pack.m:made", "pack.m:K"}
+
+
+def test_a_plugin_that_is_a_package_uses_no_library_of_its_own_name(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    texts = {
+        "__init__": "from mine.inner import f\nlimit = 1\n",
+        "inner": "import numpy\nfrom mine import limit\ndef f(): return numpy.pi * limit\n",
+    }
+    for name, text in texts.items():
+        path = toy.folder / "mine" / f"{name}.py"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text)
+    module = ModuleType("mine")
+    module.__file__ = str(toy.folder / "mine" / "__init__.py")
+    monkeypatch.setitem(sys.modules, "mine", module)
+
+    def function() -> None: ...
+
+    function.__module__ = "mine"
+    entry = toy.session().workflow.stages["scaled"]
+    spec = replace(entry.spec, function=function, code_digest="one")  # type: ignore[arg-type]
+    code = stage_code(spec, entry.params)
+    assert code.libraries.keys() == {"numpy"}
+    assert stage_code(spec.with_code("other"), entry.params).digest != code.digest
