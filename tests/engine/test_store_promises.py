@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import json
 import os
+import subprocess
+import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +18,7 @@ from numpy.lib import format as npy
 from pano_mvs.core.digest import digest_from_bytes
 from pano_mvs.core.errors import ChangedFileError, ContractError, StoreError, UsageError
 from pano_mvs.core.files import CACHE_MARK
+from pano_mvs.core.processes import process_place
 from pano_mvs.engine import store as store_module
 from pano_mvs.engine.blobs import BlobRef, DamagedBlobError
 from pano_mvs.engine.stat_cache import StatCache
@@ -463,6 +466,7 @@ def test_what_has_another_name_goes_from_the_scratch_folder_after_seven_days(
 
 def test_a_store_has_the_settings_that_it_was_opened_with(tmp_path: Path) -> None:
     plain, other = Store(tmp_path), Store(tmp_path, durable=True, least_free_bytes=5)
+    assert LEAST_FREE_BYTES == 200_000_000  # as docs/running.md says
     assert (plain.durable, plain.least_free_bytes, plain.blobs.durable) == (False, LEAST_FREE_BYTES, False)
     assert (other.durable, other.least_free_bytes, other.blobs.durable) == (True, 5, True)
     greedy = Store(tmp_path, least_free_bytes=1 << 62)
@@ -488,3 +492,19 @@ def test_with_durable_every_blob_and_record_is_flushed(tmp_path: Path, monkeypat
     before = len(flushed)
     durable.put(record_of(store))
     assert len(flushed) > before
+
+
+@pytest.mark.skipif(os.name != "posix", reason="whether a process has ended is not known")
+def test_what_a_process_that_has_ended_left_half_written_goes_at_once(tmp_path: Path) -> None:
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    Store(tmp_path)
+    folder = tmp_path / "tmp"
+    folder.mkdir(exist_ok=True)
+    left = folder / f".tmp-{process_place()}-{ended.pid}-x"
+    own = folder / f".tmp-{process_place()}-{os.getpid()}-x"
+    left.mkdir()
+    own.mkdir()
+    (left / "half").write_bytes(b"x")
+    Store(tmp_path)
+    assert [path.name for path in folder.iterdir()] == [own.name]
