@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -48,7 +48,7 @@ def sample_panorama(panorama: NDArray[np.generic], pixels_px: ArrayLike) -> NDAr
     """
     pixels = np.asarray(pixels_px, dtype=np.float64)
     height, width = panorama.shape[:2]
-    padded = pad_panorama(panorama, 1)
+    padded: NDArray[Any] = pad_panorama(panorama, 1)
     x = np.mod(pixels[..., 0], width) + 0.5
     y = np.clip(pixels[..., 1], 0, height) + 0.5
     column, row = np.floor(x).astype(np.intp), np.floor(y).astype(np.intp)

@@ -94,7 +94,7 @@ def outcome_of(tree: Path, mutant: Mutant, baseline: Baseline) -> str:
     original = path.read_bytes()
     _write(path, mutant.text.encode())
     try:
-        limit = 20 + 4 * sum(baseline.seconds[test] for test in chosen)
+        limit = 60 + 6 * sum(baseline.seconds[test] for test in chosen)
         status = _in_child(tree, lambda: _pytest(["-x", *chosen]), limit)
     finally:
         _write(path, original)
