@@ -262,13 +262,12 @@ def test_files_that_give_way_to_those_of_an_earlier_unit_end_the_run_if_asked(to
 def test_of_units_that_deliver_one_file_the_first_of_the_capture_stays(toy: Toy, shelf: Shelf) -> None:
     """Also where a later one was there before it: that one's result is withdrawn."""
     toy.edit("plug.py", lambda text: text.replace("mean/{item}.txt", "mean/fixed.txt"))
-    result = run_with(toy, shelf)
+    session = toy.session()
+    run = Run(session.workflow, session.graph, Store(session.store_root), session.out, executor=shelf)
+    result = run.execute()
     assert [one.item for one in result.failures] == ["2.txt", "3.txt", "4.txt", "5.txt"]
     assert summary(result)["each"] == (1, 0, 4, 0)
     assert toy.deliverables()["mean/fixed.txt"] == b"45.0"
-    session = toy.session()
-    run = Run(session.workflow, session.graph, Store(session.store_root), session.out, executor=shelf)
-    run.execute()
     assert list(run.states["each"].items) == ["1.txt"]
     assert list(run.states["each"].failed) == ["2.txt", "3.txt", "4.txt", "5.txt"]
     cached = run_with(toy, shelf)

@@ -9,6 +9,9 @@ EQUIVALENT = {
     "0c56e3aa": "_write: likewise, as a comma follows each item of a list",
     "05b3ca1c": "CodeGraph._definition_node: the digest is set before the node is returned",
     "0625d3c6": "Resolver._input: a unit that cannot run does not wait, whatever is said of its waiting",
+    # wiring
+    "262a5645": "wiring_problems: the name of the workflow is not read",
+    "699b16f0": "_Wirer.connect: of several names that are close only the first is shown",
     # scheduler
     "7842c540": "Scheduler._accept: nobody reads the status of a unit whose files cannot be delivered",
     "72fec1b1": "Scheduler._accept: the damaged blob is gone, so that its record is not found either",
