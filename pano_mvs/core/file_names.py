@@ -5,6 +5,8 @@ from __future__ import annotations
 import unicodedata
 from pathlib import PurePosixPath
 
+from pano_mvs.scene.index import PAIR_SEPARATOR
+
 MAX_NAME_LENGTH = 100
 _RESERVED = {"con", "prn", "aux", "nul", *(f"{port}{digit}" for port in ("com", "lpt") for digit in "0123456789")}
 _INVALID_CHARACTERS = '<>:"|?*'
@@ -42,6 +44,8 @@ def item_problem(name: str) -> str:
         return f"its name {name!r} is empty or has control characters; rename it"
     if leads_outside(name):
         return f"its name {name!r} would lead outside the output folder; rename it"
+    if PAIR_SEPARATOR in name:
+        return f"its name {name!r} holds {PAIR_SEPARATOR!r}, which stands between the names of a pair; rename it"
     return ""
 
 

@@ -8,8 +8,8 @@ from typing import ClassVar
 
 from pano_mvs.scene.record import Axis, Record, require
 
-# A vertical bar cannot be part of a file's name on Windows and is rare elsewhere; sources refuse it.
-_PAIR_SEPARATOR = " | "
+# A vertical bar cannot be part of a file's name on Windows and is rare elsewhere; images with it are refused.
+PAIR_SEPARATOR = " | "
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +58,10 @@ class Views(Record):
 
 def pair_name(first: str, second: str) -> str:
     """Return the name of the unit that joins two images."""
-    return f"{first}{_PAIR_SEPARATOR}{second}"
+    return f"{first}{PAIR_SEPARATOR}{second}"
 
 
 def pair_from_name(name: str) -> tuple[str, str]:
     """Return the two images that a unit of the pair axis joins."""
-    first, _, second = name.partition(_PAIR_SEPARATOR)
+    first, _, second = name.partition(PAIR_SEPARATOR)
     return first, second
