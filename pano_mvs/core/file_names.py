@@ -5,9 +5,10 @@ from __future__ import annotations
 import unicodedata
 from pathlib import PurePosixPath
 
-from pano_mvs.scene.index import PAIR_SEPARATOR
-
 MAX_NAME_LENGTH = 100
+PAIR_SEPARATOR = " | "
+"""Stands between the two names of a pair. Windows allows no vertical bar in a file name, and few files have one."""
+
 _RESERVED = {"con", "prn", "aux", "nul", *(f"{port}{digit}" for port in ("com", "lpt") for digit in "0123456789")}
 _INVALID_CHARACTERS = '<>:"|?*'
 _RUN_FILES = {"logs", "run.json", "report.html"}
@@ -45,7 +46,7 @@ def item_problem(name: str) -> str:
     if leads_outside(name):
         return f"its name {name!r} would lead outside the output folder; rename it"
     if PAIR_SEPARATOR in name:
-        return f"its name {name!r} holds {PAIR_SEPARATOR!r}, which stands between the names of a pair; rename it"
+        return f"its name {name!r} contains {PAIR_SEPARATOR!r}, which separates the names of a pair; rename it"
     return ""
 
 

@@ -6,10 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
+from pano_mvs.core.file_names import PAIR_SEPARATOR
 from pano_mvs.scene.record import Axis, Record, require
-
-# A vertical bar cannot be part of a file's name on Windows and is rare elsewhere; images with it are refused.
-PAIR_SEPARATOR = " | "
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from pano_mvs.geometry import PinholeView, rotation_from_rotvec
 from tests.geometry.strategies import ROTATIONS
@@ -14,7 +15,7 @@ from tests.geometry.strategies import ROTATIONS
 AHEAD = PinholeView(np.eye(3), 50.0, np.array([30.0, 22.0]), (40, 64))
 
 
-def view_of(rotation):
+def view_of(rotation: NDArray[np.float64]) -> PinholeView:
     return PinholeView(rotation, 50.0, np.array([30.0, 22.0]), (40, 64))
 
 
@@ -33,7 +34,9 @@ def test_the_calibration_matrix_projects_as_the_view_does() -> None:
 
 
 @given(ROTATIONS, st.floats(-20, 90), st.floats(-20, 60), st.floats(0.1, 10))
-def test_pixels_survive_the_round_trip_at_any_distance(rotation, x, y, distance):
+def test_pixels_survive_the_round_trip_at_any_distance(
+    rotation: NDArray[np.float64], x: float, y: float, distance: float
+) -> None:
     bearing = view_of(rotation).bearings_from_pixels((x, y))
     assert np.linalg.norm(bearing) == pytest.approx(1)
     assert view_of(rotation).pixels_from_rays(distance * bearing) == pytest.approx([x, y], abs=1e-8)

@@ -12,12 +12,12 @@ EQUIVALENT = {
     # wiring
     "262a5645": "wiring_problems: the name of the workflow is not read",
     "699b16f0": "_Wirer.connect: of several names that are close only the first is shown",
-    # scheduler
-    "7842c540": "Scheduler._accept: nobody reads the status of a unit whose files cannot be delivered",
-    "72fec1b1": "Scheduler._accept: the damaged blob is gone, so that its record is not found either",
-    "0a2a90b3": "Scheduler._hand_out: nobody reads the status of a unit that is refused",
+    # run
+    "46a1225a": "RunPass._publish: nobody reads the status of a unit whose files cannot be delivered",
+    "45236129": "RunPass._publish: the damaged blob is gone, so that its record is not found either",
+    "ecfbff9e": "RunPass._dispatch: nobody reads the status of a unit that is refused",
     # scene
     "1005f29f": "JPEG_FRAMES: the marker D0 has no length, and is never asked after",
-    "16abb2fe": "_heif_size: the fifth to eighth bytes are another box's, so that none begins at 0",
+    "a7dd3345": "_heif_size: the fifth to eighth bytes are another box's, so that none begins at 0",
     "0add1aad": "_SIZES: fields of type 6 have one byte, as fields of unknown types have",
 }

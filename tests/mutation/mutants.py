@@ -22,7 +22,8 @@ SIGNS = {operator: SWAPS[other] for other, operator in [
 ]}  # fmt: skip
 MESSAGE_CALLS = frozenset({"require", "_problem", "_warn", "warn", "isinstance", "issubclass"})
 
-Fault: TypeAlias = "tuple[ast.stmt, str, bool, ast.AST, str]"
+Node: TypeAlias = ast.stmt | ast.expr
+Fault: TypeAlias = tuple[ast.stmt, str, bool, Node, str]
 
 
 @dataclass(frozen=True)
@@ -56,10 +57,11 @@ def mutants_of(path: str, text: str) -> list[Mutant]:
         starts.append(starts[-1] + len(line))
     found = []
     for statement, where, on_import, node, new in _faults(ast.parse(text).body, "", on_import=True):
+        assert node.end_lineno is not None
+        assert node.end_col_offset is not None
         begin, end = starts[node.lineno - 1] + node.col_offset, starts[node.end_lineno - 1] + node.end_col_offset
         old = encoded[begin:end].decode()
-        if isinstance(node, ast.stmt | ast.expr):
-            new = new.replace("{}", old)
+        new = new.replace("{}", old)
         mutated = (encoded[:begin] + new.encode() + encoded[end:]).decode()
         what = " ".join(f"{old} → {new}".split())
         name = f"{path.rpartition('/')[2]} {where}: {what}"
@@ -100,7 +102,7 @@ def _is_for_types(statement: ast.stmt) -> bool:
     return isinstance(statement, ast.If) and ast.unparse(statement.test) == "TYPE_CHECKING"
 
 
-def _in_statement(statement: ast.stmt, where: str) -> Iterator[tuple[ast.AST, str]]:
+def _in_statement(statement: ast.stmt, where: str) -> Iterator[tuple[Node, str]]:
     is_text = isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
     sets_part = isinstance(statement, ast.Assign) and not isinstance(statement.targets[0], ast.Name | ast.Tuple)
     left_out = (ast.Expr, ast.AugAssign, ast.Raise, ast.Break, ast.Continue, ast.Delete)
@@ -121,7 +123,7 @@ def _in_statement(statement: ast.stmt, where: str) -> Iterator[tuple[ast.AST, st
                     yield from _in_expression(one)
 
 
-def _in_expression(node: ast.AST) -> Iterator[tuple[ast.AST, str]]:
+def _in_expression(node: ast.AST) -> Iterator[tuple[Node, str]]:
     match node:
         case ast.JoinedStr() | ast.Call(func=ast.Name(id="TypeVar")):
             return
@@ -147,14 +149,14 @@ def _in_expression(node: ast.AST) -> Iterator[tuple[ast.AST, str]]:
             yield from ((test, "not ({})") for test in node.ifs)
         case ast.keyword(arg="strict"):
             return
-        case ast.Constant(value=bool()):
-            yield node, str(not node.value)
-        case ast.Constant(value=int()):
-            yield node, str(node.value + 1)
-        case ast.Constant(value=float()):
-            yield node, repr(node.value * 2 or 1.0)
-        case ast.Constant(value=str()) if " " not in node.value:
-            yield node, repr(node.value + "X")
+        case ast.Constant(value=bool(value)):
+            yield node, str(not value)
+        case ast.Constant(value=int(value)):
+            yield node, str(value + 1)
+        case ast.Constant(value=float(value)):
+            yield node, repr(value * 2 or 1.0)
+        case ast.Constant(value=str(value)) if " " not in value:
+            yield node, repr(value + "X")
     for child in ast.iter_child_nodes(node):
         yield from _in_expression(child)
 

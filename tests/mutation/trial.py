@@ -1,5 +1,7 @@
 """Run tests against one fault after another, each in a process forked from one that has loaded the libraries."""
 
+from __future__ import annotations
+
 import json
 import os
 import resource
@@ -13,8 +15,12 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tests.mutation.mutants import Mutant
+
+if TYPE_CHECKING:
+    from coverage import Coverage
 
 COPIED = ("pano_mvs", "tests", "docs", "workflows", "plugins", "pyproject.toml", "README.md", "CONTRIBUTING.md")
 NOT_COPIED = shutil.ignore_patterns("__pycache__", ".git", ".hypothesis")
@@ -45,7 +51,8 @@ class Baseline:
         found = {test for line in range(first, last + 1) for test in lines.get(line, ())}
         if mutant.on_import:
             found |= set(lines.get(0, ()))
-        chosen, total = [], 0.0
+        chosen: list[str] = []
+        total = 0.0
         for test in sorted(found, key=lambda one: (self.seconds[one], one)):
             total += self.seconds[test]
             if chosen and total > SECONDS:
@@ -166,17 +173,18 @@ class _WithoutShrinking:
 
 
 class _PerTest:
-    """Tells coverage which test runs, and takes the time."""
+    """Tells coverage which test runs, and measures its time."""
 
-    def __init__(self, coverage: object) -> None:
-        self.coverage, self.seconds = coverage, {}
+    def __init__(self, watch: Coverage) -> None:
+        self.watch = watch
+        self.seconds: dict[str, float] = {}
 
     def pytest_runtest_logstart(self, nodeid: str) -> None:
-        self.coverage.switch_context(nodeid)
+        self.watch.switch_context(nodeid)
         self.seconds[nodeid] = -time.perf_counter()
 
     def pytest_runtest_logfinish(self, nodeid: str) -> None:
-        self.coverage.switch_context("")
+        self.watch.switch_context("")
         self.seconds[nodeid] += time.perf_counter()
 
 

@@ -83,7 +83,7 @@ def refuse(*_: object) -> None:
 def test_what_opencv_does_not_take_is_reported_with_its_limits(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, width: int, height: int, is_limit: bool
 ) -> None:
-    monkeypatch.setattr(decoding.cv2, "imdecode", refuse)
+    monkeypatch.setattr(cv2, "imdecode", refuse)
     data = png_of(width, height, more=bytes(width * height // 10_000))
     said = r"is more than OpenCV decodes, 1074 megapixels and 1048576 px" if is_limit else r"not a picture that can be"
     with pytest.raises(InputError, match=said):
@@ -93,7 +93,7 @@ def test_what_opencv_does_not_take_is_reported_with_its_limits(
 def test_a_small_picture_that_opencv_refuses_is_none_that_can_be_decoded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(decoding.cv2, "imdecode", refuse)
+    monkeypatch.setattr(cv2, "imdecode", refuse)
     with pytest.raises(InputError, match=r"a\.png: not a picture that can be decoded \(its header states 256×128 px\)"):
         decode_picture(encoded(".png"), tmp_path / "a.png", cv2.IMREAD_COLOR)
     with pytest.raises(InputError, match=r"a: not a picture that can be decoded\. Copy it again"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import pytest
@@ -347,10 +348,12 @@ def test_summaries_are_kept_on_the_disk_for_the_same_text_and_the_same_python(
     file = tmp_path / "alone.py"
     file.write_text("def f(): return 1\n")
     made: list[str] = []
-    summarize = sources.summarize_module
-    monkeypatch.setattr(
-        sources, "summarize_module", lambda *args, **named: made.append(args[1]) or summarize(*args, **named)
-    )
+
+    def summarized(text: str, module: str, *, is_package: bool = False) -> ModuleSummary:
+        made.append(module)
+        return summarize_module(text, module, is_package=is_package)
+
+    monkeypatch.setattr(sources, "summarize_module", summarized)
 
     def read(kept_in: Path | None = tmp_path / "kept") -> ModuleSummary | None:
         some = Sources({"alone": file}, kept_in)
@@ -412,7 +415,7 @@ def test_versions_of_libraries_are_those_of_what_is_installed(monkeypatch: pytes
     def version(name: str) -> str:
         if name in known:
             return known[name]
-        raise libraries.PackageNotFoundError(name)
+        raise PackageNotFoundError(name)
 
     monkeypatch.setattr(libraries, "version", version)
     monkeypatch.setattr(libraries, "packages_distributions", lambda: {"x": ["x-1", "x-2"], "numpy": ["other"]})

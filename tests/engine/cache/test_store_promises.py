@@ -21,8 +21,9 @@ from pano_mvs.core.files import CACHE_MARK
 from pano_mvs.core.processes import process_place
 from pano_mvs.engine.cache import store as store_module
 from pano_mvs.engine.cache.blobs import BlobRef, DamagedBlobError
+from pano_mvs.engine.cache.disk_guard import DiskGuard
 from pano_mvs.engine.cache.stat_cache import StatCache
-from pano_mvs.engine.cache.store import LEAST_FREE_BYTES, ItemRef, Store, UnitRecord, record_from_bytes
+from pano_mvs.engine.cache.store import MIN_FREE_BYTES, ItemRef, Store, UnitRecord, record_from_bytes
 from pano_mvs.scene import FilePart, Record
 from tests.engine.conftest import settle
 
@@ -156,7 +157,7 @@ def test_a_value_that_cannot_be_stored_breaks_the_contract_of_its_kind(tmp_path:
 def test_parts_that_make_no_value_are_removed_and_reported(tmp_path: Path) -> None:
     store = Store(tmp_path)
     parts = {name: store.blobs.put(part) for name, part in {"array": np.arange(3), "other": np.arange(4)}.items()}
-    with pytest.raises(DamagedBlobError, match=r"is no part of a Pair; the same command computes it again"):
+    with pytest.raises(DamagedBlobError, match=r"is not a part of a Pair; the same command computes it again"):
         store.load(ItemRef("Pair", "d", parts), Pair)
     assert not any(store.blobs.exists(ref) for ref in parts.values())
     assert len(store.damaged) == 1
@@ -229,7 +230,7 @@ def test_a_users_file_that_is_not_as_it_was_listed_is_refused(tmp_path: Path) ->
     with pytest.raises(ChangedFileError, match="changed during the run"):
         blobs.put(FilePart(path, external=True, digest=digest_from_bytes(b"xyz")))
     path.write_bytes(b"abcd")
-    with pytest.raises(DamagedBlobError, match="is gone or changed"):
+    with pytest.raises(DamagedBlobError, match="is missing or changed"):
         blobs.get(listed)
     assert path.read_bytes() == b"abcd"  # it is the user's
 
@@ -276,7 +277,7 @@ def test_bytes_are_checked_once_in_the_life_of_a_store(tmp_path: Path) -> None:
     data = path.read_bytes()
     path.write_bytes(data[::-1])
     assert store.blobs.verified_path(ref) == path
-    with pytest.raises(DamagedBlobError, match="is damaged or gone"):
+    with pytest.raises(DamagedBlobError, match="is damaged or missing"):
         Store(tmp_path).blobs.verified_path(ref)
     assert not path.exists()
     path.write_bytes(data[::-1])
@@ -284,14 +285,14 @@ def test_bytes_are_checked_once_in_the_life_of_a_store(tmp_path: Path) -> None:
     assert isinstance(error, DamagedBlobError)
     assert str(error) == f"{path} is of no use; the same command computes it again"
     path.write_bytes(data[::-1])
-    with pytest.raises(DamagedBlobError, match="is damaged or gone"):
+    with pytest.raises(DamagedBlobError, match="is damaged or missing"):
         store.blobs.verified_path(ref)
 
 
 def test_a_blob_that_was_collected_since_it_was_verified_is_damage(tmp_path: Path) -> None:
     store = Store(tmp_path)
     for part in ({"a": 1}, np.arange(3)):
-        ref = store.blobs.put(part)  # type: ignore[arg-type]
+        ref = store.blobs.put(part)
         store.blobs.verified_path(ref).unlink()
         with pytest.raises(DamagedBlobError, match="is gone; the same command"):
             store.blobs.get(ref)
@@ -315,7 +316,7 @@ def test_an_array_with_fewer_or_more_bytes_than_it_says_is_damage(tmp_path: Path
     ref = BlobRef(digest_from_bytes(data), len(data), ".npy")
     blobs.path(ref).parent.mkdir(exist_ok=True)
     blobs.path(ref).write_bytes(data)
-    with pytest.raises(DamagedBlobError, match=r"holds nothing that pano_mvs writes \([0-9]+ bytes for an array of"):
+    with pytest.raises(DamagedBlobError, match=r"that pano_mvs does not write \([0-9]+ bytes for an array of"):
         blobs.get(ref)
 
 
@@ -353,17 +354,17 @@ def test_a_cache_goes_on_with_the_folders_that_it_has(tmp_path: Path, layout: in
 @pytest.mark.parametrize("text", ['{"layout": true}', '{"layout": 3}', '{"layout": "2"}', "[2]", "{}"])
 def test_a_cache_of_an_unknown_layout_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "layout.json").write_text(text)
-    with pytest.raises(UsageError, match=r"has layout .*, this version uses 2\. Choose another with --cache"):
+    with pytest.raises(UsageError, match=r"has layout .*, but this version uses 2\. Choose another cache with --cache"):
         Store(tmp_path)
 
 
 def test_a_cache_whose_layout_cannot_be_read_is_refused(tmp_path: Path) -> None:
     (tmp_path / "layout.json").write_text("{")
-    with pytest.raises(UsageError, match="it is not known how the cache is laid out"):
+    with pytest.raises(UsageError, match="so that the layout of the cache is unknown"):
         Store(tmp_path)
     (tmp_path / "layout.json").unlink()
     (tmp_path / "layout.json").mkdir()
-    with pytest.raises(UsageError, match=r"cannot be read .*Mend its permissions"):
+    with pytest.raises(UsageError, match=r"cannot be read .*Check its permissions"):
         Store(tmp_path)
 
 
@@ -407,7 +408,7 @@ def test_records_and_blobs_behind_links_are_neither_written_nor_removed(tmp_path
         path.parent.symlink_to(outside)
         assert path.is_file()
         before = path.read_bytes()
-        with pytest.raises(StoreError, match="is a link, which no cache has"):
+        with pytest.raises(StoreError, match="is a link, but caches have no links"):
             store.put(record) if path.suffix == ".json" else Store(tmp_path / "store").blobs.put(np.arange(3))
         if path.suffix == ".json":
             store.drop(KEY)
@@ -435,7 +436,7 @@ def test_a_digest_that_was_remembered_of_a_users_file_goes_with_what_turned_out_
 def test_a_blob_that_is_not_there_is_damage(tmp_path: Path) -> None:
     blobs = Store(tmp_path).blobs
     for ref in (BlobRef(KEY, 3, ".npy"), BlobRef(KEY, 3, ".json")):
-        with pytest.raises(DamagedBlobError, match="is damaged or gone"):
+        with pytest.raises(DamagedBlobError, match="is damaged or missing"):
             blobs.verified_path(ref)
 
 
@@ -447,7 +448,7 @@ def test_an_array_of_a_shape_that_there_cannot_be_is_damage(tmp_path: Path, shap
     ref = BlobRef(digest_from_bytes(data), len(data), ".npy")
     blobs.path(ref).parent.mkdir(exist_ok=True, parents=True)
     blobs.path(ref).write_bytes(data)
-    with pytest.raises(DamagedBlobError, match="holds nothing that pano_mvs writes"):
+    with pytest.raises(DamagedBlobError, match="has content that pano_mvs does not write"):
         blobs.get(ref)
 
 
@@ -465,16 +466,18 @@ def test_what_has_another_name_goes_from_the_scratch_folder_after_seven_days(
 
 
 def test_a_store_has_the_settings_that_it_was_opened_with(tmp_path: Path) -> None:
-    plain, other = Store(tmp_path), Store(tmp_path, durable=True, least_free_bytes=5)
-    assert LEAST_FREE_BYTES == 200_000_000  # as docs/running.md says
-    assert (plain.durable, plain.least_free_bytes, plain.blobs.durable) == (False, LEAST_FREE_BYTES, False)
-    assert (other.durable, other.least_free_bytes, other.blobs.durable) == (True, 5, True)
-    greedy = Store(tmp_path, least_free_bytes=1 << 62)
-    with pytest.raises(StoreError, match="MB are free where the cache"):
-        greedy.require_room()
-    with pytest.raises(StoreError, match="MB are free where the cache"), greedy.scratch():
+    plain, other = Store(tmp_path), Store(tmp_path, durable=True, min_free_bytes=5)
+    assert MIN_FREE_BYTES == 200_000_000  # as docs/running.md says
+    assert (plain.durable, plain.min_free_bytes, plain.blobs.durable) == (False, MIN_FREE_BYTES, False)
+    assert (other.durable, other.min_free_bytes, other.blobs.durable) == (True, 5, True)
+    greedy = Store(tmp_path, min_free_bytes=1 << 62)
+    with pytest.raises(StoreError, match="MB are free on the disk of the cache"):
+        DiskGuard(tmp_path, min_free_bytes=1 << 62).require()
+    with pytest.raises(StoreError, match="MB are free on the disk of the cache"), greedy.scratch():
         pass
-    other.require_room()
+    with other.scratch():
+        pass
+    DiskGuard(tmp_path, min_free_bytes=5).require()
     assert "is full" in str(plain.cannot_write(OSError(errno.ENOSPC, "no")))
     assert "cannot be written: no" in str(plain.cannot_write(OSError(errno.EROFS, "no")))
 

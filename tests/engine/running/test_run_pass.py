@@ -1,20 +1,20 @@
-"""The scheduler hands units out and acts on what comes back, whatever the executor does."""
+"""A pass of a run submits units and acts on their outcomes, whatever the executor does."""
 
 from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping
-from types import SimpleNamespace
 
 import pytest
-from pano_mvs.engine.running.scheduler import Scheduler, StoppedError
 
-from pano_mvs.core.errors import GateError, InputError, PanoMvsError, StoreError, UsageError
+from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError, StoreError, UsageError
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
-from pano_mvs.engine.executors.protocol import Job, Outcome
+from pano_mvs.engine.executors.protocol import Job, JobOutcome
 from pano_mvs.engine.executors.serial import SerialExecutor
-from pano_mvs.engine.running.events import RunResult, Silent
-from pano_mvs.engine.running.run import Run
+from pano_mvs.engine.planning.units import Unit
+from pano_mvs.engine.running.dispatcher import FinishedJob
+from pano_mvs.engine.running.events import RunResult, SilentObserver, UnitStatus
+from pano_mvs.engine.running.run import Run, RunPass, UnusableInputError
 from tests.engine.conftest import Toy, ran
 
 
@@ -34,7 +34,7 @@ class Shelf(SerialExecutor):
         self.capacity = 4
         self.latest_first = True
         self.memory_bytes = 0
-        self.answers: dict[str, Outcome] = {}
+        self.answers: dict[str, JobOutcome] = {}
         self.submitted: list[str] = []
         self.most = 0
 
@@ -43,7 +43,7 @@ class Shelf(SerialExecutor):
         self.submitted.append(job.unit.label)
         self.most = max(self.most, len(self._jobs))
 
-    def wait(self, timeout_s: float | None = None) -> tuple[int, Outcome] | None:
+    def wait(self, timeout_s: float | None = None) -> tuple[int, JobOutcome] | None:
         if self.latest_first:
             self._jobs[:] = self._jobs[-1:] + self._jobs[:-1]
         if timeout_s != 0 and self._jobs and self._jobs[0].unit.label in self.answers:
@@ -57,7 +57,7 @@ class Shelf(SerialExecutor):
 
 def run_with(toy: Toy, shelf: Shelf, *overrides: str) -> RunResult:
     session = toy.session(*overrides)
-    return Run(session.workflow, session.graph, Store(session.store_root), session.out, executor=shelf).execute()
+    return Run(session.workflow, session.graph, Store(session.store_root), out=session.out, executor=shelf).execute()
 
 
 @pytest.fixture
@@ -118,7 +118,7 @@ def test_where_a_unit_fails_those_of_its_key_fail_with_it(toy: Toy, shelf: Shelf
 def test_what_stops_the_run_is_raised_as_what_it_is(
     toy: Toy, shelf: Shelf, name: str, error: type[PanoMvsError]
 ) -> None:
-    shelf.answers["scaled:4.txt"] = Outcome("stopped", cause="nothing can go on", error=name)
+    shelf.answers["scaled:4.txt"] = JobOutcome("stopped", cause="nothing can go on", error=name)
     with pytest.raises(error, match="nothing can go on") as caught:
         run_with(toy, shelf)
     assert type(caught.value) is error
@@ -126,13 +126,13 @@ def test_what_stops_the_run_is_raised_as_what_it_is(
 
 
 def test_a_gate_that_a_stage_closes_ends_the_run_with_its_code(toy: Toy, shelf: Shelf) -> None:
-    shelf.answers["scaled:4.txt"] = Outcome("stopped", cause="too dark", error="GateError")
+    shelf.answers["scaled:4.txt"] = JobOutcome("stopped", cause="too dark", error="RunStoppedError")
     result = run_with(toy, shelf)
-    assert (result.exit_code, result.stopped) == (GateError.exit_code, "too dark")
+    assert (result.exit_code, result.stopped) == (RunStoppedError.exit_code, "too dark")
 
 
 def test_a_unit_that_fails_costs_what_needs_it_and_is_listed_with_its_reason(toy: Toy, shelf: Shelf) -> None:
-    shelf.answers["scaled:3.txt"] = Outcome("failed", cause="too dark", trace="line 1", seconds=2.0)
+    shelf.answers["scaled:3.txt"] = JobOutcome("failed", cause="too dark", trace="line 1", seconds=2.0)
     result = run_with(toy, shelf)
     assert result.exit_code == 3
     failure = next(one for one in result.failures if one.stage == "scaled")
@@ -146,33 +146,33 @@ def test_a_unit_that_fails_costs_what_needs_it_and_is_listed_with_its_reason(toy
 
 
 def test_a_unit_that_fails_ends_the_run_where_the_workflow_says_so(toy: Toy, shelf: Shelf) -> None:
-    shelf.answers["scaled:3.txt"] = Outcome("failed", cause="too dark")
+    shelf.answers["scaled:3.txt"] = JobOutcome("failed", cause="too dark")
     result = run_with(toy, shelf, "scaled.on_error=stop")
-    assert result.exit_code == GateError.exit_code
+    assert result.exit_code == RunStoppedError.exit_code
     assert result.stopped == "stage 'scaled' has on_error: stop, and scaled:3.txt failed: too dark"
 
 
 def test_bad_input_to_a_stage_on_which_all_wait_ends_the_run_with_its_code(toy: Toy, shelf: Shelf) -> None:
-    shelf.answers["pairs"] = Outcome("failed", cause="no such file", exit_code=InputError.exit_code)
+    shelf.answers["pairs"] = JobOutcome("failed", cause="no such file", exit_code=InputError.exit_code)
     result = run_with(toy, shelf)
     assert (result.exit_code, result.stopped) == (InputError.exit_code, "pairs: no such file")
 
 
 def test_bad_input_to_one_of_many_units_costs_that_unit(toy: Toy, shelf: Shelf) -> None:
-    shelf.answers["scaled:3.txt"] = Outcome("failed", cause="no such file", exit_code=InputError.exit_code)
+    shelf.answers["scaled:3.txt"] = JobOutcome("failed", cause="no such file", exit_code=InputError.exit_code)
     assert run_with(toy, shelf).exit_code == 3
 
 
 def test_a_failure_of_a_stage_on_which_all_wait_is_a_failure_like_others(toy: Toy, shelf: Shelf) -> None:
-    shelf.answers["pairs"] = Outcome("failed", cause="a mistake in the code")
+    shelf.answers["pairs"] = JobOutcome("failed", cause="a mistake in the code")
     result = run_with(toy, shelf)
     assert (result.exit_code, result.stopped) == (3, "")
 
 
 def test_a_stop_carries_its_code() -> None:
-    assert StoppedError("why", 5).exit_code == 5
-    assert str(StoppedError("why", 5)) == "why"
-    assert isinstance(StoppedError("why", 5), GateError)
+    assert UnusableInputError("why", 5).exit_code == 5
+    assert str(UnusableInputError("why", 5)) == "why"
+    assert isinstance(UnusableInputError("why", 5), RunStoppedError)
 
 
 def test_a_unit_that_needs_more_memory_than_there_is_fails_and_the_others_go_on(toy: Toy, shelf: Shelf) -> None:
@@ -186,18 +186,18 @@ def test_a_unit_that_needs_more_memory_than_there_is_fails_and_the_others_go_on(
     assert "pairs" not in shelf.submitted
 
 
-class Heard(Silent):
+class Heard(SilentObserver):
     """Notes what it hears of units."""
 
     def __init__(self) -> None:
         self.started: list[str] = []
         self.finished: list[tuple[str, str]] = []
 
-    def unit_started(self, stage: str, item: str) -> None:
-        self.started.append(f"{stage}:{item}")
+    def unit_started(self, name: str, item: str) -> None:
+        self.started.append(f"{name}:{item}")
 
-    def unit_finished(self, stage: str, item: str, outcome: str, seconds: float) -> None:  # type: ignore[override]
-        self.finished.append((f"{stage}:{item}", outcome))
+    def unit_finished(self, name: str, item: str, *, status: UnitStatus, seconds: float) -> None:
+        self.finished.append((f"{name}:{item}", status))
 
 
 @pytest.mark.parametrize("memory", ["1MB", "5MB"])
@@ -205,11 +205,11 @@ def test_whatever_is_computed_or_refused_is_heard_of_as_begun_and_ended(toy: Toy
     shelf.memory_bytes = 3_000_000
     session, heard = toy.session(f"pairs.memory={memory}"), Heard()
     Run(
-        session.workflow, session.graph, Store(session.store_root), session.out, executor=shelf, observer=heard
+        session.workflow, session.graph, Store(session.store_root), out=session.out, executor=shelf, observer=heard
     ).execute()
     assert [name for name in heard.started if name.startswith("pairs")] == ["pairs:"]
     assert [one for one in heard.finished if one[0] == "pairs:"] == [("pairs:", "run" if memory == "1MB" else "failed")]
-    blocked = {name for name, outcome in heard.finished if outcome == "blocked"}
+    blocked = {name for name, status in heard.finished if status == "blocked"}
     assert sorted(heard.started) == sorted(name for name, _ in heard.finished if name not in blocked)
 
 
@@ -254,7 +254,7 @@ def test_a_damaged_record_is_reported_with_its_path_and_computed_again(toy: Toy,
 def test_files_that_give_way_to_those_of_an_earlier_unit_end_the_run_if_asked(toy: Toy, shelf: Shelf) -> None:
     toy.edit("plug.py", lambda text: text.replace("mean/{item}.txt", "mean/fixed.txt"))
     result = run_with(toy, shelf, "each.on_error=stop")
-    assert result.exit_code == GateError.exit_code
+    assert result.exit_code == RunStoppedError.exit_code
     assert "stage 'each' has on_error: stop" in result.stopped
     assert "mean/fixed.txt" in result.stopped
 
@@ -263,7 +263,7 @@ def test_of_units_that_deliver_one_file_the_first_of_the_capture_stays(toy: Toy,
     """Also where a later one was there before it: that one's result is withdrawn."""
     toy.edit("plug.py", lambda text: text.replace("mean/{item}.txt", "mean/fixed.txt"))
     session = toy.session()
-    run = Run(session.workflow, session.graph, Store(session.store_root), session.out, executor=shelf)
+    run = Run(session.workflow, session.graph, Store(session.store_root), out=session.out, executor=shelf)
     result = run.execute()
     assert [one.item for one in result.failures] == ["2.txt", "3.txt", "4.txt", "5.txt"]
     assert summary(result)["each"] == (1, 0, 4, 0)
@@ -275,10 +275,10 @@ def test_of_units_that_deliver_one_file_the_first_of_the_capture_stays(toy: Toy,
 
 
 def test_a_damaged_input_is_left_for_the_next_pass(toy: Toy, shelf: Shelf) -> None:
-    shelf.answers["scaled:4.txt"] = Outcome("damaged", cause="a blob is damaged")
+    shelf.answers["scaled:4.txt"] = JobOutcome("damaged", cause="a blob is damaged")
     wait = shelf.wait
 
-    def once(timeout_s: float | None = None) -> tuple[int, Outcome] | None:
+    def once(timeout_s: float | None = None) -> tuple[int, JobOutcome] | None:
         found = wait(timeout_s)
         if found is not None and found[1].status == "damaged":
             shelf.answers.clear()
@@ -309,7 +309,7 @@ def test_a_file_whose_stored_bytes_are_damaged_is_computed_and_delivered_again(t
 def test_an_image_that_changed_is_left_out_and_the_run_goes_over_its_stages_again(toy: Toy, shelf: Shelf) -> None:
     path = toy.folder / "capture" / "3.txt"
     reason = f"{path} changed during the run"
-    shelf.answers["scaled:3.txt"] = Outcome("changed", cause=reason, changed={str(path): reason})
+    shelf.answers["scaled:3.txt"] = JobOutcome("changed", cause=reason, changed={str(path): reason})
     result = run_with(toy, shelf)
     assert result.exit_code == 3
     assert result.warnings == [reason]
@@ -320,8 +320,8 @@ def test_an_image_that_changed_is_left_out_and_the_run_goes_over_its_stages_agai
 
 
 def test_a_change_of_a_file_that_no_source_listed_is_a_failure_of_the_unit(toy: Toy, shelf: Shelf) -> None:
-    reason = "settings.csv changed during the run"
-    shelf.answers["scaled:3.txt"] = Outcome("changed", cause=reason, changed={str(toy.folder / "settings.csv"): reason})
+    path, reason = str(toy.folder / "settings.csv"), "settings.csv changed during the run"
+    shelf.answers["scaled:3.txt"] = JobOutcome("changed", cause=reason, changed={path: reason})
     result = run_with(toy, shelf)
     assert (result.exit_code, result.warnings) == (3, [])
     assert [(one.stage, one.item, one.cause) for one in result.failures if not one.blocked] == [
@@ -329,15 +329,15 @@ def test_a_change_of_a_file_that_no_source_listed_is_a_failure_of_the_unit(toy: 
     ]
 
 
-def test_results_that_come_after_the_end_of_a_pass_count_as_computed() -> None:
-    record = UnitRecord("a", {}, ItemRef("K", "d", {}))
-    outcomes = [Outcome("done", record), Outcome("failed"), Outcome("done", record)]
-    units = (SimpleNamespace(key=key) for key in "abc")
-    ended = [SimpleNamespace(unit=unit, outcome=one) for unit, one in zip(units, outcomes, strict=True)]
-    desk = SimpleNamespace(take=lambda: ended.pop(0) if ended else None)
-    unused, publisher = SimpleNamespace(), SimpleNamespace(store=None)
-    scheduler = Scheduler(
-        unused, unused, desk, publisher, keys={}, computed={"z"}, finder=lambda _: None, warn=print,  # type: ignore[arg-type]
-    )  # fmt: skip
-    scheduler.drain()
-    assert scheduler.computed == {"a", "c", "z"}
+def test_results_that_come_after_the_end_of_a_pass_count_as_computed(
+    toy: Toy, shelf: Shelf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = toy.session()
+    run = Run(session.workflow, session.graph, Store(session.store_root), out=session.out, executor=shelf)
+    run.computed.add("z")
+    record, entry = UnitRecord("a", {}, ItemRef("K", "d", {})), session.workflow.stages["scaled"]
+    outcomes = {"a": JobOutcome("done", record), "b": JobOutcome("failed"), "c": JobOutcome("done", record)}
+    ended = [FinishedJob(Unit(entry, key, (), {}, key, {}), outcome) for key, outcome in outcomes.items()]
+    monkeypatch.setattr(run.dispatcher, "next_finished", lambda: ended.pop(0) if ended else None)
+    RunPass(run, []).drain()
+    assert run.computed == {"a", "c", "z"}

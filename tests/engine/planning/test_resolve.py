@@ -19,7 +19,7 @@ from pano_mvs.engine.stages.stage import SourceItem
 from pano_mvs.engine.stages.stage_code import reach_of_function, stage_code
 from pano_mvs.scene import Axis, Pairs, Views
 from tests.engine.conftest import Toy
-from tests.engine.test_wiring import MORE
+from tests.engine.workflows.test_wiring import MORE
 
 
 def ref(name: str) -> ItemRef:
@@ -29,7 +29,7 @@ def ref(name: str) -> ItemRef:
 def images(*names: str, pending: str = "", failed: str = "") -> StageState:
     """Return the state of a stage of images; those that are pending or failed have no value."""
     there = {name: ref(name) for name in names if name not in pending and name not in failed}
-    members = {name: (name,) for name in names}
+    members: dict[str, tuple[str, ...]] = {name: (name,) for name in names}
     return StageState(Axis.IMAGE, there, {}, members, dict.fromkeys(failed, "dark"), set(pending))
 
 
@@ -52,7 +52,7 @@ class Resolved:
         self, stage: str, only: Mapping[str, frozenset[str]] | None = None, **states: StageState
     ) -> tuple[dict[str, Unit], Resolution]:
         graph = replace(self.session.graph, only=only or {})
-        units, resolution = resolve(self.session.workflow.stages[stage], graph, states, self.store)
+        units, resolution = resolve(self.session.workflow.stages[stage], graph, states=states, store=self.store)
         return {unit.item: unit for unit in units}, resolution
 
 
@@ -114,7 +114,9 @@ def test_a_pair_needs_both_ends(resolved: Resolved) -> None:
     assert list(units) == ["b | a"]
     unit = units["b | a"]
     assert unit.members == ("b", "a")
-    assert list(unit.inputs["ends"] or ()) == ["b", "a"]
+    ends = unit.inputs["ends"]
+    assert isinstance(ends, dict)
+    assert list(ends) == ["b", "a"]
     assert unit.identity["inputs"] == {"ends": ["digest of b", "digest of a"]}
     assert rest.waiting == ["b | c"]
     assert rest.blocked == {"a | d": "needs scaled:d, which failed"}
@@ -143,9 +145,9 @@ def test_without_an_index_no_unit_is_known(resolved: Resolved, stage: str) -> No
     producer = {"difference": "pairs", "mean": "views"}[stage]
     some = images("a", "b")
     for state in (whole(None, pending=True), OPEN):
-        units, rest = resolved(stage, scaled=some, **{producer: state})
+        units, rest = resolved(stage, None, scaled=some, **{producer: state})
         assert (units, rest.open, rest.blocked) == ({}, True, {})
-    units, rest = resolved(stage, scaled=some, **{producer: whole(None, failed=True)})
+    units, rest = resolved(stage, None, scaled=some, **{producer: whole(None, failed=True)})
     assert (units, rest.open) == ({}, False)
     assert rest.blocked == {WHOLE: f"needs {producer}, which failed"}
 
@@ -217,7 +219,7 @@ def test_a_key_is_made_of_the_identity_and_nothing_else(resolved: Resolved) -> N
 def sources(toy: Toy, *items: SourceItem, only: frozenset[str] | None = None) -> tuple[dict[str, Unit], Resolution]:
     entry = toy.session().workflow.stages["images"]
     spec = replace(entry.spec, list_items=lambda _: items)
-    found = resolve_source(replace(entry, spec=spec), Store(toy.folder / "cache"), only)
+    found = resolve_source(replace(entry, spec=spec), Store(toy.folder / "cache"), only=only)
     return {unit.item: unit for unit in found.units}, found
 
 
@@ -248,7 +250,7 @@ def test_items_of_a_source_that_cannot_be_used_are_blocked(toy: Toy) -> None:
     assert found.blocked.keys() == {"a", "b", "d | e"}
     assert found.blocked["a"] == "too dark"
     assert "gone: cannot be read" in found.blocked["b"]
-    assert "holds ' | ', which stands between the names of a pair" in found.blocked["d | e"]
+    assert "contains ' | ', which separates the names of a pair" in found.blocked["d | e"]
     with pytest.raises(InputError, match="images: the item 'a' is listed twice"):
         sources(toy, *[SourceItem("a", {"text": path})] * 2)
 

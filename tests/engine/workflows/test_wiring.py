@@ -123,11 +123,11 @@ def test_stages_run_in_the_order_of_the_file_but_for_what_feeds_them(wired) -> N
 
 
 def test_a_part_of_a_graph_is_what_its_ends_need(toy: Toy) -> None:
-    part = toy.session().graph.confined(["mean", "shifted"], {"mean": frozenset({"1.txt"})})
+    part = toy.session().graph.limited_to(["mean", "shifted"], {"mean": frozenset({"1.txt"})})
     assert part.order == ("images", "scaled", "shifted", "views", "mean")
     assert part.only == {"mean": frozenset({"1.txt"})}
     assert part.is_part
-    assert toy.session().graph.confined(["pairs"], {}).order == ("images", "scaled", "pairs")
+    assert toy.session().graph.limited_to(["pairs"], {}).order == ("images", "scaled", "pairs")
 
 
 def test_a_port_that_may_stay_unconnected_does(wired) -> None:  # type: ignore[no-untyped-def]
@@ -200,7 +200,7 @@ def test_the_nearest_of_several_is_taken_if_it_depends_on_the_others(wired) -> N
         (
             SOURCE + "  a: {use: toy.scale}\n  b: {use: toy.scale, in: {x: i}}\n"
             "  c: {use: toy.scale, in: {x: i}}\n  t: {use: toy.total}\n",
-            "stage 't': port xs: All[Number] could be fed by a, b, c; say which with `in: {xs: …}`",
+            "stage 't': port xs: All[Number] could be fed by a, b, c; choose with `in: {xs: …}`",
         ),
     ],
 )
