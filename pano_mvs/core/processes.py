@@ -1,4 +1,4 @@
-"""Find out which processes of this host are running, and tell apart processes that had the same id."""
+"""Find out which processes of this host are running, and distinguish processes that had the same id."""
 
 from __future__ import annotations
 

@@ -16,12 +16,12 @@ import tempfile
 import time
 from pathlib import Path
 
-from pano_mvs.cli.plan_command import without_collector
-from pano_mvs.cli.session import open_session
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
 from pano_mvs.engine.running.run import Run
+from pano_mvs.session.planning import without_collector
+from pano_mvs.session.session import open_session
 
 ITEMS = 5000
 PLUGIN = """

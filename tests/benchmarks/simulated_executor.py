@@ -58,5 +58,5 @@ def _simulated(store: Store, *_name: str, **_settings: object) -> Executor:
 
 
 if __name__ == "__main__":
-    with patch("pano_mvs.cli.run_command.make_executor", _simulated):
+    with patch("pano_mvs.session.running.make_executor", _simulated):
         main()

@@ -67,7 +67,7 @@ def test_verify_names_what_is_temporary(toy: Toy, cache: Cache) -> None:  # noqa
     assert code == 0
     assert f"scratch (of process {os.getpid()} on this host, which is running)" in said
     assert f"{folder / '.tmp-00000000-7-log.txt'} (of another host or container;" in said
-    assert f"{folder / 'worker-1.txt'} (not of this version;" in said
+    assert f"{folder / 'worker-1.txt'} (of another version;" in said
 
 
 @pytest.fixture
@@ -229,8 +229,8 @@ def test_pins_are_asked_for_properly(toy: Toy, cache: Cache) -> None:  # noqa: F
     run(toy, "one")
     run(toy, "two", "--set", "scaled.by=5")
     for run_name, name, why in (("nothing", "good", "0 runs match"), ("", "good", "2 runs match"),
-                                (str(toy.folder / "one"), "../x", "no name for a pin"),
-                                (str(toy.folder / "one"), "", "no name for a pin")):  # fmt: skip
+                                (str(toy.folder / "one"), "../x", "not a valid name of a pin"),
+                                (str(toy.folder / "one"), "", "not a valid name of a pin")):  # fmt: skip
         code, said = cache("pin", run_name, name)
         assert code == 2
         assert why in said

@@ -21,9 +21,9 @@ from pano_mvs.cli.doctor.machine import kernel_cache_finding, machine_findings
 from pano_mvs.cli.doctor.packages import is_older, package_findings
 from pano_mvs.cli.doctor.plugins import plugin_findings
 from pano_mvs.cli.doctor.probes import Outcome, library_findings, run_probe
-from pano_mvs.cli.session import presets_folder
 from pano_mvs.core.kernel_cache import kernel_cache_folder
 from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.session.session import presets_folder
 from tests.cli.conftest import Command
 from tests.permissions import permissions_hold
 

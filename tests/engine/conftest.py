@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from pano_mvs.cli.session import Session, open_session
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
 from pano_mvs.engine.running.events import RunResult
 from pano_mvs.engine.running.run import Run
+from pano_mvs.session.session import Session, open_session
 from tests.engine.toy import HELPER, PLUGIN, WORKFLOW
 
 

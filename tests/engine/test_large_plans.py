@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import gc
 
-from pano_mvs.cli.session import open_session
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.planning.plan import make_plan
 from pano_mvs.engine.planning.units import Unit
+from pano_mvs.session.session import open_session
 from tests.engine.conftest import Toy
 
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from pano_mvs.cli.session import open_session
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.running.run import Run
+from pano_mvs.session.session import open_session
 from tests.benchmarks.plan import PLUGIN, WORKFLOW
 from tests.engine.conftest import settle
 

@@ -11,7 +11,7 @@ import pytest
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.images.preview import write_preview
-from pano_mvs.report.results import Results
+from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.scene import Panorama, PointCloud, Poses, RangeMap, TwoView
 from pano_mvs.scene.index import pair_name
 from pano_mvs.testing.room import default_room, render
@@ -40,12 +40,12 @@ def tiny() -> TinyCapture:
 
 
 @pytest.fixture
-def results(tmp_path: Path, tiny: TinyCapture) -> Results:
+def results(tmp_path: Path, tiny: TinyCapture) -> StoredValues:
     """What a run over the tiny capture might have left in a store; the last two pictures have nothing in common."""
     return stored(Store(tmp_path / "cache"), tiny)
 
 
-def stored(store: Store, tiny: TinyCapture) -> Results:
+def stored(store: Store, tiny: TinyCapture) -> StoredValues:
     names = tiny.names
     pairs = {pair_name(*pair): record for pair, record in tiny.each(TwoView).items()}
     pairs[pair_name(names[2], names[3])] = TwoView.failed("only 7 of 31 matches agree", candidates=31)
@@ -56,7 +56,7 @@ def stored(store: Store, tiny: TinyCapture) -> Results:
         "ranges": {name: store.put_value(tiny.each(RangeMap)[name]) for name in names},
         "cloud": {"": store.put_value(outward(tiny))},
     }
-    return Results(store, refs)
+    return StoredValues(store, refs)
 
 
 def outward(tiny: TinyCapture) -> PointCloud:

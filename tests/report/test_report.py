@@ -14,8 +14,10 @@ import numpy as np
 import pytest
 
 from pano_mvs.report import write_report
-from pano_mvs.report.results import Results
 from pano_mvs.report.view_cards import chosen_views
+from pano_mvs.results.records import ViewSummary
+from pano_mvs.results.stored_values import StoredValues
+from pano_mvs.results.summary import RunSummary
 from tests.report.html_page import Page
 
 NAMES = ["a/1.png", "a/2.png", "a/3.png"]
@@ -71,8 +73,8 @@ SUMMARY: dict[str, Any] = {
 }  # fmt: skip
 
 
-def reported(out_dir: Path, summary: Mapping[str, Any], results: Results | None = None) -> Page:
-    write_report(out_dir, summary, results)
+def reported(out_dir: Path, summary: Mapping[str, Any], results: StoredValues | None = None) -> Page:
+    write_report(out_dir, RunSummary.from_json(summary), results)
     return Page((out_dir / "report.html").read_text(encoding="utf-8"))
 
 
@@ -132,7 +134,7 @@ def test_a_doubtful_camera_is_marked_wherever_it_is_shown(out_dir: Path) -> None
 
 
 def test_of_very_many_views_doubtful_ones_are_always_shown_in_full() -> None:
-    views = [{"name": str(idx), "completeness": 1.0, "consistent": 0.01 * idx} for idx in range(100)]
+    views = [ViewSummary(name=str(idx), metrics={"completeness": 1.0, "consistent": 0.01 * idx}) for idx in range(100)]
     assert 90 not in chosen_views(views)
     chosen = chosen_views(views, always=("90",))
     assert 90 in chosen
@@ -179,8 +181,8 @@ def test_names_and_causes_are_text_and_never_markup(out_dir: Path) -> None:
         "poses": {"registered": [evil], "centers": [[0, 0, 0]], "rejected": {evil + "2": evil}, "frame": evil,
                   "scale": evil, "links": [[evil, evil, 0, 2, None]]},
         "views": [{"name": evil, "preview": evil}], "stopped": evil, "machine": {evil: evil},
-        "stages": [{"name": evil, "use": evil, "metrics": {evil: evil}, "params": {evil: [evil]}}],
-        "scores": {"poses": {evil: 1}, "views": {evil: {evil: evil}}, "notes": [evil]}, "files": {evil: evil},
+        "stages": [{"name": evil, "use": evil, "metrics": {evil: 1}, "params": {evil: [evil]}}],
+        "scores": {"poses": {evil: 1}, "views": {evil: {evil: 1}}, "notes": [evil]}, "files": {evil: evil},
     }  # fmt: skip
     page = reported(out_dir, summary)
     assert page.tags.count("script") == 2, "ours and the facts"

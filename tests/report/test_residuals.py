@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.report.completeness import Shares, fact_of, shares_from_fact, shares_of
-from pano_mvs.report.residuals import histogram, reprojection_residuals
+from pano_mvs.results.residuals import histogram, reprojection_residuals
 from pano_mvs.scene import Poses
 from pano_mvs.testing.tiny_capture import TinyCapture
 

@@ -24,11 +24,11 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from pano_mvs.cli.session import open_session
 from pano_mvs.core.errors import PanoMvsError
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.running.run import Run
+from pano_mvs.session.session import open_session
 from tests.stress.hostile_crafted import crafted
 from tests.stress.hostile_samples import Sample, samples
 

@@ -61,7 +61,7 @@ class DaskExecutor:
         self._sources: dict[str, Any] = {}
         self._cluster: Any = None
         if not scheduler:
-            # Threads suffice for dask workers, because each has a worker process of ours.
+            # Threads suffice for dask workers, because each starts one of our worker processes.
             self._cluster = distributed.LocalCluster(
                 n_workers=1, threads_per_worker=workers, processes=False, dashboard_address=None
             )

@@ -421,7 +421,7 @@ class RunPass:
                     self._store.drop(key)
 
     def _replaced(self) -> set[str]:
-        """Return the stages whose results a finished later stage reads and delivers anew, as the same kind."""
+        """Return the stages whose results a finished later stage reads and replaces by its own, of the same kind."""
         stages, states = self._run.workflow.stages, self.queue.states
         return {
             edge.producer

@@ -164,7 +164,7 @@ class RunStatistics:
 
         Args:
             position_of: returns the position of a unit in the workflow and in the capture.
-            replaced: stages whose results later stages delivered anew: their doubts do not count any more.
+            replaced: stages whose results later stages replaced: their doubts do not count any more.
             refusals: stage and item of units whose files could not be published, to the final reason.
         """
         result = self._result

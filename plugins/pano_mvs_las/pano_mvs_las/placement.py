@@ -7,9 +7,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from pano_mvs.algorithms.poses.frame.geodesy import lla_from_local
-from pano_mvs.algorithms.poses.frame.georeference import origin_of_frame
-from pano_mvs.api import Poses, UsageError
+from pano_mvs.api import Poses, UsageError, lla_from_local, origin_of_frame
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 

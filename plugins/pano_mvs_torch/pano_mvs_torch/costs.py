@@ -7,15 +7,15 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pano_mvs.algorithms.sweep.preparation import SweepInput
-from pano_mvs.algorithms.sweep.settings import (
+from pano_mvs.api import SweepInput, pad_panorama
+from pano_mvs.api.sweep import (
     GREY_WEIGHT,
     LARGEST_COLOR_COST,
     LARGEST_GRADIENT_COST,
     ZNCC_NOISE_VARIANCE,
+    WindowBands,
+    column_offsets,
 )
-from pano_mvs.algorithms.sweep.windows import WindowBands, column_offsets
-from pano_mvs.geometry import pad_panorama
 from torch import Tensor
 
 

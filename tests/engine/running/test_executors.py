@@ -419,7 +419,7 @@ def test_executors_are_chosen_by_name_and_contradictions_refused(
         make_executor(store, "thread")
     with pytest.raises(UsageError, match="one unit at a time"):
         make_executor(store, "serial", workers=2)
-    with pytest.raises(UsageError, match="--scheduler is dask's"):
+    with pytest.raises(UsageError, match="--scheduler requires --executor dask"):
         make_executor(store, "processes", scheduler="tcp://somewhere:8786")
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from pano_mvs.cli.session import open_session, presets_folder
 from pano_mvs.core.errors import WorkflowError
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.workflow import Workflow, load_workflow
+from pano_mvs.session.session import open_session, presets_folder
 from tests.engine.conftest import Toy, ran
 
 CHILD = "pano_mvs: 1\nname: child\nextends: wf.yaml\n"
@@ -135,7 +135,7 @@ def test_mistakes_are_told_with_the_place_in_their_own_file(toy: Toy) -> None:
     assert any(line.startswith("child.yaml:5:11: stage 'pairs': unknown setting 'colour'") for line in found), found
     assert any("child.yaml:6:3: stage 'none' needs `use: NAME`; no file that is extended has" in line for line in found)
     assert any(
-        "child.yaml:7:3: stage 'away' needs `use: NAME`; there is none of that name to remove" in p for p in found
+        "child.yaml:7:3: stage 'away' needs `use: NAME`; there is no stage of that name to remove" in p for p in found
     )
     assert any(line.startswith("child.yaml:8:3: stage 'nine' needs `use: NAME`: write") for line in found)
 

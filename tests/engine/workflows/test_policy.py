@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from pano_mvs.cli.session import presets_folder
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.policy import RESERVED_KEYS
 from pano_mvs.engine.workflows.wiring import wire
 from pano_mvs.engine.workflows.workflow import WorkflowReader
+from pano_mvs.session.session import presets_folder
 from tests.engine.conftest import Toy, ran
 
 REFERENCE = Path(__file__).parents[3] / "docs" / "workflows.md"
