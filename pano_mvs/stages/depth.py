@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from pano_mvs.algorithms.sweep.backends import SWEEP_BACKENDS, backend_for, check_levels
-from pano_mvs.algorithms.sweep.costs import SWEEP_COSTS
+from pano_mvs.algorithms.sweep.backends.registry import SWEEP_BACKENDS, backend_for, check_levels
+from pano_mvs.algorithms.sweep.costs.registry import SWEEP_COSTS
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.sweep import sweep_range

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.backends import SWEEP_BACKENDS
-from pano_mvs.algorithms.sweep.costs import CostWindow, PluginCost, checked_cost, plugin_cost
+from pano_mvs.algorithms.sweep.backends.registry import SWEEP_BACKENDS
+from pano_mvs.algorithms.sweep.costs.registry import CostWindow, PluginCost, checked_cost, plugin_cost
 from pano_mvs.core.errors import UsageError
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.testing.law import Law

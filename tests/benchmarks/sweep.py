@@ -16,7 +16,7 @@ import cv2
 import numba
 import numpy as np
 
-from pano_mvs.algorithms.sweep import numba_backend
+from pano_mvs.algorithms.sweep.backends import numba_backend
 from pano_mvs.algorithms.sweep.hypotheses import virtual_ranges
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec

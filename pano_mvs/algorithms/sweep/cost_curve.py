@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.sweep.backends.numpy_backend import path_step, winners_of
 from pano_mvs.algorithms.sweep.no_match import has_match
-from pano_mvs.algorithms.sweep.numpy_backend import path_step, winners_of
 from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, step_penalties, warm_up
 from pano_mvs.algorithms.sweep.pixel_costs import costs_at, is_seen, votes_at
 from pano_mvs.algorithms.sweep.preparation import SweepInput

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.consistency import check_consistency
-from pano_mvs.algorithms.sweep.backends import helper_backend
+from pano_mvs.algorithms.sweep.backends.registry import helper_backend
 from pano_mvs.algorithms.sweep.hypotheses import range_limits
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.sweep import sweep_range

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.costs import plugin_cost
-from pano_mvs.algorithms.sweep.numpy_backend import _combined_cost
+from pano_mvs.algorithms.sweep.backends.numpy_backend import _combined_cost
+from pano_mvs.algorithms.sweep.costs.registry import plugin_cost
 from pano_mvs.algorithms.sweep.preparation import SweepInput, valid_where_seen
 from pano_mvs.geometry import pixel_from_ray, ray_from_pixel, sample_panorama
 
@@ -30,10 +30,10 @@ def costs_at(work: SweepInput, rows: NDArray[np.intp], columns: NDArray[np.intp]
 def _compiled_costs(work: SweepInput, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float32]:
     """Sweep the tiles in which the pixels lie, range by range: the winner's cost is then that of the range."""
     # On use: numba is slow to import.
-    from pano_mvs.algorithms.sweep.kernels_band import sweep_band
-    from pano_mvs.algorithms.sweep.kernels_winner import BEST
-    from pano_mvs.algorithms.sweep.numba_backend import _fresh_state
-    from pano_mvs.algorithms.sweep.tiles import run_arguments, runs_of, shared_arguments, tile_means
+    from pano_mvs.algorithms.sweep.backends.numba_backend import _fresh_state
+    from pano_mvs.algorithms.sweep.numba.kernels_band import sweep_band
+    from pano_mvs.algorithms.sweep.numba.kernels_winner import BEST
+    from pano_mvs.algorithms.sweep.numba.tiles import run_arguments, runs_of, shared_arguments, tile_means
 
     height, width = work.reference.shape[:2]
     wanted = np.zeros((height, width), np.bool_)

@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Literal
 
-from pano_mvs.algorithms.sweep.costs import plugin_cost
+from pano_mvs.algorithms.sweep.costs.registry import plugin_cost
 from pano_mvs.core.errors import UsageError
 
 # Costs are cut off: what differs by more is simply wrong. Grey levels, summed over R, G and B …

@@ -9,8 +9,8 @@ from importlib.metadata import entry_points
 import numpy as np
 import pytest
 import torch
-from pano_mvs.algorithms.sweep.numpy_backend import path_step as plain_path_step
-from pano_mvs.algorithms.sweep.numpy_backend import winners_of as plain_winners_of
+from pano_mvs.algorithms.sweep.backends.numpy_backend import path_step as plain_path_step
+from pano_mvs.algorithms.sweep.backends.numpy_backend import winners_of as plain_winners_of
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.api import Rigid3, UsageError
 from pano_mvs.geometry import roll_panorama, sample_panorama
@@ -129,6 +129,6 @@ def _nothing():
 def test_torch_is_not_imported_before_it_is_used():
     code = "import sys; from importlib.metadata import entry_points as e\n" \
            "[p.load() for p in e(group='pano_mvs.plugins')]\n" \
-           "from pano_mvs.algorithms.sweep.backends import SWEEP_BACKENDS as b\n" \
+           "from pano_mvs.algorithms.sweep.backends.registry import SWEEP_BACKENDS as b\n" \
            "assert 'torch' in b.names() and 'torch' not in sys.modules"  # fmt: skip
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -8,11 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.sweep.backends import SWEEP_BACKENDS, backend_for, helper_backend, register_sweep_backend
-from pano_mvs.algorithms.sweep.costs import SWEEP_COSTS, CostWindow, register_sweep_cost
+from pano_mvs.algorithms.sweep.backends.numpy_backend import find_winners, winners_of
+from pano_mvs.algorithms.sweep.backends.registry import (
+    SWEEP_BACKENDS,
+    backend_for,
+    helper_backend,
+    register_sweep_backend,
+)
+from pano_mvs.algorithms.sweep.backends.running_winner import RunningWinner
+from pano_mvs.algorithms.sweep.costs.registry import SWEEP_COSTS, CostWindow, register_sweep_cost
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
-from pano_mvs.algorithms.sweep.numpy_backend import find_winners, winners_of
-from pano_mvs.algorithms.sweep.running_winner import RunningWinner
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.algorithms.sweep.windows import WindowBands, column_offsets
 from pano_mvs.core.errors import ContractError, PluginError, UsageError

@@ -10,15 +10,15 @@ import numba
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.sweep.guided import STEPS, GuidedSweep
+from pano_mvs.algorithms.sweep.backends.numba_backend import _fresh_state
+from pano_mvs.algorithms.sweep.coarse_to_fine.guided import STEPS, GuidedSweep
+from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guided_paths import follow_rows, follow_tube
+from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guides import adopt_candidates, split_layers
 from pano_mvs.algorithms.sweep.hypotheses import virtual_ranges
-from pano_mvs.algorithms.sweep.kernels_band import sweep_band
-from pano_mvs.algorithms.sweep.kernels_layers import adopt_candidates, split_layers
-from pano_mvs.algorithms.sweep.kernels_tube import follow_rows, follow_tube
-from pano_mvs.algorithms.sweep.numba_backend import _fresh_state
+from pano_mvs.algorithms.sweep.numba.kernels_band import sweep_band
+from pano_mvs.algorithms.sweep.numba.tiles import run_arguments, runs_of, shared_arguments, spread_tiles, tile_means
 from pano_mvs.algorithms.sweep.preparation import SweepInput, prepare_picture
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
-from pano_mvs.algorithms.sweep.tiles import run_arguments, runs_of, shared_arguments, spread_tiles, tile_means
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pad_panorama, roll_panorama
 from pano_mvs.testing.room import Room, capture_poses, default_room, render
@@ -57,7 +57,7 @@ def test_around_a_flat_guide_costs_are_those_of_the_plain_sweep(changes):
     _compare_with_the_plain_sweep(64, SweepSettings(planes=20, exposure=False, **changes))
 
 
-@pytest.mark.kernel("sweep.kernels_guided", "sweep.kernels_band")
+@pytest.mark.kernel("sweep.coarse_to_fine.kernels_guided", "sweep.numba.kernels_band")
 def test_around_a_flat_guide_costs_of_a_tiny_picture_are_those_of_the_plain_sweep():
     """Small enough to run as plain Python too."""
     _compare_with_the_plain_sweep(16, SweepSettings(planes=14, window=3, exposure=False))
@@ -112,7 +112,7 @@ def test_runs_cover_the_tiles_that_are_set_and_no_others():
     ].flags.c_contiguous
 
 
-@pytest.mark.kernel("sweep.kernels_tube")
+@pytest.mark.kernel("sweep.coarse_to_fine.kernels_guided_paths")
 @pytest.mark.parametrize("upward", [False, True])
 @pytest.mark.parametrize("drift", [0, 1, -1])
 def test_paths_among_candidates_follow_the_definition(drift, upward):
@@ -135,7 +135,7 @@ def test_paths_among_candidates_follow_the_definition(drift, upward):
     assert np.array_equal(total, expected)
 
 
-@pytest.mark.kernel("sweep.kernels_tube")
+@pytest.mark.kernel("sweep.coarse_to_fine.kernels_guided_paths")
 def test_paths_along_rows_go_around_the_sphere():
     rng = np.random.default_rng(8)
     height, width, count = 3, 20, 3
@@ -154,7 +154,7 @@ def test_paths_along_rows_go_around_the_sphere():
     assert np.array_equal(total, expected)
 
 
-@pytest.mark.kernel("sweep.kernels_layers")
+@pytest.mark.kernel("sweep.coarse_to_fine.kernels_guides")
 def test_two_surfaces_are_told_apart_and_one_is_not_split():
     positions = np.full((12, 16), 10.0, np.float32)
     positions[:, 8:] = 30.0
@@ -168,7 +168,7 @@ def test_two_surfaces_are_told_apart_and_one_is_not_split():
     assert np.array_equal(layers[0], layers[1])
 
 
-@pytest.mark.kernel("sweep.kernels_layers")
+@pytest.mark.kernel("sweep.coarse_to_fine.kernels_guides")
 def test_candidates_are_adopted_with_those_that_agree():
     found, costs = np.full((9, 9), 50.0, np.float32), np.full((9, 9), np.inf, np.float32)
     found[4, 4:6], costs[4, 4:6] = (10, 12), (1, 2)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.sweep import numba_backend
+from pano_mvs.algorithms.sweep.backends import numba_backend
+from pano_mvs.algorithms.sweep.backends.numpy_backend import _aggregate, _source_cost, find_winners
 from pano_mvs.algorithms.sweep.cost_curve import cost_curve
-from pano_mvs.algorithms.sweep.costs import SWEEP_COSTS, register_sweep_cost
-from pano_mvs.algorithms.sweep.numpy_backend import _aggregate, _source_cost, find_winners
+from pano_mvs.algorithms.sweep.costs.registry import SWEEP_COSTS, register_sweep_cost
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_input, sweep_range
 from pano_mvs.core.errors import UsageError

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.sweep.combination import parallax_weights
-from pano_mvs.algorithms.sweep.costs import BUILTIN_COSTS
-from pano_mvs.algorithms.sweep.kernels_gradient import census_gradient_row, sad_gradient_row
-from pano_mvs.algorithms.sweep.kernels_zncc import zncc_rows
+from pano_mvs.algorithms.sweep.costs.registry import BUILTIN_COSTS
+from pano_mvs.algorithms.sweep.numba.kernels_gradient import census_gradient_row, sad_gradient_row
+from pano_mvs.algorithms.sweep.numba.kernels_zncc import zncc_rows
 from pano_mvs.algorithms.sweep.settings import (
     GREY_WEIGHT,
     LARGEST_COLOR_COST,
@@ -52,7 +52,7 @@ def good_share(result, truth, ratio=1.07):
     return float((np.maximum(result.range / truth, truth / result.range) < ratio).mean())
 
 
-@pytest.mark.kernel("sweep.kernels_zncc")
+@pytest.mark.kernel("sweep.numba.kernels_zncc")
 @pytest.mark.parametrize("first", [0, 6, 13])
 def test_correlation_by_running_sums_equals_the_definition(first):
     rng = np.random.default_rng(first)
@@ -78,7 +78,7 @@ def test_correlation_by_running_sums_equals_the_definition(first):
     np.testing.assert_allclose(means, expected, atol=2e-4)
 
 
-@pytest.mark.kernel("sweep.kernels_gradient")
+@pytest.mark.kernel("sweep.numba.kernels_gradient")
 @pytest.mark.parametrize("row", [0, 7, 15])
 def test_differences_of_colours_and_gradients_equal_the_definition(row):
     rng = np.random.default_rng(row)
@@ -95,7 +95,7 @@ def test_differences_of_colours_and_gradients_equal_the_definition(row):
     assert len(set(expected)) > 5
 
 
-@pytest.mark.kernel("sweep.kernels_gradient")
+@pytest.mark.kernel("sweep.numba.kernels_gradient")
 def test_census_beside_grey_levels_equals_the_definition():
     rng = np.random.default_rng(5)
     reference = rng.integers(0, 256, SIZE, dtype=np.uint8)

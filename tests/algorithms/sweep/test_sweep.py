@@ -79,7 +79,11 @@ def test_the_compiled_sweep_equals_the_readable_one(settings, masked, source_hei
 
 
 @pytest.mark.kernel(
-    "sweep.kernels_band", "sweep.kernels_sgm", "sweep.kernels_lookup", "sweep.kernels_warp", "sweep.kernels_winner"
+    "sweep.numba.kernels_band",
+    "sweep.numba.kernels_sgm",
+    "sweep.numba.kernels_lookup",
+    "sweep.numba.kernels_warp",
+    "sweep.numba.kernels_winner",
 )
 @pytest.mark.parametrize("changes", [{}, {"cost": "sad", "aggregation": "box"}])
 def test_a_tiny_sweep_equals_the_readable_one(changes):

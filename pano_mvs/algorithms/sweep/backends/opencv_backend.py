@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.sweep.backends.numpy_backend import combine_costs, pixel_cost
+from pano_mvs.algorithms.sweep.backends.running_winner import RunningWinner
 from pano_mvs.algorithms.sweep.combination import source_weights
-from pano_mvs.algorithms.sweep.costs import CostWindow
-from pano_mvs.algorithms.sweep.numpy_backend import combine_costs, pixel_cost
+from pano_mvs.algorithms.sweep.costs.registry import CostWindow
 from pano_mvs.algorithms.sweep.preparation import SweepInput
-from pano_mvs.algorithms.sweep.running_winner import RunningWinner
 from pano_mvs.algorithms.sweep.settings import ZNCC_NOISE_VARIANCE
 from pano_mvs.algorithms.sweep.windows import WindowBands
 from pano_mvs.algorithms.sweep.winner import Winners
@@ -58,7 +58,7 @@ def find_winners(work: SweepInput) -> Winners:
             winner.add(combined)
     if not with_volume:
         return winner.result()
-    from pano_mvs.algorithms.sweep.numba_backend import winners_by_paths  # on use: numba is slow to import
+    from pano_mvs.algorithms.sweep.backends.numba_backend import winners_by_paths  # on use: numba is slow to import
 
     return winners_by_paths(work, volume)
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from pano_mvs.algorithms.sweep.kernels_cost import census_row
-from pano_mvs.algorithms.sweep.kernels_vector import CENSUS_PIXELS, HAS_VECTOR, census_block
+from pano_mvs.algorithms.sweep.numba.kernels_cost import census_row
+from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import CENSUS_PIXELS, HAS_VECTOR, census_block
 
 _U = np.uint64
 

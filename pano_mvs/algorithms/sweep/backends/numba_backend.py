@@ -25,12 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.combination import source_weights
-from pano_mvs.algorithms.sweep.kernels_band import sweep_band
-from pano_mvs.algorithms.sweep.kernels_cost import COSTS
-from pano_mvs.algorithms.sweep.kernels_sgm import sweep_row, sweep_strip
-from pano_mvs.algorithms.sweep.kernels_vector import HAS_VECTOR
-from pano_mvs.algorithms.sweep.kernels_winner import AFTER, BEFORE, BEST, RIVAL, STATES, winners_of_rows
-from pano_mvs.algorithms.sweep.packing import pack_sources, pack_votes
+from pano_mvs.algorithms.sweep.numba.kernels_band import sweep_band
+from pano_mvs.algorithms.sweep.numba.kernels_cost import COSTS
+from pano_mvs.algorithms.sweep.numba.kernels_sgm import sweep_row, sweep_strip
+from pano_mvs.algorithms.sweep.numba.kernels_winner import AFTER, BEFORE, BEST, RIVAL, STATES, winners_of_rows
+from pano_mvs.algorithms.sweep.numba.packing import pack_sources, pack_votes
+from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR
 from pano_mvs.algorithms.sweep.penalties import step_penalties, warm_up
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.settings import SweepSettings

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from pano_mvs.algorithms.sweep.kernels_census import count_census_row
-from pano_mvs.algorithms.sweep.kernels_combine import combine_row
-from pano_mvs.algorithms.sweep.kernels_cost import (
+from pano_mvs.algorithms.sweep.numba.kernels_census import count_census_row
+from pano_mvs.algorithms.sweep.numba.kernels_combine import combine_row
+from pano_mvs.algorithms.sweep.numba.kernels_cost import (
     CENSUS,
     CENSUS_GRADIENT,
     SAD,
@@ -16,20 +16,20 @@ from pano_mvs.algorithms.sweep.kernels_cost import (
     box_rows,
     difference_row,
 )
-from pano_mvs.algorithms.sweep.kernels_gradient import census_gradient_row, sad_gradient_row
-from pano_mvs.algorithms.sweep.kernels_lookup import warp_band
-from pano_mvs.algorithms.sweep.kernels_project import knot_rows
-from pano_mvs.algorithms.sweep.kernels_sad import (
+from pano_mvs.algorithms.sweep.numba.kernels_gradient import census_gradient_row, sad_gradient_row
+from pano_mvs.algorithms.sweep.numba.kernels_lookup import warp_band
+from pano_mvs.algorithms.sweep.numba.kernels_project import knot_rows
+from pano_mvs.algorithms.sweep.numba.kernels_sad import (
     add_differences,
     average_differences,
     divide_row,
     interleave_rows,
     one_box_serves,
 )
-from pano_mvs.algorithms.sweep.kernels_vector import PIXELS
-from pano_mvs.algorithms.sweep.kernels_warp import wrap_row
-from pano_mvs.algorithms.sweep.kernels_winner import PLANES_AT_ONCE, update_winners
-from pano_mvs.algorithms.sweep.kernels_zncc import zncc_rows
+from pano_mvs.algorithms.sweep.numba.kernels_warp import wrap_row
+from pano_mvs.algorithms.sweep.numba.kernels_winner import PLANES_AT_ONCE, update_winners
+from pano_mvs.algorithms.sweep.numba.kernels_zncc import zncc_rows
+from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import PIXELS
 
 _F = np.float32
 _U = np.uint64

@@ -13,7 +13,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from pano_mvs.algorithms.sweep.kernels_vector import REGISTER_BYTES, element_pointer, load_unaligned
+from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import REGISTER_BYTES, element_pointer, load_unaligned
 
 LINES: Final = REGISTER_BYTES // 2
 """How many paths one call advances."""

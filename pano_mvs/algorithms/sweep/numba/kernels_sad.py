@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from pano_mvs.algorithms.sweep.kernels_combine import ENOUGH
-from pano_mvs.algorithms.sweep.kernels_cost import box_rows, difference_row
-from pano_mvs.algorithms.sweep.kernels_vector import HAS_VECTOR, PIXELS, difference_rgb_block
-from pano_mvs.algorithms.sweep.kernels_warp import wrap_row
+from pano_mvs.algorithms.sweep.numba.kernels_combine import ENOUGH
+from pano_mvs.algorithms.sweep.numba.kernels_cost import box_rows, difference_row
+from pano_mvs.algorithms.sweep.numba.kernels_warp import wrap_row
+from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR, PIXELS, difference_rgb_block
 
 _F = np.float32
 _U = np.uint64

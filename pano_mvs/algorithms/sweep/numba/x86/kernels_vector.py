@@ -17,7 +17,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from pano_mvs.algorithms.sweep.kernels_warp import HALFWAY_ROUND, HALFWAY_SHIFT, ROUND, SHIFT
+from pano_mvs.algorithms.sweep.numba.kernels_warp import HALFWAY_ROUND, HALFWAY_SHIFT, ROUND, SHIFT
 
 
 def _lanes_of_this_machine() -> int:

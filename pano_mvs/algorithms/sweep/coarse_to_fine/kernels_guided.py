@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from pano_mvs.algorithms.sweep.kernels_band import source_cost, store_row
-from pano_mvs.algorithms.sweep.kernels_combine import combine_row
-from pano_mvs.algorithms.sweep.kernels_lookup import _sample_planes, _sample_rgb
-from pano_mvs.algorithms.sweep.kernels_warp import _atan_unit, place_row, wrap_row
+from pano_mvs.algorithms.sweep.numba.kernels_band import source_cost, store_row
+from pano_mvs.algorithms.sweep.numba.kernels_combine import combine_row
+from pano_mvs.algorithms.sweep.numba.kernels_lookup import _sample_planes, _sample_rgb
+from pano_mvs.algorithms.sweep.numba.kernels_warp import _atan_unit, place_row, wrap_row
 
 _F = np.float32
 _U = np.uint64

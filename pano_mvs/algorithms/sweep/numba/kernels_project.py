@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from pano_mvs.algorithms.sweep.kernels_warp import project_row
+from pano_mvs.algorithms.sweep.numba.kernels_warp import project_row
 
 _F = np.float32
 _U = np.uint64

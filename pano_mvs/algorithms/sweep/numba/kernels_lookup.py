@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from pano_mvs.algorithms.sweep.kernels_project import (
+from pano_mvs.algorithms.sweep.numba.kernels_project import (
     EVERY,
     fit_group,
     follow_curve,
@@ -14,9 +14,9 @@ from pano_mvs.algorithms.sweep.kernels_project import (
     replace_rough,
     rough_runs,
 )  # fmt: skip
-from pano_mvs.algorithms.sweep.kernels_sad import add_sampled_differences
-from pano_mvs.algorithms.sweep.kernels_vector import HAS_VECTOR, PIXELS, blend_grey_block, sample_rgb_block
-from pano_mvs.algorithms.sweep.kernels_warp import blend_row, gather_row, place_row, project_row, wrap_row
+from pano_mvs.algorithms.sweep.numba.kernels_sad import add_sampled_differences
+from pano_mvs.algorithms.sweep.numba.kernels_warp import blend_row, gather_row, place_row, project_row, wrap_row
+from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR, PIXELS, blend_grey_block, sample_rgb_block
 
 _F = np.float32
 _U = np.uint64

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from pano_mvs.algorithms.sweep.kernels_cost import box_rows
+from pano_mvs.algorithms.sweep.numba.kernels_cost import box_rows
 from pano_mvs.algorithms.sweep.settings import ZNCC_NOISE_VARIANCE
 
 _F = np.float32

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from pano_mvs.algorithms.sweep.kernels_census import count_census_row
-from pano_mvs.algorithms.sweep.kernels_cost import difference_row
+from pano_mvs.algorithms.sweep.numba.kernels_census import count_census_row
+from pano_mvs.algorithms.sweep.numba.kernels_cost import difference_row
 from pano_mvs.algorithms.sweep.settings import GREY_WEIGHT, LARGEST_COLOR_COST, LARGEST_GRADIENT_COST
 
 _U = np.uint64

@@ -20,11 +20,11 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep import numba_backend
+from pano_mvs.algorithms.sweep.backends import numba_backend
+from pano_mvs.algorithms.sweep.coarse_to_fine.guided import GuidedSweep
+from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guides import split_layers
 from pano_mvs.algorithms.sweep.exposure import shrink
-from pano_mvs.algorithms.sweep.guided import GuidedSweep
 from pano_mvs.algorithms.sweep.hypotheses import virtual_ranges
-from pano_mvs.algorithms.sweep.kernels_layers import split_layers
 from pano_mvs.algorithms.sweep.preparation import SweepInput, voting_pixels
 from pano_mvs.algorithms.sweep.winner import Winners, subplane_offset
 from pano_mvs.geometry import pad_panorama

@@ -10,8 +10,8 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
-from pano_mvs.algorithms.sweep import numpy_backend, opencv_backend
-from pano_mvs.algorithms.sweep.costs import BUILTIN_COSTS, SWEEP_COSTS
+from pano_mvs.algorithms.sweep.backends import numpy_backend, opencv_backend
+from pano_mvs.algorithms.sweep.costs.registry import BUILTIN_COSTS, SWEEP_COSTS
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.winner import Winners
 from pano_mvs.core.errors import UsageError
@@ -50,10 +50,10 @@ class SweepBackend:
 
 
 def _numba(work: SweepInput) -> Winners:
-    from pano_mvs.algorithms.sweep import numba_backend  # on use: numba is slow to import
+    from pano_mvs.algorithms.sweep.backends import numba_backend
 
     if work.settings.levels > 1:
-        from pano_mvs.algorithms.sweep import coarse_to_fine
+        from pano_mvs.algorithms.sweep.coarse_to_fine import coarse_to_fine
 
         return coarse_to_fine.find_winners(work)
     return numba_backend.find_winners(work)

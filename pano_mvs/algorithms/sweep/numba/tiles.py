@@ -10,8 +10,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.kernels_band import sweep_band
-from pano_mvs.algorithms.sweep.numba_backend import _band_arguments
+from pano_mvs.algorithms.sweep.backends.numba_backend import _band_arguments
+from pano_mvs.algorithms.sweep.numba.kernels_band import sweep_band
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 
 BAND_ROWS = 32

@@ -8,18 +8,21 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.sweep.backends.numba_backend import _fresh_state as fresh_state
+from pano_mvs.algorithms.sweep.backends.numba_backend import _run as run_all
+from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guided import sweep_guided_band
+from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guided_paths import (
+    PER_PLANE,
+    cheapest_candidates,
+    follow_rows,
+    follow_tube,
+)
+from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guides import adopt_candidates
 from pano_mvs.algorithms.sweep.hypotheses import range_at
-from pano_mvs.algorithms.sweep.kernels_band import sweep_band
-from pano_mvs.algorithms.sweep.kernels_guided import sweep_guided_band
-from pano_mvs.algorithms.sweep.kernels_layers import adopt_candidates
-from pano_mvs.algorithms.sweep.kernels_tube import PER_PLANE, cheapest_candidates, follow_rows, follow_tube
-from pano_mvs.algorithms.sweep.kernels_winner import BEST
 from pano_mvs.algorithms.sweep.no_match import is_bare
-from pano_mvs.algorithms.sweep.numba_backend import _fresh_state as fresh_state
-from pano_mvs.algorithms.sweep.numba_backend import _run as run_all
-from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, step_penalties, warm_up
-from pano_mvs.algorithms.sweep.preparation import SweepInput
-from pano_mvs.algorithms.sweep.tiles import (
+from pano_mvs.algorithms.sweep.numba.kernels_band import sweep_band
+from pano_mvs.algorithms.sweep.numba.kernels_winner import BEST
+from pano_mvs.algorithms.sweep.numba.tiles import (
     BAND_ROWS,
     Run,
     run_arguments,
@@ -28,6 +31,8 @@ from pano_mvs.algorithms.sweep.tiles import (
     spread_tiles,
     tile_means,
 )
+from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, step_penalties, warm_up
+from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.winner import Winners
 from pano_mvs.geometry import pad_panorama
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from pano_mvs.algorithms.sweep.kernels_vector import HAS_VECTOR, REGISTER_BYTES
-from pano_mvs.algorithms.sweep.kernels_vector_winner import (
+from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR, REGISTER_BYTES
+from pano_mvs.algorithms.sweep.numba.x86.kernels_vector_winner import (
     AFTER,
     BEFORE,
     BEST,

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from pano_mvs.algorithms.sweep.kernels_vector import HAS_VECTOR
-from pano_mvs.algorithms.sweep.kernels_vector_path import LINES, step_lines
+from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR
+from pano_mvs.algorithms.sweep.numba.x86.kernels_vector_path import LINES, step_lines
 
 _U = np.uint64
 _H = np.uint16

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.combination import source_weights
-from pano_mvs.algorithms.sweep.costs import CostWindow, checked_cost, plugin_cost
+from pano_mvs.algorithms.sweep.costs.registry import CostWindow, checked_cost, plugin_cost
 from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, step_penalties, warm_up
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.settings import (
