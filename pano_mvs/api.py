@@ -11,8 +11,9 @@ def my_sweep(ref: Each[Panorama], pose: Each[Pose], sources: Near[Panorama], sou
 """
 
 from pano_mvs.algorithms.sweep.backends.registry import register_sweep_backend
-from pano_mvs.algorithms.sweep.costs.registry import CostWindow, register_sweep_cost
+from pano_mvs.algorithms.sweep.costs.registry import register_sweep_cost
 from pano_mvs.algorithms.sweep.preparation import SweepInput
+from pano_mvs.algorithms.sweep.windows import CostWindow
 from pano_mvs.algorithms.sweep.winner import Winners
 from pano_mvs.core.errors import GateError, InputError, PanoMvsError, UsageError
 from pano_mvs.core.parts import Parts

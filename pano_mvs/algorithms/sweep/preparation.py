@@ -46,7 +46,7 @@ def prepare_picture(picture: NDArray[np.uint8], settings: SweepSettings) -> NDAr
     """Return the picture as it is compared, (H, W, 3) RGB to (H, W, 1) grey or (H, W, 3), prefiltered if asked for."""
     if settings.prefilter_diameter:
         picture = _bilateral(picture, settings)
-    if settings.compares_colors:
+    if settings.matching_cost.colors:
         return np.ascontiguousarray(picture)
     grey = np.empty((*picture.shape[:2], 1), np.uint8)
     for first in range(0, len(picture), _ROWS_AT_ONCE):  # 16 bits of all colours at once would be a picture six times

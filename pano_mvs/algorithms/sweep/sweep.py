@@ -13,7 +13,7 @@ from math import ceil
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.backends.registry import backend_for, check_levels, helper_backend
+from pano_mvs.algorithms.sweep.backends.registry import backend_for, helper_backend
 from pano_mvs.algorithms.sweep.exposure import match_all, shrink
 from pano_mvs.algorithms.sweep.hypotheses import virtual_ranges
 from pano_mvs.algorithms.sweep.no_match import has_match
@@ -71,8 +71,7 @@ def sweep_range(
         UsageError: if shapes, types or numbers do not fit together, or near and far are no limits.
     """
     settings = settings or SweepSettings()
-    compute = backend_for(backend, settings.cost).find_winners
-    check_levels(backend, settings.levels)
+    compute = backend_for(backend, settings).find_winners
     work = sweep_input(
         reference, sources, source_from_reference, near=near, far=far, settings=settings, backend=backend,
         device=device, reference_mask=reference_mask, source_masks=source_masks,
@@ -102,7 +101,7 @@ def sweep_input(
     _check_picture("reference", reference, reference_mask)
     masks = _checked_sources(sources, source_from_reference, source_masks)
     ranges = virtual_ranges(near, far, planes=settings.planes, spacing=settings.spacing)
-    if settings.exposure and settings.minds_exposure:
+    if settings.exposure and settings.matching_cost.minds_exposure:
         rough = _rough_range(
             reference, sources, source_from_reference, near=near, far=far, backend=backend, device=device,
             masks=(reference_mask, masks),

@@ -39,6 +39,12 @@ class Winners:
     rival: NDArray[np.float32]
     lean: NDArray[np.float32] | None = None
 
+    @staticmethod
+    def unset(size_hw: tuple[int, int]) -> Winners:
+        """Return winners of a picture that are yet to be written."""
+        costs = [np.empty(size_hw, np.float32) for _ in range(4)]
+        return Winners(np.empty(size_hw, np.int32), *costs)
+
     @property
     def position(self) -> NDArray[np.float64]:
         """Where the winner lies among the planes, (H, W)."""

@@ -18,7 +18,7 @@ _STAGE_DECORATORS = frozenset(
 
 _PURE_DECORATORS = frozenset({
     "njit", "jit", "vectorize", "guvectorize", "intrinsic", "dataclass", "cache", "lru_cache", "contextmanager",
-    "total_ordering", "wraps", "runtime_checkable", "final", "unique",
+    "total_ordering", "wraps", "runtime_checkable", "final", "unique", "params_from",
 })  # fmt: skip
 """Register nothing anywhere, unlike others for all that is known."""
 

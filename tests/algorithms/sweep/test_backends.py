@@ -16,10 +16,10 @@ from pano_mvs.algorithms.sweep.backends.registry import (
     register_sweep_backend,
 )
 from pano_mvs.algorithms.sweep.backends.running_winner import RunningWinner
-from pano_mvs.algorithms.sweep.costs.registry import SWEEP_COSTS, CostWindow, register_sweep_cost
+from pano_mvs.algorithms.sweep.costs.registry import SWEEP_COSTS, register_sweep_cost
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
-from pano_mvs.algorithms.sweep.windows import WindowBands, column_offsets
+from pano_mvs.algorithms.sweep.windows import CostWindow, WindowBands, column_offsets
 from pano_mvs.core.errors import ContractError, PluginError, UsageError
 from pano_mvs.geometry import Rigid3
 from pano_mvs.testing.room import capture_poses, default_room, render
@@ -143,7 +143,7 @@ def test_the_small_sweeps_behind_a_sweep_need_not_be_the_backends_own(ours):
     )  # fmt: skip
     found.check()
     with pytest.raises(UsageError, match="'differences' does not have the cost 'census'; those that do: numba, numpy"):
-        backend_for("differences", "census")
+        backend_for("differences", SweepSettings())
 
 
 def test_built_in_names_are_not_to_be_taken(ours):

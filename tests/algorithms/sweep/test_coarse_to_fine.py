@@ -10,13 +10,13 @@ import numba
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.sweep.backends.numba_backend import _fresh_state
 from pano_mvs.algorithms.sweep.coarse_to_fine.guided import STEPS, GuidedSweep
-from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guided_paths import follow_rows, follow_tube
+from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guided_paths import follow_guided_rows, follow_guided_strip
 from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guides import adopt_candidates, split_layers
 from pano_mvs.algorithms.sweep.hypotheses import virtual_ranges
+from pano_mvs.algorithms.sweep.numba.arguments import fresh_state, sweep_arguments
 from pano_mvs.algorithms.sweep.numba.kernels_band import sweep_band
-from pano_mvs.algorithms.sweep.numba.tiles import run_arguments, runs_of, shared_arguments, spread_tiles, tile_means
+from pano_mvs.algorithms.sweep.numba.tiles import run_arguments, runs_of, spread_tiles, tile_means
 from pano_mvs.algorithms.sweep.preparation import SweepInput, prepare_picture
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.core.errors import UsageError
@@ -66,10 +66,10 @@ def test_around_a_flat_guide_costs_of_a_tiny_picture_are_those_of_the_plain_swee
 def _compare_with_the_plain_sweep(height, settings):
     work, bands = _work(height, settings), range(0, height, 32)
     plain = np.empty((height, settings.planes, 2 * height), np.uint8)
-    shared = shared_arguments(work)
+    shared = sweep_arguments(work)
     for first in bands:
         rows = min(32, height - first)
-        sweep_band(first, *shared.values(), plain[first : first + rows], *_fresh_state(rows, 2 * height))
+        sweep_band(first, shared, work.ranges, plain[first : first + rows], *fresh_state(rows, 2 * height))
     with ThreadPoolExecutor(1) as pool:
         sweep = GuidedSweep(work, np.full((2, height, 2 * height), 9.0, np.float32), pool)
         sweep._sweep(0, np.ones((height, 2 * height), np.bool_))
@@ -101,15 +101,14 @@ def test_runs_cover_the_tiles_that_are_set_and_no_others():
     size_hw = (80, 400)
     tiles = rng.random((3, 7)) < 0.4
     tiles[1] = True
-    shared = shared_arguments(_work(64, SweepSettings(planes=20)))
+    shared = sweep_arguments(_work(64, SweepSettings(planes=20)))
     covered = np.zeros(size_hw, int)
-    for run in runs_of(tiles, size_hw, shared):
+    for run in runs_of(tiles, size_hw, shared.windows):
         covered[run.place] += 1
         assert (run.margin == 0) == (run.columns == 400)
     assert np.array_equal(covered, spread_tiles(tiles, size_hw).astype(int))
-    assert run_arguments(shared, runs_of(np.array([[True, False, False]]), (32, 128), shared)[0])[
-        "reference"
-    ].flags.c_contiguous
+    run = runs_of(np.array([[True, False, False]]), (32, 128), shared.windows)[0]
+    assert run_arguments(shared, run).reference.flags.c_contiguous
 
 
 @pytest.mark.kernel("sweep.coarse_to_fine.kernels_guided_paths")
@@ -124,7 +123,7 @@ def test_paths_among_candidates_follow_the_definition(drift, upward):
     total = np.zeros(volume.shape, np.uint16)
     for first in (0, 5):  # two strips, one of which crosses the seam
         lines = 5 if first == 0 else 7
-        follow_tube(volume, total, guides, penalties, np.uint16(40), first, lines, drift, upward, 0, True)
+        follow_guided_strip(volume, total, guides, penalties, np.uint16(40), first, lines, drift, upward, 0, True)
     expected = np.zeros(volume.shape)
     for column in range(width):
         rows = np.arange(height)[:: -1 if upward else 1]
@@ -143,7 +142,7 @@ def test_paths_along_rows_go_around_the_sphere():
     guides = rng.integers(0, 60, (height, 2, width)).astype(np.int16)
     penalties = rng.integers(60, 300, (2, height, width)).astype(np.uint16)
     total = np.zeros(volume.shape, np.uint16)
-    follow_rows(volume, total, guides, penalties, np.uint16(40), 0, height, width)
+    follow_guided_rows(volume, total, guides, penalties, np.uint16(40), 0, height, width)
     expected = np.zeros(volume.shape)
     for row in range(height):
         for way, step in enumerate((1, -1)):
@@ -242,7 +241,7 @@ def test_the_number_of_threads_changes_no_bit():
 
 def test_only_the_compiled_backend_has_levels():
     pictures, poses, _ = _capture(64)
-    with pytest.raises(UsageError, match="needs the sweep backend 'numba'"):
+    with pytest.raises(UsageError, match="needs the sweep backend numba, got 'numpy'"):
         _sweep(pictures, poses, PLAIN.replace(levels=2), backend="numpy")
     with pytest.raises(UsageError, match="levels must be"):
         SweepSettings(levels=0)

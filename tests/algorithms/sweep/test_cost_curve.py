@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.sweep.backends import numba_backend
 from pano_mvs.algorithms.sweep.backends.numpy_backend import _aggregate, _source_cost, find_winners
 from pano_mvs.algorithms.sweep.cost_curve import cost_curve
 from pano_mvs.algorithms.sweep.costs.registry import SWEEP_COSTS, register_sweep_cost
+from pano_mvs.algorithms.sweep.numba.arguments import fresh_state, sweep_arguments
+from pano_mvs.algorithms.sweep.numba.kernels_band import sweep_band
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_input, sweep_range
 from pano_mvs.core.errors import UsageError
@@ -65,9 +66,7 @@ def test_paths_end_in_the_pixel_with_the_sums_of_the_volume():
             if costs is not None:
                 volume[row, :, column] = np.rint(costs.raw * 255)
     stored = np.empty((24, 9, 48), np.uint8)
-    prepared = numba_backend._band_arguments(work)
-    state, planes = numba_backend._fresh_state(24, 48)
-    numba_backend.sweep_band(0, *prepared, stored, state, planes)
+    sweep_band(0, sweep_arguments(work), work.ranges, stored, *fresh_state(24, 48))
     total = _aggregate(stored.astype(np.int64), work)
     for row in (0, 12, 23):
         for column in (3, 19, 35):

@@ -8,11 +8,12 @@ from numba import njit
 
 from pano_mvs.algorithms.sweep.backends.numpy_backend import path_step, winners_of
 from pano_mvs.algorithms.sweep.numba import kernels_sgm
-from pano_mvs.algorithms.sweep.numba.kernels_band import store_row
 from pano_mvs.algorithms.sweep.numba.kernels_combine import combine_row
 from pano_mvs.algorithms.sweep.numba.kernels_cost import box_rows, census_row, difference_row
+from pano_mvs.algorithms.sweep.numba.kernels_records import Combination
 from pano_mvs.algorithms.sweep.numba.kernels_sad import average_differences, one_box_serves
 from pano_mvs.algorithms.sweep.numba.kernels_sgm import sweep_row, sweep_strip
+from pano_mvs.algorithms.sweep.numba.kernels_source_cost import store_row
 from pano_mvs.algorithms.sweep.numba.kernels_winner import (
     AFTER,
     BEFORE,
@@ -83,7 +84,10 @@ def test_running_sums_equal_the_mean_over_each_window(radius):
      (85, 1.0, 85, 4, True), (86, 1.0, 86, 4, False), (80, 1.0, 80, 4096, False)],
 )  # fmt: skip
 def test_one_box_serves_where_all_sources_count_and_nothing_overflows(sources, share, most, pad, serves):
-    assert one_box_serves(sources, share, most, 3, pad) == serves
+    combination = Combination(np.zeros((0, 0, 0), np.float32), share, most, np.float32(9))
+    assert one_box_serves(sources, combination, 3, pad) == serves
+    weighted = combination._replace(weights=np.ones((sources, 1, 1), np.float32))
+    assert not one_box_serves(sources, weighted, 3, pad)
 
 
 @pytest.mark.kernel("sweep.numba.kernels_sad")
@@ -118,7 +122,8 @@ def test_sources_combine_to_the_mean_of_those_that_count(sources, share, most, a
         voting = sorted((float(c), float(w)) for c, w in zip(costs[:, 1, column], weight, strict=True) if c < np.inf)
         expected.append(oracle.combined_cost(voting, share=share, most=most, neutral=9.0))
     result = np.zeros(40, np.float32)
-    combine_row(costs, 1, weights, 2, share, min(most, sources), all_vote, np.float32(9), result)
+    combination = Combination(weights, share, min(most, sources), np.float32(9))
+    combine_row(costs, 1, combination, 2, all_vote, result)
     np.testing.assert_allclose(result, expected, rtol=1e-5)
 
 
@@ -154,7 +159,7 @@ def test_winners_of_rows_are_those_of_the_volume():
     np.testing.assert_array_equal(state[RIVAL], expected.rival[3:])
 
 
-@pytest.mark.kernel("sweep.numba.kernels_band")
+@pytest.mark.kernel("sweep.numba.kernels_source_cost")
 def test_costs_are_stored_rounded_and_saturated():
     voxels = np.zeros(5, np.uint8)
     store_row(np.array([0.0, 1.24, 1.26, 100.0, 1e6], np.float32), np.float32(2.0), voxels)

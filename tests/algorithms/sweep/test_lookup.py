@@ -10,6 +10,7 @@ from pano_mvs.algorithms.sweep.numba.kernels_census import count_census_row
 from pano_mvs.algorithms.sweep.numba.kernels_cost import census_row
 from pano_mvs.algorithms.sweep.numba.kernels_lookup import warp_band
 from pano_mvs.algorithms.sweep.numba.kernels_project import knot_rows
+from pano_mvs.algorithms.sweep.numba.kernels_records import Lookup, Sources
 from pano_mvs.algorithms.sweep.numba.kernels_sad import add_differences, interleave_rows
 from pano_mvs.algorithms.sweep.numba.packing import pack_colors, pack_plane, pack_sources
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR, _lanes_of_this_machine
@@ -38,11 +39,10 @@ def _warped(source, translation, size_hw, *, vector, halo=3, pad=4, first=0, row
     valid = np.ones((source.shape[0] + 1) * (source.shape[1] + 2), np.uint8)
     against = np.zeros((0, width), np.uint32) if against is None else against
     pixel_costs = np.zeros((rows + 2 * halo, width + 2 * pad), np.uint16)
-    warp_band(
-        first - halo, height, sin_cos, np.column_stack([ROTATION, translation]), 1.3, packed, colors, starts[0],
-        np.array(source.shape[:2]), valid, 0, vector, pad, knots, warped, votes, against,
-        pixel_costs,
-    )  # fmt: skip
+    shapes, poses = np.array([source.shape[:2]]), np.column_stack([ROTATION, translation])[None]
+    sources = Sources(poses, packed, colors, starts, shapes, valid, np.zeros(1, np.int64), vector)
+    found = Lookup(knots, warped, votes, against, pixel_costs)
+    warp_band(first - halo, height, sin_cos, sources, 0, 1.3, pad, found)
     assert votes.all()
     return pixel_costs if len(against) else warped
 

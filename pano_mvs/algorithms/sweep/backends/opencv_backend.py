@@ -17,16 +17,15 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.sweep.backends.numpy_backend import combine_costs, pixel_cost
 from pano_mvs.algorithms.sweep.backends.running_winner import RunningWinner
 from pano_mvs.algorithms.sweep.combination import source_weights
-from pano_mvs.algorithms.sweep.costs.registry import CostWindow
+from pano_mvs.algorithms.sweep.numba.kernels_constants import ZNCC_NOISE_VARIANCE
 from pano_mvs.algorithms.sweep.preparation import SweepInput
-from pano_mvs.algorithms.sweep.settings import ZNCC_NOISE_VARIANCE
-from pano_mvs.algorithms.sweep.windows import WindowBands
+from pano_mvs.algorithms.sweep.windows import CostWindow, WindowBands
 from pano_mvs.algorithms.sweep.winner import Winners
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pad_panorama, ray_grid
 
 # cv2.remap holds positions in 16 bits.
-_MOST_COLUMNS = 32_000
+_MAX_COLUMNS = 32_000
 
 Cost = Callable[[NDArray[np.uint8]], NDArray[np.float32]]
 
@@ -38,14 +37,14 @@ def find_winners(work: SweepInput) -> Winners:
         UsageError: if a picture has more columns than cv2.remap can address.
     """
     widest = max(picture.shape[1] for picture in (work.reference, *work.sources))
-    if widest > _MOST_COLUMNS:
-        raise UsageError(f"the sweep backend 'opencv' takes at most {_MOST_COLUMNS} columns, got {widest}: use numba")
+    if widest > _MAX_COLUMNS:
+        raise UsageError(f"the sweep backend 'opencv' takes at most {_MAX_COLUMNS} columns, got {widest}: use numba")
     settings = work.settings
     size_hw = work.reference.shape[0], work.reference.shape[1]
     lookups = [_Lookup(work, idx, size_hw) for idx in range(len(work.sources))]
     cost = _source_cost(work)
     equal = work.source_valid is None and not len(source_weights(size_hw, work.source_from_reference, settings))
-    used = min(ceil(settings.weight_share * len(lookups)), settings.most_sources(len(lookups)))
+    used = min(ceil(settings.weight_share * len(lookups)), settings.max_sources(len(lookups)))
     with_volume = settings.aggregation == "sgm"
     volume = np.empty((size_hw[0], len(work.ranges) if with_volume else 0, size_hw[1]), np.uint8)
     winner = RunningWinner(size_hw)
@@ -58,7 +57,7 @@ def find_winners(work: SweepInput) -> Winners:
             winner.add(combined)
     if not with_volume:
         return winner.result()
-    from pano_mvs.algorithms.sweep.backends.numba_backend import winners_by_paths  # on use: numba is slow to import
+    from pano_mvs.algorithms.sweep.numba.aggregation import winners_by_paths  # on use: numba is slow to import
 
     return winners_by_paths(work, volume)
 
@@ -113,7 +112,7 @@ def _source_cost(work: SweepInput) -> Cost:
     else:
 
         def compare(warped: NDArray[np.uint8]) -> NDArray[np.float32]:
-            return pixel_cost(work.reference, warped.astype(np.float64), work).astype(np.float32)
+            return pixel_cost(work.reference, warped.astype(np.float64), settings).astype(np.float32)
 
     return lambda warped: np.asarray(_box_mean(compare(warped), box), dtype=np.float32)
 

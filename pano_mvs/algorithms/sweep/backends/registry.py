@@ -1,7 +1,7 @@
-"""What computes a sweep and what it compares by: chosen by name, and open to plugins.
+"""The backends of a sweep by name, and what each of them can do; plugins add their own.
 
 A backend turns a `SweepInput` into `Winners`. All backends give the same winners on the same input but for rounding:
-`numpy` is the readable one against which the others are held, `numba` the default, `opencv` warps by cv2.remap.
+`numpy` is the readable one against which the others are tested, `numba` the default, `opencv` warps by cv2.remap.
 """
 
 from __future__ import annotations
@@ -11,13 +11,14 @@ from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 from pano_mvs.algorithms.sweep.backends import numpy_backend, opencv_backend
-from pano_mvs.algorithms.sweep.costs.registry import BUILTIN_COSTS, SWEEP_COSTS
+from pano_mvs.algorithms.sweep.costs.registry import BUILTIN, SWEEP_COSTS
 from pano_mvs.algorithms.sweep.preparation import SweepInput
+from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.winner import Winners
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.parts import Parts
 
-# By which cost the small sweeps run that find limits and match exposures.
+# The cost of the small sweeps that find limits and match exposures, and a backend that has it.
 _HELPER_COST, _HELPER_BACKEND = "census", "numba"
 
 
@@ -38,43 +39,67 @@ Function = TypeVar("Function", bound=FindWinners)
 
 @dataclass(frozen=True)
 class SweepBackend:
-    """A backend as it is registered.
+    """A backend and what it can do.
 
     Attributes:
         find_winners: see `FindWinners`.
         costs: the costs that it has; None: any, plugins' too.
+        coarse_to_fine: whether it takes `levels` above 1.
+        bytes_per_voxel: bytes that semi-global matching takes for each pixel and plane.
+        keeps_volume_limit: whether it keeps the volume of semi-global matching within `volume_limit_gb`.
     """
 
     find_winners: FindWinners
     costs: frozenset[str] | None = None
+    coarse_to_fine: bool = False
+    bytes_per_voxel: int = 3
+    keeps_volume_limit: bool = False
+
+    def has_cost(self, name: str) -> bool:
+        """Return whether it has a cost."""
+        return self.costs is None or name in self.costs
+
+    def volume_bytes(self, pixels: int, settings: SweepSettings) -> int:
+        """Return what the volume of semi-global matching takes at most, for a reference of so many pixels.
+
+        From coarse to fine the volume is that of the coarsest level.
+        """
+        if settings.aggregation != "sgm":
+            return 0
+        volume = pixels * settings.planes * self.bytes_per_voxel >> 2 * (settings.levels - 1)
+        return min(volume, int(settings.volume_limit_gb * 1e9)) if self.keeps_volume_limit else volume
 
 
 def _numba(work: SweepInput) -> Winners:
-    from pano_mvs.algorithms.sweep.backends import numba_backend
+    from pano_mvs.algorithms.sweep.backends import numba_backend  # on use: numba is slow to import
 
-    if work.settings.levels > 1:
-        from pano_mvs.algorithms.sweep.coarse_to_fine import coarse_to_fine
-
-        return coarse_to_fine.find_winners(work)
     return numba_backend.find_winners(work)
 
 
 SWEEP_BACKENDS = Parts(
     "sweep backend",
     {
-        "numba": SweepBackend(_numba, BUILTIN_COSTS),
-        "numpy": SweepBackend(numpy_backend.find_winners),
+        "numba": SweepBackend(
+            _numba,
+            frozenset(name for name, cost in BUILTIN.items() if cost.kernel is not None),
+            coarse_to_fine=True,
+            keeps_volume_limit=True,
+        ),
+        "numpy": SweepBackend(numpy_backend.find_winners, bytes_per_voxel=24),
         "opencv": SweepBackend(opencv_backend.find_winners),
     },
 )
 
 
-def register_sweep_backend(name: str, *, costs: Collection[str] | None = None) -> Callable[[Function], Function]:
+def register_sweep_backend(
+    name: str, *, costs: Collection[str] | None = None, bytes_per_voxel: int = 3
+) -> Callable[[Function], Function]:
     """Declare a function `(work: SweepInput) -> Winners` as the sweep backend of that name.
 
     Args:
         name: for `backend:` in workflows.
         costs: the names of the costs that it has; None: any, those of other plugins too.
+        bytes_per_voxel: bytes for each pixel and plane in semi-global matching; runs are planned by it.
 
     Raises:
         PluginError: if the name is that of a built-in backend.
@@ -82,37 +107,34 @@ def register_sweep_backend(name: str, *, costs: Collection[str] | None = None) -
 
     def decorate(function: Function) -> Function:
         known = None if costs is None else frozenset(costs)
-        SWEEP_BACKENDS.register(name, SweepBackend(function, known), function)
+        SWEEP_BACKENDS.register(name, SweepBackend(function, known, bytes_per_voxel=bytes_per_voxel), function)
         return function
 
     return decorate
 
 
-def backend_for(name: str, cost: str) -> SweepBackend:
+def backend_for(name: str, settings: SweepSettings) -> SweepBackend:
     """Return the backend of that name.
 
     Raises:
-        UsageError: if there is none, or it does not have that cost; the message names those that do.
+        UsageError: if there is none, or it cannot do what the settings ask for; the message names those that can.
     """
-    backend = SWEEP_BACKENDS.get(name)
-    SWEEP_COSTS.check(cost)
-    if _has(backend, cost):
-        return backend
-    able = [other for other in SWEEP_BACKENDS.names() if _has(SWEEP_BACKENDS.get(other), cost)]
-    raise UsageError(f"the sweep backend {name!r} does not have the cost {cost!r}; those that do: "
-                     f"{', '.join(able) or 'none'}")  # fmt: skip
+    backend, cost = SWEEP_BACKENDS.get(name), SWEEP_COSTS.check(settings.cost)
+    if not backend.has_cost(cost):
+        able = _names_of(lambda other: other.has_cost(cost))
+        raise UsageError(f"the sweep backend {name!r} does not have the cost {cost!r}; those that do: {able or 'none'}")
+    if settings.levels > 1 and not backend.coarse_to_fine:
+        able = _names_of(lambda other: other.coarse_to_fine)
+        raise UsageError(
+            f"levels: {settings.levels} needs the sweep backend {able}, got {name!r}: use it, or levels: 1"
+        )
+    return backend
 
 
-def check_levels(name: str, levels: int) -> None:
-    """Raise UsageError if the backend of that name cannot go from coarse to fine over so many levels."""
-    if levels > 1 and name != "numba":
-        raise UsageError(f"levels: {levels} needs the sweep backend 'numba', got {name!r}: use it, or levels: 1")
+def _names_of(able: Callable[[SweepBackend], bool]) -> str:
+    return ", ".join(name for name in SWEEP_BACKENDS.names() if able(SWEEP_BACKENDS.get(name)))
 
 
 def helper_backend(name: str) -> str:
     """Return the backend for the small sweeps behind a sweep: its own, if it has the cost that they need."""
-    return name if _has(SWEEP_BACKENDS.get(name), _HELPER_COST) else _HELPER_BACKEND
-
-
-def _has(backend: SweepBackend, cost: str) -> bool:
-    return backend.costs is None or cost in backend.costs
+    return name if SWEEP_BACKENDS.get(name).has_cost(_HELPER_COST) else _HELPER_BACKEND

@@ -12,26 +12,25 @@ Memory: 42 bytes a pixel for costs and sums instead of 3 bytes for each pixel an
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.backends import numba_backend
+from pano_mvs.algorithms.sweep.backends.numba_backend import find_winners_plainly
 from pano_mvs.algorithms.sweep.coarse_to_fine.guided import GuidedSweep
 from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guides import split_layers
 from pano_mvs.algorithms.sweep.exposure import shrink
 from pano_mvs.algorithms.sweep.hypotheses import virtual_ranges
+from pano_mvs.algorithms.sweep.numba.threads import workers
 from pano_mvs.algorithms.sweep.preparation import SweepInput, voting_pixels
 from pano_mvs.algorithms.sweep.winner import Winners, subplane_offset
 from pano_mvs.geometry import pad_panorama
 
-_LOWEST_PICTURE = 64
-_FEWEST_PLANES = 16
-_LARGEST_PENALTY = 4000
+_MIN_ROWS = 64
+_MIN_PLANES = 16
+_MAX_PENALTY = 4000
 # Two surfaces meet where positions within this many coarse pixels differ by more planes.
 _SPLIT_RADIUS, _SPLIT_GAP = 2, 6.0
 
@@ -43,10 +42,10 @@ def find_winners(work: SweepInput) -> Winners:
     """
     coarse = _coarse_input(work)
     if coarse is None:
-        return numba_backend.find_winners(work)
+        return find_winners_plainly(work)
     found = find_winners(coarse)
     guides = _guides(found, coarse, work)
-    with ThreadPoolExecutor(numba.get_num_threads()) as pool:
+    with workers() as pool:
         winners = GuidedSweep(work, guides, pool).find_winners()
     return replace(winners, rival=_rival(winners, found))
 
@@ -54,11 +53,11 @@ def find_winners(work: SweepInput) -> Winners:
 def _coarse_input(work: SweepInput) -> SweepInput | None:
     """Return the same sweep at half the size and half the planes, or None if this is the last level."""
     settings, (height, width) = work.settings, work.reference.shape[:2]
-    if settings.levels < 2 or height % 2 or width % 4 or height // 2 < _LOWEST_PICTURE:
+    if settings.levels < 2 or height % 2 or width % 4 or height // 2 < _MIN_ROWS:
         return None
-    planes = max(min(_FEWEST_PLANES, settings.planes), -(-settings.planes // 2))
+    planes = max(min(_MIN_PLANES, settings.planes), -(-settings.planes // 2))
     # A step by one plane is as much longer as there are fewer of them.
-    p1 = min(round(settings.p1 * (settings.planes - 1) / (planes - 1)), max(settings.p2, settings.p1), _LARGEST_PENALTY)
+    p1 = min(round(settings.p1 * (settings.planes - 1) / (planes - 1)), max(settings.p2, settings.p1), _MAX_PENALTY)
     ranges = virtual_ranges(work.ranges[0], work.ranges[-1], planes=planes, spacing=settings.spacing)
     return replace(
         work,

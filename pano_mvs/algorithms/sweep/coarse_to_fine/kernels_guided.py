@@ -6,21 +6,24 @@ lie on the surface, slanted as it is, and few offsets do.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.numba.kernels_band import source_cost, store_row
 from pano_mvs.algorithms.sweep.numba.kernels_combine import combine_row
-from pano_mvs.algorithms.sweep.numba.kernels_lookup import _sample_planes, _sample_rgb
-from pano_mvs.algorithms.sweep.numba.kernels_warp import _atan_unit, place_row, wrap_row
+from pano_mvs.algorithms.sweep.numba.kernels_lookup import sample_row, vote_row
+from pano_mvs.algorithms.sweep.numba.kernels_records import F32, I64, Guide, Lookup, Sweep
+from pano_mvs.algorithms.sweep.numba.kernels_source_cost import silence, source_cost, store_row
+from pano_mvs.algorithms.sweep.numba.kernels_warp import azimuth_of, dip_of, place_row
 
 _F = np.float32
 _U = np.uint64
-_HALF_PI, _PI, _TINY = _F(np.pi / 2), _F(np.pi), _F(1e-30)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def inverse_row(guide, shift, table, per_plane, inverse):  # type: ignore[no-untyped-def]
+def inverse_row(guide: F32, shift: int, table: F32, per_plane: int, inverse: F32) -> None:
     """Look up the inverse ranges at `guide + shift`.
 
     Args:
@@ -43,7 +46,9 @@ def inverse_row(guide, shift, table, per_plane, inverse):  # type: ignore[no-unt
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def project_guided_row(sin_cos_azimuth, matrix, offset, translation, inverse, shape, x_px, y_px):  # type: ignore[no-untyped-def]
+def project_guided_row(
+    sin_cos_azimuth: F32, matrix: F32, offset: F32, translation: F32, inverse: F32, shape: I64, x_px: F32, y_px: F32
+) -> None:
     """Find where a row of rays, each with its own range, arrives in a packed source.
 
     Args:
@@ -66,33 +71,29 @@ def project_guided_row(sin_cos_azimuth, matrix, offset, translation, inverse, sh
         x = m00 * s + m01 * c + o0 + t0 * nearness
         y = m10 * s + m11 * c + o1 + t1 * nearness
         z = m20 * s + m21 * c + o2 + t2 * nearness
-        ax, ay, az = abs(x), abs(y), abs(z)
-        small = ax if ax < az else az
-        large = az if ax < az else ax
-        turn = _atan_unit(small / (large + _TINY))
-        turn = _HALF_PI - turn if ax > az else turn
-        turn = _PI - turn if z < _F(0) else turn
-        turn = -turn if x < _F(0) else turn
-        level = np.sqrt(x * x + z * z)
-        small = ay if ay < level else level
-        large = level if ay < level else ay
-        dip = _atan_unit(small / (large + _TINY))
-        dip = _HALF_PI - dip if ay > level else dip
-        dip = -dip if y < _F(0) else dip
-        x_px[i] = turn * x_scale + x_middle
-        y_px[i] = dip * y_scale + y_middle
+        x_px[i] = azimuth_of(x, z) * x_scale + x_middle
+        y_px[i] = dip_of(x, y, z) * y_scale + y_middle
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def warp_guided_band(  # type: ignore[no-untyped-def]
-    first, height, sin_cos_azimuth, pose, guide, shift, table, per_plane, packed, colors, starts, shape, valid,
-    valid_start, vector, pad, warped, votes,
-):  # fmt: skip
+def warp_guided_band(first: int, sweep: Sweep, source: int, guide: Guide, shift: int, found: Lookup) -> None:
     """Look up the rows `first` …, `shift` planes beyond the guide, in one source.
 
-    `guide` is (rows, W) float32 positions among planes, `shift` in planes, `table` and `per_plane` as of `inverse_row`,
-    all others as of `warp_band`.
+    Args:
+        first: the first row, may be negative.
+        sweep: the sources and the directions of the columns.
+        source: the index of the source.
+        guide: the surface, in these rows.
+        shift: planes.
+        found: written; `knots`, `against` and `pixel_costs` are not used.
     """
+    sources, height = sweep.sources, sweep.windows.offsets.shape[0]
+    pose, shape, starts = sources.poses[source], sources.shapes[source], sources.starts[source]
+    packed, colors, vector = sources.packed, sources.colors, sources.vector
+    valid, valid_start = sources.valid, sources.valid_starts[source]
+    warped, votes, pad = found.warped, found.votes, sweep.windows.pad
+    positions, table, per_plane = guide
+    sin_cos_azimuth = sweep.sin_cos_azimuth
     width = sin_cos_azimuth.shape[1]
     x_px, y_px = np.empty(width, np.float32), np.empty(width, np.float32)
     index, inverse = np.empty(width, np.int32), np.empty(width, np.float32)
@@ -106,58 +107,43 @@ def warp_guided_band(  # type: ignore[no-untyped-def]
             matrix[a, 1] = _F(np.cos(elevation) * pose[a, 2])
             offset[a] = _F(-np.sin(elevation) * pose[a, 1])
             translation[a] = _F(pose[a, 3])
-        inverse_row(guide[j], shift, table, per_plane, inverse)
+        inverse_row(positions[j], shift, table, per_plane, inverse)
         project_guided_row(sin_cos_azimuth, matrix, offset, translation, inverse, shape, x_px, y_px)
         place_row(x_px, y_px, shape, index, weight_x, weight_y)
-        if len(colors):
-            _sample_rgb(colors, starts[0], index, weight_y, weight_x, warped, j, pad)
-        else:
-            _sample_planes(packed, starts, vector, index, weight_y, weight_x, patches, warped, j, pad)
-        for c in range(warped.shape[0]):
-            wrap_row(warped[c, j], width, pad)
-        if len(valid):
-            for i in range(_U(width)):
-                votes[_U(j), i] = valid[_U(valid_start) + _U(index[i])]
+        sample_row(packed, colors, starts, vector, index, weight_y, weight_x, patches, warped, j, pad)
+        vote_row(valid, valid_start, index, votes, j)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def sweep_guided_band(  # type: ignore[no-untyped-def]
-    first, guide, steps, table, per_plane, reference, sin_cos_azimuth, poses, packed, colors, starts, shapes, valid,
-    valid_starts, vector, offsets, reach, cost, census_weight, compare_radius, box_radius, pad, weights, share, most,
-    scale, neutral, costs,
-):  # fmt: skip
-    """Compute the costs of one band at −steps … steps planes from the guide.
+def sweep_guided_band(first: int, sweep: Sweep, guide: Guide, costs: NDArray[Any]) -> None:
+    """Compute the costs of one band at some planes on either side of the guide.
 
-    `guide` is (rows + 2 (compare_radius + box_radius), W) float32 positions among planes, with the rows around; `table`
-    and `per_plane` as of `inverse_row`; `costs` (rows, 2 steps + 1, W), written: uint8 on the scale of the volume, or
-    float32 means if `scale` is 0; all others as of `sweep_band`.
+    Args:
+        first: the first row of the band.
+        sweep: what all bands share.
+        guide: the surface, in the rows of the band and compare_radius + box_radius rows on either side.
+        costs: (rows, 2 steps + 1, W), written: uint8 on the scale of the volume; float32 means if `sweep.scale` is 0.
     """
     rows, count, width = costs.shape
-    sources, halo = starts.shape[0], compare_radius + box_radius
-    warped = np.empty((reference.shape[0], rows + 2 * halo, width + 2 * pad), np.uint8)
+    windows = sweep.windows
+    sources, halo, pad = sweep.sources.starts.shape[0], windows.compare_radius + windows.box_radius, windows.pad
+    all_vote = len(sweep.sources.valid) == 0
+    warped = np.empty((sweep.reference.shape[0], rows + 2 * halo, width + 2 * pad), np.uint8)
     votes = np.empty((rows + 2 * halo, width), np.uint8)
-    pixel_costs = np.empty((rows + 2 * box_radius, width + 2 * pad), np.uint16)
+    pixel_costs = np.empty((rows + 2 * windows.box_radius, width + 2 * pad), np.uint16)
     scratch = np.empty((2, width + 2 * pad), np.int32)
     means = np.empty((sources, rows, width), np.float32)
     combined = np.empty(width, np.float32)
+    found = Lookup(np.empty((0, 0, 0), np.float32), warped, votes, np.empty((0, 0), np.uint32), pixel_costs)
     for k in range(count):
         for s in range(sources):
-            warp_guided_band(
-                first - halo, offsets.shape[0], sin_cos_azimuth, poses[s], guide, k - steps, table, per_plane, packed,
-                colors, starts[s], shapes[s], valid, valid_starts[s], vector, pad, warped, votes,
-            )  # fmt: skip
-            source_cost(
-                first, reference, warped, offsets, reach, cost, census_weight, compare_radius, box_radius, pad,
-                pixel_costs, scratch, means[s],
-            )  # fmt: skip
-            if len(valid):
-                for j in range(rows):
-                    for i in range(width):
-                        if votes[j + halo, i] == 0:
-                            means[s, j, i] = np.inf
+            warp_guided_band(first - halo, sweep, s, guide, k - count // 2, found)
+            source_cost(first, sweep, warped, pixel_costs, scratch, means[s])
+            if not all_vote:
+                silence(votes, halo, means[s])
         for j in range(rows):
-            combine_row(means, j, weights, first + j, share, most, len(valid) == 0, neutral, combined)
-            if scale > _F(0):
-                store_row(combined, scale, costs[j, k])
+            combine_row(means, j, sweep.combination, first + j, all_vote, combined)
+            if sweep.scale > _F(0):
+                store_row(combined, sweep.scale, costs[j, k])
             else:
                 costs[j, k] = combined

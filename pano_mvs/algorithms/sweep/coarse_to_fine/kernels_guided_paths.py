@@ -9,8 +9,13 @@ matching", 3DV 2017), P1 for a step by one offset, and P2 for any other candidat
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.sweep.numba.kernels_records import F32, I16, U8, U16
 
 _F = np.float32
 _U = np.uint64
@@ -24,8 +29,32 @@ PER_PLANE = 4
 _ONE_SURFACE = np.int16(4 * PER_PLANE)
 
 
+class Costs(NamedTuple):
+    """What the paths of one direction read and write, as of `follow_guided_strip`."""
+
+    volume: U8
+    total: U16
+    guides: I16
+    penalties: U16
+    p1: np.uint16
+
+
+class Front(NamedTuple):
+    """Where the paths have come to, in one row.
+
+    Attributes:
+        paths: (2, K + 2, lines) uint16 costs of the paths, with a plane beyond either end.
+        least: (lines,) uint16 the least of each.
+        guides: (2, lines) int16 positions of the guides.
+    """
+
+    paths: U16
+    least: U16
+    guides: I16
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
-def _link(guides, row, column, first, lines, before, now, barred):  # type: ignore[no-untyped-def]
+def _link(guides: I16, row: int, column: int, first: int, lines: int, before: I16, now: I16, barred: U16) -> None:
     """Find which guides of the pixels before are one surface with which of these; see `_step`."""
     layers = guides.shape[1]
     for a in range(_U(layers)):
@@ -38,7 +67,7 @@ def _link(guides, row, column, first, lines, before, now, barred):  # type: igno
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _near_steps(before, p1, first, lines, nearby):  # type: ignore[no-untyped-def]
+def _near_steps(before: U16, p1: np.uint16, first: int, lines: int, nearby: U16) -> None:
     """Compute what each candidate would inherit along its own guide: from the same offset or, for P1, from the next."""
     layers, padded = before.shape[:2]
     for b in range(_U(layers)):
@@ -52,15 +81,23 @@ def _near_steps(before, p1, first, lines, nearby):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _step(  # type: ignore[no-untyped-def]
-    volume, total, guides, place, segment, penalties, p1, before, least_before, guides_before, after, least, guides_now,
-    nearby, barred, keep,
-):  # fmt: skip
+def _step(
+    costs: Costs,
+    place: tuple[int, int],
+    segment: tuple[int, int],
+    before: Front,
+    after: Front,
+    nearby: U16,
+    barred: U16,
+    keep: bool,
+) -> None:
     """Advance the lines of one segment by one row: `place` (row, column), `segment` (first line, lines)."""
+    volume, total, penalties = costs.volume, costs.total, costs.penalties
+    paths, least, least_before = after.paths, after.least, before.least
     row, column = _U(place[0]), _U(place[1])
     first, lines = _U(segment[0]), _U(segment[1])
-    _link(guides, row, column, first, lines, guides_before, guides_now, barred)
-    _near_steps(before, p1, first, lines, nearby)
+    _link(costs.guides, row, column, first, lines, before.guides, after.guides, barred)
+    _near_steps(before.paths, costs.p1, first, lines, nearby)
     count = _U(nearby.shape[1])
     for a in range(_U(2)):
         for d in range(count):
@@ -73,17 +110,27 @@ def _step(  # type: ignore[no-untyped-def]
                 near = near if near < other else other
                 best = near if near < best else best
                 value = _H(_H(best - floor) + _H(volume[row, voxel, column + k]))
-                after[a, d + _U(1), line] = value
+                paths[a, d + _U(1), line] = value
                 least[line] = value if value < least[line] else least[line]
             if keep:
                 for k in range(lines):
-                    total[row, voxel, column + k] = _H(total[row, voxel, column + k] + after[a, d + _U(1), first + k])
+                    total[row, voxel, column + k] = _H(total[row, voxel, column + k] + paths[a, d + _U(1), first + k])
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def follow_tube(  # type: ignore[no-untyped-def]
-    volume, total, guides, penalties, p1, first, lines, drift, upward, warm, beyond_pole
-):
+def follow_guided_strip(
+    volume: U8,
+    total: U16,
+    guides: I16,
+    penalties: U16,
+    p1: np.uint16,
+    first: int,
+    lines: int,
+    drift: int,
+    upward: bool,
+    warm: int,
+    beyond_pole: bool,
+) -> None:
     """Follow one strip of parallel paths from pole to pole and add their costs to the total; see `sweep_strip`.
 
     Args:
@@ -101,6 +148,7 @@ def follow_tube(  # type: ignore[no-untyped-def]
     """
     height, depth, width = volume.shape
     count = depth // 2
+    costs = Costs(volume, total, guides, penalties, p1)
     buffers = np.zeros((2, 2, count + 2, lines), np.uint16)
     buffers[:, :, 0, :] = _OUTSIDE
     buffers[:, :, count + 1, :] = _OUTSIDE
@@ -115,25 +163,22 @@ def follow_tube(  # type: ignore[no-untyped-def]
         column = (column % width + width) % width
         least[now, :] = _OUTSIDE
         direct = min(lines, width - column)
-        _step(
-            volume, total, guides, (row, column), (0, direct), penalties, p1, buffers[before], least[before],
-            passed[before], buffers[now], least[now], passed[now], nearby, barred, i >= 0,
-        )  # fmt: skip
+        fronts = Front(buffers[before], least[before], passed[before]), Front(buffers[now], least[now], passed[now])
+        _step(costs, (row, column), (0, direct), fronts[0], fronts[1], nearby, barred, i >= 0)
         if direct < lines:
-            _step(
-                volume, total, guides, (row, 0), (direct, lines - direct), penalties, p1, buffers[before],
-                least[before], passed[before], buffers[now], least[now], passed[now], nearby, barred, i >= 0,
-            )  # fmt: skip
+            _step(costs, (row, 0), (direct, lines - direct), fronts[0], fronts[1], nearby, barred, i >= 0)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def follow_rows(volume, total, guides, penalties, p1, first, lines, warm):  # type: ignore[no-untyped-def]
+def follow_guided_rows(
+    volume: U8, total: U16, guides: I16, penalties: U16, p1: np.uint16, first: int, lines: int, warm: int
+) -> None:
     """Follow both horizontal paths of some rows around the sphere: turned by 90°, they are a strip.
 
     Args:
         volume: (H, 2 K, W) uint8.
         total: (H, 2 K, W) uint16, added to.
-        guides: (H, 2, W) int16, as of `follow_tube`.
+        guides: (H, 2, W) int16, as of `follow_guided_strip`.
         penalties: (2, H, W) uint16 P2 of the step into each pixel from its left and from its right.
         p1: uint16.
         first: the first row.
@@ -152,8 +197,8 @@ def follow_rows(volume, total, guides, penalties, p1, first, lines, warm):  # ty
             for x in range(width):
                 turned[x, a, j] = guides[first + j, a, x]
                 paid[a, x, j] = penalties[a, first + j, x]
-    follow_tube(costs, sums, turned, paid[0], p1, 0, lines, 0, False, warm, False)
-    follow_tube(costs, sums, turned, paid[1], p1, 0, lines, 0, True, warm, False)
+    follow_guided_strip(costs, sums, turned, paid[0], p1, 0, lines, 0, False, warm, False)
+    follow_guided_strip(costs, sums, turned, paid[1], p1, 0, lines, 0, True, warm, False)
     for j in range(lines):
         for d in range(depth):
             for x in range(width):
@@ -161,7 +206,7 @@ def follow_rows(volume, total, guides, penalties, p1, first, lines, warm):  # ty
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def cheapest_candidates(total, guides, first, planes, position, costs):  # type: ignore[no-untyped-def]
+def cheapest_candidates(total: NDArray[Any], guides: F32, first: int, planes: int, position: F32, costs: F32) -> None:
     """Find the cheapest candidate of each pixel of some rows, and what is around it.
 
     Args:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from pano_mvs.algorithms.sweep.numba.kernels_records import F32
+
 _F = np.float32
 _INFINITE = np.float32(np.inf)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _means(positions, y, x, side, middle, layers):  # type: ignore[no-untyped-def]
+def _means(positions: F32, y: int, x: int, side: int, middle: float, layers: F32) -> None:
     """Write the means of what is nearer than `middle` around a pixel and of the rest; the same if nothing is nearer."""
     below = above = _F(0)
     count = 0
@@ -27,7 +29,7 @@ def _means(positions, y, x, side, middle, layers):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def split_layers(positions, radius, least_gap, layers):  # type: ignore[no-untyped-def]
+def split_layers(positions: F32, radius: int, least_gap: float, layers: F32) -> None:
     """Tell the two surfaces around each pixel apart where they meet.
 
     Args:
@@ -50,7 +52,7 @@ def split_layers(positions, radius, least_gap, layers):  # type: ignore[no-untyp
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def adopt_candidates(found, costs, radius, least_gap, layer):  # type: ignore[no-untyped-def]
+def adopt_candidates(found: F32, costs: F32, radius: int, least_gap: float, layer: F32) -> None:
     """Replace a guide around candidates that are cheaper, by the mean of those around that agree with the cheapest.
 
     Args:

@@ -1,1 +1,1 @@
-"""The compiled sweep: kernels, and the arrays that they read. Import only where numba is available."""
+"""The compiled sweep: kernels, their arguments, threads. All but `kernels_constants` import numba, so import on use."""

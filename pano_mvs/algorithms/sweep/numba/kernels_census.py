@@ -6,15 +6,16 @@ import numpy as np
 from numba import njit
 
 from pano_mvs.algorithms.sweep.numba.kernels_cost import census_row
+from pano_mvs.algorithms.sweep.numba.kernels_records import I64, U8
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import CENSUS_PIXELS, HAS_VECTOR, census_block
 
 _U = np.uint64
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def count_census_row(  # type: ignore[no-untyped-def]
-    reference, reference_row, warped, warped_row, offsets, pad, disagree
-):
+def count_census_row(
+    reference: U8, reference_row: int, warped: U8, warped_row: int, offsets: I64, pad: int, disagree: U8
+) -> None:
     """Do what `census_row` does, which shorter rows are left to. Both pictures must be as wide as each other."""
     width = disagree.shape[0]
     if not HAS_VECTOR or width < CENSUS_PIXELS:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from pano_mvs.algorithms.sweep.numba.kernels_records import F32, Combination
+
 _F = np.float32
 _U = np.uint64
 # Sources hold the share that is asked for although their weights, added up, fall short of it by rounding.
@@ -12,29 +14,27 @@ ENOUGH = 1 - 1e-5
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def combine_row(costs, y, weights, picture_row, share, most, all_vote, neutral, result):  # type: ignore[no-untyped-def]
+def combine_row(costs: F32, y: int, combination: Combination, picture_row: int, all_vote: bool, result: F32) -> None:
     """Combine the sources' costs of one row, infinite where a source has no vote.
 
-    Sources are taken from the cheapest one on until they hold `share` of the weight of all that vote, or are `most`;
-    the result is the weighted mean of their costs.
+    Sources are taken from the cheapest one on until they hold `share` of the weight of all that vote, or are
+    `max_count`; the result is the weighted mean of their costs.
 
     Args:
         costs: (S, rows, W) float32; sorted in place unless all sources count.
         y: the row in `costs`.
-        weights: (S, H, W) float32 of every source; empty if all are equal.
-        picture_row: the row in `weights`.
-        share: of the weight that counts, in (0, 1].
-        most: how many sources count at most.
+        combination: what counts.
+        picture_row: the row in its weights.
         all_vote: that no cost is infinite.
-        neutral: the cost where no source has a vote.
         result: (W,) float32, written.
     """
+    share, most, neutral = combination.share, combination.max_count, combination.neutral
     sources = costs.shape[0]
-    if len(weights):
-        _combine_weighted(costs, y, weights, picture_row, share, most, neutral, result)
+    if len(combination.weights):
+        _combine_weighted(costs, y, combination, picture_row, result)
         return
     row = _U(y)
-    used = min(most, np.int64(np.ceil(share * ENOUGH * sources)))
+    used = min(most, int(np.ceil(share * ENOUGH * sources)))
     if used < sources:
         _sort_sources(costs, row)
     if all_vote:
@@ -44,7 +44,7 @@ def combine_row(costs, y, weights, picture_row, share, most, all_vote, neutral, 
         votes = 0
         for k in range(sources):
             votes += costs[_U(k), row, i] < np.inf
-        used = min(most, np.int64(np.ceil(share * ENOUGH * votes)))
+        used = min(most, int(np.ceil(share * ENOUGH * votes)))
         total = _F(0)
         taken = 0
         for k in range(sources):
@@ -56,7 +56,7 @@ def combine_row(costs, y, weights, picture_row, share, most, all_vote, neutral, 
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _sort_sources(costs, row):  # type: ignore[no-untyped-def]
+def _sort_sources(costs: F32, row: int) -> None:
     """Sort the costs of one row over the sources, each pixel on its own."""
     for last in range(costs.shape[0] - 1, 0, -1):
         for k in range(last):
@@ -68,7 +68,7 @@ def _sort_sources(costs, row):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _mean_of_first(costs, row, used, result):  # type: ignore[no-untyped-def]
+def _mean_of_first(costs: F32, row: int, used: int, result: F32) -> None:
     result[:] = _F(0)
     for k in range(used):
         for i in range(_U(result.shape[0])):
@@ -78,7 +78,8 @@ def _mean_of_first(costs, row, used, result):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _combine_weighted(costs, y, weights, picture_row, share, most, neutral, result):  # type: ignore[no-untyped-def]
+def _combine_weighted(costs: F32, y: int, combination: Combination, picture_row: int, result: F32) -> None:
+    weights, share, most = combination.weights, combination.share, combination.max_count
     sources = costs.shape[0]
     row, weight_row = _U(y), _U(picture_row)
     own = np.empty(sources, np.float32)
@@ -102,4 +103,4 @@ def _combine_weighted(costs, y, weights, picture_row, share, most, neutral, resu
             combined += weight[taken] * own[taken]
             held += weight[taken]
             taken += 1
-        result[i] = combined / held if taken else neutral
+        result[i] = combined / held if taken else combination.neutral

@@ -1,22 +1,20 @@
-"""Compiled: the cost of a band of rows at one virtual range."""
+"""Compiled: census and differences of one row, and means over boxes."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
+from pano_mvs.algorithms.sweep.numba.kernels_records import F32, I32, I64, U8, U16
+
 _F = np.float32
 _U = np.uint64
 
-# What `source_cost` compares by.
-CENSUS, ZNCC, SAD, SAD_GRADIENT, CENSUS_GRADIENT = range(5)
-COSTS = {
-    "census": CENSUS, "zncc": ZNCC, "sad": SAD, "sad_gradient": SAD_GRADIENT, "census_gradient": CENSUS_GRADIENT,
-}  # fmt: skip
-
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def census_row(reference, reference_row, warped, warped_row, offsets, pad, disagree):  # type: ignore[no-untyped-def]
+def census_row(
+    reference: U8, reference_row: int, warped: U8, warped_row: int, offsets: I64, pad: int, disagree: U8
+) -> None:
     """Count the neighbours whose order against the centre differs between reference and warped source.
 
     Args:
@@ -47,7 +45,7 @@ def census_row(reference, reference_row, warped, warped_row, offsets, pad, disag
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def difference_row(reference, reference_row, warped, warped_row, pad, total):  # type: ignore[no-untyped-def]
+def difference_row(reference: U8, reference_row: int, warped: U8, warped_row: int, pad: int, total: U16) -> None:
     """Add |reference − warped| of one row of one colour to `total`, (W,) uint16."""
     r, w, first = _U(reference_row), _U(warped_row), _U(pad)
     for i in range(_U(total.shape[0])):
@@ -56,7 +54,7 @@ def difference_row(reference, reference_row, warped, warped_row, pad, total):  #
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def box_rows(pixel_costs, reach, radius, pad, column_sums, prefix, means):  # type: ignore[no-untyped-def]
+def box_rows(pixel_costs: U16, reach: I64, radius: int, pad: int, column_sums: I32, prefix: I32, means: F32) -> None:
     """Average costs over windows of 2 radius + 1 rows by 2 reach + 1 columns, in O(1) each.
 
     Args:

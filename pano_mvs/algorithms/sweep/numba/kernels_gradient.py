@@ -6,14 +6,17 @@ import numpy as np
 from numba import njit
 
 from pano_mvs.algorithms.sweep.numba.kernels_census import count_census_row
+from pano_mvs.algorithms.sweep.numba.kernels_constants import GREY_WEIGHT, MAX_COLOR_COST, MAX_GRADIENT_COST
 from pano_mvs.algorithms.sweep.numba.kernels_cost import difference_row
-from pano_mvs.algorithms.sweep.settings import GREY_WEIGHT, LARGEST_COLOR_COST, LARGEST_GRADIENT_COST
+from pano_mvs.algorithms.sweep.numba.kernels_records import I64, U8, U16
 
 _U = np.uint64
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def gradient_row(reference, reference_row, warped, warped_row, reach, pad, total):  # type: ignore[no-untyped-def]
+def gradient_row(
+    reference: U8, reference_row: int, warped: U8, warped_row: int, reach: int, pad: int, total: U16
+) -> None:
     """Add |∂x r − ∂x w| + |∂y r − ∂y w| of one row of one colour to `total`, (W,) uint16.
 
     Central differences, not halved: over two rows, and over `reach` columns on either side.
@@ -31,7 +34,9 @@ def gradient_row(reference, reference_row, warped, warped_row, reach, pad, total
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def sad_gradient_row(reference, reference_row, warped, warped_row, reach, pad, total):  # type: ignore[no-untyped-def]
+def sad_gradient_row(
+    reference: U8, reference_row: int, warped: U8, warped_row: int, reach: int, pad: int, total: U16
+) -> None:
     """Write the truncated differences of one row to `total`, (W,) uint16: of all colours, and of their gradients.
 
     Args:
@@ -49,14 +54,22 @@ def sad_gradient_row(reference, reference_row, warped, warped_row, reach, pad, t
         difference_row(reference[c], reference_row, warped[c], warped_row, pad, total)
         gradient_row(reference[c], reference_row, warped[c], warped_row, reach, pad, gradient)
     for i in range(_U(total.shape[0])):
-        color = min(np.int32(total[i]), np.int32(LARGEST_COLOR_COST))
-        total[i] = np.uint16(color + min(np.int32(gradient[i]), np.int32(LARGEST_GRADIENT_COST)))
+        color = min(np.int32(total[i]), np.int32(MAX_COLOR_COST))
+        total[i] = np.uint16(color + min(np.int32(gradient[i]), np.int32(MAX_GRADIENT_COST)))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def census_gradient_row(  # type: ignore[no-untyped-def]
-    reference, reference_row, warped, warped_row, offsets, census_weight, pad, disagree, total
-):
+def census_gradient_row(
+    reference: U8,
+    reference_row: int,
+    warped: U8,
+    warped_row: int,
+    offsets: I64,
+    census_weight: int,
+    pad: int,
+    disagree: U8,
+    total: U16,
+) -> None:
     """Write the census cost of one row, its weight times, plus that of grey levels and of their gradients.
 
     Args:
@@ -76,7 +89,7 @@ def census_gradient_row(  # type: ignore[no-untyped-def]
     difference_row(reference, reference_row, warped, warped_row, pad, total)
     reach = offsets[offsets.shape[0] // 2 + 1]
     gradient_row(reference, reference_row, warped, warped_row, reach, pad, gradient)
-    largest_level, largest_gradient = np.int32(LARGEST_COLOR_COST // 3), np.int32(LARGEST_GRADIENT_COST // 3)
+    largest_level, largest_gradient = np.int32(MAX_COLOR_COST // 3), np.int32(MAX_GRADIENT_COST // 3)
     for i in range(_U(total.shape[0])):
         grey = min(np.int32(total[i]), largest_level) + min(np.int32(gradient[i]), largest_gradient)
         total[i] = np.uint16(np.int32(census_weight) * np.int32(disagree[i]) + np.int32(GREY_WEIGHT) * grey)

@@ -13,7 +13,8 @@ from pano_mvs.algorithms.sweep.numba.kernels_project import (
     ray_row,
     replace_rough,
     rough_runs,
-)  # fmt: skip
+)
+from pano_mvs.algorithms.sweep.numba.kernels_records import F32, I32, I64, U8, U32, U64, Lookup, Sources
 from pano_mvs.algorithms.sweep.numba.kernels_sad import add_sampled_differences
 from pano_mvs.algorithms.sweep.numba.kernels_warp import blend_row, gather_row, place_row, project_row, wrap_row
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR, PIXELS, blend_grey_block, sample_rgb_block
@@ -23,7 +24,18 @@ _U = np.uint64
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _sample_planes(packed, starts, vector, index, weight_y, weight_x, patches, warped, row, pad):  # type: ignore[no-untyped-def]
+def _sample_planes(
+    packed: U32,
+    starts: I64,
+    vector: bool,
+    index: I32,
+    weight_y: I32,
+    weight_x: I32,
+    patches: U32,
+    warped: U8,
+    row: int,
+    pad: int,
+) -> None:
     """Sample each colour on its own, from packed planes."""
     channels, _, padded = warped.shape
     flat = warped.reshape(-1)
@@ -37,7 +49,7 @@ def _sample_planes(packed, starts, vector, index, weight_y, weight_x, patches, w
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _blend_blocks(patches, weight_y, weight_x, out, out_at):  # type: ignore[no-untyped-def]
+def _blend_blocks(patches: U32, weight_y: I32, weight_x: I32, out: U8, out_at: int) -> None:
     """Do what `blend_row` does; the last block overlaps the one before it."""
     if HAS_VECTOR:  # a constant: without it the block is not compiled, which is impossible on other processors
         width = patches.shape[0]
@@ -48,7 +60,9 @@ def _blend_blocks(patches, weight_y, weight_x, out, out_at):  # type: ignore[no-
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _sample_rgb(colors, start, index, weight_y, weight_x, warped, row, pad):  # type: ignore[no-untyped-def]
+def _sample_rgb(
+    colors: U64, start: int, index: I32, weight_y: I32, weight_x: I32, warped: U8, row: int, pad: int
+) -> None:
     """Sample three colours at once, from interleaved patches."""
     flat = warped.reshape(-1)
     step = _U(warped.shape[1] * warped.shape[2])
@@ -63,10 +77,16 @@ def _sample_rgb(colors, start, index, weight_y, weight_x, warped, row, pad):  # 
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def warp_band(  # type: ignore[no-untyped-def]
-    first, height, sin_cos_azimuth, pose, virtual_range, packed, colors, starts, shape, valid, valid_start, vector, pad,
-    knots, warped, votes, against, pixel_costs,
-):  # fmt: skip
+def warp_band(
+    first: int,
+    height: int,
+    sin_cos_azimuth: F32,
+    sources: Sources,
+    source: int,
+    virtual_range: float,
+    pad: int,
+    found: Lookup,
+) -> None:
     """Look up the rows `first` … of the reference, at one virtual range, in one source.
 
     Rows before the first or after the last one of the picture lie beyond a pole: elevations over 90° turn the ray
@@ -76,23 +96,16 @@ def warp_band(  # type: ignore[no-untyped-def]
         first: the first row, may be negative.
         height: rows of the reference picture.
         sin_cos_azimuth: (2, W) float32.
-        pose: (3, 4) float64 source_from_reference.
+        sources: all sources.
+        source: the index of the one.
         virtual_range: in scene units.
-        packed: (·,) uint32 `pack_plane` of all planes of all sources.
-        colors: (·,) uint64 `pack_colors` of all sources, instead of `packed`; needs vector instructions.
-        starts: (C,) int64 where the planes of this source begin, or its colours.
-        shape: (2,) int64 of the source picture.
-        valid: (·,) uint8 like a packed plane: whether a patch may vote; empty if all may.
-        valid_start: where this source's begins.
-        vector: whether to use vector instructions; the result is the same.
         pad: width of the wrapped margin of the result.
-        knots: (2, `knot_rows`(rows), W) float32, scratch.
-        warped: (C, rows, W + 2 pad) uint8, written unless `against` is there.
-        votes: (rows, W) uint8, written unless `valid` is empty.
-        against: (rows, W) uint32 what to compare with at once, see `add_sampled_differences`, or empty.
-        pixel_costs: (rows, W + 2 pad) uint16, to which differences are then added.
+        found: written.
     """
-    rows = warped.shape[1]
+    pose, shape, starts = sources.poses[source], sources.shapes[source], sources.starts[source]
+    packed, colors, vector = sources.packed, sources.colors, sources.vector
+    valid, valid_start = sources.valid, sources.valid_starts[source]
+    knots, warped, votes, against, pixel_costs = found
     width = sin_cos_azimuth.shape[1]
     x_px, y_px = np.empty(width, np.float32), np.empty(width, np.float32)
     index = np.empty(width, np.int32)
@@ -104,7 +117,7 @@ def warp_band(  # type: ignore[no-untyped-def]
     runs = np.empty((width // 16 + 1, 2), np.int64)
     count = 0
     project_knots(first, height, sin_cos_azimuth, pose, virtual_range, shape, knots)
-    for j in range(rows):
+    for j in range(warped.shape[1]):
         base = min(max(j // EVERY - 1, 0), knots.shape[1] - 4)
         if j % EVERY == 0:
             fit_group(knots, base, height, _F(shape[1]), curve, rough)
@@ -118,12 +131,51 @@ def warp_band(  # type: ignore[no-untyped-def]
         place_row(x_px, y_px, shape, index, weight_x, weight_y)
         if len(against):
             add_sampled_differences(colors, starts[0], index, weight_y, weight_x, against, j, pad, pixel_costs)
-        elif len(colors):
-            _sample_rgb(colors, starts[0], index, weight_y, weight_x, warped, j, pad)
         else:
-            _sample_planes(packed, starts, vector, index, weight_y, weight_x, patches, warped, j, pad)
-        for c in range(0 if len(against) else warped.shape[0]):
-            wrap_row(warped[c, j], width, pad)
-        if len(valid):
-            for i in range(_U(width)):
-                votes[_U(j), i] = valid[_U(valid_start) + _U(index[i])]
+            sample_row(packed, colors, starts, vector, index, weight_y, weight_x, patches, warped, j, pad)
+        vote_row(valid, valid_start, index, votes, j)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def sample_row(
+    packed: U32,
+    colors: U64,
+    starts: I64,
+    vector: bool,
+    index: I32,
+    weight_y: I32,
+    weight_x: I32,
+    patches: U32,
+    warped: U8,
+    row: int,
+    pad: int,
+) -> None:
+    """Sample one row of a source at places that are known. No records: at each row they would cost what they hold.
+
+    Args:
+        packed: (·,) uint32 of `Sources`.
+        colors: (·,) uint64 likewise.
+        starts: (C or 1,) int64 of this source.
+        vector: whether to use vector instructions.
+        index: (W,) int32 of the patches, see `place_row`.
+        weight_y: (W,) int32.
+        weight_x: (W,) int32.
+        patches: (W,) uint32, scratch.
+        warped: (C, rows, W + 2 pad) uint8, written.
+        row: of `warped`.
+        pad: width of the wrapped margin.
+    """
+    if len(colors):
+        _sample_rgb(colors, starts[0], index, weight_y, weight_x, warped, row, pad)
+    else:
+        _sample_planes(packed, starts, vector, index, weight_y, weight_x, patches, warped, row, pad)
+    for c in range(warped.shape[0]):
+        wrap_row(warped[c, row], index.shape[0], pad)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def vote_row(valid: U8, start: int, index: I32, votes: U8, row: int) -> None:
+    """Write whether the patches at `index`, (W,), may vote to a row of `votes`; nothing if `valid` is empty."""
+    if len(valid):
+        for i in range(_U(index.shape[0])):
+            votes[_U(row), i] = valid[_U(start) + _U(index[i])]

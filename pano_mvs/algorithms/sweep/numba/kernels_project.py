@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from pano_mvs.algorithms.sweep.numba.kernels_records import F32, F64, I64, U8
 from pano_mvs.algorithms.sweep.numba.kernels_warp import project_row
 
 _F = np.float32
@@ -20,13 +21,13 @@ EVERY = 8
 """Rows from one exact row to the next."""
 
 _BLOCK = 16
-_LARGEST_THIRD_PX = _F(1)
+_MAX_THIRD_PX = _F(1)
 # Eight rows of a lower picture are no small step on the sphere: all its positions are exact.
 _LOWEST_PICTURE = 128
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def ray_row(y, height, pose, virtual_range, matrix, offset):  # type: ignore[no-untyped-def]
+def ray_row(y: int, height: int, pose: F64, virtual_range: float, matrix: F32, offset: F32) -> None:
     """Compute what takes (sin θ, cos θ) of row y, which may lie beyond a pole, into the source; see `project_row`."""
     elevation = np.pi * (0.5 - (y + 0.5) / height)
     level, dip = np.cos(elevation), -np.sin(elevation)
@@ -37,7 +38,7 @@ def ray_row(y, height, pose, virtual_range, matrix, offset):  # type: ignore[no-
 
 
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
-def _across(step, turn):  # type: ignore[no-untyped-def]
+def _across(step: np.float32, turn: np.float32) -> np.float32:
     """Return a difference of columns the short way around."""
     half = _F(turn * _F(0.5))
     step = step - turn if step > half else step
@@ -45,7 +46,7 @@ def _across(step, turn):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def fit_group(knots, first, height, turn, curve, rough):  # type: ignore[no-untyped-def]
+def fit_group(knots: F32, first: int, height: int, turn: np.float32, curve: F32, rough: U8) -> None:
     """Fit cubics through the exact rows `first` to `first` + 3, and see where they are too bent for that.
 
     Args:
@@ -57,7 +58,7 @@ def fit_group(knots, first, height, turn, curve, rough):  # type: ignore[no-unty
         rough: (W,) uint8, written: whether the cubic misses.
     """
     k, one, two, three = _U(first), _U(first + 1), _U(first + 2), _U(first + 3)
-    largest = _LARGEST_THIRD_PX if height >= _LOWEST_PICTURE else _F(-1)
+    largest = _MAX_THIRD_PX if height >= _LOWEST_PICTURE else _F(-1)
     for i in range(_U(rough.shape[0])):
         step = _across(knots[0, one, i] - knots[0, k, i], turn)
         after = _across(knots[0, two, i] - knots[0, one, i], turn)
@@ -77,7 +78,7 @@ def fit_group(knots, first, height, turn, curve, rough):  # type: ignore[no-unty
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def rough_runs(rough, runs):  # type: ignore[no-untyped-def]
+def rough_runs(rough: U8, runs: I64) -> int:
     """Write the runs of blocks of columns that need exact positions, (·, 2) int64 start and stop; return how many."""
     width = rough.shape[0]
     count = 0
@@ -97,7 +98,7 @@ def rough_runs(rough, runs):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def replace_rough(rough, exact, start, stop, x_px, y_px):  # type: ignore[no-untyped-def]
+def replace_rough(rough: U8, exact: F32, start: int, stop: int, x_px: F32, y_px: F32) -> None:
     """Take the exact positions, (2, W), of the rough columns, and of no others: blocks must not show in the result."""
     for i in range(_U(start), _U(stop)):
         x_px[i] = exact[0, i] if rough[i] else x_px[i]
@@ -105,7 +106,7 @@ def replace_rough(rough, exact, start, stop, x_px, y_px):  # type: ignore[no-unt
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def follow_curve(knots, first, curve, step, x_px, y_px):  # type: ignore[no-untyped-def]
+def follow_curve(knots: F32, first: int, curve: F32, step: float, x_px: F32, y_px: F32) -> None:
     """Evaluate the cubics `step` exact rows after `first`, at most 3; writes x_px and y_px, (W,) float32."""
     k = _U(first)
     t = _F(step)
@@ -118,13 +119,15 @@ def follow_curve(knots, first, curve, step, x_px, y_px):  # type: ignore[no-unty
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def knot_rows(rows):  # type: ignore[no-untyped-def]
+def knot_rows(rows: int) -> int:
     """Return how many exact rows a band of `rows` needs; at least four."""
     return max(-(-(rows - 1) // EVERY) + 1, 4)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def project_knots(first, height, sin_cos_azimuth, pose, virtual_range, shape, knots):  # type: ignore[no-untyped-def]
+def project_knots(
+    first: int, height: int, sin_cos_azimuth: F32, pose: F64, virtual_range: float, shape: I64, knots: F32
+) -> None:
     """Compute every eighth row from `first` exactly, into (2, K, W) float32."""
     matrix = np.empty((3, 2), np.float32)
     offset = np.empty(3, np.float32)

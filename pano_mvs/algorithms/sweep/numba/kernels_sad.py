@@ -7,28 +7,29 @@ from numba import njit
 
 from pano_mvs.algorithms.sweep.numba.kernels_combine import ENOUGH
 from pano_mvs.algorithms.sweep.numba.kernels_cost import box_rows, difference_row
+from pano_mvs.algorithms.sweep.numba.kernels_records import F32, I32, I64, U8, U16, U32, U64, Combination
 from pano_mvs.algorithms.sweep.numba.kernels_warp import wrap_row
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR, PIXELS, difference_rgb_block
 
 _F = np.float32
 _U = np.uint64
-_LARGEST = 3 * 255
+_MAX_DIFFERENCE = 3 * 255
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def one_box_serves(sources, share, most, box_radius, pad):  # type: ignore[no-untyped-def]
+def one_box_serves(sources: int, combination: Combination, box_radius: int, pad: int) -> bool:
     """Return whether the mean of all sources counts, whose differences can then be added before they are averaged.
 
-    `share` and `most` are those of `combine_row`; all sources must vote alike. The sums have to fit uint16, and int32
-    in the widest box.
+    All sources must vote alike. The sums have to fit uint16, and int32 in the widest box.
     """
-    used = min(most, np.int64(np.ceil(share * ENOUGH * sources)))
-    largest = _LARGEST * sources
-    return used == sources and largest < 1 << 16 and largest * (2 * box_radius + 1) * (2 * pad + 1) < 1 << 31
+    used = min(combination.max_count, int(np.ceil(combination.share * ENOUGH * sources)))
+    largest = _MAX_DIFFERENCE * sources
+    fits = largest < 1 << 16 and largest * (2 * box_radius + 1) * (2 * pad + 1) < 1 << 31
+    return len(combination.weights) == 0 and used == sources and fits
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def interleave_rows(reference, first, rows, pad):  # type: ignore[no-untyped-def]
+def interleave_rows(reference: U8, first: int, rows: int, pad: int) -> U32:
     """Return rows `first` … of (3, H + 2 pad, W + 2 pad) uint8, without the margin, as R | G << 8 | B << 16."""
     width = reference.shape[2] - 2 * pad
     pixels = np.zeros((rows, width), np.uint32)
@@ -40,9 +41,17 @@ def interleave_rows(reference, first, rows, pad):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def add_sampled_differences(  # type: ignore[no-untyped-def]
-    colors, start, index, weight_y, weight_x, reference, row, pad, pixel_costs
-):
+def add_sampled_differences(
+    colors: U64,
+    start: int,
+    index: I32,
+    weight_y: I32,
+    weight_x: I32,
+    reference: U32,
+    row: int,
+    pad: int,
+    pixel_costs: U16,
+) -> None:
     """Sample a row by vector instructions and add its differences from the reference; W must be whole blocks.
 
     Args:
@@ -66,7 +75,7 @@ def add_sampled_differences(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def add_differences(reference, first, warped, pad, pixel_costs):  # type: ignore[no-untyped-def]
+def add_differences(reference: U8, first: int, warped: U8, pad: int, pixel_costs: U16) -> None:
     """Add what a warped source, (C, rows, W + 2 pad) uint8, differs by from the reference's rows `first` …."""
     width = pixel_costs.shape[1] - 2 * pad
     for j in range(pixel_costs.shape[0]):
@@ -75,7 +84,7 @@ def add_differences(reference, first, warped, pad, pixel_costs):  # type: ignore
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def average_differences(pixel_costs, reach, radius, pad, scratch, means):  # type: ignore[no-untyped-def]
+def average_differences(pixel_costs: U16, reach: I64, radius: int, pad: int, scratch: I32, means: F32) -> None:
     """Average costs over the box; the margins of `pixel_costs` are written first. See `box_rows`."""
     for j in range(pixel_costs.shape[0]):
         wrap_row(pixel_costs[j], means.shape[1], pad)
@@ -88,7 +97,7 @@ def average_differences(pixel_costs, reach, radius, pad, scratch, means):  # typ
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def divide_row(sums, count, result):  # type: ignore[no-untyped-def]
+def divide_row(sums: F32, count: int, result: F32) -> None:
     """Write sums / count, both (W,) float32."""
     for i in range(_U(result.shape[0])):
         result[i] = sums[i] / _F(count)

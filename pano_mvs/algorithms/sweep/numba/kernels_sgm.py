@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from pano_mvs.algorithms.sweep.numba.kernels_records import U8, U16
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector_path import LINES, step_lines
 
@@ -19,9 +20,19 @@ _BLOCK = 32  # columns of which all planes fit the nearest cache
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def step_plain(  # type: ignore[no-untyped-def]
-    volume, total, place, segment, penalties, p1, before, least_before, after, least, keep
-):
+def step_plain(
+    volume: U8,
+    total: U16,
+    place: tuple[int, int],
+    segment: tuple[int, int],
+    penalties: U16,
+    p1: np.uint16,
+    before: U16,
+    least_before: U16,
+    after: U16,
+    least: U16,
+    keep: bool,
+) -> None:
     """Advance the lines of one segment by one row: `place` (row, column), `segment` (first line, lines)."""
     row, column = _U(place[0]), _U(place[1])
     first, lines = _U(segment[0]), _U(segment[1])
@@ -44,7 +55,17 @@ def step_plain(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def step_segment(volume, total, place, segment, penalties, p1, state, least, keep):  # type: ignore[no-untyped-def]
+def step_segment(
+    volume: U8,
+    total: U16,
+    place: tuple[int, int],
+    segment: tuple[int, int],
+    penalties: U16,
+    p1: np.uint16,
+    state: U16,
+    least: U16,
+    keep: bool,
+) -> None:
     """Do what `step_plain` does by vector instructions, in place; volume and total must be contiguous.
 
     Lines have a margin of `LINES` on either side: where the row ends before a register does, it starts earlier, with
@@ -55,15 +76,25 @@ def step_segment(volume, total, place, segment, penalties, p1, state, least, kee
     for done in range(0, lines, LINES):
         back = max(0, place[1] + done + LINES - width)
         column = place[1] + done - back
+        counted = _U(back), _U(back + min(LINES, lines - done))
         step_lines(
-            volume, total, _U(place[0] * depth * width + column), _U(width), _U(depth), p1, penalties,
-            _U(place[0] * width + column), state, least, _U(LINES + first + done - back), _U(state.shape[1]),
-            _U(back), _U(back + min(LINES, lines - done)), _U(keep),
-        )  # fmt: skip
+            volume,
+            total,
+            (_U(place[0] * depth * width + column), _U(width), _U(depth)),
+            p1,
+            penalties,
+            _U(place[0] * width + column),
+            state,
+            least,
+            (_U(LINES + first + done - back), _U(state.shape[1]), counted[0], counted[1]),
+            _U(keep),
+        )
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def sweep_strip(volume, total, penalties, p1, first, lines, drift, upward, warm):  # type: ignore[no-untyped-def]
+def sweep_strip(
+    volume: U8, total: U16, penalties: U16, p1: np.uint16, first: int, lines: int, drift: int, upward: bool, warm: int
+) -> None:
     """Follow one strip of parallel paths from pole to pole and add their costs to the total.
 
     Line k is at column first + k + drift·i in step i. Steps i < 0 lie beyond the pole from which the paths come:
@@ -104,13 +135,22 @@ def sweep_strip(volume, total, penalties, p1, first, lines, drift, upward, warm)
         least[now, :] = _OUTSIDE
         for place, segment in (((row, column), (0, direct)), ((row, 0), (direct, lines - direct))):
             step_plain(
-                volume, total, place, segment, penalties, p1,
-                buffers[1 - now], least[1 - now], buffers[now], least[now], i >= 0,
-            )  # fmt: skip
+                volume,
+                total,
+                place,
+                segment,
+                penalties,
+                p1,
+                buffers[1 - now],
+                least[1 - now],
+                buffers[now],
+                least[now],
+                i >= 0,
+            )
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _turn_row(volume, y, costs):  # type: ignore[no-untyped-def]
+def _turn_row(volume: U8, y: int, costs: U8) -> None:
     """Write row y of a volume, (H, D, W), pixel by pixel, into (W, D)."""
     row, width = _U(y), volume.shape[2]
     for start in range(0, width, _BLOCK):
@@ -121,7 +161,7 @@ def _turn_row(volume, y, costs):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _add_turned_row(sums, y, total):  # type: ignore[no-untyped-def]
+def _add_turned_row(sums: U16, y: int, total: U16) -> None:
     """Add (W, D) to row y of (H, D, W)."""
     row, width = _U(y), total.shape[2]
     for start in range(0, width, _BLOCK):
@@ -132,7 +172,7 @@ def _add_turned_row(sums, y, total):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _circle(costs, penalties, p1, direction, warm, sums):  # type: ignore[no-untyped-def]
+def _circle(costs: U8, penalties: U16, p1: np.uint16, direction: int, warm: int, sums: U16) -> None:
     """Follow one horizontal path and add its costs to `sums`, (W, D) uint16; `penalties` is (W,).
 
     The loops are in this function, and not in one for each pixel: views of arrays take longer than a pixel's planes.
@@ -163,7 +203,7 @@ def _circle(costs, penalties, p1, direction, warm, sums):  # type: ignore[no-unt
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def sweep_row(volume, total, penalties, p1, y, warm):  # type: ignore[no-untyped-def]
+def sweep_row(volume: U8, total: U16, penalties: U16, p1: np.uint16, y: int, warm: int) -> None:
     """Follow both horizontal paths of one row around the sphere and add their costs to the total.
 
     Args:

@@ -7,8 +7,13 @@ signed ones for negative indices.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.sweep.numba.kernels_records import F32, I32, I64, U8, U32
 
 _F = np.float32
 _U = np.uint64
@@ -25,15 +30,41 @@ HALFWAY_ROUND, ROUND = 1 << (HALFWAY_SHIFT - 1), 1 << (SHIFT - 1)
 
 
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
-def _atan_unit(a):  # type: ignore[no-untyped-def]
+def _atan_unit(a: np.float32) -> np.float32:
     """Return atan of a number in [0, 1], float32."""
     s = a * a
     tail = _A8 + s * (_A10 + s * (_A12 + s * (_A14 + s * _A16)))
     return a * (_ONE + s * (_A2 + s * (_A4 + s * (_A6 + s * tail))))
 
 
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def azimuth_of(x: np.float32, z: np.float32) -> np.float32:
+    """Return atan2(x, z), float32."""
+    ax, az = abs(x), abs(z)
+    small = ax if ax < az else az
+    large = az if ax < az else ax
+    turn: np.float32 = _atan_unit(small / (large + _TINY))
+    turn = _HALF_PI - turn if ax > az else turn
+    turn = _PI - turn if z < _F(0) else turn
+    return -turn if x < _F(0) else turn
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def dip_of(x: np.float32, y: np.float32, z: np.float32) -> np.float32:
+    """Return atan2(y, hypot(x, z)), the angle below the horizon, float32."""
+    ay = abs(y)
+    level = np.sqrt(x * x + z * z)
+    small = ay if ay < level else level
+    large = level if ay < level else ay
+    dip: np.float32 = _atan_unit(small / (large + _TINY))
+    dip = _HALF_PI - dip if ay > level else dip
+    return -dip if y < _F(0) else dip
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
-def project_row(sin_cos_azimuth, matrix, offset, shape, start, stop, x_px, y_px):  # type: ignore[no-untyped-def]
+def project_row(
+    sin_cos_azimuth: F32, matrix: F32, offset: F32, shape: I64, start: int, stop: int, x_px: F32, y_px: F32
+) -> None:
     """Find where the columns `start` … `stop` − 1 of a row of rays, of azimuth θ, arrive in a packed source.
 
     Args:
@@ -56,25 +87,12 @@ def project_row(sin_cos_azimuth, matrix, offset, shape, start, stop, x_px, y_px)
         x = m00 * s + m01 * c + o0
         y = m10 * s + m11 * c + o1
         z = m20 * s + m21 * c + o2
-        ax, ay, az = abs(x), abs(y), abs(z)
-        small = ax if ax < az else az
-        large = az if ax < az else ax
-        turn = _atan_unit(small / (large + _TINY))
-        turn = _HALF_PI - turn if ax > az else turn
-        turn = _PI - turn if z < _F(0) else turn
-        turn = -turn if x < _F(0) else turn
-        level = np.sqrt(x * x + z * z)
-        small = ay if ay < level else level
-        large = level if ay < level else ay
-        dip = _atan_unit(small / (large + _TINY))
-        dip = _HALF_PI - dip if ay > level else dip
-        dip = -dip if y < _F(0) else dip
-        x_px[i] = turn * x_scale + x_middle
-        y_px[i] = dip * y_scale + y_middle
+        x_px[i] = azimuth_of(x, z) * x_scale + x_middle
+        y_px[i] = dip_of(x, y, z) * y_scale + y_middle
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def place_row(x_px, y_px, shape, index, weight_x, weight_y):  # type: ignore[no-untyped-def]
+def place_row(x_px: F32, y_px: F32, shape: I64, index: I32, weight_x: I32, weight_y: I32) -> None:
     """Turn positions among packed patches into an index and integer weights.
 
     Args:
@@ -103,7 +121,7 @@ def place_row(x_px, y_px, shape, index, weight_x, weight_y):  # type: ignore[no-
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def gather_row(packed, start, index, patches):  # type: ignore[no-untyped-def]
+def gather_row(packed: U32, start: int, index: I32, patches: U32) -> None:
     """Fetch the 2×2 patches, packed as four bytes, at `start + index`; all (W,) but `packed`."""
     base = _U(start)
     for i in range(_U(index.shape[0])):
@@ -111,7 +129,7 @@ def gather_row(packed, start, index, patches):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def blend_row(patches, weight_x, weight_y, out, out_at):  # type: ignore[no-untyped-def]
+def blend_row(patches: U32, weight_x: I32, weight_y: I32, out: U8, out_at: int) -> None:
     """Blend 2×2 patches bilinearly into `out[out_at:out_at + W]`, uint8, rounded.
 
     A patch holds values less 128 in four signed bytes, upper left, lower left, upper right and lower right. Weights are
@@ -134,7 +152,7 @@ def blend_row(patches, weight_x, weight_y, out, out_at):  # type: ignore[no-unty
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def wrap_row(row, width, pad):  # type: ignore[no-untyped-def]
+def wrap_row(row: NDArray[Any], width: int, pad: int) -> None:
     """Fill the `pad` entries on either side of `row[pad:pad + width]` over the seam."""
     for i in range(pad):
         row[i] = row[width + i]

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
+from pano_mvs.algorithms.sweep.numba.kernels_records import U16
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR, REGISTER_BYTES
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector_winner import (
     AFTER,
@@ -37,7 +41,16 @@ PLANES_AT_ONCE = 8
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def update_plain(costs, start, count, plane, state, y, planes, begin):  # type: ignore[no-untyped-def]
+def update_plain(
+    costs: NDArray[Any],
+    start: int,
+    count: int,
+    plane: int,
+    state: NDArray[Any],
+    y: int,
+    planes: NDArray[Any],
+    begin: int,
+) -> None:
     """Take in the costs of some planes for one row.
 
     `EARLIER` is the least cost of all planes but the last two: when a plane wins, it is the rival so far.
@@ -79,7 +92,9 @@ def update_plain(costs, start, count, plane, state, y, planes, begin):  # type: 
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def update_winners(costs, start, count, plane, state, y, planes):  # type: ignore[no-untyped-def]
+def update_winners(
+    costs: NDArray[Any], start: int, count: int, plane: int, state: NDArray[Any], y: int, planes: NDArray[Any]
+) -> None:
     """Do what `update_plain` does, by vector instructions where there are any; costs and state must be contiguous."""
     width, rows = costs.shape[1], state.shape[1]
     whole = 0
@@ -88,14 +103,22 @@ def update_winners(costs, start, count, plane, state, y, planes):  # type: ignor
         whole = width - width % pixels
         for i in range(0, whole, pixels):
             take_planes(
-                costs, _U(start * width + i), _U(width), _U(plane), _U(count),
-                state, _U(y * width + i), _U(rows * width), planes, _U(y * width + i),
-            )  # fmt: skip
+                costs,
+                _U(start * width + i),
+                _U(width),
+                _U(plane),
+                _U(count),
+                state,
+                _U(y * width + i),
+                _U(rows * width),
+                planes,
+                _U(y * width + i),
+            )
     update_plain(costs, start, count, plane, state, y, planes, whole)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def winners_of_rows(total, first, state, planes):  # type: ignore[no-untyped-def]
+def winners_of_rows(total: U16, first: int, state: U16, planes: U16) -> None:
     """Find the winners of some rows of a volume.
 
     Args:

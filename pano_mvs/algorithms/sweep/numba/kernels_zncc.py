@@ -5,15 +5,18 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from pano_mvs.algorithms.sweep.numba.kernels_constants import ZNCC_NOISE_VARIANCE
 from pano_mvs.algorithms.sweep.numba.kernels_cost import box_rows
-from pano_mvs.algorithms.sweep.settings import ZNCC_NOISE_VARIANCE
+from pano_mvs.algorithms.sweep.numba.kernels_records import F32, I32, I64, U8, U16
 
 _F = np.float32
 _U = np.uint64
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def zncc_rows(first, reference, warped, reach, radius, pad, products, scratch, means):  # type: ignore[no-untyped-def]
+def zncc_rows(
+    first: int, reference: U8, warped: U8, reach: I64, radius: int, pad: int, products: U16, scratch: I32, means: F32
+) -> None:
     """Write 1 − ρ of a band, ρ the correlation of reference and warped source over each pixel's window.
 
     ρ = cov(r, w) / √((var r + ν)(var w + ν)), ν the variance of noise: what is bare correlates with nothing.
@@ -50,7 +53,7 @@ def zncc_rows(first, reference, warped, reach, radius, pad, products, scratch, m
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _multiply(one, other, products):  # type: ignore[no-untyped-def]
+def _multiply(one: U8, other: U8, products: U16) -> None:
     for j in range(_U(products.shape[0])):
         for i in range(_U(products.shape[1])):
             products[j, i] = np.uint16(np.uint16(one[j, i]) * np.uint16(other[j, i]))

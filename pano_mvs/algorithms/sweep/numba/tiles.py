@@ -1,31 +1,24 @@
-"""Parts of bands of rows in which something is to be swept, and the arguments of the band kernels for them."""
+"""Sweep parts of bands only: tiles, the runs of neighbouring tiles, and the arguments of the kernels for a run."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from inspect import signature
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.backends.numba_backend import _band_arguments
-from pano_mvs.algorithms.sweep.numba.kernels_band import sweep_band
-from pano_mvs.algorithms.sweep.preparation import SweepInput
+from pano_mvs.algorithms.sweep.numba.arguments import BAND_ROWS
+from pano_mvs.algorithms.sweep.numba.kernels_records import Sweep, Windows
 
-BAND_ROWS = 32
 _TILE_COLUMNS = 64
-# A band of which so much is to be swept is swept as a whole.
+# A band of which this share is to be swept is swept as a whole.
 _WHOLE_SHARE = 0.7
-# The arguments of `sweep_band` that all bands share, as `numba_backend` prepares them.
-_SHARED = tuple(signature(getattr(sweep_band, "py_func", sweep_band)).parameters)[1:-3]
-
-Arguments: TypeAlias = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Run:
+class TileRun:
     """Neighbouring tiles of one band.
 
     Attributes:
@@ -74,44 +67,40 @@ def spread_tiles(tiles: NDArray[Any], size_hw: tuple[int, int]) -> NDArray[Any]:
     return tiles.repeat(BAND_ROWS, axis=0)[:height].repeat(_TILE_COLUMNS, axis=1)[:, :width]
 
 
-def runs_of(tiles: NDArray[np.bool_], size_hw: tuple[int, int], shared: Arguments) -> list[Run]:
+def runs_of(tiles: NDArray[np.bool_], size_hw: tuple[int, int], windows: Windows) -> list[TileRun]:
     """Return the runs of tiles that are set, (bands, tiles), from top to bottom."""
     height, width = size_hw
     runs = []
     for band, row in enumerate(tiles):
         first, rows = band * BAND_ROWS, min(BAND_ROWS, height - band * BAND_ROWS)
         if row.mean() > _WHOLE_SHARE:
-            runs.append(Run(first, rows, 0, width, 0))
+            runs.append(TileRun(first, rows, 0, width, 0))
             continue
-        margin = _margin(shared, first, rows)
-        runs += [Run(first, rows, start, stop - start, margin) for start, stop in _stretches(row, width)]
+        margin = _margin(windows, first, rows)
+        runs += [TileRun(first, rows, start, stop - start, margin) for start, stop in _stretches(row, width)]
     return runs
 
 
-def shared_arguments(work: SweepInput) -> Arguments:
-    """Return the arguments of `sweep_band` that all bands share, by name and in its order."""
-    return dict(zip(_SHARED, _band_arguments(work), strict=True))
-
-
-def run_arguments(shared: Arguments, run: Run) -> Arguments:
+def run_arguments(sweep: Sweep, run: TileRun) -> Sweep:
     """Return the arguments that all bands share, cut to the columns of a run."""
     if run.margin == 0:
-        return dict(shared)
-    pad, width, columns = shared["pad"], shared["sin_cos_azimuth"].shape[1], run.with_margin
+        return sweep
+    pad, width, columns = sweep.windows.pad, sweep.sin_cos_azimuth.shape[1], run.with_margin
     padded = np.arange(columns[0] - pad, columns[-1] + pad + 1) % width + pad
-    cut = {
-        "reference": np.ascontiguousarray(shared["reference"][:, :, padded]),
-        "sin_cos_azimuth": np.ascontiguousarray(shared["sin_cos_azimuth"][:, columns % width]),
-    }
-    if shared["weights"].size:
-        cut["weights"] = np.ascontiguousarray(shared["weights"][:, :, columns % width])
-    return shared | cut
+    combination = sweep.combination
+    if combination.weights.size:
+        combination = combination._replace(weights=np.ascontiguousarray(combination.weights[:, :, columns % width]))
+    return sweep._replace(
+        reference=np.ascontiguousarray(sweep.reference[:, :, padded]),
+        sin_cos_azimuth=np.ascontiguousarray(sweep.sin_cos_azimuth[:, columns % width]),
+        combination=combination,
+    )
 
 
-def _margin(shared: Arguments, first: int, rows: int) -> int:
+def _margin(windows: Windows, first: int, rows: int) -> int:
     """Return how far the windows of a band reach, the box's and those that look around within it."""
     around = slice(max(0, first - BAND_ROWS // 2), first + rows + BAND_ROWS // 2)
-    return int(shared["offsets"][around].max() + shared["reach"][around].max()) + 1
+    return int(windows.offsets[around].max() + windows.reach[around].max()) + 1
 
 
 def _stretches(tiles: NDArray[np.bool_], width: int) -> Iterator[tuple[int, int]]:

@@ -51,12 +51,16 @@ _I8, _I16, _I32, _I64 = (ir.IntType(bits) for bits in (8, 16, 32, 64))
 _NAMES = {
     "pairs": {1: "llvm.x86.sse2.pmadd.wd", 2: "llvm.x86.avx2.pmadd.wd", 4: "llvm.x86.avx512.pmaddw.d.512"},
     "to_words": {
-        1: "llvm.x86.sse2.packssdw.128", 2: "llvm.x86.avx2.packssdw", 4: "llvm.x86.avx512.packssdw.512",
+        1: "llvm.x86.sse2.packssdw.128",
+        2: "llvm.x86.avx2.packssdw",
+        4: "llvm.x86.avx512.packssdw.512",
     },
     "to_bytes": {
-        1: "llvm.x86.sse2.packsswb.128", 2: "llvm.x86.avx2.packsswb", 4: "llvm.x86.avx512.packsswb.512",
+        1: "llvm.x86.sse2.packsswb.128",
+        2: "llvm.x86.avx2.packsswb",
+        4: "llvm.x86.avx512.packsswb.512",
     },
-}  # fmt: skip
+}
 
 
 def _vector(element: ir.IntType) -> ir.VectorType:
@@ -136,11 +140,11 @@ def _unsigned_byte(builder: Any, values: Any) -> Any:
 
 
 @intrinsic
-def blend_grey_block(typingctx, patches, weight_y, weight_x, at, out, out_at):  # type: ignore[no-untyped-def]
+def blend_grey_block(typingctx: Any, patches: Any, weight_y: Any, weight_x: Any, at: Any, out: Any, out_at: Any) -> Any:
     """Blend patches `at` … of one colour, into `out_at` … of `out`, uint8; the positions are counted in elements."""
     signature = types.void(patches, weight_y, weight_x, types.uint64, out, types.uint64)
 
-    def emit(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         whole = _vector(_I32)
         loaded = [
             load_unaligned(builder, element_pointer(context, builder, sig.args[k], args[k], args[3], whole))
@@ -187,14 +191,23 @@ def _rgb_bytes(context: Any, builder: Any, packed: tuple[Any, Any], base: Any, r
 
 
 @intrinsic
-def sample_rgb_block(  # type: ignore[no-untyped-def]
-    typingctx, packed, base, index, weight_y, weight_x, at, out, out_at, out_step
-):
+def sample_rgb_block(
+    typingctx: Any,
+    packed: Any,
+    base: Any,
+    index: Any,
+    weight_y: Any,
+    weight_x: Any,
+    at: Any,
+    out: Any,
+    out_at: Any,
+    out_step: Any,
+) -> Any:
     """Sample pixels `at` … in a source packed from `base`, into `out_at` …; each next colour `out_step` further on."""
     place = types.uint64
     signature = types.void(packed, place, index, weight_y, weight_x, place, out, place, place)
 
-    def emit(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         whole = _vector(_I32)
         rows = [element_pointer(context, builder, sig.args[2], args[2], args[5], _I32)]
         rows += [
@@ -213,9 +226,19 @@ def sample_rgb_block(  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def difference_rgb_block(  # type: ignore[no-untyped-def]
-    typingctx, packed, base, index, weight_y, weight_x, at, reference, reference_at, total, total_at
-):
+def difference_rgb_block(
+    typingctx: Any,
+    packed: Any,
+    base: Any,
+    index: Any,
+    weight_y: Any,
+    weight_x: Any,
+    at: Any,
+    reference: Any,
+    reference_at: Any,
+    total: Any,
+    total_at: Any,
+) -> Any:
     """Sample as `sample_rgb_block` does and add |R − r| + |G − g| + |B − b| to `total`, uint16.
 
     `reference` holds its pixels as R | G << 8 | B << 16, uint32; the positions are counted in elements.
@@ -223,7 +246,7 @@ def difference_rgb_block(  # type: ignore[no-untyped-def]
     place = types.uint64
     signature = types.void(packed, place, index, weight_y, weight_x, place, reference, place, total, place)
 
-    def emit(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         whole, byte = _vector(_I32), _constant(_I32, 255)
         rows = [element_pointer(context, builder, sig.args[2], args[2], args[5], _I32)]
         for k in (3, 4):
@@ -251,9 +274,18 @@ CENSUS_PIXELS: Final = 4 * PIXELS
 
 
 @intrinsic
-def census_block(  # type: ignore[no-untyped-def]
-    typingctx, reference, reference_at, warped, warped_at, stride, offsets, side, out, out_at
-):
+def census_block(
+    typingctx: Any,
+    reference: Any,
+    reference_at: Any,
+    warped: Any,
+    warped_at: Any,
+    stride: Any,
+    offsets: Any,
+    side: Any,
+    out: Any,
+    out_at: Any,
+) -> Any:
     """Do what `kernels_cost.census_row` does for some pixels, the counts staying in a register.
 
     Args:
@@ -271,7 +303,7 @@ def census_block(  # type: ignore[no-untyped-def]
     place = types.uint64
     signature = types.void(reference, place, warped, place, place, offsets, place, out, place)
 
-    def emit(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         whole = _vector(_I8)
         pictures = ((sig.args[0], args[0], args[1]), (sig.args[2], args[2], args[3]))
         centers = [

@@ -52,55 +52,71 @@ def _add(builder: Any, pointer: Any, value: Any, inside: Any, whole: Any) -> Non
 
 
 @intrinsic
-def step_lines(  # type: ignore[no-untyped-def]
-    typingctx, volume, total, at, step, depth, p1, penalties, penalty_at, state, least, line, stride, first, last, keep
-):
-    """Do what `kernels_sgm.step_plain` does, for the lines `first` to before `last` of those a register holds.
+def step_lines(
+    typingctx: Any,
+    volume: Any,
+    total: Any,
+    voxels: Any,
+    p1: Any,
+    penalties: Any,
+    penalty_at: Any,
+    state: Any,
+    least: Any,
+    lines: Any,
+    keep: Any,
+) -> Any:
+    """Do what `kernels_sgm.step_plain` does, for some of the lines that a register holds.
 
     Args:
         typingctx: numba's.
         volume: uint8, of any rank; positions are counted in elements.
         total: uint16, of the volume's shape.
-        at: where in both the register's first line is in the first plane.
-        step: from a plane to the next.
-        depth: number of planes.
+        voxels: three uint64: where in both the register's first line is in the first plane, from a plane to the next,
+            the number of planes.
         p1: uint16.
         penalties: uint16.
         penalty_at: where the first line's is.
         state: (depth + 1, stride) uint16.
         least: (stride,) uint16.
-        line: where the first line is in those.
-        stride: of the state.
-        first: of the lines that count.
-        last: one past them.
+        lines: four uint64: where the first line is in those, the stride of the state, the first of the lines that
+            count and one past the last.
         keep: 1 to add to the total, 0 not to.
     """
     place = types.uint64
     signature = types.void(
-        volume, total, place, place, place, types.uint16, penalties, place, state, least, place, place, place, place,
+        volume,
+        total,
+        types.UniTuple(place, 3),
+        types.uint16,
+        penalties,
         place,
-    )  # fmt: skip
+        state,
+        least,
+        types.UniTuple(place, 4),
+        place,
+    )
 
-    def emit(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         def at(k: int, position: Any, kind: Any = _WORDS) -> Any:
             return element_pointer(context, builder, sig.args[k], args[k], position, kind)
 
-        inside = _inside(builder, args[12], args[13])
-        count = builder.sub(args[13], args[12])
-        whole = builder.icmp_unsigned("==", count, ir.Constant(_I64, LINES))
-        keep = builder.icmp_unsigned("!=", args[14], ir.Constant(_I64, 0))
-        least_at = at(9, args[10])
+        voxel_at, voxel_step, depth = cgutils.unpack_tuple(builder, args[2], 3)
+        line, stride, first, last = cgutils.unpack_tuple(builder, args[8], 4)
+        inside = _inside(builder, first, last)
+        whole = builder.icmp_unsigned("==", builder.sub(last, first), ir.Constant(_I64, LINES))
+        keep = builder.icmp_unsigned("!=", args[9], ir.Constant(_I64, 0))
+        least_at = at(7, line)
         floor = load_unaligned(builder, least_at)
-        jump = builder.add(floor, load_unaligned(builder, at(6, args[7])))
-        p1 = _everywhere(builder, args[5])
+        jump = builder.add(floor, load_unaligned(builder, at(4, args[5])))
+        p1 = _everywhere(builder, args[3])
         outside = ir.Constant(_WORDS, [60000] * LINES)
         before = cgutils.alloca_once_value(builder, outside)
-        here = cgutils.alloca_once_value(builder, load_unaligned(builder, at(8, args[10])))
+        here = cgutils.alloca_once_value(builder, load_unaligned(builder, at(6, line)))
         lowest = cgutils.alloca_once_value(builder, outside)
-        with cgutils.for_range(builder, args[4]) as loop:
-            position = builder.add(args[10], builder.mul(loop.index, args[11]))
-            voxel = builder.add(args[2], builder.mul(loop.index, args[3]))
-            stay, after = builder.load(here), load_unaligned(builder, at(8, builder.add(position, args[11])))
+        with cgutils.for_range(builder, depth) as loop:
+            position = builder.add(line, builder.mul(loop.index, stride))
+            voxel = builder.add(voxel_at, builder.mul(loop.index, voxel_step))
+            stay, after = builder.load(here), load_unaligned(builder, at(6, builder.add(position, stride)))
             near = builder.add(_least(builder, builder.load(before), after), p1)
             near = _least(builder, stay, _least(builder, near, jump))
             cost = builder.zext(load_unaligned(builder, at(0, voxel, _BYTES)), _WORDS)
@@ -108,7 +124,7 @@ def step_lines(  # type: ignore[no-untyped-def]
             builder.store(_least(builder, value, builder.load(lowest)), lowest)
             builder.store(stay, before)
             builder.store(after, here)
-            builder.store(builder.select(inside, value, stay), at(8, position), align=1)
+            builder.store(builder.select(inside, value, stay), at(6, position), align=1)
             with builder.if_then(keep):
                 _add(builder, at(1, voxel), value, inside, whole)
         builder.store(builder.select(inside, builder.load(lowest), floor), least_at, align=1)

@@ -42,19 +42,33 @@ def _take(builder: Any, cost: Any, now: Any, state: list[Any], planes: Any) -> N
     kept_rival = builder.select(builder.icmp_unsigned(">", gap, one), _least(builder, cost, rival), rival)
     kept_after = builder.select(builder.icmp_unsigned("==", gap, one), cost, after)
     following = {
-        BEST: builder.select(wins, cost, best), BEFORE: builder.select(wins, last, before),
-        AFTER: builder.select(wins, cost, kept_after), RIVAL: builder.select(wins, earlier, kept_rival),
-        LAST: cost, LAST_BUT_ONE: last, EARLIER: earlier,
-    }  # fmt: skip
+        BEST: builder.select(wins, cost, best),
+        BEFORE: builder.select(wins, last, before),
+        AFTER: builder.select(wins, cost, kept_after),
+        RIVAL: builder.select(wins, earlier, kept_rival),
+        LAST: cost,
+        LAST_BUT_ONE: last,
+        EARLIER: earlier,
+    }
     for row, value in following.items():
         builder.store(value, state[row])
     builder.store(builder.select(wins, now, winner), planes)
 
 
 @intrinsic
-def take_planes(  # type: ignore[no-untyped-def]
-    typingctx, costs, cost_at, cost_step, plane, count, state, state_at, state_step, planes, planes_at
-):
+def take_planes(
+    typingctx: Any,
+    costs: Any,
+    cost_at: Any,
+    cost_step: Any,
+    plane: Any,
+    count: Any,
+    state: Any,
+    state_at: Any,
+    state_step: Any,
+    planes: Any,
+    planes_at: Any,
+) -> Any:
     """Do what `kernels_winner.update_plain` does for as many pixels as a register holds.
 
     Args:
@@ -73,7 +87,7 @@ def take_planes(  # type: ignore[no-untyped-def]
     place = types.uint64
     signature = types.void(costs, place, place, place, place, state, place, place, planes, place)
 
-    def emit(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         element, index = (context.get_value_type(sig.args[k].dtype) for k in (0, 8))
         lanes = REGISTER_BYTES * 8 // index.width
         kind, indices = ir.VectorType(element, lanes), ir.VectorType(index, lanes)
