@@ -18,15 +18,14 @@ from pano_mvs.scene import Record
 
 _INTRODUCTION = """# API for plugins
 
-All that `pano_mvs.api` has, from its docstrings; [Plugins](../plugins.md) shows how it is used. The rest of `pano_mvs`
-may be used like any library, [`pano_mvs.geometry`](conventions.md) above all."""
+This page is generated from the docstrings of `pano_mvs.api`; [Plugins](../plugins.md) shows how to use it. The rest of
+`pano_mvs` may be used like any library, for example [`pano_mvs.geometry`](conventions.md)."""
 
 _CARDINALITIES = {
-    "One": "`x: One[K]`: the one `K` of the capture, such as `Poses`.",
-    "Each": "`x: Each[K]`: the `K` of the picture, pair or view that this call is about. `Each[K] | None` may stay "
-    "unconnected.",
-    "Near": "`x: Near[K]`: a list, the `K` of its neighbours, in order; of a pair, of both pictures.",
-    "All": "`x: All[K]`: a mapping, by name, of all; loaded when asked for.",
+    "One": "`x: One[K]`: the single `K` of the capture, such as `Poses`.",
+    "Each": "`x: Each[K]`: the `K` of the image, pair or view of this call. `Each[K] | None` may stay unconnected.",
+    "Near": "`x: Near[K]`: a list of the `K` of its neighbours, in order; for a pair, of both images.",
+    "All": "`x: All[K]`: a mapping from names to the `K` of all items; values are loaded on access.",
 }
 
 

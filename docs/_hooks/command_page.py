@@ -1,4 +1,4 @@
-"""The reference of the command line, from the commands themselves."""
+"""Generate the reference of the command line from the commands."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from pano_mvs.cli.app import app
 
 _INTRODUCTION = """# Commands
 
-This page is made from the commands themselves; `pano-mvs COMMAND --help` says the same. Exit codes are told in
-[Workflows](../workflows.md#exit-codes), what a run does in [Running](../running.md)."""
+This page is generated from the commands; `pano-mvs COMMAND --help` prints the same text.
+[Workflows](../workflows.md#exit-codes) lists the exit codes, and [Running](../running.md) describes what a run does."""
 
 
 def command_page() -> str:

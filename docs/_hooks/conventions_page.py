@@ -11,11 +11,11 @@ from pano_mvs import geometry
 
 _INTRODUCTION = """# Conventions
 
-Stated once, in the docstring of `pano_mvs.geometry`, from which this page is made; every sentence is held by a test.
-Where the world's origin, axes and unit are is told in [Frames and scale](../frames_and_scale.md)."""
+This page is generated from the docstring of `pano_mvs.geometry`; tests check every statement.
+[Frames and scale](../frames_and_scale.md) describes the origin, axes and unit of the world."""
 
 _ELSEWHERE = (
-    ("COLMAP", "`EQUIRECTANGULAR`, camera x right, y down, z forward, corners at integers", "nothing: it is ours"),
+    ("COLMAP", "`EQUIRECTANGULAR`, camera x right, y down, z forward, corners at integers", "nothing: it is the same"),
     ("nerfstudio", "camera-to-world, x right, y up, z backward (OpenGL)", "read by `poses.from_model`"),
     ("OpenSfM", "u = longitude / 2π, v = −latitude / 2π", "read by `poses.from_model`"),
     ("SphereSfM", "a camera model SPHERE, with COLMAP's number 11", "read by `poses.from_model`"),
@@ -32,7 +32,7 @@ def conventions_page() -> str:
         name, _, body = section.partition("\n")
         parts += [f"## {name}", _body(inspect.cleandoc(body))]
     elsewhere = table(("program", "its convention", "what to do"), _ELSEWHERE)
-    return "\n\n".join([*parts, "## How others say it", elsewhere]) + "\n"
+    return "\n\n".join([*parts, "## Conventions of other programs", elsewhere]) + "\n"
 
 
 def _body(text: str) -> str:

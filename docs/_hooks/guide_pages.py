@@ -1,4 +1,4 @@
-"""Which pages that are written by hand tell of a stage."""
+"""Find the hand-written pages that mention a stage."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from pathlib import Path
 
 DOCS = Path(__file__).parents[1]
 _FENCE = re.compile(r"^ *```.*?^ *```$", re.DOTALL | re.MULTILINE)
-_NOT_GUIDES = ("benchmarks.md", "comparison.md")
+_NOT_GUIDES = ("architecture.md", "benchmarks.md", "comparison.md", "glossary.md")
 
 
-def pages_that_tell_of(stage: str) -> str:
+def pages_about(stage: str) -> str:
     """Return a sentence that names the pages in whose text a stage is named, with links; empty if there is none."""
     links = [f"[{title}](../{place})" for place, title, text in _pages() if f"`{stage}`" in text]
-    return f"More in {', '.join(links)}." if links else ""
+    return f"See also {', '.join(links)}." if links else ""
 
 
 @cache

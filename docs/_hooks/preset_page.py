@@ -12,10 +12,10 @@ WORKFLOWS = Path(__file__).parents[2] / "workflows"
 
 _INTRODUCTION = """# Shipped workflows
 
-Each is run by its name (`pano-mvs run quickstart --images photos`), or laid under a workflow of yours by `extends:`
-([Workflows](../workflows.md)). In all of them the source is called `images`, the pose solver `poses`, the sweep
-`depth`, so that `--set depth.planes=192` works on each. By themselves they run on a sample capture that comes along.
-This page shows the files as they are."""
+Run a preset by its name (`pano-mvs run quickstart --images photos`), or modify it in your own workflow with `extends:`
+([Workflows](../workflows.md)). In all of them, the source is called `images`, the pose solver `poses` and the sweep
+`depth`, so `--set depth.planes=192` works with each. Without `--images`, they run on an included sample capture. This
+page shows the files unchanged."""
 
 
 def preset_page() -> str:
@@ -30,7 +30,7 @@ def presets_that_use(stage: str) -> str:
     """Return a sentence that names the presets in which a stage is, with links; empty if there is none."""
     names = [path.stem for path in sorted(WORKFLOWS.glob("*.yaml")) if stage in _uses(path)]
     links = ", ".join(f"[{name}](presets.md#{name})" for name in names)
-    return f"In the presets {links}." if names else ""
+    return f"Used in the presets {links}." if names else ""
 
 
 @cache

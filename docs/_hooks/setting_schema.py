@@ -1,4 +1,4 @@
-"""How the JSON Schema of a setting is told to a reader: its type and its limits."""
+"""Describe the type and the limits of a setting, from its JSON Schema."""
 
 from __future__ import annotations
 

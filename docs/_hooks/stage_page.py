@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 
-from guide_pages import pages_that_tell_of
+from guide_pages import pages_about
 from markdown_text import cell, docstring, table
 from preset_page import presets_that_use
 from pydantic.fields import FieldInfo
@@ -20,20 +20,20 @@ from pano_mvs.engine.workflows.policy import Policy
 from pano_mvs.engine.workflows.schema import workflow_schema
 
 KINDS = {
-    "source": "which pictures there are, and how one is read",
-    "mask": "what is to be ignored in a picture",
-    "features": "key points of one panorama, as bearings on the sphere",
-    "global": "one vector that sums up a picture",
-    "pairs": "which pictures are matched",
-    "matches": "which key points are the same, and the geometry of two views",
-    "poses": "where the pictures were taken, and what is done to poses",
-    "views": "which sources each reference is swept against",
-    "depth": "the range of every pixel of a reference",
-    "filters": "range map in, range map out",
-    "fusion": "from all range maps to one cloud",
-    "points": "points to start from, for programs that want few and good ones",
-    "export": "files in the output folder",
-    "evaluate": "comparison with the truth",
+    "source": "list the images of a capture and read them",
+    "mask": "mask areas of an image",
+    "features": "compute key points of a panorama, as bearings on the sphere",
+    "global": "describe an image by one vector",
+    "pairs": "select the pairs of images to match",
+    "matches": "match key points and estimate the geometry of two views",
+    "poses": "estimate, verify, refine and transform poses",
+    "views": "select the sources of each reference",
+    "depth": "compute the range of every pixel of a reference",
+    "filters": "improve range maps",
+    "fusion": "merge range maps into one cloud",
+    "points": "select seed points for other programs",
+    "export": "write files to the output folder",
+    "evaluate": "compare with ground truth",
 }
 """What the stages of a kind do, in the order of a workflow."""
 
@@ -73,13 +73,13 @@ def _anchor(name: str) -> str:
 
 _INTRODUCTION = """# Stages
 
-This page is made from the stages themselves, when the site is built: it is what `pano-mvs stage show NAME`
-says, all at once. How stages are put together is told in [Workflows](../workflows.md), how to write one in
-[Plugins](../plugins.md). The same as a [JSON Schema](pano-mvs.schema.json), for editors that complete and check."""
+This page is generated from the stages; `pano-mvs stage show NAME` prints the same text for one stage.
+[Workflows](../workflows.md) describes how stages are combined, and [Plugins](../plugins.md) how to write one. The same
+information is available as a [JSON Schema](pano-mvs.schema.json) for editors."""
 
 _COMMON = """## What every stage takes
 
-Beside its own settings; none of these counts towards the cache."""
+Every stage accepts these keys in addition to its own settings. They are not part of the cache key."""
 
 
 def _policy() -> str:
@@ -94,22 +94,22 @@ def _policy() -> str:
 
 
 def _stage(spec: StageSpec) -> str:
-    reads = [f"- `{port.name}` {_port(port)}" for port in spec.all_ports] or ["- files that the settings name"]
+    reads = [f"- `{port.name}` {_port(port)}" for port in spec.all_ports] or ["- files named in its settings"]
     parts = [
         f"### {spec.name} {{ #{_anchor(spec.name)} }}",
         docstring(spec.doc),
         '<div class="ports" markdown>\n',
         "Reads\n",
         "\n".join(reads),
-        f"\nGives {_kind(spec.output.kind_name())}, version {spec.version}{_memory(spec)}.\n\n</div>",
+        f"\nReturns {_kind(spec.output.kind_name())}, version {spec.version}{_memory(spec)}.\n\n</div>",
         _settings(spec),
-        " ".join(sentence for sentence in (presets_that_use(spec.name), pages_that_tell_of(spec.name)) if sentence),
+        " ".join(sentence for sentence in (presets_that_use(spec.name), pages_about(spec.name)) if sentence),
     ]
     return "\n\n".join(part for part in parts if part)
 
 
 def _port(port: Port) -> str:
-    return f"`{port.cardinality}` {_kind(port.kind.kind_name())}{', if there is one' if port.optional else ''}"
+    return f"`{port.cardinality}` {_kind(port.kind.kind_name())}{', optional' if port.optional else ''}"
 
 
 def _kind(name: str) -> str:
@@ -118,7 +118,7 @@ def _kind(name: str) -> str:
 
 def _memory(spec: StageSpec) -> str:
     if spec.memory_needed is not None:
-        return "; says for each unit how much memory it needs"
+        return "; estimates the memory of each unit"
     return f"; a unit needs up to {spec.memory_bytes / 1e9:.1f} GB" if spec.memory_bytes else ""
 
 

@@ -36,6 +36,7 @@ from pano_mvs.cli.options import (
 )
 from pano_mvs.cli.plugin_app import plugin_app, plugins, stage_app
 from pano_mvs.cli.streams import protect_standard_streams
+from pano_mvs.core.text import plural
 from pano_mvs.engine.executors.threads import available_threads, bound_environment
 
 app = typer.Typer(
@@ -141,7 +142,8 @@ def check(workflow: WorkflowArgument, images: ImagesOption = None, overrides: Se
     from pano_mvs.cli.session import open_session
 
     session = open_session(workflow, overrides=overrides or [], images=images)
-    Console().print(f"{escape(workflow)}: {len(session.workflow.stages)} stages, no mistakes", highlight=False)
+    count = len(session.workflow.stages)
+    Console().print(f"{escape(workflow)}: {count} {plural(count, 'stage')}, no mistakes", highlight=False)
 
 
 @app.command()

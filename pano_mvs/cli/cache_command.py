@@ -14,13 +14,14 @@ from rich.table import Table
 from pano_mvs.cli.session import CACHE_VARIABLE
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.paths import is_denied, is_file
+from pano_mvs.core.text import plural
 from pano_mvs.engine.cache.maintenance import Collection, collect, size_on_disk, usage_of, verify
 from pano_mvs.engine.cache.store import Store
 
 _SHOWN = 10
 _UNITS_S = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0, "w": 604800.0}
 _FAILED_ITEMS = 3
-_UNPROVEN = ("{} results of an earlier version, which did not check the images that it read, are not proven: images "
+_UNPROVEN = ("{} of an earlier version, which did not check the images that it read, {} not proven: images "
              "were changed, moved or deleted since, perhaps while they were being read")  # fmt: skip
 
 
@@ -69,11 +70,15 @@ def verify_cache(store: Store, console: Console, *, drop_unproven: bool = False)
             console.print(f"{what}: {escape(path)}", highlight=False, soft_wrap=True)
         if len(paths) > _SHOWN:
             console.print(f"{what}: … and {len(paths) - _SHOWN} more")
-    console.print(f"{damage.records} records and {damage.blobs} blobs are sound, {len(damage.removed)} damaged",
+    console.print(f"{damage.records} {plural(damage.records, 'record')} and {damage.blobs} "
+                  f"{plural(damage.blobs, 'blob')} are sound, {len(damage.removed)} damaged",
                   highlight=False)  # fmt: skip
     if damage.unproven:
-        console.print(_UNPROVEN.format(len(damage.unproven)), highlight=False, soft_wrap=True)
-        console.print("they were removed" if drop_unproven else "--drop-unproven removes them", highlight=False)
+        count = len(damage.unproven)
+        unproven = _UNPROVEN.format(f"{count} {plural(count, 'result')}", plural(count, "is", "are"))
+        console.print(unproven, highlight=False, soft_wrap=True)
+        removed, it = plural(count, "it was removed", "they were removed"), plural(count, "it", "them")
+        console.print(removed if drop_unproven else f"--drop-unproven removes {it}", highlight=False)
     if not damage.removed and not damage.incomplete and not damage.unproven:
         return 0
     if damage.removed or damage.incomplete or drop_unproven:
@@ -93,15 +98,17 @@ def collect_cache(store: Store, console: Console, *, delete: bool, unused: str, 
 
 
 def _told(found: Collection, *, delete: bool) -> str:
-    what = f"{len(found.records)} units, {len(found.blobs)} blobs, {size_text(found.size_bytes)}"
+    records, blobs = len(found.records), len(found.blobs)
+    what = (f"{records} {plural(records, 'unit')}, {blobs} {plural(blobs, 'blob')}, "
+            f"{size_text(found.size_bytes)}")  # fmt: skip
     return f"{'deleted' if delete else 'would delete'}: {what}; {size_text(found.kept_bytes)} stay"
 
 
 def pin_run(store: Store, console: Console, run: str, name: str) -> None:
     """Keep what a run used whatever runs after it."""
     pin = store.runs.pin(run, name)
-    console.print(f"{escape(pin.name)}: {pin.units} units of {escape(pin.workflow)} are kept until `cache unpin`",
-                  highlight=False)  # fmt: skip
+    console.print(f"{escape(pin.name)}: {pin.units} {plural(pin.units, 'unit')} of {escape(pin.workflow)} "
+                  f"{plural(pin.units, 'is', 'are')} kept until `cache unpin`", highlight=False)  # fmt: skip
 
 
 def unpin_run(store: Store, console: Console, name: str) -> None:

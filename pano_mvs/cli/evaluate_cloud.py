@@ -24,6 +24,7 @@ from pano_mvs.algorithms.metrics.poses import align_centers
 from pano_mvs.algorithms.metrics.surface import TrueSurface, TrueView, surface_of_cloud, surface_of_views, view_points
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.paths import is_file, is_folder
+from pano_mvs.core.text import plural
 from pano_mvs.geometry import Rigid3, Similarity3
 from pano_mvs.io.clouds.ply_points import PlyPoints, open_ply_points
 from pano_mvs.io.images.names import match_image_names
@@ -251,9 +252,12 @@ def _finite(value: float) -> float | None:
 
 def _print(judged: JudgedCloud, scores: Sequence[CloudScore], console: Console) -> None:
     compared = judged.compared
-    against = (f"the surface that {compared.views} views see; of it to be found is what at least 2 of "
+    see = plural(compared.views, "view sees", "views see")
+    against = (f"the surface that {compared.views} {see}; of it to be found is what at least 2 of "
                f"{len(compared.used)} cameras see") if compared.used else "a reference cloud"  # fmt: skip
-    console.print(f"{judged.file.count} points against {against}", highlight=False, markup=False)
+    console.print(
+        f"{judged.file.count} {plural(judged.file.count, 'point')} against {against}", highlight=False, markup=False
+    )
     if not compared.used and judged.truth_from_cloud is None:
         console.print("both clouds are taken to lie in one frame; if they do not, give --true-poses, those in the "
                       "frame of the reference cloud", highlight=False, markup=False, soft_wrap=True)  # fmt: skip

@@ -24,6 +24,7 @@ from pano_mvs.cli.evaluate_depth_inputs import (
 from pano_mvs.cli.evaluate_depth_print import DepthReport, print_report, report_json, write_csv
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.files import write_text
+from pano_mvs.core.text import plural
 from pano_mvs.io.error_picture import write_error_picture
 
 
@@ -89,7 +90,8 @@ def evaluate_depth(
         return
     print_report(report, console, baseline=baseline)
     if out is not None:
-        text = f"{len(report.views)} pictures of the errors, scores.json and scores.csv are in {out}"
+        count = len(report.views)
+        text = f"{count} {plural(count, 'picture')} of the errors, scores.json and scores.csv are in {out}"
         console.print(text, highlight=False, markup=False, soft_wrap=True)
 
 

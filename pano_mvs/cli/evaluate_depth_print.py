@@ -20,6 +20,7 @@ from pano_mvs.algorithms.metrics.view_scores import BASELINES, PROTOCOLS, Judgin
 from pano_mvs.cli.evaluate_depth_inputs import FoundScale
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.files import write_text
+from pano_mvs.core.text import plural
 
 _PROTOCOL_HEADINGS = ("every pixel", "… on sphere", "estimated", "… on sphere")
 _LABELS = {"psnr_db": "PSNR dB", "mse": "MSE ×10⁻²", "rmse": "RMSE", "mae": "MAE", "abs_rel": "AbsRel %"} | dict(
@@ -144,7 +145,7 @@ def _conditions(report: DepthReport, baseline: str) -> list[str]:
     judging = report.judging
     count = len(report.views)
     lines = [
-        f"{count} view{'s' if count != 1 else ''} of {report.source} against {report.truth}",
+        f"{count} {plural(count, 'view')} of {report.source} against {report.truth}",
         f"estimates × {report.scale.value:.6g}: {report.scale.reason}",
     ]
     if judging.align == "none":
@@ -157,12 +158,14 @@ def _conditions(report: DepthReport, baseline: str) -> list[str]:
     if judging.min_confidence:
         lines.append(f"ranges of a confidence below {judging.min_confidence} count as missing")
     if report.without_mask:
-        lines.append(f"no mask in --masks for {len(report.without_mask)} of {count} views, {report.without_mask[0]} "
-                     "first: all of their pixels count that --mask does not leave out")  # fmt: skip
+        lines.append(f"no mask in --masks for {len(report.without_mask)} of {count} {plural(count, 'view')}, "
+                     f"{report.without_mask[0]} first: all of their pixels count that --mask does not leave "
+                     "out")  # fmt: skip
     for (size, true_size), views in report.sizes.items():
         if size != true_size:
-            lines.append(f"{views} of the views are {size[1]}×{size[0]}, their truth {true_size[1]}×{true_size[0]}: "
-                         "read at the true pixels, between pixels of one surface alone")  # fmt: skip
+            lines.append(f"{views} of the views {plural(views, 'is', 'are')} {size[1]}×{size[0]}, "
+                         f"{plural(views, 'its', 'their')} truth {true_size[1]}×{true_size[0]}: read at the true "
+                         "pixels, between pixels of one surface alone")  # fmt: skip
     lines.append(f"a missing range is an error as large as the truth in “every pixel”; peak {judging.peak:g}; in "
                  f"brackets {_BASELINE_WORDS[baseline]}")  # fmt: skip
     return lines

@@ -11,6 +11,7 @@ from rich.table import Table
 
 from pano_mvs.algorithms.metrics.pose_report import PoseReport, report_poses, summary
 from pano_mvs.core.errors import InputError
+from pano_mvs.core.text import plural
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.io.poses.files import read_groups, read_poses
 from pano_mvs.scene import Poses
@@ -32,8 +33,8 @@ def evaluate_poses(model: Path, truth_path: Path, console: Console, *, as_json: 
     estimated = groups[0]
     ours = _truth_to_model(estimated, truth)
     if len(ours) < 2:
-        raise InputError(f"{model} and {truth_path} have {len(ours) or 'no'} images in common, two are needed to "
-                         f"compare poses. The model has {_shown(estimated.names)}, the truth "
+        raise InputError(f"{model} and {truth_path} have {len(ours) or 'no'} {plural(len(ours), 'image')} in common, "
+                         f"two are needed to compare poses. The model has {_shown(estimated.names)}, the truth "
                          f"{_shown(truth.names)}")  # fmt: skip
     model_idx = {name: idx for idx, name in enumerate(estimated.names)}
     report = report_poses(
@@ -49,8 +50,9 @@ def evaluate_poses(model: Path, truth_path: Path, console: Console, *, as_json: 
     _print(report, unit, console)
     if len(groups) > 1:
         count = sum(len(group.names) for group in groups[1:])
-        console.print(f"{len(groups) - 1} further groups of {count} images in {model}, each with a frame of its own, "
-                      "count as not registered", highlight=False, markup=False, soft_wrap=True)  # fmt: skip
+        further = f"{len(groups) - 1} further {plural(len(groups) - 1, 'group')} of {count} {plural(count, 'image')}"
+        console.print(f"{further} in {model}, each with a frame of its own, count as not registered",
+                      highlight=False, markup=False, soft_wrap=True)  # fmt: skip
     if without_truth:
         console.print(f"no truth for {_shown(without_truth)}", highlight=False, markup=False)
 
@@ -64,8 +66,12 @@ def _truth_to_model(estimated: Poses, truth: Poses) -> dict[str, str]:
 
 def _print(report: PoseReport, unit: str, console: Console) -> None:
     pairs, some = report.pairs, report.registered_pairs
-    console.print(f"{pairs.registered} of {pairs.expected} images registered", highlight=False)
-    table = Table(f"over {len(some.pairs)} pairs of registered images", "median", "mean", "max")
+    console.print(
+        f"{pairs.registered} of {pairs.expected} {plural(pairs.expected, 'image')} registered", highlight=False
+    )
+    table = Table(
+        f"over {len(some.pairs)} {plural(len(some.pairs), 'pair')} of registered images", "median", "mean", "max"
+    )
     for label, values in (
         ("rotation °", some.rotation_deg),
         ("translation direction °", some.direction_deg),
@@ -79,7 +85,9 @@ def _print(report: PoseReport, unit: str, console: Console) -> None:
         table.add_row("camera centre, % of extent", *(f"{value:.4f}" for value in shares.values()))
     console.print(table)
     auc = ", ".join(f"{100 * value:.1f} @ {limit:g}°" for limit, value in pairs.auc.items())
-    console.print(f"AUC over all {len(pairs.pairs)} pairs, %: {auc}", highlight=False)
+    console.print(
+        f"AUC over {plural(len(pairs.pairs), 'one pair', f'all {len(pairs.pairs)} pairs')}, %: {auc}", highlight=False
+    )
     if some.scale_ratio_max == some.scale_ratio_max:
         console.print(f"translation scale ratios: median {100 * some.scale_ratio_median:.3f} %, largest "
                       f"{100 * some.scale_ratio_max:.3f} % off", highlight=False)  # fmt: skip

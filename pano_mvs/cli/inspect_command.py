@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -154,11 +155,22 @@ def _why_not(plans: Sequence[StagePlan], sweep: str, image: str, session: Sessio
     if image in plan.blocked:
         return f"{sweep}:{image} cannot be swept: {plan.blocked[image]}"
     if plan.open or plan.may_run:
-        command = f"pano-mvs run {session.workflow.path} --cache {session.store_root} --only {sweep}:{image}"
         return (f"{sweep}:{image} reads what the cache {session.store_root} does not hold, with these settings, "
-                f"pictures and version: run the workflow first, with the same --set and --images, or just that: "
-                f"{command}")  # fmt: skip
+                f"pictures and version. Inspect the output folder of a run in place of the workflow, or run the "
+                f"workflow with these settings first, or just that: {_run_command(session, f'{sweep}:{image}')}"
+                )  # fmt: skip
     return f"{sweep} has no view of {image}: it was not registered, or has no neighbours; see report.html"
+
+
+def _run_command(session: Session, unit: str) -> str:
+    """Return the command that computes a unit with this session's settings, images and cache."""
+    words = ["pano-mvs", "run", str(session.workflow.path), "--cache", str(session.store_root), "--only", unit]
+    for override in session.workflow.overrides:
+        setting, _, _ = override.partition("=")
+        path = getattr(session.workflow.stages["images"].params, "path", None) if setting == "images.path" else None
+        # The workflow writes --images as a setting, but as it was typed, which need not be YAML.
+        words += ["--images", str(path)] if isinstance(path, Path) and is_folder(path) else ["--set", override]
+    return shlex.join(words)
 
 
 def _truth_of(session: Session, image: str) -> Path | None:

@@ -15,6 +15,7 @@ from rich.table import Table
 
 from pano_mvs.cli.session import Session
 from pano_mvs.core.errors import StoreError
+from pano_mvs.core.text import plural
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
 from pano_mvs.engine.running.run import workflow_id
@@ -35,7 +36,7 @@ def show_plan(session: Session, console: Console) -> None:
         _print_reasons(plan, console)
     total = sum(len(plan.run) for plan in plans)
     may = sum(len(plan.may_run) for plan in plans) + sum(plan.open for plan in plans)
-    text = "nothing to compute" if not total and not may else f"{total} units would run"
+    text = "nothing to compute" if not total and not may else f"{total} {plural(total, 'unit')} would run"
     console.print(text + (", more may follow" if may else ""), highlight=False)
 
 
@@ -93,6 +94,7 @@ def _print_reasons(plan: StagePlan, console: Console) -> None:
         which = f":{items[0]}" + (f" and {count - 1} more" if count > 1 else "") if items else ""
         console.print(escape(f"{plan.name}{which}: {reason}"), highlight=False, soft_wrap=True)
     if len(by_reason) > _SHOWN_REASONS:
-        console.print(f"{plan.name}: … and {len(by_reason) - _SHOWN_REASONS} other reasons", highlight=False)
+        more = len(by_reason) - _SHOWN_REASONS
+        console.print(f"{plan.name}: … and {more} other {plural(more, 'reason')}", highlight=False)
     for item, reason in list(plan.blocked.items())[:_SHOWN_REASONS]:
         console.print(escape(f"{plan.name}:{item}: cannot run: {reason}"), highlight=False, soft_wrap=True)

@@ -31,7 +31,7 @@ from pano_mvs.cli.telling import INTERRUPTED, tell, tell_of_end
 from pano_mvs.core.errors import PanoMvsError, UsageError
 from pano_mvs.core.files import OUTPUT_MARK, set_aside
 from pano_mvs.core.paths import exists, is_file
-from pano_mvs.core.text import one_line
+from pano_mvs.core.text import one_line, plural
 from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import LEAST_FREE_BYTES, Store
 from pano_mvs.engine.executors.choose import make_executor
@@ -217,7 +217,7 @@ def print_summary(summary: Mapping[str, Any], out: Path, console: Console, *, wr
     units = summary["units"]
     failed = f", {units['failed']} failed" if units["failed"] else ""
     cached = " (nothing to compute)" if not units["run"] and not units["failed"] else ""
-    counts = f"{units['run']} units computed, {units['cached']} cached{failed}"
+    counts = f"{units['run']} {plural(units['run'], 'unit')} computed, {units['cached']} cached{failed}"
     console.print(f"\n{counts} in {summary['seconds']:.1f} s{cached}", highlight=False)
     _print_failures(summary, console)
     _print_poses(summary, console)
@@ -228,12 +228,14 @@ def print_summary(summary: Mapping[str, Any], out: Path, console: Console, *, wr
     if summary["left_over"]:
         count = len(summary["left_over"])
         console.print(
-            f"{count} files of an earlier run, which this one did not write, are still there", highlight=False
-        )
+            f"{count} {plural(count, 'file')} of an earlier run, which this one did not write, "
+            f"{plural(count, 'is', 'are')} still there", highlight=False
+        )  # fmt: skip
     _print_verdict(verdict, console)
     look = f", or look around with pano-mvs view {escape(shlex.quote(str(out)))}" if is_to_see(summary["files"]) else ""
     console.print(
-        f"results in {escape(str(out))} ({len(summary['files'])} files, {written} written now): open report.html{look}",
+        f"results in {escape(str(out))} ({len(summary['files'])} {plural(len(summary['files']), 'file')}, {written} "
+        f"written now): open report.html{look}",
         highlight=False,
         soft_wrap=True,
     )
@@ -258,8 +260,9 @@ def _print_poses(summary: Mapping[str, Any], console: Console) -> None:
     poses = summary["poses"]
     if poses:
         total = len(poses["registered"]) + len(poses["rejected"])
-        console.print(f"poses: {len(poses['registered'])} of {total} registered, {poses['points']} points; "
-                      f"scale: {escape(poses['scale'])}", highlight=False)  # fmt: skip
+        console.print(f"poses: {len(poses['registered'])} of {total} registered, {poses['points']} "
+                      f"{plural(poses['points'], 'point')}; scale: {escape(poses['scale'])}",
+                      highlight=False)  # fmt: skip
 
 
 def _print_verdict(verdict: Verdict, console: Console) -> None:
@@ -284,8 +287,9 @@ def print_scores(scores: Mapping[str, Any], console: Console) -> None:
     if poses:
         together = poses.get("registered_in_one_frame")
         in_one_frame = "" if together is None else f" ({together} in one frame)"
-        text = (f"{poses['registered']} of {poses['of']} registered{in_one_frame}, median pair error "
-                f"{poses['median_pair_error_deg']:.3f}°")  # fmt: skip
+        error_deg = poses.get("median_pair_error_deg")
+        measured = "no pair to measure" if error_deg is None else f"median pair error {error_deg:.3f}°"
+        text = f"{poses['registered']} of {poses['of']} registered{in_one_frame}, {measured}"
         if "scale_ratio_error_max" in poses:
             text += f", translation scale ratios within {100 * poses['scale_ratio_error_max']:.2f} %"
         console.print(f"against the ground truth: {text}", highlight=False)

@@ -23,6 +23,15 @@ def shortened(text: str, most: int = MAX_CHARACTERS) -> str:
     return f"{text[: most - end]} … ({len(text) - most} characters left out) … {text[-end:]}"
 
 
+def plural(count: int, one: str, many: str = "") -> str:
+    """Return the form of a word, or of a few, that goes with a count; `many` is by default `one` with an s.
+
+    >>> [f"{count} {plural(count, 'file')} {plural(count, 'is', 'are')} left" for count in (0, 1, 2)]
+    ['0 files are left', '1 file is left', '2 files are left']
+    """
+    return one if count == 1 else many or f"{one}s"
+
+
 def without_controls(text: str) -> str:
     r"""Return a text in which control characters are spelled out, so that a terminal shows them and obeys none.
 

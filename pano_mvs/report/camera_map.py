@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.text import plural
 from pano_mvs.geometry import rotation_from_two_vectors
+from pano_mvs.report.figures import significant
 
 FloatArray = NDArray[np.float64]
 
@@ -143,8 +145,9 @@ def _chosen(
     for first, second, inliers, *more in links:
         if first in position and second in position:
             a, b = position[first], position[second]
-            candidates = f" of {more[0]} candidates" if more and more[0] is not None else ""
-            words = f"{inliers} matches{candidates}" if inliers else f"rejected{candidates and f', none{candidates}'}"
+            candidates = f" of {more[0]} {plural(more[0], 'candidate')}" if more and more[0] is not None else ""
+            words = (f"{inliers} {plural(inliers, 'match', 'matches')}{candidates}" if inliers else
+                     f"rejected{candidates and f', none{candidates}'}")  # fmt: skip
             why = reasons.get((first, second), "")
             known = int(more[0] or 0) if more else 0
             found.append(_Joined(a, b, int(inliers), known, f"{labels[a]} – {labels[b]}: {words}{why and f'; {why}'}"))
@@ -188,8 +191,9 @@ def _drawn(
     cameras = [(float(x), float(y), label, spot) for (x, y), label, spot in zip(placed, labels, spots, strict=True)]
     length = _round_length(110 / scale)
     bar = (14.0, height - 14.0, round(length * scale, 1), _measured(length, unit))
-    wide, deep = (f"{float(size):.3g} {unit}" for size in high - low)
-    text = f"{len(labels)} cameras {title.lower()}, {wide} across and {deep} {'deep' if tallest == _HEIGHT else 'high'}"
+    wide, deep = (f"{significant(float(size), 3)} {unit}" for size in high - low)
+    cameras_text = f"{len(labels)} {plural(len(labels), 'camera')}"
+    text = f"{cameras_text} {title.lower()}, {wide} across and {deep} {'deep' if tallest == _HEIGHT else 'high'}"
     dots = "" if named else "".join(f"M{x:g} {y:g}h0" for x, y in placed)
     text += f", {len(doubts)} of them doubtful" if doubts else ""
     doubtful = tuple((float(placed[idx, 0]), float(placed[idx, 1]), labels[idx], why) for idx, why in doubts.items())

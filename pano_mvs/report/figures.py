@@ -25,6 +25,7 @@ _WORDS = {
 _CONSTANTS = "best_constant_", "constant_"
 _BRACKETS = ("In brackets: what one constant range for all pixels scores, the constant that is best for the very score "
              "(in runs of earlier versions the median of the true ranges).")  # fmt: skip
+_LEAST_SHOWN = 0.0001
 _UNITS = {"deg": "°", "rad": "rad", "px": "px", "s": "s", "db": "dB", "mb": "MB"}
 
 
@@ -55,7 +56,14 @@ def duration(seconds: Any) -> str:
 
 def degrees(value: Any) -> str:
     """Return an angle in degrees with two significant digits."""
-    return f"{value:.2g}°" if _is_number(value) else "–"
+    return f"{significant(value)}°" if _is_number(value) else "–"
+
+
+def significant(value: float, digits: int = 2) -> str:
+    """Return a number with at least so many significant digits, and never with an exponent."""
+    if 0 < abs(value) < _LEAST_SHOWN:
+        return f"< {_LEAST_SHOWN}"
+    return f"{value:z.0f}" if abs(value) >= 10**digits - 0.5 else f"{value:z.{digits}g}"
 
 
 def figure(value: Any) -> str:

@@ -8,7 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pano_mvs.report.figures import figure, median, share
+from pano_mvs.core.text import plural
+from pano_mvs.report.figures import figure, median, share, significant
 
 GOOD_REGISTERED, FAIR_REGISTERED = 0.95, 0.5
 # Residuals are compared with a pixel of the panorama: what is measured to within one is measured well.
@@ -22,6 +23,8 @@ _SHOWN_GROUPS = 5
 _SHOWN_DOUBTS = 5
 # A model more than half of whose cameras are doubtful is not to be relied on.
 FAIR_UNDOUBTED = 0.5
+_NAMES_AND_FIGURES = re.compile(r"\d+([.,]\d+)?|'[^']*'")
+_ENDINGS = re.compile(r"\b(is|are)\b|(?<=\w)e?s\b")  # by which one and several differ
 
 
 @dataclass(frozen=True)
@@ -85,8 +88,8 @@ def _failures(summary: Mapping[str, Any]) -> list[Finding]:
         return []
     stages = Counter(str(failure.get("stage", "")) for failure in failures)
     where = ", ".join(f"{count} in {stage}" for stage, count in stages.most_common(3))
-    more = f"; {_units(len(blocked))} could not run because of them" if blocked else ""
-    verb = "unit of work failed" if len(failures) == 1 else "units of work failed"
+    more = f"; {_units(len(blocked))} could not run because of {plural(len(failures), 'it', 'them')}" if blocked else ""
+    verb = plural(len(failures), "unit of work failed", "units of work failed")
     return [Finding("fair", f"{figure(len(failures))} {verb} ({where}){more}.", "Each is listed with its cause.")]
 
 
@@ -98,7 +101,8 @@ def _registration(summary: Mapping[str, Any]) -> list[Finding]:
     if not total or not rejected:
         return []
     mood = mood_of(registered / total, GOOD_REGISTERED, FAIR_REGISTERED)
-    text = f"{len(rejected)} of {total} panoramas have no pose: {_commonest(list(map(str, rejected.values())))}."
+    text = (f"{len(rejected)} of {total} {plural(total, 'panorama')} {plural(len(rejected), 'has', 'have')} no pose: "
+            f"{_commonest(list(map(str, rejected.values())))}.")  # fmt: skip
     if mood == "good":
         return [Finding("", text)]
     return [Finding(mood, text, "Take more pictures between those, 0.5–1 m apart indoors, each seeing much of what the "
@@ -126,12 +130,12 @@ def _doubts(summary: Mapping[str, Any]) -> list[Finding]:
     reasons = [f"{name} ({reason})" for name, reason in doubts.items()]
     more = f"; and {len(reasons) - _SHOWN_DOUBTS} more" if len(reasons) > _SHOWN_DOUBTS else ""
     what = "camera" if poses.get("doubts") else "image"
-    count = f"1 {what} is doubtful" if len(reasons) == 1 else f"{len(reasons)} {what}s are doubtful"
-    them = "it and its" if len(reasons) == 1 else "them and their"
+    count = f"{len(reasons)} {plural(len(reasons), f'{what} is', f'{what}s are')} doubtful"
+    them = plural(len(reasons), "it and its", "them and their")
     mood = doubt_mood(poses) if poses.get("doubts") else "fair"
     return [Finding(mood, f"{count}: {'; '.join(reasons[:_SHOWN_DOUBTS])}{more}.",
                     f"Take panoramas between {them} neighbours, with things in view that occur only once, or leave "
-                    f"{'it' if len(reasons) == 1 else 'these images'} out.")]  # fmt: skip
+                    f"{plural(len(reasons), 'it', 'these images')} out.")]  # fmt: skip
 
 
 def _groups(summary: Mapping[str, Any]) -> list[Finding]:
@@ -141,8 +145,9 @@ def _groups(summary: Mapping[str, Any]) -> list[Finding]:
         return []
     sizes = [f"group {number} has {_named(group)}" for number, group in enumerate(groups[1:], start=1)]
     more = f"; and {len(sizes) - _SHOWN_GROUPS} more" if len(sizes) > _SHOWN_GROUPS else ""
+    largest = len(groups[0].get("images") or [])
     text = (f"{len(groups)} groups of panoramas share no reliable connection: each has its own frame and scale. The "
-            f"largest has {len(groups[0].get('images') or [])} panoramas; "
+            f"largest has {largest} {plural(largest, 'panorama')}; "
             f"{'; '.join(sizes[:_SHOWN_GROUPS])}{more}.")  # fmt: skip
     return [Finding("fair", text, pictures_between(poses))]
 
@@ -163,7 +168,8 @@ def pictures_between(poses: Mapping[str, Any]) -> str:
         pair = group.get("nearest_pair")
         if pair:
             first, second, matches, candidates = pair
-            known = f"{matches} matches" if matches else f"{candidates} candidates"
+            known = (f"{matches} {plural(matches, 'match', 'matches')}" if matches else
+                     f"{candidates} {plural(candidates, 'candidate')}")  # fmt: skip
             found.append(f"{first} and {second} ({known})")
     if not found:
         return "Take pictures between the groups, 0.5–1 m apart, and compare them with both."
@@ -173,10 +179,10 @@ def pictures_between(poses: Mapping[str, Any]) -> str:
 
 def _commonest(reasons: Sequence[str]) -> str:
     """Return the reason that is given most often, whatever the figures and names in it, and how often it is."""
-    kinds = [re.sub(r"\d+([.,]\d+)?|'[^']*'", "…", reason) for reason in reasons]
+    kinds = [_ENDINGS.sub("", _NAMES_AND_FIGURES.sub("…", reason)) for reason in reasons]
     ((kind, count),) = Counter(kinds).most_common(1)
     example = reasons[kinds.index(kind)]
-    return example if len(reasons) == 1 else f"{count} times such as “{example}”"
+    return example if len(reasons) == 1 else f"{count} {plural(count, 'time')} such as “{example}”"
 
 
 def _graph(summary: Mapping[str, Any]) -> list[Finding]:
@@ -191,15 +197,15 @@ def _graph(summary: Mapping[str, Any]) -> list[Finding]:
         return []
     shown = ", ".join(loose[:3]) + (" …" if len(loose) > 3 else "")
     mood = "fair" if len(loose) > len(names) / 4 else ""
-    count_text = "1 camera shares" if len(loose) == 1 else f"{len(loose)} cameras share"
-    return [Finding(mood, f"{count_text} a verified geometry with one other alone ({shown}): unless their poses were "
-                    "given, nothing confirms them.")]  # fmt: skip
+    sharing = plural(len(loose), "camera shares", "cameras share")
+    return [Finding(mood, f"{len(loose)} {sharing} a verified geometry with one other alone ({shown}): unless their "
+                          "poses were given, nothing confirms them.")]  # fmt: skip
 
 
 def _residual(residual_px: float | None) -> list[Finding]:
     if residual_px is None or (mood := mood_of(residual_px, GOOD_RESIDUAL_PX, FAIR_RESIDUAL_PX)) == "good":
         return []
-    text = f"The points miss the pictures by {residual_px:.2g} pixels in the median: the poses are not sharp."
+    text = f"The points miss the pictures by {significant(residual_px)} pixels in the median: the poses are not sharp."
     return [Finding(mood, text, "Check that the pictures are sharp, unstitched seams aside, and not edited one by one; "
                     "put poses.refine behind the solver if it is not there.")]  # fmt: skip
 
@@ -255,4 +261,4 @@ def scores_by_stage(summary: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _units(count: int) -> str:
-    return "1 further unit" if count == 1 else f"{figure(count)} further units"
+    return f"{figure(count)} further {plural(count, 'unit')}"

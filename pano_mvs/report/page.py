@@ -15,6 +15,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from pano_mvs.core.files import write_text
+from pano_mvs.core.text import plural
 from pano_mvs.report import figures
 from pano_mvs.report.content import gather
 from pano_mvs.report.earlier_page import Kept
@@ -73,7 +74,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters |= {"share": figures.share, "duration": figures.duration, "figure": figures.figure,
-                            "words": figures.words, "degrees": figures.degrees}  # fmt: skip
+                            "words": figures.words, "degrees": figures.degrees, "plural": plural}  # fmt: skip
     return environment
 
 

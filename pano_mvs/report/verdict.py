@@ -6,7 +6,8 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from pano_mvs.report.figures import figure, median, share
+from pano_mvs.core.text import plural
+from pano_mvs.report.figures import degrees, figure, median, share, significant
 from pano_mvs.report.findings import (
     FAIR_COMPLETE,
     FAIR_CONSISTENT,
@@ -89,8 +90,9 @@ def verdict(
     """
     code = summary.get("exit_code", 0)
     mood, outcome = _OUTCOMES.get(code, ("bad", f"Ended with code {code}"))
-    if code == _SOME_FAILED and summary.get("doubts") and not (summary.get("failures") or summary.get("rejected")):
-        outcome = "Finished, with doubtful cameras"
+    if code == _SOME_FAILED and not summary.get("failures"):
+        parts = {"rejected": "panoramas left out", "doubts": "doubtful cameras"}
+        outcome = f"Finished, with {' and '.join(parts[key] for key in parts if summary.get(key)) or 'failed items'}"
     residual_deg = residuals.overall.median_deg if residuals else None
     residual_px = residual_deg * image_width / 360 if residual_deg is not None and image_width else None
     tiles = [*_registered(summary), *_residual(residual_deg, residual_px), *_coverage(summary), *_cloud(summary),
@@ -119,8 +121,10 @@ def _sentence(summary: Mapping[str, Any]) -> str:
     if failed:
         parts.append(f"{figure(failed)} failed")
     if not run and not failed:
-        return f"Nothing had changed: all {figure(cached)} units of work were taken from the cache."
-    return f"{figure(run + cached + failed)} units of work: {', '.join(parts)}."
+        units = plural(cached, "the one unit of work was", f"all {figure(cached)} units of work were")
+        return f"Nothing had changed: {units} taken from the cache."
+    total = run + cached + failed
+    return f"{figure(total)} {plural(total, 'unit of work', 'units of work')}: {', '.join(parts)}."
 
 
 def _registered(summary: Mapping[str, Any]) -> list[Tile]:
@@ -139,8 +143,8 @@ def _residual(residual_deg: float | None, residual_px: float | None) -> list[Til
     if residual_deg is None:
         return []
     mood = mood_of(residual_px, GOOD_RESIDUAL_PX, FAIR_RESIDUAL_PX) if residual_px is not None else ""
-    pixels = f", {residual_px:.2g} px" if residual_px is not None else ""
-    return [Tile(f"{residual_deg:.2g}°", f"median reprojection residual{pixels}", mood)]
+    pixels = f", {significant(residual_px)} px" if residual_px is not None else ""
+    return [Tile(degrees(residual_deg), f"median reprojection residual{pixels}", mood)]
 
 
 def _coverage(summary: Mapping[str, Any]) -> list[Tile]:
@@ -161,7 +165,7 @@ def _cloud(summary: Mapping[str, Any]) -> list[Tile]:
     if points is None:
         return []
     text = f"{points / 1e6:.2f} M" if points >= 1_000_000 else figure(points)
-    return [Tile(text, "points in the cloud", "" if points else "bad")]
+    return [Tile(text, f"{plural(points, 'point')} in the cloud", "" if points else "bad")]
 
 
 def _accuracy(summary: Mapping[str, Any]) -> list[Tile]:
@@ -170,9 +174,9 @@ def _accuracy(summary: Mapping[str, Any]) -> list[Tile]:
     tiles = []
     error_deg = median([(scores.get("poses") or {}).get("median_pair_error_deg")])
     if error_deg is not None:
-        tiles.append(Tile(f"{error_deg:.2g}°", "median pose error against the truth"))
+        tiles.append(Tile(degrees(error_deg), "median pose error against the truth"))
     errors = [view.get("median_relative_error") for view in (scores.get("views") or {}).values()]
     relative = median(errors)
     if relative is not None:
-        tiles.append(Tile(f"{100 * relative:.2g} %", "median range error against the truth"))
+        tiles.append(Tile(f"{significant(100 * relative)} %", "median range error against the truth"))
     return tiles

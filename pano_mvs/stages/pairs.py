@@ -69,19 +69,25 @@ def sequential(
 class VladParams(Params):
     """Settings of global.vlad."""
 
-    strongest: int = Field(default=4000, ge=8, description="so many of the strongest key points are summed up")
+    strongest: int = Field(default=4000, ge=8, description="number of the strongest key points in the vector")
+    sample: int = Field(
+        default=200,
+        ge=0,
+        le=2000,
+        description="number of key points of the coarsest scales that pairs.retrieval matches with one another",
+    )
 
 
 @stage("global.vlad")
 def vlad(features: Each[Features], params: VladParams) -> GlobalDescriptor:
-    """One vector that sums up a picture's descriptors, for pairs.retrieval and loop closure."""
-    return vlad_descriptor(features, strongest=params.strongest)
+    """A global descriptor of each panorama, for pairs.retrieval and loop closure."""
+    return vlad_descriptor(features, strongest=params.strongest, sample=params.sample)
 
 
 class RetrievalParams(Params):
     """Settings of pairs.retrieval."""
 
-    neighbours: int = Field(default=20, ge=1, description="each picture with so many that look most like it")
+    neighbours: int = Field(default=20, ge=1, description="number of most similar panoramas to match each one with")
 
 
 @stage("pairs.retrieval")

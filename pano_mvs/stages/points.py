@@ -7,6 +7,7 @@ from pydantic import Field
 from pano_mvs.algorithms.points.samples import sample_surface
 from pano_mvs.algorithms.points.tracking import track_points
 from pano_mvs.api import All, Context, Each, One, Panorama, Params, Poses, RangeMap, stage
+from pano_mvs.core.text import plural
 from pano_mvs.scene.surface_samples import SurfaceSamples
 from pano_mvs.scene.tracked_points import TrackedPoints
 
@@ -47,6 +48,7 @@ def tracked(
     ctx.metric("points", len(points))
     ctx.metric("views_per_point", len(points.track_point_idx) / max(len(points), 1))
     if len(points) < params.count:
-        ctx.note(f"{len(points)} points where {params.count} were asked for: the range maps have no more that are sure "
-                 "enough; raise points.surface's count or lower its min_confidence")  # fmt: skip
+        ctx.note(f"{len(points)} {plural(len(points), 'point')} where {params.count} were asked for: the range maps "
+                 "have no more that are sure enough; raise points.surface's count or lower its "
+                 "min_confidence")  # fmt: skip
     return points

@@ -30,6 +30,7 @@ from pano_mvs.api import (
     TwoView,
     stage,
 )
+from pano_mvs.core.text import plural
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.io.poses.files import read_groups, recorded_pictures
 from pano_mvs.scene.pose_groups import split_groups
@@ -247,8 +248,9 @@ def known_poses(path: Path, images: tuple[str, ...]) -> Poses:
     model, *others = read_groups(path)
     known = match_image_names(images, model.names)
     if not known:
-        raise InputError(f"{path}: none of its {len(model.names)} images is one of this capture (it has "
-                         f"{', '.join(model.names[:3])} …, the capture {', '.join(images[:3])} …)")  # fmt: skip
+        raise InputError(f"{path}: none of its {len(model.names)} {plural(len(model.names), 'image')} is one of this "
+                         f"capture (it has {', '.join(model.names[:3])} …, the capture "
+                         f"{', '.join(images[:3])} …)")  # fmt: skip
     position = {name: idx for idx, name in enumerate(model.names)}
     claims = Counter(known.values())
     poses = {

@@ -16,6 +16,7 @@ from pano_mvs.algorithms.dual_fisheye import is_dual_fisheye
 from pano_mvs.algorithms.sharpness import sharpness
 from pano_mvs.api import NOT_IN_KEY, Context, FilePart, InputError, Panorama, Params, SourceItem, SourcePath, source
 from pano_mvs.core.paths import is_folder
+from pano_mvs.core.text import plural
 from pano_mvs.io.images.names import printable_name
 from pano_mvs.io.images.video import VideoInfo, describe_video, frames_between, list_videos
 from pano_mvs.scene.files import item_stems
@@ -77,8 +78,9 @@ def list_frames(params: VideoParams) -> Iterator[SourceItem]:
     if len(items) < 2:
         if first_error is not None:
             raise first_error
-        raise InputError(f"{items[0].files['video'] if items else params.path}: gives {len(items)} frames; depth needs "
-                         "two or more. Set a smaller every_s, or another start_s and end_s")  # fmt: skip
+        raise InputError(f"{items[0].files['video'] if items else params.path}: gives {len(items)} "
+                         f"{plural(len(items), 'frame')}; depth needs two or more. Set a smaller every_s, or another "
+                         "start_s and end_s")  # fmt: skip
     yield from (replace(item, notes=tuple(unread)) for item in items)
     yield from failed
 

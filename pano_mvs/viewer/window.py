@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.text import plural
 from pano_mvs.viewer.cloud_actor import CloudActor
 from pano_mvs.viewer.cloud_colors import POINT_BUDGET, color_cloud, drawn_cloud
 from pano_mvs.viewer.controller import Tour, TourState
@@ -280,11 +281,11 @@ class SceneWindow:
         counts = []
         if cloud is not None:
             of = f" of {cloud.total:,}" if len(cloud.points) < cloud.total else ""
-            counts.append(f"{len(cloud.points):,}{of} points")
+            counts.append(f"{len(cloud.points):,}{of} {plural(len(cloud.points), 'point')}")
         if scene.mesh is not None:
             counts.append("mesh" if cloud is None else f"s: {state.surface} shown")
         if scene.cameras:
-            counts.append(f"{len(scene.cameras):,} cameras")
+            counts.append(f"{len(scene.cameras):,} {plural(len(scene.cameras), 'camera')}")
         self._overlay.text([title, *state.message.split("\n")], "upper_left")
         self._overlay.text([self._legend, "   ".join([*counts, "h: keys"])], "lower_right")
         self._overlay.help(wanted=state.help)

@@ -36,6 +36,7 @@ from pano_mvs.algorithms.poses.verification.verify_poses import verify_poses
 from pano_mvs.algorithms.two_view import verify_pair
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.scene.image_files.image_file import decode_image
+from pano_mvs.scene.pose_groups import split_groups
 from tests.benchmarks.poses import (
     MAPPERS,
     SEED,
@@ -113,7 +114,13 @@ def in_memory(images: Path, steps: Steps, *, neighbours: int = 0, names: tuple[s
 
     poses = steps.take("solve", lambda: solve_scaled_translation(features, two_views, load=load, rng=rng))
     poses = steps.take("verify poses", lambda: verify_poses(poses, load, features=features, two_views=two_views))
-    return cameras_of(steps.take("refine", lambda: refine_poses(poses)))
+    refined = steps.take("refine", lambda: refine_poses(poses))
+    if not refined.other_worlds:
+        return cameras_of(refined)
+    groups = split_groups(refined)
+    sizes = ", ".join(str(len(group.names)) for group in groups)
+    print(f"    {len(groups)} groups, of {sizes} cameras; the largest counts")
+    return cameras_of(groups[0])
 
 
 def through_the_engine(images: Path, steps: Steps, *, neighbours: int = 0) -> Cameras:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 from pathlib import Path
 
@@ -159,13 +160,28 @@ def test_people_see_tables_a_plot_and_a_picture(run: Path, tmp_path: Path) -> No
         (("lobby.jpg", 5, 3), "no images are called 'lobby.jpg'; there are: 000.png"),
         (("000.png", 5, 3, "--stage", "checked"), "its sweeps: depth, boxed"),
         (("000.png", 5, 3, "--plot", "curve.pdf"), "the plot is a PNG"),
-        (("000.png", 5, 3, "--set", "images.nadir_deg=30"), "run the workflow first, with the same --set"),
+        (("000.png", 5, 3, "--set", "images.nadir_deg=30"), "run the workflow with these settings first"),
     ],
 )
 def test_mistakes_are_told_with_a_remedy(run: Path, arguments: tuple[object, ...], message: str) -> None:
     outcome = call("inspect", run / "out", *arguments)
     assert outcome.code == 2
     assert message.casefold() in outcome.flat.casefold()
+
+
+def test_the_command_that_mends_it_can_be_copied(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It once left out --images and --set, so that it computed something else, and was not quoted."""
+    shutil.copytree(run / "capture" / "images", tmp_path / "it's: a #new" / "hall")
+    monkeypatch.chdir(tmp_path)
+    arguments = ("000.png", 40, 28, "--images", "it's: a #new/hall", "--set", "images.nadir_deg=33", "--cache", "a b",
+                 "--set", "depth.planes=9")  # fmt: skip
+    mistake = call("inspect", run / "wf.yaml", *arguments)
+    assert mistake.code == 2
+    program, *command = shlex.split(mistake.text[mistake.text.index("pano-mvs run") :])
+    assert program == "pano-mvs"
+    outcome = call(*command)
+    assert outcome.code == 0, outcome.text
+    assert len(inspected(run / "wf.yaml", *arguments)["curve"]["ranges"]) == 9
 
 
 def test_folders_that_are_no_output_are_refused(run: Path, tmp_path: Path) -> None:

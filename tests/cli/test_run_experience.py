@@ -301,5 +301,5 @@ def test_an_interrupt_lets_a_single_worker_finish_its_unit(toy: Toy) -> None:  #
     process.send_signal(signal.SIGTERM)
     code, out, _ = finish(process)
     assert code == 130
-    assert "1 units may finish within" in out
+    assert "1 unit may finish within" in out
     assert finished_records(toy) >= 19

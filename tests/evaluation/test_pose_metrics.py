@@ -76,7 +76,7 @@ def test_too_few_images_are_refused():
     pose = Rigid3.identity()
     with pytest.raises(UsageError, match="at least two"):
         relative_pose_errors({}, {"a": pose})
-    with pytest.raises(UsageError, match="only 1 images"):
+    with pytest.raises(UsageError, match="only 1 image has"):
         align_centers({"a": pose}, {"a": pose, "b": pose})
 
 

@@ -55,6 +55,18 @@ def test_what_is_masked_is_not_judged():
     assert score_capture(POSES, POSES, *views).views["a"]["completeness"] == 0.5
 
 
+def test_a_pair_with_an_unregistered_camera_has_no_error():
+    """Where most pairs had one, the report gave 180° as the median pose error."""
+    true = {name: Rigid3(np.eye(3), np.array(place)) for name, place in
+            (("a", (0.0, 0, 0)), ("b", (1.0, 0, 0)), ("c", (0.0, 1, 0)), ("d", (0.0, 0, 1)))}  # fmt: skip
+    found = score_capture({name: true[name] for name in "ab"}, true, {}, {}).poses
+    assert [found[f"median_{kind}_error_deg"] for kind in ("pair", "rotation", "direction")] == [0, 0, 0]
+    assert found["auc_5_deg"] == pytest.approx(1 / 6)
+    apart = score_capture({name: true[name] for name in "ab"}, true, {}, {}, groups={"a": 0, "b": 1}).poses
+    assert (apart["registered"], apart["auc_5_deg"]) == (2, 0)
+    assert not any("median" in name for name in apart)
+
+
 def test_what_cannot_be_judged_has_no_score():
     nothing = np.full((8, 16), np.nan, np.float32)
     found = scored(nothing, box_range((8, 16))[0], np.zeros((8, 16), np.uint8)).views["a"]

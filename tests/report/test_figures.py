@@ -2,7 +2,7 @@
 
 import pytest
 
-from pano_mvs.report.figures import duration, figure, median, score_tables, share, words
+from pano_mvs.report.figures import degrees, duration, figure, median, score_tables, share, words
 
 
 @pytest.mark.parametrize(
@@ -30,6 +30,16 @@ def test_durations_are_those_of_a_clock(seconds, text):
 )  # fmt: skip
 def test_figures_have_four_digits(value, text):
     assert figure(value) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.01234, "0.012°"), (9.96, "10°"), (99.4, "99°"), (99.6, "100°"), (123.4, "123°"), (180.0, "180°"), (0.0, "0°"),
+     (-0.0, "0°"), (1.2e-6, "< 0.0001°"), (None, "–"), (float("nan"), "–")],
+)  # fmt: skip
+def test_angles_have_two_digits_and_no_exponent(value, text):
+    """Those of 100° and more were shown as 1.2e+02°, those of known poses as 1.2e-06°."""
+    assert degrees(value) == text
 
 
 @pytest.mark.parametrize(

@@ -105,7 +105,7 @@ def test_everything_that_is_known_is_said(out_dir):
         "the scale was fitted", "PSNR dB", "pano_mvs: 1 stages: {}", "numpy 2.1", "no preview", "1 min 30 s",
         "9 blocked", "depth.planes=64", "logs/depth.txt", "1 further unit", "a blob was damaged", "not a picture",
         "workers: 2", "cores: 2", "range/ (2)", "cloud.ply", "planes", "census", "3 of 4 have a common geometry",
-        "2 min 50 s of work", "show 1 of 1 rejected pairs",
+        "2 min 50 s of work", "show 1 of 1 rejected pair",
         "1 camera is doubtful: a/1.png (hardly confirmed).", "triangles are doubtful cameras",
         "a/1.png 12 % 62 % hardly confirmed", "Doubtful (1)", "in scene units, not metres", "no range map",
     ):  # fmt: skip

@@ -112,6 +112,32 @@ def test_a_run_with_doubtful_cameras_alone_has_no_failed_items():
     assert verdict(failed).outcome == "Finished, with failed items"
 
 
+def test_a_run_with_unregistered_panoramas_alone_has_no_failed_items():
+    rejected = {"x0.png": {"stage": "poses", "reason": "0 matches, 20 needed"}}
+    summary = GOOD | {"exit_code": 3, "poses": rejecting(1), "rejected": rejected}
+    assert verdict(summary).outcome == "Finished, with panoramas left out"
+    doubts = {"0.png": {"stage": "checked", "reason": "confirmed 1 %"}}
+    assert verdict(summary | {"doubts": doubts}).outcome == "Finished, with panoramas left out and doubtful cameras"
+    assert verdict({"exit_code": 3}).outcome == "Finished, with failed items"
+
+
+def test_one_of_anything_is_not_named_as_several():
+    (finding,) = [one for one in findings({"poses": rejecting(1)}) if "no pose" in one.text]
+    assert finding.text == "1 of 11 panoramas has no pose: 0 matches, 20 needed."
+    failed = {"failures": [{"stage": "depth"}], "blocked": [{}]}
+    assert findings(failed)[0].text == "1 unit of work failed (1 in depth); 1 further unit could not run because of it."
+    assert verdict({"stages": [{"run": 1}]}).sentence.startswith("1 unit of work: 1 computed")
+    assert "the one unit of work was taken" in verdict({"stages": [{"cached": 1}]}).sentence
+    assert verdict({"cloud": {"points": 1}}).tiles[0].label == "point in the cloud"
+
+
+def test_reasons_that_differ_in_figures_and_endings_alone_are_counted_together():
+    reasons = {"a": "1 match, 20 needed", "b": "7 matches, 20 needed", "c": "1 of its points is known",
+               "d": "2 of its points are known", "e": "3 of its points are known"}  # fmt: skip
+    (finding,) = findings({"poses": {"registered": NAMES, "rejected": reasons}})
+    assert "3 times such as “1 of its points is known”" in finding.text
+
+
 def test_where_nothing_is_known_nothing_is_judged():
     assert verdict({}).judgement == ""
 

@@ -232,7 +232,7 @@ def test_settings_that_contradict_each_other(tmp_path: Path, settings: dict[str,
 
 def test_too_few_frames_are_told(tmp_path: Path) -> None:
     path = write_video(tmp_path / "walk.avi", 10)
-    with pytest.raises(InputError, match=r"walk\.avi: gives 1 frames; .*every_s"):
+    with pytest.raises(InputError, match=r"walk\.avi: gives 1 frame; .*every_s"):
         list(list_frames(params(path, every_s=5)))
     with pytest.raises(InputError, match=r"no such video or folder"):
         list(list_frames(params(tmp_path / "gone.mp4")))

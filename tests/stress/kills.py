@@ -219,7 +219,28 @@ def _faults(setting: Setting, runners: list[Runner], expected: dict[str, bytes])
         faults.append(f"cache verify: {verified.stdout}{verified.stderr}")
     if "not of the cache" in verified.stdout:
         faults.append(f"left in the store: {verified.stdout}")
+    faults.extend(_leftovers(setting, runners[0], store))
     return faults
+
+
+def _leftovers(setting: Setting, runner: Runner, store: Path) -> list[str]:
+    """Return what is wrong with a run that has nothing to compute, and with what it leaves in the store's `tmp/`.
+
+    `cache verify` names what lies there, but that is no fault while runs may go on. The next run on a store removes
+    what killed processes have left.
+    """
+    again = subprocess.run([*setting.command, "--cache", str(store), "--out", str(runner.out)],
+                           capture_output=True, text=True, env=setting.environment, cwd=setting.folder,
+                           check=False)  # fmt: skip
+    faults = [] if "0 units computed" in again.stdout else [f"a run after all has units to compute:\n{again.stdout}"]
+    left = half_written(store)
+    return [*faults, f"half written files are left: {', '.join(left)}"] if left else faults
+
+
+def half_written(store: Path) -> list[str]:
+    """Return the files and folders in a store that a process was writing when it ended."""
+    found = {*store.rglob(".tmp-*"), *(store / "tmp").glob("*")}
+    return sorted(path.relative_to(store).as_posix() for path in found)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -32,6 +32,14 @@ def test_much_damage_is_healed_by_processes() -> None:
     assert damage.main(["150", "--executor", "processes"]) == 0
 
 
+def test_half_written_files_of_a_store_are_found(tmp_path: Path) -> None:
+    (tmp_path / "tmp" / "unit").mkdir(parents=True)
+    (tmp_path / "blobs" / "ab").mkdir(parents=True)
+    assert kills.half_written(tmp_path) == ["tmp/unit"]
+    (tmp_path / "blobs" / "ab" / ".tmp-0123abcd-7-x.json").touch()
+    assert kills.half_written(tmp_path) == ["blobs/ab/.tmp-0123abcd-7-x.json", "tmp/unit"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("executor", ["processes", "serial"])
 def test_killed_runs_lose_nothing(executor: str) -> None:

@@ -12,7 +12,7 @@ from tests.io.images.videos import tiny_video
 SETTINGS = {
     "poses.from_model": {"path": "{capture}/truth/poses.json"},
     "poses.extend": {"path": "{capture}/truth/poses.json"},
-    "poses.placement.scale": {"factor": 2.0},
+    "poses.scale": {"factor": 2.0},
     "source.video": {"path": str(tiny_video())},
 }
 FRAME = NerfstudioFrame(
@@ -21,7 +21,7 @@ FRAME = NerfstudioFrame(
 INPUTS = {
     "export.nerfstudio": {"frames": {f"{idx:03d}.png": NerfstudioFrames({}, frames=(FRAME,)) for idx in range(4)}},
 }
-SIZES_HW = {"poses.colmap.sift": (96, 192)}
+SIZES_HW = {"poses.colmap_sift": (96, 192)}
 
 
 def laws() -> list[Law]:

@@ -10,6 +10,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import minimum_spanning_tree
 
 from pano_mvs.algorithms.matching.pairs import sequential_pairs
+from pano_mvs.algorithms.matching.shortlist import sample_matches
 from pano_mvs.algorithms.poses.frame.geodesy import local_from_lla
 from pano_mvs.core.errors import UsageError
 from pano_mvs.scene import GlobalDescriptor, Pairs
@@ -55,13 +56,15 @@ def retrieval_pairs(
 ) -> Pairs:
     """Return every image with those that look most like it, so that all hang together.
 
-    A pair is listed if either image is among the most similar of the other. Where that leaves groups apart, the most
-    similar links that join them are added.
+    The vectors of the global descriptors give a shortlist for each image (all images in captures of up to a few
+    hundred); the number of key points of their samples that match puts it in order (see `shortlist`). A pair is listed
+    if either image is among the most similar of the other. Where that leaves groups apart, the most similar links that
+    join them are added.
 
     Args:
         names: image names in the capture's order.
         descriptors: image name to its global descriptor; those without one are paired with none.
-        neighbours: so many most similar images each.
+        neighbours: number of most similar images for each image.
 
     Raises:
         UsageError: if the number of neighbours is less than 1.
@@ -70,7 +73,8 @@ def retrieval_pairs(
     known = [name for name in names if name in descriptors]
     if len(known) < 2:
         return Pairs(())
-    return _named(known, {(a, b) for a, b in nearest_links(_dissimilarities(known, descriptors), neighbours).tolist()})
+    apart = _dissimilarities(known, descriptors, neighbours)
+    return _named(known, {(a, b) for a, b in nearest_links(apart, neighbours).tolist()})
 
 
 def loop_closing_pairs(
@@ -98,7 +102,7 @@ def loop_closing_pairs(
     if loop_closure and len(known) > 1:
         place = {name: idx for idx, name in enumerate(names)}
         number = {name: idx for idx, name in enumerate(known)}
-        apart = _dissimilarities(known, descriptors)
+        apart = _dissimilarities(known, descriptors, loop_closure)
         for a, b in pairs:
             if a in number and b in number:
                 apart[number[a], number[b]] = apart[number[b], number[a]] = np.inf
@@ -158,11 +162,16 @@ def _squared_distances(places: FloatArray) -> FloatArray:
     return np.asarray(np.sum([np.subtract.outer(axis, axis) ** 2 for axis in places.T], axis=0), np.float64)
 
 
-def _dissimilarities(names: Sequence[str], descriptors: Mapping[str, GlobalDescriptor]) -> FloatArray:
-    """Return how little alike images are, (N, N), not negative; whole numbers, so that no order of adding shows."""
+def _dissimilarities(names: Sequence[str], descriptors: Mapping[str, GlobalDescriptor], neighbours: int) -> FloatArray:
+    """Return how little alike images are, (N, N), not negative; whole numbers, so that no order of adding shows.
+
+    More matches of the samples make two images more alike; the vectors decide between equal numbers of matches.
+    """
     vectors = np.array([descriptors[name].vector for name in names], np.float32)
     alike = (vectors @ vectors.T).astype(np.float64)
-    return np.asarray(alike.max() - alike, np.float64)
+    by_looks = np.asarray(alike.max() - alike, np.float64)
+    matches = sample_matches([descriptors[name].sample for name in names], by_looks, neighbours=neighbours)
+    return np.asarray(by_looks + (by_looks.max() + 1) * (matches.max() - matches), np.float64)
 
 
 def _named(names: Sequence[str], links: set[tuple[int, int]]) -> Pairs:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from pano_mvs.algorithms.matching.brute_force import match_features
+from pano_mvs.core.text import plural
 from pano_mvs.scene import Features
 
 _RATIO = 0.8
@@ -28,7 +29,8 @@ def hopeless_reason(first: Features, second: Features, *, preemptive: int = 0) -
     needed = max(_MIN_MATCHES, int(_MIN_SHARE * preemptive))
     if found >= needed:
         return ""
-    return f"only {found} of their {preemptive} strongest key points match, {needed} needed for a closer look"
+    verb = plural(found, "matches", "match")
+    return f"only {found} of their {preemptive} strongest key points {verb}, {needed} needed for a closer look"
 
 
 def _strongest(features: Features, count: int) -> Features:

@@ -1,4 +1,4 @@
-"""One vector for a whole picture from the descriptors of its key points, with a codebook that no data made."""
+"""A global descriptor of a panorama: one vector over all its key points, and a sample of their descriptors."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ _LENGTH = 1024.0
 _CODEBOOK_SEED = 20261121  # any other would do; it never changes, so that pictures can be compared
 
 
-def vlad_descriptor(features: Features, *, strongest: int = 4000) -> GlobalDescriptor:
-    """Return the vector of locally aggregated descriptors of a picture.
+def vlad_descriptor(features: Features, *, strongest: int = 4000, sample: int = 200) -> GlobalDescriptor:
+    """Return the vector of locally aggregated descriptors of a panorama, and the descriptors of its largest key points.
 
     Jégou et al., "Aggregating local descriptors into a compact image representation", 2010, with the signed square
     root and the normalisation within cells of Arandjelović & Zisserman, "All about VLAD", 2013. The cells are not
@@ -26,14 +26,18 @@ def vlad_descriptor(features: Features, *, strongest: int = 4000) -> GlobalDescr
 
     Args:
         features: key points, strongest first, with either kind of descriptor.
-        strongest: so many of them are used.
+        strongest: number of key points that the vector sums up.
+        sample: number of key points, those of the coarsest scales, whose descriptors are kept as they are. Key points
+            of coarse scales are the ones found again from elsewhere (Wu, "Towards linear-time incremental structure
+            from motion", 2013, section 3.1).
 
     Returns:
         A vector of length 1024 within rounding, of whole numbers: scalar products are exact in any order.
     """
+    largest = _whole(features, np.argsort(-features.sizes_rad, kind="stable")[:sample]).astype(np.int16)
     turned = _turned(_centered(features, strongest))
     if turned.shape[1] <= _CELL_BITS or not len(turned):
-        return GlobalDescriptor(np.zeros(_RESIDUAL_SIZE << _CELL_BITS, np.float32))
+        return GlobalDescriptor(np.zeros(_RESIDUAL_SIZE << _CELL_BITS, np.float32), largest)
     unit = turned / np.maximum(np.sqrt(np.sum(turned**2, axis=1, keepdims=True)), 1e-12)
     cell = (unit[:, :_CELL_BITS] > 0) @ (1 << np.arange(_CELL_BITS))
     residuals = unit[:, _CELL_BITS:][:, :_RESIDUAL_SIZE]
@@ -41,16 +45,24 @@ def vlad_descriptor(features: Features, *, strongest: int = 4000) -> GlobalDescr
     sums = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
     vector = (np.sign(sums) * np.sqrt(np.abs(sums))).ravel()
     vector *= _LENGTH / max(float(np.linalg.norm(vector)), 1e-12)
-    return GlobalDescriptor(np.rint(vector).astype(np.float32))
+    return GlobalDescriptor(np.rint(vector).astype(np.float32), largest)
 
 
 def _centered(features: Features, strongest: int) -> FloatArray:
     """Return the descriptors as whole numbers whose mean over the components is zero, (N, D): bits become ± 1."""
+    whole = _whole(features, np.arange(len(features))[:strongest])
     if features.metric == "hamming":
-        return 2.0 * np.unpackbits(features.descriptors[:strongest].astype(np.uint8), axis=1).astype(np.float64) - 1.0
-    whole = np.rint(features.descriptors[:strongest]).astype(np.float64)
+        return whole
     centered: FloatArray = whole.shape[1] * whole - whole.sum(axis=1, keepdims=True)
     return centered
+
+
+def _whole(features: Features, chosen: NDArray[np.intp]) -> FloatArray:
+    """Return the chosen descriptors in whole numbers, (N, D): bits become ± 1."""
+    if features.metric == "hamming":
+        return 2.0 * np.unpackbits(features.descriptors[chosen].astype(np.uint8), axis=1).astype(np.float64) - 1.0
+    whole: FloatArray = np.rint(features.descriptors[chosen]).astype(np.float64)
+    return whole
 
 
 def _turned(vectors: FloatArray) -> FloatArray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,25 +37,60 @@ def nearest_two_whole(first: NDArray[np.generic], second: NDArray[np.generic]) -
     Raises:
         UsageError: if there are fewer than two to choose from, or the descriptors do not fit.
     """
-    from pano_mvs.algorithms.matching import kernels_vector_match as kernels
-
     if len(second) < 2 or first.shape[1] != second.shape[1]:
         raise UsageError(f"cannot find the nearest two among descriptors {second.shape} for descriptors {first.shape}")
-    if not (fits_whole_numbers(first) and fits_whole_numbers(second)):
-        raise UsageError("descriptors must be small whole numbers, on a machine with vector instructions")
-    rows, columns = _filled_up(first, kernels.ROWS), _filled_up(second, kernels.COLUMNS)
-    row_squares, column_squares = _squares(rows, len(first)), _squares(columns, len(second))
-    packed = columns.reshape(-1, kernels.COLUMNS, columns.shape[1] // 2, 2).transpose(0, 2, 1, 3)
-    state = np.full((len(rows), 3, kernels.LANES), _START, np.int32)
-    column_best = np.full(len(columns), _START, np.int32)
-    kernels.compare_all(rows, np.ascontiguousarray(packed), row_squares, column_squares, state, column_best)
-    best, second_best, nearest = _over_lanes(state[: len(first)])
-    squares = row_squares[: len(first)]
+    return nearest_two_packed(PackedDescriptors.of(first), PackedDescriptors.of(second))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PackedDescriptors:
+    """Descriptors in the layout of the compiled comparison, to be compared with many others.
+
+    Attributes:
+        count: number of descriptors, N.
+        rows: (N filled up, D filled up) int16.
+        columns: the same in blocks of columns, pairs of components together.
+        row_squares: (N filled up,) int32 squared lengths.
+        column_squares: likewise, for the number of columns filled up.
+    """
+
+    count: int
+    rows: NDArray[np.int16]
+    columns: NDArray[np.int16]
+    row_squares: NDArray[np.int32]
+    column_squares: NDArray[np.int32]
+
+    @classmethod
+    def of(cls, descriptors: NDArray[np.generic]) -> PackedDescriptors:
+        """Return descriptors (N, D) packed.
+
+        Raises:
+            UsageError: if `fits_whole_numbers` is false for them.
+        """
+        from pano_mvs.algorithms.matching import kernels_vector_match as kernels
+
+        if not fits_whole_numbers(descriptors):
+            raise UsageError("descriptors must be small whole numbers, on a machine with vector instructions")
+        rows, columns = _filled_up(descriptors, kernels.ROWS), _filled_up(descriptors, kernels.COLUMNS)
+        packed = columns.reshape(-1, kernels.COLUMNS, columns.shape[1] // 2, 2).transpose(0, 2, 1, 3)
+        count = len(descriptors)
+        return cls(count, rows, np.ascontiguousarray(packed), _squares(rows, count), _squares(columns, count))
+
+
+def nearest_two_packed(first: PackedDescriptors, second: PackedDescriptors) -> NearestTwo:
+    """Return what `nearest_two_whole` returns; `second` holds two descriptors at least, of as many components."""
+    from pano_mvs.algorithms.matching import kernels_vector_match as kernels
+
+    state = np.full((len(first.rows), 3, kernels.LANES), _START, np.int32)
+    column_best = np.full(len(second.column_squares), _START, np.int32)
+    kernels.compare_all(first.rows, second.columns, first.row_squares, second.column_squares, state, column_best)
+    best, second_best, nearest = _over_lanes(state[: first.count])
+    squares = first.row_squares[: first.count]
     return NearestTwo(
         nearest=nearest,
         squared=(squares - best).astype(np.float32),
         next_squared=(squares - second_best).astype(np.float32),
-        squared_back=(column_squares - column_best)[: len(second)].astype(np.float32),
+        squared_back=(second.column_squares - column_best)[: second.count].astype(np.float32),
     )
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.metrics.poses import CenterErrors, PoseErrors, center_errors, relative_pose_errors
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.text import plural
 from pano_mvs.geometry import Rigid3
 
 
@@ -75,7 +76,10 @@ def report_poses(estimated: Mapping[str, Rigid3], truth: Mapping[str, Rigid3]) -
     """
     common = {name: pose for name, pose in truth.items() if name in estimated}
     if len(common) < 2:
-        raise UsageError(f"only {len(common)} images have both an estimate and truth; relative poses need two")
+        raise UsageError(
+            f"only {len(common)} {plural(len(common), 'image has', 'images have')} both an estimate and truth; "
+            "relative poses need two"
+        )
     pairs, registered_pairs = relative_pose_errors(estimated, truth), relative_pose_errors(estimated, common)
     try:
         return PoseReport(pairs, registered_pairs, center_errors(estimated, truth))

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.text import plural
 from pano_mvs.geometry import Rigid3, Similarity3, angle_between, geodesic_angle, nearest_rotation
 
 FloatArray = NDArray[np.float64]
@@ -31,6 +32,7 @@ class PoseErrors:
         rotation_deg: (P,) error of second_from_first's rotation; 180 where an image is not registered.
         direction_deg: (P,) error of the direction of its translation; 180 likewise.
         pair_deg: (P,) the larger of the two.
+        measured: (P,) bool, False where an image is not registered, or the two are in different groups.
         median_pair_deg: median of `pair_deg`.
         auc: limit in degrees to the area under the recall curve of `pair_deg` up to it, in [0, 1].
         registered: number of images that have an estimate.
@@ -44,6 +46,7 @@ class PoseErrors:
     rotation_deg: FloatArray
     direction_deg: FloatArray
     pair_deg: FloatArray
+    measured: NDArray[np.bool_]
     median_pair_deg: float
     auc: dict[float, float]
     registered: int
@@ -94,11 +97,10 @@ def relative_pose_errors(
     }
     true_limit = _COINCIDENT_SHARE * _extent(truth)
     limits = {number: (_COINCIDENT_SHARE * _extent(world), true_limit) for number, world in worlds.items()}
+    measured = [a in known and b in known and group_of[a] == group_of[b] for a, b in pairs]
     errors = np.array([
-        _pair_error_deg(first, second, known, truth, limits[group_of[first]])
-        if first in known and second in known and group_of[first] == group_of[second]
-        else (180.0, 180.0)
-        for first, second in pairs
+        _pair_error_deg(a, b, known, truth, limits[group_of[a]]) if is_measured else (180.0, 180.0)
+        for (a, b), is_measured in zip(pairs, measured, strict=True)
     ])  # fmt: skip
     pair_deg = errors.max(axis=1)
     ratios = [_baseline_ratios(world, truth, limits[number]) for number, world in sorted(worlds.items())]
@@ -109,6 +111,7 @@ def relative_pose_errors(
         rotation_deg=errors[:, 0],
         direction_deg=errors[:, 1],
         pair_deg=pair_deg,
+        measured=np.array(measured),
         median_pair_deg=float(np.median(pair_deg)),
         auc={limit: float(np.clip(1 - pair_deg / limit, 0, 1).mean()) for limit in AUC_LIMITS_DEG},
         registered=len(known),
@@ -151,7 +154,10 @@ def align_centers(estimated: Mapping[str, Rigid3], truth: Mapping[str, Rigid3]) 
     """
     names = [name for name in truth if name in estimated]
     if len(names) < 2:
-        raise UsageError(f"only {len(names)} images have both an estimate and truth; two are needed for a scale")
+        raise UsageError(
+            f"only {len(names)} {plural(len(names), 'image has', 'images have')} both an estimate and truth; two are "
+            "needed for a scale"
+        )
     source = np.array([estimated[name].center for name in names])
     target = np.array([truth[name].center for name in names])
     middle, aim = source.mean(axis=0), target.mean(axis=0)

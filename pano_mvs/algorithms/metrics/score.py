@@ -37,7 +37,8 @@ def score_capture(
     with the true ones; they are never fitted to the true ranges. Pixels without true surface are left out; a pixel
     without an estimate counts as an error equal to the truth. Names of scores are those of `score_view`; `constant_`
     before one is what the median of the view's true ranges scores in its place, `best_constant_` what the constant that
-    is best for it does.
+    is best for it does. The median errors of poses are those of the pairs that can be measured, and are left out where
+    there is none; in the areas under the recall curve the others count as 180° off.
 
     Args:
         estimated_poses: cam_from_world by image.
@@ -55,11 +56,11 @@ def score_capture(
     poses: dict[str, float] = {
         "registered": errors.registered,
         "of": errors.expected,
-        "median_pair_error_deg": errors.median_pair_deg,
-        "median_rotation_error_deg": float(np.median(errors.rotation_deg)),
-        "median_direction_error_deg": float(np.median(errors.direction_deg)),
+        **{f"median_{name}_error_deg": float(np.median(error_deg[errors.measured]))
+           for name, error_deg in (("pair", errors.pair_deg), ("rotation", errors.rotation_deg),
+                                   ("direction", errors.direction_deg)) if errors.measured.any()},
         **{f"auc_{limit:g}_deg": value for limit, value in errors.auc.items()},
-    }
+    }  # fmt: skip
     if np.isfinite(errors.scale_ratio_max):
         poses |= {
             "scale_ratio_error_median": errors.scale_ratio_median,

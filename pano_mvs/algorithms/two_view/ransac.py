@@ -13,6 +13,7 @@ from pano_mvs.algorithms.two_view.hypotheses import SOLVERS, MinimalSolver, Solv
 from pano_mvs.algorithms.two_view.redirection import best_redirected
 from pano_mvs.algorithms.two_view.refinement import refine_relative_pose
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.text import plural
 from pano_mvs.geometry import Rigid3
 
 FloatArray = NDArray[np.float64]
@@ -88,7 +89,10 @@ def estimate_two_view(
     if solver not in SOLVERS:
         raise UsageError(f"there is no solver {solver!r}; choose one of {', '.join(SOLVERS)}")
     if len(first) < _MIN_MATCHES:
-        return _none(len(first), f"only {len(first)} matches, {_MIN_MATCHES} needed for a hypothesis")
+        return _none(
+            len(first),
+            f"only {len(first)} {plural(len(first), 'match', 'matches')}, {_MIN_MATCHES} needed for a hypothesis",
+        )
     # Hypotheses are given up after a few matches, which must be any.
     order = rng.permutation(len(first))
     search = _Search(first[order], second[order], rng, threshold_rad, SOLVERS[solver], optimise=refine)

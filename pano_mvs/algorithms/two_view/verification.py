@@ -19,6 +19,7 @@ from pano_mvs.algorithms.two_view.significance import (
     independent_count,
     log10_false_alarms,
 )
+from pano_mvs.core.text import plural
 from pano_mvs.geometry import Rigid3, angle_between
 from pano_mvs.scene import Features, TwoView
 
@@ -69,7 +70,9 @@ def verify_pair(
     threshold_rad = float(np.deg2rad(threshold_deg))
     count = len(matches_idx)
     if count < max(min_inliers, 16):
-        return TwoView.failed(f"{count} matches, {max(min_inliers, 16)} needed", candidates=count)
+        return TwoView.failed(
+            f"{count} {plural(count, 'match', 'matches')}, {max(min_inliers, 16)} needed", candidates=count
+        )
     rotation, turned = estimate_rotation(p, q, rng=rng, threshold_rad=1.5 * threshold_rad)
     pose = estimate_two_view(
         p, q, rng=rng, threshold_rad=threshold_rad, solver=solver, refine=refine, max_iterations=max_iterations
@@ -79,7 +82,7 @@ def verify_pair(
     kept = pose.inliers
     witnesses = independent_count(p[kept], q[kept]) if kept.any() else 0
     if not pose or witnesses < min_inliers:
-        few = f"{witnesses} independent matches of {count} agree on a relative pose, {min_inliers} needed"
+        few = f"{_agreeing(witnesses, count)} on a relative pose, {min_inliers} needed"
         return TwoView.failed(pose.reason or few, candidates=count)
     reason = _why_chance(pose, p, q, witnesses, rng=rng, threshold_rad=threshold_rad, solver=solver)
     if reason:
@@ -171,8 +174,12 @@ def _why_chance(
     )
     if false_alarms <= MAX_LOG10_FALSE_ALARMS:
         return ""
-    return (f"{witnesses} independent matches of {len(p)} agree on a relative pose, which may be chance: the "
+    return (f"{_agreeing(witnesses, len(p))} on a relative pose, which may be chance: the "
             "pictures may not overlap")  # fmt: skip
+
+
+def _agreeing(witnesses: int, count: int) -> str:
+    return f"{witnesses} independent {plural(witnesses, f'match of {count} agrees', f'matches of {count} agree')}"
 
 
 def _why_no_parallax(parallax: FloatArray, threshold_rad: float) -> str:
@@ -180,8 +187,8 @@ def _why_no_parallax(parallax: FloatArray, threshold_rad: float) -> str:
     moved = int((parallax > _MIN_PARALLAX * threshold_rad).sum())
     if moved >= _MIN_WITH_PARALLAX:
         return ""
-    return (f"only {moved} of {len(parallax)} agreeing matches show parallax, {_MIN_WITH_PARALLAX} needed: the "
-            "pictures were taken too close together for what they see")  # fmt: skip
+    return (f"only {moved} of {len(parallax)} agreeing matches {plural(moved, 'shows', 'show')} parallax, "
+            f"{_MIN_WITH_PARALLAX} needed: the pictures were taken too close together for what they see")  # fmt: skip
 
 
 def _why_open(direction_std_deg: float) -> str:

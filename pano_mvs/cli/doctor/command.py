@@ -17,6 +17,7 @@ from pano_mvs.cli.console import Console
 from pano_mvs.cli.doctor.finding import Finding
 from pano_mvs.cli.guard import guarded
 from pano_mvs.cli.options import CacheOption, OutOption
+from pano_mvs.core.text import plural
 
 _COLOURS = {"ok": "green", "note": "cyan", "warning": "yellow", "failed": "red"}
 _EXIT_FAILED = 2
@@ -89,4 +90,4 @@ def show(findings: Sequence[Finding], console: Console, *, as_json: bool = False
             console.print(f"{head}: {escape(finding.remedy)}", highlight=False, soft_wrap=True)
     warned = sum(finding.state == "warning" for finding in findings)
     verdict = f"{len(failed)} failed: a run cannot work" if failed else "a run can work"
-    console.print(f"{verdict}; {warned} warnings", highlight=False)
+    console.print(f"{verdict}; {warned} {plural(warned, 'warning')}", highlight=False)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pano_mvs.cli.doctor.finding import Finding
 from pano_mvs.core.paths import children, is_folder
+from pano_mvs.core.text import plural
 from pano_mvs.engine.stages.plugin_files import PLUGINS_VARIABLE, plugin_files_in, user_plugin_folders
 from pano_mvs.engine.stages.registry import Registry
 
@@ -25,9 +26,9 @@ def plugin_findings(
         environment: the variables.
     """
     if _BUILTIN in registry.stages:
-        yield Finding(
-            "plugins", "stages", "ok", f"{len(registry.stages)}, from {len(registry.plugins)} packages and files"
-        )
+        count = len(registry.plugins)
+        yield Finding("plugins", "stages", "ok", f"{len(registry.stages)}, from {count} "
+                      f"{plural(count, 'package or file', 'packages and files')}")  # fmt: skip
     else:
         yield Finding("plugins", "stages", "failed", "the built-in stages are not registered",
                       "pip install --force-reinstall pano-mvs, or pip install -e . in a checkout")  # fmt: skip
@@ -55,4 +56,4 @@ def _folders(environment: Mapping[str, str]) -> Iterator[Finding]:
         if not is_folder(folder):
             yield Finding("plugins", PLUGINS_VARIABLE, "warning", f"{folder} is no folder", f"mend {PLUGINS_VARIABLE}")
         else:
-            yield Finding("plugins", str(folder), "ok" if files else "note", f"{files} plugin files")
+            yield Finding("plugins", str(folder), "ok" if files else "note", f"{files} plugin {plural(files, 'file')}")

@@ -26,7 +26,7 @@ _LEFT_OUT = (
     f"{_OURS}.engine",  # its own part in a key is raised by hand: resolve.KEY_SCHEMA
     f"{_OURS}.core.kernel_cache",  # a matter of speed
 )
-_KEPT = (f"{_OURS}.engine.context",)
+_KEPT = (f"{_OURS}.engine.stages.context",)
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from pano_mvs.engine.code.canonical import canonical_text, strip
 from pano_mvs.engine.code.references import Import, dotted, references_of
 
 _STAGE_DECORATORS = frozenset(
-    f"pano_mvs.{module}.{name}" for module in ("api", "engine.stage") for name in ("stage", "source")
+    f"pano_mvs.{module}.{name}" for module in ("api", "engine.stages.stage") for name in ("stage", "source")
 )
 """Do not count: what they say of a stage is in its key already, or cannot change its result."""
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pano_mvs.core.files import temporary_prefix
-from pano_mvs.core.paths import exists, resolved
+from pano_mvs.core.paths import resolved, stat_of
 from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.executors.capture import tail
@@ -160,7 +160,9 @@ class Desk:
         if not resolved(path.parent).is_relative_to(resolved(self._logs.parent)):
             return None, said  # a link, or a plugin's name of an item, leads outside
         with suppress(OSError):  # a log is not worth failing for
-            if not exists(job.log):
+            found = stat_of(job.log)
+            if found is None or found.st_size == 0:  # a process that died of it leaves an empty one
+                job.log.unlink(missing_ok=True)
                 path.unlink(missing_ok=True)
                 return None, said
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
+from types import MappingProxyType
 from typing import NamedTuple
 
 from pano_mvs.core.errors import ContractError, StoreError, UsageError
@@ -30,7 +31,16 @@ class _Owner(NamedTuple):
 
 
 class NameClashError(UsageError):
-    """A unit would write a file where another unit of its stage, or itself, writes one."""
+    """A unit would write a file where another unit of its stage, or itself, writes one.
+
+    Attributes:
+        losers: the units of the same stage that were published before and are not any more, since files of theirs clash
+            with those of this one: item to the reason.
+    """
+
+    def __init__(self, text: str, losers: Mapping[str, str] = MappingProxyType({})) -> None:
+        self.losers = losers
+        super().__init__(text)
 
 
 class Publisher:
@@ -59,8 +69,10 @@ class Publisher:
         self.published: dict[str, str] = {}
         self.earlier: dict[str, str] = {}
         self.set_aside: dict[str, str] = {}
-        self._owners: dict[str, _Owner] = {}
+        self._owners: dict[str, _Owner] = {}  # of each file, the unit that comes first, even if it is not published
         self._folders: set[str] = set()
+        self._delivered: set[_Owner] = set()
+        self._lost: dict[_Owner, tuple[str, ...]] = {}  # units that clash to the files that they would have delivered
         self._stems: dict[str, str] = {}
         self._ranks: dict[str, int] = {}
         try:
@@ -88,12 +100,14 @@ class Publisher:
         """Take what was published so far for that of an earlier run: not all of it need be published again."""
         self.earlier |= self.published
         self.published = {}
+        self._owners, self._folders, self._delivered, self._lost = {}, set(), set(), {}
 
     def publish(self, stage: str, item: str, ref: ItemRef, *, to: str = "") -> Mapping[str, str]:
         """Write the files of one unit, unless they are there with the right bytes.
 
-        Where two units of one stage write the same file, that of the image that comes first in the capture is
-        written, whichever of them was computed first.
+        Of several units of one stage that write the same file, none is published but that of the image that comes
+        first in the capture, and that one only if it does not clash over another file with one before it. So it does
+        not matter which of them is computed first.
 
         Returns:
             The units of the same stage that were published before and are not any more, since files of theirs clash
@@ -119,36 +133,54 @@ class Publisher:
             if name in files:
                 raise NameClashError(f"it delivers {name} twice. Give each of its files a name of its own")
             files[name] = blob
-        losers = self._resolved_clashes(owner, files)
+        for name in files:
+            if folder := next((folder for folder in _folders_of(name) if folder in files), ""):
+                raise NameClashError(f"it delivers {folder} as a file and {name} inside of it. Rename one of them")
+        lost, losers = self._resolved_clashes(owner, files)
         for loser in losers:
             self._withdraw(_Owner(stage, loser))
-        for name, blob in files.items():
-            self._owners[name] = owner
+        for name in files:
+            self._owners[name] = min(owner, self._owners.get(name, owner), key=self._order)
             self._folders.update(_folders_of(name))
+        if lost:
+            self._lost[owner] = tuple(files)
+            raise NameClashError(lost, losers)
+        for name, blob in files.items():
             self._write(name, blob)
             self.published[name] = blob.digest
+        self._delivered.add(owner)
         return losers
 
-    def _resolved_clashes(self, owner: _Owner, files: Mapping[str, BlobRef]) -> dict[str, str]:
-        """Return the items that have to give way to a unit, each with the reason; raise if the unit has to."""
-        losers: dict[str, str] = {}
+    def _resolved_clashes(self, owner: _Owner, files: Mapping[str, BlobRef]) -> tuple[str, dict[str, str]]:
+        """Return why a unit cannot be published, if it cannot, and the published items that have to give way to it."""
+        lost, losers = "", {}
         for what, other in self._clashes(owner, files):
             if other.stage != owner.stage:
                 raise UsageError(f"stages {other.stage!r} and {owner.stage!r} both write {what}; give one a folder of "
                                  "its own with `to: NAME`")  # fmt: skip
             if self._order(owner) > self._order(other):
-                raise NameClashError(_clash(what, other.item))
-            losers[other.item] = _clash(what, owner.item)
-        return losers
+                lost = lost or _clash(what, other.item)
+            elif other in self._delivered:
+                losers[other.item] = _clash(what, owner.item)
+        return lost, losers
 
-    def _clashes(self, owner: _Owner, files: Mapping[str, BlobRef]) -> Iterator[tuple[str, _Owner]]:
+    def clash_causes(self) -> dict[tuple[str, str], str]:
+        """Return why units were not published, whichever were computed first: stage and item to the reason."""
+        return {
+            (owner.stage, owner.item): next(
+                _clash(what, other.item)
+                for what, other in self._clashes(owner, files)
+                if self._order(other) < self._order(owner)
+            )
+            for owner, files in self._lost.items()
+        }
+
+    def _clashes(self, owner: _Owner, files: Iterable[str]) -> Iterator[tuple[str, _Owner]]:
         """Yield what clashes, in words, with the unit whose file it is already."""
         for name in files:
             if (other := self._owners.get(name)) is not None and other != owner:
                 yield name, other
             for folder in _folders_of(name):
-                if folder in files:
-                    raise NameClashError(f"it delivers {folder} as a file and {name} inside of it. Rename one of them")
                 if (other := self._owners.get(folder)) is not None and other != owner:
                     yield f"{folder}, as a file and as a folder,", other
             if name in self._folders:
@@ -159,9 +191,11 @@ class Publisher:
         return self._ranks.get(owner.item, len(self._ranks)), owner.item
 
     def _withdraw(self, owner: _Owner) -> None:
-        """Take the files of a unit out of the output folder again."""
-        for name in [name for name, found in self._owners.items() if found == owner]:
-            del self._owners[name], self.published[name]
+        """Take the files of a unit out of the output folder again; what they clash with they still clash with."""
+        self._delivered.remove(owner)
+        self._lost[owner] = tuple(name for name, found in self._owners.items() if found == owner)
+        for name in self._lost[owner]:
+            del self.published[name]
             with suppress(ValueError):
                 self.written.remove(name)
             (self.out / name).unlink(missing_ok=True)

@@ -11,6 +11,7 @@ from pathlib import Path
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import GateError, StoreError
 from pano_mvs.core.paths import is_file
+from pano_mvs.core.text import plural
 from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.executors.protocol import Executor
@@ -168,7 +169,8 @@ class Run:
         except GateError as error:
             stop = error
         finally:
-            tally.put_in_order(board.place, replaced=self._replaced())
+            clashes = self._publisher.clash_causes()
+            tally.put_in_order(board.place, replaced=self._replaced(), clashes=clashes)
         if stop is not None:
             result.stopped, result.exit_code = str(stop), stop.exit_code
         else:
@@ -198,8 +200,8 @@ class Run:
         """Give units in flight some time after an interrupt; a second interrupt ends it at once."""
         deadline = time.monotonic() + GRACE_S
         if self._desk and self.executor.enforces_timeouts:  # units run elsewhere, and go on
-            self.observer.warn(f"interrupted: {len(self._desk)} units may finish within {GRACE_S:.0f} s; "
-                               "interrupt again to stop at once")  # fmt: skip
+            self.observer.warn(f"interrupted: {len(self._desk)} {plural(len(self._desk), 'unit')} may finish within "
+                               f"{GRACE_S:.0f} s; interrupt again to stop at once")  # fmt: skip
             while self._desk and (left := deadline - time.monotonic()) > 0:
                 self._desk.take(left)
 

@@ -152,6 +152,8 @@ class Scheduler:
                 losers = self._publisher.publish(unit.entry.name, unit.item, record.output, to=unit.entry.policy.to)
             except (NameClashError, ContractError) as error:
                 self._fail(Ended(unit, Outcome("failed", cause=str(error), seconds=record.seconds), None, ()))
+                for item, cause in error.losers.items() if isinstance(error, NameClashError) else ():
+                    self._give_way(unit.entry, item, cause)
                 return
             except DamagedBlobError as error:
                 self._store.drop(record.key)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 
 from pano_mvs.core.errors import GateError, InputError
+from pano_mvs.core.text import plural
 from pano_mvs.engine.cache.store import UnitRecord
 from pano_mvs.engine.planning.units import StageState
 from pano_mvs.engine.running.events import Failure, Observer, Outcome, RunResult, StageSummary
@@ -138,20 +140,30 @@ class Tally:
         self._observer.stage_finished(summary)
         if entry.spec.list_items is not None and not state.items:
             shown = "".join(f"\n  {cause}" for cause in list(state.failed.values())[:_SHOWN_CAUSES])
-            raise InputError(f"{entry.name}: none of the {len(state.members)} items can be used{shown}")
+            raise InputError(
+                f"{entry.name}: none of the {len(state.members)} {plural(len(state.members), 'item')} "
+                f"can be used{shown}"
+            )
         _check_gates(entry, summary)
 
     def put_in_order(
-        self, place: Callable[[str, str], tuple[int, int]], *, replaced: Collection[str] = frozenset()
+        self,
+        place: Callable[[str, str], tuple[int, int]],
+        *,
+        replaced: Collection[str] = frozenset(),
+        clashes: Mapping[tuple[str, str], str] = MappingProxyType({}),
     ) -> None:
         """Put what is told of the run into the order of the workflow and the capture, whatever came first.
 
         Args:
             place: returns where a unit stands in the workflow and in the capture.
             replaced: stages whose values later stages have made anew: what they doubted does not count any more.
+            clashes: stage and item of units whose files clash with those of another one, to the final reason.
         """
         self._result.stages.sort(key=lambda summary: place(summary.name, ""))
         self._result.failures.sort(key=lambda failure: place(failure.stage, failure.item))
+        self._result.failures[:] = [replace(failure, cause=clashes.get((failure.stage, failure.item), failure.cause))
+                                    for failure in self._result.failures]  # fmt: skip
         for summary in self._result.stages:
             rejected = self._counts[summary.name].rejected
             for item in sorted(rejected, key=lambda item: place(summary.name, item)):
@@ -166,8 +178,8 @@ class Tally:
 def _check_gates(entry: StageEntry, summary: StageSummary) -> None:
     done = summary.run + summary.cached
     if summary.units and done / summary.units < entry.policy.min_success:
-        raise GateError(f"stage {entry.name!r}: {done} of {summary.units} units succeeded, min_success is "
-                        f"{entry.policy.min_success}")  # fmt: skip
+        raise GateError(f"stage {entry.name!r}: {done} of {summary.units} {plural(summary.units, 'unit')} "
+                        f"succeeded, min_success is {entry.policy.min_success}")  # fmt: skip
     for metric, limits in entry.policy.gate.items():
         if metric not in summary.metrics:
             known = ", ".join(summary.metrics) or "none"

@@ -51,7 +51,7 @@ def write_colmap_model(
 
     missing = [name for name in poses.names if name not in sizes_hw]
     if missing:
-        raise UsageError(f"the size of {missing[0]} is not given (nor of {len(missing) - 1} more images)")
+        raise UsageError(f"the size of {missing[0]} is not given (nor of {len(missing) - 1} more)")
     model = pycolmap.Reconstruction()
     camera_ids = _add_cameras(model, [sizes_hw[name] for name in poses.names])
     points = ModelPoints(poses)

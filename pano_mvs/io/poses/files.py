@@ -9,7 +9,7 @@ import numpy as np
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import exists, is_file, is_folder
-from pano_mvs.core.text import shortened
+from pano_mvs.core.text import plural, shortened
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
 from pano_mvs.io.colmap.model import is_colmap_model, read_colmap_model
 from pano_mvs.io.poses.json_files import (
@@ -147,7 +147,10 @@ def _from_file(poses: dict[str, Rigid3], path: Path, *, metric: bool) -> Poses:
 
 def _pose_from_row(row: list[str], where: str) -> Rigid3:
     if len(row) != len(CSV_HEADER) or not row[0]:
-        raise InputError(f"{where}: expected a name and 7 numbers ({','.join(CSV_HEADER)}), got {len(row)} cells")
+        raise InputError(
+            f"{where}: expected a name and 7 numbers ({','.join(CSV_HEADER)}), got "
+            f"{len(row)} {plural(len(row), 'cell')}"
+        )
     try:
         numbers = np.array([float(cell) for cell in row[1:]])
     except ValueError as error:

@@ -13,6 +13,7 @@ from pano_mvs.algorithms.faces.layout import Face, covers_sphere, default_face_s
 from pano_mvs.algorithms.faces.render import colmap_depth_view, face_source, render_face
 from pano_mvs.api import All, Context, Each, Files, Names, One, Panorama, Params, Poses, RangeMap, UsageError, stage
 from pano_mvs.core.paths import children
+from pano_mvs.core.text import plural
 from pano_mvs.geometry import PinholeView
 from pano_mvs.io.colmap.images import resized_mask, write_picture
 from pano_mvs.io.colmap.model import write_colmap_model
@@ -143,8 +144,9 @@ def colmap_dense(
     blind = sum(not count for count in seen.values())
     ctx.metric("faces_without_points", blind)
     if blind:
-        ctx.note(f"{blind} of {len(seen)} faces see no point of the model: COLMAP fuses none of their depths. Add a "
-                 "stage points.tracked, or raise its count")  # fmt: skip
+        ctx.note(f"{blind} of {len(seen)} faces {plural(blind, 'sees', 'see')} no point of the model: COLMAP fuses "
+                 f"none of {plural(blind, 'its', 'their')} depths. Add a stage points.tracked, or raise its "
+                 "count")  # fmt: skip
     return Files(files)
 
 

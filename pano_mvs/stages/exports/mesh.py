@@ -10,6 +10,7 @@ from pydantic import Field
 from pano_mvs.algorithms.mesh.poisson import FEWEST_POINTS, poisson_depth, solve_poisson
 from pano_mvs.algorithms.mesh.triangles import Mesh, point_spacings, trimmed_mesh, without_crumbs
 from pano_mvs.api import Context, Files, InputError, One, Params, PointCloud, stage
+from pano_mvs.core.text import plural
 from pano_mvs.io.clouds.ply import read_ply, write_ply
 from pano_mvs.io.clouds.ply_mesh import read_ply_mesh, write_ply_mesh
 from pano_mvs.io.clouds.thinning import Selection, select_points
@@ -74,8 +75,9 @@ def _solved(cloud: PointCloud, params: MeshParams, folder: Path) -> tuple[Mesh, 
     write_ply(source, cloud, kept=select_points(cloud, selection, folder))
     points = read_ply(source).points_in_world
     if len(points) < FEWEST_POINTS:
-        raise InputError(f"{len(points)} of {len(cloud)} points are left for a mesh; {FEWEST_POINTS} are needed. Lower "
-                         "`min_views` or `min_confidence`, or look at why the cloud is empty")  # fmt: skip
+        raise InputError(f"{len(points)} of {len(cloud)} points {plural(len(points), 'is', 'are')} left for a mesh; "
+                         f"{FEWEST_POINTS} are needed. Lower `min_views` or `min_confidence`, or look at why the cloud "
+                         "is empty")  # fmt: skip
     spacing = float(np.median(point_spacings(points)))
     depth = params.depth or poisson_depth(points, spacing)
     solved = Mesh(*read_ply_mesh(solve_poisson(source, folder, depth=depth, point_weight=params.point_weight)))

@@ -30,6 +30,7 @@ from pano_mvs.api import (
     stage,
     write_png,
 )
+from pano_mvs.core.text import plural
 from pano_mvs.io.clouds.ply import write_ply
 from pano_mvs.io.clouds.thinning import Selection, select_points
 from pano_mvs.io.colmap.images import write_picture
@@ -119,8 +120,9 @@ def nerfstudio(
     if not loaded:
         raise InputError("no panorama has both a pose and frames: nothing can be listed in transforms.json")
     if len(loaded) < len(poses.names):
-        ctx.note(f"{len(poses.names) - len(loaded)} of {len(poses.names)} registered panoramas have no ranges and "
-                 "are not in transforms.json")  # fmt: skip
+        without = len(poses.names) - len(loaded)
+        ctx.note(f"{without} of {len(poses.names)} registered panoramas {plural(without, 'has', 'have')} no ranges and "
+                 f"{plural(without, 'is', 'are')} not in transforms.json")  # fmt: skip
     files: dict[str, Path] = {}
     groups = split_groups(poses)
     clouds = [] if cloud is None else cloud.groups()

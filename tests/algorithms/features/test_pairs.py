@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.matching.neighbours import (
     east_north_m,
     loop_closing_pairs,
@@ -17,6 +18,7 @@ from pano_mvs.algorithms.matching.neighbours import (
 )
 from pano_mvs.algorithms.matching.pairs import sequential_pairs
 from pano_mvs.algorithms.matching.preemptive import hopeless_reason
+from pano_mvs.algorithms.matching.shortlist import sample_matches
 from pano_mvs.algorithms.matching.vlad import vlad_descriptor
 from pano_mvs.core.errors import UsageError
 from pano_mvs.scene import GlobalDescriptor
@@ -106,6 +108,52 @@ def test_pictures_of_one_place_are_found_by_their_looks(walk, looks):
     assert groups(names, pairs) == 1
     next_ones = set(pairwise(names))
     assert len(next_ones & set(pairs)) > 0.6 * len(next_ones)
+
+
+def test_a_sample_of_key_points_finds_neighbours_that_the_vectors_miss(walk):
+    """Half of the neighbours' vectors are those of other places, as where all rooms have the same textures."""
+    names = list(walk.poses)
+    looks = {name: vlad_descriptor(walk.features[name], sample=200) for name in names}
+    misled = {name: replace(looks[name], vector=looks[names[idx * 7 % 40]].vector) for idx, name in enumerate(names)}
+    without = {name: replace(found, sample=np.zeros((0, 0), np.int16)) for name, found in misled.items()}
+
+    def share_near(descriptors):
+        pairs = retrieval_pairs(names, descriptors, neighbours=3).pairs
+        return np.mean([np.linalg.norm(walk.poses[a].center - walk.poses[b].center) < SIGHT for a, b in pairs])
+
+    assert share_near(misled) > 0.95
+    assert share_near(without) < 0.7
+
+
+@pytest.mark.parametrize("metric", ["l2", "hamming"])
+def test_matches_of_samples_are_those_of_matching_them(metric):
+    rng = np.random.default_rng(5)
+    size, kind = (64, np.float32) if metric == "l2" else (32, np.uint8)
+    common = rng.integers(0, 200, (30, size)).astype(kind)
+    found = [
+        features(np.concatenate([common[:part], rng.integers(0, 200, (40, size)).astype(kind)]), metric)
+        for part in (30, 20, 0)
+    ]
+    samples = [vlad_descriptor(one, sample=100).sample for one in found]
+    counts = sample_matches(samples, np.zeros((3, 3)), neighbours=2)
+    np.testing.assert_array_equal(counts, counts.T)
+    assert counts[0, 1] >= 20 > 5 > counts[0, 2]
+    assert not np.diag(counts).any()
+    if metric == "l2":
+        assert counts[0, 1] == len(match_features(found[0], found[1]))
+
+
+def test_samples_of_other_kinds_or_none_match_nothing():
+    samples = [np.zeros((0, 0), np.int16), np.ones((4, 8), np.int16), np.ones((4, 16), np.int16)]
+    assert not sample_matches(samples, np.zeros((3, 3)), neighbours=1).any()
+
+
+def test_compiled_and_plain_comparison_count_the_same(monkeypatch):
+    rng = np.random.default_rng(6)
+    samples = [rng.integers(0, 12, (50, 8)).astype(np.int16) for _ in range(4)]
+    compiled = sample_matches(samples, np.zeros((4, 4)), neighbours=3)
+    monkeypatch.setattr("pano_mvs.algorithms.matching.shortlist.fits_whole_numbers", lambda _: False)
+    np.testing.assert_array_equal(sample_matches(samples, np.zeros((4, 4)), neighbours=3), compiled)
 
 
 def test_looks_of_a_picture_depend_on_this_picture_alone(walk, looks):

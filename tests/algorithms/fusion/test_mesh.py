@@ -107,7 +107,7 @@ def test_untrimmed_it_is_closed_and_the_same_bytes_again(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("count", [0, 1, 99])
 def test_too_few_points_are_refused_with_the_remedy(tmp_path: Path, count: int) -> None:
-    with pytest.raises(InputError, match=r"\d+ of \d+ points are left for a mesh; 100 are needed"):
+    with pytest.raises(InputError, match=r"\d+ of \d+ points (is|are) left for a mesh; 100 are needed"):
         mesh(room_cloud(count), MeshParams(), context(tmp_path))
 
 

@@ -98,7 +98,7 @@ def test_what_cannot_be_compared_is_named(pano_mvs: Command, tmp_path: Path, tru
     assert "have no images in common, two are needed" in result.flat
     assert "x0.jpg, x1.jpg, x2.jpg … (5 in all)" in result.flat
     single = write_json(tmp_path / "s.json", {"0.jpg": truth["0.jpg"]})
-    assert "have 1 images in common" in pano_mvs("evaluate", "poses", single, "--truth", known).flat
+    assert "have 1 image in common" in pano_mvs("evaluate", "poses", single, "--truth", known).flat
     ambiguous = write_json(tmp_path / "a.json", {f"{d}/{name}": pose for d in "ab" for name, pose in truth.items()})
     assert "have no images in common" in pano_mvs("evaluate", "poses", ambiguous, "--truth", known).flat
     assert "no such file or folder" in pano_mvs("evaluate", "poses", tmp_path / "nothing", "--truth", known).flat

@@ -39,8 +39,11 @@ def test_the_papers_way_from_pictures_to_ranges(run) -> None:  # type: ignore[no
     assert (params["depth"]["near"], params["depth"]["far"]) == (0.05, 10)
     assert (params["depth"]["cost"], params["depth"]["window"], params["depth"]["selection"]) == ("sad", 7, "winner")
     for name, view in summary["scores"]["views"].items():
-        assert view["psnr_db"] > view["constant_psnr_db"], name
-        assert view["w_delta_105"] > 0.2, name
+        # Ranges of a plane sweep over uniform hypotheses are coarse far away; no constant comes near them all the same.
+        assert view["psnr_db"] > view["best_constant_psnr_db"] + 4, name
+        assert view["w_mae"] < 0.65 * view["best_constant_w_mae"], name
+        assert view["w_delta_105"] > view["best_constant_w_delta_105"], name
+        assert view["median_relative_error"] < 0.16, name
     for name in ("000", "003"):
         ranges = read_range_tiff(Path("out") / f"range/{name}.tiff")
         assert ranges.shape == SIZE_HW

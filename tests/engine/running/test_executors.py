@@ -18,7 +18,7 @@ from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors import choose, worker_process
 from pano_mvs.engine.executors.choose import make_executor
 from pano_mvs.engine.executors.processes import ProcessExecutor
-from pano_mvs.engine.executors.protocol import Executor
+from pano_mvs.engine.executors.protocol import Executor, Outcome
 from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.executors.threads import bound_environment, share_cores
 from pano_mvs.engine.running.events import RunResult, Silent
@@ -98,6 +98,19 @@ def test_what_fails_is_told_the_same_in_the_same_order(toy: Toy) -> None:
     assert "ValueError" in side_by_side.failures[0].trace
 
 
+def test_the_same_units_deliver_where_several_clash(toy: Toy) -> None:
+    """Each clashes with the one before and the one behind it; the first units are done last."""
+    toy.edit("plug.py", lambda text: text.replace(
+        '    return Files({"mean/{item}.txt": path})', """    number = int(path.read_text().partition(".")[0]) // 30
+    time.sleep(0.1 * max(0, 4 - number))
+    return Files({f"{number}.txt": path, f"{number + 1}.txt": path})"""))  # fmt: skip
+    serial = run_with(toy, SerialExecutor, name="serial")
+    side_by_side = run_with(toy, two_processes, name="processes")
+    assert len(serial.failures) > 1
+    assert told(side_by_side) == told(serial)
+    assert files_below(toy.folder / "out-processes") == files_below(toy.folder / "out-serial")
+
+
 def test_unit_starts_before_the_stage_before_it_is_complete(toy: Toy) -> None:
     """The second stage's first unit is waited for by the last unit of the first: a barrier would stop it for ever."""
     seen = toy.folder / "seen"
@@ -157,7 +170,33 @@ def test_a_unit_that_ends_its_process_fails_with_one_worker_too(toy: Toy, how: s
     (failure,) = (f for f in result.failures if f.stage == "scaled")
     assert (failure.item, result.exit_code) == ("3.txt", 3)
     assert f"its worker process died ({cause})" in failure.cause
+    assert bool(failure.log) == (cause == "killed by SIGABRT")  # of which Python prints where it was
     assert ran(result)["scaled"] == 4
+
+
+@pytest.mark.parametrize("said", ["", "about to go"])
+def test_the_log_of_a_process_that_died_is_named_if_it_holds_anything(
+    toy: Toy, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An empty log file was kept and named: a process that dies cannot remove its own."""
+    wait = SerialExecutor.wait
+
+    def wait_for_death(self: SerialExecutor, timeout_s: float | None = None) -> tuple[int, Outcome] | None:
+        job = self._jobs[0] if self._jobs else None
+        if timeout_s == 0 or job is None or (job.unit.entry.name, job.unit.item) != ("scaled", "3.txt"):
+            return wait(self, timeout_s)
+        self._jobs.clear()
+        job.log.parent.mkdir(parents=True, exist_ok=True)
+        job.log.write_text(said)
+        return job.number, Outcome("failed", cause="its worker process died (exit code 7)", died=True)
+
+    monkeypatch.setattr(SerialExecutor, "wait", wait_for_death)
+    result = run_with(toy, SerialExecutor)
+    failure = next(f for f in result.failures if f.stage == "scaled")
+    assert failure.cause == "its worker process died (exit code 7)"
+    assert (bool(failure.log), "\n".join(failure.said)) == (bool(said), said)
+    assert bool(files_below(toy.folder / "out-x" / "logs")) == bool(said)
+    assert not list((toy.folder / "cache-x" / "tmp").iterdir())
 
 
 @pytest.mark.parametrize("make", [SerialExecutor, two_processes])

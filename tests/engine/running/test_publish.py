@@ -96,6 +96,35 @@ def test_of_two_units_with_one_file_the_first_of_the_capture_has_it(tmp_path: Pa
     assert publisher.published.keys() == expected.keys() == set(publisher.written)
 
 
+@pytest.mark.parametrize("order", list(permutations("abcd")))
+def test_who_delivers_of_a_chain_of_clashes_does_not_depend_on_the_order(
+    tmp_path: Path, order: tuple[str, ...]
+) -> None:
+    """`c` came back if it was computed after `a` had taken `b` away, and did not if it was computed before."""
+    store = Store(tmp_path / "cache")
+    publisher = Publisher(tmp_path / "out", store)
+    publisher.name_items("abcd")
+    targets = {"a": ["ab", "a"], "b": ["ab", "bc"], "c": ["bc", "c/d"], "d": ["d"]}
+    failed: set[str] = set()
+    for item in order:
+        try:
+            losers = delivered(tmp_path, publisher, store, item, *targets[item])
+        except NameClashError as error:
+            failed.add(item)
+            losers = error.losers
+        assert not failed & losers.keys()
+        failed |= losers.keys()
+    assert failed == {"b", "c"}
+    assert files_in(tmp_path / "out") == {"ab": "a", "a": "a", "d": "d"}
+    assert publisher.published.keys() == {"ab", "a", "d"} == set(publisher.written)
+    causes = publisher.clash_causes()
+    assert causes.keys() == {("toy", "b"), ("toy", "c")}
+    assert "ab is delivered for a too" in causes["toy", "b"]
+    assert "bc is delivered for b too" in causes["toy", "c"]
+    publisher.begin_pass()  # in which `a` has vanished
+    assert not delivered(tmp_path, publisher, store, "b", *targets["b"])
+
+
 @pytest.mark.parametrize("order", [["a", "b"], ["b", "a"]])
 def test_a_file_where_another_unit_needs_a_folder_costs_that_unit(tmp_path: Path, order: list[str]) -> None:
     store = Store(tmp_path / "cache")

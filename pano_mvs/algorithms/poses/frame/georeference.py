@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.algorithms.poses.frame.geodesy import lla_from_local, local_from_lla
+from pano_mvs.core.text import plural
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec, rotation_from_two_vectors
 from pano_mvs.scene import Poses
 
@@ -84,8 +85,8 @@ def fit_gps(
     located = [(idx, positions_lla[name]) for idx, name in enumerate(poses.names) if name in positions_lla]
     unknown = GpsFit(Similarity3(1.0, np.eye(3), np.zeros(3)), np.zeros(3), 0, len(located))
     if len(located) < _FEWEST_POSITIONS:
-        return replace(unknown, reason=f"{len(located)} of {len(poses.names)} registered panoramas have a GPS "
-                       f"position; {_FEWEST_POSITIONS} are needed")  # fmt: skip
+        return replace(unknown, reason=f"{len(located)} of {len(poses.names)} registered panoramas "
+                       f"{plural(len(located), 'has', 'have')} a GPS position; {_FEWEST_POSITIONS} needed")  # fmt: skip
     lla = np.array([position for _, position in located], np.float64)
     origin_lla = np.median(lla, axis=0)
     local = local_from_lla(lla, origin_lla)

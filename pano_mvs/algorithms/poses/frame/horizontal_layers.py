@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from pano_mvs.core.text import plural
 from pano_mvs.geometry import rotation_from_rotvec, rotation_from_two_vectors
 
 FloatArray = NDArray[np.float64]
@@ -111,7 +112,9 @@ def floor_below(points: FloatArray, centers: FloatArray, up: FloatArray) -> Floo
     aside = np.linalg.norm(offsets - (offsets @ up)[:, None] * up, axis=1)
     below = depths[(depths > lowest) & (depths > 0) & (depths > _STEEPEST_SHARE * aside)]
     if len(below) < _FEWEST_FLOOR_POINTS:
-        return Floor(0.0, reason=f"only {len(below)} sparse points lie below the cameras")
+        return Floor(
+            0.0, reason=f"only {len(below)} sparse {plural(len(below), 'point lies', 'points lie')} below the cameras"
+        )
     logs = np.log(below)
     counts = np.bincount(((logs - logs.min()) / _LOG_STEP).astype(np.int64))
     density = gaussian_filter1d(np.pad(counts.astype(np.float64), 1), _LOG_WIDTH / _LOG_STEP, mode="constant")

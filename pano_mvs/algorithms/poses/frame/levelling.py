@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.algorithms.poses.frame.vertical import Evidence, Vertical, find_vertical
+from pano_mvs.core.text import plural
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec, rotation_from_two_vectors
 from pano_mvs.scene import Poses
 
@@ -71,5 +72,5 @@ def _northward(level: Poses, heading_deg: Mapping[str, float]) -> tuple[FloatArr
     if off_deg > _MAX_HEADING_DISAGREEMENT_DEG:
         return np.eye(3), f"{unturned} (the compass headings disagree by {off_deg:.0f}°)"
     return rotation_from_rotvec([0.0, turn_rad, 0.0]), (
-        f"z north, by {len(headings)} compass headings (median disagreement {off_deg:.1f}°)"
+        f"z north, by {len(headings)} compass {plural(len(headings), 'heading')} (median disagreement {off_deg:.1f}°)"
     )

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.frame.horizontal_layers import sharpest_up
+from pano_mvs.core.text import plural
 from pano_mvs.geometry import angle_between
 from pano_mvs.scene import Poses
 
@@ -87,7 +88,8 @@ def vertical_from_sensors(poses: Poses, up_in_cam: Mapping[str, Sequence[float]]
     if disagreement_deg > _MAX_SENSOR_DISAGREEMENT_DEG:
         return _unknown(f"the sensors of {len(measured)} panoramas disagree by {disagreement_deg:.1f}° in the median")
     agreement = f", median disagreement {disagreement_deg:.2f}°" if len(measured) > 1 else ", nothing to compare with"
-    evidence = f"the pitch and roll that {kept.sum()} of {len(poses.names)} panoramas state{agreement}"
+    states = plural(int(kept.sum()), "states", "state")
+    evidence = f"the pitch and roll that {kept.sum()} of {len(poses.names)} panoramas {states}{agreement}"
     return Vertical(up, "sensors", evidence, disagreement_deg if len(measured) > 1 else float("nan"))
 
 

@@ -21,6 +21,7 @@ from pano_mvs.algorithms.poses.placement.view_graph import Edge
 from pano_mvs.algorithms.poses.verification.aliases import find_aliases
 from pano_mvs.algorithms.poses.verification.arbitration import PAIRS_POWER, Arbitration, arbitrate, judge
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation
+from pano_mvs.core.text import plural
 from pano_mvs.geometry import Rigid3
 
 _FULL_PARALLAX_DEG = 10.0
@@ -326,10 +327,12 @@ def _why_refused(pairs: Pairs, image: int, support: int, known: int, *, agreeing
         share = MIN_SHARE if agreeing < 2 else MIN_SHARE_OF_AGREEING
         needed = max(MIN_POINTS, int(np.ceil(share * known)))
         return (
-            f"only {support} of {known} points known from other images are seen where they should be, {needed} needed: "
-            "repeated structure, something that moved, stitching errors, or an image that is no panorama"
+            f"only {support} of {known} points known from other images {plural(support, 'is', 'are')} seen where they "
+            f"should be, {needed} needed: repeated structure, something that moved, stitching errors, or an image that "
+            "is no panorama"
         )
     partner = pairs.partners[image][0]
     count = max(len(found.view) for found in pairs.geometries[min(image, partner), max(image, partner)])
-    return (f"{known} of its points are known from two other images, {MIN_POINTS} needed; its best partner is "
-            f"{pairs.names[partner]!r} with {count} matches: take panoramas in between")  # fmt: skip
+    return (f"{known} of its points {plural(known, 'is', 'are')} known from two other images, {MIN_POINTS} needed; its "
+            f"best partner is {pairs.names[partner]!r} with {count} {plural(count, 'match', 'matches')}: take "
+            "panoramas in between")  # fmt: skip

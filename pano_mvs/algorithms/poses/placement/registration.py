@@ -14,6 +14,7 @@ from pano_mvs.algorithms.poses.adjustment.tracks import Tracks
 from pano_mvs.algorithms.poses.placement.resection import refine_resection, resection_errors
 from pano_mvs.algorithms.poses.placement.scale import ScaleEstimator, estimate_scale
 from pano_mvs.algorithms.poses.placement.view_graph import Edge, relative_pose
+from pano_mvs.core.text import plural
 from pano_mvs.geometry import Rigid3, angle_between, ranges_from_bearings
 from pano_mvs.scene import TwoView
 
@@ -196,9 +197,9 @@ class GrowingModel:
         if support < max(_MIN_POINTS, _MIN_SHARE * len(points)):
             return Attachment(
                 pose, support, len(points),
-                f"only {support} of {len(points)} points known from other pictures are seen where they should be, "
-                f"{max(_MIN_POINTS, int(np.ceil(_MIN_SHARE * len(points))))} needed: repeated structure, something "
-                "that moved, stitching errors, or a picture that is no panorama",
+                f"only {support} of {len(points)} points known from other pictures {plural(support, 'is', 'are')} seen "
+                f"where they should be, {max(_MIN_POINTS, int(np.ceil(_MIN_SHARE * len(points))))} needed: repeated "
+                "structure, something that moved, stitching errors, or a picture that is no panorama",
             )  # fmt: skip
         return Attachment(pose, support, len(points))
 
@@ -235,8 +236,9 @@ class GrowingModel:
 
     def _too_few(self, image: int, known: int) -> str:
         count, partner = max((-negative, partner) for negative, partner in self._pairs[image])
-        return (f"{known} of its points are known from two other pictures, {_MIN_POINTS} needed; its best partner is "
-                f"{self.tracks.names[partner]!r} with {count} matches: take pictures in between")  # fmt: skip
+        return (f"{known} of its points {plural(known, 'is', 'are')} known from two other pictures, {_MIN_POINTS} "
+                f"needed; its best partner is {self.tracks.names[partner]!r} with {count} "
+                f"{plural(count, 'match', 'matches')}: take pictures in between")  # fmt: skip
 
     def _arrays(self) -> tuple[FloatArray, FloatArray]:
         rotations = np.tile(np.eye(3), (len(self.tracks.names), 1, 1))
