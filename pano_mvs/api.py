@@ -17,9 +17,11 @@ from pano_mvs.algorithms.sweep.windows import CostWindow
 from pano_mvs.algorithms.sweep.winner import Winners
 from pano_mvs.core.errors import GateError, InputError, PanoMvsError, UsageError
 from pano_mvs.core.parts import Parts
+from pano_mvs.core.settings import setting
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.params import NOT_IN_KEY, InputPath, Params, PartOf, SourcePath
 from pano_mvs.engine.stages.ports import All, Each, Names, Near, One
+from pano_mvs.engine.stages.settings import params_from, settings_from
 from pano_mvs.engine.stages.stage import SourceItem, source, stage
 from pano_mvs.geometry import Rigid3, Similarity3
 from pano_mvs.scene import (
@@ -82,9 +84,12 @@ __all__ = [
     "Winners",
     "decode_image",
     "join_groups",
+    "params_from",
     "per_group",
     "register_sweep_backend",
     "register_sweep_cost",
+    "setting",
+    "settings_from",
     "source",
     "split_groups",
     "stage",

@@ -2,7 +2,7 @@
 
 @dataclass(frozen=True)
 class SweepSettings:
-    planes: int = setting(128, ge=3, le=4096, doc="number of virtual ranges")
+    planes: int = setting(128, ge=3, le=4096, doc="number of depth hypotheses")
 
     def __post_init__(self) -> None:
         check_settings(self)
@@ -49,7 +49,7 @@ class Setting:
         if self.parts is not None:
             self.parts.check(value)
         if self.odd and value % 2 == 0:
-            return odd_problem(value)
+            return _odd_problem(value)
         if self.ge is not None and not value >= self.ge:
             return f"must be at least {self.ge}"
         if self.gt is not None and not value > self.gt:
@@ -85,6 +85,16 @@ def check_settings(settings: Any) -> None:
             raise UsageError(f"{name} {why}, got {value}")
 
 
-def odd_problem(value: int) -> str:
-    """Return what is wrong with an even window."""
+def odd(value: int) -> int:
+    """Return a value that is odd.
+
+    Raises:
+        UsageError: if it is even.
+    """
+    if value % 2 == 0:
+        raise UsageError(_odd_problem(value))
+    return value
+
+
+def _odd_problem(value: int) -> str:
     return f"must be odd, since a window has a centre: {value - 1} or {value + 1}"

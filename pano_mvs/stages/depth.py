@@ -11,9 +11,21 @@ from pano_mvs.algorithms.sweep.backends.registry import SWEEP_BACKENDS, backend_
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.sweep import sweep_range
-from pano_mvs.api import NOT_IN_KEY, Context, Each, Near, Panorama, Params, PartOf, Pose, RangeMap, stage
+from pano_mvs.api import (
+    NOT_IN_KEY,
+    Context,
+    Each,
+    Near,
+    Panorama,
+    Params,
+    PartOf,
+    Pose,
+    RangeMap,
+    params_from,
+    settings_from,
+    stage,
+)
 from pano_mvs.core.errors import UsageError
-from pano_mvs.engine.stages.settings import params_from, settings_from
 from pano_mvs.scene.pose_groups import require_one_group
 
 _PICTURE_BYTES, _RESULT_BYTES = 16, 40
@@ -30,9 +42,9 @@ class SweepParams(Params):
         default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="where a backend that can choose computes"
     )
     near: float | None = Field(
-        default=None, gt=0, description="nearest virtual range, scene units; else found by small sweeps"
+        default=None, gt=0, description="nearest depth hypothesis, scene units; else found by small sweeps"
     )
-    far: float | None = Field(default=None, gt=0, description="farthest virtual range, likewise")
+    far: float | None = Field(default=None, gt=0, description="farthest depth hypothesis, likewise")
 
     @model_validator(mode="after")
     def _fit_together(self) -> SweepParams:
@@ -59,7 +71,7 @@ def sweep(
     params: SweepParams,
     ctx: Context,
 ) -> RangeMap:
-    """The sphere sweep over virtual ranges: for each the sources are looked up where the reference's rays would end.
+    """The sphere sweep: at each depth hypothesis, look the sources up where the reference's rays would end.
 
     Without `near` and `far` the limits come from small sweeps of the reference and its first sources, from what they
     agree on.

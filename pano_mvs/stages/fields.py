@@ -6,7 +6,7 @@ from typing import Annotated, TypeAlias
 
 from pydantic import AfterValidator
 
-from pano_mvs.engine.stages.settings import odd
+from pano_mvs.core.settings import odd
 
 Odd: TypeAlias = Annotated[int, AfterValidator(odd)]
 """The side of a window."""

@@ -1,4 +1,4 @@
-"""The costs of some pixels at all virtual ranges, without those of all the others."""
+"""The costs of some pixels at all depth hypotheses, without those of all other pixels."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ def _compiled_costs(work: SweepInput, rows: NDArray[np.intp], columns: NDArray[n
     return costs
 
 
-def votes_at(work: SweepInput, source_idx: int, row: int, column: int) -> NDArray[np.bool_]:
-    """Return at which virtual ranges a source may vote on a pixel, (D,): all that is sampled there is valid."""
+def votes_at(work: SweepInput, source_idx: int, *, row: int, column: int) -> NDArray[np.bool_]:
+    """Return at which depth hypotheses a source is valid for a pixel, (D,): all pixels sampled there are."""
     if work.source_valid is None:
         return np.ones(len(work.ranges), np.bool_)
     valid = work.source_valid[source_idx]
@@ -61,7 +61,7 @@ def votes_at(work: SweepInput, source_idx: int, row: int, column: int) -> NDArra
     return np.asarray(sample_panorama(valid, pixels) > 1 - 1e-9)
 
 
-def is_seen(work: SweepInput, row: int, column: int, plane: int) -> bool:
+def is_seen(work: SweepInput, *, row: int, column: int, plane: int) -> bool:
     """Return whether a sweep keeps a pixel's winner: a source sees it in a valid pixel; see `sees_winner`."""
     point = _points_at(work, row, column)[plane]
     return work.source_valid is None or any(

@@ -27,8 +27,8 @@ class SweepInput:
         reference: (H, W, C) uint8: grey (C = 1) for census and zncc, RGB for differences.
         sources: the sources likewise, each of its own size.
         source_from_reference: their poses.
-        source_valid: for each source, where a sample may vote, (Hs, Ws); None if everywhere in all of them.
-        ranges: (D,) float64 virtual ranges, ascending.
+        source_valid: for each source, where a sample is valid, (Hs, Ws); None if everywhere in all of them.
+        ranges: (D,) float64 depth hypotheses, ascending.
         settings: what was asked for.
         device: where a backend that can choose computes.
     """
@@ -112,7 +112,7 @@ def _spread_columns(blocked: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]
 
 
 def sees_winner(winners: Winners, work: SweepInput) -> NDArray[np.bool_]:
-    """Return where at least one source may vote on the plane that won, (H, W)."""
+    """Return where at least one source is valid at the plane that won, (H, W)."""
     if work.source_valid is None:
         return np.ones(winners.plane.shape, np.bool_)
     height, width = winners.plane.shape

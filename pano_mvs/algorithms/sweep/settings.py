@@ -30,9 +30,9 @@ class SweepSettings:
     backend numba.
     """
 
-    planes: int = setting(128, ge=3, le=4096, doc="number of virtual ranges")
+    planes: int = setting(128, ge=3, le=4096, doc="number of depth hypotheses")
     spacing: Literal["inverse", "log", "uniform"] = setting(
-        "inverse", doc="virtual ranges: even in 1/range, log range, or range (the paper)"
+        "inverse", doc="depth hypotheses: even in 1/range, log range, or range (the paper)"
     )
     cost: str = setting(
         "census",
@@ -69,7 +69,7 @@ class SweepSettings:
         "plane as good as infinitely far: leave `far` to be found outdoors; the paper keeps them",
     )
     prefilter_diameter: int = setting(
-        0, ge=0, le=31, doc="bilateral filter of the pictures before the sweep (the paper: 3); 0 is none"
+        0, ge=0, le=31, doc="bilateral filter of the pictures before the sweep (the paper: 3); 0: no filter"
     )
     prefilter_sigma_color: float = setting(25.0, gt=0, doc="its width in grey levels")
     prefilter_sigma_space_px: float = setting(25.0, gt=0, doc="its width in pixels")
@@ -142,5 +142,5 @@ class SweepSettings:
         return min(self.best, count) if self.combination == "best_k" else count
 
     def replace(self, **changes: Any) -> SweepSettings:
-        """Return the same settings but for those named."""
+        """Return the same settings with some changed."""
         return dataclasses.replace(self, **changes)

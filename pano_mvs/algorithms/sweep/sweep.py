@@ -1,6 +1,6 @@
-"""The sphere sweep: the range of every pixel of a panorama by testing virtual ranges.
+"""The sphere sweep: the range of every pixel of a panorama by testing depth hypotheses, the paper's virtual depths.
 
-For a virtual range r a reference pixel u is looked up in source k at F⁻¹(r R F(u) + t), (R, t) = source_from_reference
+For a hypothesis r, a reference pixel u is looked up in source k at F⁻¹(r R F(u) + t), (R, t) = source_from_reference
 and F the ray of a pixel; the range at which reference and sources agree best wins.
 S. Yang, K. Kim, Y. Lee, "Dense Depth Estimation from Multiple 360-degree Images Using Virtual Depth", section 3.3.
 """
@@ -53,14 +53,14 @@ def sweep_range(
         reference: (H, W, 3) uint8 RGB, the full sphere, W even, H and W at least 16.
         sources: one or more (Hs, Ws, 3) uint8 RGB, each of its own size.
         source_from_reference: the pose of each source: x_in_source = R x_in_reference + t, t in scene units.
-        near: the first virtual range, in scene units.
-        far: the last one.
+        near: the nearest depth hypothesis, in scene units.
+        far: the farthest one.
         settings: how to sample, compare and decide.
         backend: "numba", compiled; "numpy", the readable reference (the whole volume in memory); "opencv"; or the
             name of a plugin's.
         device: where a backend that can choose computes: "auto", "cpu", "cuda", "cuda:1".
         reference_mask: (H, W) False where the reference is to be ignored: NaN in the result.
-        source_masks: for each source (Hs, Ws), False where it has no vote, or None.
+        source_masks: for each source (Hs, Ws), False where it is not valid, or None.
 
     Returns:
         Ranges in scene units and confidence 64–127 ("seen but weak": a sweep alone cannot say that other views
@@ -106,7 +106,7 @@ def sweep_input(
             reference, sources, source_from_reference, near=near, far=far, backend=backend, device=device,
             masks=(reference_mask, masks),
         )  # fmt: skip
-        sources = match_all(reference, sources, source_from_reference, rough, masks)
+        sources = match_all(reference, sources, source_from_reference, ranges=rough, masks=masks)
     poses = tuple(source_from_reference)
     if settings.derotate:
         sources, poses, masks = derotated(sources, poses, masks)
@@ -158,7 +158,7 @@ def _shrunk(mask: Mask, *, like: Picture) -> Mask:
 
 
 def _voting(masks: tuple[Mask, ...] | None, settings: SweepSettings, *, rows: int) -> tuple[Mask, ...] | None:
-    """Return where each source may vote: a window's radius in pixels of the reference away from what is masked."""
+    """Return where each source is valid: a window's radius in pixels of the reference away from what is masked."""
     if masks is None:
         return None
     radius = settings.compare_radius + settings.box_radius

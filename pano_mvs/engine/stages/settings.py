@@ -7,18 +7,11 @@ from typing import Annotated, Any, TypeVar, get_type_hints
 
 from pydantic import AfterValidator, Field, create_model
 
-from pano_mvs.core.settings import Setting, odd_problem, settings_of
+from pano_mvs.core.settings import Setting, odd, settings_of
 from pano_mvs.engine.stages.params import Params, PartOf
 
 Model = TypeVar("Model", bound=Params)
 Settings = TypeVar("Settings")
-
-
-def odd(value: int) -> int:
-    """Return a value that is odd, and refuse any other."""
-    if value % 2 == 0:
-        raise ValueError(odd_problem(value))
-    return value
 
 
 def params_from(settings: type) -> Callable[[type[Model]], type[Model]]:

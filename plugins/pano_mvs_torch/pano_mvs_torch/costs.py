@@ -7,13 +7,14 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pano_mvs.algorithms.sweep.preparation import SweepInput
-from pano_mvs.algorithms.sweep.settings import (
+from pano_mvs.algorithms.sweep.costs.census_gradient import census_weight
+from pano_mvs.algorithms.sweep.numba.kernels_constants import (
     GREY_WEIGHT,
-    LARGEST_COLOR_COST,
-    LARGEST_GRADIENT_COST,
+    MAX_COLOR_COST,
+    MAX_GRADIENT_COST,
     ZNCC_NOISE_VARIANCE,
 )
+from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.windows import WindowBands, column_offsets
 from pano_mvs.geometry import pad_panorama
 from torch import Tensor
@@ -30,7 +31,7 @@ class BandCost:
         settings = work.settings
         height, width = work.reference.shape[:2]
         self.compare_radius, self.box_radius = settings.compare_radius, settings.box_radius
-        self.census_weight = settings.census_weight
+        self.census_weight = census_weight(self.compare_radius)
         self.halo = self.compare_radius + self.box_radius
         spherical = settings.spherical_window
         columns = column_offsets((height, width), self.compare_radius, spherical=spherical)
@@ -64,8 +65,8 @@ class BandCost:
 
     def _census_gradient(self, warped: Tensor) -> Tensor:
         """Return the census cost, its weight times, plus differences of grey levels and of their gradients, cut off."""
-        levels = self._absolute(warped).clamp_(max=LARGEST_COLOR_COST // 3)
-        grey = levels + self._gradients(warped).clamp_(max=LARGEST_GRADIENT_COST // 3)
+        levels = self._absolute(warped).clamp_(max=MAX_COLOR_COST // 3)
+        grey = levels + self._gradients(warped).clamp_(max=MAX_GRADIENT_COST // 3)
         return self._box_mean(self.census_weight * self._disagreements(warped) + GREY_WEIGHT * grey)
 
     def _disagreements(self, warped: Tensor) -> Tensor:
@@ -101,8 +102,8 @@ class BandCost:
 
     def _sad_gradient(self, warped: Tensor) -> Tensor:
         """Return differences of colours and of their gradients, each cut off."""
-        colors = self._absolute(warped).clamp_(max=LARGEST_COLOR_COST)
-        return self._box_mean(colors + self._gradients(warped).clamp_(max=LARGEST_GRADIENT_COST))
+        colors = self._absolute(warped).clamp_(max=MAX_COLOR_COST)
+        return self._box_mean(colors + self._gradients(warped).clamp_(max=MAX_GRADIENT_COST))
 
     def _gradients(self, warped: Tensor) -> Tensor:
         """Return the sum of absolute differences of the gradients of all colours, (P, rows, W)."""

@@ -246,7 +246,7 @@ def test_calls_that_cannot_work_say_why():
     [
         ({"planes": 2}, "planes"),
         ({"window": 6}, "window must be odd"),
-        ({"support": 17}, "support must be odd"),
+        ({"support": 17}, "support must be at most 15"),
         ({"window": 1}, "census needs"),
         ({"window": 1, "cost": "zncc"}, "zncc needs"),
         ({"best": 0}, "best must"),

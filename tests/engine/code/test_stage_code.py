@@ -92,7 +92,7 @@ def test_every_kernel_that_a_stage_can_run_is_in_its_key(name: str) -> None:
     [
         ("algorithms.sweep.sweep", '"""', '"""Anew. '),
         ("algorithms.sweep.numba.kernels_sgm", "_BLOCK = ", "# how many\n_BLOCK = "),
-        ("algorithms.sweep.settings", 'doc="number of virtual ranges"', 'doc="how many virtual ranges"'),
+        ("algorithms.sweep.settings", 'doc="number of depth hypotheses"', 'doc="how many hypotheses"'),
         ("stages.depth", "_PICTURE_BYTES, _RESULT_BYTES = 16", "_PICTURE_BYTES, _RESULT_BYTES = 17"),
     ],
 )

@@ -24,7 +24,7 @@ NO_VOLUME = np.empty((0, 0, 0), np.uint8)
 
 
 def find_winners(work: SweepInput) -> Winners:
-    """Return the winning plane of every pixel and the costs around it; equals the numpy backend's but for rounding.
+    """Return the winning plane of every pixel and the costs around it; equals the numpy backend's except for rounding.
 
     With `levels` above 1 it sweeps from coarse to fine. Semi-global matching of a volume beyond `volume_limit_gb` is
     done in parts of the rows, see `volume_parts`.
@@ -59,7 +59,7 @@ def _box_winners(work: SweepInput, sweep: Sweep) -> Winners:
     def sweep_rows(first: int) -> None:
         state, planes = fresh_state(min(BAND_ROWS, height - first), width)
         sweep_band(first, sweep, work.ranges, NO_VOLUME, state, planes)
-        keep_band(found, first, state, planes)
+        keep_band(found, state, planes, first=first)
 
     with workers() as pool:
         run_jobs(pool, sweep_rows, range(0, height, BAND_ROWS))

@@ -51,7 +51,7 @@ def combined_cost(work: SweepInput, virtual_range: float) -> FloatArray:
 
 
 def combine_costs(costs: NDArray[np.floating], work: SweepInput) -> FloatArray:
-    """Return the mean cost of the sources that count, (S, H, W) to (H, W); infinite stands for no vote."""
+    """Return the mean cost of the sources that count, (S, H, W) to (H, W); infinite where a source is not valid."""
     votes = np.isfinite(costs)
     weights = source_weights(costs.shape[1:], work.source_from_reference, work.settings)
     weights = np.where(votes, weights if len(weights) else 1.0, 0.0)
@@ -67,7 +67,7 @@ def combine_costs(costs: NDArray[np.floating], work: SweepInput) -> FloatArray:
 
 
 def _source_cost(work: SweepInput, idx: int, virtual_range: float) -> FloatArray:
-    """Return the cost of one plane in one source, (H, W), infinite where the source has no vote."""
+    """Return the cost of one plane in one source, (H, W), infinite where the source is not valid."""
     size_hw = work.reference.shape[0], work.reference.shape[1]
     settings, source = work.settings, work.sources[idx]
     points = work.source_from_reference[idx].apply(ray_grid(size_hw) * virtual_range)

@@ -1,8 +1,9 @@
 """The sweep by OpenCV: whole pictures warped by cv2.remap, windows by cv2.blur, one plane at a time.
 
-cv2.remap rounds positions to 1/32 pixel; all else is as in the readable backend, and so are the costs for which OpenCV
-has nothing. Semi-global matching, which OpenCV has for flat pairs alone, is the compiled backend's. Memory beyond the
-pictures and the result: some 40 bytes a pixel and source, and for "sgm" 3 bytes for each pixel and plane.
+cv2.remap rounds positions to 1/32 pixel. Everything else is as in the numpy backend, which also computes the costs for
+which OpenCV has no function. Semi-global matching is the numba backend's, since OpenCV has it for flat pairs alone.
+Memory beyond the pictures and the result: about 40 bytes a pixel and source, and for "sgm" 3 bytes for each pixel and
+plane.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ Cost = Callable[[NDArray[np.uint8]], NDArray[np.float32]]
 
 
 def find_winners(work: SweepInput) -> Winners:
-    """Return the winning plane of every pixel and the costs around it; equals the numpy backend's but for rounding.
+    """Return the winning plane of every pixel and the costs around it; equals the numpy backend's except for rounding.
 
     Raises:
         UsageError: if a picture has more columns than cv2.remap can address.
@@ -75,7 +76,7 @@ class _Lookup:
         self.translation = pose.translation
 
     def at(self, virtual_range: float) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
-        """Return the source as the reference would see it at one range, (H, W, C), and where it may vote."""
+        """Return the source as the reference would see it at one range, (H, W, C), and where it is valid."""
         x, y, z = (
             axis + np.float32(step)
             for axis, step in zip(self.directions, self.translation / virtual_range, strict=True)
@@ -92,7 +93,7 @@ class _Lookup:
 
 
 def _seen(cost: Cost, lookup: _Lookup, virtual_range: float) -> NDArray[np.float32]:
-    """Return the costs of one plane in one source, (H, W), infinite where it has no vote."""
+    """Return the costs of one plane in one source, (H, W), infinite where it is not valid."""
     warped, votes = lookup.at(virtual_range)
     result = cost(warped)
     return result if votes is None else np.where(votes, result, np.float32(np.inf))

@@ -1,7 +1,7 @@
 """The backends of a sweep by name, and what each of them can do; plugins add their own.
 
-A backend turns a `SweepInput` into `Winners`. All backends give the same winners on the same input but for rounding:
-`numpy` is the readable one against which the others are tested, `numba` the default, `opencv` warps by cv2.remap.
+A backend turns a `SweepInput` into `Winners`; all backends return the same ones, except for rounding. `numpy` is the
+readable one against which the others are tested, `numba` the default; `opencv` warps by cv2.remap.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class SweepBackend:
         return self.costs is None or name in self.costs
 
     def volume_bytes(self, pixels: int, settings: SweepSettings) -> int:
-        """Return what the volume of semi-global matching takes at most, for a reference of so many pixels.
+        """Return what the volume of semi-global matching takes at most, for a reference of this many pixels.
 
         From coarse to fine the volume is that of the coarsest level.
         """

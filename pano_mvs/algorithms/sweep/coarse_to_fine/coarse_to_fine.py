@@ -74,7 +74,7 @@ def _halved(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _halved_masks(work: SweepInput) -> tuple[NDArray[np.bool_], ...] | None:
-    """Return where sources vote at half size, a window's radius of it away from what is masked."""
+    """Return where sources are valid at half size: a window's radius away from masked pixels."""
     if work.source_valid is None:
         return None
     radius = work.settings.compare_radius + work.settings.box_radius
@@ -100,7 +100,7 @@ def _doubled(picture: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _rival(winners: Winners, coarse: Winners) -> NDArray[np.float32]:
-    """Return the rival's cost, (H, W): candidates tell only those nearby, the coarse sweep those far away."""
+    """Return the rival's cost, (H, W): among the candidates if it is near, from the coarse sweep if it is far away."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.nan_to_num(coarse.rival / coarse.cost, nan=np.inf, posinf=np.inf)
         farther = winners.cost * ratio.repeat(2, axis=0).repeat(2, axis=1)

@@ -80,11 +80,11 @@ class GuidedSweep:
         guide = pad_panorama(self.guides[layer], halo)[:, halo:-halo] if halo else self.guides[layer]
         run_jobs(
             self._pool,
-            partial(self._sweep_run, layer, guide, halo),
+            partial(self._sweep_run, layer=layer, guide=guide, halo=halo),
             runs_of(tile_means(active) > 0, active.shape, self._shared.windows),
         )
 
-    def _sweep_run(self, layer: int, guide: NDArray[np.float32], halo: int, run: TileRun) -> None:
+    def _sweep_run(self, run: TileRun, *, layer: int, guide: NDArray[np.float32], halo: int) -> None:
         columns = run.with_margin % guide.shape[1]
         around = np.ascontiguousarray(guide[run.first : run.first + run.rows + 2 * halo][:, columns])
         sweep = run_arguments(self._shared, run)

@@ -30,7 +30,7 @@ def _means(positions: F32, y: int, x: int, side: int, middle: float, layers: F32
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def split_layers(positions: F32, radius: int, least_gap: float, layers: F32) -> None:
-    """Tell the two surfaces around each pixel apart where they meet.
+    """Separate the two surfaces around each pixel where they meet.
 
     Args:
         positions: (H + 2 radius, W + 2 radius) float32 positions among planes, padded over the seam and the poles.

@@ -25,7 +25,7 @@ Function = TypeVar("Function", bound=CostFunction)
 def register_sweep_cost(name: str, *, colors: bool = False) -> Callable[[Function], Function]:
     """Declare a function `(reference, warped, window) -> (H, W)` as the matching cost of that name.
 
-    Backends that take any cost (numpy, opencv) call it once for each source and virtual range.
+    Backends that take any cost (numpy, opencv) call it once for each source and depth hypothesis.
 
     Args:
         name: for `cost:` in workflows.

@@ -48,7 +48,7 @@ class VolumePart:
 def volume_parts(size_hw: tuple[int, int], settings: SweepSettings) -> list[VolumePart]:
     """Return the parts of a panorama, from top to bottom, whose volumes keep within `volume_limit_gb`.
 
-    Paths begin anew a twentieth of the rows (nine degrees) away from the rows that they decide. A path keeps its costs
+    Paths begin again a twentieth of the rows (nine degrees) away from the rows that they decide. A path keeps its costs
     until it has gathered the penalty of a step, which grows with the rows: on surfaces with texture, nothing from
     beyond is left by then; on plain ones ranges change, though they are as often right.
     """
@@ -88,18 +88,18 @@ def winners_by_paths(work: SweepInput, volume: NDArray[np.uint8], *, top: int = 
         rows = min(BAND_ROWS, height - first)
         state, planes = np.full((STATES, rows, width), _NO_SUM, np.uint16), np.zeros((rows, width), np.uint16)
         winners_of_rows(total, first, state, planes)
-        keep_band(found, first, state, planes)
+        keep_band(found, state, planes, first=first)
         rival = found.rival[first : first + rows]
         rival[rival == _NO_SUM] = np.inf
 
     with workers() as pool:
-        total = _sum_paths(pool, work, volume, top)
+        total = _sum_paths(pool, work, volume, top=top)
         run_jobs(pool, decide, range(0, height, BAND_ROWS))
     return found
 
 
 def keep_band(
-    found: Winners, first: int, state: NDArray[np.float32 | np.uint16], planes: NDArray[np.int32 | np.uint16]
+    found: Winners, state: NDArray[np.float32 | np.uint16], planes: NDArray[np.int32 | np.uint16], *, first: int
 ) -> None:
     """Write the winners of a band, from the final state of `update_plain`, to its rows from `first` on."""
     rows = slice(first, first + len(planes))
@@ -110,7 +110,7 @@ def keep_band(
     found.rival[rows] = state[RIVAL]
 
 
-def _sum_paths(pool: Pool, work: SweepInput, volume: NDArray[np.uint8], top: int) -> NDArray[np.uint16]:
+def _sum_paths(pool: Pool, work: SweepInput, volume: NDArray[np.uint8], *, top: int) -> NDArray[np.uint16]:
     """Return the sum of the eight paths' costs, (rows, D, W) uint16."""
     height, width = work.reference.shape[:2]
     settings, rows = work.settings, slice(top, top + len(volume))
@@ -121,12 +121,12 @@ def _sum_paths(pool: Pool, work: SweepInput, volume: NDArray[np.uint8], top: int
     warm = (beyond_pole if rows.start == 0 else 0, beyond_pole if rows.stop == height else 0)
     for drift in (-1, 0, 1):
         penalties = (
-            step_penalties(work.reference, (1, drift), settings, rows),
-            step_penalties(work.reference, (-1, -drift), settings, rows),
+            step_penalties(work.reference, (1, drift), settings, rows=rows),
+            step_penalties(work.reference, (-1, -drift), settings, rows=rows),
         )
         follow = partial(_follow_lines, volume, total, penalties=penalties, p1=p1, drift=drift, warm=warm)
         run_jobs(pool, follow, range(0, width, _STRIP_LINES))
-    sideways = np.stack([step_penalties(work.reference, (0, step), settings, rows) for step in (1, -1)])
+    sideways = np.stack([step_penalties(work.reference, (0, step), settings, rows=rows) for step in (1, -1)])
     run_jobs(pool, lambda y: sweep_row(volume, total, sideways, p1, y, before_seam), range(len(volume)))
     return total
 

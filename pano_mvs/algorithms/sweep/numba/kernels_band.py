@@ -24,7 +24,7 @@ from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import PIXELS
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def sweep_band(first: int, sweep: Sweep, ranges: F64, volume: U8, state: F32, planes: I32) -> None:
-    """Compute the costs of one band at all virtual ranges, into the volume or straight into the winners.
+    """Compute the costs of one band at all depth hypotheses, into the volume or straight into the winners.
 
     Args:
         first: the first row of the band; it has as many rows as `planes`.

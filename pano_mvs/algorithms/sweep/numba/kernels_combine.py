@@ -15,9 +15,9 @@ ENOUGH = 1 - 1e-5
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def combine_row(costs: F32, y: int, combination: Combination, picture_row: int, all_vote: bool, result: F32) -> None:
-    """Combine the sources' costs of one row, infinite where a source has no vote.
+    """Combine the sources' costs of one row, infinite where a source is not valid.
 
-    Sources are taken from the cheapest one on until they hold `share` of the weight of all that vote, or are
+    Sources are taken from the cheapest one on until they hold `share` of the weight of all valid ones, or are
     `max_count`; the result is the weighted mean of their costs.
 
     Args:

@@ -1,7 +1,7 @@
 """Numbers that are compiled into the kernels and that others need too. This module does not import numba.
 
 The folder of compiled kernels is named by the text of all files `kernels_*.py`; a constant anywhere else could change
-without the kernels being compiled anew.
+without the kernels being compiled again.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Compiled: a band of rows of the reference, at one virtual range, looked up in one source."""
+"""Compiled: a band of rows of the reference, at one depth hypothesis, looked up in one source."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def warp_band(
     pad: int,
     found: Lookup,
 ) -> None:
-    """Look up the rows `first` … of the reference, at one virtual range, in one source.
+    """Look up the rows `first` … of the reference, at one depth hypothesis, in one source.
 
     Rows before the first or after the last one of the picture lie beyond a pole: elevations over 90° turn the ray
     around by themselves.
@@ -175,7 +175,7 @@ def sample_row(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def vote_row(valid: U8, start: int, index: I32, votes: U8, row: int) -> None:
-    """Write whether the patches at `index`, (W,), may vote to a row of `votes`; nothing if `valid` is empty."""
+    """Write whether the patches at `index`, (W,), are valid to a row of `votes`; nothing if `valid` is empty."""
     if len(valid):
         for i in range(_U(index.shape[0])):
             votes[_U(row), i] = valid[_U(start) + _U(index[i])]

@@ -31,7 +31,7 @@ class Sources(NamedTuple):
         colors: (·,) uint64 `pack_colors` of all sources, or empty; needs vector instructions.
         starts: (S, C or 1) int64, where the planes of each source begin, or its colours.
         shapes: (S, 2) int64 rows and columns of each source.
-        valid: (·,) uint8 like a packed plane: whether a patch may vote; empty if all may.
+        valid: (·,) uint8 like a packed plane: whether a patch is valid; empty if all are.
         valid_starts: (S,) int64, where each source begins in `valid`.
         vector: whether to use vector instructions; the result is the same.
     """
@@ -71,7 +71,7 @@ class Combination(NamedTuple):
         weights: (S, H, W) float32 of every source; empty if all are equal.
         share: of the weight that counts, in (0, 1].
         max_count: how many sources count at most.
-        neutral: float32 mean cost where no source votes.
+        neutral: float32 mean cost where no source is valid.
     """
 
     weights: F32
@@ -110,7 +110,7 @@ class Lookup(NamedTuple):
     Attributes:
         knots: (2, `knot_rows`(rows), W) float32, scratch.
         warped: (C, rows, W + 2 pad) uint8, written unless `against` is there.
-        votes: (rows, W) uint8, written unless all patches may vote.
+        votes: (rows, W) uint8, whether the source is valid there, written unless all patches are.
         against: (rows, W) uint32, what to compare with at once, see `add_sampled_differences`; or empty.
         pixel_costs: (rows, W + 2 pad) uint16, to which differences from `against` are added.
     """

@@ -20,7 +20,7 @@ _MAX_DIFFERENCE = 3 * 255
 def one_box_serves(sources: int, combination: Combination, box_radius: int, pad: int) -> bool:
     """Return whether the mean of all sources counts, whose differences can then be added before they are averaged.
 
-    All sources must vote alike. The sums have to fit uint16, and int32 in the widest box.
+    All sources must be valid everywhere. The sums have to fit uint16, and int32 in the widest box.
     """
     used = min(combination.max_count, int(np.ceil(combination.share * ENOUGH * sources)))
     largest = _MAX_DIFFERENCE * sources

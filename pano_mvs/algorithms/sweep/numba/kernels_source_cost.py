@@ -1,4 +1,4 @@
-"""Compiled: the costs of a band of rows in one source, at one virtual range."""
+"""Compiled: the costs of a band of rows in one source, at one depth hypothesis."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def source_cost(first: int, sweep: Sweep, warped: U8, pixel_costs: U16, scratch:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def silence(votes: U8, halo: int, costs: F32) -> None:
-    """Make costs, (rows, W), infinite where a source has no vote; `votes` has `halo` rows more on either side."""
+    """Make costs, (rows, W), infinite where a source is not valid; `votes` has `halo` rows more on either side."""
     for j in range(costs.shape[0]):
         for i in range(costs.shape[1]):
             if votes[j + halo, i] == 0:

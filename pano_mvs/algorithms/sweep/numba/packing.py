@@ -66,7 +66,7 @@ def pack_sources(
 
 
 def pack_votes(work: SweepInput) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-    """Return whether each patch of each source may vote (all four pixels may), and where each source begins."""
+    """Return whether each patch of each source is valid (all four pixels are), and where each source begins."""
     if work.source_valid is None:
         return np.zeros(0, np.uint8), np.zeros(len(work.sources), np.int64)
     whole = np.uint32(0x81818181)  # four ones, less 128

@@ -51,6 +51,42 @@ def _add(builder: Any, pointer: Any, value: Any, inside: Any, whole: Any) -> Non
             builder.call(store, [added, pointer, ir.Constant(_I32, 1), inside])
 
 
+def _emit_step_lines(context: Any, builder: Any, sig: Any, args: Any) -> None:
+    """Emit the instructions of `step_lines`; see there for the arguments."""
+
+    def at(k: int, position: Any, kind: Any = _WORDS) -> Any:
+        return element_pointer(context, builder, sig.args[k], args[k], position, kind)
+
+    voxel_at, voxel_step, depth = cgutils.unpack_tuple(builder, args[2], 3)
+    line, stride, first, last = cgutils.unpack_tuple(builder, args[8], 4)
+    inside = _inside(builder, first, last)
+    whole = builder.icmp_unsigned("==", builder.sub(last, first), ir.Constant(_I64, LINES))
+    keep = builder.icmp_unsigned("!=", args[9], ir.Constant(_I64, 0))
+    least_at = at(7, line)
+    floor = load_unaligned(builder, least_at)
+    jump = builder.add(floor, load_unaligned(builder, at(4, args[5])))
+    p1 = _everywhere(builder, args[3])
+    outside = ir.Constant(_WORDS, [60000] * LINES)
+    before = cgutils.alloca_once_value(builder, outside)
+    here = cgutils.alloca_once_value(builder, load_unaligned(builder, at(6, line)))
+    lowest = cgutils.alloca_once_value(builder, outside)
+    with cgutils.for_range(builder, depth) as loop:
+        position = builder.add(line, builder.mul(loop.index, stride))
+        voxel = builder.add(voxel_at, builder.mul(loop.index, voxel_step))
+        stay, after = builder.load(here), load_unaligned(builder, at(6, builder.add(position, stride)))
+        near = builder.add(_least(builder, builder.load(before), after), p1)
+        near = _least(builder, stay, _least(builder, near, jump))
+        cost = builder.zext(load_unaligned(builder, at(0, voxel, _BYTES)), _WORDS)
+        value = builder.add(builder.sub(near, floor), cost)
+        builder.store(_least(builder, value, builder.load(lowest)), lowest)
+        builder.store(stay, before)
+        builder.store(after, here)
+        builder.store(builder.select(inside, value, stay), at(6, position), align=1)
+        with builder.if_then(keep):
+            _add(builder, at(1, voxel), value, inside, whole)
+    builder.store(builder.select(inside, builder.load(lowest), floor), least_at, align=1)
+
+
 @intrinsic
 def step_lines(
     typingctx: Any,
@@ -96,37 +132,4 @@ def step_lines(
         place,
     )
 
-    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        def at(k: int, position: Any, kind: Any = _WORDS) -> Any:
-            return element_pointer(context, builder, sig.args[k], args[k], position, kind)
-
-        voxel_at, voxel_step, depth = cgutils.unpack_tuple(builder, args[2], 3)
-        line, stride, first, last = cgutils.unpack_tuple(builder, args[8], 4)
-        inside = _inside(builder, first, last)
-        whole = builder.icmp_unsigned("==", builder.sub(last, first), ir.Constant(_I64, LINES))
-        keep = builder.icmp_unsigned("!=", args[9], ir.Constant(_I64, 0))
-        least_at = at(7, line)
-        floor = load_unaligned(builder, least_at)
-        jump = builder.add(floor, load_unaligned(builder, at(4, args[5])))
-        p1 = _everywhere(builder, args[3])
-        outside = ir.Constant(_WORDS, [60000] * LINES)
-        before = cgutils.alloca_once_value(builder, outside)
-        here = cgutils.alloca_once_value(builder, load_unaligned(builder, at(6, line)))
-        lowest = cgutils.alloca_once_value(builder, outside)
-        with cgutils.for_range(builder, depth) as loop:
-            position = builder.add(line, builder.mul(loop.index, stride))
-            voxel = builder.add(voxel_at, builder.mul(loop.index, voxel_step))
-            stay, after = builder.load(here), load_unaligned(builder, at(6, builder.add(position, stride)))
-            near = builder.add(_least(builder, builder.load(before), after), p1)
-            near = _least(builder, stay, _least(builder, near, jump))
-            cost = builder.zext(load_unaligned(builder, at(0, voxel, _BYTES)), _WORDS)
-            value = builder.add(builder.sub(near, floor), cost)
-            builder.store(_least(builder, value, builder.load(lowest)), lowest)
-            builder.store(stay, before)
-            builder.store(after, here)
-            builder.store(builder.select(inside, value, stay), at(6, position), align=1)
-            with builder.if_then(keep):
-                _add(builder, at(1, voxel), value, inside, whole)
-        builder.store(builder.select(inside, builder.load(lowest), floor), least_at, align=1)
-
-    return signature, emit
+    return signature, _emit_step_lines
