@@ -1,7 +1,65 @@
 """Dense 3D from 360° photographs.
 
-The command line is `pano-mvs`; a plugin author imports `pano_mvs.api`; the conventions (frames,
-pixels, ranges) are stated once, in `pano_mvs.geometry`.
+    run = pano_mvs.run("quickstart", images="photos", out="out")    # compute, or take from the cache
+    run = pano_mvs.load("out")                                      # what an earlier run made
+    plan = pano_mvs.plan("quickstart", images="photos")             # what a run would compute
+
+The command line is `pano-mvs`. Authors of plugins import `pano_mvs.api`. The conventions (frames, pixels, ranges) are
+stated once, in `pano_mvs.geometry`.
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError, StoreError, UsageError, WorkflowError
+    from pano_mvs.results.run_output import RunOutput, RunView, load
+    from pano_mvs.results.summary import RunSummary
+    from pano_mvs.session.planning import RunPlan, plan
+    from pano_mvs.session.running import run
+
 __version__ = "0.1.0"
+
+__all__ = [
+    "InputError",
+    "PanoMvsError",
+    "RunOutput",
+    "RunPlan",
+    "RunStoppedError",
+    "RunSummary",
+    "RunView",
+    "StoreError",
+    "UsageError",
+    "WorkflowError",
+    "__version__",
+    "load",
+    "plan",
+    "run",
+]
+
+# Where each name is; imported when it is first used, since the libraries behind it take a second to load.
+_HOMES = {
+    "InputError": "core.errors",
+    "PanoMvsError": "core.errors",
+    "RunOutput": "results.run_output",
+    "RunPlan": "session.planning",
+    "RunStoppedError": "core.errors",
+    "RunSummary": "results.summary",
+    "RunView": "results.run_output",
+    "StoreError": "core.errors",
+    "UsageError": "core.errors",
+    "WorkflowError": "core.errors",
+    "load": "results.run_output",
+    "plan": "session.planning",
+    "run": "session.running",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOMES})

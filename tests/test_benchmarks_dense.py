@@ -1,11 +1,15 @@
 """The benchmarks of depth measure what they say: on a tiny scene, with settings whose effect is known."""
 
+from __future__ import annotations
+
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.scenes import weak_room, write_scene
-from tests.benchmarks.captures import read_capture, scene_capture
+from tests.benchmarks.captures import Capture, read_capture, scene_capture
 from tests.benchmarks.dense_chain import DenseChain, score_view
 from tests.benchmarks.depth_metrics import depth_metrics
 from tests.benchmarks.scenes import line, measure
@@ -15,12 +19,12 @@ SMALL = ["depth.planes=48", "depth.near=1.0", "depth.far=6.0"]
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory):
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     folder = tmp_path_factory.mktemp("scene")
     return scene_capture(weak_room(views=3), folder, width=192)
 
 
-def test_a_chain_runs_the_dense_stages_with_true_poses(capture):
+def test_a_chain_runs_the_dense_stages_with_true_poses(capture: Capture) -> None:
     run = DenseChain("known_poses", overrides=SMALL).run(capture)
     assert list(run.range_maps) == ["depth", "checked", "smooth"]
     assert all(list(step) == list(capture.panoramas) for step in run.range_maps.values())
@@ -35,7 +39,7 @@ def test_a_chain_runs_the_dense_stages_with_true_poses(capture):
     )
 
 
-def test_overrides_reach_the_stages(capture):
+def test_overrides_reach_the_stages(capture: Capture) -> None:
     chain = DenseChain("known_poses", overrides=[*SMALL, "depth.far=1.5"])
     chain.dense = ["depth"]
     near = chain.run(capture, references=["000.png"])
@@ -43,7 +47,7 @@ def test_overrides_reach_the_stages(capture):
     assert np.nanmax(near.range_maps["depth"]["000.png"].range) <= 1.6
 
 
-def test_skies_are_counted():
+def test_skies_are_counted() -> None:
     truth = np.full((4, 8), 2.0, np.float32)
     truth[:2] = np.nan
     found = RangeMap(np.full((4, 8), 2.0, np.float32), np.full((4, 8), 130, np.uint8))
@@ -55,7 +59,7 @@ def test_skies_are_counted():
     assert depth_metrics(found.range, truth).completeness == 1
 
 
-def test_a_capture_on_disk_is_the_scene(tmp_path, capture):
+def test_a_capture_on_disk_is_the_scene(tmp_path: Path, capture: Capture) -> None:
     write_scene(tmp_path, weak_room(views=3), (96, 192))
     read = read_capture(tmp_path)
     assert list(read.panoramas) == list(capture.panoramas)
@@ -68,7 +72,7 @@ def test_a_capture_on_disk_is_the_scene(tmp_path, capture):
     assert all(ranges.shape == (48, 96) for ranges in half.ranges.values())
 
 
-def test_the_papers_figures_stand_where_they_belong():
+def test_the_papers_figures_stand_where_they_belong() -> None:
     assert reported("classroom", 4, 7, "estimated") == "0.193 / 27.18"
     assert reported("smallroom", 2, 9, "estimated") == "21.27"
     assert reported("smallroom", 2, 9, "known") == reported("court", 4, 7, "known") == "–"

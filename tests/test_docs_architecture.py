@@ -29,10 +29,14 @@ def graph() -> grimp.ImportGraph:
     return grimp.build_graph("pano_mvs", cache_dir=None)
 
 
-def test_layers_are_those_of_the_import_contract() -> None:
+@pytest.mark.parametrize(
+    ("mark", "name"),
+    [("layers", "Imports go downwards only"), ("engine layers", "The engine's packages import downwards only")],
+)
+def test_layers_are_those_of_the_import_contract(mark: str, name: str) -> None:
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    (contract,) = [one for one in settings["tool"]["importlinter"]["contracts"] if one["type"] == "layers"]
-    shown = re.search(r"<!-- layers -->\n```text\n(.*?)```", PAGE, re.DOTALL)
+    (contract,) = [one for one in settings["tool"]["importlinter"]["contracts"] if one["name"] == name]
+    shown = re.search(rf"<!-- {mark} -->\n```text\n(.*?)```", PAGE, re.DOTALL)
     assert shown
     assert shown[1].splitlines() == [layer.replace("pano_mvs.", "") for layer in contract["layers"]]
 

@@ -13,6 +13,7 @@ from pano_mvs.io.clouds.ply import read_ply
 from pano_mvs.io.ranges.files import read_range_tiff
 from pano_mvs.testing.conformance import stage_laws
 from tests.cli.conftest import Command, capture, pano_mvs, rendered  # noqa: F401  # fixtures
+from tests.stored import read_picture
 
 PAGE = (Path(__file__).parent.parent / "docs" / "masks.md").read_text(encoding="utf-8")
 
@@ -43,7 +44,7 @@ def test_nothing_of_a_bearer_is_left_in_any_output(pano_mvs: Command, capture: P
     beside_seam = np.minimum(columns, size_hw[1] - 1 - columns)
     bearer = np.hypot(beside_seam, rows - 90) < 14
     for idx, path in enumerate(sorted((capture / "images").iterdir())):
-        picture = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
+        picture = cv2.cvtColor(read_picture(path), cv2.COLOR_BGR2RGB)
         pattern = np.random.default_rng(idx).integers(-25, 26, (*size_hw, 1))
         picture[bearer] = (np.array([225, 95, 5]) + pattern * (1, 0.4, 0.1))[bearer].astype(np.uint8)
         cv2.imwrite(str(path), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))

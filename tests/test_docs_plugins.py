@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from pano_mvs import api
 from pano_mvs.cli.app import app
-from pano_mvs.cli.plugin_new import KINDS, rendered
+from pano_mvs.cli.plugins.new import KINDS, rendered
 from pano_mvs.engine.stages.plugin_files import declared_names
 from pano_mvs.scene import Record
 

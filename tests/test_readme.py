@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
 from pano_mvs.testing.room import capture_poses, default_room, write_capture
+from tests.stored import read_picture
 
 README = Path(__file__).parent.parent / "README.md"
 
@@ -31,7 +32,7 @@ def test_plugin_and_workflow_run_as_they_stand(tmp_path: Path, monkeypatch: pyte
     result = CliRunner().invoke(app, ["run", "mine.yaml", "--set", "depth.planes=16", "--set", "near.far=8"])
     assert result.exit_code == 0, result.output
     for path in sorted((tmp_path / "out" / "mine" / "range").iterdir()):
-        ranges = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        ranges = read_picture(path, cv2.IMREAD_UNCHANGED)
         assert ranges[ranges == ranges].max() <= 8
 
 

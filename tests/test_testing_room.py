@@ -1,5 +1,9 @@
 """The synthetic room: everything else trusts it, so it is held against closed forms."""
 
+from __future__ import annotations
+
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,7 +21,9 @@ COMPONENT = st.floats(-0.6, 0.6)
 
 @given(center=st.tuples(COMPONENT, COMPONENT, COMPONENT), turn=st.tuples(*[st.floats(-3, 3)] * 3))
 @settings(max_examples=20, deadline=None)
-def test_range_inside_a_sphere_solves_its_quadratic(center, turn):
+def test_range_inside_a_sphere_solves_its_quadratic(
+    center: tuple[float, float, float], turn: tuple[float, float, float]
+) -> None:
     pose = Rigid3.from_center(rotation_from_rotvec(turn), center)
     _, range_map = render(Room((Ball((0.1, -0.2, 0.3), 2.0, GREY),)), pose, (16, 32), supersample=1)
     points = np.array(center) + range_map[..., None] * (ray_grid((16, 32)) @ pose.rotation)
@@ -26,14 +32,16 @@ def test_range_inside_a_sphere_solves_its_quadratic(center, turn):
 
 @given(center=st.tuples(COMPONENT, COMPONENT, COMPONENT), turn=st.tuples(*[st.floats(-3, 3)] * 3))
 @settings(max_examples=20, deadline=None)
-def test_range_inside_a_box_ends_on_its_nearest_wall(center, turn):
+def test_range_inside_a_box_ends_on_its_nearest_wall(
+    center: tuple[float, float, float], turn: tuple[float, float, float]
+) -> None:
     pose = Rigid3.from_center(rotation_from_rotvec(turn), center)
     _, range_map = render(Room((Cuboid((-1, -2, -3), (1, 2, 3), GREY),)), pose, (16, 32), supersample=1)
     points = np.array(center) + range_map[..., None].astype(float) * (ray_grid((16, 32)) @ pose.rotation)
     assert np.max(np.abs(points) / (1, 2, 3), axis=-1) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_rays_parallel_to_a_slab_are_told_apart():
+def test_rays_parallel_to_a_slab_are_told_apart() -> None:
     box = Cuboid((-1, -1, 2), (1, 1, 3), GREY)
     ahead = np.array([[0.0, 0.0, 1.0]])
     assert box.hit(np.zeros(3), ahead)[0] == 2
@@ -42,7 +50,7 @@ def test_rays_parallel_to_a_slab_are_told_apart():
     assert box.hit(np.array([0.0, 0.0, 2.25]), ahead)[0] == 0.75
 
 
-def test_a_quad_is_met_within_its_edges_and_from_both_sides():
+def test_a_quad_is_met_within_its_edges_and_from_both_sides() -> None:
     quad = Quad((-1, -1, 2), (2, 0, 0), (0, 2, 0), GREY)
     rays = np.array([[0, 0, 1.0], [0.49, 0, 1], [0.51, 0, 1], [0, -0.49, 1], [0, -0.51, 1], [0, 0, -1]])
     assert np.isfinite(quad.hit(np.zeros(3), rays)[0]).tolist() == [True, True, False, True, False, False]
@@ -50,7 +58,7 @@ def test_a_quad_is_met_within_its_edges_and_from_both_sides():
     assert (distance.item(), normal.tolist()) == (1.0, [[0.0, 0.0, 1.0]])
 
 
-def test_normals_point_towards_the_camera():
+def test_normals_point_towards_the_camera() -> None:
     room = default_room()
     rays = ray_grid(SIZE).reshape(-1, 3)
     for surface in room.surfaces:
@@ -61,14 +69,14 @@ def test_normals_point_towards_the_camera():
         assert np.linalg.norm(normal[met], axis=1) == pytest.approx(1.0, abs=1e-9)
 
 
-def test_range_is_taken_at_the_exact_pixel_centre():
+def test_range_is_taken_at_the_exact_pixel_centre() -> None:
     room, pose = default_room(), capture_poses(3)[2]
     _, range_map = render(room, pose, SIZE, supersample=3)
     exact = range_along(room, pose.center, ray_grid(SIZE).reshape(-1, 3) @ pose.rotation)
     np.testing.assert_array_equal(range_map.ravel(), exact.astype(np.float32))
 
 
-def test_where_nothing_is_met_the_range_is_nan():
+def test_where_nothing_is_met_the_range_is_nan() -> None:
     image, range_map = render(Room((Ball((0, 0, 3), 1.0, GREY),)), Rigid3.identity(), SIZE)
     assert 0.9 < np.isnan(range_map).mean() < 1.0
     assert np.nanmin(range_map) == pytest.approx(2.0, abs=5e-3)
@@ -76,7 +84,7 @@ def test_where_nothing_is_met_the_range_is_nan():
 
 
 @pytest.mark.parametrize("columns", [1, 37, 64, -5])
-def test_rolling_the_camera_rolls_the_picture(columns):
+def test_rolling_the_camera_rolls_the_picture(columns: int) -> None:
     room, pose = default_room(), capture_poses(2)[1]
     image, range_map = render(room, pose, SIZE)
     rolled, new_from_old = roll_panorama(range_map, columns)
@@ -85,7 +93,7 @@ def test_rolling_the_camera_rolls_the_picture(columns):
     assert np.abs(turned_image.astype(int) - np.roll(image, columns, axis=1)).max() <= 1
 
 
-def test_turning_the_camera_keeps_every_point_in_its_place():
+def test_turning_the_camera_keeps_every_point_in_its_place() -> None:
     room, pose = default_room(texture="isotropic"), Rigid3.from_center(np.eye(3), (0.3, -0.1, 0.2))
     turn = rotation_from_rotvec((0.9, -0.4, 1.3))
     turned = Rigid3(turn, np.zeros(3)) @ pose
@@ -97,7 +105,7 @@ def test_turning_the_camera_keeps_every_point_in_its_place():
     assert np.median(difference) < 12  # a texture this fine is blurred a little by the interpolation
 
 
-def test_a_point_has_the_same_colour_from_two_places():
+def test_a_point_has_the_same_colour_from_two_places() -> None:
     room, sizes = default_room(), (160, 320)
     first, second = Rigid3.identity(), capture_poses(2, seed=4)[1]
     image, range_map = render(room, first, sizes)
@@ -112,7 +120,7 @@ def test_a_point_has_the_same_colour_from_two_places():
     assert error < 0.3 * shuffled
 
 
-def test_the_weak_texture_is_weak_and_seeds_differ():
+def test_the_weak_texture_is_weak_and_seeds_differ() -> None:
     pose = Rigid3.identity()
     strong, weak = (render(default_room(texture=name), pose, SIZE)[0].astype(float) for name in ("strong", "weak"))
     steps = [np.abs(np.diff(image, axis=1)).mean() for image in (strong, weak)]
@@ -122,7 +130,7 @@ def test_the_weak_texture_is_weak_and_seeds_differ():
     assert np.abs(render(default_room(1), pose, SIZE)[0] - strong).mean() > 10
 
 
-def test_the_isotropic_texture_is_as_rough_at_the_pole_as_at_the_equator():
+def test_the_isotropic_texture_is_as_rough_at_the_pole_as_at_the_equator() -> None:
     room = default_room(texture="isotropic")
     tipped = Rigid3(rotation_from_rotvec((np.pi / 2, 0, 0)), np.zeros(3))
     upright, turned = (render(room, pose, (128, 256))[0].astype(float) for pose in (Rigid3.identity(), tipped))
@@ -130,7 +138,7 @@ def test_the_isotropic_texture_is_as_rough_at_the_pole_as_at_the_equator():
     assert turned[ahead].std() == pytest.approx(upright[ahead].std(), rel=0.2)
 
 
-def test_the_cameras_of_a_capture_are_free_and_apart():
+def test_the_cameras_of_a_capture_are_free_and_apart() -> None:
     room = default_room()
     poses = capture_poses(9, seed=3)
     assert len(poses) == 9
@@ -142,7 +150,7 @@ def test_the_cameras_of_a_capture_are_free_and_apart():
         assert pose.rotation @ pose.rotation.T == pytest.approx(np.eye(3), abs=1e-12)
 
 
-def test_a_written_capture_is_the_same_bytes_twice(tmp_path):
+def test_a_written_capture_is_the_same_bytes_twice(tmp_path: Path) -> None:
     for folder in ("a", "b"):
         write_capture(tmp_path / folder, default_room(), capture_poses(2), SIZE)
     files = sorted(path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*.*"))
@@ -151,7 +159,7 @@ def test_a_written_capture_is_the_same_bytes_twice(tmp_path):
         assert (tmp_path / "a" / path).read_bytes() == (tmp_path / "b" / path).read_bytes()
 
 
-def test_the_texture_is_smooth_noise_of_the_wavelengths_that_are_asked_for():
+def test_the_texture_is_smooth_noise_of_the_wavelengths_that_are_asked_for() -> None:
     rng = np.random.default_rng(1)
     points = rng.uniform(-3, 3, (20_000, 3))
     values = noise(points, cells=((0.1, 1.0),), seed=3)

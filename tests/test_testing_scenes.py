@@ -1,6 +1,9 @@
 """The synthetic scenes: their truth is held against closed forms, and each is the hard place that it claims to be."""
 
-import cv2
+from __future__ import annotations
+
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,13 +15,16 @@ from pano_mvs.testing.paint import STEEL
 from pano_mvs.testing.room import Room, range_along, render
 from pano_mvs.testing.scenes import SCENES, courtyard, poles, white_room, write_scene
 from pano_mvs.testing.surfaces import Rod
+from tests.stored import read_picture
 
 SIZE = (64, 128)
 
 
 @given(turn=st.tuples(*[st.floats(-3, 3)] * 3), tilt=st.tuples(*[st.floats(-0.7, 0.7)] * 3))
 @settings(max_examples=20, deadline=None)
-def test_points_of_a_rod_are_a_radius_off_its_axis_and_between_its_ends(turn, tilt):
+def test_points_of_a_rod_are_a_radius_off_its_axis_and_between_its_ends(
+    turn: tuple[float, float, float], tilt: tuple[float, float, float]
+) -> None:
     foot, head = np.array([0.4, 1.5, 2.0]), np.array([0.4, -1.5, 2.0]) + tilt
     rod = Rod(tuple(foot), tuple(head), 0.3, STEEL)
     pose = Rigid3.from_center(rotation_from_rotvec(turn), (0.1, -0.2, 0.3))
@@ -38,7 +44,7 @@ def test_points_of_a_rod_are_a_radius_off_its_axis_and_between_its_ends(turn, ti
     assert np.all(np.sum(normals[met] * rays[met], axis=1) < 0)
 
 
-def test_a_rod_across_the_view_is_as_near_as_its_axis_less_its_radius():
+def test_a_rod_across_the_view_is_as_near_as_its_axis_less_its_radius() -> None:
     rod = Rod((-1, 0, 2), (1, 0, 2), 0.1, STEEL)
     rays = np.array([[0, 0, 1.0], [0, 0, -1], [1, 0, 0]])
     assert rod.hit(np.zeros(3), rays)[0].tolist() == [pytest.approx(1.9), np.inf, np.inf]
@@ -46,7 +52,7 @@ def test_a_rod_across_the_view_is_as_near_as_its_axis_less_its_radius():
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_ranges_of_a_scene_are_exact_and_its_views_agree(name):
+def test_ranges_of_a_scene_are_exact_and_its_views_agree(name: str) -> None:
     scene = SCENES[name](seed=3)
     (image, ranges), (other, other_ranges) = (scene.view(idx, SIZE) for idx in (0, 1))
     exact = range_along(scene.room, scene.poses[0].center, ray_grid(SIZE).reshape(-1, 3) @ scene.poses[0].rotation)
@@ -69,7 +75,7 @@ def test_ranges_of_a_scene_are_exact_and_its_views_agree(name):
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_cameras_are_turned_at_random_and_stand_free_and_apart(name):
+def test_cameras_are_turned_at_random_and_stand_free_and_apart(name: str) -> None:
     scene = SCENES[name](views=6)
     turns = [np.degrees(np.arccos((np.trace(pose.rotation) - 1) / 2)) for pose in scene.poses]
     assert np.ptp(turns) > 30
@@ -83,7 +89,7 @@ def test_cameras_are_turned_at_random_and_stand_free_and_apart(name):
     assert all(np.array_equal(pose.rotation, np.eye(3)) for pose in level.poses)
 
 
-def test_the_court_has_sky_and_ranges_to_sixty():
+def test_the_court_has_sky_and_ranges_to_sixty() -> None:
     _, ranges = courtyard(turned=False).view(0, SIZE, supersample=1)
     assert 0.25 < np.isnan(ranges).mean() < 0.45
     assert np.isnan(ranges[0]).all()
@@ -91,7 +97,7 @@ def test_the_court_has_sky_and_ranges_to_sixty():
     assert 50 < np.nanmax(ranges) < 65
 
 
-def test_walls_of_the_white_room_are_plain_but_for_noise():
+def test_walls_of_the_white_room_are_plain_but_for_noise() -> None:
     scene = white_room(turned=False)
     image, _ = scene.view(0, SIZE)
     ceiling, floor = image[4:16].astype(float), image[48:60].astype(float)
@@ -102,7 +108,7 @@ def test_walls_of_the_white_room_are_plain_but_for_noise():
     np.testing.assert_array_equal(again, image)
 
 
-def test_rods_are_a_few_pixels_thick():
+def test_rods_are_a_few_pixels_thick() -> None:
     with_rods = poles(turned=False).room
     without = Room(with_rods.surfaces[:11])
     rays = ray_grid((512, 1024))[200:312].reshape(-1, 3)
@@ -112,7 +118,7 @@ def test_rods_are_a_few_pixels_thick():
     assert 1 < np.median(run) <= 5
 
 
-def test_exposure_changes_pictures_and_not_ranges():
+def test_exposure_changes_pictures_and_not_ranges() -> None:
     plain, exposed = courtyard(), courtyard(exposure=0.15)
     (image, ranges), (other, other_ranges) = plain.view(1, SIZE), exposed.view(1, SIZE)
     np.testing.assert_array_equal(ranges, other_ranges)
@@ -123,7 +129,7 @@ def test_exposure_changes_pictures_and_not_ranges():
     assert np.ptp(np.log(exposed.gains)) > 0.1
 
 
-def test_a_written_scene_is_read_back_with_its_truth(tmp_path):
+def test_a_written_scene_is_read_back_with_its_truth(tmp_path: Path) -> None:
     scene = white_room(views=2)
     write_scene(tmp_path, scene, SIZE)
     truth = read_truth(tmp_path / "truth")
@@ -132,11 +138,11 @@ def test_a_written_scene_is_read_back_with_its_truth(tmp_path):
         image, ranges = scene.view(idx, SIZE)
         np.testing.assert_allclose(truth.views[name].cam_from_world.rotation, scene.poses[idx].rotation, atol=1e-12)
         np.testing.assert_array_equal(truth.range_map(truth.views[name]), ranges)
-        read = cv2.imread(str(tmp_path / name))[..., ::-1]
+        read = read_picture(tmp_path / name)[..., ::-1]
         np.testing.assert_array_equal(read, image)
 
 
-def test_a_far_wall_does_not_flicker_between_views():
+def test_a_far_wall_does_not_flicker_between_views() -> None:
     """Texture finer than a pixel once made far walls look different from every place."""
     scene = courtyard(turned=False)
     ranges = render(scene.room, scene.poses[0], SIZE, supersample=1)[1]

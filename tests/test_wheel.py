@@ -66,7 +66,7 @@ def test_licences_and_metadata(wheel: Path, names: set[str]) -> None:
     assert metadata["License-Expression"] == "MIT"
     assert metadata["Requires-Python"] == ">=3.11"
     assert {"dask", "heic"} <= set(metadata.get_all("Provides-Extra") or ())
-    assert metadata.get_payload().startswith("# pano_mvs")
+    assert str(metadata.get_payload()).startswith("# pano_mvs")
 
 
 def test_the_source_distribution_builds_the_same_wheel(tmp_path: Path, names: set[str]) -> None:

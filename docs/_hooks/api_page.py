@@ -18,8 +18,8 @@ from pano_mvs.scene import Record
 
 _INTRODUCTION = """# API for plugins
 
-This page is generated from the docstrings of `pano_mvs.api`; [Plugins](../plugins.md) shows how to use it. The rest of
-`pano_mvs` may be used like any library, for example [`pano_mvs.geometry`](conventions.md)."""
+This page is generated from the docstrings of `pano_mvs.api`; [Plugins](../plugins.md) shows how to use it. To run
+workflows from Python, see [Python](../python.md)."""
 
 _CARDINALITIES = {
     "One": "`x: One[K]`: the single `K` of the capture, such as `Poses`.",
@@ -33,8 +33,27 @@ _GROUPS = {
     "Declaring": ("stage", "source"),
     "What a stage is given": ("Params", "Context", "SourceItem"),
     "What a stage reads": (*_CARDINALITIES, "Names"),
-    "Geometry": ("Rigid3", "Similarity3"),
-    "Settings": ("NOT_IN_KEY", "InputPath", "SourcePath", "PartOf", "Parts"),
+    "Geometry": (
+        "Rigid3",
+        "Similarity3",
+        "ray_grid",
+        "ray_from_pixel",
+        "pixel_from_ray",
+        "sample_panorama",
+        "pad_panorama",
+        "roll_panorama",
+    ),
+    "Pairs": ("verify_pair",),
+    "Groups and frames": (
+        "split_groups",
+        "join_groups",
+        "per_group",
+        "group_file",
+        "origin_of_frame",
+        "lla_from_local",
+    ),
+    "Clouds": ("PointSelection", "select_points", "KeptPoints", "chunks", "CHUNK_POINTS"),
+    "Settings": ("NOT_IN_KEY", "InputPath", "SourcePath", "RegisteredIn", "NamedRegistry"),
     "Parts of the sweep": ("register_sweep_cost", "CostWindow", "register_sweep_backend", "SweepInput", "Winners"),
 }
 
@@ -122,7 +141,9 @@ def _string_after(name: str) -> str:
 
 
 def _modules() -> list[ModuleType]:
-    return [module for name, module in sorted(sys.modules.items()) if name.startswith("pano_mvs.engine.")]
+    return [
+        module for name, module in sorted(sys.modules.items()) if name.startswith(("pano_mvs.engine.", "pano_mvs.io."))
+    ]
 
 
 def _assigned(statement: ast.stmt) -> list[str]:

@@ -10,17 +10,17 @@ import faulthandler
 import os
 import sys
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 from rich.markup import escape
 
 from pano_mvs import __version__
-from pano_mvs.cli.cache_app import cache_app
+from pano_mvs.cli.cache.app import cache_app
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.doctor.command import doctor
 from pano_mvs.cli.evaluate_app import evaluate_app
-from pano_mvs.cli.guard import guarded, turn_exits_into_errors
+from pano_mvs.cli.guard import guarded
 from pano_mvs.cli.options import (
     AcceptOption,
     CacheOption,
@@ -34,10 +34,11 @@ from pano_mvs.cli.options import (
     UntilOption,
     WorkflowArgument,
 )
-from pano_mvs.cli.plugin_app import plugin_app, plugins, stage_app
+from pano_mvs.cli.plugins.app import plugin_app, plugins, stage_app
 from pano_mvs.cli.streams import protect_standard_streams
 from pano_mvs.core.text import plural
 from pano_mvs.engine.executors.threads import available_threads, bound_environment
+from pano_mvs.session.sudden_exit import turn_exits_into_errors
 
 app = typer.Typer(
     name="pano-mvs",
@@ -75,34 +76,56 @@ def run(
     out: OutOption = None,
     overrides: SetOption = None,
     cache: CacheOption = None,
-    executor: Annotated[str, typer.Option("--executor", help="processes (the default), dask, or serial: one unit "
-                                          "after another in this process, for a debugger; a crash ends the run.",
-                                          show_default=False)] = "",
-    workers: Annotated[int, typer.Option("--workers", min=0, help="Units at a time, each in a process of its own; 0: "
-                                         "as many as there are cores for.")] = 0,
-    threads: Annotated[int, typer.Option("--threads-per-worker", min=0, help="Threads of each; 0: an equal share of "
-                                         "the cores.")] = 0,
-    scheduler: Annotated[str, typer.Option("--scheduler", metavar="ADDRESS", help="An existing dask scheduler, such as "
-                                           "tcp://host:8786, whose workers see the cache.", show_default=False)] = "",
+    executor: Annotated[
+        str,
+        typer.Option(
+            "--executor",
+            help="processes (the default), dask, or serial: one unit "
+            "after another in this process, for a debugger; a crash ends the run.",
+            show_default=False,
+        ),
+    ] = "",
+    workers: Annotated[
+        int,
+        typer.Option(
+            "--workers", min=0, help="Units at a time, each in a process of its own; 0: as many as there are cores for."
+        ),
+    ] = 0,
+    threads: Annotated[
+        int, typer.Option("--threads-per-worker", min=0, help="Threads of each; 0: an equal share of the cores.")
+    ] = 0,
+    scheduler: Annotated[
+        str,
+        typer.Option(
+            "--scheduler",
+            metavar="ADDRESS",
+            help="An existing dask scheduler, such as tcp://host:8786, whose workers see the cache.",
+            show_default=False,
+        ),
+    ] = "",
     as_json: Annotated[bool, typer.Option("--json", help="Print events, one JSON object in a line.")] = False,
     until: UntilOption = None,
     only: OnlyOption = None,
     refresh: RefreshOption = None,
     accept_code: AcceptOption = False,
-    keep_going: Annotated[bool, typer.Option("-k", "--keep-going", help="Go on after failures even where a stage "
-                                             "says on_error: stop.")] = False,
+    keep_going: Annotated[
+        bool, typer.Option("-k", "--keep-going", help="Go on after failures even where a stage says on_error: stop.")
+    ] = False,
     min_free: MinFreeOption = "",
     durable: DurableOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Run a workflow; the same command resumes it."""
-    from pano_mvs.cli.run_command import Execution, run_workflow
-    from pano_mvs.cli.session import open_session
-    from pano_mvs.engine.running.options import Demands
+    from pano_mvs.cli.run.command import run_workflow
+    from pano_mvs.engine.planning.run_options import RunOptions
+    from pano_mvs.session.running import Execution
+    from pano_mvs.session.session import open_session
 
-    demands = Demands(tuple(until or ()), tuple(only or ()), tuple(refresh or ()), accept_code, keep_going)
-    session = open_session(workflow, overrides=overrides or [], images=images, cache=cache, out=out, demands=demands)
-    execution = Execution(executor, workers, threads, scheduler, as_json, min_free, durable)
-    raise typer.Exit(run_workflow(session, execution))
+    run_options = RunOptions(tuple(until or ()), tuple(only or ()), tuple(refresh or ()), accept_code, keep_going)
+    session = open_session(
+        workflow, overrides=overrides or [], images=images, cache=cache, out=out, run_options=run_options
+    )
+    execution = Execution(executor, workers, threads, scheduler, min_free, durable)
+    raise typer.Exit(run_workflow(session, execution, as_json=as_json))
 
 
 @app.command()
@@ -117,17 +140,26 @@ def plan(
     only: OnlyOption = None,
     refresh: RefreshOption = None,
     accept_code: AcceptOption = False,
-    explain: Annotated[str, typer.Option("--explain", metavar="STAGE:ITEM", help="All about one unit: what it reads, "
-                                         "what it is made of, where its result is.", show_default=False)] = "",
-) -> None:  # fmt: skip
+    explain: Annotated[
+        str,
+        typer.Option(
+            "--explain",
+            metavar="STAGE:ITEM",
+            help="All about one unit: what it reads, what it is made of, where its result is.",
+            show_default=False,
+        ),
+    ] = "",
+) -> None:
     """Show what a run would do, what is cached, and why the rest is not; nothing is written into --out."""
-    from pano_mvs.cli.explain import explain_unit
-    from pano_mvs.cli.plan_command import show_plan
-    from pano_mvs.cli.session import check_output, open_session
-    from pano_mvs.engine.running.options import Demands
+    from pano_mvs.cli.plan.command import show_plan
+    from pano_mvs.cli.plan.explain import explain_unit
+    from pano_mvs.engine.planning.run_options import RunOptions
+    from pano_mvs.session.session import check_output, open_session
 
-    demands = Demands(tuple(until or ()), tuple(only or ()), tuple(refresh or ()), accept_code)
-    session = open_session(workflow, overrides=overrides or [], images=images, cache=cache, out=out, demands=demands)
+    run_options = RunOptions(tuple(until or ()), tuple(only or ()), tuple(refresh or ()), accept_code)
+    session = open_session(
+        workflow, overrides=overrides or [], images=images, cache=cache, out=out, run_options=run_options
+    )
     check_output(session)
     if explain:
         explain_unit(session, explain, Console())
@@ -139,7 +171,7 @@ def plan(
 @guarded
 def check(workflow: WorkflowArgument, images: ImagesOption = None, overrides: SetOption = None) -> None:
     """Show every mistake in a workflow at once, with its line and column."""
-    from pano_mvs.cli.session import open_session
+    from pano_mvs.session.session import open_session
 
     session = open_session(workflow, overrides=overrides or [], images=images)
     count = len(session.workflow.stages)
@@ -150,10 +182,10 @@ def check(workflow: WorkflowArgument, images: ImagesOption = None, overrides: Se
 @guarded
 def schema(
     workflow: Annotated[
-        Optional[str],  # noqa: UP045
+        str | None,
         typer.Argument(metavar="[WORKFLOW]", help="With its plugins, and the stages of what it extends."),
     ] = None,
-    out: Annotated[Optional[Path], typer.Option("--out", help="A file; else the standard output.")] = None,  # noqa: UP045
+    out: Annotated[Path | None, typer.Option("--out", help="A file; else the standard output.")] = None,
 ) -> None:
     """Write the JSON Schema of workflows, with which an editor completes and checks them."""
     from pano_mvs.cli.schema_command import show_schema
@@ -167,8 +199,8 @@ def status(
     workflow: WorkflowArgument, images: ImagesOption = None, out: OutOption = None, cache: CacheOption = None
 ) -> None:
     """Show what the latest run did and what is cached now."""
-    from pano_mvs.cli.plan_command import show_status
-    from pano_mvs.cli.session import open_session
+    from pano_mvs.cli.plan.command import show_status
+    from pano_mvs.session.session import open_session
 
     show_status(open_session(workflow, images=images, out=out, cache=cache), Console())
 
@@ -190,22 +222,37 @@ app.command()(doctor)
 @guarded
 def view_results(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="The output folder of a run, or a .ply file.")],
-    screenshot: Annotated[Optional[Path], typer.Option("--screenshot", metavar="FILE", help="Write a picture instead "  # noqa: UP045
-                                                       "of opening a window; needs no display.")] = None,
+    screenshot: Annotated[
+        Path | None,
+        typer.Option(
+            "--screenshot", metavar="FILE", help="Write a picture instead of opening a window; needs no display."
+        ),
+    ] = None,
     view: Annotated[str, typer.Option("--view", help="overview, top, front or inside:NAME of an image.")] = "overview",
     color: Annotated[str, typer.Option("--color", help="rgb, confidence, views, normals or height.")] = "rgb",
-    surface: Annotated[str, typer.Option("--show", metavar="cloud|mesh|both", help="By default the cloud, if there is "
-                                         "one.", show_default=False)] = "",
+    surface: Annotated[
+        str,
+        typer.Option(
+            "--show", metavar="cloud|mesh|both", help="By default the cloud, if there is one.", show_default=False
+        ),
+    ] = "",
     points: Annotated[int, typer.Option("--points", min=0, help="Draw at most so many points; 0: all.")] = 2_000_000,
     size: Annotated[str, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Of the window in pixels.")] = "1280x860",
-    images: Annotated[Optional[Path], typer.Option("--images", help="Folder of the panoramas, if they "  # noqa: UP045
-                                                   "have moved.")] = None,
+    images: Annotated[
+        Path | None, typer.Option("--images", help="Folder of the panoramas, if they have moved.")
+    ] = None,
     labels: Annotated[bool, typer.Option("--labels", help="Name the cameras.")] = False,
     blended: Annotated[bool, typer.Option("--blend", help="Show the cloud within a panorama.")] = False,
     backs: Annotated[bool, typer.Option("--backs", help="Show points that turn their back to the eye too.")] = False,
-    group: Annotated[int, typer.Option("--group", min=0, help="Which group of panoramas, where no reliable pair "
-                                       "connects all of them; 0 is the largest.")] = 0,
-) -> None:  # fmt: skip
+    group: Annotated[
+        int,
+        typer.Option(
+            "--group",
+            min=0,
+            help="Which group of panoramas, where no reliable pair connects all of them; 0 is the largest.",
+        ),
+    ] = 0,
+) -> None:
     """Look at cloud, mesh and cameras, and step inside the panoramas."""
     from pano_mvs.cli.view_command import ViewOptions, view_scene
 
@@ -216,8 +263,12 @@ def view_results(
 @app.command("inspect")
 @guarded
 def inspect_pixel(
-    target: Annotated[str, typer.Argument(metavar="WORKFLOW|OUT", help="A workflow file, the name of a preset, or the "
-                                          "output folder of a run.")],
+    target: Annotated[
+        str,
+        typer.Argument(
+            metavar="WORKFLOW|OUT", help="A workflow file, the name of a preset, or the output folder of a run."
+        ),
+    ],
     image: Annotated[str, typer.Argument(help="Name of the image, or a part of it that fits one alone.")],
     x: Annotated[float, typer.Argument(help="Column from the left edge at the swept size; fractions are dropped.")],
     y: Annotated[float, typer.Argument(help="Row from the upper edge, likewise.")],
@@ -225,13 +276,14 @@ def inspect_pixel(
     overrides: SetOption = None,
     images: ImagesOption = None,
     cache: CacheOption = None,
-    truth: Annotated[Optional[Path], typer.Option("--truth", help="Folder with poses.json and depth.npz; else the "  # noqa: UP045
-                                                  "workflow's own.")] = None,
-    plot: Annotated[Optional[Path], typer.Option("--plot", metavar="FILE.png", help="Draw the curve there.")] = None,  # noqa: UP045
+    truth: Annotated[
+        Path | None, typer.Option("--truth", help="Folder with poses.json and depth.npz; else the workflow's own.")
+    ] = None,
+    plot: Annotated[Path | None, typer.Option("--plot", metavar="FILE.png", help="Draw the curve there.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
-) -> None:  # fmt: skip
+) -> None:
     """Show one pixel: its ray, its range after each stage, what its neighbours see, its cost at every virtual range."""
-    from pano_mvs.cli.inspect_command import PixelWanted, inspect, open_run
+    from pano_mvs.cli.inspect.command import PixelWanted, inspect, open_run
 
     session = open_run(target, overrides=overrides or [], images=images, cache=cache)
     inspect(session, PixelWanted(image, x, y, stage, truth), Console(), plot=plot, as_json=as_json)

@@ -8,13 +8,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from inspect import signature
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from pano_mvs.core.errors import PanoMvsError
 from pano_mvs.core.paths import children, is_folder
-from pano_mvs.engine.workflows.workflow import StageEntry
+
+if TYPE_CHECKING:
+    from pano_mvs.engine.workflows.workflow import StageEntry
 
 Offer = tuple[str, str]
 """What may be put there, and what it is."""
@@ -37,7 +39,7 @@ def _silent(complete: Callable[..., Iterator[Offer]]) -> Callable[..., list[Offe
 @_silent
 def complete_workflow(incomplete: str) -> Iterator[Offer]:
     """Offer the presets, and workflow files and folders."""
-    from pano_mvs.cli.session import presets_folder
+    from pano_mvs.session.session import presets_folder
 
     for preset in children(presets_folder(), "*.yaml"):
         yield preset.stem, _first_comment(preset)
@@ -83,16 +85,16 @@ def complete_setting(ctx: typer.Context, incomplete: str) -> Iterator[Offer]:
 @_silent
 def complete_plugin_kind() -> Iterator[Offer]:
     """Offer the kinds of plugins that can be written."""
-    from pano_mvs.cli.plugin_new import KINDS
+    from pano_mvs.cli.plugins.new import KINDS
 
     for name, kind in KINDS.items():
         yield name, kind.what
 
 
 def _stages(ctx: typer.Context) -> Mapping[str, StageEntry]:
-    from pano_mvs.cli.session import presets_folder
     from pano_mvs.engine.stages.registry import Registry
     from pano_mvs.engine.workflows.workflow import find_workflow, load_workflow
+    from pano_mvs.session.session import presets_folder
 
     # click leaves arguments where they are once it has met an option that still lacks its value.
     named = ctx.params.get("workflow") or next((word for word in ctx.args if not word.startswith("-")), None)

@@ -9,7 +9,7 @@ from pano_mvs.algorithms.metrics.view_scores import Judging
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.evaluate_cloud import CloudRequest, evaluate_cloud
 from pano_mvs.cli.evaluate_depth import DepthRequest, evaluate_depth
-from pano_mvs.cli.run_command import print_scores
+from pano_mvs.cli.run.printing import print_scores
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.paths import is_file, is_folder
 from pano_mvs.geometry import Rigid3
@@ -17,6 +17,7 @@ from pano_mvs.io.colmap.model import is_colmap_model
 from pano_mvs.io.poses.files import read_groups, read_poses
 from pano_mvs.io.ranges.folders import find_ranges, match_pictures
 from pano_mvs.io.truth import find_true_ranges
+from pano_mvs.results.records import ScoresSummary
 
 MODEL_ABOVE, MODEL, CLOUD, RANGES = "colmap", "colmap/sparse/0", "cloud.ply", "range"
 
@@ -59,7 +60,7 @@ def _poses(out: Path, truth: Path, console: Console) -> str:
     # An image that the truth knows and the run did not register keeps the truth's name, and counts as a failure.
     scores = score_capture(estimated, {ours.get(known, known): pose for known, pose in true.items()}, {}, {},
                            groups=groups)  # fmt: skip
-    print_scores({"poses": scores.poses, "views": {}}, console)
+    print_scores(ScoresSummary(poses=scores.poses), console)
     if "registered_in_one_frame" in scores.poses:
         console.print(scores.notes[0], highlight=False, markup=False, soft_wrap=True)
     return "" if scores.poses else "; ".join(scores.notes)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 import sys
-import threading
 import traceback
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, NoReturn, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import typer
 from rich.markup import escape
@@ -17,6 +15,7 @@ from rich.markup import escape
 from pano_mvs.cli.console import Console
 from pano_mvs.core.errors import PanoMvsError, StoreError, WorkflowError
 from pano_mvs.core.paths import reason_of
+from pano_mvs.session.sudden_exit import exit_text
 
 Command = TypeVar("Command", bound=Callable[..., None])
 
@@ -41,8 +40,12 @@ def guarded(command: Command) -> Command:
             raise
         except SystemExit as end:  # a plugin's code; ours raises typer.Exit
             traceback.print_exc()
-            errors.print(f"[red]error:[/] the code above called {escape(exit_text(end))}, which a plugin must not do; "
-                         "what was finished is kept", highlight=False, soft_wrap=True)  # fmt: skip
+            errors.print(
+                f"[red]error:[/] the code above called {escape(exit_text(end))}, which a plugin must not do; "
+                "what was finished is kept",
+                highlight=False,
+                soft_wrap=True,
+            )
             raise typer.Exit(1) from None
         except Exception as error:
             if isinstance(error, OSError) and error.filename is not None:  # where no better message was foreseen
@@ -54,28 +57,3 @@ def guarded(command: Command) -> Command:
             raise typer.Exit(1) from None
 
     return cast(Command, run_guarded)
-
-
-def exit_text(end: SystemExit) -> str:
-    """Return how a program ended itself, such as `sys.exit(0)`."""
-    return str(end) if isinstance(end, SuddenExit) else f"sys.exit({'' if end.code is None else end.code})"
-
-
-class SuddenExit(SystemExit):
-    """Somebody called os._exit, which would have ended this process without a word."""
-
-
-def turn_exits_into_errors() -> None:
-    """Let os._exit raise SuddenExit in this thread, so that a plugin that calls it cannot end a run silently.
-
-    In another thread it still ends the process, though never with exit code 0; in a forked child it does what it always
-    does. Native code that exits is out of reach.
-    """
-    exit_now, process, thread = os._exit, os.getpid(), threading.get_ident()
-
-    def refuse(status: int) -> NoReturn:
-        if os.getpid() == process and threading.get_ident() == thread:
-            raise SuddenExit(f"os._exit({status})")
-        exit_now((status or 1) if os.getpid() == process else status)
-
-    os._exit = refuse

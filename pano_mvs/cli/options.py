@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
@@ -15,23 +15,23 @@ WorkflowArgument = Annotated[
         metavar="WORKFLOW", help="A workflow file, or the name of a preset.", autocompletion=complete_workflow
     ),
 ]
-ImagesOption = Annotated[Optional[Path], typer.Option("--images", help="Folder of panoramas to use instead.")]  # noqa: UP045
+ImagesOption = Annotated[Path | None, typer.Option("--images", help="Folder of panoramas to use instead.")]
 SetOption = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option("--set", metavar="STAGE.PARAM=VALUE", help="Change a setting.", autocompletion=complete_setting),
 ]
-CacheOption = Annotated[Optional[Path], typer.Option("--cache", help="Folder of the cache.")]  # noqa: UP045
-OutOption = Annotated[Optional[Path], typer.Option("--out", help="Folder of the results; default out/<workflow>.")]  # noqa: UP045
+CacheOption = Annotated[Path | None, typer.Option("--cache", help="Folder of the cache.")]
+OutOption = Annotated[Path | None, typer.Option("--out", help="Folder of the results; default out/<workflow>.")]
 UntilOption = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option("--until", metavar="STAGE", help="Only this stage and what it needs.", autocompletion=complete_stage),
 ]
 OnlyOption = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option("--only", metavar="STAGE:ITEM", help="Only this unit and what it needs."),
 ]
 RefreshOption = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    list[str] | None,
     typer.Option(
         "--refresh",
         metavar="STAGE[:ITEM]",

@@ -8,7 +8,6 @@ from pathlib import Path
 from rich.markup import escape
 
 from pano_mvs.cli.console import Console
-from pano_mvs.cli.session import presets_folder
 from pano_mvs.core.errors import StoreError, UsageError
 from pano_mvs.core.files import write_text
 from pano_mvs.engine.stages.registry import Registry
@@ -16,6 +15,7 @@ from pano_mvs.engine.workflows.extends import read_text
 from pano_mvs.engine.workflows.schema import workflow_schema
 from pano_mvs.engine.workflows.workflow import WorkflowReader, find_workflow
 from pano_mvs.engine.workflows.yaml_text import Located
+from pano_mvs.session.session import presets_folder
 
 
 def show_schema(workflow: str | None, out: Path | None) -> None:

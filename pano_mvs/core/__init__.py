@@ -1,1 +1,1 @@
-"""Errors, digests and other things that every layer may use and that know nothing of panoramas."""
+"""Errors, digests, files and other basics that every layer may use and that do not concern panoramas."""

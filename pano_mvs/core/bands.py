@@ -1,4 +1,4 @@
-"""Rows of a picture, handed to plain threads in bands."""
+"""Process the rows of an image in bands, on threads."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ _BAND_ROWS = 32
 
 
 def for_bands(work: Callable[[int, int], object], height: int, *, threads: int) -> None:
-    """Call `work` with the first row and the number of rows of bands that make up all rows.
+    """Call `work` with the first row and the number of rows of each band.
 
-    Bands write disjoint rows, so that the number of threads changes no bit. Compiled work that releases the GIL runs
-    side by side; what one band raises is raised here.
+    Bands are disjoint, so that results do not depend on the number of threads. Compiled work that releases the GIL runs
+    in parallel; an exception in one band is raised here.
 
     Args:
         work: called once for each band, in any order.
         height: number of rows.
-        threads: how many bands to work on at a time.
+        threads: number of bands to process at a time.
     """
     firsts = range(0, height, _BAND_ROWS)
     if threads <= 1:

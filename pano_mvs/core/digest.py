@@ -1,7 +1,7 @@
 """Canonical digests of plain values: equal values give equal digests, on every machine.
 
-The encoding is type-tagged, so `1`, `1.0`, `True` and `"1"` differ; floats are written in hex, so
-no digit is lost; NaN and infinities are refused, since a key that is not equal to itself finds nothing.
+The encoding is type-tagged, so `1`, `1.0`, `True` and `"1"` differ. Floats are written in hex, so no digit is lost. NaN
+and infinities are refused, because NaN is not equal to itself and would never be found again.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pano_mvs.core.errors import UsageError
 
 DIGEST_BYTES = 16
 IS_DIGEST = re.compile(rf"[0-9a-f]{{{2 * DIGEST_BYTES}}}")
-"""Matches what the functions below return."""
+"""Matches the digests that the functions below return."""
 
 
 def digest_from_value(value: object) -> str:
@@ -51,7 +51,7 @@ def digest_from_stream(stream: IO[bytes]) -> str:
 
 
 def _encode(value: object, chunks: list[bytes]) -> None:
-    """Append the canonical form; the commonest types come first, since a plan encodes a hundred thousand keys."""
+    """Append the canonical form. The most frequent type comes first, because a plan encodes 100,000 keys."""
     if isinstance(value, str):
         text = value.encode()
         chunks.append(b"s%d:%b" % (len(text), text))
@@ -63,7 +63,7 @@ def _encode(value: object, chunks: list[bytes]) -> None:
             chunks.append(b"i%d;" % value)
         case float():
             if not math.isfinite(value):
-                raise UsageError(f"{value} has no place in a cache key: use None, or a finite number")
+                raise UsageError(f"{value} cannot be part of a cache key: use None, or a finite number")
             chunks.append(b"f" + (value + 0.0).hex().encode() + b";")
         case None:
             chunks.append(b"n;")

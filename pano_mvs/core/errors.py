@@ -2,17 +2,17 @@
 
     PanoMvsError
     ├── UsageError (ValueError)            exit 2: a call or an option that cannot work
-    │   └── WorkflowError                  exit 2: mistakes in a workflow file, with line and column
-    ├── InputError (ValueError)            exit 2, or 3 where the rest can go on: a file we cannot use
-    │   └── ChangedFileError               exit 3: a file that is not the one that the run listed
+    │   └── WorkflowError                  exit 2: errors in a workflow file, with line and column
+    ├── InputError (ValueError)            exit 2, or 3 if the run can go on: a file that cannot be used
+    │   └── ChangedFileError               exit 3: a file that changed after the run had listed it
     ├── PluginError (ImportError)          exit 2: a plugin that failed to import or to register
-    ├── ContractError (TypeError)          exit 1: a stage returned what it had not declared
+    ├── ContractError (TypeError)          exit 1: a stage returned something it had not declared
     ├── StoreError (OSError)               exit 4: the cache or the output folder cannot be written
-    ├── GateError (RuntimeError)           exit 4: a quality gate stopped the run
+    ├── RunStoppedError (RuntimeError)     exit 4: a quality threshold or a stage stopped the run
     └── StageFailedError (RuntimeError)    exit 3: a stage's own code failed on a unit
 
 A message says what is wrong, with which item, where, and what to do about it. Expected degeneracy
-(too few matches, pure rotation) is not an error: it is a falsy value that carries its reason.
+(too few matches, pure rotation) is not an error: functions return a falsy value with the reason.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class UsageError(PanoMvsError, ValueError):
 
 
 class WorkflowError(UsageError):
-    """One or more mistakes in a workflow; `problems` holds one line for each."""
+    """One or more errors in a workflow; `problems` holds one line for each."""
 
     def __init__(self, problems: list[str]) -> None:
         self.problems = problems
@@ -41,13 +41,13 @@ class WorkflowError(UsageError):
 
 
 class InputError(PanoMvsError, ValueError):
-    """A file or folder given by the user that cannot be used; the message names it and the remedy."""
+    """A file or folder of the user that cannot be used; the message names it and the remedy."""
 
     exit_code = 2
 
 
 class ChangedFileError(InputError):
-    """A user's file that changed, or vanished, after the run had listed it."""
+    """A file of the user that changed, or disappeared, after the run had listed it."""
 
     exit_code = 3
 
@@ -74,8 +74,8 @@ class StoreError(PanoMvsError, OSError):
     exit_code = 4
 
 
-class GateError(PanoMvsError, RuntimeError):
-    """A quality gate stopped the run; what was computed is kept."""
+class RunStoppedError(PanoMvsError, RuntimeError):
+    """The run stops here, such as at a quality threshold; what was computed stays in the cache."""
 
     exit_code = 4
 

@@ -1,4 +1,4 @@
-"""Write files so that a reader sees the old one or the new one, never half of one."""
+"""Write files atomically: a reader sees the old file or the new one, never a partial one."""
 
 from __future__ import annotations
 
@@ -17,17 +17,16 @@ from pano_mvs.core.paths import children, exists, is_file, is_folder, is_link
 from pano_mvs.core.processes import process_place, start_of
 
 OUTPUT_MARK = ".pano-mvs-output"
-"""An empty file in every output folder, written first: no source takes what lies there for pictures."""
-
+"""An empty file, written first into every output folder, so that sources do not read images from there."""
 
 CACHE_MARK = ".pano-mvs-cache"
-"""An empty file in every cache: no source takes what lies there for pictures."""
+"""An empty file in every cache, so that sources do not read images from there."""
 
 _FOLDERS_OF_A_CACHE = ("blobs", "records")
 
 
 def is_cache(folder: Path) -> bool:
-    """Return whether a folder is a cache; those of versions that wrote no mark are known by what they hold."""
+    """Return whether a folder is a cache; caches of early versions have no mark and are recognised by their files."""
     if exists(folder / CACHE_MARK):
         return True
     return is_file(folder / "layout.json") and all(is_folder(folder / name) for name in _FOLDERS_OF_A_CACHE)
@@ -39,13 +38,13 @@ def _umask() -> int:
     return mask
 
 
-_UMASK = _umask()  # once: to ask is to set it for a moment, for all threads
+_UMASK = _umask()  # read once, because reading it sets it for a moment, in all threads
 _TEMPORARY = re.compile(r"\.tmp-([0-9a-f]{8})-(\d{1,10})-.*")
 _ABANDONED_AFTER_S = 7 * 24 * 3600.0
 
 
 def set_aside(path: Path) -> Path:
-    """Rename a file to `<name>.bak`, or `<name>.1.bak` and so on where that is taken; return its new place.
+    """Rename a file to `<name>.bak`, or `<name>.1.bak` and so on if that exists; return its new path.
 
     Raises:
         StoreError: if it cannot be renamed.
@@ -59,15 +58,15 @@ def set_aside(path: Path) -> Path:
 
 
 def temporary_prefix() -> str:
-    """Return how the names of this process's temporary files begin: they tell whether who made them is still there."""
+    """Return the prefix of this process's temporary files, from which other processes see whether it is running."""
     return f".tmp-{process_place()}-{os.getpid()}-"
 
 
 def whose_temporary(path: Path) -> str:
-    """Return to whom a temporary file or folder belongs, in words."""
+    """Return in words which process a temporary file or folder belongs to."""
     match = _TEMPORARY.fullmatch(path.name)
     if match is None:
-        return "not of this version; removed when it is seven days old"
+        return "of another version; removed when it is seven days old"
     if match[1] != process_place() or os.name != "posix":
         return "of another host or container; removed when it is seven days old"
     state = "gone" if start_of(int(match[2])) is None else "running"
@@ -77,8 +76,8 @@ def whose_temporary(path: Path) -> str:
 def clear_abandoned(folder: Path) -> None:
     """Remove the temporary files and folders of processes that were killed.
 
-    Those of processes that are known to be gone are removed at once. Where that cannot be known (another host or
-    container, Windows), and what bears another name, it is for age to tell: no unit takes seven days.
+    Those of processes that are known to have ended are removed at once. Where this cannot be known (another host or
+    container, Windows, other names), they are removed after seven days: no unit takes that long.
     """
     with suppress(OSError):
         for path in children(folder, ".tmp-*"):
@@ -87,7 +86,7 @@ def clear_abandoned(folder: Path) -> None:
 
 
 def remove_whole(path: Path) -> None:
-    """Remove a file, a link or a whole folder; another process may be doing so too."""
+    """Remove a file, a link or a folder with its contents; other processes may do so at the same time."""
     with suppress(OSError):
         if is_folder(path) and not is_link(path):
             shutil.rmtree(path, ignore_errors=True)
@@ -98,12 +97,12 @@ def remove_whole(path: Path) -> None:
 def _is_abandoned(path: Path) -> bool:
     match = _TEMPORARY.fullmatch(path.name)
     if match and match[1] == process_place() and os.name == "posix":
-        return start_of(int(match[2])) is None  # one that has ended and is not yet cleared away is no owner
+        return start_of(int(match[2])) is None  # also for a process that has ended but is not reaped yet
     return is_older(path, _ABANDONED_AFTER_S)
 
 
 def is_older(path: Path, seconds: float) -> bool:
-    """Return whether a file was last changed longer ago; not if it is gone."""
+    """Return whether a file was last changed more than `seconds` ago; False if it does not exist."""
     try:
         return time.time() - path.lstat().st_mtime > seconds
     except OSError:
@@ -112,12 +111,12 @@ def is_older(path: Path, seconds: float) -> bool:
 
 @contextmanager
 def replacing(path: Path, *, temporary_in: Path | None = None, durable: bool = False) -> Iterator[Path]:
-    """Yield a temporary path to write; on success it takes the name `path` in one step, else it is removed.
+    """Yield a temporary path to write to; on success it is renamed to `path`, otherwise it is removed.
 
     Args:
-        path: the file to create or replace; its folder is made.
+        path: the file to create or replace; its folder is created.
         temporary_in: folder for the temporary file, on the same file system; default beside `path`.
-        durable: return only when the bytes and the name are on the disk itself, so that a power cut loses neither.
+        durable: return only after file and name have been flushed to the disk, so that they survive a power cut.
 
     Raises:
         StoreError: if the file cannot be written (no permission, disk full).
@@ -141,27 +140,29 @@ def replacing(path: Path, *, temporary_in: Path | None = None, durable: bool = F
         if isinstance(error, StoreError):
             raise
         reason = error.strerror or str(error)
-        raise StoreError(f"{path} cannot be written: {reason}. Free some space, mend the permissions or choose another "
-                         "folder, then run the same command again")  from error  # fmt: skip
+        raise StoreError(
+            f"{path} cannot be written: {reason}. Free some space, check the permissions or choose another "
+            "folder, then run the same command again"
+        ) from error
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str, *, temporary_in: Path | None = None, durable: bool = False) -> None:
-    """Write a text file in one step (UTF-8, as given); see `replacing`."""
+    """Write a text file atomically (UTF-8, line ends as given); see `replacing`."""
     with replacing(path, temporary_in=temporary_in, durable=durable) as temporary:
-        temporary.write_bytes(text.encode(errors="backslashreplace"))  # names of files need not be text
+        temporary.write_bytes(text.encode(errors="backslashreplace"))  # file names may have bytes that are not text
 
 
 def copy_file(source: Path, target: Path) -> None:
-    """Copy a file's bytes to a place in one step."""
+    """Copy a file atomically."""
     with replacing(target) as temporary:
         shutil.copyfile(source, temporary)
 
 
 def _take_name(temporary: Path, path: Path) -> None:
-    """Rename; where a reader holds a file of the same content open, some systems refuse, and there is nothing to do."""
+    """Rename; some systems refuse this while a reader has the target open, which is fine if its bytes are the same."""
     try:
         temporary.replace(path)
     except PermissionError:

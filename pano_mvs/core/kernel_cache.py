@@ -1,8 +1,8 @@
-"""Where compiled kernels are kept: a folder of the user's, named by what the kernels' source says.
+"""The folder for compiled kernels: one of the user's, named after a digest of the kernels' source.
 
-numba notices an edit of the file that holds a kernel, but not of the files that it calls, and installed files may all
-carry the same time stamp. A folder named by the digest of all kernel files is right whatever happened to them, and
-works where the package itself cannot be written.
+numba notices an edit of the file that holds a kernel, but not of the files of the kernels that it calls, and installed
+files may all have the same time stamp. A folder named after the digest of all kernel files is always right, and works
+if the package itself cannot be written.
 """
 
 from __future__ import annotations
@@ -25,16 +25,18 @@ _PLACES = {"win32": ("LOCALAPPDATA", "AppData/Local"), "darwin": ("", "Library/C
 
 
 def use_kernel_cache(package: Path) -> None:
-    """Point numba to the folder for the kernels below a package, unless the user has chosen one.
+    """Set numba's cache folder for the kernels in a package, unless the user has set one.
+
+    Call this before any of the kernels is imported.
 
     Args:
-        package: folder in which the kernel files, `kernels_*.py`, lie; to be called before any of them is imported.
+        package: folder that contains the kernel files, `kernels_*.py`.
     """
     if VARIABLE in os.environ:
         return
     try:
         folder = str(kernel_cache_folder(package))
-    except OSError:  # numba fails at the first kernel if it finds no folder at all
+    except OSError:  # without any folder numba fails at the first kernel
         folder = tempfile.mkdtemp(prefix="pano-mvs-kernels-")
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
     os.environ[VARIABLE] = folder  # also for processes that we start
@@ -44,20 +46,20 @@ def use_kernel_cache(package: Path) -> None:
 
 
 def kernel_cache_folder(package: Path) -> Path:
-    """Return the folder for the kernels below a package as they are now.
+    """Return the cache folder for the present kernels of a package.
 
     Raises:
-        OSError: if the user has no folder for caches that can be written.
+        OSError: if the user has no writable folder for caches.
     """
     sources = {str(path.relative_to(package)): path.read_bytes() for path in below(package, "kernels_*.py")}
     return user_cache_folder() / "pano-mvs" / "kernels" / digest_from_value(sources)[:16]
 
 
 def user_cache_folder() -> Path:
-    """Return the folder for caches that this system gives to each user, if it can be written.
+    """Return the user's folder for caches, or else a folder of their own for temporary files.
 
     Raises:
-        OSError: if there is none.
+        OSError: if neither can be written.
     """
     variable, below_home = _PLACES.get(sys.platform, ("XDG_CACHE_HOME", ".cache"))
     given, home = os.environ.get(variable), home_folder()
@@ -70,7 +72,7 @@ def user_cache_folder() -> Path:
 
 
 def _own_temporary_folder() -> Path:
-    """Return a folder that stays between runs, and in which nobody else can leave code for us to execute.
+    """Return a folder that stays between runs and that nobody else can write to, as it holds code that we execute.
 
     Raises:
         OSError: if there is none.
@@ -81,10 +83,10 @@ def _own_temporary_folder() -> Path:
         info = folder.lstat()
         if stat.S_ISDIR(info.st_mode) and info.st_uid == os.getuid() and not info.st_mode & 0o077:
             return folder
-    raise OSError(errno.EACCES, "you have no folder for caches that can be written")
+    raise OSError(errno.EACCES, "you have no writable folder for caches")
 
 
 def _can_be_made(folder: Path) -> bool:
-    """Return whether a folder can be written, or made in the nearest one above it that exists."""
+    """Return whether a folder is writable, or can be created in the nearest existing folder above it."""
     there = next((path for path in (folder, *folder.absolute().parents) if exists(path)), None)
     return there is not None and is_folder(there) and os.access(there, os.W_OK | os.X_OK)

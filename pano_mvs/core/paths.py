@@ -1,10 +1,11 @@
-"""Questions about paths, answered without exceptions.
+"""Query paths without exceptions.
 
 `Path.is_file`, `exists`, `is_dir`, `resolve` and `glob` raise on some paths: below a folder that may not be searched
 (PermissionError), with a name that is too long or links that form a circle (OSError, RuntimeError), with a null byte
-(ValueError). The functions here do not. What cannot be looked at is not there; `problem_of` says why.
+(ValueError). The functions here do not: a path that cannot be examined does not exist, and
+`problem_of` says why.
 
-The rest of the package asks these functions only; a test checks that.
+The rest of the package uses only these functions; a test checks this.
 """
 
 from __future__ import annotations
@@ -17,24 +18,24 @@ _NO_PATH = (OSError, ValueError, RuntimeError)
 
 
 def is_file(path: Path) -> bool:
-    """Return whether a path leads to a plain file."""
+    """Return whether a path is a regular file, or a link to one."""
     info = stat_of(path)
     return info is not None and stat.S_ISREG(info.st_mode)
 
 
 def is_folder(path: Path) -> bool:
-    """Return whether a path leads to a folder."""
+    """Return whether a path is a folder, or a link to one."""
     info = stat_of(path)
     return info is not None and stat.S_ISDIR(info.st_mode)
 
 
 def exists(path: Path) -> bool:
-    """Return whether a path leads to anything."""
+    """Return whether a path exists; False for a broken link."""
     return stat_of(path) is not None
 
 
 def is_link(path: Path) -> bool:
-    """Return whether a path is a symbolic link, whether or not it leads anywhere."""
+    """Return whether a path is a symbolic link, broken or not."""
     try:
         return path.is_symlink()
     except _NO_PATH:
@@ -42,7 +43,7 @@ def is_link(path: Path) -> bool:
 
 
 def stat_of(path: Path) -> os.stat_result | None:
-    """Return what the system knows of what a path leads to, or None if it cannot be looked at."""
+    """Return the status of a file or folder, or None if it cannot be examined."""
     try:
         return path.stat()
     except _NO_PATH:
@@ -50,7 +51,7 @@ def stat_of(path: Path) -> os.stat_result | None:
 
 
 def problem_of(path: Path) -> str:
-    """Return why a path leads to nothing that can be looked at, such as "Permission denied"; "" if it does."""
+    """Return why a path cannot be examined, such as "Permission denied", or "" if it can."""
     try:
         path.stat()
     except _NO_PATH as error:
@@ -59,7 +60,7 @@ def problem_of(path: Path) -> str:
 
 
 def is_denied(path: Path) -> bool:
-    """Return whether it cannot be known what a path leads to, since a folder above it may not be searched."""
+    """Return whether a path cannot be examined because a folder above it may not be searched."""
     try:
         path.stat()
     except PermissionError:
@@ -70,12 +71,12 @@ def is_denied(path: Path) -> bool:
 
 
 def reason_of(error: BaseException) -> str:
-    """Return in words why the system refused something, without the path."""
+    """Return the reason in a system error, without the path."""
     return getattr(error, "strerror", None) or str(error)
 
 
 def resolved(path: Path) -> Path:
-    """Return a path without links and "..", or as it is, made absolute, where these cannot be followed."""
+    """Return a path with links and ".." resolved; if that is impossible, only made absolute."""
     try:
         return path.resolve()
     except _NO_PATH:
@@ -86,11 +87,11 @@ def resolved(path: Path) -> Path:
 
 
 def children(folder: Path, pattern: str = "*") -> list[Path]:
-    """Return what a folder holds, in order of the names; nothing if it cannot be listed.
+    """Return the entries of a folder, sorted by name; none if it cannot be listed.
 
     Args:
         folder: the folder.
-        pattern: which names, such as "*.yaml".
+        pattern: of the names to return, such as "*.yaml".
     """
     try:
         return sorted(folder.glob(pattern))
@@ -99,7 +100,7 @@ def children(folder: Path, pattern: str = "*") -> list[Path]:
 
 
 def below(folder: Path, pattern: str = "*") -> list[Path]:
-    """Return what a folder and its subfolders hold, in order of the paths, as far as they can be listed."""
+    """Return all files and folders below a folder, sorted by path, as far as they can be listed."""
     try:
         return sorted(folder.rglob(pattern))
     except _NO_PATH:
@@ -107,17 +108,17 @@ def below(folder: Path, pattern: str = "*") -> list[Path]:
 
 
 def home_folder() -> Path | None:
-    """Return the user's home folder; None if there is none, or it may not be searched."""
+    """Return the user's home folder, or None if there is none or it may not be searched."""
     try:
         home = Path.home()
-        os.stat(f"{home}/.")  # noqa: PTH116  # Path would drop the dot, for which the folder has to be searched
+        os.stat(f"{home}/.")  # noqa: PTH116  # the dot requires search permission, and Path would drop it
     except _NO_PATH:
         return None
     return home
 
 
 def expanded(path: Path) -> Path:
-    """Return a path with the home folder for "~"; as it is where there is no such home folder."""
+    """Return a path with "~" replaced by the home folder, or unchanged if there is no home folder."""
     try:
         return path.expanduser()
     except RuntimeError:

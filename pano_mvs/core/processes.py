@@ -1,4 +1,4 @@
-"""Which processes of this host are running, and what makes a process's number mean one process."""
+"""Find out which processes of this host are running, and distinguish processes that had the same id."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _ENDED = "ZX"
 
 @cache
 def process_place() -> str:
-    """Return a name for that within which a process's number means one process: this start of this container."""
+    """Return a name for the scope of process ids: the present start of this host or container."""
     marks = [socket.gethostname(), boot_id()]
     with suppress(OSError):
         marks.append(str(Path("/proc/self/ns/pid").readlink()))
@@ -25,18 +25,18 @@ def process_place() -> str:
 
 
 def boot_id() -> str:
-    """Return a text that every start of the system changes; empty if it is not known."""
+    """Return a text that changes at every start of the system; empty if unknown."""
     return _text("/proc/sys/kernel/random/boot_id")
 
 
 def machine_id() -> str:
-    """Return a text that stays the same when this installation starts again; empty if it is not known."""
+    """Return a text that identifies this installation across restarts; empty if unknown."""
     text = _text("/etc/machine-id") or _text("/var/lib/dbus/machine-id")
     return hashlib.blake2b(text.encode(), key=b"pano-mvs", digest_size=8).hexdigest() if text else ""
 
 
 def is_running(process: int) -> bool:
-    """Return whether there is a process with a number (POSIX)."""
+    """Return whether a process with this id exists (POSIX)."""
     try:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):
@@ -47,18 +47,18 @@ def is_running(process: int) -> bool:
 
 
 def start_of(process: int) -> str | None:
-    """Return when a process was started, in the system's own words; empty if that is not known, None if it has ended.
+    """Return the start time of a process in the notation of the system; "" if unknown, None if the process has ended.
 
-    Two processes that had the same number one after the other differ in it.
+    Two successive processes with the same id have different start times.
     """
     if os.name != "posix":
         return ""
     if not is_running(process):
         return None
-    fields = _text(f"/proc/{process}/stat").rpartition(")")[2].split()  # the name before may hold anything
+    fields = _text(f"/proc/{process}/stat").rpartition(")")[2].split()  # the name before it may contain anything
     if fields:
         return None if fields[0] in _ENDED else fields[19]
-    if exists(Path("/proc/self/stat")):  # it has just ended, or is hidden from us
+    if exists(Path("/proc/self/stat")):  # the process has just ended, or is hidden from us
         return "" if is_running(process) else None
     return _start_by_ps(process)
 

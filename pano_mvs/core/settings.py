@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.core.parts import Parts
+from pano_mvs.core.named_registry import NamedRegistry
 
 Value = TypeVar("Value")
 _KEY = "pano_mvs.setting"
@@ -32,7 +32,7 @@ class Setting:
         gt: a bound that it must exceed.
         le: the largest value.
         odd: whether it must be odd.
-        parts: those that it names one of; None if it is no such name.
+        registry: of what it names; None if it names nothing.
     """
 
     doc: str
@@ -40,14 +40,14 @@ class Setting:
     gt: float | None = None
     le: float | None = None
     odd: bool = False
-    parts: Parts[Any] | None = None
+    registry: NamedRegistry[Any] | None = None
 
     def problem(self, value: Any) -> str:
         """Return what is wrong with a value, "must be …"; empty if nothing is. None is always taken."""
         if value is None:
             return ""
-        if self.parts is not None:
-            self.parts.check(value)
+        if self.registry is not None:
+            self.registry.check(value)
         if self.odd and value % 2 == 0:
             return _odd_problem(value)
         if self.ge is not None and not value >= self.ge:
@@ -65,10 +65,10 @@ def setting(
     gt: float | None = None,
     le: float | None = None,
     odd: bool = False,
-    parts: Parts[Any] | None = None,
+    registry: NamedRegistry[Any] | None = None,
 ) -> Value:
     """Declare a field of a dataclass as a setting; see `Setting`."""
-    told = Setting(doc=doc, ge=ge, gt=gt, le=le, odd=odd, parts=parts)
+    told = Setting(doc=doc, ge=ge, gt=gt, le=le, odd=odd, registry=registry)
     return field(default=default, metadata={_KEY: told})
 
 

@@ -1,18 +1,18 @@
-"""Text of files, plugins and exceptions: cut to a length that can be read, and without control characters."""
+"""Make text of files, plugins and exceptions safe to print: not too long, and without control characters."""
 
 from __future__ import annotations
 
 import re
 
 MAX_CHARACTERS = 2000
-"""The length of a message; what is longer is a dump."""
+"""Maximum length of a message."""
 
-# Control characters but tab and newline, marks that turn the direction of writing, line separators, surrogates.
-_STEERING = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+# Control characters except tab and newline, marks of writing direction, line separators, surrogates.
+_CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
 def shortened(text: str, most: int = MAX_CHARACTERS) -> str:
-    """Return a text of about `most` characters: its beginning and its end, with how many are left out between.
+    """Return a text shortened to about `most` characters: its beginning, the number of omitted ones, and its end.
 
     >>> shortened("a" * 10 + "b" * 90, 20)
     'aaaaaaaaaabbbbb … (80 characters left out) … bbbbb'
@@ -24,7 +24,7 @@ def shortened(text: str, most: int = MAX_CHARACTERS) -> str:
 
 
 def plural(count: int, one: str, many: str = "") -> str:
-    """Return the form of a word, or of a few, that goes with a count; `many` is by default `one` with an s.
+    """Return the singular or plural of a word or phrase for a count; `many` defaults to `one` with an s.
 
     >>> [f"{count} {plural(count, 'file')} {plural(count, 'is', 'are')} left" for count in (0, 1, 2)]
     ['0 files are left', '1 file is left', '2 files are left']
@@ -33,27 +33,27 @@ def plural(count: int, one: str, many: str = "") -> str:
 
 
 def without_controls(text: str) -> str:
-    r"""Return a text in which control characters are spelled out, so that a terminal shows them and obeys none.
+    r"""Return a text with control characters escaped, so that a terminal shows them and does not execute them.
 
     >>> without_controls("a\x1b[31m.jpg")
     'a\\x1b[31m.jpg'
     """
-    return _STEERING.sub(lambda match: _spelled(match[0]), text)
+    return _CONTROLS.sub(lambda match: _escaped(match[0]), text)
 
 
 def one_line(text: str) -> str:
-    r"""Return a name as `without_controls` does, on one line: tabs and newlines are spelled out, too.
+    r"""Return a text with control characters, tabs and newlines escaped, for one line.
 
     >>> one_line("a\nb.jpg")
     'a\\x0ab.jpg'
     """
-    return without_controls(text).replace("\t", _spelled("\t")).replace("\n", _spelled("\n"))
+    return without_controls(text).replace("\t", _escaped("\t")).replace("\n", _escaped("\n"))
 
 
 def json_without_controls(line: str) -> str:
-    """Return a line of JSON in which the control characters that JSON permits in strings are written as escapes."""
-    return _STEERING.sub(lambda match: f"\\u{ord(match[0]):04x}", line)
+    """Return a line of JSON with the control characters that JSON permits in strings escaped."""
+    return _CONTROLS.sub(lambda match: f"\\u{ord(match[0]):04x}", line)
 
 
-def _spelled(sign: str) -> str:
+def _escaped(sign: str) -> str:
     return f"\\x{ord(sign):02x}" if ord(sign) < 256 else f"\\u{ord(sign):04x}"

@@ -1,1 +1,1 @@
-"""Workflows, plans, the store and execution; knows no stage by name."""
+"""Run workflows: from their files over plans to cached results. The engine knows no stage by name."""

@@ -25,6 +25,12 @@ def pad_panorama(panorama: NDArray[Scalar], pad_px: int) -> NDArray[Scalar]:
 
     Raises:
         UsageError: if W is odd (then no column lies exactly half a turn away) or the margin is wider than H.
+
+    >>> pad_panorama(np.array([[1, 2, 3, 4], [5, 6, 7, 8]]), 1)
+    array([[2, 3, 4, 1, 2, 3],
+           [4, 1, 2, 3, 4, 1],
+           [8, 5, 6, 7, 8, 5],
+           [6, 7, 8, 5, 6, 7]])
     """
     height, width = panorama.shape[:2]
     if width % 2 or not 0 <= pad_px <= min(height, width):
@@ -44,6 +50,9 @@ def sample_panorama(panorama: NDArray[np.generic], pixels_px: ArrayLike) -> NDAr
 
     Returns:
         (...,) or (..., C) float64.
+
+    >>> sample_panorama(np.array([[1.0, 2.0, 3.0, 4.0]]), np.array([[1.5, 0.5], [2.0, 0.5], [0.0, 0.5]])).tolist()
+    [2.0, 2.5, 2.5]
     """
     pixels = np.asarray(pixels_px, dtype=np.float64)
     height, width = panorama.shape[:2]
@@ -86,6 +95,10 @@ def roll_panorama(panorama: NDArray[Scalar], columns: int) -> tuple[NDArray[Scal
     """Return a panorama rolled to the right by whole columns, and the rotation new_from_old (3, 3) that this is.
 
     A camera known as cam_from_world becomes new_from_old @ cam_from_world (rotation and translation).
+
+    >>> panorama, new_from_old = roll_panorama(np.array([[1, 2, 3, 4]]), 1)
+    >>> panorama.tolist(), (new_from_old @ [0, 0, 1]).round(6).tolist()
+    ([[4, 1, 2, 3]], [1.0, 0.0, 0.0])
     """
     width = panorama.shape[1]
     angle = 2 * np.pi * columns / width

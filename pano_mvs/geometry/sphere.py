@@ -21,6 +21,10 @@ def ray_from_pixel(pixels_px: ArrayLike, size_hw: tuple[int, int]) -> FloatArray
 
     Returns:
         (..., 3) unit vectors in the camera frame (x right, y down, z forward).
+
+    >>> ray_from_pixel([[512, 256], [768, 256]], (512, 1024)).round(6) + 0.0  # forward, right
+    array([[0., 0., 1.],
+           [1., 0., 0.]])
     """
     pixels = np.asarray(pixels_px, dtype=np.float64)
     height, width = _checked_size(size_hw)
@@ -39,6 +43,9 @@ def pixel_from_ray(rays: ArrayLike, size_hw: tuple[int, int]) -> FloatArray:
 
     Returns:
         (..., 2) positions (x, y), x in [0, w], y in [0, h]. The azimuth of a pole is arbitrary.
+
+    >>> pixel_from_ray([0, 1, 1], (512, 1024)).tolist()  # 45° below the horizon
+    [512.0, 384.0]
     """
     vectors = np.asarray(rays, dtype=np.float64)
     height, width = _checked_size(size_hw)
@@ -48,7 +55,11 @@ def pixel_from_ray(rays: ArrayLike, size_hw: tuple[int, int]) -> FloatArray:
 
 
 def ray_grid(size_hw: tuple[int, int]) -> FloatArray:
-    """Return the unit rays through all pixel centres, (height, width, 3), in the camera frame."""
+    """Return the unit rays through all pixel centres, (height, width, 3), in the camera frame.
+
+    >>> ray_grid((512, 1024)).shape
+    (512, 1024, 3)
+    """
     height, width = _checked_size(size_hw)
     # One row and one column are enough: nothing as large as the result is made beside it.
     azimuth = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)

@@ -20,6 +20,10 @@ class Rigid3:
     Attributes:
         rotation: (3, 3) rotation matrix.
         translation: (3,) in scene units.
+
+    >>> cam_from_world = Rigid3.from_center(np.eye(3), [1.0, 0.0, 0.0])
+    >>> cam_from_world.apply([1.0, 0.0, 2.0]).tolist(), cam_from_world.center.tolist()
+    ([0.0, 0.0, 2.0], [1.0, 0.0, 0.0])
     """
 
     rotation: FloatArray
@@ -61,6 +65,10 @@ class Similarity3:
         scale: positive factor from source lengths to target lengths.
         rotation: (3, 3) rotation matrix.
         translation: (3,) in target units.
+
+    >>> metres_from_scene = Similarity3(2.0, np.eye(3), np.zeros(3))
+    >>> metres_from_scene.apply([1.0, 0.0, 0.5]).tolist()
+    [2.0, 0.0, 1.0]
     """
 
     scale: float

@@ -6,20 +6,20 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import rotation_from_two_vectors
-from pano_mvs.report.figures import significant
+from pano_mvs.results.figures import significant
+from pano_mvs.results.records import PairLink, PosesSummary
 
 FloatArray = NDArray[np.float64]
 
 _WIDTH, _HEIGHT, _SIDE_HEIGHT = 480, 400, 200
 _BORDER = 44
-_MOST_LABELS, _MOST_LINKS, _MOST_REJECTED, _MOST_NAMED = 40, 1500, 600, 600
+_MAX_LABELS, _MAX_LINKS, _MAX_REJECTED, _MAX_NAMED = 40, 1500, 600, 600
 _ABOVE, _SIDE = ((0, 1.0), (2, -1.0)), ((0, 1.0), (1, 1.0))
 _ALONG_NORTH = re.compile(r"\bz north\b")
 _DOWN = re.compile(r"\by down\b")
@@ -71,7 +71,7 @@ class CameraMap:
     @property
     def radius(self) -> float:
         """The radius at which a camera is drawn."""
-        return 4.5 if len(self.cameras) <= _MOST_LABELS else 2.5
+        return 4.5 if len(self.cameras) <= _MAX_LABELS else 2.5
 
     @property
     def rejected(self) -> int:
@@ -79,42 +79,47 @@ class CameraMap:
         return sum(link.rejected for link in self.links)
 
 
-def camera_maps(
-    poses: Mapping[str, Any], reasons: Mapping[tuple[str, str], str] | None = None
-) -> tuple[CameraMap, ...]:
+def camera_maps(poses: PosesSummary, reasons: Mapping[tuple[str, str], str] | None = None) -> tuple[CameraMap, ...]:
     """Return the cameras from above and from the side; none where no centre is known.
 
     Args:
-        poses: as in run.json: `registered`, `centers`, `links`, `metric`, `frame`, `up`, `doubts`.
+        poses: of one group of cameras.
         reasons: why pairs have no common geometry, where that is known.
     """
-    names = [str(name) for name in poses.get("registered") or []]
-    centers = np.array(poses.get("centers") or [], dtype=np.float64).reshape(-1, 3)
+    names = list(poses.registered)
+    centers = np.array(poses.centers, dtype=np.float64).reshape(-1, 3)
     if not names or len(centers) != len(names) or not np.isfinite(centers).all():
         return ()
     centers = centers @ rotation_from_two_vectors(up_of(poses), (0, -1, 0)).T
-    unit = "m" if poses.get("metric") else "scene units"
+    unit = "m" if poses.metric else "scene units"
     labels = short_names(names)
-    links = _chosen(poses.get("links") or [], names, labels, reasons or {})
-    north = bool(_ALONG_NORTH.search(str(poses.get("frame") or "")))
-    known = poses.get("doubts") or {}
-    doubts = {idx: str(known[name]) for idx, name in enumerate(names) if name in known}
+    links = _chosen(poses.links, names, labels, reasons or {})
+    north = bool(_ALONG_NORTH.search(poses.frame))
+    doubts = {idx: poses.doubts[name] for idx, name in enumerate(names) if name in poses.doubts}
     return tuple(
-        _drawn(title, np.stack([sign * centers[:, axis] for axis, sign in axes], axis=-1), labels, links, doubts,
-               unit=unit, tallest=tallest, north=north and title == "From above")
+        _drawn(
+            title,
+            np.stack([sign * centers[:, axis] for axis, sign in axes], axis=-1),
+            labels,
+            links,
+            doubts,
+            unit=unit,
+            tallest=tallest,
+            north=north and title == "From above",
+        )
         for title, axes, tallest in (("From above", _ABOVE, _HEIGHT), ("From the side", _SIDE, _SIDE_HEIGHT))
-    )  # fmt: skip
+    )
 
 
-def up_of(poses: Mapping[str, Any]) -> FloatArray:
+def up_of(poses: PosesSummary) -> FloatArray:
     """Return the direction up in the world, unit (3,).
 
     That is −y where the frame says so; else the mean of the cameras' own, `up`, since they are mostly held upright;
     else −y, the first camera's.
     """
-    up = np.array(poses.get("up") or (0, -1, 0), np.float64)
-    usable = up.shape == (3,) and np.isfinite(up).all() and np.linalg.norm(up) > 1e-6
-    if not usable or _DOWN.search(str(poses.get("frame") or "")):
+    up = np.array(poses.up or (0, -1, 0), np.float64)
+    usable = np.isfinite(up).all() and np.linalg.norm(up) > 1e-6
+    if not usable or _DOWN.search(poses.frame):
         return np.array([0.0, -1.0, 0.0])
     return np.asarray(up / np.linalg.norm(up))
 
@@ -137,24 +142,26 @@ class _Joined:
 
 
 def _chosen(
-    links: Sequence[Any], names: list[str], labels: list[str], reasons: Mapping[tuple[str, str], str]
+    links: Sequence[PairLink], names: list[str], labels: list[str], reasons: Mapping[tuple[str, str], str]
 ) -> list[_Joined]:
     """Return the links between registered cameras: some rejected ones, then the strongest, weak ones first."""
     position = {name: idx for idx, name in enumerate(names)}
     found: list[_Joined] = []
-    for first, second, inliers, *more in links:
-        if first in position and second in position:
-            a, b = position[first], position[second]
-            candidates = f" of {more[0]} {plural(more[0], 'candidate')}" if more and more[0] is not None else ""
-            words = (f"{inliers} {plural(inliers, 'match', 'matches')}{candidates}" if inliers else
-                     f"rejected{candidates and f', none{candidates}'}")  # fmt: skip
-            why = reasons.get((first, second), "")
-            known = int(more[0] or 0) if more else 0
-            found.append(_Joined(a, b, int(inliers), known, f"{labels[a]} – {labels[b]}: {words}{why and f'; {why}'}"))
+    for link in links:
+        if link.first in position and link.second in position:
+            a, b = position[link.first], position[link.second]
+            of = ""
+            if link.candidates is not None:
+                of = f" of {link.candidates} {plural(link.candidates, 'candidate')}"
+            matches = f"{link.inliers} {plural(link.inliers, 'match', 'matches')}{of}"
+            words = matches if link.inliers else f"rejected{of and f', none{of}'}"
+            why = reasons.get((link.first, link.second), "")
+            text = f"{labels[a]} – {labels[b]}: {words}{why and f'; {why}'}"
+            found.append(_Joined(a, b, link.inliers, link.candidates or 0, text))
     # Of rejected ones those that came nearest, with most candidates.
     found.sort(key=lambda link: (link.inliers, -link.candidates))
     split = sum(not link.inliers for link in found)
-    return found[:split][:_MOST_REJECTED] + found[split:][-_MOST_LINKS:]
+    return found[:split][:_MAX_REJECTED] + found[split:][-_MAX_LINKS:]
 
 
 def _measured(length: float, unit: str) -> str:
@@ -181,12 +188,11 @@ def _drawn(
     height = int(np.clip(extent[1] * scale + 2 * _BORDER, 150, tallest))
     placed = np.round((flat - (low + high) / 2) * scale + (_WIDTH / 2, height / 2 - 6), 1)
     most = max((link.inliers for link in links), default=1) or 1
+    at = [(float(x), float(y)) for x, y in placed]
     lines = tuple(
-        Link((*map(float, (*placed[link.first], *placed[link.second])),), link.inliers / most, link.text,  # type: ignore[arg-type]
-             not link.inliers)
-        for link in links
-    )  # fmt: skip
-    named = len(labels) <= _MOST_NAMED
+        Link((*at[link.first], *at[link.second]), link.inliers / most, link.text, not link.inliers) for link in links
+    )
+    named = len(labels) <= _MAX_NAMED
     spots = _label_spots(placed, labels)
     cameras = [(float(x), float(y), label, spot) for (x, y), label, spot in zip(placed, labels, spots, strict=True)]
     length = _round_length(110 / scale)
@@ -205,7 +211,7 @@ def _label_spots(placed: FloatArray, labels: list[str]) -> list[tuple[float, flo
 
     Where there are too many cameras none has a label.
     """
-    if len(labels) > _MOST_LABELS:
+    if len(labels) > _MAX_LABELS:
         return [None] * len(labels)
     found: list[tuple[float, float] | None] = []
     taken: list[tuple[float, float, float]] = []

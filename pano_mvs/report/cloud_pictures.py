@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.report.cloud_renderer import read_pictures, write_scene
-from pano_mvs.report.earlier_page import Kept
-from pano_mvs.report.pictures import Picture, picture
-from pano_mvs.report.results import Results
+from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.report.software_cloud import draw_cloud
 from pano_mvs.report.viewpoints import Viewpoint, inside_camera, viewpoints
+from pano_mvs.results.pictures import Picture, picture
+from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.scene import PointCloud
 from pano_mvs.scene.pose_groups import split_groups
 
@@ -29,8 +29,8 @@ VERSION = 2
 """Raise it when the pictures change: earlier pages' are then drawn again."""
 
 _SIZE_HW = (600, 960)
-_MOST_POINTS = 800_000
-MOST_BYTES = 300_000
+_MAX_POINTS = 800_000
+MAX_BYTES = 300_000
 _TIMEOUT_S = 120.0
 _COMMAND = (sys.executable, "-m", "pano_mvs.report.cloud_renderer")
 
@@ -51,7 +51,7 @@ class CloudPictures:
 
 
 def cloud_pictures(
-    results: Results, kept: Kept, *, up: NDArray[np.float64], command: Sequence[str] = _COMMAND
+    results: StoredValues, kept: EarlierPage, *, up: NDArray[np.float64], command: Sequence[str] = _COMMAND
 ) -> CloudPictures:
     """Return pictures of the cloud: those of an earlier page, if they are of the same cloud, else new ones.
 
@@ -84,13 +84,18 @@ def cloud_pictures(
     seen_from = viewpoints(arrays[0], centers, up, aspect=_SIZE_HW[1] / _SIZE_HW[0], place=place)
     images, note = _drawn(arrays, seen_from, software=software, command=command)
     if whole.group_sizes:
-        note = "; ".join([*filter(None, [note]), "shown is group 0 of the poses, the largest; the clouds of the others "
-                          "are cloud_1.ply … (pano-mvs view OUT --group 1)"])  # fmt: skip
+        note = "; ".join(
+            [
+                *filter(None, [note]),
+                "shown is group 0 of the poses, the largest; the clouds of the others "
+                "are cloud_1.ply … (pano-mvs view OUT --group 1)",
+            ]
+        )
     titles = [view.title for view in seen_from]
     kept.keep(stem, {"titles": titles, "note": note})
     return CloudPictures(
         tuple(
-            (title, picture(image, width=_SIZE_HW[1], most_bytes=MOST_BYTES, key=f"{stem}.{number}"))
+            (title, picture(image, width=_SIZE_HW[1], most_bytes=MAX_BYTES, key=f"{stem}.{number}"))
             for number, (title, image) in enumerate(zip(titles, images, strict=True))
         ),
         note,
@@ -99,9 +104,12 @@ def cloud_pictures(
 
 def _thinned(cloud: PointCloud) -> Arrays:
     """Return every n-th point of a cloud, so that no more are drawn than a picture can show."""
-    step = -(-len(cloud) // _MOST_POINTS)
-    return (np.ascontiguousarray(cloud.points_in_world[::step]), np.ascontiguousarray(cloud.normals_in_world[::step]),
-            np.ascontiguousarray(cloud.colors_rgb[::step]))  # fmt: skip
+    step = -(-len(cloud) // _MAX_POINTS)
+    return (
+        np.ascontiguousarray(cloud.points_in_world[::step]),
+        np.ascontiguousarray(cloud.normals_in_world[::step]),
+        np.ascontiguousarray(cloud.colors_rgb[::step]),
+    )
 
 
 def _drawn(

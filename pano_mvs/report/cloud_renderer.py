@@ -38,10 +38,15 @@ def write_scene(
     for idx, name in enumerate(_ARRAYS):
         np.save(folder / f"{name}.npy", arrays[idx])
     views = [
-        {"eye": view.eye.tolist(), "target": view.target.tolist(), "up": view.up.tolist(), "fov_deg": view.fov_deg,
-         "height": view.height}
+        {
+            "eye": view.eye.tolist(),
+            "target": view.target.tolist(),
+            "up": view.up.tolist(),
+            "fov_deg": view.fov_deg,
+            "height": view.height,
+        }
         for view in seen_from
-    ]  # fmt: skip
+    ]
     (folder / "scene.json").write_text(json.dumps({"views": views, "size_hw": size_hw}), encoding="utf-8")
 
 
@@ -75,8 +80,9 @@ def draw(folder: Path) -> None:
         if shown.any():
             mesh = pyvista.PolyData(points[shown])
             mesh["rgb"] = colors[shown]
-            plotter.add_points(mesh, scalars="rgb", rgb=True, point_size=_point_size(int(shown.sum()), width * height),
-                               lighting=False)  # fmt: skip
+            plotter.add_points(
+                mesh, scalars="rgb", rgb=True, point_size=_point_size(int(shown.sum()), width * height), lighting=False
+            )
         plotter.camera_position = [view["eye"], view["target"], view["up"]]
         if seen_from.height:
             plotter.enable_parallel_projection()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,20 +10,19 @@ from typing import Any
 from pano_mvs.report.camera_map import CameraMap, camera_maps, up_of
 from pano_mvs.report.cloud_pictures import CloudPictures, cloud_pictures
 from pano_mvs.report.completeness import Shares
-from pano_mvs.report.earlier_page import Kept
-from pano_mvs.report.figures import score_tables, side_by_side
-from pano_mvs.report.findings import scores_by_stage
+from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.report.panoramas import Row, panorama_rows
-from pano_mvs.report.residuals import Histogram, Residuals, histogram, reprojection_residuals
-from pano_mvs.report.results import Results
 from pano_mvs.report.thumbnails import measured_shares, thumbnails
-from pano_mvs.report.verdict import Verdict, verdict
 from pano_mvs.report.view_cards import ViewCard, chosen_views, view_cards
+from pano_mvs.results.figures import score_tables, side_by_side
+from pano_mvs.results.records import PairLink, PosesSummary, Verdict, ViewSummary
+from pano_mvs.results.residuals import Histogram, Residuals, histogram, reprojection_residuals
+from pano_mvs.results.stored_values import StoredValues
+from pano_mvs.results.summary import RunSummary
+from pano_mvs.results.verdict import verdict
 from pano_mvs.scene.index import pair_name
 
-_MOST_REASONS = 300
-_NO_POSES: Mapping[str, Any] = {"registered": [], "rejected": {}, "doubts": {}, "confirmed": {}, "centers": [],
-                                "links": [], "frame": "", "scale": "", "metric": False}  # fmt: skip
+_MAX_REASONS = 300
 
 
 @dataclass(frozen=True)
@@ -32,8 +31,7 @@ class Content:
 
     Attributes:
         verdict: the head of the page.
-        poses: as in run.json, without gaps.
-        groups: of poses, as in run.json; one where it is silent of them.
+        groups: the poses of each group of cameras, the largest first.
         maps: the cameras of each group, from above and from the side.
         metric: images whose ranges are in metres.
         rejected_pairs: (first, second, candidates or None, reason) of pairs without a common geometry.
@@ -49,11 +47,11 @@ class Content:
         scores: (stage, tables) of each branch that has some.
         comparison: the medians of several branches side by side.
         notes: what could not be shown.
+        facts: figures that the next page may use again.
     """
 
     verdict: Verdict
-    poses: Mapping[str, Any]
-    groups: tuple[Mapping[str, Any], ...]
+    groups: tuple[PosesSummary, ...]
     maps: tuple[tuple[CameraMap, ...], ...]
     metric: frozenset[str]
     rejected_pairs: tuple[tuple[str, str, int | None, str], ...]
@@ -69,100 +67,79 @@ class Content:
     scores: tuple[tuple[str, Mapping[str, Any]], ...]
     comparison: Mapping[str, Any]
     notes: tuple[str, ...]
+    facts: Mapping[str, Any]
 
 
-def gather(out_dir: Path, summary: Mapping[str, Any], results: Results, kept: Kept) -> Content:
-    """Return what the page shows; what is missing or damaged is left out and told.
+def gather(out_dir: Path, summary: RunSummary, values: StoredValues, earlier: EarlierPage) -> Content:
+    """Return what the page shows; what is missing or damaged is left out and named in the notes.
 
     Args:
         out_dir: the output folder.
-        summary: what run.json holds; every key may be missing.
-        results: the values behind it.
-        kept: the earlier page's pictures and figures; those that go on are marked.
+        summary: of the run.
+        values: that the run made.
+        earlier: the earlier page, whose pictures and figures are used again.
     """
-    known = dict(summary.get("poses") or {})
-    poses = {name: known.get(name) or empty for name, empty in _NO_POSES.items()} | {"up": known.get("up")}
-    views = summary.get("views") or []
-    links = poses["links"]
-    groups = pose_groups(poses | {"groups": known.get("groups")})
-    rejected_pairs = _rejected_pairs(links, results)
-    record = results.poses
+    poses, views = summary.poses, summary.views
+    groups = poses.by_group()
+    rejected_pairs = _rejected_pairs(poses.links, values)
+    reasons = {(first, second): why for first, second, _, why in rejected_pairs}
+    record = values.poses
     residuals = reprojection_residuals(record) if record is not None else None
-    cards = view_cards(out_dir, [views[idx] for idx in chosen_views(views, always=poses["doubts"])], results, kept)
-    shares = measured_shares(views, results, kept) | {card.name: card.shares for card in cards if card.shares}
-    rows = panorama_rows(summary, shares=shares, residuals=residuals,
-                         thumbnails=thumbnails(out_dir, views, results, kept))  # fmt: skip
-    scores = tuple((stage, score_tables(scored)) for stage, scored in scores_by_stage(summary).items())
-    judged = dict(summary) | {"views": [_judged(view, shares) for view in views]}
+    cards = view_cards(out_dir, [views[idx] for idx in chosen_views(views, always=poses.doubts)], values, earlier)
+    shares = measured_shares(views, values, earlier) | {card.name: card.shares for card in cards if card.shares}
+    rows = panorama_rows(
+        summary, shares=shares, residuals=residuals, thumbnails=thumbnails(out_dir, views, values, earlier)
+    )
+    scores = tuple((stage, score_tables(scored)) for stage, scored in summary.scores_by_stage.items())
+    judged = summary.model_copy(update={"views": tuple(_judged(view, shares) for view in views)})
     return Content(
-        verdict=verdict(judged, residuals=residuals, image_width=_image_width(results)),
-        poses=poses,
+        verdict=verdict(judged, residuals=residuals, image_width=_image_width(values)),
         groups=groups,
-        maps=tuple(
-            camera_maps(group, {(first, second): why for first, second, _, why in rejected_pairs}) for group in groups
-        ),
-        metric=frozenset(str(name) for group in groups if group["metric"] for name in group["registered"]),
+        maps=tuple(camera_maps(group, reasons) for group in groups),
+        metric=frozenset(name for group in groups if group.metric for name in group.registered),
         rejected_pairs=rejected_pairs,
-        pairs=len(links),
-        cloud=cloud_pictures(results, kept, up=up_of(poses)),
+        pairs=len(poses.links),
+        cloud=cloud_pictures(values, earlier, up=up_of(poses)),
         cards=cards,
         total_views=len(views),
         rows=rows,
-        total_rows=len({*map(str, poses["registered"]), *(str(view.get("name", "")) for view in views),
-                        *map(str, poses["rejected"]), *map(str, summary.get("rejected") or {})}),
+        total_rows=len({*poses.registered, *(view.name for view in views), *poses.rejected, *summary.rejected}),
         mean_shares=_mean(list(shares.values())),
         residuals=residuals,
-        pair_residuals=histogram([link[4] for link in links if len(link) > 4 and link[4] is not None]),
+        pair_residuals=histogram([link.residual_deg for link in poses.links if link.residual_deg is not None]),
         scores=scores,
         comparison=side_by_side(scores),
-        notes=tuple(sorted(set(results.notes))),
-    )  # fmt: skip
-
-
-def pose_groups(poses: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:
-    """Return the groups of poses, each as the poses of a run that has one group alone.
-
-    Args:
-        poses: as in run.json, without gaps; where it names no groups, or one, it is returned as it is.
-    """
-    groups = poses.get("groups") or []
-    if len(groups) < 2:
-        return (poses,)
-    centers = dict(zip(map(str, poses["registered"]), poses["centers"], strict=False))
-    found = []
-    for group in groups:
-        names = dict.fromkeys(str(name) for name in group.get("images") or [])
-        found.append({
-            "registered": list(names),
-            "centers": [centers[name] for name in names if name in centers],
-            "links": [link for link in poses["links"] if link[0] in names and link[1] in names],
-            "frame": group.get("frame", ""), "scale": group.get("scale", ""), "metric": group.get("metric", False),
-            "doubts": {name: poses["doubts"][name] for name in names if name in poses["doubts"]},
-            "up": group.get("up"), "points": group.get("points"), "nearest_pair": group.get("nearest_pair"),
-        })  # fmt: skip
-    return tuple(found)
-
-
-def _rejected_pairs(links: Any, results: Results) -> tuple[tuple[str, str, int | None, str], ...]:
-    """Return the pairs without inliers, those with most candidates first, and why, of the first 300."""
-    rejected = [(str(first), str(second), more[0] if more else None) for first, second, inliers, *more in links
-                if not inliers]  # fmt: skip
-    rejected.sort(key=lambda pair: -(pair[2] or 0))
-    return tuple(
-        (first, second, candidates, results.pair_reason(pair_name(first, second)) if idx < _MOST_REASONS else "")
-        for idx, (first, second, candidates) in enumerate(rejected)
+        notes=tuple(sorted(set(values.notes))),
+        facts=earlier.facts,
     )
 
 
-def _judged(view: Mapping[str, Any], shares: Mapping[str, Shares]) -> dict[str, Any]:
-    """Return a view with its shares of the unmasked sphere, where they were measured, in place of its pixels'."""
-    own = shares.get(str(view.get("name", "")))
-    return dict(view) | ({"completeness": own.complete, "consistent": own.confirmed} if own else {})
+def _rejected_pairs(links: Sequence[PairLink], values: StoredValues) -> tuple[tuple[str, str, int | None, str], ...]:
+    """Return the pairs without inliers, those with most candidates first, and why, of the first 300."""
+    rejected = sorted((link for link in links if not link.inliers), key=lambda link: -(link.candidates or 0))
+    return tuple(
+        (
+            link.first,
+            link.second,
+            link.candidates,
+            values.pair_reason(pair_name(link.first, link.second)) if idx < _MAX_REASONS else "",
+        )
+        for idx, link in enumerate(rejected)
+    )
 
 
-def _image_width(results: Results) -> int | None:
-    for name in results.refs.get("images", {}):
-        panorama = results.panorama(name)
+def _judged(view: ViewSummary, shares: Mapping[str, Shares]) -> ViewSummary:
+    """Return a view with its shares of the unmasked sphere, if they were measured, in place of its pixels'."""
+    own = shares.get(view.name)
+    if own is None:
+        return view
+    measured = {"completeness": own.complete, "consistent": own.confirmed}
+    return view.model_copy(update={"metrics": {**view.metrics, **measured}})
+
+
+def _image_width(values: StoredValues) -> int | None:
+    for name in values.refs.get("images", {}):
+        panorama = values.panorama(name)
         return panorama.size_hw[1] if panorama is not None else None
     return None
 

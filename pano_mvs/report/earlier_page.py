@@ -12,17 +12,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pano_mvs.report.pictures import Picture
+from pano_mvs.results.pictures import Picture
 
 _PICTURE = re.compile(
     r'<img data-key="([0-9a-z.]{1,80})" src="(data:image/jpeg;base64,[A-Za-z0-9+/=]+)" width="(\d{1,5})" '
     r'height="(\d{1,5})"'
 )
 _FACTS = re.compile(r'<script type="application/json" id="facts">([^<]*)</script>')
-_LARGEST_BYTES = 100_000_000
+_MAX_BYTES = 100_000_000
 
 
-class Kept:
+class EarlierPage:
     """The pictures and the figures of an earlier page, by key, and those that the next one is to keep."""
 
     def __init__(self, pictures: Mapping[str, Picture] | None = None, facts: Mapping[str, Any] | None = None) -> None:
@@ -31,16 +31,16 @@ class Kept:
         self.facts: dict[str, Any] = {}
 
     @staticmethod
-    def of_page(path: Path) -> Kept:
+    def of_file(path: Path) -> EarlierPage:
         """Return what a page holds; nothing if it is not there or no page of ours."""
         try:
-            text = path.read_text(encoding="utf-8") if path.stat().st_size <= _LARGEST_BYTES else ""
+            text = path.read_text(encoding="utf-8") if path.stat().st_size <= _MAX_BYTES else ""
         except (OSError, UnicodeDecodeError):
-            return Kept()
+            return EarlierPage()
         pictures = {
             key: Picture(uri, (int(height), int(width)), key) for key, uri, width, height in _PICTURE.findall(text)
         }
-        return Kept(pictures, _facts(text))
+        return EarlierPage(pictures, _facts(text))
 
     def picture(self, key: str) -> Picture | None:
         """Return a picture, None if it was not kept."""

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from pano_mvs.report.completeness import Shares
-from pano_mvs.report.findings import doubts_of
-from pano_mvs.report.pictures import Picture
-from pano_mvs.report.residuals import Residuals
+from pano_mvs.results.pictures import Picture
+from pano_mvs.results.records import ViewSummary
+from pano_mvs.results.residuals import Residuals
+from pano_mvs.results.summary import RunSummary
 
-MOST_ROWS = 5000
+MAX_ROWS = 5000
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Row:
 
 
 def panorama_rows(
-    summary: Mapping[str, Any],
+    summary: RunSummary,
     *,
     shares: Mapping[str, Shares],
     residuals: Residuals | None,
@@ -66,37 +66,37 @@ def panorama_rows(
     """Return the rows in the order of the capture, those left out behind; not more than 5,000.
 
     Args:
-        summary: what run.json holds; every key may be missing.
+        summary: of the run.
         shares: image name to its shares of the sphere.
         residuals: of the points, if known.
         thumbnails: image name to its small picture.
     """
-    poses, views = summary.get("poses") or {}, summary.get("views") or []
-    registered = {str(name) for name in poses.get("registered") or []}
-    rejected = {str(name): str(reason) for name, reason in (poses.get("rejected") or {}).items()}
-    for name, told in (summary.get("rejected") or {}).items():
-        rejected.setdefault(str(name), str(told.get("reason", "")))
-    figures = {str(view.get("name", "")): view for view in views}
-    links = Counter(
-        name for first, second, inliers, *_ in poses.get("links") or [] if inliers for name in (first, second)
-    )
-    groups = poses.get("groups") or []
-    group_of = {
-        str(name): number for number, group in enumerate(groups) for name in group.get("images") or () if groups[1:]
-    }
-    doubts = doubts_of(summary)
-    names = dict.fromkeys([*map(str, poses.get("registered") or []), *figures, *rejected, *doubts])
+    poses = summary.poses
+    registered = set(poses.registered)
+    rejected = {name: rejection.reason for name, rejection in summary.rejected.items()} | dict(poses.rejected)
+    figures = {view.name: view for view in summary.views}
+    links = Counter(name for link in poses.links if link.inliers for name in link[:2])
+    group_of = {name: number for number, group in enumerate(poses.groups) for name in group.images if poses.groups[1:]}
+    doubts = summary.doubtful_images
+    order = [*poses.registered, *figures, *poses.rejected, *summary.rejected, *doubts]
     rows = []
-    for name in list(names)[:MOST_ROWS]:
+    for name in list(dict.fromkeys(order))[:MAX_ROWS]:
         median, p95, _ = (residuals.views.get(name) if residuals else None) or (None, None, 0)
-        view = figures.get(name, {})
+        view = figures.get(name, ViewSummary())
         rows.append(
-            Row(name, name in registered if poses else None, rejected.get(name, ""), doubts.get(name, ""),
-                shares.get(name), _number(view.get("completeness")), _number(view.get("consistent")), links[name],
-                median, p95, thumbnails.get(name), group_of.get(name))
-        )  # fmt: skip
+            Row(
+                name,
+                name in registered if poses else None,
+                rejected.get(name, ""),
+                doubts.get(name, ""),
+                shares.get(name),
+                view.completeness,
+                view.consistent,
+                links[name],
+                median,
+                p95,
+                thumbnails.get(name),
+                group_of.get(name),
+            )
+        )
     return tuple(rows)
-
-
-def _number(value: Any) -> float | None:
-    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None

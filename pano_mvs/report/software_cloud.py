@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pano_mvs.report.viewpoints import Viewpoint, facing
 
 _PAPER = (238, 241, 244)
-_LARGEST_PX = 5
+_MAX_PX = 5
 
 
 def draw_cloud(
@@ -36,7 +36,7 @@ def draw_cloud(
     # Far ones first: of several writes to a pixel, the last one stays.
     order = np.argsort(-depth[inside], kind="stable")
     image = np.full((size_hw[0] * size_hw[1], 3), _PAPER, np.uint8)
-    side = int(np.clip(np.sqrt(image.shape[0] / max(1, len(pixel))) * 2, 1, _LARGEST_PX))
+    side = int(np.clip(np.sqrt(image.shape[0] / max(1, len(pixel))) * 2, 1, _MAX_PX))
     nearest = np.full(image.shape[0], np.inf)
     nearest[pixel[order]] = depth[inside][order]
     image[pixel[order]] = colors_rgb[shown][inside][order]
@@ -62,8 +62,11 @@ def _projected(
         x, y = width / 2 + across * scale, height / 2 - upwards * scale
     valid = (depth > 0) & np.isfinite(x) & np.isfinite(y)
     limit = 10.0 * (width + height)
-    return (np.where(valid, x, -1.0).clip(-limit, limit), np.where(valid, y, -1.0).clip(-limit, limit),
-            np.where(valid, depth, 0.0))  # fmt: skip
+    return (
+        np.where(valid, x, -1.0).clip(-limit, limit),
+        np.where(valid, y, -1.0).clip(-limit, limit),
+        np.where(valid, depth, 0.0),
+    )
 
 
 def _spread(image: NDArray[np.uint8], nearest: NDArray[np.float64], side: int) -> NDArray[np.uint8]:

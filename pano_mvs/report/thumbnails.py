@@ -2,40 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from pano_mvs.report.completeness import Shares, fact_of, shares_from_fact, shares_of
-from pano_mvs.report.earlier_page import Kept
-from pano_mvs.report.pictures import Picture, picture, preview_panels
-from pano_mvs.report.results import Results
+from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.report.view_cards import key_of
+from pano_mvs.results.pictures import Picture, picture, preview_panels
+from pano_mvs.results.records import ViewSummary
+from pano_mvs.results.stored_values import StoredValues
 
-MOST_THUMBNAILS = 1000
-MOST_MEASURED = 1000
-MOST_BYTES = 9_000
+MAX_THUMBNAILS = 1000
+MAX_MEASURED = 1000
+MAX_BYTES = 9_000
 _WIDTH = 160
 _THREADS = 2
 _VERSION = 1
 
 
-def thumbnails(out_dir: Path, views: Sequence[Mapping[str, Any]], results: Results, kept: Kept) -> dict[str, Picture]:
+def thumbnails(
+    out_dir: Path, views: Sequence[ViewSummary], results: StoredValues, kept: EarlierPage
+) -> dict[str, Picture]:
     """Return image name to a small picture of its preview, of at most 1,000 views, evenly apart."""
-    chosen = [views[idx] for idx in _evenly(len(views), MOST_THUMBNAILS)]
+    chosen = [views[idx] for idx in _evenly(len(views), MAX_THUMBNAILS)]
     with ThreadPoolExecutor(_THREADS) as pool:
         found = pool.map(lambda view: _thumbnail(out_dir, view, results, kept), chosen)
-        return {str(view["name"]): small for view, small in zip(chosen, found, strict=True) if small is not None}
+        return {view.name: small for view, small in zip(chosen, found, strict=True) if small is not None}
 
 
-def measured_shares(views: Sequence[Mapping[str, Any]], results: Results, kept: Kept) -> dict[str, Shares]:
+def measured_shares(views: Sequence[ViewSummary], results: StoredValues, kept: EarlierPage) -> dict[str, Shares]:
     """Return image name to its shares of the sphere, of at most 1,000 views, evenly apart; masks are not looked at."""
     found: dict[str, Shares] = {}
-    for idx in _evenly(len(views), MOST_MEASURED):
-        name = str(views[idx].get("name", ""))
+    for idx in _evenly(len(views), MAX_MEASURED):
+        name = views[idx].name
         key = key_of(results, name, "s", _VERSION)
         shares = shares_from_fact(kept.fact(key)) if key else None
         if shares is None and key:
@@ -52,10 +54,10 @@ def _evenly(count: int, most: int) -> list[int]:
     return sorted({round(at) for at in np.linspace(0, count - 1, min(count, most))}) if count else []
 
 
-def _thumbnail(out_dir: Path, view: Mapping[str, Any], results: Results, kept: Kept) -> Picture | None:
-    key = key_of(results, str(view.get("name", "")), "t", _VERSION)
+def _thumbnail(out_dir: Path, view: ViewSummary, results: StoredValues, kept: EarlierPage) -> Picture | None:
+    key = key_of(results, view.name, "t", _VERSION)
     known = kept.picture(key) if key else None
     if known is not None:
         return known
-    panels = preview_panels(out_dir, str(view.get("preview") or ""), small=True)
-    return picture(np.vstack(panels), width=_WIDTH, most_bytes=MOST_BYTES, key=key) if panels else None
+    panels = preview_panels(out_dir, view.preview, small=True)
+    return picture(np.vstack(panels), width=_WIDTH, most_bytes=MAX_BYTES, key=key) if panels else None

@@ -15,17 +15,18 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.io.images.preview import color_mapped, range_limits, scale_ticks
 from pano_mvs.report.completeness import Shares, fact_of, shares_from_fact, shares_of
-from pano_mvs.report.earlier_page import Kept
-from pano_mvs.report.pictures import Picture, picture, preview_panels, resized
-from pano_mvs.report.results import Results
+from pano_mvs.report.earlier_page import EarlierPage
+from pano_mvs.results.pictures import Picture, picture, preview_panels, resized
+from pano_mvs.results.records import ViewSummary
+from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, WEAK_CONFIDENCE
 
 VERSION = 2
 """Raise it when the pictures change: earlier pages' are then drawn again."""
 
-MOST_CARDS = 36
+MAX_CARDS = 36
 WIDTH = 768
-MOST_BYTES = 80_000
+MAX_BYTES = 80_000
 _TICKS_APART = 0.09
 _DECODERS = 2  # a large panorama takes 100 MB while it is decoded
 _PARTS = ("panorama", "range", "confidence")
@@ -55,9 +56,7 @@ class ViewCard:
     ticks: tuple[tuple[float, float], ...]
 
 
-def chosen_views(
-    views: Sequence[Mapping[str, Any]], most: int = MOST_CARDS, *, always: Collection[str] = ()
-) -> list[int]:
+def chosen_views(views: Sequence[ViewSummary], most: int = MAX_CARDS, *, always: Collection[str] = ()) -> list[int]:
     """Return the positions of the views to show in full: all; of many, the least complete third and others evenly.
 
     The views named in `always` come first in that third, as far as there is room.
@@ -65,29 +64,27 @@ def chosen_views(
     everything = list(range(len(views)))
     if len(views) <= most:
         return everything
-    by_quality = sorted(
-        everything, key=lambda idx: (str(views[idx].get("name")) not in always, _quality(views[idx]), idx)
-    )
+    by_quality = sorted(everything, key=lambda idx: (views[idx].name not in always, _quality(views[idx]), idx))
     worst, rest = by_quality[: most // 3], sorted(by_quality[most // 3 :])
     evenly = [rest[round(at)] for at in np.linspace(0, len(rest) - 1, most - len(worst))]
     return sorted({*worst, *evenly})
 
 
-def view_cards(out_dir: Path, views: Sequence[Mapping[str, Any]], results: Results, kept: Kept) -> tuple[ViewCard, ...]:
+def view_cards(
+    out_dir: Path, views: Sequence[ViewSummary], results: StoredValues, kept: EarlierPage
+) -> tuple[ViewCard, ...]:
     """Return the cards of views; what an earlier page shows of the same values is taken from there.
 
     Args:
         out_dir: the output folder, for previews that stand in for what is not in the store.
-        views: of run.json.
+        views: of the run.
         results: the values.
         kept: the earlier page's.
     """
 
-    def card(view: Mapping[str, Any]) -> ViewCard:
-        name = str(view.get("name", ""))
-        return _kept_card(results, kept, name) or _new_card(
-            results, kept, name, out_dir, str(view.get("preview") or "")
-        )
+    def card(view: ViewSummary) -> ViewCard:
+        name = view.name
+        return _kept_card(results, kept, name) or _new_card(results, kept, name, out_dir, view.preview)
 
     with ThreadPoolExecutor(_DECODERS) as pool:
         return tuple(pool.map(card, views))
@@ -103,17 +100,17 @@ def confidence_colors(confidence: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return table[confidence]
 
 
-def key_of(results: Results, name: str, what: str, version: int) -> str:
+def key_of(results: StoredValues, name: str, what: str, version: int) -> str:
     """Return the key of something that is made from a view's panorama and range map; "" if it has no range map."""
     digest = results.digest("ranges", name)
     return f"{digest[:24]}.{results.digest('images', name)[:16]}.{what}{version}" if digest else ""
 
 
-def _quality(view: Mapping[str, Any]) -> float:
-    return float(view.get("completeness") or 0.0) + float(view.get("consistent") or 0.0)
+def _quality(view: ViewSummary) -> float:
+    return (view.completeness or 0.0) + (view.consistent or 0.0)
 
 
-def _kept_card(results: Results, kept: Kept, name: str) -> ViewCard | None:
+def _kept_card(results: StoredValues, kept: EarlierPage, name: str) -> ViewCard | None:
     stem = key_of(results, name, "v", VERSION)
     fact = kept.fact(stem) if stem else None
     found = {part: shown for part in _PARTS if (shown := kept.picture(f"{stem}.{part}")) is not None}
@@ -126,7 +123,7 @@ def _kept_card(results: Results, kept: Kept, name: str) -> ViewCard | None:
     return ViewCard(name, found, shares_from_fact(fact.get("shares")), ticks)
 
 
-def _new_card(results: Results, kept: Kept, name: str, out_dir: Path, preview: str) -> ViewCard:
+def _new_card(results: StoredValues, kept: EarlierPage, name: str, out_dir: Path, preview: str) -> ViewCard:
     range_map, panorama = results.range_map(name), results.panorama(name)
     stem = key_of(results, name, "v", VERSION)
     pictures: dict[str, Picture] = {}
@@ -165,7 +162,7 @@ def _ticks(near: float, far: float) -> tuple[tuple[float, float], ...]:
 
 
 def _part(image: NDArray[np.uint8], stem: str, part: str) -> Picture:
-    return picture(resized(image, WIDTH), width=WIDTH, most_bytes=MOST_BYTES, key=f"{stem}.{part}" if stem else "")
+    return picture(resized(image, WIDTH), width=WIDTH, most_bytes=MAX_BYTES, key=f"{stem}.{part}" if stem else "")
 
 
 def _shrunk(array: NDArray[Any]) -> NDArray[Any]:

@@ -55,7 +55,11 @@ class Files(Record):
 
 
 def group_file(name: str, group: int) -> str:
-    """Return the name of a group's file: cloud.ply of group 0, cloud_1.ply of group 1."""
+    """Return the name of a group's file: cloud.ply of group 0, cloud_1.ply of group 1.
+
+    >>> group_file("cloud.ply", 0), group_file("cloud.ply", 1)
+    ('cloud.ply', 'cloud_1.ply')
+    """
     path = PurePosixPath(name)
     return str(path.with_stem(f"{path.stem}_{group}")) if group else name
 

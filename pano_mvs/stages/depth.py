@@ -18,9 +18,9 @@ from pano_mvs.api import (
     Near,
     Panorama,
     Params,
-    PartOf,
     Pose,
     RangeMap,
+    RegisteredIn,
     params_from,
     settings_from,
     stage,
@@ -35,7 +35,7 @@ _PICTURE_BYTES, _RESULT_BYTES = 16, 40
 class SweepParams(Params):
     """Settings of depth.sweep."""
 
-    backend: Annotated[str, PartOf(SWEEP_BACKENDS)] = Field(
+    backend: Annotated[str, RegisteredIn(SWEEP_BACKENDS)] = Field(
         default="numba", description="numpy is the slow, readable reference; opencv; a plugin's"
     )
     device: Annotated[str, NOT_IN_KEY] = Field(

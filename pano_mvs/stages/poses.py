@@ -20,13 +20,13 @@ from pano_mvs.api import (
     All,
     Context,
     Features,
-    GateError,
     InputError,
     InputPath,
     One,
     Panorama,
     Params,
     Poses,
+    RunStoppedError,
     TwoView,
     stage,
 )
@@ -220,7 +220,7 @@ def checked_poses(poses: Poses, ctx: Context, *, remedy: str = _CLOSER) -> Poses
     """Report what was left out; stop where less than two pictures are left.
 
     Raises:
-        GateError: if fewer than two pictures are registered: there is nothing to sweep.
+        RunStoppedError: if fewer than two pictures are registered: there is nothing to sweep.
     """
     for name, reason in poses.rejected.items():
         ctx.reject(name, reason)
@@ -232,7 +232,7 @@ def checked_poses(poses: Poses, ctx: Context, *, remedy: str = _CLOSER) -> Poses
     ctx.metric("groups", len(poses.worlds))
     if registered < 2:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(poses.rejected.items())[:8])
-        raise GateError(f"no two panoramas could be registered, so there is no model. {remedy}. {reasons}")
+        raise RunStoppedError(f"no two panoramas could be registered, so there is no model. {remedy}. {reasons}")
     return poses
 
 

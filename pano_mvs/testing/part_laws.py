@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.backends.registry import SWEEP_BACKENDS
 from pano_mvs.algorithms.sweep.costs.cost import SweepCost, checked_cost
-from pano_mvs.algorithms.sweep.costs.registry import SWEEP_COSTS
+from pano_mvs.algorithms.sweep.costs.registry import BUILTIN, SWEEP_COSTS
 from pano_mvs.algorithms.sweep.windows import CostWindow
 from pano_mvs.core.errors import UsageError
 from pano_mvs.engine.stages.registry import Registry
@@ -104,7 +104,7 @@ def _looks(name: str, size_hw: tuple[int, int]) -> tuple[NDArray[np.uint8], NDAr
 
 
 def _registered(name: str) -> SweepCost:
-    if SWEEP_COSTS.is_builtin(name):
+    if name in BUILTIN:
         raise UsageError(f"the sweep cost {name!r} is built in: each backend has its own version of it")
     return SWEEP_COSTS.get(name)
 
@@ -114,7 +114,7 @@ def _names(kind: str, part: Path | str) -> list[str]:
         return [part]
     registry = Registry()
     registry.add_file(part)
-    names = [name for known, name in registry.parts if known == kind]
+    names = [name for known, name in registry.registrations if known == kind]
     if not names:
         raise UsageError(f"{part} registers no {kind}")
     return names

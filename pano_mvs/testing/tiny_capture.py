@@ -95,8 +95,7 @@ class TinyCapture:
     @functools.cached_property
     def items(self) -> Mapping[type[Record], Mapping[Any, Record]]:
         """Kind to the item of each picture, or of each pair."""
-        pairs = self.wholes[Pairs]
-        assert isinstance(pairs, Pairs)
+        pairs = self.whole(Pairs)
         return {
             Panorama: self.images,
             Pose: {name: Pose(pose) for name, pose in zip(self.names, self.poses, strict=True)},
@@ -122,6 +121,16 @@ class TinyCapture:
             TrackedPoints: self._tracked_points(),
             Scores: Scores({"registered": 1.0}, {}),
         }
+
+    def each(self, kind: type[Frozen]) -> dict[Any, Frozen]:
+        """Return the items of a kind."""
+        return {key: item for key, item in self.items[kind].items() if isinstance(item, kind)}
+
+    def whole(self, kind: type[Frozen]) -> Frozen:
+        """Return the one value of a kind."""
+        value = self.wholes[kind]
+        assert isinstance(value, kind)
+        return value
 
     @functools.cached_property
     def points_in_world(self) -> NDArray[np.float64]:

@@ -89,8 +89,10 @@ def color_cloud(cloud: DrawnCloud, by: str, *, up: NDArray[np.float64], unit: st
         UsageError: if the file does not hold what they need.
     """
     if by not in cloud.colorings:
-        raise UsageError(f"this cloud cannot be coloured by {by!r}, only by {', '.join(cloud.colorings)}: views and "
-                         "confidence are in clouds that export.ply writes with `quality: true`")  # fmt: skip
+        raise UsageError(
+            f"this cloud cannot be coloured by {by!r}, only by {', '.join(cloud.colorings)}: views and "
+            "confidence are in clouds that export.ply writes with `quality: true`"
+        )
     if by == "normals" and cloud.normals is not None:
         colors = np.rint((cloud.normals * [1, -1, -1] + 1) * 127.5).clip(0, 255).astype(np.uint8)
         return Coloring(colors, "normals: red to the right, green up, blue towards the viewer")
@@ -102,8 +104,11 @@ def color_cloud(cloud: DrawnCloud, by: str, *, up: NDArray[np.float64], unit: st
         return _photographed(cloud)
     values = cloud.vertices[by].astype(np.float32)
     high = 255.0 if by == "confidence" else max(float(values.max(initial=0)), 2.0)
-    legend = "confidence: blue 0 to red 255, consistent from 128" if by == "confidence" else (
-        f"views that agree: blue 0 to red {high:.0f}")  # fmt: skip
+    legend = (
+        "confidence: blue 0 to red 255, consistent from 128"
+        if by == "confidence"
+        else (f"views that agree: blue 0 to red {high:.0f}")
+    )
     return Coloring(_mapped(values, 0.0, high), legend)
 
 

@@ -21,8 +21,10 @@ def require_display(environment: Mapping[str, str] = os.environ, platform: str =
         platform: of Python.
     """
     if platform.startswith("linux") and not environment.get("DISPLAY"):
-        raise UsageError(f"there is no display (DISPLAY is not set), so no window can be opened. {_REMEDY}, or run "
-                         "this on a machine with a screen, or over ssh -X")  # fmt: skip
+        raise UsageError(
+            f"there is no display (DISPLAY is not set), so no window can be opened. {_REMEDY}, or run "
+            "this on a machine with a screen, or over ssh -X"
+        )
 
 
 def require_window(window_class: str) -> None:
@@ -47,8 +49,10 @@ def require_drawing(
     if not platform.startswith("linux") or environment.get("DISPLAY"):
         return
     if not any((loads or _loads)(name) for name in _DRAWING_LIBRARIES):
-        raise UsageError("pictures cannot be drawn here: neither EGL nor OSMesa is installed. Install one: for Debian "
-                         "and Ubuntu `apt install libegl1 libgl1-mesa-dri`")  # fmt: skip
+        raise UsageError(
+            "pictures cannot be drawn here: neither EGL nor OSMesa is installed. Install one: for Debian "
+            "and Ubuntu `apt install libegl1 libgl1-mesa-dri`"
+        )
 
 
 def _loads(name: str) -> bool:

@@ -47,10 +47,21 @@ class Overlay:
     def label(self, points: NDArray[np.float64], texts: list[str], name: str, *, color: str = "") -> None:
         """Write a text at each point (N, 3) of the scene."""
         self._plotter.add_point_labels(
-            points, texts, name=name, font_size=round(1.5 * self._font), text_color=color or self._ink,
-            shape="rounded_rect", shape_color=self._paper, shape_opacity=0.7, margin=4, always_visible=True,
-            show_points=False, reset_camera=False, render=False, pickable=False,
-        )  # fmt: skip
+            points,
+            texts,
+            name=name,
+            font_size=round(1.5 * self._font),
+            text_color=color or self._ink,
+            shape="rounded_rect",
+            shape_color=self._paper,
+            shape_opacity=0.7,
+            margin=4,
+            always_visible=True,
+            show_points=False,
+            reset_camera=False,
+            render=False,
+            pickable=False,
+        )
 
     def help(self, *, wanted: bool) -> None:
         """Show the keys, or take them away."""
@@ -61,7 +72,15 @@ class Overlay:
         if not text:
             return
         x, y, across, upright = _PLACES[name]
-        actor = self._plotter.add_text(text, position=(x, y), viewport=True, name=name, font=font, color=self._ink,
-                                       font_size=size * self._font, render=False)  # fmt: skip
+        actor = self._plotter.add_text(
+            text,
+            position=(x, y),
+            viewport=True,
+            name=name,
+            font=font,
+            color=self._ink,
+            font_size=size * self._font,
+            render=False,
+        )
         actor.prop.justification_horizontal, actor.prop.justification_vertical = across, upright
         actor.prop.background_color, actor.prop.background_opacity = self._paper, 0.75

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.paths import is_file, is_folder, resolved
+from pano_mvs.core.text import plural
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.clouds.ply_points import PlyPoints, open_ply_points
 from pano_mvs.io.poses.files import read_poses
+from pano_mvs.results.records import PosesSummary
+from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene.files import group_file
 
 FloatArray = NDArray[np.float64]
@@ -24,7 +25,7 @@ FloatArray = NDArray[np.float64]
 _CLOUD, _MESH, _MODELS = "cloud.ply", "mesh.ply", "colmap/sparse"
 _HEAD_BYTES = 1 << 14
 # The cameras' own directions up must agree this well to count as the scene's.
-_LEAST_AGREEMENT = 0.5
+_MIN_AGREEMENT = 0.5
 _NAMED_DOUBTS = 5
 
 
@@ -99,48 +100,66 @@ def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> Sho
         UsageError: if there is no such group.
     """
     if is_file(path):
-        cloud, mesh = (None, path) if has_faces(path) else (open_ply_points(path), None)
-        if cloud is not None and not cloud.count:
-            raise InputError(f"{path}: holds no points, so there is nothing to show. Look at what wrote it")
-        return ShownScene(path.name, cloud, mesh, (), "scene units", *_frame(()))
+        return _scene_of_ply(path)
     if not is_folder(path):
         raise InputError(f"{path}: no such file or folder. Give the output folder of a run, or a .ply file")
-    run = _run_json(path)
+    run = _summary(path)
     notes: list[str] = []
-    groups = (run.get("poses") or {}).get("groups") or [run.get("poses") or {}]
-    if group >= len(groups):
-        raise UsageError(f"--group {group}: {path} has {len(groups)} {'groups' if len(groups) > 1 else 'group'}, "
-                         f"numbered from 0")  # fmt: skip
-    if len(groups) > 1:
-        others = ", ".join(f"{number} ({len(groups[number].get('images') or ())} images)"
-                           for number in range(len(groups)) if number != group)  # fmt: skip
-        notes.append(f"shown is group {group} of {len(groups)}, each with a frame and a scale of its own; --group N "
-                     f"shows another: {others}")  # fmt: skip
+    chosen = _group_of(run, group, path, notes)
     cloud_name, mesh_name, model = group_file(_CLOUD, group), group_file(_MESH, group), f"{_MODELS}/{group}"
-    cloud_file, mesh_file = _written(path, run, cloud_name), _written(path, run, mesh_name)
+    mesh_file = _written(path, run, mesh_name)
     cameras = _cameras(path, model, run, images, notes)
     if doubtful := [camera.name for camera in cameras if camera.doubtful]:
         shown = ", ".join(doubtful[:_NAMED_DOUBTS]) + (" …" if len(doubtful) > _NAMED_DOUBTS else "")
         notes.append(f"doubtful: {shown}; the ranges of these cameras may be in the wrong place, see report.html")
-    cloud = None if cloud_file is None else open_ply_points(cloud_file)
-    if cloud is None:
-        notes.append(f"no {cloud_name}: the workflow has no export.ply, or the run did not get there")
-    elif not cloud.count:
-        cloud = None
-        notes.append(f"{cloud_name} holds no points: report.html tells why")
+    cloud = _cloud(_written(path, run, cloud_name), cloud_name, notes)
     if cloud is None and mesh_file is None and not cameras:
-        raise InputError(f"{path}: holds no {cloud_name} with points, no {mesh_name} and no {model}. Give the output "
-                         "folder of a run; its report.html tells what became of it")  # fmt: skip
-    metric = bool(groups[group].get("metric"))
+        raise InputError(
+            f"{path}: holds no {cloud_name} with points, no {mesh_name} and no {model}. Give the output "
+            "folder of a run; its report.html tells what became of it"
+        )
     return ShownScene(
         name=resolved(path).name,
         cloud=cloud,
         mesh=mesh_file,
         cameras=cameras,
-        unit="m" if metric else "scene units",
+        unit="m" if chosen.metric else "scene units",
         **dict(zip(("up", "ahead"), _frame(cameras), strict=True)),
         notes=tuple(notes),
     )
+
+
+def _scene_of_ply(path: Path) -> ShownScene:
+    cloud, mesh = (None, path) if has_faces(path) else (open_ply_points(path), None)
+    if cloud is not None and not cloud.count:
+        raise InputError(f"{path}: holds no points, so there is nothing to show. Look at what wrote it")
+    return ShownScene(path.name, cloud, mesh, (), "scene units", *_frame(()))
+
+
+def _group_of(run: RunSummary, group: int, path: Path, notes: list[str]) -> PosesSummary:
+    """Return the poses of a group; if there are several groups, a note names the others."""
+    groups = run.poses.by_group()
+    if group >= len(groups):
+        raise UsageError(f"--group {group}: {path} has {len(groups)} {plural(len(groups), 'group')}, numbered from 0")
+    if len(groups) > 1:
+        sizes = [f"{number} ({len(poses.registered)} images)" for number, poses in enumerate(groups)]
+        notes.append(
+            f"shown is group {group} of {len(groups)}, each with a frame and a scale of its own; --group N "
+            f"shows another: {', '.join(sizes[:group] + sizes[group + 1 :])}"
+        )
+    return groups[group]
+
+
+def _cloud(path: Path | None, name: str, notes: list[str]) -> PlyPoints | None:
+    """Return the vertices of a cloud; None, with a note, if there is no file or it holds no points."""
+    cloud = None if path is None else open_ply_points(path)
+    if cloud is not None and cloud.count:
+        return cloud
+    if cloud is None:
+        notes.append(f"no {name}: the workflow has no export.ply, or the run did not get there")
+    else:
+        notes.append(f"{name} holds no points: report.html tells why")
+    return None
 
 
 def is_to_see(files: Iterable[str]) -> bool:
@@ -159,45 +178,45 @@ def has_faces(path: Path) -> bool:
     return counted is not None and int(counted[1]) > 0
 
 
-def _run_json(folder: Path) -> Mapping[str, Any]:
-    """Return what run.json says; nothing if there is none, or it is no object: the files speak for themselves."""
+def _summary(folder: Path) -> RunSummary:
+    """Return what run.json says; an empty summary if there is none that can be read: the files are enough."""
     try:
-        value = json.loads((folder / "run.json").read_bytes())
-    except (OSError, ValueError):
-        return {}
-    return value if isinstance(value, dict) else {}
+        return RunSummary.read(folder)
+    except InputError:
+        return RunSummary()
 
 
-def _written(folder: Path, run: Mapping[str, Any], name: str) -> Path | None:
+def _written(folder: Path, run: RunSummary, name: str) -> Path | None:
     """Return the file of that name in the folder, or the first that the run wrote below it."""
-    names = [name, *(written for written in run.get("files") or () if PurePosixPath(written).name == name)]
+    names = [name, *(written for written in run.files if PurePosixPath(written).name == name)]
     return next((folder / found for found in names if is_file(folder / found)), None)
 
 
 def _cameras(
-    folder: Path, model_name: str, run: Mapping[str, Any], images: Path | None, notes: list[str]
+    folder: Path, model_name: str, run: RunSummary, images: Path | None, notes: list[str]
 ) -> tuple[ShownCamera, ...]:
     model = folder / model_name
     if not is_folder(model):
         notes.append(f"no {model_name}: the workflow has no export.colmap, or the run did not get there; no cameras")
         return ()
     poses = read_poses(model)
-    source = images or _source_folder(run)
-    previews = {str(view.get("name")): str(view.get("preview") or "") for view in run.get("views") or ()}
-    doubts = (run.get("poses") or {}).get("doubts") or {}
+    source = images or run.source_folder
+    previews = {view.name: view.preview for view in run.views}
     cameras = []
     for idx, name in enumerate(poses.names):
         picture = source / name if source is not None else None
         preview = folder / (previews.get(name) or f"preview/{PurePosixPath(name).with_suffix('.jpg')}")
-        cameras.append(ShownCamera(
-            name=name,
-            cam_from_world=poses.cam_from_world(idx),
-            picture=picture if picture is not None and is_file(picture) else None,
-            preview=preview if is_file(preview) else None,
-            range_file=_map_of(folder, "range", name, ".tiff"),
-            confidence_file=_map_of(folder, "confidence", name, ".png"),
-            doubtful=name in doubts,
-        ))  # fmt: skip
+        cameras.append(
+            ShownCamera(
+                name=name,
+                cam_from_world=poses.cam_from_world(idx),
+                picture=picture if picture is not None and is_file(picture) else None,
+                preview=preview if is_file(preview) else None,
+                range_file=_map_of(folder, "range", name, ".tiff"),
+                confidence_file=_map_of(folder, "confidence", name, ".png"),
+                doubtful=name in run.poses.doubts,
+            )
+        )
     if any(camera.picture is None for camera in cameras):
         where = source if source is not None else "the place from which the run read them"
         notes.append(f"panoramas are not in {where}: shown by their previews; give --images DIR for the pictures")
@@ -210,20 +229,12 @@ def _map_of(folder: Path, kind: str, name: str, suffix: str) -> Path | None:
     return next((path for path in candidates if is_file(path)), None)
 
 
-def _source_folder(run: Mapping[str, Any]) -> Path | None:
-    """Return the folder from which the run read its pictures."""
-    for stage in run.get("stages") or ():
-        if str(stage.get("use", "")).startswith("source.") and (stage.get("params") or {}).get("path"):
-            return Path(stage["params"]["path"])
-    return None
-
-
 def _frame(cameras: tuple[ShownCamera, ...]) -> tuple[FloatArray, FloatArray]:
     """Return the directions up and ahead: those of the cameras where they agree, else −y and z."""
     ups = np.array([-camera.cam_from_world.rotation[1] for camera in cameras]).reshape(-1, 3)
     mean = ups.mean(axis=0) if len(ups) else np.zeros(3)
     length = float(np.linalg.norm(mean))
-    up = mean / length if length > _LEAST_AGREEMENT else np.array([0.0, -1.0, 0.0])
+    up = mean / length if length > _MIN_AGREEMENT else np.array([0.0, -1.0, 0.0])
     ahead = cameras[0].cam_from_world.rotation[2] if cameras else np.array([0.0, 0.0, 1.0])
     ahead = ahead - up * float(ahead @ up)
     if np.linalg.norm(ahead) < 1e-6:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 FloatArray = NDArray[np.float64]
 
 OUTSIDE_ANGLE_DEG, INSIDE_ANGLE_DEG = 45.0, 80.0
-_LEAST_ANGLE_DEG, _LARGEST_ANGLE_DEG = 15.0, 110.0
+_MIN_ANGLE_DEG, _MAX_ANGLE_DEG = 15.0, 110.0
 # One does not look straight up or down: there the direction up has no meaning.
 _STEEPEST_DEG = 89.0
 # The scene fills the window up to this share.
@@ -88,7 +88,7 @@ class Viewpoint:
 
     def zoomed(self, steps: float) -> Viewpoint:
         """Return the view with a smaller angle for positive steps, within reason."""
-        angle = float(np.clip(self.angle_deg * 0.9**steps, _LEAST_ANGLE_DEG, _LARGEST_ANGLE_DEG))
+        angle = float(np.clip(self.angle_deg * 0.9**steps, _MIN_ANGLE_DEG, _MAX_ANGLE_DEG))
         return replace(self, angle_deg=angle)
 
 

@@ -25,7 +25,7 @@ TEXTURED = 64
 _BACKGROUND, _BACKGROUND_TOP, _INK = "#15181d", "#2b313a", "#e8ebf0"
 _ACCENT, _DOTS, _RIM = "#ffb454", "#7fb4ff", "#4da3ff"
 _RIM_OUTSIDE, _RIM_INSIDE = 1.1, 1.03
-_MOST_LABELS = 300
+_MAX_LABELS = 300
 _SURROUND_SHARE = 2.0
 _FONT_SHARE = 1 / 72
 # Upper right, as least and greatest x and y: the bar lies at the lower edge, texts in other corners.
@@ -87,9 +87,12 @@ class SceneWindow:
         parallel = bool(camera.parallel_projection)
         return replace(
             self.tour.state.viewpoint,
-            eye=np.array(camera.position), target=np.array(camera.focal_point), up=np.array(camera.up),
-            angle_deg=float(camera.view_angle), height=2 * float(camera.parallel_scale) if parallel else 0.0,
-        )  # fmt: skip
+            eye=np.array(camera.position),
+            target=np.array(camera.focal_point),
+            up=np.array(camera.up),
+            angle_deg=float(camera.view_angle),
+            height=2 * float(camera.parallel_scale) if parallel else 0.0,
+        )
 
     def update(self) -> None:
         """Show the tour's state."""
@@ -130,9 +133,14 @@ class SceneWindow:
         if self.tour.scene.mesh is not None:
             mesh = pyvista.read(self.tour.scene.mesh)
             colored = "RGB" in mesh.array_names
-            self._mesh = self.plotter.add_mesh(mesh, scalars="RGB" if colored else None, rgb=colored,
-                                               color=None if colored else "#b8bcc4", name="mesh",
-                                               reset_camera=False)  # fmt: skip
+            self._mesh = self.plotter.add_mesh(
+                mesh,
+                scalars="RGB" if colored else None,
+                rgb=colored,
+                color=None if colored else "#b8bcc4",
+                name="mesh",
+                reset_camera=False,
+            )
 
     def _add_bar(self) -> None:
         """Lay a line of known length along the lower front edge of the scene."""
@@ -222,7 +230,7 @@ class SceneWindow:
         self.plotter.remove_actor("names", render=False)
         named = [state.hovered] if state.hovered is not None else []
         if state.labels and state.cameras:
-            named = [int(idx) for idx in self._nearest(state.viewpoint.eye, _MOST_LABELS) if idx != state.inside]
+            named = [int(idx) for idx in self._nearest(state.viewpoint.eye, _MAX_LABELS) if idx != state.inside]
         if named:
             above = centers[named] + 1.4 * self.tour.radius * self.tour.scene.up
             self._overlay.label(above, [self.tour.scene.cameras[idx].label for idx in named], "names")
@@ -256,8 +264,9 @@ class SceneWindow:
             self.plotter.add_actor(self._rims, name="rims", reset_camera=False, pickable=False)
         others = np.delete(tour.centers, sorted(textured), axis=0)
         if len(others):
-            self._dots = self.plotter.add_points(others, color=_DOTS, point_size=0.7 * self._font, name="dots",
-                                                 reset_camera=False, pickable=False)  # fmt: skip
+            self._dots = self.plotter.add_points(
+                others, color=_DOTS, point_size=0.7 * self._font, name="dots", reset_camera=False, pickable=False
+            )
 
     def _show_picked(self, state: TourState) -> None:
         for name in ("picked", "measured", "distance"):
@@ -265,8 +274,15 @@ class SceneWindow:
         if not state.picked:
             return
         points = np.array(state.picked)
-        self.plotter.add_points(points, color=_ACCENT, point_size=self._font, render_points_as_spheres=True,
-                                name="picked", reset_camera=False, pickable=False)  # fmt: skip
+        self.plotter.add_points(
+            points,
+            color=_ACCENT,
+            point_size=self._font,
+            render_points_as_spheres=True,
+            name="picked",
+            reset_camera=False,
+            pickable=False,
+        )
         distance = self.tour.distance
         if distance is not None:
             self.plotter.add_lines(points, color=_ACCENT, width=3, name="measured")

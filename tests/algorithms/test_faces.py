@@ -3,48 +3,57 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pycolmap
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.layout import covers_sphere, default_face_size, panorama_faces
 from pano_mvs.algorithms.faces.pictures import face_image, face_mask
 from pano_mvs.algorithms.faces.ranges import face_confidence, face_normals, face_z_depth
 from pano_mvs.algorithms.faces.render import face_source, render_face
 from pano_mvs.core.errors import UsageError
-from pano_mvs.geometry import ray_grid, roll_panorama, rotation_from_rotvec
+from pano_mvs.geometry import PinholeView, Rigid3, ray_grid, roll_panorama, rotation_from_rotvec
 from pano_mvs.scene import RangeMap
+from pano_mvs.scene.face_files import FaceLayout
 from pano_mvs.testing.room import capture_poses, default_room, range_along, render
 from tests.oracles.faces import z_depth as slow_z_depth
+
+View = tuple[NDArray[np.uint8], NDArray[np.float32], Rigid3]
 
 SIZE = (128, 256)
 LAYOUTS = ("cube", "octagon", "icosahedron")
 
 
 @pytest.fixture(scope="module")
-def panorama():
+def panorama() -> View:
     """Picture, true ranges and pose of a tilted camera in the room."""
     pose = capture_poses(2, seed=3)[1]
     return *render(default_room(), pose, SIZE), pose
 
 
-def smooth_panorama(size_hw=SIZE):
+def smooth_panorama(size_hw: tuple[int, int] = SIZE) -> NDArray[np.uint8]:
     """A picture whose colours are linear in the ray, so that every place has a known one."""
     return np.rint(128 + 100 * ray_grid(size_hw)).astype(np.uint8)
 
 
-def unit_rays(view):
+def unit_rays(view: PinholeView) -> NDArray[np.float64]:
     rays = view.rays()
-    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    result: NDArray[np.float64] = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    return result
 
 
-def valid_but_for_a_disc(center, radius_deg=12.0):
-    return ray_grid(SIZE) @ (np.array(center) / np.linalg.norm(center)) < np.cos(np.radians(radius_deg))
+def valid_but_for_a_disc(center: tuple[float, float, float], radius_deg: float = 12.0) -> NDArray[np.bool_]:
+    result: NDArray[np.bool_] = ray_grid(SIZE) @ (np.array(center) / np.linalg.norm(center)) < np.cos(
+        np.radians(radius_deg)
+    )
+    return result
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_faces_are_right_handed_named_and_cover_the_sphere(layout):
+def test_faces_are_right_handed_named_and_cover_the_sphere(layout: FaceLayout) -> None:
     faces = panorama_faces(SIZE, layout=layout)
     assert len({face.name for face in faces}) == len(faces) == {"cube": 6, "octagon": 10, "icosahedron": 20}[layout]
     for face in faces:
@@ -56,7 +65,7 @@ def test_faces_are_right_handed_named_and_cover_the_sphere(layout):
     assert not covers_sphere(panorama_faces(SIZE, layout=layout, fov_deg=70))
 
 
-def test_faces_look_where_their_names_say():
+def test_faces_look_where_their_names_say() -> None:
     axes = {face.name: face.view.view_from_cam[2] for face in panorama_faces(SIZE)}
     assert axes["front"] == pytest.approx((0, 0, 1))
     assert axes["right"] == pytest.approx((1, 0, 0))
@@ -66,7 +75,7 @@ def test_faces_look_where_their_names_say():
     assert all(around[name][1] == pytest.approx((0, 1, 0)) for name in ("front", "right", "back-left"))
 
 
-def test_the_camera_is_colmaps_pinhole_camera():
+def test_the_camera_is_colmaps_pinhole_camera() -> None:
     view = panorama_faces(SIZE, fov_deg=96, size_px=300)[3].view
     camera = pycolmap.Camera(model="PINHOLE", width=300, height=300, params=[view.focal_px, view.focal_px, 150, 150])
     assert view.calibration == pytest.approx(camera.calibration_matrix())
@@ -80,14 +89,14 @@ def test_the_camera_is_colmaps_pinhole_camera():
     assert np.degrees(np.arctan2(left[0], left[2])) == pytest.approx(-48)
 
 
-def test_pixels_and_rays_are_each_others_inverse():
+def test_pixels_and_rays_are_each_others_inverse() -> None:
     for face in panorama_faces(SIZE, layout="icosahedron", fov_deg=80, size_px=24):
         x, y = np.meshgrid(np.arange(24) + 0.5, np.arange(24) + 0.5)
         assert face.view.pixels_from_rays(face.view.rays()) == pytest.approx(np.stack([x, y], axis=-1), abs=1e-9)
         assert face.view.contains(face.view.pixels_from_rays(face.view.rays())).all()
 
 
-def test_the_default_size_keeps_the_resolution():
+def test_the_default_size_keeps_the_resolution() -> None:
     for fov_deg in (60.0, 90.0, 96.0, 120.0):
         faces = panorama_faces((512, 1024), fov_deg=fov_deg)
         assert faces[0].view.size_hw[0] == default_face_size((512, 1024), fov_deg=fov_deg)
@@ -95,20 +104,20 @@ def test_the_default_size_keeps_the_resolution():
 
 
 @pytest.mark.parametrize("wrong", [{"fov_deg": 20.0}, {"fov_deg": 170.0}, {"fov_deg": np.nan}, {"size_px": 2}])
-def test_faces_that_are_none_are_refused(wrong):
+def test_faces_that_are_none_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match="a face must be"):
         panorama_faces(SIZE, **wrong)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_colors_are_those_of_the_rays(layout):
+def test_colors_are_those_of_the_rays(layout: FaceLayout) -> None:
     image = smooth_panorama()
     for face in panorama_faces(SIZE, layout=layout, fov_deg=100):
         expected = 128 + 100 * unit_rays(face.view)
         assert np.abs(face_image(image, face.view) - expected).max() < 2, face.name
 
 
-def test_a_coarse_face_averages_and_does_not_alias():
+def test_a_coarse_face_averages_and_does_not_alias() -> None:
     """Every second column black: a face with half the pixels is grey, where single samples would be stripes."""
     stripes = np.zeros((*SIZE, 3), np.uint8)
     stripes[:, ::2] = 255
@@ -117,7 +126,7 @@ def test_a_coarse_face_averages_and_does_not_alias():
     assert np.abs(middle - 127.5).max() < 40
 
 
-def test_colors_roll_with_the_panorama(panorama):
+def test_colors_roll_with_the_panorama(panorama: View) -> None:
     rolled, turn = roll_panorama(panorama[0], 37)
     for face in panorama_faces(SIZE):
         turned = replace(face.view, view_from_cam=face.view.view_from_cam @ turn.T)
@@ -125,7 +134,7 @@ def test_colors_roll_with_the_panorama(panorama):
         assert np.percentile(difference, 99) <= 2, face.name
 
 
-def test_z_depths_are_the_true_ones_between_steps(panorama):
+def test_z_depths_are_the_true_ones_between_steps(panorama: View) -> None:
     _, ranges, pose = panorama
     errors = []
     for face in panorama_faces(SIZE, size_px=64):
@@ -138,7 +147,7 @@ def test_z_depths_are_the_true_ones_between_steps(panorama):
 
 @pytest.mark.kernel("faces.kernels_faces")
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_the_compiled_loop_is_the_plain_one(panorama, layout):
+def test_the_compiled_loop_is_the_plain_one(panorama: View, layout: FaceLayout) -> None:
     ranges = panorama[1].copy()
     ranges[np.random.default_rng(2).random(SIZE) < 0.02] = np.nan
     turn = rotation_from_rotvec((0.11, 0.23, 0.05))  # so that no ray lies exactly between two pixels
@@ -151,7 +160,7 @@ def test_the_compiled_loop_is_the_plain_one(panorama, layout):
         np.testing.assert_allclose(one, expected, rtol=1e-6)
 
 
-def test_no_depth_lies_between_two_surfaces_and_no_hole_is_closed():
+def test_no_depth_lies_between_two_surfaces_and_no_hole_is_closed() -> None:
     ranges = np.full(SIZE, 2.0, np.float32)
     ranges[:, ::2] = 5.0
     ranges[:, 60:80] = np.nan
@@ -163,7 +172,7 @@ def test_no_depth_lies_between_two_surfaces_and_no_hole_is_closed():
     assert np.isnan(face_z_depth(ranges, left.view)).mean() > 0.15
 
 
-def test_normals_turn_into_the_faces_frame():
+def test_normals_turn_into_the_faces_frame() -> None:
     """All normals of a sphere around the camera look back along the rays, in any face."""
     for face in panorama_faces(SIZE, layout="octagon"):
         normals = face_normals(-ray_grid(SIZE).astype(np.float32), face.view)
@@ -174,7 +183,7 @@ def test_normals_turn_into_the_faces_frame():
 
 @pytest.mark.parametrize("size_px", [20, 64, 160])
 @pytest.mark.parametrize("center", [(0, 0, -1), (0, 1, 0), (1, -0.2, 1)], ids=["seam", "nadir", "edge"])
-def test_nothing_masked_is_seen(center, size_px):
+def test_nothing_masked_is_seen(center: tuple[int, float, int], size_px: int) -> None:
     """What is masked may have any colour and any range: no face changes where its mask is True."""
     valid = valid_but_for_a_disc(center)
     image, ranges = smooth_panorama(), np.full(SIZE, 3.0, np.float32)
@@ -200,7 +209,7 @@ def test_nothing_masked_is_seen(center, size_px):
     assert face_confidence(confidence, face.view).shape == face.view.size_hw
 
 
-def test_doubtful_ranges_have_no_depth(panorama):
+def test_doubtful_ranges_have_no_depth(panorama: View) -> None:
     image, ranges, _ = panorama
     confidence = np.full(SIZE, 200, np.uint8)
     confidence[:, :100] = 40
@@ -210,7 +219,7 @@ def test_doubtful_ranges_have_no_depth(panorama):
     assert (rendered.confidence == 0).mean() > 0.3
 
 
-def test_normals_are_given_or_fitted_and_face_the_camera(panorama):
+def test_normals_are_given_or_fitted_and_face_the_camera(panorama: View) -> None:
     image, ranges, _ = panorama
     valid, view = np.ones(SIZE, np.bool_), panorama_faces(SIZE)[0].view
     confidence = np.full(SIZE, 200, np.uint8)
@@ -222,7 +231,7 @@ def test_normals_are_given_or_fitted_and_face_the_camera(panorama):
     assert given.normals_in_face == pytest.approx(np.broadcast_to(turned[0, 0], (*view.size_hw, 3)), abs=1e-3)
 
 
-def test_arrays_that_do_not_fit_are_named(panorama):
+def test_arrays_that_do_not_fit_are_named(panorama: View) -> None:
     image, ranges, _ = panorama
     view = panorama_faces(SIZE)[0].view
     with pytest.raises(UsageError, match="differ in size"):

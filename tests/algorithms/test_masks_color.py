@@ -26,16 +26,19 @@ def room() -> np.ndarray:
 
 @pytest.mark.parametrize("pixel", [(128, 64), (0, 64), (30, 0.5), (200, 127.5)])
 @pytest.mark.parametrize("color", [(0, 0, 0), (10, 200, 90)])
-def test_a_disc_is_found_anywhere_after_compression(room, pixel, color):
+def test_a_disc_is_found_anywhere_after_compression(
+    room: np.ndarray, pixel: tuple[int, float], color: tuple[int, int, int]
+) -> None:
     drawn = disc(ray_from_pixel(np.array(pixel), SIZE_HW), 12)
     picture = np.where(drawn[..., None], np.array(color, np.uint8), room)
-    picture = cv2.imdecode(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90])[1], cv2.IMREAD_COLOR)
-    found = areas_of_color(picture, color, tolerance=12)
+    compressed = cv2.imdecode(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90])[1], cv2.IMREAD_COLOR)
+    assert compressed is not None
+    found = areas_of_color(compressed, color, tolerance=12)
     assert found[drawn].mean() > 0.97
     assert not found[~disc(ray_from_pixel(np.array(pixel), SIZE_HW), 30)].any()
 
 
-def test_what_is_small_or_of_another_colour_is_left(room):
+def test_what_is_small_or_of_another_colour_is_left(room: np.ndarray) -> None:
     small = disc(np.array([0.0, 0.0, 1.0]), 1.0)
     assert not areas_of_color(np.where(small[..., None], np.uint8(0), room), (0, 0, 0), min_area_deg2=10).any()
     large = disc(np.array([0.0, 1.0, 0.0]), 20.0)
@@ -45,7 +48,7 @@ def test_what_is_small_or_of_another_colour_is_left(room):
     np.testing.assert_array_equal(found, large)
 
 
-def test_areas_are_of_the_sphere_not_of_the_grid(room):
+def test_areas_are_of_the_sphere_not_of_the_grid(room: np.ndarray) -> None:
     """Over the seam, over the poles: rolled pictures give rolled areas, and one area is not two halves."""
     ring = disc(np.array([0.0, 0.0, -1.0]), 1.5)
     area = np.degrees(1) ** 2 * (pixel_solid_angle(SIZE_HW)[:, None] * ring).sum()
@@ -60,7 +63,7 @@ def test_areas_are_of_the_sphere_not_of_the_grid(room):
     assert areas_of_color(cap, (0, 0, 0), min_area_deg2=0.7 * area).any()
 
 
-def test_numbers_that_make_no_sense_are_refused(room):
+def test_numbers_that_make_no_sense_are_refused(room: np.ndarray) -> None:
     with pytest.raises(UsageError, match="must not be negative"):
         areas_of_color(room, (0, 0, 0), tolerance=-1)
     with pytest.raises(UsageError, match="must be \\(H, W, 3\\) uint8"):

@@ -14,6 +14,7 @@ from pano_mvs.geometry import Rigid3
 from pano_mvs.io.truth import read_truth
 from pano_mvs.scene import FilePart, Panorama
 from pano_mvs.testing.scenes import SCENES, Scene
+from tests.stored import read_picture
 
 
 @dataclass(frozen=True)
@@ -37,10 +38,13 @@ class Capture:
     def first(self, count: int) -> Capture:
         """Return the first few views only."""
         names = list(self.panoramas)[:count]
-        panoramas, poses, ranges = (
-            {name: part[name] for name in names} for part in (self.panoramas, self.poses, self.ranges)
+        return Capture(
+            self.name,
+            {name: self.panoramas[name] for name in names},
+            {name: self.poses[name] for name in names},
+            {name: self.ranges[name] for name in names},
+            self.outdoor,
         )
-        return Capture(self.name, panoramas, poses, ranges, self.outdoor)
 
 
 def read_capture(folder: Path, *, width: int | None = None) -> Capture:
@@ -57,7 +61,7 @@ def read_capture(folder: Path, *, width: int | None = None) -> Capture:
         if true is None:
             continue
         path = next(path for path in (folder / view.name, folder / "rgb" / view.name) if path.is_file())
-        height, own_width = cv2.imread(str(path)).shape[:2]
+        height, own_width = read_picture(path).shape[:2]
         size = height * (width or own_width) // own_width, width or own_width
         name = Path(view.name).name
         panoramas[name] = Panorama(FilePart(path), size, (height, own_width))
@@ -97,4 +101,7 @@ def scene_captures(
 def _shrunk(ranges: NDArray[np.float32], size_hw: tuple[int, int]) -> NDArray[np.float32]:
     if ranges.shape == size_hw:
         return ranges
-    return cv2.resize(ranges, size_hw[::-1], interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float32)
+    result: NDArray[np.float32] = cv2.resize(ranges, size_hw[::-1], interpolation=cv2.INTER_NEAREST_EXACT).astype(
+        np.float32
+    )
+    return result

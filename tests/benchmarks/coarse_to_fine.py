@@ -23,6 +23,7 @@ from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.geometry import Rigid3
 from pano_mvs.testing.room import default_room, render
 from pano_mvs.testing.scenes import SCENES, Scene
+from tests.stored import read_picture
 
 Case = tuple[str, list[np.ndarray], list[Rigid3], np.ndarray, np.ndarray | None]
 
@@ -40,7 +41,8 @@ def _thin(scene: Scene, truth: np.ndarray) -> np.ndarray:
     count = len(default_room().surfaces)
     empty = dataclasses.replace(scene.room, surfaces=scene.room.surfaces[:count], textures=scene.room.textures[:count])
     behind = render(empty, scene.poses[0], truth.shape, supersample=1)[1]
-    return np.abs(behind - truth) > 0.05 * truth
+    result: np.ndarray = np.abs(behind - truth) > 0.05 * truth
+    return result
 
 
 def measure(case: Case, settings: SweepSettings, *, levels: Sequence[int], rounds: int) -> None:
@@ -97,7 +99,7 @@ def _capture(folder: Path, rows: int, sources: int) -> Case:
     truth = np.load(next(folder.rglob("depth.npz")))
     pictures, poses = [], []
     for view in listed:
-        picture = cv2.cvtColor(cv2.imread(str(next(folder.rglob(Path(view["image"]).name)))), cv2.COLOR_BGR2RGB)
+        picture = cv2.cvtColor(read_picture(next(folder.rglob(Path(view["image"]).name))), cv2.COLOR_BGR2RGB)
         pictures.append(cv2.resize(picture, (2 * rows, rows), interpolation=cv2.INTER_AREA))
         poses.append(Rigid3(np.array(view["R"], float), np.array(view["t"], float)))
     first = truth[Path(listed[0]["image"]).stem]

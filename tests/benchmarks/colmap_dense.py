@@ -13,6 +13,7 @@ import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -43,7 +44,7 @@ def write_workspace(
     ranges: Mapping[str, RangeMap],
     *,
     points: int = 20_000,
-    **faces: object,
+    **faces: Any,
 ) -> Path:
     """Write colmap_dense/ into a folder by the stages themselves, and return it."""
     scratch = out / "scratch"
@@ -80,7 +81,7 @@ def deliver(files: Files, out: Path, item: str) -> None:
 def fused_points(workspace: Path, *, min_num_pixels: int = 3, masks: bool = False) -> FloatArray:
     """Return the points, (N, 3), that COLMAP's fusion makes of a workspace."""
     pycolmap.logging.minloglevel = 2
-    options = {"num_threads": 1, "min_num_pixels": min_num_pixels}
+    options: dict[str, Any] = {"num_threads": 1, "min_num_pixels": min_num_pixels}
     if masks:
         options["mask_path"] = str(workspace / "masks")
     target = workspace / "fused.ply"

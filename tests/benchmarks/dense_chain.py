@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.cli.session import open_session
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.ports import Cardinality, Port
 from pano_mvs.engine.stages.stage import INDEX_PORT
@@ -24,6 +23,7 @@ from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import StageEntry
 from pano_mvs.scene import Axis, Panorama, Pose, Poses, RangeMap, Record, Views
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
+from pano_mvs.session.session import open_session
 from tests.benchmarks.captures import Capture
 from tests.benchmarks.depth_metrics import DepthMetrics, depth_metrics
 

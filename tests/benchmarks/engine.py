@@ -16,13 +16,13 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from pano_mvs.cli.session import open_session
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.processes import ProcessExecutor
 from pano_mvs.engine.executors.protocol import Executor
 from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.running.events import RunResult
 from pano_mvs.engine.running.run import Run
+from pano_mvs.session.session import open_session
 from tests.engine.toy import HELPER, PLUGIN
 
 UNITS = 5000
@@ -145,7 +145,7 @@ def _run(folder: Path, workflow: str, make: Callable[[Store], Executor], cache: 
     store = Store(session.store_root)
     executor = make(store)
     try:
-        return Run(session.workflow, session.graph, store, session.out, executor=executor).execute()
+        return Run(session.workflow, session.graph, store, out=session.out, executor=executor).execute()
     finally:
         executor.close()
 

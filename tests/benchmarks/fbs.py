@@ -8,11 +8,14 @@ from __future__ import annotations
 import statistics
 import sys
 import time
+from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
 
 from pano_mvs.algorithms.filters import bilateral_solver as solver
+from pano_mvs.algorithms.filters.confidence import confidence_weight
 from pano_mvs.algorithms.filters.sphere_cells import sphere_cells
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import RangeMap
@@ -38,11 +41,11 @@ def main(height: int) -> None:
     """Print the time of the whole, of its parts, and the scores before and after."""
     image, truth = render(default_room(), Rigid3.identity(), (height, 2 * height), supersample=1)
     broken = harmed(truth)
-    weight = np.where(broken.valid, solver.confidence_weight(broken.confidence), 0.0)
+    weight = np.where(broken.valid, confidence_weight(broken.confidence), 0.0)
     target = np.where(broken.valid, 1 / broken.range.astype(np.float64), 0.0)
     cells = sphere_cells(truth.shape, 8.0)
     colors = solver._color_bins(image, 8.0, 8.0)
-    works = {
+    works: dict[str, Callable[[], Any]] = {
         "whole": lambda: solver.fast_bilateral_solver(broken, image),
         "cells": lambda: sphere_cells(truth.shape, 8.0),
         "colours": lambda: solver._color_bins(image, 8.0, 8.0),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import statistics
 import time
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -15,13 +16,14 @@ import numpy as np
 from pano_mvs.algorithms.features.sphorb import extract_sphorb
 from pano_mvs.algorithms.features.tangent import extract_orb, extract_sift
 from pano_mvs.geometry import Rigid3
+from pano_mvs.scene import Features
 from pano_mvs.testing.room import default_room, render
 
 RUNS = 5
 WIDTHS = (1024, 1280, 2048)
 KEYPOINTS = 10_000
 LIMIT_S = 1.5  # SPHORB at 640 × 1280, warm, one core
-EXTRACTORS = {"sift": extract_sift, "orb": extract_orb, "sphorb": extract_sphorb}
+EXTRACTORS: dict[str, Callable[..., Features]] = {"sift": extract_sift, "orb": extract_orb, "sphorb": extract_sphorb}
 
 
 def main() -> None:

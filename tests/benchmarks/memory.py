@@ -13,6 +13,7 @@ import resource
 import subprocess
 import sys
 from collections.abc import Sequence
+from typing import Literal
 
 import numba
 import numpy as np
@@ -37,7 +38,7 @@ def peak_mb(rows: int, planes: int, sources: int, aggregation: str, threads: int
     return (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
 
 
-def large_peak_mb(rows: int, planes: int, aggregation: str, threads: int) -> float:
+def large_peak_mb(rows: int, planes: int, aggregation: Literal["box", "sgm"], threads: int) -> float:
     """Return the peak of a process, in MB, that runs the stage on three panoramas; to be called once in a process."""
     numba.set_num_threads(threads)
     images, poses = pictures(rows, 2)

@@ -16,12 +16,12 @@ import tempfile
 import time
 from pathlib import Path
 
-from pano_mvs.cli.plan_command import without_collector
-from pano_mvs.cli.session import open_session
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
-from pano_mvs.engine.running.run import Run, workflow_id
+from pano_mvs.engine.running.run import Run
+from pano_mvs.session.planning import without_collector
+from pano_mvs.session.session import open_session
 
 ITEMS = 5000
 PLUGIN = """
@@ -179,10 +179,10 @@ def _measure(step: str, folder: Path) -> None:
     store = Store(session.store_root)
     if step.startswith("plan"):
         with without_collector():
-            counts = _count(make_plan(session.workflow, session.graph, store, workflow_id(session.workflow)))
+            counts = _count(make_plan(session.workflow, session.graph, store))
         store.stat_cache.save()
     else:
-        result = Run(session.workflow, session.graph, store, session.out, executor=SerialExecutor(store)).execute()
+        result = Run(session.workflow, session.graph, store, out=session.out, executor=SerialExecutor(store)).execute()
         counts = f"{sum(s.cached for s in result.stages)} / {sum(s.run for s in result.stages)}"
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000
     print(f"| {step} | {counts} | {time.process_time() - cpu:.2f} | {time.perf_counter() - wall:.2f} | {peak:.0f} |",

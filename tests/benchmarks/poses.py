@@ -10,12 +10,14 @@ median over all pairs of the larger of rotation and direction error, the areas u
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import tempfile
 import time
 from collections.abc import Callable
 from itertools import combinations
 from pathlib import Path
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -144,7 +146,10 @@ def show(label: str, found: Cameras, truth: Cameras, seconds: float) -> float:
     return errors.median_pair_deg
 
 
-def timed(work: Callable[[Path], Cameras]) -> tuple[Cameras, float]:
+Value = TypeVar("Value")
+
+
+def timed(work: Callable[[Path], Value]) -> tuple[Value, float]:
     """Return the result of some work in an empty folder, and its seconds."""
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
@@ -157,15 +162,18 @@ def measure(pictures: Pictures, truth: Cameras) -> None:
     print(f"  {'':32s} {'median °':>8s}  " + " ".join(f"@{limit:<4g}" for limit in AUC_LIMITS_DEG))
     bar = 180.0
     for mapper in MAPPERS:
-        found, seconds = timed(lambda folder, mapper=mapper: native(pictures, mapper, folder))
+        found, seconds = timed(functools.partial(native, pictures, mapper))
         bar = min(bar, show(f"native {mapper}", found, truth, seconds))
     start = time.perf_counter()
     features, two_views = matched(pictures)
     print(f"  our key points and matches: {time.perf_counter() - start:.1f} s")
+
+    def by_colmap(folder: Path, *, mapper: Any, cameras: Any) -> Poses:
+        rng = np.random.default_rng(SEED)
+        return solve_colmap(features, two_views, mapper=mapper, cameras=cameras, rng=rng, scratch=folder)
+
     rows: dict[str, Callable[[Path], Poses]] = {
-        f"poses.colmap {mapper} {cameras}": lambda folder, mapper=mapper, cameras=cameras: solve_colmap(
-            features, two_views, mapper=mapper, cameras=cameras, rng=np.random.default_rng(SEED), scratch=folder
-        )
+        f"poses.colmap {mapper} {cameras}": functools.partial(by_colmap, mapper=mapper, cameras=cameras)
         for mapper in MAPPERS
         for cameras in ("sphere", "faces")
     }
@@ -173,11 +181,11 @@ def measure(pictures: Pictures, truth: Cameras) -> None:
         features, two_views, rng=np.random.default_rng(SEED)
     )
     for label, solve in rows.items():
-        poses: list[Poses] = []
-        found, seconds = timed(lambda folder, solve=solve, poses=poses: poses.append(solve(folder)) or {})
-        errors = [show(label, cameras_of(poses[0]), truth, seconds)]
-        found, seconds = timed(lambda folder, poses=poses: cameras_of(refine_poses(poses[0])))
-        errors.append(show("  … poses.refine", found, truth, seconds))
+        poses, seconds = timed(solve)
+        errors = [show(label, cameras_of(poses), truth, seconds)]
+        start = time.perf_counter()
+        refined = refine_poses(poses)
+        errors.append(show("  … poses.refine", cameras_of(refined), truth, time.perf_counter() - start))
         verdicts = ["goal" if error <= bar / 2 else "bar" if error <= bar else "MISSED" for error in errors]
         print(f"  {'':32s} better native {bar:.4f}°: {verdicts[0]}, refined {verdicts[1]}")
 

@@ -12,6 +12,7 @@ Pictures, key points and verified matches are kept in the cache folder: empty it
 from __future__ import annotations
 
 import argparse
+import functools
 import pickle
 import tempfile
 import time
@@ -120,20 +121,18 @@ def main() -> None:
         for draw in range(given.draws):
             name = place.name if isinstance(place, Path) else place
             stem = given.cache / f"{name}-{given.views}-{draw}"
-            pictures, truth = cached(
-                stem.with_suffix(".capture"), lambda place=place, draw=draw: capture(place, draw, given.views)
-            )
-            pairs = cached(stem.with_suffix(".matches"), lambda pictures=pictures: matched(pictures))
+            pictures, truth = cached(stem.with_suffix(".capture"), functools.partial(capture, place, draw, given.views))
+            pairs = cached(stem.with_suffix(".matches"), functools.partial(matched, pictures))
             for label, cameras, seconds in measured(pictures, pairs):
                 rows.setdefault(label, []).append((*judged(cameras, truth), seconds))
             if given.native:
-                cameras = cached(stem.with_suffix(".native"), lambda pictures=pictures: native_cameras(pictures))
+                cameras = cached(stem.with_suffix(".native"), functools.partial(native_cameras, pictures))
                 rows.setdefault("COLMAP alone", []).append((*judged(cameras, truth), 0.0))
         for label, row in rows.items():
             medians = [median for median, *_ in row]
             each = " ".join(f"{median:.4f}" for median in medians)
             wrong, registered = sum(item[1] for item in row), sum(item[2] for item in row)
-            expected, seconds = given.draws * given.views, np.mean([item[3] for item in row])
+            expected, seconds = given.draws * given.views, float(np.mean([item[3] for item in row]))
             print(f"| {name} | {label} | {each} | {np.nanmean(medians):.4f} | {wrong} | {registered}/{expected} | "
                   f"{seconds:.2f} |", flush=True)  # fmt: skip
 

@@ -18,7 +18,8 @@ from pano_mvs.engine.cache.store import Store
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.images.preview import write_preview
 from pano_mvs.report import write_report
-from pano_mvs.report.results import Results
+from pano_mvs.results.stored_values import StoredValues
+from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene import Poses, RangeMap
 from pano_mvs.testing.room import default_room, render
 
@@ -26,7 +27,7 @@ _SIZE_HW = (64, 128)
 _OBSERVATIONS, _PAIRS, _POINTS = 400, 8, 100_000
 
 
-def made(folder: Path, count: int) -> tuple[dict[str, Any], Results]:
+def made(folder: Path, count: int) -> tuple[dict[str, Any], StoredValues]:
     """Return what a run over so many views would leave."""
     rng = np.random.default_rng(0)
     names = [f"{idx:05d}.jpg" for idx in range(count)]
@@ -54,7 +55,7 @@ def made(folder: Path, count: int) -> tuple[dict[str, Any], Results]:
         "views": views,
         "poses": {"registered": names, "rejected": {}, "centers": poses.centers.tolist(), "links": links},
     }
-    return summary, Results(store, {"poses": {"": store.put_value(poses)}, "ranges": ranges})
+    return summary, StoredValues(store, {"poses": {"": store.put_value(poses)}, "ranges": ranges})
 
 
 def _poses(names: list[str], rng: np.random.Generator) -> Poses:
@@ -87,7 +88,9 @@ def main(count: int) -> None:
         summary, results = made(folder, count)
         for what in ("first", "again"):
             passed, worked = time.perf_counter(), time.process_time()
-            write_report(folder / "out", summary, Results(Store(folder / "cache"), results.refs))
+            write_report(
+                folder / "out", RunSummary.from_json(summary), StoredValues(Store(folder / "cache"), results.refs)
+            )
             size = (folder / "out" / "report.html").stat().st_size
             print(f"{count} views, {what}: {time.process_time() - worked:.2f} s of work, "
                   f"{time.perf_counter() - passed:.2f} s passed, {size / 1e6:.1f} MB")  # fmt: skip

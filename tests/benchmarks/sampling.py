@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.numba.packing import pack_colors
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR, PIXELS, sample_rgb_block
@@ -26,7 +28,14 @@ def cpu_seconds(work: Callable[[], object]) -> float:
 
 
 @njit(nogil=True, error_model="numpy")
-def _split(x, y, stride, index, weight_x, weight_y):  # type: ignore[no-untyped-def]
+def _split(
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
+    stride: int,
+    index: NDArray[np.int32],
+    weight_x: NDArray[np.int32],
+    weight_y: NDArray[np.int32],
+) -> None:
     for i in range(_U(index.shape[0])):
         column, row = np.int32(x[i]), np.int32(y[i])
         index[i] = np.int32(row * np.int32(stride) + column)
@@ -37,7 +46,17 @@ def _split(x, y, stride, index, weight_x, weight_y):  # type: ignore[no-untyped-
 
 
 @njit(nogil=True, error_model="numpy")
-def _sample(packed, x, y, stride, convert, index, weight_x, weight_y, out):  # type: ignore[no-untyped-def]
+def _sample(
+    packed: NDArray[np.uint32],
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
+    stride: int,
+    convert: bool,
+    index: NDArray[np.int32],
+    weight_x: NDArray[np.int32],
+    weight_y: NDArray[np.int32],
+    out: NDArray[Any],
+) -> None:
     if convert:
         _split(x, y, stride, index, weight_x, weight_y)
     for i in range(0, index.shape[0], PIXELS):

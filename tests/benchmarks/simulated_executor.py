@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
+from unittest.mock import patch
 
-from pano_mvs.cli import run_command
 from pano_mvs.cli.app import main
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
-from pano_mvs.engine.executors.protocol import Executor, Job, Outcome
+from pano_mvs.engine.executors.execute import execute_unit
+from pano_mvs.engine.executors.protocol import Executor, Job, JobOutcome
 from pano_mvs.engine.executors.serial import SerialExecutor
-from pano_mvs.engine.running.execute import execute_unit
 
 STOP_VARIABLE = "SIMULATED_STOP_AFTER"
 """After so many units the run is interrupted."""
@@ -31,7 +31,7 @@ class SimulatedExecutor(SerialExecutor):
         self._first: dict[str, UnitRecord] = {}
         self._left = int(os.environ.get(STOP_VARIABLE, "0"))
 
-    def wait(self, timeout_s: float | None = None) -> tuple[int, Outcome] | None:
+    def wait(self, timeout_s: float | None = None) -> tuple[int, JobOutcome] | None:
         """Store the record of the job that was taken."""
         if not self._jobs or timeout_s == 0:
             return None
@@ -39,7 +39,7 @@ class SimulatedExecutor(SerialExecutor):
         if self._left == 0:
             raise KeyboardInterrupt
         job = self._jobs.pop(0)
-        return job.number, Outcome("done", self._record(job))
+        return job.number, JobOutcome("done", self._record(job))
 
     def _record(self, job: Job) -> UnitRecord:
         unit = job.unit
@@ -58,5 +58,5 @@ def _simulated(store: Store, *_name: str, **_settings: object) -> Executor:
 
 
 if __name__ == "__main__":
-    run_command.make_executor = _simulated  # type: ignore[assignment]
-    main()
+    with patch("pano_mvs.session.running.make_executor", _simulated):
+        main()

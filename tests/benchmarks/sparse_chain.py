@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from pano_mvs.cli.session import open_session
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.ports import Cardinality
 from pano_mvs.engine.workflows.workflow import StageEntry
 from pano_mvs.scene import Features, Panorama, Poses, TwoView
+from pano_mvs.session.session import open_session
 from tests.benchmarks.captures import Capture
 
 
@@ -43,8 +43,8 @@ class SparseChain:
         pairs = list(combinations(names, 2))
         for pair in pairs:
             if pair not in self._pairs:
-                ports = {port.name: [self._features[name] for name in pair] for port in self.matcher.spec.ports}
-                self._pairs[pair] = _call(self.matcher, ports)
+                both = {port.name: [self._features[name] for name in pair] for port in self.matcher.spec.ports}
+                self._pairs[pair] = _call(self.matcher, both)
         poses = None
         for solver in self.solvers:
             poses = _call(solver, self._given(solver, capture, pairs, poses))

@@ -19,8 +19,8 @@ from pathlib import Path
 
 from pano_mvs.algorithms.metrics.poses import align_centers
 from pano_mvs.algorithms.poses.unit_translations import unit_translations
-from pano_mvs.cli.session import presets_folder
 from pano_mvs.scene import Poses
+from pano_mvs.session.session import presets_folder
 from tests.benchmarks.captures import Capture, read_capture
 from tests.benchmarks.dense_chain import DenseChain, score_view
 from tests.benchmarks.depth_metrics import DepthMetrics, constant_baseline

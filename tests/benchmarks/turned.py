@@ -25,7 +25,10 @@ _RAYS_PER_PIXEL = 3
 class Place(Protocol):
     """Where pictures come from, whichever way the cameras are turned."""
 
-    capture: Capture
+    @property
+    def capture(self) -> Capture:
+        """The capture as it is."""
+        ...
 
     def turned(self, turns: Turns, folder: Path) -> Capture:
         """Return the capture with some cameras, by name, turned by new_from_old (3, 3); pictures go to the folder."""
@@ -131,4 +134,5 @@ def _nearest(
     """Return the ranges of the pixels in which a turned camera's rays arrive, (h, w)."""
     height, width = ranges.shape
     column, row = np.moveaxis(np.floor(pixel_from_ray(ray_grid(size_hw) @ new_from_old, (height, width))), -1, 0)
-    return ranges[np.clip(row, 0, height - 1).astype(int), np.mod(column, width).astype(int)]
+    result: NDArray[np.float32] = ranges[np.clip(row, 0, height - 1).astype(int), np.mod(column, width).astype(int)]
+    return result

@@ -12,6 +12,7 @@ import pytest
 
 from tests.cli.conftest import SMALL, Command, run_json
 from tests.permissions import permissions_hold
+from tests.stored import read_picture
 
 TO_POSES = ("--until", "poses", *SMALL)
 
@@ -63,7 +64,7 @@ def test_one_image(pano_mvs: Command, capture: Path) -> None:
 
 @pytest.mark.parametrize("damage", ["truncated", "text", "empty", "not 2:1"])
 def test_one_bad_picture_among_good_ones(pano_mvs: Command, short: Path, capture: Path, damage: str) -> None:
-    image = cv2.imread(str(capture / "images" / "001.png"))
+    image = read_picture(capture / "images" / "001.png")
     (capture / "images" / "001.png").unlink()
     bad = capture / "images" / "001.jpg"
     cv2.imwrite(str(bad), image[:, : image.shape[1] - 64] if damage == "not 2:1" else image)
@@ -91,7 +92,7 @@ def test_only_bad_pictures(pano_mvs: Command, short: Path, capture: Path) -> Non
 
 def test_mixed_sizes_work(pano_mvs: Command, capture: Path) -> None:
     path = capture / "images" / "002.png"
-    image = cv2.imread(str(path))
+    image = read_picture(path)
     cv2.imwrite(str(path), cv2.resize(image, (256, 128), interpolation=cv2.INTER_AREA))
     result = pano_mvs("run", "quickstart", "--images", capture / "images", "--out", "out", *SMALL)
     assert result.code == 0, result.text
@@ -180,7 +181,7 @@ def test_picture_without_its_mask_is_noted(pano_mvs: Command, short: Path, captu
 @pytest.mark.skipif(os.name != "posix", reason="names of any bytes exist on POSIX systems only")
 def test_names_that_cannot_be_written_or_look_like_markup(pano_mvs: Command, short: Path, capture: Path) -> None:
     images = capture / "images"
-    shutil.copy(images / "000.png", os.fsencode(images) + b"/gr\xf6sse.png")
+    shutil.copy(os.fsencode(images / "000.png"), os.fsencode(images) + b"/gr\xf6sse.png")
     (images / "a[").mkdir()
     (images / "a[" / "b].jpg").write_bytes(b"broken")
     result = pano_mvs("run", short, "--out", "out")
@@ -215,7 +216,7 @@ def test_status_of_a_strange_run_json(pano_mvs: Command, short: Path) -> None:
         Path("out/run.json").write_text(text)
         result = pano_mvs("status", short, "--out", "out")
         assert result.code == 0, result.text
-        assert "run again to write it anew" in result.flat
+        assert "Run again to write it anew" in result.flat
 
 
 def test_pictures_without_a_mask_are_told_in_each_run_and_only_there(

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -66,7 +67,7 @@ def test_verify_names_what_is_temporary(toy: Toy, cache: Cache) -> None:  # noqa
     assert code == 0
     assert f"scratch (of process {os.getpid()} on this host, which is running)" in said
     assert f"{folder / '.tmp-00000000-7-log.txt'} (of another host or container;" in said
-    assert f"{folder / 'worker-1.txt'} (not of this version;" in said
+    assert f"{folder / 'worker-1.txt'} (of another version;" in said
 
 
 @pytest.fixture
@@ -74,10 +75,10 @@ def unwritable(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Let nothing be written below the caches `cache` and `none`; for root, permissions would not."""
     make = tempfile.mkstemp
 
-    def refuse(*, dir: Path, **options: str) -> tuple[int, str]:  # noqa: A002
+    def refuse(*, dir: Path, **options: Any) -> tuple[int, str]:  # noqa: A002
         if Path(dir).is_relative_to(tmp_path / "cache") or Path(dir).is_relative_to(tmp_path / "none"):
             raise PermissionError(13, "Permission denied")
-        return make(dir=dir, **options)
+        return make(dir=os.fspath(dir), **options)
 
     monkeypatch.setattr(tempfile, "mkstemp", refuse)
 
@@ -200,9 +201,8 @@ def test_run_that_did_not_end_keeps_what_its_folder_had(toy: Toy, cache: Cache) 
     run(toy, "other")
     session = toy.session("scaled.by=5")
     store = Store(session.store_root)
-    from pano_mvs.engine.running.run import workflow_id
 
-    store.runs.remember(workflow_id(session.workflow), {}, workflow="toy", out=toy.folder / "mine", finished=False)
+    store.runs.remember(session.workflow.id, {}, workflow="toy", out=toy.folder / "mine", finished=False)
     cache("gc", "--delete", "--unused", "0s")
     assert "(nothing to compute)" in run(toy, "mine", "--set", "scaled.by=5")[1]
 
@@ -228,9 +228,9 @@ def test_runs_that_are_too_old_are_forgotten_and_pins_are_not(toy: Toy, cache: C
 def test_pins_are_asked_for_properly(toy: Toy, cache: Cache) -> None:  # noqa: F811
     run(toy, "one")
     run(toy, "two", "--set", "scaled.by=5")
-    for run_name, name, why in (("nothing", "good", "0 runs are called"), ("", "good", "2 runs are called"),
-                                (str(toy.folder / "one"), "../x", "no name for a pin"),
-                                (str(toy.folder / "one"), "", "no name for a pin")):  # fmt: skip
+    for run_name, name, why in (("nothing", "good", "0 runs match"), ("", "good", "2 runs match"),
+                                (str(toy.folder / "one"), "../x", "not a valid name of a pin"),
+                                (str(toy.folder / "one"), "", "not a valid name of a pin")):  # fmt: skip
         code, said = cache("pin", run_name, name)
         assert code == 2
         assert why in said
@@ -365,10 +365,10 @@ def test_blob_that_a_run_came_to_use_is_not_swept(toy: Toy, monkeypatch: pytest.
 
     delete = upkeep._delete
 
-    def after_a_use(*arguments: object) -> None:
+    def after_a_use(*arguments: Any) -> None:
         for path in (*root.rglob("*.json"), *root.rglob("*.txt")):
             os.utime(path)
-        delete(*arguments)  # type: ignore[arg-type]
+        delete(*arguments)
 
     before = files_of(root)
     monkeypatch.setattr(upkeep, "_delete", after_a_use)

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -20,9 +21,9 @@ from pano_mvs.cli.doctor.machine import kernel_cache_finding, machine_findings
 from pano_mvs.cli.doctor.packages import is_older, package_findings
 from pano_mvs.cli.doctor.plugins import plugin_findings
 from pano_mvs.cli.doctor.probes import Outcome, library_findings, run_probe
-from pano_mvs.cli.session import presets_folder
 from pano_mvs.core.kernel_cache import kernel_cache_folder
 from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.session.session import presets_folder
 from tests.cli.conftest import Command
 from tests.permissions import permissions_hold
 
@@ -80,7 +81,7 @@ def test_this_installation_has_what_it_needs() -> None:
     assert not [finding for finding in found.values() if finding.state == "failed"]
 
 
-GOOD = {
+GOOD: dict[str, dict[str, Any]] = {
     "numba": {"version": "1", "seconds": 1.0, "disabled": False},
     "pycolmap": {"version": "2", "cuda": False},
     "cv2": {"version": "3", "missing": [], "video": True, "avif": True},
@@ -89,7 +90,7 @@ GOOD = {
 }
 
 
-def fake(**answers: object) -> probes.Try:
+def fake(**answers: Any) -> probes.Try:
     def attempt(code: str) -> Outcome:
         name = next(name for name in ("numba", "pycolmap", "cv2", "pyvista", "torch") if f"import {name}" in code
                     or f", {name}" in code)  # fmt: skip

@@ -6,6 +6,7 @@ import json
 import shlex
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,10 +38,11 @@ def call(*arguments: object) -> Outcome:
     return Outcome(result.exit_code, result.output)
 
 
-def inspected(*arguments: object) -> dict:
+def inspected(*arguments: object) -> dict[str, Any]:
     found = call("inspect", *arguments, "--json")
     assert found.code == 0, found.text
-    return json.loads(found.text)
+    result: dict[str, Any] = json.loads(found.text)
+    return result
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +189,7 @@ def test_the_command_that_mends_it_can_be_copied(run: Path, tmp_path: Path, monk
 def test_folders_that_are_no_output_are_refused(run: Path, tmp_path: Path) -> None:
     outcome = call("inspect", tmp_path, "000.png", 1, 1)
     assert outcome.code == 2
-    assert "holds no run.json" in outcome.flat
+    assert "run.json cannot be read" in outcome.flat
     moved = shutil.copytree(run / "out", tmp_path / "out")
     summary = json.loads((moved / "run.json").read_text())
     summary["workflow"]["path"] = "/nowhere/wf.yaml"

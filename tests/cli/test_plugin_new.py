@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pano_mvs.cli.plugin_new import KINDS, rendered
+from pano_mvs.cli.plugins.new import KINDS, rendered
 from pano_mvs.testing import conformance
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
 from tests.cli.conftest import Command, deliverables

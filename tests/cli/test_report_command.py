@@ -91,7 +91,7 @@ def test_a_run_that_a_gate_stops_says_why_at_once(pano_mvs: Command, toy: Toy) -
     assert run(pano_mvs, toy) == 4
     page = page_in(toy.folder / "out")
     assert "Stopped by a quality gate" in page.words
-    assert page.words.index("the gate asks for") < page.words.index("Stages")
+    assert page.words.index("requires") < page.words.index("Stages")
 
 
 def test_a_run_that_breaks_has_a_report_and_keeps_its_error(

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -94,9 +95,15 @@ def test_a_stream_apart_is_closed_with_its_own_descriptor_and_shares_the_state()
     assert (state.reader_left, state.reader_may_leave) == (True, True)
 
 
-def command(*arguments: str | Path, **options: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "pano_mvs", *map(str, arguments)], stderr=subprocess.PIPE,
-                          text=True, check=False, **options)  # type: ignore[call-overload, no-any-return]  # fmt: skip
+def command(*arguments: str | Path, **options: Any) -> subprocess.CompletedProcess[str]:
+    done: subprocess.CompletedProcess[str] = subprocess.run(
+        [sys.executable, "-m", "pano_mvs", *map(str, arguments)],
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+        **options,
+    )
+    return done
 
 
 def closed_pipe() -> int:

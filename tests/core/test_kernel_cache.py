@@ -3,6 +3,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -50,14 +51,14 @@ def test_kernels_are_kept_there_whichever_is_imported_first(tmp_path: Path, firs
 
 @pytest.mark.skipif(sys.platform == "win32", reason="permissions as POSIX has them")
 def test_kernels_that_others_could_have_written_are_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kernel_cache.tempfile, "gettempdir", lambda: str(tmp_path))
+    monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path))
     folder = kernel_cache._own_temporary_folder()
     assert kernel_cache._own_temporary_folder() == folder
     folder.chmod(0o770)
-    with pytest.raises(OSError, match="no folder for caches"):
+    with pytest.raises(OSError, match="no writable folder for caches"):
         kernel_cache._own_temporary_folder()
     folder.rmdir()
     (tmp_path / "elsewhere").mkdir(mode=0o700)
     folder.symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(OSError, match="no folder for caches"):
+    with pytest.raises(OSError, match="no writable folder for caches"):
         kernel_cache._own_temporary_folder()

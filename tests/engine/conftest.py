@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from pano_mvs.cli.session import Session, open_session
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
 from pano_mvs.engine.running.events import RunResult
-from pano_mvs.engine.running.run import Run, workflow_id
+from pano_mvs.engine.running.run import Run
+from pano_mvs.session.session import Session, open_session
 from tests.engine.toy import HELPER, PLUGIN, WORKFLOW
 
 
@@ -37,12 +37,12 @@ class Toy:
 
     def run(self, *overrides: str, earlier: dict[str, str] | None = None, cache: Path | None = None) -> RunResult:
         session = self.session(*overrides, cache=cache)
-        run = Run(session.workflow, session.graph, Store(session.store_root), session.out)
+        run = Run(session.workflow, session.graph, Store(session.store_root), out=session.out)
         return run.execute(earlier_files=earlier)
 
     def plan(self, *overrides: str) -> dict[str, StagePlan]:
         session = self.session(*overrides)
-        plans = make_plan(session.workflow, session.graph, Store(session.store_root), workflow_id(session.workflow))
+        plans = make_plan(session.workflow, session.graph, Store(session.store_root))
         return {plan.name: plan for plan in plans}
 
     def edit(self, name: str, change: Callable[[str], str]) -> None:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import gc
 
-from pano_mvs.cli.session import open_session
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.planning.plan import make_plan
 from pano_mvs.engine.planning.units import Unit
-from pano_mvs.engine.running.run import workflow_id
+from pano_mvs.session.session import open_session
 from tests.engine.conftest import Toy
 
 
@@ -24,7 +23,7 @@ def test_a_plan_takes_units_one_at_a_time(toy: Toy) -> None:
         found = sum(type(value) is Unit for value in gc.get_objects())  # isinstance asks dead proxies for their class
         alive[unit.entry.name] = max(found, alive.get(unit.entry.name, 0))
 
-    make_plan(session.workflow, session.graph, Store(session.store_root), workflow_id(session.workflow), visit=look)
+    make_plan(session.workflow, session.graph, Store(session.store_root), visit=look)
     assert alive["images"] > 20  # a source lists its items at once
     assert alive["difference"] - alive["pairs"] <= 1
     assert alive["mean"] - alive["pairs"] <= 1

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from pano_mvs.cli.session import open_session
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.running.run import Run
+from pano_mvs.session.session import open_session
 from tests.benchmarks.plan import PLUGIN, WORKFLOW
 from tests.engine.conftest import settle
 
@@ -29,7 +29,7 @@ def folder(tmp_path: Path) -> Path:
 
 def run(folder: Path) -> dict[str, int]:
     session = open_session(str(folder / "wf.yaml"), cache=folder / "cache", out=folder / "out")
-    result = Run(session.workflow, session.graph, Store(session.store_root), session.out).execute()
+    result = Run(session.workflow, session.graph, Store(session.store_root), out=session.out).execute()
     return {stage.name: stage.run for stage in result.stages if stage.run}
 
 

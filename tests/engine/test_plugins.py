@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
 from pano_mvs.core.errors import PluginError, UsageError, WorkflowError
-from pano_mvs.core.parts import Parts
+from pano_mvs.core.named_registry import NamedRegistry
 from pano_mvs.engine.stages.plugin_files import declared_names, plugin_files_in, user_plugin_folders
 from pano_mvs.engine.stages.registry import Registry
 from tests.engine.conftest import Toy, ran
@@ -97,7 +97,7 @@ def test_a_part_of_a_broken_plugin_says_why_it_is_not_there(mine: Path) -> None:
     (mine / "bad.py").write_text(
         "from pano_mvs.api import register_toy_part\n\n@register_toy_part('mine')\ndef f(): ...\n"
     )
-    parts: Parts[int] = Parts("toy part", {"ours": 1})
+    parts: NamedRegistry[int] = NamedRegistry("toy part", {"ours": 1})
     Registry.installed()
     with pytest.raises(UsageError, match=r"the toy part 'mine' cannot be used: .*bad\.py"):
         parts.check("mine")

@@ -1,5 +1,9 @@
 """Depth metrics: both protocols, the weights, and what a constant scores."""
 
+from __future__ import annotations
+
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -11,7 +15,7 @@ from tests.benchmarks.depth_metrics import constant_baseline, depth_metrics
 SIZE = (16, 32)
 
 
-def test_the_truth_scores_perfectly():
+def test_the_truth_scores_perfectly() -> None:
     truth, _ = box_range(SIZE)
     truth[3, 4] = np.inf
     metrics = depth_metrics(truth / 2, truth, scale=2.0)
@@ -22,7 +26,7 @@ def test_the_truth_scores_perfectly():
     assert metrics.bad_5 == metrics.median_relative_error == 0
 
 
-def test_figures_of_a_uniform_error():
+def test_figures_of_a_uniform_error() -> None:
     truth = np.full(SIZE, 2.0)
     metrics = depth_metrics(np.full(SIZE, 2.2), truth)
     assert metrics.mae == pytest.approx(0.2)
@@ -34,7 +38,7 @@ def test_figures_of_a_uniform_error():
     assert metrics.w_mae == pytest.approx(0.2)
 
 
-def test_a_missing_pixel_is_an_error_equal_to_the_truth_in_one_protocol_and_nothing_in_the_other():
+def test_a_missing_pixel_is_an_error_equal_to_the_truth_in_one_protocol_and_nothing_in_the_other() -> None:
     truth = np.full(SIZE, 3.0)
     estimated = truth.copy()
     estimated[:, :8] = np.nan
@@ -48,7 +52,7 @@ def test_a_missing_pixel_is_an_error_equal_to_the_truth_in_one_protocol_and_noth
     assert metrics.valid_w_delta_105 == 1
 
 
-def test_weights_are_solid_angles():
+def test_weights_are_solid_angles() -> None:
     truth = np.full(SIZE, 2.0)
     estimated = truth.copy()
     estimated[0] = 3.0
@@ -60,7 +64,7 @@ def test_weights_are_solid_angles():
     assert metrics.w_rmse == pytest.approx(np.sqrt(share))
 
 
-def test_sky_and_masked_pixels_are_left_out():
+def test_sky_and_masked_pixels_are_left_out() -> None:
     truth, _ = box_range(SIZE)
     broken, mask = truth.copy(), np.ones(SIZE, bool)
     broken[:4], mask[:4] = 99, False
@@ -70,7 +74,7 @@ def test_sky_and_masked_pixels_are_left_out():
     assert depth_metrics(broken, truth).pixels == 12 * 32
 
 
-def test_a_constant_scores_what_its_definition_says():
+def test_a_constant_scores_what_its_definition_says() -> None:
     truth, _ = box_range(SIZE)
     truth[0] = np.inf
     expected = depth_metrics(np.full(SIZE, np.median(truth[1:])), truth)
@@ -78,7 +82,7 @@ def test_a_constant_scores_what_its_definition_says():
     assert 10 < expected.psnr_db < 30
 
 
-def test_nothing_to_count_is_not_a_number():
+def test_nothing_to_count_is_not_a_number() -> None:
     metrics = depth_metrics(np.ones(SIZE), np.full(SIZE, np.inf))
     assert metrics.pixels == 0
     assert np.isnan(metrics.mae)
@@ -90,7 +94,7 @@ def test_nothing_to_count_is_not_a_number():
     assert np.isnan(nothing.valid_mae)
 
 
-def test_all_figures_come_as_a_dict_of_numbers():
+def test_all_figures_come_as_a_dict_of_numbers() -> None:
     figures = depth_metrics(np.ones(SIZE), np.ones(SIZE)).as_dict()
     assert {"psnr_db", "w_mae", "w_delta_105", "valid_w_delta_105", "completeness"} <= set(figures)
     assert all(isinstance(value, float | int) for value in figures.values())
@@ -104,6 +108,6 @@ def test_all_figures_come_as_a_dict_of_numbers():
         ({"mask": np.ones((2, 2), bool)}, "one size"),
     ],
 )
-def test_impossible_settings_are_named(settings, words):
+def test_impossible_settings_are_named(settings: dict[str, Any], words: str) -> None:
     with pytest.raises(UsageError, match=words):
         depth_metrics(np.ones(SIZE), np.ones(SIZE), **settings)

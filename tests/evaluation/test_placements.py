@@ -1,9 +1,13 @@
 """Single cameras against the truth: a wrong one is found and does not make others wrong."""
 
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.metrics.placements import judge_placements
 from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec
@@ -11,27 +15,29 @@ from pano_mvs.scene import Poses
 from tests.algorithms.poses.synthetic_capture import random_poses, random_rotation
 
 
-def poses_of(cameras, **more):
+def poses_of(cameras: dict[str, Rigid3], **more: Any) -> Poses:
     return replace(Poses.without_points(cameras, frame="any", scale="any", metric=False), **more)
 
 
-def moved(cameras, rng):
+def moved(cameras: dict[str, Rigid3], rng: np.random.Generator) -> dict[str, Rigid3]:
     similarity = Similarity3(float(rng.uniform(0.1, 10)), random_rotation(rng), rng.normal(size=3))
     return {name: similarity.move_camera(pose) for name, pose in cameras.items()}
 
 
-def extent_of(cameras):
+def extent_of(cameras: dict[str, Rigid3]) -> float:
     centers = np.array([pose.center for pose in cameras.values()])
-    return np.linalg.norm(centers[:, None] - centers, axis=-1).max()
+    return float(np.linalg.norm(centers[:, None] - centers, axis=-1).max())
 
 
-def displaced(pose, *, by=(0.0, 0.0, 0.0), turn_deg=0.0):
+def displaced(
+    pose: Rigid3, *, by: NDArray[np.float64] | tuple[float, float, float] = (0.0, 0.0, 0.0), turn_deg: float = 0.0
+) -> Rigid3:
     turn = rotation_from_rotvec([0, np.deg2rad(turn_deg), 0])
     return Rigid3.from_center(turn @ pose.rotation, pose.center + np.array(by))
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_right_cameras_are_right_in_any_world_frame_and_scale(seed):
+def test_right_cameras_are_right_in_any_world_frame_and_scale(seed: int) -> None:
     rng = np.random.default_rng(seed)
     truth = random_poses(rng, 6)
     placed = judge_placements(poses_of(moved(truth, rng)), truth)
@@ -43,7 +49,7 @@ def test_right_cameras_are_right_in_any_world_frame_and_scale(seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_camera_that_is_far_off_spoils_no_other(seed):
+def test_a_camera_that_is_far_off_spoils_no_other(seed: int) -> None:
     rng = np.random.default_rng(seed)
     truth = random_poses(rng, 6)
     names = list(truth)
@@ -60,7 +66,7 @@ def test_a_camera_that_is_far_off_spoils_no_other(seed):
     assert placed.unreported == (names[2],)
 
 
-def test_limits_are_a_degree_and_a_fiftieth_of_the_true_extent():
+def test_limits_are_a_degree_and_a_fiftieth_of_the_true_extent() -> None:
     rng = np.random.default_rng(5)
     truth = random_poses(rng, 12)
     names, extent = list(truth), extent_of(truth)
@@ -74,7 +80,7 @@ def test_limits_are_a_degree_and_a_fiftieth_of_the_true_extent():
     assert verdicts == [True, False, True, False]
 
 
-def test_of_two_pieces_that_contradict_each_other_the_larger_is_right():
+def test_of_two_pieces_that_contradict_each_other_the_larger_is_right() -> None:
     rng = np.random.default_rng(6)
     truth = random_poses(rng, 7)
     names = list(truth)
@@ -83,7 +89,7 @@ def test_of_two_pieces_that_contradict_each_other_the_larger_is_right():
     assert placed.right.tolist() == [False] * 3 + [True] * 4
 
 
-def test_groups_are_aligned_each_by_itself():
+def test_groups_are_aligned_each_by_itself() -> None:
     rng = np.random.default_rng(7)
     truth = random_poses(rng, 6)
     names = list(truth)
@@ -96,7 +102,7 @@ def test_groups_are_aligned_each_by_itself():
     assert judge_placements(poses_of(estimated), truth).right.sum() < 5
 
 
-def test_noise_within_the_limits_is_right_though_pairs_are_short():
+def test_noise_within_the_limits_is_right_though_pairs_are_short() -> None:
     """The scale that a pair proposes is as unsure as the pair is short; the fit to all right cameras mends that."""
     rng = np.random.default_rng(8)
     truth = random_poses(rng, 12)
@@ -108,7 +114,7 @@ def test_noise_within_the_limits_is_right_though_pairs_are_short():
     assert judge_placements(poses_of(moved(noisy, rng)), truth).right.all()
 
 
-def test_two_cameras_are_right_though_the_direction_between_them_is_not_exact():
+def test_two_cameras_are_right_though_the_direction_between_them_is_not_exact() -> None:
     """A fit to centres alone once turned two close cameras by the error of their direction, and both were wrong."""
     rng = np.random.default_rng(10)
     truth = random_poses(rng, 6)
@@ -120,7 +126,7 @@ def test_two_cameras_are_right_though_the_direction_between_them_is_not_exact():
     assert judge_placements(poses_of(moved(estimated, rng)), truth).right.all()
 
 
-def test_cameras_that_have_nothing_in_common_with_the_truth_are_wrong_by_finite_errors():
+def test_cameras_that_have_nothing_in_common_with_the_truth_are_wrong_by_finite_errors() -> None:
     rng = np.random.default_rng(11)
     truth = random_poses(rng, 5)
     placed = judge_placements(poses_of(dict(zip(truth, random_poses(rng, 5).values(), strict=True))), truth)
@@ -130,7 +136,7 @@ def test_cameras_that_have_nothing_in_common_with_the_truth_are_wrong_by_finite_
     assert placed.center_shares.max() > 0.1
 
 
-def test_nothing_registered_and_cameras_in_one_place_are_judged_without_complaint():
+def test_nothing_registered_and_cameras_in_one_place_are_judged_without_complaint() -> None:
     truth = random_poses(np.random.default_rng(9), 3)
     none = judge_placements(poses_of({}), truth)
     assert (none.names, none.expected, none.unreported) == ((), 3, ())

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
@@ -9,11 +11,11 @@ from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec
 from tests.algorithms.poses.synthetic_capture import random_poses, random_rotation
 
 
-def moved(poses, similarity):
+def moved(poses: dict[str, Rigid3], similarity: Similarity3) -> dict[str, Rigid3]:
     return {name: similarity.move_camera(pose) for name, pose in poses.items()}
 
 
-def test_no_error_in_any_world_frame_and_scale():
+def test_no_error_in_any_world_frame_and_scale() -> None:
     rng = np.random.default_rng(1)
     truth = random_poses(rng, 5)
     errors = relative_pose_errors(moved(truth, Similarity3(3.0, random_rotation(rng), rng.normal(size=3))), truth)
@@ -24,7 +26,7 @@ def test_no_error_in_any_world_frame_and_scale():
     assert errors.auc[0.1] == pytest.approx(1.0, abs=1e-4)
 
 
-def test_one_turned_camera_spoils_its_pairs_by_its_angle():
+def test_one_turned_camera_spoils_its_pairs_by_its_angle() -> None:
     truth = random_poses(np.random.default_rng(2), 4)
     turn = Rigid3(rotation_from_rotvec([np.deg2rad(2.0), 0, 0]), np.zeros(3))
     estimated = {**truth, "3.jpg": turn @ truth["3.jpg"]}
@@ -37,7 +39,7 @@ def test_one_turned_camera_spoils_its_pairs_by_its_angle():
     assert errors.auc[5.0] == pytest.approx(0.5 + 0.5 * 0.6)
 
 
-def test_missing_images_count_as_half_a_turn():
+def test_missing_images_count_as_half_a_turn() -> None:
     truth = random_poses(np.random.default_rng(3), 3)
     errors = relative_pose_errors({name: truth[name] for name in ("0.jpg", "2.jpg")}, truth)
     assert sorted(errors.pair_deg)[1:] == [180.0, 180.0]
@@ -46,14 +48,14 @@ def test_missing_images_count_as_half_a_turn():
     assert np.isnan(errors.scale_ratio_median)
 
 
-def test_coincident_estimate_has_no_direction():
+def test_coincident_estimate_has_no_direction() -> None:
     truth = random_poses(np.random.default_rng(4), 2)
     same = Rigid3.from_center(truth["1.jpg"].rotation, truth["0.jpg"].center)
     assert relative_pose_errors({**truth, "1.jpg": same}, truth).pair_deg[0] == 180.0
     assert relative_pose_errors({**truth, "1.jpg": same}, {**truth, "1.jpg": same}).direction_deg[0] == 0.0
 
 
-def test_scale_ratio_sees_a_baseline_that_is_too_long():
+def test_scale_ratio_sees_a_baseline_that_is_too_long() -> None:
     x = np.array([1.0, 0, 0])
     truth = {f"{n}": Rigid3.from_center(np.eye(3), n * x) for n in range(3)}
     estimated = {**truth, "2": Rigid3.from_center(np.eye(3), 2.1 * x)}
@@ -62,7 +64,7 @@ def test_scale_ratio_sees_a_baseline_that_is_too_long():
     assert errors.median_pair_deg == 0.0
 
 
-def test_align_centers_recovers_the_similarity():
+def test_align_centers_recovers_the_similarity() -> None:
     rng = np.random.default_rng(5)
     truth = random_poses(rng, 4)
     there = Similarity3(0.25, random_rotation(rng), rng.normal(size=3))
@@ -72,7 +74,7 @@ def test_align_centers_recovers_the_similarity():
     np.testing.assert_allclose((back @ there).translation, 0, atol=1e-9)
 
 
-def test_too_few_images_are_refused():
+def test_too_few_images_are_refused() -> None:
     pose = Rigid3.identity()
     with pytest.raises(UsageError, match="at least two"):
         relative_pose_errors({}, {"a": pose})
@@ -81,7 +83,7 @@ def test_too_few_images_are_refused():
 
 
 @pytest.mark.parametrize("places", [[0, 1], [0, 1, 2], [0, 1, 1], [0, 0, 1, 1]])
-def test_alignment_is_whole_where_centres_leave_a_turn_open(places):
+def test_alignment_is_whole_where_centres_leave_a_turn_open(places: Sequence[int]) -> None:
     """Two images, images on a line and duplicate pictures once left the turn about the line to rounding."""
     rng = np.random.default_rng(6)
     line = random_rotation(rng)[0]
@@ -93,7 +95,7 @@ def test_alignment_is_whole_where_centres_leave_a_turn_open(places):
     np.testing.assert_allclose(identity.translation, 0, atol=1e-6)
 
 
-def test_centre_errors_are_in_the_unit_of_the_truth():
+def test_centre_errors_are_in_the_unit_of_the_truth() -> None:
     x, y = np.eye(3)[0], np.eye(3)[1]
     truth = {f"{n}": Rigid3.from_center(np.eye(3), c) for n, c in enumerate([-2 * x, 2 * x, -2 * y, 2 * y])}
     wide = {name: Rigid3.from_center(np.eye(3), 10 * pose.center * (1, 1.5, 1)) for name, pose in truth.items()}
@@ -105,7 +107,7 @@ def test_centre_errors_are_in_the_unit_of_the_truth():
 
 
 @pytest.mark.parametrize("which", ["estimated", "true"])
-def test_one_place_cannot_be_aligned(which):
+def test_one_place_cannot_be_aligned(which: str) -> None:
     poses = random_poses(np.random.default_rng(7), 3)
     same = dict.fromkeys(poses, poses["0.jpg"])
     with pytest.raises(UsageError, match=f"the {which} centres of all 3 images coincide"):
@@ -113,7 +115,7 @@ def test_one_place_cannot_be_aligned(which):
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e4])
-def test_a_picture_that_is_there_twice_has_no_direction_in_any_unit(unit):
+def test_a_picture_that_is_there_twice_has_no_direction_in_any_unit(unit: float) -> None:
     """Rounding of a duplicate's centre once counted as a baseline with a direction of its own."""
     poses = random_poses(np.random.default_rng(8), 3)
     truth = {**poses, "again": Rigid3.from_center(poses["0.jpg"].rotation, poses["0.jpg"].center + 1e-8)}

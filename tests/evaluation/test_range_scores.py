@@ -1,15 +1,20 @@
 """Scores of range maps against their definitions, on the sphere, and beside the best constants."""
 
+from __future__ import annotations
+
+from typing import Any, Literal
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from pano_mvs.algorithms.metrics.best_constant import best_constant_errors, best_constant_median
 from pano_mvs.algorithms.metrics.judged import aligning_scale, judged_pixels, weighted_median, weighted_quantile
 from pano_mvs.algorithms.metrics.range_errors import BadLimit, range_errors
-from pano_mvs.algorithms.metrics.view_scores import PROTOCOLS, Judging, mean_scores, score_view
+from pano_mvs.algorithms.metrics.view_scores import PROTOCOLS, Judging, ViewScores, mean_scores, score_view
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import pixel_solid_angle
 from tests.oracles import range_scores as oracle
@@ -21,7 +26,9 @@ NAMES = ["mse", "psnr_db", "rmse", "mae", "abs_rel", "delta_105", "delta_125", "
 HARD = [np.nan, np.inf, -np.inf, 0.0, -1.0]
 
 
-def draw(seed, size_hw=SIZE, hard=0.3):
+def draw(
+    seed: int, size_hw: tuple[int, int] = SIZE, hard: float = 0.3
+) -> tuple[NDArray[np.float64], NDArray[np.float64], np.random.Generator]:
     """An estimate and a truth with all that can be wrong in them."""
     rng = np.random.default_rng(seed)
     truth = rng.choice([1.0, 2.0, 2.0 * 1.05**2, 3.0, *rng.uniform(0.1, 9, 6)], size_hw)
@@ -35,7 +42,7 @@ def draw(seed, size_hw=SIZE, hard=0.3):
 class TestDefinitions:
     @given(st.integers(0, 10**6), st.sampled_from([0.5, 1.0, 2.5]), st.sampled_from([0.0, 0.3, 0.9]))
     @settings(max_examples=15, deadline=None)
-    def test_every_score_is_what_its_definition_says(self, seed, scale, hard):
+    def test_every_score_is_what_its_definition_says(self, seed: int, scale: float, hard: float) -> None:
         estimated, truth, _ = draw(seed, hard=hard)
         found = score_view(estimated, truth, scale=scale, judging=Judging(peak=7.0, bad=BAD)).scores
         for prefix in PROTOCOLS:
@@ -46,7 +53,7 @@ class TestDefinitions:
             assert found[name] == pytest.approx(oracle.score(name, estimated, truth, scale=scale), nan_ok=True)
 
     @pytest.mark.parametrize("value", [2.2, *HARD])
-    def test_a_single_pixel(self, value):
+    def test_a_single_pixel(self, value: float) -> None:
         found = score_view(np.array([[value]]), np.array([[2.0]])).scores
         known = value == 2.2
         assert found["mae"] == found["w_mae"] == pytest.approx(0.2 if known else 2.0)
@@ -54,17 +61,17 @@ class TestDefinitions:
         assert np.isnan(found["valid_mae"]) != known
         assert np.isnan(found["median_relative_error"]) != known
 
-    def test_no_pixel_at_all_is_no_number_and_no_error(self):
+    def test_no_pixel_at_all_is_no_number_and_no_error(self) -> None:
         found = score_view(np.ones(SIZE), np.full(SIZE, np.nan), confidence=np.full(SIZE, 9, np.uint8))
         assert found.pixels == 0
         assert all(np.isnan(value) for value in found.scores.values())
         assert all(np.isnan(value) for constant in found.constants.values() for value in constant.values())
 
-    def test_a_missing_pixel_is_bad_at_any_limit(self):
+    def test_a_missing_pixel_is_bad_at_any_limit(self) -> None:
         found = score_view(np.full(SIZE, np.nan), np.full(SIZE, 2.0), judging=Judging(bad=BAD)).scores
         assert {found[limit.name] for limit in BAD} == {1}
 
-    def test_confidence_below_what_is_asked_is_no_estimate(self):
+    def test_confidence_below_what_is_asked_is_no_estimate(self) -> None:
         truth = np.full(SIZE, 2.0)
         estimated, confidence = truth.copy(), np.full(SIZE, 200, np.uint8)
         estimated[:3], confidence[:3] = 9.0, 100
@@ -81,16 +88,16 @@ class TestDefinitions:
             ({"scale": np.nan}, "must be positive"),
         ],
     )
-    def test_what_cannot_be_judged_is_told(self, settings, words):
+    def test_what_cannot_be_judged_is_told(self, settings: dict[str, Any], words: str) -> None:
         with pytest.raises(UsageError, match=words):
             score_view(np.ones(SIZE), np.ones(SIZE), **settings)
 
     @pytest.mark.parametrize("text", ["", "5 percent", "0", "-1%", "nan", "inf"])
-    def test_limits_that_are_none_are_told(self, text):
+    def test_limits_that_are_none_are_told(self, text: str) -> None:
         with pytest.raises(UsageError, match="is no limit for bad pixels"):
             BadLimit.from_text(text)
 
-    def test_limits_are_named_by_what_they_are(self):
+    def test_limits_are_named_by_what_they_are(self) -> None:
         assert [BadLimit.from_text(text).name for text in ("5%", "2.5 %", "0.1")] == ["bad_5", "bad_2.5", "bad_abs_0.1"]
 
 
@@ -100,7 +107,7 @@ class TestSphere:
     SIZE = (180, 360)
     SHARE = (1 - np.sin(np.deg2rad(60))) / 2
 
-    def scores(self):
+    def scores(self) -> ViewScores:
         truth = np.full(self.SIZE, 2.0)
         estimated = truth.copy()
         estimated[:30] *= 1.5
@@ -108,7 +115,7 @@ class TestSphere:
         confidence[:30] = 50
         return score_view(estimated, truth, confidence=confidence)
 
-    def test_weighted_scores_are_shares_of_the_sphere(self):
+    def test_weighted_scores_are_shares_of_the_sphere(self) -> None:
         found = self.scores().scores
         assert found["mae"] == pytest.approx(1 / 6)
         assert found["w_mae"] == pytest.approx(self.SHARE)
@@ -118,7 +125,7 @@ class TestSphere:
         assert found["bad_5"] == pytest.approx(1 / 6)
         assert found["w_bad_5"] == pytest.approx(self.SHARE)
 
-    def test_completeness_and_medians_are_too(self):
+    def test_completeness_and_medians_are_too(self) -> None:
         truth = np.full(self.SIZE, 2.0)
         estimated = truth.copy()
         estimated[:30] = np.nan
@@ -127,7 +134,7 @@ class TestSphere:
         median = score_view(truth * (1 + rows / 1000), truth).scores["w_median_relative_error"]
         assert median == pytest.approx(0.089, abs=0.002)  # half the sphere lies above the equator
 
-    def test_a_confidence_that_knows_the_error_has_no_area_but_an_unranked_one(self):
+    def test_a_confidence_that_knows_the_error_has_no_area_but_an_unranked_one(self) -> None:
         found = self.scores()
         assert found.scores["ause"] == pytest.approx(0, abs=1e-9)
         # unranked: the mean error; ranked: that error's share of what is kept beyond the sure ones
@@ -140,7 +147,7 @@ class TestSphere:
 
 class TestBestConstant:
     @pytest.mark.parametrize(("seed", "weighted"), [(0, False), (1, True), (2, False), (3, True)])
-    def test_no_constant_found_by_search_is_better_and_one_is_as_good(self, seed, weighted):
+    def test_no_constant_found_by_search_is_better_and_one_is_as_good(self, seed: int, weighted: bool) -> None:
         rng = np.random.default_rng(seed)
         true = rng.choice([rng.uniform(1, 5, 40), rng.lognormal(0.5, 0.6, 40), np.repeat(rng.uniform(1, 3, 5), 8)])
         weight = rng.uniform(0.1, 2, 40) if weighted else np.ones(40)
@@ -163,14 +170,14 @@ class TestBestConstant:
 
     @pytest.mark.parametrize("name", ["mse", "mae", "abs_rel"])
     @pytest.mark.parametrize("seed", range(4))
-    def test_it_is_what_a_minimiser_finds(self, name, seed):
+    def test_it_is_what_a_minimiser_finds(self, name: str, seed: int) -> None:
         rng = np.random.default_rng(seed)
         true, weight = rng.lognormal(0.7, 0.5, 300), rng.uniform(0.1, 1, 300)
         found = minimize_scalar(lambda c: range_errors(np.full(300, c), true, weight)[name], bounds=(0.05, 15),
                                 method="bounded", options={"xatol": 1e-10})  # fmt: skip
         assert best_constant_errors(true, weight)[name] == pytest.approx(found.fun, rel=1e-6)
 
-    def test_what_lies_just_at_a_limit_is_judged_as_the_scores_do(self):
+    def test_what_lies_just_at_a_limit_is_judged_as_the_scores_do(self) -> None:
         """1 and 1.25² are each 1.25 times from 1.25, which is not below; 1 and 3 are each 50 % from 1.5, not above."""
         even = np.ones(2)
         found = best_constant_errors(np.array([1.0, 1.5625]), even)
@@ -181,7 +188,7 @@ class TestBestConstant:
         assert best_constant_errors(np.array([1.0, 2.0]), even, bad=length)["bad_abs_0.5"] == 0
 
     @pytest.mark.parametrize("seed", range(5))
-    def test_the_median_too(self, seed):
+    def test_the_median_too(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
         true, weight = rng.lognormal(0.7, 0.5, 101), rng.choice([0.5, 1.0, 2.0], 101)
         tried = np.linspace(true.min(), true.max(), 20_000)
@@ -189,7 +196,7 @@ class TestBestConstant:
         assert best_constant_median(true, weight) == pytest.approx(least, abs=2e-3)
         assert best_constant_median(true, weight) <= least + 1e-9
 
-    def test_a_view_is_compared_with_constants_on_the_very_pixels_of_each_score(self):
+    def test_a_view_is_compared_with_constants_on_the_very_pixels_of_each_score(self) -> None:
         truth = np.where(np.arange(12) < 6, 1.0, 5.0) * np.ones(SIZE)
         estimated = np.where(truth < 2, truth, np.nan)
         constants = score_view(estimated, truth).constants
@@ -201,7 +208,7 @@ class TestBestConstant:
 
     @given(st.integers(0, 10**6))
     @settings(max_examples=15, deadline=None)
-    def test_the_best_constant_is_never_worse_than_mean_or_median(self, seed):
+    def test_the_best_constant_is_never_worse_than_mean_or_median(self, seed: int) -> None:
         estimated, truth, _ = draw(seed)
         constants = score_view(estimated, truth, judging=Judging(bad=BAD)).constants
         for other in ("median", "mean"):
@@ -213,13 +220,13 @@ class TestBestConstant:
 
 
 class TestFit:
-    def test_without_a_fit_and_without_pixels_the_factor_is_one(self):
+    def test_without_a_fit_and_without_pixels_the_factor_is_one(self) -> None:
         estimated, truth, _ = draw(0)
         assert aligning_scale(judged_pixels(estimated, truth), "none") == 1
         assert aligning_scale(judged_pixels(np.full(SIZE, np.nan), truth), "lsq") == 1
 
     @pytest.mark.parametrize("align", ["median", "lsq"])
-    def test_a_factor_is_found_and_undone(self, align):
+    def test_a_factor_is_found_and_undone(self, align: Literal["median", "lsq"]) -> None:
         _, truth, _ = draw(1, hard=0.2)
         found = score_view(truth / 3, truth, judging=Judging(align=align))
         assert found.scale == pytest.approx(3)
@@ -227,14 +234,14 @@ class TestFit:
         unfitted = score_view(truth / 3, truth)
         assert unfitted.scores["valid_abs_rel"] == pytest.approx(2 / 3)
 
-    def test_least_squares_are_the_least(self):
+    def test_least_squares_are_the_least(self) -> None:
         estimated, truth, _ = draw(2)
         both = judged_pixels(estimated, truth).only_valid()
         found = minimize_scalar(lambda s: np.sum(both.weight * (s * both.found - both.true) ** 2), bounds=(0.01, 10),
                                 method="bounded", options={"xatol": 1e-10})  # fmt: skip
         assert aligning_scale(judged_pixels(estimated, truth), "lsq") == pytest.approx(found.x, rel=1e-5)
 
-    def test_the_fit_weights_by_solid_angle(self):
+    def test_the_fit_weights_by_solid_angle(self) -> None:
         weight = pixel_solid_angle((4, 8))
         truth = np.full((4, 8), 2.0)
         estimated = truth.copy()
@@ -244,7 +251,7 @@ class TestFit:
         assert aligning_scale(judged_pixels(estimated, truth), "lsq") == pytest.approx(expected)
 
 
-def test_quantiles_by_weight_are_those_of_repeated_values():
+def test_quantiles_by_weight_are_those_of_repeated_values() -> None:
     rng = np.random.default_rng(4)
     values, times = rng.normal(size=30), rng.integers(1, 6, 30)
     repeated = np.sort(np.repeat(values, times))
@@ -254,7 +261,7 @@ def test_quantiles_by_weight_are_those_of_repeated_values():
     assert np.isnan(weighted_quantile(np.zeros(0), np.zeros(0), 0.5))
 
 
-def test_means_over_views_leave_out_what_is_no_number():
+def test_means_over_views_leave_out_what_is_no_number() -> None:
     mean = mean_scores([{"a": 1.0, "b": np.nan}, {"a": 3.0, "b": np.nan, "c": 5.0}])
     assert (mean["a"], mean["c"]) == (2, 5)
     assert np.isnan(mean["b"])

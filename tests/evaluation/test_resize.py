@@ -1,5 +1,7 @@
 """Range maps at another size: exact on planes, nothing between two surfaces."""
 
+from __future__ import annotations
+
 import numpy as np
 import pytest
 
@@ -8,13 +10,13 @@ from pano_mvs.core.errors import UsageError
 from tests.algorithms.range_scenes import box_range
 
 
-def test_the_same_size_is_the_same_map():
+def test_the_same_size_is_the_same_map() -> None:
     ranges, _ = box_range((16, 32))
     assert resized_range(ranges, (16, 32)) is ranges
 
 
 @pytest.mark.parametrize(("old", "new"), [((64, 128), (128, 256)), ((128, 256), (64, 128)), ((48, 96), (64, 128))])
-def test_walls_keep_their_distance(old, new):
+def test_walls_keep_their_distance(old: tuple[int, int], new: tuple[int, int]) -> None:
     """A walk over the seam and over both poles: the box is closed, its truth known in closed form at any size."""
     found, true = resized_range(box_range(old)[0], new), box_range(new)[0]
     error = np.abs(found / true - 1)
@@ -25,7 +27,7 @@ def test_walls_keep_their_distance(old, new):
     assert error.max() <= nearest.max()  # the edges, where two walls meet
 
 
-def test_nothing_lies_between_two_surfaces_and_no_hole_shrinks():
+def test_nothing_lies_between_two_surfaces_and_no_hole_shrinks() -> None:
     ranges = np.where(np.arange(32) < 16, 1.0, 3.0).astype(np.float32) * np.ones((16, 1), np.float32)
     ranges[4:6, 4:6] = np.nan
     found = resized_range(ranges, (64, 128))
@@ -34,7 +36,7 @@ def test_nothing_lies_between_two_surfaces_and_no_hole_shrinks():
     np.testing.assert_array_equal(np.nan_to_num(found), np.nan_to_num(resized_labels(ranges, (64, 128))))
 
 
-def test_rolling_before_and_after_is_the_same():
+def test_rolling_before_and_after_is_the_same() -> None:
     ranges = np.random.default_rng(0).uniform(1, 1.09, (8, 16)).astype(np.float32)
     for columns in (1, 5, 8):
         np.testing.assert_allclose(
@@ -44,12 +46,12 @@ def test_rolling_before_and_after_is_the_same():
         )
 
 
-def test_labels_are_those_of_the_pixel_that_holds_the_place():
+def test_labels_are_those_of_the_pixel_that_holds_the_place() -> None:
     labels = np.arange(8).reshape(2, 4)
     np.testing.assert_array_equal(resized_labels(labels, (4, 8)), np.repeat(np.repeat(labels, 2, 0), 2, 1))
     np.testing.assert_array_equal(resized_labels(np.arange(32).reshape(4, 8), (2, 4))[0], [9, 11, 13, 15])
 
 
-def test_other_shapes_are_told():
+def test_other_shapes_are_told() -> None:
     with pytest.raises(UsageError, match="16×8 px cannot be compared with one of 16×9"):
         resized_range(np.ones((8, 16), np.float32), (9, 16))

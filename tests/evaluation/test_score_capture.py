@@ -1,25 +1,35 @@
 """The scores that are kept with a run: names that stay, constants beside them, truth of another size."""
 
+from __future__ import annotations
+
 import json
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.metrics.score import KEPT, KEPT_OF_CONFIDENCE, score_capture
 from pano_mvs.algorithms.metrics.view_scores import score_view
 from pano_mvs.geometry import Rigid3
+from pano_mvs.scene import Scores
 from tests.algorithms.range_scenes import box_range
 
 POSES = {name: Rigid3(np.eye(3), np.array([x, 0.0, 0.0])) for name, x in (("a", 0.0), ("b", 1.0))}
 HALF = {name: Rigid3(pose.rotation, pose.translation / 2) for name, pose in POSES.items()}
 
 
-def scored(estimated, truth, confidence=None, poses=POSES):
+def scored(
+    estimated: NDArray[Any],
+    truth: NDArray[np.float32],
+    confidence: NDArray[np.uint8] | None = None,
+    poses: dict[str, Rigid3] = POSES,
+) -> Scores:
     confidences = {"a": confidence} if confidence is not None else None
     return score_capture(poses, POSES, {"a": estimated}, {"a": lambda: truth}, confidences=confidences)
 
 
-def test_each_score_stands_beside_what_constants_score():
+def test_each_score_stands_beside_what_constants_score() -> None:
     truth, _ = box_range((16, 32))
     estimated = np.float32(1.1) * truth
     confidence = np.random.default_rng(0).integers(1, 255, truth.shape).astype(np.uint8)
@@ -36,7 +46,7 @@ def test_each_score_stands_beside_what_constants_score():
     assert found["best_constant_psnr_db"] >= found["constant_psnr_db"]
 
 
-def test_ranges_are_scaled_by_the_cameras_and_read_at_the_true_pixels():
+def test_ranges_are_scaled_by_the_cameras_and_read_at_the_true_pixels() -> None:
     truth, _ = box_range((64, 128))
     estimated, _ = box_range((32, 64))
     confidence = np.full((32, 64), 200, np.uint8)
@@ -46,7 +56,7 @@ def test_ranges_are_scaled_by_the_cameras_and_read_at_the_true_pixels():
     assert not found.notes
 
 
-def test_what_is_masked_is_not_judged():
+def test_what_is_masked_is_not_judged() -> None:
     truth, _ = box_range((32, 64))
     estimated, mask = truth.copy(), np.ones((16, 32), bool)
     estimated[16:], mask[8:] = np.nan, False
@@ -55,7 +65,7 @@ def test_what_is_masked_is_not_judged():
     assert score_capture(POSES, POSES, *views).views["a"]["completeness"] == 0.5
 
 
-def test_a_pair_with_an_unregistered_camera_has_no_error():
+def test_a_pair_with_an_unregistered_camera_has_no_error() -> None:
     """Where most pairs had one, the report gave 180° as the median pose error."""
     true = {name: Rigid3(np.eye(3), np.array(place)) for name, place in
             (("a", (0.0, 0, 0)), ("b", (1.0, 0, 0)), ("c", (0.0, 1, 0)), ("d", (0.0, 0, 1)))}  # fmt: skip
@@ -67,7 +77,7 @@ def test_a_pair_with_an_unregistered_camera_has_no_error():
     assert not any("median" in name for name in apart)
 
 
-def test_what_cannot_be_judged_has_no_score():
+def test_what_cannot_be_judged_has_no_score() -> None:
     nothing = np.full((8, 16), np.nan, np.float32)
     found = scored(nothing, box_range((8, 16))[0], np.zeros((8, 16), np.uint8)).views["a"]
     assert found["completeness"] == 0

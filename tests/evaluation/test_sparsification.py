@@ -1,7 +1,10 @@
 """Sparsification: the order that confidence gives against the order of the errors."""
 
+from __future__ import annotations
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.metrics.score import score_capture
 from pano_mvs.algorithms.metrics.sparsification import sparsify
@@ -11,17 +14,17 @@ from pano_mvs.geometry import Rigid3
 SIZE = (16, 32)
 
 
-def noisy(seed=0):
+def noisy(seed: int = 0) -> tuple[NDArray[np.float64], NDArray[np.float64], np.random.Generator]:
     rng = np.random.default_rng(seed)
     truth = rng.uniform(1, 4, SIZE)
     return truth, truth * (1 + rng.normal(0, 0.1, SIZE)), rng
 
 
-def ranks(values):
+def ranks(values: NDArray[np.float64]) -> NDArray[np.int64]:
     return np.argsort(np.argsort(values.ravel())).reshape(values.shape)
 
 
-def test_confidence_in_the_order_of_the_errors_is_as_good_as_can_be():
+def test_confidence_in_the_order_of_the_errors_is_as_good_as_can_be() -> None:
     truth, estimated, _ = noisy()
     error = np.abs(estimated - truth) / truth
     best, worst = (sparsify(estimated, ranks(order), truth) for order in (-error, error))
@@ -32,7 +35,7 @@ def test_confidence_in_the_order_of_the_errors_is_as_good_as_can_be():
     assert worst.ause > 2 * sparsify(estimated, np.zeros(SIZE, np.uint8), truth).ause > 0
 
 
-def test_no_confidence_at_all_keeps_the_mean_error_whatever_is_kept():
+def test_no_confidence_at_all_keeps_the_mean_error_whatever_is_kept() -> None:
     truth, estimated, rng = noisy()
     flat = sparsify(estimated, np.full(SIZE, 9), truth)
     assert flat.area == pytest.approx(flat.error[-1])
@@ -40,7 +43,7 @@ def test_no_confidence_at_all_keeps_the_mean_error_whatever_is_kept():
     assert shuffled.area == pytest.approx(flat.area, rel=0.15)
 
 
-def test_coarse_confidence_has_the_area_of_a_random_order_within_each_level():
+def test_coarse_confidence_has_the_area_of_a_random_order_within_each_level() -> None:
     truth, estimated, rng = noisy()
     coarse = ranks(-np.abs(estimated - truth) / truth) // 100
     drawn = [
@@ -50,7 +53,7 @@ def test_coarse_confidence_has_the_area_of_a_random_order_within_each_level():
     assert sparsify(estimated, coarse, truth).area == pytest.approx(np.mean(drawn), rel=0.02)
 
 
-def test_pixels_without_truth_or_estimate_do_not_count_and_scale_does():
+def test_pixels_without_truth_or_estimate_do_not_count_and_scale_does() -> None:
     truth, estimated, rng = noisy()
     confidence = rng.integers(1, 255, SIZE)
     expected = sparsify(estimated[:, :16], confidence[:, :16], truth[:, :16])
@@ -62,13 +65,13 @@ def test_pixels_without_truth_or_estimate_do_not_count_and_scale_does():
     assert len(nothing.kept) == 0
 
 
-def test_shapes_that_differ_are_refused():
+def test_shapes_that_differ_are_refused() -> None:
     truth, estimated, _ = noisy()
     with pytest.raises(UsageError, match="one size"):
         sparsify(estimated, np.zeros((3, 3), np.uint8), truth)
 
 
-def test_scores_of_a_capture_tell_how_confidence_ranks_if_it_is_given():
+def test_scores_of_a_capture_tell_how_confidence_ranks_if_it_is_given() -> None:
     truth, estimated, rng = noisy()
     confidence = rng.integers(1, 255, SIZE).astype(np.uint8)
     poses = {name: Rigid3(np.eye(3), np.array([x, 0.0, 0.0])) for name, x in (("a", 0.0), ("b", 1.0))}

@@ -1,7 +1,10 @@
 """What the laws of the geometry are drawn from: hard cases first (near identity, seam, poles, antipodes)."""
 
+from __future__ import annotations
+
 import numpy as np
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec
 
@@ -10,8 +13,9 @@ TINY = st.sampled_from([0.0, 1e-300, -1e-12, 1e-9, -1e-6, 1e-3])
 COMPONENT = st.one_of(TINY, st.floats(-1, 1), st.sampled_from([1.0, -1.0]))
 
 
-def _unit(vector):
-    return np.array(vector) / np.linalg.norm(vector)
+def _unit(vector: tuple[float, float, float]) -> NDArray[np.float64]:
+    result: NDArray[np.float64] = np.array(vector) / np.linalg.norm(vector)
+    return result
 
 
 UNITS = st.tuples(COMPONENT, COMPONENT, COMPONENT).filter(lambda v: np.linalg.norm(v) > 1e-3).map(_unit)

@@ -1,11 +1,16 @@
 """The equirectangular camera keeps what the conventions page says of it."""
 
+from __future__ import annotations
+
 import re
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from pano_mvs import geometry
 from pano_mvs.core.errors import UsageError
@@ -27,22 +32,22 @@ SHARES = st.one_of(st.floats(0, 1), st.sampled_from([0.0, 0.5, 1.0, 1e-12, 1 - 1
         ((8, 2), (0, 0, -1), "and so is the right edge"),
     ],
 )
-def test_the_frame_is_x_right_y_down_z_forward(pixel, ray, what):
+def test_the_frame_is_x_right_y_down_z_forward(pixel: tuple[int, int], ray: tuple[int, int, int], what: str) -> None:
     assert ray_from_pixel(pixel, (4, 8)) == pytest.approx(np.array(ray), abs=1e-15), what
 
 
-def test_the_camera_frame_is_right_handed():
+def test_the_camera_frame_is_right_handed() -> None:
     right, down, ahead = (ray_from_pixel(pixel, (4, 8)) for pixel in ((6, 2), (4, 4), (4, 2)))
     assert np.cross(right, down) == pytest.approx(ahead, abs=1e-15)
 
 
-def test_the_first_pixels_centre_is_at_one_half():
+def test_the_first_pixels_centre_is_at_one_half() -> None:
     np.testing.assert_array_equal(ray_grid((6, 12))[0, 0], ray_from_pixel((0.5, 0.5), (6, 12)))
     np.testing.assert_array_equal(ray_grid((6, 12))[4, 7], ray_from_pixel((7.5, 4.5), (6, 12)))
 
 
 @given(SIZES, SHARES, SHARES)
-def test_azimuth_and_elevation_are_those_of_the_page(size, share_x, share_y):
+def test_azimuth_and_elevation_are_those_of_the_page(size: tuple[int, int], share_x: float, share_y: float) -> None:
     height, width = size
     theta, phi = 2 * np.pi * (share_x - 0.5), np.pi * (0.5 - share_y)
     ray = ray_from_pixel((share_x * width, share_y * height), size)
@@ -52,48 +57,52 @@ def test_azimuth_and_elevation_are_those_of_the_page(size, share_x, share_y):
 
 
 @given(UNITS)
-def test_the_inverse_is_that_of_the_page(ray):
+def test_the_inverse_is_that_of_the_page(ray: NDArray[np.float64]) -> None:
     x, y = pixel_from_ray(ray, (180, 360))
     assert np.radians(x - 180) == pytest.approx(np.arctan2(ray[0], ray[2]), abs=1e-12)
     assert np.radians(90 - y) == pytest.approx(np.arctan2(-ray[1], np.hypot(ray[0], ray[2])), abs=1e-12)
 
 
 @given(SIZES, UNITS, st.floats(1e-6, 1e6))
-def test_a_ray_of_any_length_survives_the_round_trip(size, ray, length):
+def test_a_ray_of_any_length_survives_the_round_trip(
+    size: tuple[int, int], ray: NDArray[np.float64], length: float
+) -> None:
     back = ray_from_pixel(pixel_from_ray(length * ray, size), size)
     assert angle_between(back, ray) < 1e-12
 
 
 @given(SIZES, st.floats(1e-6, 1 - 1e-6), st.floats(1e-3, 1 - 1e-3))
 @example((512, 1024), 0.5, 0.5)
-def test_a_pixel_survives_the_round_trip(size, share_x, share_y):
+def test_a_pixel_survives_the_round_trip(size: tuple[int, int], share_x: float, share_y: float) -> None:
     pixel = np.array([share_x * size[1], share_y * size[0]])
     assert pixel_from_ray(ray_from_pixel(pixel, size), size) == pytest.approx(pixel, abs=1e-9)
 
 
 @given(UNITS)
-def test_pixels_lie_within_the_picture(ray):
+def test_pixels_lie_within_the_picture(ray: NDArray[np.float64]) -> None:
     x, y = pixel_from_ray(ray, (7, 14))
     assert 0 <= x <= 14
     assert 0 <= y <= 7
 
 
 @given(SIZES)
-def test_solid_angles_sum_to_the_whole_sphere(size):
+def test_solid_angles_sum_to_the_whole_sphere(size: tuple[int, int]) -> None:
     areas = pixel_solid_angle(size)
     assert areas.shape == (size[0],)
     assert areas.sum() * size[1] == pytest.approx(4 * np.pi, rel=1e-12)
     assert areas == pytest.approx(areas[::-1], rel=1e-9)
 
 
-def test_solid_angle_of_a_pixel_is_the_integral_of_the_cosine():
+def test_solid_angle_of_a_pixel_is_the_integral_of_the_cosine() -> None:
     elevation = np.pi * (0.5 - (np.arange(180_000) + 0.5) / 180_000)
     by_sum = np.cos(elevation).reshape(18, -1).sum(axis=1) * (np.pi / 180_000) * (2 * np.pi / 36)
     assert pixel_solid_angle((18, 36)) == pytest.approx(by_sum, rel=1e-8)
 
 
 @given(UNITS, UNITS, ANGLES)
-def test_angle_between_is_exact_near_zero_and_near_pi(first, second, angle):
+def test_angle_between_is_exact_near_zero_and_near_pi(
+    first: NDArray[np.float64], second: NDArray[np.float64], angle: float
+) -> None:
     axis = np.cross(first, second)
     if np.linalg.norm(axis) < 0.1:
         return
@@ -102,18 +111,18 @@ def test_angle_between_is_exact_near_zero_and_near_pi(first, second, angle):
     assert angle_between(3 * first, 7 * turned) == pytest.approx(abs(angle), abs=2e-15 + 1e-12 * abs(angle))
 
 
-def test_angle_between_keeps_the_digits_that_acos_loses():
+def test_angle_between_keeps_the_digits_that_acos_loses() -> None:
     assert angle_between((1, 0, 0), (1, 1e-11, 0)) == pytest.approx(1e-11, rel=1e-9)
     assert angle_between((1, 0, 0), (-1, 1e-11, 0)) == pytest.approx(np.pi - 1e-11, abs=1e-15)
 
 
 @pytest.mark.parametrize("call", [ray_grid, pixel_solid_angle])
-def test_a_size_without_pixels_is_refused(call):
+def test_a_size_without_pixels_is_refused(call: Callable[..., Any]) -> None:
     with pytest.raises(UsageError, match=re.escape("0×4 pixels has no pixels")):
         call((4, 0))
 
 
-def test_the_public_names_are_those_that_exist():
+def test_the_public_names_are_those_that_exist() -> None:
     public = {name for name, value in vars(geometry).items() if callable(value) and not name.startswith("_")}
     assert public == set(geometry.__all__)
     assert list(geometry.__all__) == sorted(geometry.__all__)

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from pano_mvs.core.errors import PanoMvsError
-from pano_mvs.engine.code.stage_code import stage_code
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.engine.stages.stage_code import stage_code
 from pano_mvs.testing.stage_calls import StageCase
 from tests.golden.summaries import Summary, differences, summary_of
 from tests.testing.test_builtin_stages import INPUTS, SETTINGS, SIZES_HW

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.scene import FilePart, Record
+from tests.stored import read_picture
 
 Summary = dict[str, Any]
 """Name to a list of numbers, the count first, or to a text."""
@@ -43,7 +44,7 @@ def summary_of(value: Record, metrics: Mapping[str, float]) -> Summary:
 
 def _of_file(name: str, path: Path) -> Summary:
     if path.suffix in _PICTURES:
-        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        picture = read_picture(path, cv2.IMREAD_UNCHANGED)
         assert picture is not None, path
         return {name: _of_array(picture)}
     data = path.read_bytes()

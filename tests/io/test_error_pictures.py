@@ -1,5 +1,9 @@
 """Pictures and clouds of errors: what colour says what."""
 
+from __future__ import annotations
+
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -9,11 +13,12 @@ from pano_mvs.io.cloud_picture import distance_colors
 from pano_mvs.io.clouds.ply_points import open_ply_points
 from pano_mvs.io.error_cloud import write_error_cloud
 from pano_mvs.io.error_picture import error_colored, signed_error, write_error_picture
+from tests.stored import read_picture
 
 GREY, BLACK = (128, 128, 128), (25, 25, 25)
 
 
-def test_hue_tells_the_sign_and_lightness_the_size():
+def test_hue_tells_the_sign_and_lightness_the_size() -> None:
     errors = np.array([-1.0, -0.1, -0.05, 0.0, 0.05, 0.1, 1.0])
     colors = error_colored(errors, 0.1).astype(int)
     np.testing.assert_array_equal(colors[0], colors[1])
@@ -25,7 +30,7 @@ def test_hue_tells_the_sign_and_lightness_the_size():
     assert (np.diff(lightness[3:6]) < 0).all()
 
 
-def test_missing_is_black_and_what_does_not_count_is_grey():
+def test_missing_is_black_and_what_does_not_count_is_grey() -> None:
     truth = np.array([[2.0, 2.0, np.nan]])
     error = signed_error(np.array([[2.2, np.nan, 1.0]]), truth)
     np.testing.assert_allclose(error, [[0.1, np.nan, np.nan]])
@@ -34,7 +39,9 @@ def test_missing_is_black_and_what_does_not_count_is_grey():
 
 
 @pytest.mark.parametrize("size", [(8, 16), (512, 1024), (600, 1200)])
-def test_the_picture_holds_four_panels_of_any_size_with_the_seam_and_the_poles(tmp_path, size):
+def test_the_picture_holds_four_panels_of_any_size_with_the_seam_and_the_poles(
+    tmp_path: Path, size: tuple[int, int]
+) -> None:
     truth = np.full(size, 2.0, np.float32)
     estimated = truth.copy()
     estimated[:, : size[1] // 2] *= 1.5
@@ -42,7 +49,7 @@ def test_the_picture_holds_four_panels_of_any_size_with_the_seam_and_the_poles(t
     image = np.full((10, 20, 3), (200, 30, 30), np.uint8)
     path = tmp_path / "new" / "a.jpg"
     write_error_picture(path, estimated, truth, image=image, unit="m")
-    picture = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB).astype(int)
+    picture = cv2.cvtColor(read_picture(path), cv2.COLOR_BGR2RGB).astype(int)
     assert picture.shape == (2 * (34 + 512 + 60), 2 * 1024 + 8, 3)
     panels = picture[34 : 34 + 512, :1024], picture[34 : 34 + 512, 1032:]
     assert np.abs(panels[0] - (200, 30, 30)).max() < 12
@@ -54,16 +61,16 @@ def test_the_picture_holds_four_panels_of_any_size_with_the_seam_and_the_poles(t
     assert np.abs(corners["none"] - BLACK).max() < 20
 
 
-def test_a_picture_without_panorama_or_truth_is_made_too(tmp_path):
+def test_a_picture_without_panorama_or_truth_is_made_too(tmp_path: Path) -> None:
     nothing = np.full((8, 16), np.nan, np.float32)
     write_error_picture(tmp_path / "a.jpg", nothing, nothing, counted=np.zeros((8, 16), bool))
-    picture = cv2.imread(str(tmp_path / "a.jpg"))
+    picture = read_picture(tmp_path / "a.jpg")
     assert tuple(picture[200, 1500]) == GREY
 
 
-def test_a_cloud_carries_its_errors_as_numbers_and_as_colours(tmp_path):
+def test_a_cloud_carries_its_errors_as_numbers_and_as_colours(tmp_path: Path) -> None:
     points = np.random.default_rng(0).normal(size=(9, 3)).astype(np.float32)
-    distances = np.float32([0.01, 0.03, 0.2, np.inf, 0.01, 0.02, 0.05, 0.06, 0])
+    distances = np.array([0.01, 0.03, 0.2, np.inf, 0.01, 0.02, 0.05, 0.06, 0], np.float32)
     path = tmp_path / "new" / "a.ply"
     write_error_cloud(path, (points[i : i + 4] for i in (0, 4, 8)), distances, limits=(0.02, 0.05), farthest=1.0)
     read = open_ply_points(path)
@@ -75,11 +82,11 @@ def test_a_cloud_carries_its_errors_as_numbers_and_as_colours(tmp_path):
         write_error_cloud(path, [points], distances[:8], limits=(0.02,), farthest=1.0)
 
 
-def test_pyvista_reads_the_scalar(tmp_path):
+def test_pyvista_reads_the_scalar(tmp_path: Path) -> None:
     import pyvista
 
     points = np.eye(3, dtype=np.float32)
-    write_error_cloud(tmp_path / "a.ply", [points], np.float32([0, 0.5, 2]), limits=(1,), farthest=1.5)
+    write_error_cloud(tmp_path / "a.ply", [points], np.array([0, 0.5, 2], np.float32), limits=(1,), farthest=1.5)
     mesh = pyvista.read(tmp_path / "a.ply")
     np.testing.assert_array_equal(mesh.points, points)
     assert mesh.n_points == 3

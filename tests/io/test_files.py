@@ -1,8 +1,15 @@
 """Range maps, confidences, clouds and previews come back as they were written."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.geometry import Rigid3
@@ -11,16 +18,17 @@ from pano_mvs.io.images.preview import color_mapped, range_limits, scale_ticks, 
 from pano_mvs.io.ranges.files import read_confidence_png, read_range_tiff, write_confidence_png, write_range_tiff
 from pano_mvs.scene import PointCloud
 from pano_mvs.testing.room import default_room, render
+from tests.stored import read_picture
 
 
-def range_map():
+def range_map() -> NDArray[np.float32]:
     values = np.random.default_rng(0).gamma(2, 2, (24, 48)).astype(np.float32)
     values[values < 1] = np.nan
     values[0, :2] = (1e-30, 3e30)
     return values
 
 
-def test_a_range_map_keeps_every_bit_and_its_nans(tmp_path):
+def test_a_range_map_keeps_every_bit_and_its_nans(tmp_path: Path) -> None:
     write_range_tiff(tmp_path / "a.tiff", range_map())
     write_range_tiff(tmp_path / "b.tiff", range_map())
     np.testing.assert_array_equal(read_range_tiff(tmp_path / "a.tiff"), range_map())
@@ -28,12 +36,12 @@ def test_a_range_map_keeps_every_bit_and_its_nans(tmp_path):
 
 
 @pytest.mark.parametrize("array", [np.zeros((2, 2)), np.zeros((2, 2, 1), np.float32)])
-def test_another_array_is_no_range_map(tmp_path, array):
+def test_another_array_is_no_range_map(tmp_path: Path, array: NDArray[Any]) -> None:
     with pytest.raises(UsageError, match=r"a range map is \(H, W\) float32"):
         write_range_tiff(tmp_path / "a.tiff", array)
 
 
-def test_a_confidence_map_comes_back(tmp_path):
+def test_a_confidence_map_comes_back(tmp_path: Path) -> None:
     confidence = np.random.default_rng(1).integers(0, 256, (6, 12), dtype=np.uint8)
     write_confidence_png(tmp_path / "a.png", confidence)
     np.testing.assert_array_equal(read_confidence_png(tmp_path / "a.png"), confidence)
@@ -42,7 +50,7 @@ def test_a_confidence_map_comes_back(tmp_path):
         read_confidence_png(tmp_path / "colour.png")
 
 
-def test_another_file_is_no_range_map(tmp_path):
+def test_another_file_is_no_range_map(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"gone\.tiff: cannot be read"):
         read_range_tiff(tmp_path / "gone.tiff")
     cv2.imwrite(str(tmp_path / "grey.tiff"), np.zeros((4, 4), np.uint8))
@@ -53,15 +61,15 @@ def test_another_file_is_no_range_map(tmp_path):
             read_range_tiff(tmp_path / f"{name}.tiff")
 
 
-def test_a_confidence_map_is_an_8_bit_png(tmp_path):
+def test_a_confidence_map_is_an_8_bit_png(tmp_path: Path) -> None:
     confidence = np.arange(256, dtype=np.uint8).reshape(8, 32)
     write_confidence_png(tmp_path / "a.png", confidence)
-    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED), confidence)
+    np.testing.assert_array_equal(read_picture(tmp_path / "a.png", cv2.IMREAD_UNCHANGED), confidence)
     with pytest.raises(UsageError, match=r"a confidence map is \(H, W\) uint8"):
         write_confidence_png(tmp_path / "a.png", confidence.astype(float))
 
 
-def cloud(count):
+def cloud(count: int) -> PointCloud:
     rng = np.random.default_rng(count)
     normals = rng.normal(size=(count, 3)).astype(np.float32)
     return PointCloud(
@@ -71,7 +79,7 @@ def cloud(count):
 
 
 @pytest.mark.parametrize("count", [0, 1, 1000])
-def test_a_cloud_survives_the_round_trip(tmp_path, count):
+def test_a_cloud_survives_the_round_trip(tmp_path: Path, count: int) -> None:
     write_ply(tmp_path / "a.ply", cloud(count))
     back = read_ply(tmp_path / "a.ply")
     back.check()
@@ -79,7 +87,7 @@ def test_a_cloud_survives_the_round_trip(tmp_path, count):
         np.testing.assert_array_equal(getattr(back, name), value)
 
 
-def test_the_ply_header_is_what_other_programs_expect(tmp_path):
+def test_the_ply_header_is_what_other_programs_expect(tmp_path: Path) -> None:
     write_ply(tmp_path / "a.ply", cloud(3))
     lines = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")[0].decode().splitlines()
     names = [
@@ -108,20 +116,20 @@ def test_the_ply_header_is_what_other_programs_expect(tmp_path):
         (lambda data: b"", "not a PLY file of pano-mvs"),
     ],
 )
-def test_another_ply_is_refused(tmp_path, change, what):
+def test_another_ply_is_refused(tmp_path: Path, change: Callable[..., Any], what: str) -> None:
     write_ply(tmp_path / "a.ply", cloud(3))
     (tmp_path / "a.ply").write_bytes(change((tmp_path / "a.ply").read_bytes()))
     with pytest.raises(InputError, match=rf"a\.ply: .*{what}"):
         read_ply(tmp_path / "a.ply")
 
 
-def test_a_preview_shows_the_panorama_above_its_range(tmp_path):
+def test_a_preview_shows_the_panorama_above_its_range(tmp_path: Path) -> None:
     image, ranges = render(default_room(), Rigid3.identity(), (64, 128))
     ranges[20:30, 40:60] = np.nan
     write_preview(tmp_path / "a.jpg", image, ranges)
     write_preview(tmp_path / "b.jpg", image, ranges)
     assert (tmp_path / "a.jpg").read_bytes() == (tmp_path / "b.jpg").read_bytes()
-    shown = cv2.imread(str(tmp_path / "a.jpg"))
+    shown = read_picture(tmp_path / "a.jpg")
     assert shown.shape[1] == 1280
     assert shown.shape[0] > 1280
     small = cv2.resize(shown[:640], (128, 64), interpolation=cv2.INTER_AREA)[..., ::-1]
@@ -130,7 +138,7 @@ def test_a_preview_shows_the_panorama_above_its_range(tmp_path):
     assert np.abs(hole - 128).max() < 12
 
 
-def test_near_is_red_far_is_blue_and_nothing_is_grey():
+def test_near_is_red_far_is_blue_and_nothing_is_grey() -> None:
     ranges = np.array([[1.0, 3.0, 9.0, np.nan, 0.1, 100.0]], np.float32)
     near, middle, far, nothing, nearer, farther = color_mapped(ranges, 1.0, 9.0)[0].astype(int)
     assert near[0] > 2 * near[2]
@@ -143,7 +151,7 @@ def test_near_is_red_far_is_blue_and_nothing_is_grey():
 @pytest.mark.parametrize(
     "ranges", [np.full((2, 4), np.nan), np.full((2, 4), 3.0), np.array([[0.01, 5000.0]]), np.array([[1e-5, 2e-5]])]
 )
-def test_the_scale_has_round_numbers_for_any_range(tmp_path, ranges):
+def test_the_scale_has_round_numbers_for_any_range(tmp_path: Path, ranges: NDArray[Any]) -> None:
     near, far = range_limits(ranges.astype(np.float32))
     ticks = scale_ticks(near, far)
     assert 2 <= len(ticks) <= 10

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.io.ranges.npy import read_npy, read_npz
@@ -19,8 +21,8 @@ def header(shape: str, descr: str = "'<f4'") -> bytes:
 
 @pytest.mark.parametrize("order", ["C", "F"])
 @pytest.mark.parametrize("dtype", ["<f4", ">f8", "<u2", "|u1"])
-def test_arrays_come_back(tmp_path: Path, order: str, dtype: str) -> None:
-    array = np.asarray(np.arange(24).reshape(4, 6), dtype, order=order)  # type: ignore[call-overload]
+def test_arrays_come_back(tmp_path: Path, order: Literal["C", "F"], dtype: str) -> None:
+    array: NDArray[Any] = np.asarray(np.arange(24).reshape(4, 6), np.dtype(dtype), order=order)
     np.save(tmp_path / "a.npy", array)
     np.savez_compressed(tmp_path / "a.npz", range=array)
     np.testing.assert_array_equal(read_npy(tmp_path / "a.npy"), array)

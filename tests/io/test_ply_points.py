@@ -1,5 +1,10 @@
 """PLY files of other programs."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -10,16 +15,16 @@ from pano_mvs.io.clouds.ply_points import open_ply_points, read_ply_points
 from pano_mvs.scene import PointCloud
 from pano_mvs.stages.exports.files import PlyParams, ply
 
-POINTS = np.float32([[1, 2, 3], [-4.5, 0.25, 1e6]])
+POINTS = np.array([[1, 2, 3], [-4.5, 0.25, 1e6]], np.float32)
 
 
-def header(form, properties, count=2, more=()):
+def header(form: str, properties: Sequence[str], count: int | str = 2, more: Sequence[str] = ()) -> bytes:
     lines = ["ply", f"format {form} 1.0", "comment of element vertex 7", f"element vertex {count}"]
     return "\n".join([*lines, *(f"property {text}" for text in properties), *more, "end_header", ""]).encode()
 
 
 @pytest.mark.parametrize(("form", "order"), [("binary_little_endian", "<"), ("binary_big_endian", ">")])
-def test_binary_files_of_either_order_with_other_properties_and_faces(tmp_path, form, order):
+def test_binary_files_of_either_order_with_other_properties_and_faces(tmp_path: Path, form: str, order: str) -> None:
     layout = [("confidence", f"{order}f4"), ("z", f"{order}f8"), ("x", f"{order}f4"), ("id", "u1"), ("y", f"{order}f4")]
     vertices = np.zeros(2, layout)
     for idx, name in enumerate("xyz"):
@@ -31,7 +36,7 @@ def test_binary_files_of_either_order_with_other_properties_and_faces(tmp_path, 
     np.testing.assert_array_equal(read_ply_points(path), POINTS)
 
 
-def test_text_files(tmp_path):
+def test_text_files(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     path.write_bytes(header("ascii", ["float x", "float y", "float z", "uchar red"]) + b"1 2 3 9\n-4.5 0.25 1e6 8\n")
     np.testing.assert_array_equal(read_ply_points(path), POINTS)
@@ -40,9 +45,9 @@ def test_text_files(tmp_path):
 
 
 @pytest.mark.parametrize("quality", [False, True])
-def test_our_own_files(tmp_path, quality):
+def test_our_own_files(tmp_path: Path, quality: bool) -> None:
     one = np.ones((2, 3), np.float32)
-    cloud = PointCloud(POINTS, one, one.astype(np.uint8), np.uint8([2, 9]), np.uint8([130, 255]))
+    cloud = PointCloud(POINTS, one, one.astype(np.uint8), np.array([2, 9], np.uint8), np.array([130, 255], np.uint8))
     write_ply(tmp_path / "a.ply", cloud, quality=quality)
     np.testing.assert_array_equal(read_ply_points(tmp_path / "a.ply"), POINTS)
     back = read_ply(tmp_path / "a.ply")
@@ -71,7 +76,7 @@ def test_our_own_files(tmp_path, quality):
         (header("ascii", ["float x", "float x", "float y", "float z"]), "or have a property twice"),
     ],
 )
-def test_damaged_and_strange_files_are_named(tmp_path, data, what):
+def test_damaged_and_strange_files_are_named(tmp_path: Path, data: bytes, what: str) -> None:
     (tmp_path / "a.ply").write_bytes(data)
     with pytest.raises(InputError, match=rf"a\.ply: .*{what}"):
         read_ply_points(tmp_path / "a.ply")
@@ -79,8 +84,10 @@ def test_damaged_and_strange_files_are_named(tmp_path, data, what):
         read_ply_points(tmp_path / "no.ply")
 
 
-def test_the_export_writes_quality_on_demand(tmp_path):
-    cloud = PointCloud(POINTS, POINTS, POINTS.astype(np.uint8), np.uint8([2, 9]), np.uint8([130, 255]))
+def test_the_export_writes_quality_on_demand(tmp_path: Path) -> None:
+    cloud = PointCloud(
+        POINTS, POINTS, POINTS.astype(np.uint8), np.array([2, 9], np.uint8), np.array([130, 255], np.uint8)
+    )
     context = Context(np.random.default_rng(0), tmp_path)
     for quality, confidence in ((False, None), (True, [130, 255])):
         files = ply(cloud, PlyParams(quality=quality), context)
@@ -88,10 +95,10 @@ def test_the_export_writes_quality_on_demand(tmp_path):
         assert (None if back.confidence is None else back.confidence.tolist()) == confidence
 
 
-def test_a_file_is_read_in_parts_with_its_normals(tmp_path):
+def test_a_file_is_read_in_parts_with_its_normals(tmp_path: Path) -> None:
     """Nothing but the part that is asked for comes into memory."""
     points = np.random.default_rng(0).normal(size=(11, 3)).astype(np.float32)
-    normals = np.tile(np.float32([0, 0, -1]), (11, 1))
+    normals = np.tile(np.array([0, 0, -1], np.float32), (11, 1))
     write_ply(tmp_path / "a.ply", PointCloud(points, normals, np.zeros((11, 3), np.uint8), np.ones(11, np.uint8)))
     file = open_ply_points(tmp_path / "a.ply")
     assert (file.count, file.has_normals) == (11, True)

@@ -1,6 +1,10 @@
 """Poses from a CSV file, from nerfstudio, and from what is neither."""
 
+from __future__ import annotations
+
 import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,13 +12,14 @@ import pytest
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import Rigid3, quat_wxyz_from_rotation
 from pano_mvs.io.poses.files import read_poses
+from pano_mvs.scene import Poses
 from pano_mvs.testing.room import capture_poses
 
 POSES = dict(zip(("a/1.jpg", "a/2.jpg", "a/10.jpg"), capture_poses(3, seed=5), strict=True))
 HEADER = "name,tx,ty,tz,qw,qx,qy,qz"
 
 
-def same(found, expected):
+def same(found: Poses, expected: Mapping[str, Rigid3]) -> None:
     found.check()
     assert found.names == tuple(expected)
     for idx, pose in enumerate(expected.values()):
@@ -22,12 +27,12 @@ def same(found, expected):
         assert found.translations[idx] == pytest.approx(pose.translation, abs=1e-9)
 
 
-def csv_line(name, pose, factor=1.0):
+def csv_line(name: str, pose: Rigid3, factor: float = 1.0) -> str:
     numbers = [*pose.translation, *(factor * quat_wxyz_from_rotation(pose.rotation))]
     return ",".join([name, *(repr(float(number)) for number in numbers)])
 
 
-def test_a_csv_file_is_read(tmp_path):
+def test_a_csv_file_is_read(tmp_path: Path) -> None:
     lines = [
         "\ufeff# made by hand",
         "",
@@ -42,7 +47,7 @@ def test_a_csv_file_is_read(tmp_path):
     assert not found.metric
 
 
-def test_a_name_with_a_comma_may_be_quoted(tmp_path):
+def test_a_name_with_a_comma_may_be_quoted(tmp_path: Path) -> None:
     (tmp_path / "poses.csv").write_text(f'{HEADER}\n"a, b.jpg", 1, 2, 3, 1, 0, 0, 0\n')
     assert read_poses(tmp_path / "poses.csv").names == ("a, b.jpg",)
 
@@ -60,13 +65,13 @@ def test_a_name_with_a_comma_may_be_quoted(tmp_path):
         ([HEADER, "a,1,2,3,1,0,0,0", "a,1,2,3,1,0,0,0"], ": image 'a' is listed twice"),
     ],
 )
-def test_a_malformed_csv_is_named_with_its_line(tmp_path, lines, what):
+def test_a_malformed_csv_is_named_with_its_line(tmp_path: Path, lines: Sequence[str], what: str) -> None:
     (tmp_path / "p.csv").write_text("\n".join(lines))
     with pytest.raises(InputError, match=rf"p\.csv{what}"):
         read_poses(tmp_path / "p.csv")
 
 
-def transforms(**more):
+def transforms(**more: object) -> dict[str, object]:
     opengl_from_opencv = np.diag([1.0, -1.0, -1.0, 1.0])
     frames = []
     for name, pose in POSES.items():
@@ -76,13 +81,13 @@ def transforms(**more):
     return {"camera_model": "EQUIRECTANGULAR", "w": 64, "h": 32, "frames": frames} | more
 
 
-def test_nerfstudios_transforms_are_read(tmp_path):
+def test_nerfstudios_transforms_are_read(tmp_path: Path) -> None:
     (tmp_path / "transforms.json").write_text(json.dumps(transforms()))
     same(read_poses(tmp_path / "transforms.json"), POSES)
     same(read_poses(tmp_path), POSES)
 
 
-def test_opengl_looks_along_minus_z_with_y_up(tmp_path):
+def test_opengl_looks_along_minus_z_with_y_up(tmp_path: Path) -> None:
     """The identity of nerfstudio is a camera that looks along −z of the world, which has y up."""
     frames = [{"file_path": "a.jpg", "transform_matrix": np.eye(4).tolist()}]
     (tmp_path / "transforms.json").write_text(json.dumps(transforms(frames=frames)))
@@ -102,13 +107,13 @@ def test_opengl_looks_along_minus_z_with_y_up(tmp_path):
         ([], "expected a JSON object, got list"),
     ],
 )
-def test_malformed_transforms_are_named_with_their_key(tmp_path, data, what):
+def test_malformed_transforms_are_named_with_their_key(tmp_path: Path, data: object, what: str) -> None:
     (tmp_path / "t.json").write_text(json.dumps(data))
     with pytest.raises(InputError, match=rf"t\.json: {what}"):
         read_poses(tmp_path / "t.json")
 
 
-def test_what_holds_no_poses_is_named(tmp_path):
+def test_what_holds_no_poses_is_named(tmp_path: Path) -> None:
     (tmp_path / "broken.json").write_text('{\n "views": [}')
     (tmp_path / "binary.json").write_bytes(b"\xff\xfe\x00")
     (tmp_path / "poses.txt").touch()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import pytest
 
@@ -12,16 +13,16 @@ from pano_mvs.io.poses.files import read_poses
 IDENTITY = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
 
 
-def views(**more):
+def views(**more: object) -> dict[str, object]:
     return {"views": [{"image": "a.png", "R": IDENTITY, "t": [0, 0, 0]}], **more}
 
 
-def frames(matrix):
+def frames(matrix: object) -> dict[str, object]:
     frame = {"file_path": "a.png", "transform_matrix": matrix}
     return {"camera_model": "EQUIRECTANGULAR", "frames": [frame]}
 
 
-def shots(**part):
+def shots(**part: object) -> list[dict[str, object]]:
     return [{"cameras": {"c": {"projection_type": "spherical"}}, **part}]
 
 
@@ -39,7 +40,7 @@ SHOT = {"camera": "c", "rotation": [0, 0, 0], "translation": [0, 0, 0]}
         ("reconstruction.json", shots(shots={"a.png": {**SHOT, "camera": ["c"]}}), "projection_type is None"),
     ],
 )
-def test_traps_are_named(tmp_path, name, data, what):
+def test_traps_are_named(tmp_path: Path, name: str, data: object, what: str) -> None:
     (tmp_path / name).write_text(json.dumps(data))
     with pytest.raises(InputError, match=what) as caught:
         read_poses(tmp_path / name)
@@ -47,13 +48,13 @@ def test_traps_are_named(tmp_path, name, data, what):
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"views": ' + "9" * 5000 + "}"])
-def test_json_that_breaks_readers_is_an_input_error(tmp_path, text):
+def test_json_that_breaks_readers_is_an_input_error(tmp_path: Path, text: str) -> None:
     (tmp_path / "poses.json").write_text(text)
     with pytest.raises(InputError, match=r"poses\.json"):
         read_poses(tmp_path / "poses.json")
 
 
-def test_a_reconstruction_without_reference_is_not_metric(tmp_path):
+def test_a_reconstruction_without_reference_is_not_metric(tmp_path: Path) -> None:
     path = tmp_path / "reconstruction.json"
     path.write_text(json.dumps(shots(shots={"a.png": SHOT})))
     assert not read_poses(path).metric

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,6 +24,7 @@ from pano_mvs.io.ranges.files import (
 )
 from pano_mvs.stages.exports.files import RangesParams, ranges
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
+from tests.stored import read_picture
 
 SIZE_HW = 24, 48
 
@@ -47,7 +49,7 @@ def some_normals() -> np.ndarray:
 def test_a_16_bit_png_is_the_range_to_half_a_step(tmp_path: Path, unit: float) -> None:
     values = some_ranges()
     assert write_range_png(tmp_path / "a.png", values, unit=unit) == 0
-    steps = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
+    steps = read_picture(tmp_path / "a.png", cv2.IMREAD_UNCHANGED)
     assert steps.dtype == np.uint16
     np.testing.assert_array_equal(steps == 0, np.isnan(values))
     assert np.nanmax(np.abs(np.where(steps > 0, steps * unit, np.nan) - values)) <= unit / 2 + 1e-6
@@ -57,7 +59,7 @@ def test_a_16_bit_png_is_the_range_to_half_a_step(tmp_path: Path, unit: float) -
 def test_what_a_16_bit_png_cannot_hold_is_invalid_and_counted(tmp_path: Path) -> None:
     values = np.array([[1e-6, 0.0004, 65.535, 65.5354, 65.5356, 1e9, np.nan, 2.0]], np.float32)
     assert write_range_png(tmp_path / "a.png", values, unit=0.001) == 2
-    steps = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
+    steps = read_picture(tmp_path / "a.png", cv2.IMREAD_UNCHANGED)
     assert steps.tolist() == [[1, 1, 65535, 65535, 0, 0, 0, 2000]]
 
 
@@ -69,9 +71,9 @@ def test_normals_come_back_from_tiff_and_png(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_normals(tmp_path / "a.tiff"), normals)
     np.testing.assert_allclose(read_normals(tmp_path / "a.png"), normals, atol=2e-5)
     np.testing.assert_array_equal(read_normals(tmp_path / "a.png")[0, :6], normals[0, :6])
-    tiff = cv2.cvtColor(cv2.imread(str(tmp_path / "a.tiff"), cv2.IMREAD_UNCHANGED), cv2.COLOR_BGR2RGB)
+    tiff = cv2.cvtColor(read_picture(tmp_path / "a.tiff", cv2.IMREAD_UNCHANGED), cv2.COLOR_BGR2RGB)
     np.testing.assert_array_equal(tiff, normals)
-    png = cv2.cvtColor(cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED), cv2.COLOR_BGR2RGB)
+    png = cv2.cvtColor(read_picture(tmp_path / "a.png", cv2.IMREAD_UNCHANGED), cv2.COLOR_BGR2RGB)
     assert png[0, :2].tolist() == [[65535, 32768, 32768], [1, 32768, 32768]]
     np.testing.assert_array_equal((png == 0).all(axis=-1), np.isnan(normals[..., 0]))
 
@@ -104,12 +106,13 @@ def test_other_arrays_and_other_files_are_refused(tmp_path: Path) -> None:
         read_normals(tmp_path / "a.png")
     with pytest.raises(InputError, match=r"a\.png: no EXR file that can be read"):
         exr.read_exr(tmp_path / "a.png")
+    doubles: Any = np.zeros((2, 4))
     with pytest.raises(UsageError, match=r"a range map is \(H, W\) float32"):
-        write_range_png(tmp_path / "b.png", np.zeros((2, 4)), unit=1)
+        write_range_png(tmp_path / "b.png", doubles, unit=1)
     with pytest.raises(UsageError, match=r"normals are \(H, W, 3\) float32"):
         write_normals_png(tmp_path / "b.png", np.zeros((2, 4), np.float32))
     with pytest.raises(UsageError, match="channels of an EXR file are"):
-        exr.write_exr(tmp_path / "b.exr", {"Z": np.zeros((2, 4))})
+        exr.write_exr(tmp_path / "b.exr", {"Z": doubles})
 
 
 def test_the_stage_writes_all_formats_of_one_map(tmp_path: Path) -> None:
@@ -128,13 +131,13 @@ def test_the_stage_writes_all_formats_of_one_map(tmp_path: Path) -> None:
         "confidence/{item}.png",
         *(f"normals/{{item}}.{suffix}" for suffix in ("tiff", "png", "exr", "npy")),
     }
-    tiff = cv2.imread(str(files["range/{item}.tiff"]), cv2.IMREAD_UNCHANGED)
+    tiff = read_picture(files["range/{item}.tiff"], cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(tiff, np.where(mask, true_range, np.float32(np.nan)))
     np.testing.assert_array_equal(np.load(files["range/{item}.npy"]), tiff)
     np.testing.assert_array_equal(exr.read_exr(files["range/{item}.exr"])["Z"], tiff)
     unit = json.loads(files["range/{item}.json"].read_text())["unit"]
     np.testing.assert_allclose(read_range_png(files["range/{item}.png"], unit=unit), tiff, atol=0.00051)
-    confidence = cv2.imread(str(files["confidence/{item}.png"]), cv2.IMREAD_UNCHANGED)
+    confidence = read_picture(files["confidence/{item}.png"], cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(confidence, np.where(mask, 200, 0))
     normals = np.load(files["normals/{item}.npy"])
     assert np.isnan(normals[~mask]).all()

@@ -86,6 +86,7 @@ def test_how_the_work_is_cut_up_changes_nothing(
     back = read_ply(tmp_path / "again.ply")
     np.testing.assert_array_equal(back.points_in_world, cloud.points_in_world[whole])
     np.testing.assert_array_equal(back.colors_rgb, cloud.colors_rgb[whole])
+    assert cloud.confidence is not None
     np.testing.assert_array_equal(back.confidence, cloud.confidence[whole])
 
 
@@ -114,8 +115,7 @@ def test_a_cloud_that_is_small_enough_is_left_alone(tmp_path: Path) -> None:
     kept = select_points(cloud, Selection(voxel=0.2, max_points=500), tmp_path)
     assert kept is not None
     assert kept.voxel == 0.2
-    few = PointCloud(*(array[:0] for array in (cloud.points_in_world, cloud.normals_in_world)),
-                     cloud.colors_rgb[:0], cloud.view_counts[:0])  # fmt: skip
+    few = PointCloud(cloud.points_in_world[:0], cloud.normals_in_world[:0], cloud.colors_rgb[:0], cloud.view_counts[:0])
     assert select_points(few, Selection(voxel=0.1, max_points=3), tmp_path) is None
     same = PointCloud(
         np.ones((50, 3), np.float32), np.ones((50, 3), np.float32), np.zeros((50, 3), np.uint8), np.ones(50, np.uint8)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,7 +15,7 @@ FloatArray = NDArray[np.float64]
 def cubic_value(picture: FloatArray, column: float, row: float) -> float:
     """Return a picture between its pixels by cubic convolution, a = −1/2; (0, 0) is the first pixel's centre."""
 
-    def kernel(distance: FloatArray) -> FloatArray:
+    def kernel(distance: NDArray[Any]) -> FloatArray:
         d = np.abs(distance)
         near = 1.5 * d**3 - 2.5 * d**2 + 1
         far = -0.5 * d**3 + 2.5 * d**2 - 4 * d + 2
@@ -46,7 +48,8 @@ def aligned_shift(
 
     def normalised(values: FloatArray) -> FloatArray:
         centred = values - w @ values
-        return centred / np.sqrt(w @ centred**2)
+        result: FloatArray = centred / np.sqrt(w @ centred**2)
+        return result
 
     def warped(warp: FloatArray) -> FloatArray:
         places = warp @ np.stack([u, v, np.ones_like(u)]) + (size - 1) / 2 + margin
@@ -54,7 +57,7 @@ def aligned_shift(
 
     raw = reference[inner, inner].ravel()
     template, contrast = normalised(raw), np.sqrt(w @ (raw - w @ raw) ** 2)
-    down, across = (part[inner, inner].ravel() / contrast for part in np.gradient(reference))
+    down, across = (np.gradient(reference, axis=axis)[inner, inner].ravel() / contrast for axis in (0, 1))
     jacobian = np.stack([across, down, across * u, across * v, down * u, down * v], axis=1)
     jacobian -= w @ jacobian + np.outer(template, template * w @ jacobian)
     prior = stiffness * np.diag([0.0, 0, 1, 1, 1, 1])

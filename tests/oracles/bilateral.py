@@ -1,18 +1,30 @@
 """The bilateral solver's linear system with dense matrices, and its solution by elimination."""
 
+from __future__ import annotations
+
 import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.filters.sphere_cells import SphereCells
 
 
-def corner_weights(cells, row, column):
+def corner_weights(cells: SphereCells, row: int, column: int) -> NDArray[np.float64]:
     gap, down = cells.gap_of_row[row], cells.weight_row[row]
     upper, lower = cells.weight_upper[gap, column], cells.weight_lower[gap, column]
     return np.array([(1 - down) * (1 - upper), (1 - down) * upper, down * (1 - lower), down * lower])
 
 
-def dense_system(target, weight, colors, cells, smoothness):
+def dense_system(
+    target: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    colors: NDArray[np.int64],
+    cells: SphereCells,
+    smoothness: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return A, b and S (V, N) of min λ yᵀ (D_m − D_n B̄ D_n) y + Σ c (Sᵀ y − t)²; `colors` is (H, W, 3) bins."""
     height, width = target.shape
-    numbers, entries = {}, []
+    numbers: dict[tuple[int, ...], int] = {}
+    entries = []
     for row in range(height):
         for column in range(width):
             corners = cells.corners[cells.element_of_pixel[cells.gap_of_row[row], column]]

@@ -1,12 +1,15 @@
 """The z-depth of a pinhole view, pixel by pixel."""
 
-import numpy as np
+from __future__ import annotations
 
-from pano_mvs.geometry import pixel_from_ray
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.geometry import PinholeView, pixel_from_ray
 from tests.oracles.range_filters import sample_range
 
 
-def z_depth(ranges, view, max_step=0.05):
+def z_depth(ranges: NDArray[np.float32], view: PinholeView, max_step: float = 0.05) -> NDArray[np.float64]:
     result = np.full(view.size_hw, np.nan)
     for row, column in np.ndindex(view.size_hw):
         bearing = view.bearings_from_pixels((column + 0.5, row + 0.5))

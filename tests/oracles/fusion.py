@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,7 +22,7 @@ def vote(
     source_from_reference: Rigid3,
     source: tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]],
     limits: NDArray[np.float64],
-) -> dict[str, NDArray[np.generic]]:
+) -> dict[str, NDArray[Any]]:
     """Return what `kernels_vote.vote` adds to tallies of zeros."""
     ranges, rays, normals, written = reference
     source_ranges, source_confidence, image = source

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 
 def match_one_by_one(
-    first: NDArray[np.generic], second: NDArray[np.generic], *, metric: str, ratio: float, mutual: bool
+    first: NDArray[Any], second: NDArray[Any], *, metric: str, ratio: float, mutual: bool
 ) -> list[tuple[int, int]]:
-    def distances(descriptor: NDArray[np.generic], others: NDArray[np.generic]) -> NDArray[np.float64]:
+    def distances(descriptor: NDArray[Any], others: NDArray[Any]) -> NDArray[np.float64]:
         if metric == "l2":
-            return np.sqrt(((others.astype(float) - descriptor.astype(float)) ** 2).sum(axis=1))
-        return np.unpackbits(np.bitwise_xor(others, descriptor), axis=1).sum(axis=1).astype(float)
+            lengths: NDArray[np.float64] = np.sqrt(((others.astype(float) - descriptor.astype(float)) ** 2).sum(axis=1))
+            return lengths
+        bits: NDArray[np.uint8] = np.unpackbits(np.bitwise_xor(others, descriptor), axis=1)
+        return np.asarray(bits.sum(axis=1), np.float64)
 
     found = []
     for i, descriptor in enumerate(first):

@@ -15,6 +15,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 
 def documented_rays(document: dict[str, Any], frame: dict[str, Any], size_wh: tuple[int, int]) -> np.ndarray:
@@ -34,17 +35,20 @@ def documented_rays(document: dict[str, Any], frame: dict[str, Any], size_wh: tu
     else:
         assert said["camera_model"] == "PINHOLE"
         rays = np.stack([x, y, -np.ones_like(x)], axis=-1)
-    return rays @ np.array(frame["transform_matrix"])[:3, :3].T
+    result: np.ndarray = rays @ np.array(frame["transform_matrix"])[:3, :3].T
+    return result
 
 
 def world_points(folder: Path, document: dict[str, Any], frame: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     """Return the points of a frame's known depths, (N, 3), and which pixels they are of, (h, w)."""
     steps = cv2.imread(str(folder / frame["depth_file_path"]), cv2.IMREAD_ANYDEPTH)
+    assert steps is not None
     assert steps.dtype == np.uint16
     depths = steps * document["depth_unit_scale_factor"]
     rays = documented_rays(document, frame, steps.shape[::-1])
     origin = np.array(frame["transform_matrix"])[:3, 3]
-    return (origin + rays * depths[..., None])[steps > 0], steps > 0
+    known: NDArray[np.bool_] = steps > 0
+    return (origin + rays * depths[..., None])[known], known
 
 
 def nerfstudio_points(folder: Path) -> tuple[np.ndarray, np.ndarray]:

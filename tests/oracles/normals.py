@@ -1,12 +1,17 @@
 """The weighted plane fit around each pixel, by numpy's least squares."""
 
+from __future__ import annotations
+
 import numpy as np
+from numpy.typing import NDArray
 
 from pano_mvs.geometry import ray_grid
 from tests.oracles.range_filters import wrap
 
 
-def normals(ranges, radius, max_step, columns_per_step):
+def normals(
+    ranges: NDArray[np.float32], radius: int, max_step: float, columns_per_step: NDArray[np.int64]
+) -> NDArray[np.float64]:
     height, width = ranges.shape
     rays = ray_grid(ranges.shape)
     result = np.full((height, width, 3), np.nan)

@@ -1,12 +1,18 @@
 """Slow, obvious versions of the refinement by slanted planes: one pixel at a time, by least squares."""
 
-import numpy as np
+from __future__ import annotations
 
-from pano_mvs.geometry import pixel_from_ray, ray_from_pixel, sample_panorama
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_from_pixel, sample_panorama
 from tests.oracles.range_filters import wrap
 
 
-def tangents(row, column, size_hw, stretch):
+def tangents(row: int, column: int, size_hw: tuple[int, int], stretch: float) -> list[NDArray[np.float64]]:
     """What a step of `stretch` columns and one of a row add to the ray of a pixel, to first order."""
     center = np.array([column + 0.5, row + 0.5])
     step = 1e-4
@@ -16,7 +22,9 @@ def tangents(row, column, size_hw, stretch):
     ]
 
 
-def weighted_plane(rows, values, deviations):
+def weighted_plane(
+    rows: NDArray[np.float64], values: NDArray[np.float64], deviations: NDArray[np.float64]
+) -> NDArray[Any] | None:
     """(α, β, γ) of the plane through values at rows (1, u, v), with Tukey's biweight; None if it is ill posed."""
     weight = np.where(np.abs(deviations) < 1, 1 - deviations**2, 0)
     if np.sum(weight**2) < 5 or np.linalg.det(np.cov(rows[:, 1:].T, aweights=weight**2, ddof=0)) < 0.25:
@@ -24,7 +32,9 @@ def weighted_plane(rows, values, deviations):
     return np.linalg.lstsq(rows * weight[:, None], values * weight)[0]
 
 
-def plane_at(inverse, row, column, columns, stretch, max_step):
+def plane_at(
+    inverse: NDArray[Any], row: int, column: int, columns: NDArray[np.int64], stretch: float, max_step: float
+) -> NDArray[np.float64]:
     """The plane p with p · ray = q around a pixel, by weighted least squares, twice."""
     size, radius = inverse.shape, len(columns) // 2
     q = inverse[row, column]
@@ -40,10 +50,15 @@ def plane_at(inverse, row, column, columns, stretch, max_step):
         slopes = slopes if found is None else found
     ray = ray_from_pixel([column + 0.5, row + 0.5], size)
     across, down = tangents(row, column, size, stretch)
-    return q * (slopes[0] * ray + slopes[1] * across / (across @ across) + slopes[2] * down / (down @ down))
+    result: NDArray[np.float64] = q * (
+        slopes[0] * ray + slopes[1] * across / (across @ across) + slopes[2] * down / (down @ down)
+    )
+    return result
 
 
-def window(grey, row, column, rows, columns, sigma_color):
+def window(
+    grey: NDArray[Any], row: int, column: int, rows: Sequence[int], columns: NDArray[np.int64], sigma_color: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Positions (K, 2) of a window's samples, their values and their weights, which sum to 1."""
     places = np.array([(column + u + 0.5, row + v + 0.5) for v in rows for u in columns])
     values = np.array([grey[wrap(row + v, column + u, *grey.shape)] for v in rows for u in columns])
@@ -51,7 +66,13 @@ def window(grey, row, column, rows, columns, sigma_color):
     return places, values, weights / weights.sum()
 
 
-def likely_inverse(plane, seen, sources, steps_uv, settings):
+def likely_inverse(
+    plane: NDArray[np.float64],
+    seen: tuple[Any, ...],
+    sources: Sequence[tuple[NDArray[Any], Rigid3, bool]],
+    steps_uv: NDArray[np.float64],
+    settings: tuple[float, ...],
+) -> float:
     """The most likely inverse range at a window's centre, by normal equations over the better half of the sources.
 
     `seen` holds size, places, values and weights of the window; `sources` (grey, pose, votes) each; `steps_uv` (K, 2)
@@ -66,11 +87,11 @@ def likely_inverse(plane, seen, sources, steps_uv, settings):
     found = []
     for grey, pose, votes in sources:
 
-        def look(delta, grey=grey, pose=pose):
+        def look(delta: float, grey: NDArray[Any] = grey, pose: Rigid3 = pose) -> NDArray[np.float64]:
             directions = rays @ pose.rotation.T + pose.translation * (rays @ plane + delta)[:, None]
             return sample_panorama(grey, pixel_from_ray(directions, grey.shape))
 
-        step = 1e-7 / np.linalg.norm(pose.translation)
+        step = 1e-7 / float(np.linalg.norm(pose.translation))
         sample = look(0)
         sample = sample - weights @ sample
         slope = ((look(step) - look(-step)) / (2 * step))[:, None] * design
@@ -90,4 +111,4 @@ def likely_inverse(plane, seen, sources, steps_uv, settings):
         normal += information * ((weights[:, None] * change).T @ change - np.outer(along, along))
         right += information * ((weights * wanted) @ change - correlation * along)
     q = plane @ rays[len(rays) // 2]
-    return max(q + np.clip(np.linalg.solve(normal, right)[0], -largest, largest), q / 2)
+    return float(max(q + np.clip(np.linalg.solve(normal, right)[0], -largest, largest), q / 2))

@@ -1,12 +1,24 @@
 """Whether a view sees a point, by its range map."""
 
-import numpy as np
+from __future__ import annotations
 
-from pano_mvs.geometry import angle_between, pixel_from_ray
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.geometry import Rigid3, angle_between, pixel_from_ray
+from pano_mvs.scene import RangeMap
 from tests.oracles.range_filters import sample_range
 
 
-def sees(point, home, pose, range_map, max_error, min_confidence, max_step=0.05):
+def sees(
+    point: NDArray[np.float64],
+    home: NDArray[np.float64],
+    pose: Rigid3,
+    range_map: RangeMap,
+    max_error: float,
+    min_confidence: int,
+    max_step: float = 0.05,
+) -> tuple[NDArray[np.float64], float] | None:
     """The unit ray to the point, and the angle at `home` between it and where the view puts it; None if unseen."""
     in_cam = pose.apply(point)
     distance = np.linalg.norm(in_cam)
@@ -16,5 +28,5 @@ def sees(point, home, pose, range_map, max_error, min_confidence, max_step=0.05)
     if not abs(found - distance) <= max_error * distance or range_map.confidence[row, column] < min_confidence:
         return None
     there = pose.inverse().apply(in_cam / distance * found)
-    angle = angle_between(point - home, there - home)
+    angle = float(angle_between(point - home, there - home))
     return (in_cam / distance, angle) if angle <= 2 * np.pi / range_map.range.shape[1] else None

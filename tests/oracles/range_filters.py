@@ -1,13 +1,16 @@
 """Slow, obvious versions of the filters on range maps."""
 
-import numpy as np
+from __future__ import annotations
 
-from pano_mvs.geometry import angle_between, pad_panorama, pixel_from_ray, ray_grid
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.geometry import Rigid3, angle_between, pad_panorama, pixel_from_ray, ray_grid
 
 UNKNOWN, AGREES, CONTRADICTS, HIDDEN = 0, 1, 2, 3
 
 
-def wrap(row, column, height, width):
+def wrap(row: int, column: int, height: int, width: int) -> tuple[int, int]:
     """The pixel in the picture that is meant by one outside of it."""
     if row < 0:
         row, column = -1 - row, column + width // 2
@@ -16,7 +19,7 @@ def wrap(row, column, height, width):
     return row, column % width
 
 
-def median(ranges, window):
+def median(ranges: NDArray[np.float32], window: int) -> NDArray[np.float32]:
     pad = window // 2
     padded = pad_panorama(ranges, pad)
     result = np.full_like(ranges, np.nan)
@@ -27,7 +30,7 @@ def median(ranges, window):
     return result
 
 
-def gaussian(ranges, window, sigma):
+def gaussian(ranges: NDArray[np.float32], window: int, sigma: float) -> NDArray[np.float64]:
     pad = window // 2
     offsets = np.arange(-pad, pad + 1)
     kernel = np.exp(-(offsets[:, None] ** 2 + offsets[None] ** 2) / (2 * sigma**2))
@@ -40,7 +43,7 @@ def gaussian(ranges, window, sigma):
     return result
 
 
-def surfaces(ranges, max_step):
+def surfaces(ranges: NDArray[np.float32], max_step: float) -> NDArray[np.int64]:
     """Label of each pixel's connected surface, −1 where invalid; found by flooding."""
     height, width = ranges.shape
     labels = np.full(ranges.shape, -1)
@@ -61,7 +64,7 @@ def surfaces(ranges, max_step):
     return labels
 
 
-def sample_range(ranges, pixel, max_step):
+def sample_range(ranges: NDArray[np.float32], pixel: NDArray[np.float64], max_step: float) -> float:
     x, y = pixel - 0.5
     left, top = int(np.floor(x)), int(np.floor(y))
     weights = {}
@@ -70,11 +73,18 @@ def sample_range(ranges, pixel, max_step):
             weights[top + d_row, left + d_column] = w_row * w_column
     values = {place: float(ranges[wrap(*place, *ranges.shape)]) for place in weights}
     if np.isfinite(list(values.values())).all() and max(values.values()) <= min(values.values()) * (1 + max_step):
-        return 1 / sum(weights[place] / values[place] for place in weights)
+        return float(1 / sum(weights[place] / values[place] for place in weights))
     return values[max(weights, key=lambda place: weights[place])]
 
 
-def judge(ranges, source_from_reference, source_ranges, max_error, max_px, max_step):
+def judge(
+    ranges: NDArray[np.float32],
+    source_from_reference: Rigid3,
+    source_ranges: NDArray[np.float32],
+    max_error: float,
+    max_px: int,
+    max_step: float,
+) -> tuple[NDArray[np.uint8], NDArray[np.float64], NDArray[np.float64]]:
     """Verdict, support and squared motion of one source on every pixel, by points, pixels and back."""
     size, source_size = ranges.shape, source_ranges.shape
     rays = ray_grid(size)
@@ -100,7 +110,13 @@ def judge(ranges, source_from_reference, source_ranges, max_error, max_px, max_s
     return verdicts, supports, motions
 
 
-def fill(ranges, trusted, columns_per_step, max_distance_px, max_ratio):
+def fill(
+    ranges: NDArray[np.float32],
+    trusted: NDArray[np.bool_],
+    columns_per_step: NDArray[np.int64],
+    max_distance_px: int,
+    max_ratio: float,
+) -> NDArray[np.float64]:
     """Range of each invalid pixel from trusted ones along eight paths; NaN where fewer than two are found."""
     height, width = ranges.shape
     result = np.full(ranges.shape, np.nan)
@@ -110,9 +126,12 @@ def fill(ranges, trusted, columns_per_step, max_distance_px, max_ratio):
             for d_column in (-1, 0, 1):
                 place = np.array([row, column])
                 for step in range(1, max_distance_px + 1) if (d_row, d_column) != (0, 0) else ():
-                    place = place + np.array([d_row, d_column * columns_per_step[wrap(*place, height, width)[0]]])
-                    if trusted[wrap(*place, height, width)]:
-                        found.append((1 / ranges[wrap(*place, height, width)], step * np.hypot(d_row, d_column)))
+                    place = place + np.array(
+                        [d_row, d_column * columns_per_step[wrap(place[0], place[1], height, width)[0]]]
+                    )
+                    at = wrap(place[0], place[1], height, width)
+                    if trusted[at]:
+                        found.append((1 / float(ranges[at]), step * np.hypot(d_row, d_column)))
                         break
         if len(found) >= 2:
             second = sorted(found)[1][0]

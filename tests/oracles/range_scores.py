@@ -1,11 +1,24 @@
 """Scores of range maps, pixel by pixel as their definitions read."""
 
+from __future__ import annotations
+
 import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from numpy.typing import NDArray
 
 from pano_mvs.geometry import pixel_solid_angle
 
 
-def pixels(estimated, truth, *, scale=1.0, valid_only=False, weighted=False):
+def pixels(
+    estimated: NDArray[Any],
+    truth: NDArray[Any],
+    *,
+    scale: float = 1.0,
+    valid_only: bool = False,
+    weighted: bool = False,
+) -> Iterator[tuple[float | None, float, float]]:
     """(estimate or None, truth, weight) of every pixel that counts."""
     for row in range(truth.shape[0]):
         weight = float(pixel_solid_angle(truth.shape)[row]) if weighted else 1.0
@@ -18,13 +31,13 @@ def pixels(estimated, truth, *, scale=1.0, valid_only=False, weighted=False):
                 yield (found if known else None), true, weight
 
 
-def average(values):
+def average(values: Sequence[tuple[float, float]]) -> float:
     """Mean of (value, weight) pairs."""
     total = sum(weight for _, weight in values)
     return sum(value * weight for value, weight in values) / total if total else float("nan")
 
 
-def score(name, estimated, truth, *, peak=10.0, scale=1.0):
+def score(name: str, estimated: NDArray[Any], truth: NDArray[Any], *, peak: float = 10.0, scale: float = 1.0) -> float:
     """One score by its name in `score_view`."""
     valid_only, weighted = name.startswith("valid_"), "w_" in name[:8]
     base = name.removeprefix("valid_").removeprefix("w_")
@@ -39,7 +52,7 @@ def score(name, estimated, truth, *, peak=10.0, scale=1.0):
     return average([(of_pixel(base, found, true, peak), weight) for found, true, weight in counted])
 
 
-def of_pixel(base, found, true, peak):
+def of_pixel(base: str, found: float | None, true: float, peak: float) -> float:
     """What one pixel adds to a mean."""
     error = true if found is None else abs(found - true)
     if base == "mse":

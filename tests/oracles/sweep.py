@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 
-def pixel_at(picture: NDArray[np.generic], row: int, column: int) -> np.generic:
+def pixel_at(picture: NDArray[Any], row: int, column: int) -> Any:
     """Return the value at any row and column: the seam wraps, a pole reflects with half a turn."""
     height, width = picture.shape[:2]
     if row < 0:

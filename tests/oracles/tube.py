@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 
-def follow(costs, guides, penalties, p1, one_surface):
+def follow(
+    costs: NDArray[Any], guides: NDArray[Any], penalties: NDArray[Any], p1: float, one_surface: float
+) -> NDArray[np.float64]:
     """Return L along one path: costs (N, 2, K), guides (N, 2), penalties (N,)."""
     result = np.zeros(costs.shape)
     before = np.zeros(costs.shape[1:])

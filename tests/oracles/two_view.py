@@ -85,7 +85,7 @@ def refine_relative_pose(
         weights = 1 / (1 + (residuals / scale_rad) ** 2)
         hessian = (jacobian * weights[:, None]).T @ jacobian
         hessian += 1e-9 * np.trace(hessian) * np.eye(5)
-        step = -np.linalg.solve(hessian, jacobian.T @ (weights * residuals))
+        step = -np.linalg.solve(hessian, jacobian.T @ (weights * residuals)).astype(np.float64)
         for shrink in (1.0, 0.3, 0.1, 0.01):
             moved = moved_pose(pose, shrink * step)
             moved_residuals, moved_jacobian = _linearised(moved, first, second)

@@ -3,6 +3,7 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.images.preview import write_preview
-from pano_mvs.report.results import Results
+from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.scene import Panorama, PointCloud, Poses, RangeMap, TwoView
 from pano_mvs.scene.index import pair_name
 from pano_mvs.testing.room import default_room, render
@@ -18,14 +19,14 @@ from pano_mvs.testing.tiny_capture import TinyCapture, tiny_capture
 
 
 @pytest.fixture(scope="session")
-def preview_file(tmp_path_factory) -> Path:
+def preview_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("preview") / "1.jpg"
     write_preview(path, *render(default_room(), Rigid3.identity(), (32, 64)))
     return path
 
 
 @pytest.fixture
-def out_dir(tmp_path, preview_file) -> Path:
+def out_dir(tmp_path: Path, preview_file: Path) -> Path:
     """An output folder with the preview of one picture."""
     out = tmp_path / "out"
     (out / "preview" / "a").mkdir(parents=True)
@@ -39,36 +40,35 @@ def tiny() -> TinyCapture:
 
 
 @pytest.fixture
-def results(tmp_path, tiny) -> Results:
+def results(tmp_path: Path, tiny: TinyCapture) -> StoredValues:
     """What a run over the tiny capture might have left in a store; the last two pictures have nothing in common."""
     return stored(Store(tmp_path / "cache"), tiny)
 
 
-def stored(store: Store, tiny: TinyCapture) -> Results:
+def stored(store: Store, tiny: TinyCapture) -> StoredValues:
     names = tiny.names
-    pairs = {pair_name(*pair): record for pair, record in tiny.items[TwoView].items()}
+    pairs = {pair_name(*pair): record for pair, record in tiny.each(TwoView).items()}
     pairs[pair_name(names[2], names[3])] = TwoView.failed("only 7 of 31 matches agree", candidates=31)
     refs = {
-        "images": {name: store.put_value(tiny.items[Panorama][name]) for name in names},
+        "images": {name: store.put_value(tiny.each(Panorama)[name]) for name in names},
         "pairs": {name: store.put_value(record) for name, record in pairs.items()},
-        "poses": {"": store.put_value(tiny.wholes[Poses])},
-        "ranges": {name: store.put_value(tiny.items[RangeMap][name]) for name in names},
+        "poses": {"": store.put_value(tiny.whole(Poses))},
+        "ranges": {name: store.put_value(tiny.each(RangeMap)[name]) for name in names},
         "cloud": {"": store.put_value(outward(tiny))},
     }
-    return Results(store, refs)
+    return StoredValues(store, refs)
 
 
 def outward(tiny: TinyCapture) -> PointCloud:
     """Return the true surfaces as a cloud, seen from the first camera."""
-    cloud = tiny.wholes[PointCloud]
-    assert isinstance(cloud, PointCloud)
+    cloud = tiny.whole(PointCloud)
     rng = np.random.default_rng(4)
     return replace(cloud, colors_rgb=rng.integers(0, 255, (len(cloud), 3), np.uint8))
 
 
-def summary_of(tiny: TinyCapture) -> dict:
+def summary_of(tiny: TinyCapture) -> dict[str, Any]:
     """Return what run.json would say of it."""
-    poses = tiny.wholes[Poses]
+    poses = tiny.whole(Poses)
     names = list(tiny.names)
     links = [[a, b, 100, 120, 0.02] for i, a in enumerate(names) for b in names[i + 1 :]]
     links[-1] = [names[2], names[3], 0, 31, None]

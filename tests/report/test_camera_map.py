@@ -1,11 +1,20 @@
 """The map: true to scale, whatever lies where; links by their inliers, rejected ones apart."""
 
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.frame.levelling import level_poses
-from pano_mvs.report.camera_map import camera_maps, up_of
+from pano_mvs.report import camera_map
+from pano_mvs.report.camera_map import CameraMap
+from pano_mvs.results.records import PosesSummary
 from pano_mvs.scene import Poses
+from pano_mvs.testing.tiny_capture import TinyCapture
 
 NAMES = ["a/1.png", "a/2.png", "a/3.png"]
 POSES = {
@@ -16,11 +25,21 @@ POSES = {
 }  # fmt: skip
 
 
-def places(drawn):
+def camera_maps(
+    poses: Mapping[str, Any], reasons: Mapping[tuple[str, str], str] | None = None
+) -> tuple[CameraMap, ...]:
+    return camera_map.camera_maps(PosesSummary.model_validate(poses), reasons)
+
+
+def up_of(poses: Mapping[str, Any]) -> NDArray[np.float64]:
+    return camera_map.up_of(PosesSummary.model_validate(poses))
+
+
+def places(drawn: CameraMap) -> NDArray[np.float64]:
     return np.array([camera[:2] for camera in drawn.cameras])
 
 
-def test_the_map_shows_the_cameras_true_to_scale_from_above_and_from_the_side():
+def test_the_map_shows_the_cameras_true_to_scale_from_above_and_from_the_side() -> None:
     above, side = camera_maps(POSES)
     centers = np.array(POSES["centers"])
     for drawn, flat in ((above, centers[:, [0, 2]] * (1, -1)), (side, centers[:, [0, 1]])):
@@ -31,7 +50,7 @@ def test_the_map_shows_the_cameras_true_to_scale_from_above_and_from_the_side():
         assert words == f"{length / scale:.2g} scene units".replace("1 scene units", "1 scene unit")
 
 
-def test_links_are_weighted_by_their_inliers_and_rejected_ones_told_apart():
+def test_links_are_weighted_by_their_inliers_and_rejected_ones_told_apart() -> None:
     above, _ = camera_maps(POSES, {("a/1.png", "a/3.png"): "too little in common"})
     assert [link.strength for link in above.links] == [0, 0.1, 1]
     assert [link.rejected for link in above.links] == [True, False, False]
@@ -40,7 +59,7 @@ def test_links_are_weighted_by_their_inliers_and_rejected_ones_told_apart():
     assert above.links[2].text == "1 – 2: 300 matches of 410 candidates"
 
 
-def test_doubtful_cameras_are_drawn_over_the_others_where_they_stand():
+def test_doubtful_cameras_are_drawn_over_the_others_where_they_stand() -> None:
     above, side = camera_maps(POSES | {"doubts": {"a/3.png": "nobody sees it there", "gone.png": "no pose"}})
     for drawn in (above, side):
         assert drawn.doubtful == ((*drawn.cameras[2][:2], "3", "nobody sees it there"),)
@@ -48,7 +67,7 @@ def test_doubtful_cameras_are_drawn_over_the_others_where_they_stand():
     assert not camera_maps(POSES)[0].doubtful
 
 
-def test_of_very_many_links_the_strongest_are_drawn():
+def test_of_very_many_links_the_strongest_are_drawn() -> None:
     names = [str(number) for number in range(200)]
     links = [[a, b, idx] for idx, (a, b) in enumerate((a, b) for a in names for b in names if a < b)]
     above, _ = camera_maps({"registered": names, "centers": [[i, 0, i % 7] for i in range(200)], "links": links})
@@ -58,7 +77,7 @@ def test_of_very_many_links_the_strongest_are_drawn():
     assert strengths[-1] == 1
 
 
-def test_of_very_many_rejected_pairs_those_that_came_nearest_are_drawn():
+def test_of_very_many_rejected_pairs_those_that_came_nearest_are_drawn() -> None:
     names = [str(number) for number in range(60)]
     pairs = [(a, b) for a in names for b in names if a < b]
     links = [[*pair, 0, idx, None] for idx, pair in enumerate(pairs)]
@@ -68,28 +87,28 @@ def test_of_very_many_rejected_pairs_those_that_came_nearest_are_drawn():
     assert not any("none of 9 candidates" in link.text for link in above.links)
 
 
-def test_of_very_many_cameras_only_dots_are_drawn():
+def test_of_very_many_cameras_only_dots_are_drawn() -> None:
     above, _ = camera_maps({"registered": [str(i) for i in range(5000)], "centers": [[i, 0, i] for i in range(5000)]})
     assert not above.cameras
     assert above.dots.count("M") == 5000
     assert "5000 cameras from above" in above.text
 
 
-def test_the_map_is_drawn_along_the_direction_up():
+def test_the_map_is_drawn_along_the_direction_up() -> None:
     """Cameras on a wall of the world stand side by side from above if that wall is the ground."""
     above, side = camera_maps({"registered": NAMES, "centers": [[0, 0, 0], [1, 0, 0], [0, 3, 0]], "up": [0, 0, 1]})
     assert np.ptp(places(above)[:, 1]) == pytest.approx(3 * np.ptp(places(above)[:, 0]), rel=0.02)
     assert np.ptp(places(side)[:, 1]) == pytest.approx(0, abs=0.11)
 
 
-@pytest.mark.parametrize("up", [None, [0, 0, 0], [1, 2], [float("nan")] * 3])
-def test_a_direction_up_that_is_none_is_that_of_the_first_camera(up):
+@pytest.mark.parametrize("up", [None, [0, 0, 0], [float("nan")] * 3])
+def test_a_direction_up_that_is_none_is_that_of_the_first_camera(up: Sequence[float] | None) -> None:
     assert up_of({"up": up}).tolist() == [0, -1, 0]
 
 
-def test_north_is_shown_where_the_levelled_frame_says_it(tiny):
+def test_north_is_shown_where_the_levelled_frame_says_it(tiny: TinyCapture) -> None:
     """The words are those of poses.level: who changes them learns it here."""
-    poses = tiny.wholes[Poses]
+    poses = tiny.whole(Poses)
     up = {name: tuple(-rotation[:, 1]) for name, rotation in zip(tiny.names, poses.rotations, strict=True)}
     forward = poses.rotations[:, 2]
     headings = dict(zip(tiny.names, np.rad2deg(np.arctan2(forward[:, 0], forward[:, 2])) + 40, strict=True))
@@ -101,7 +120,7 @@ def test_north_is_shown_where_the_levelled_frame_says_it(tiny):
         assert up_of({"frame": level.frame, "up": [1, 0, 0]}).tolist() == [0, -1, 0]
 
 
-def test_labels_stand_beside_their_cameras_and_cover_no_other():
+def test_labels_stand_beside_their_cameras_and_cover_no_other() -> None:
     """Of cameras in a row too close for their names some go without one, rather than with one far away."""
     names = [f"R{number:07d}.jpg" for number in range(10210, 10240)]
     above, _ = camera_maps({"registered": names, "centers": [[0.3 * idx, 0, 0.02 * idx] for idx in range(30)]})
@@ -118,11 +137,11 @@ def test_labels_stand_beside_their_cameras_and_cover_no_other():
 @pytest.mark.parametrize(
     "centers", [[[0, 0, 0]] * 3, [[0, 0, 0], [0, 1e-12, 0], [0, 0, 0]], [[0, 0, 0], [1e6, 0, 0], [2e6, 0, 0]]]
 )
-def test_cameras_in_one_place_or_in_a_row_are_drawn_within_the_map(centers):
+def test_cameras_in_one_place_or_in_a_row_are_drawn_within_the_map(centers: Sequence[Sequence[float]]) -> None:
     for drawn in camera_maps({"registered": ["a rather long name of a picture", "b", "c"], "centers": centers}):
         assert np.all((places(drawn) > 0) & (places(drawn) < drawn.size_wh))
 
 
 @pytest.mark.parametrize("centers", [[[0, 0, 0]], [[0, 0, float("nan")]] * 3])
-def test_centres_that_do_not_fit_give_no_map(centers):
+def test_centres_that_do_not_fit_give_no_map(centers: Sequence[Sequence[float]]) -> None:
     assert camera_maps({"registered": NAMES, "centers": centers}) == ()

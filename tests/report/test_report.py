@@ -1,8 +1,13 @@
 """The report of a run: whatever the summary lacks, one page that says what is known, and nothing leaves it."""
 
+from __future__ import annotations
+
 import base64
 import hashlib
 import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,10 +15,13 @@ import pytest
 
 from pano_mvs.report import write_report
 from pano_mvs.report.view_cards import chosen_views
+from pano_mvs.results.records import ViewSummary
+from pano_mvs.results.stored_values import StoredValues
+from pano_mvs.results.summary import RunSummary
 from tests.report.html_page import Page
 
 NAMES = ["a/1.png", "a/2.png", "a/3.png"]
-SUMMARY = {
+SUMMARY: dict[str, Any] = {
     "workflow": {"name": "lobby", "path": "flows/lobby.yaml", "overrides": ["depth.planes=64"]},
     "version": "1.2.3",
     "started": "2026-11-21 04:17",
@@ -65,12 +73,12 @@ SUMMARY = {
 }  # fmt: skip
 
 
-def reported(out_dir, summary, results=None):
-    write_report(out_dir, summary, results)
+def reported(out_dir: Path, summary: Mapping[str, Any], results: StoredValues | None = None) -> Page:
+    write_report(out_dir, RunSummary.from_json(summary), results)
     return Page((out_dir / "report.html").read_text(encoding="utf-8"))
 
 
-def assert_sound(page):
+def assert_sound(page: Page) -> None:
     """What holds of every page: nothing is fetched, what is referred to exists, pictures have words and decode."""
     forbidden = {"link", "iframe", "object", "embed", "base", "form", "audio", "video", "source"}
     assert not forbidden & set(page.tags)
@@ -88,13 +96,14 @@ def assert_sound(page):
         assert "alt" in attrs
         data = base64.b64decode(attrs["src"].partition(",")[2], validate=True)
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        assert picture is not None
         assert picture.shape[:2] == (int(attrs["height"]), int(attrs["width"]))
     for attrs in page.all("svg"):
         assert attrs["role"] == "img"
         assert attrs["aria-label"]
 
 
-def test_everything_that_is_known_is_said(out_dir):
+def test_everything_that_is_known_is_said(out_dir: Path) -> None:
     page = reported(out_dir, SUMMARY)
     assert_sound(page)
     for text in (
@@ -112,7 +121,7 @@ def test_everything_that_is_known_is_said(out_dir):
         assert text in page.words, text
 
 
-def test_a_doubtful_camera_is_marked_wherever_it_is_shown(out_dir):
+def test_a_doubtful_camera_is_marked_wherever_it_is_shown(out_dir: Path) -> None:
     """On both maps, in its view card and in the table of all panoramas; nothing is where no camera is doubtful."""
     page = reported(out_dir, SUMMARY)
     assert page.source.count('class="doubtful"') == 2
@@ -124,8 +133,8 @@ def test_a_doubtful_camera_is_marked_wherever_it_is_shown(out_dir):
     assert "triangles" not in cleared.words
 
 
-def test_of_very_many_views_doubtful_ones_are_always_shown_in_full():
-    views = [{"name": str(idx), "completeness": 1.0, "consistent": 0.01 * idx} for idx in range(100)]
+def test_of_very_many_views_doubtful_ones_are_always_shown_in_full() -> None:
+    views = [ViewSummary(name=str(idx), metrics={"completeness": 1.0, "consistent": 0.01 * idx}) for idx in range(100)]
     assert 90 not in chosen_views(views)
     chosen = chosen_views(views, always=("90",))
     assert 90 in chosen
@@ -133,21 +142,21 @@ def test_of_very_many_views_doubtful_ones_are_always_shown_in_full():
 
 
 @pytest.mark.parametrize("key", [None, *SUMMARY])
-def test_any_key_may_be_missing_or_empty(out_dir, key):
+def test_any_key_may_be_missing_or_empty(out_dir: Path, key: str | None) -> None:
     without = {name: value for name, value in SUMMARY.items() if name != key}
     assert "pano-mvs" in reported(out_dir, without if key else {}).words
-    if isinstance(SUMMARY.get(key), dict | list):
+    if key is not None and isinstance(SUMMARY[key], dict | list):
         assert_sound(reported(out_dir, without | {key: type(SUMMARY[key])()}))
         assert_sound(reported(out_dir, without | {key: None}))
 
 
 @pytest.mark.parametrize("key", SUMMARY["poses"])
-def test_any_key_of_the_poses_may_be_missing(out_dir, key):
+def test_any_key_of_the_poses_may_be_missing(out_dir: Path, key: str) -> None:
     poses = {name: value for name, value in SUMMARY["poses"].items() if name != key}
     assert_sound(reported(out_dir, SUMMARY | {"poses": poses}))
 
 
-def test_only_our_own_script_may_run(out_dir):
+def test_only_our_own_script_may_run(out_dir: Path) -> None:
     """The policy names the script by its digest: one that a file name might smuggle in has another."""
     page = reported(out_dir, SUMMARY)
     facts, script = page.scripts
@@ -158,13 +167,13 @@ def test_only_our_own_script_may_run(out_dir):
     assert f"script-src 'sha256-{digest}';" in policy
 
 
-def test_every_element_that_the_script_asks_for_is_there(out_dir):
+def test_every_element_that_the_script_asks_for_is_there(out_dir: Path) -> None:
     page = reported(out_dir, SUMMARY)
     ids = {value for _, name, value in page.attributes if name == "id"}
     assert set(re.findall(r'getElementById\("(\w+)"\)', page.scripts[1])) <= ids
 
 
-def test_names_and_causes_are_text_and_never_markup(out_dir):
+def test_names_and_causes_are_text_and_never_markup(out_dir: Path) -> None:
     evil = '<script>alert("1")</script>&\'">'
     summary = {
         "workflow": {"name": evil, "path": evil, "overrides": [evil]}, "notes": [evil], "workflow_text": evil,
@@ -172,8 +181,8 @@ def test_names_and_causes_are_text_and_never_markup(out_dir):
         "poses": {"registered": [evil], "centers": [[0, 0, 0]], "rejected": {evil + "2": evil}, "frame": evil,
                   "scale": evil, "links": [[evil, evil, 0, 2, None]]},
         "views": [{"name": evil, "preview": evil}], "stopped": evil, "machine": {evil: evil},
-        "stages": [{"name": evil, "use": evil, "metrics": {evil: evil}, "params": {evil: [evil]}}],
-        "scores": {"poses": {evil: 1}, "views": {evil: {evil: evil}}, "notes": [evil]}, "files": {evil: evil},
+        "stages": [{"name": evil, "use": evil, "metrics": {evil: 1}, "params": {evil: [evil]}}],
+        "scores": {"poses": {evil: 1}, "views": {evil: {evil: 1}}, "notes": [evil]}, "files": {evil: evil},
     }  # fmt: skip
     page = reported(out_dir, summary)
     assert page.tags.count("script") == 2, "ours and the facts"
@@ -181,7 +190,7 @@ def test_names_and_causes_are_text_and_never_markup(out_dir):
     assert page.words.count(evil) >= 24
 
 
-def test_previews_stand_in_for_what_is_not_in_the_store(out_dir):
+def test_previews_stand_in_for_what_is_not_in_the_store(out_dir: Path) -> None:
     page = reported(out_dir, SUMMARY)
     full = [attrs for attrs in page.all("img") if attrs["alt"]]
     assert [attrs["alt"].partition(":")[0] for attrs in full] == ["a/1.png", "a/1.png"]
@@ -190,7 +199,7 @@ def test_previews_stand_in_for_what_is_not_in_the_store(out_dir):
 
 
 @pytest.mark.parametrize("preview", ["../secret.jpg", "empty.jpg", "text.jpg", "", "preview", "flat.jpg"])
-def test_what_is_no_preview_within_the_folder_is_not_shown(out_dir, preview):
+def test_what_is_no_preview_within_the_folder_is_not_shown(out_dir: Path, preview: str) -> None:
     inside = out_dir / "out"
     (inside / "preview").mkdir(parents=True)
     cv2.imwrite(str(out_dir / "secret.jpg"), np.zeros((80, 16, 3), np.uint8))
@@ -202,7 +211,7 @@ def test_what_is_no_preview_within_the_folder_is_not_shown(out_dir, preview):
     assert "no preview" in page.words
 
 
-def test_scores_of_all_branches_are_told_apart(out_dir):
+def test_scores_of_all_branches_are_told_apart(out_dir: Path) -> None:
     both = {"ours": SUMMARY["scores"], "papers": {"poses": {}, "views": {"a/1.png": {"psnr_db": 11.25}}, "notes": []}}
     words = reported(out_dir, SUMMARY | {"all_scores": both}).words
     beside = words[words.index("Median over views") :]
@@ -211,5 +220,5 @@ def test_scores_of_all_branches_are_told_apart(out_dir):
     assert "Median over views" not in reported(out_dir, SUMMARY).words
 
 
-def test_where_nothing_failed_nothing_is_said_of_failures(out_dir):
+def test_where_nothing_failed_nothing_is_said_of_failures(out_dir: Path) -> None:
     assert "What failed" not in reported(out_dir, SUMMARY | {"failures": []}).words

@@ -1,18 +1,26 @@
 """What the page takes from the store: pictures of views and cloud, residuals, reasons; and what it keeps for later."""
 
+from __future__ import annotations
+
 import base64
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.report import write_report
 from pano_mvs.report.cloud_pictures import RENDERER_VARIABLE, cloud_pictures
-from pano_mvs.report.earlier_page import Kept
-from pano_mvs.report.results import Results
+from pano_mvs.report.earlier_page import EarlierPage
+from pano_mvs.results.pictures import Picture
+from pano_mvs.results.stored_values import StoredValues
+from pano_mvs.results.summary import RunSummary
+from pano_mvs.testing.tiny_capture import TinyCapture
 from tests.report.conftest import summary_of
 from tests.report.html_page import Page
 from tests.report.test_report import assert_sound
@@ -20,12 +28,14 @@ from tests.report.test_report import assert_sound
 UP = np.array([0.0, -1.0, 0.0])
 
 
-def reported(out_dir, summary, results):
-    write_report(out_dir, summary, results)
+def reported(out_dir: Path, summary: Mapping[str, Any], results: StoredValues | None) -> Page:
+    write_report(out_dir, RunSummary.from_json(summary), results)
     return Page((out_dir / "report.html").read_text(encoding="utf-8"))
 
 
-def test_views_are_shown_with_panorama_range_and_confidence(out_dir, results, tiny):
+def test_views_are_shown_with_panorama_range_and_confidence(
+    out_dir: Path, results: StoredValues, tiny: TinyCapture
+) -> None:
     page = reported(out_dir, summary_of(tiny), results)
     assert_sound(page)
     for name in tiny.names:
@@ -39,29 +49,33 @@ def test_views_are_shown_with_panorama_range_and_confidence(out_dir, results, ti
     assert "Not shown" not in page.words
 
 
-def test_nothing_is_drawn_again_where_nothing_changed(out_dir, results, tiny, monkeypatch):
+def test_nothing_is_drawn_again_where_nothing_changed(
+    out_dir: Path, results: StoredValues, tiny: TinyCapture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The second page is the first, byte for byte, and decodes no picture."""
-    write_report(out_dir, summary_of(tiny), results)
+    write_report(out_dir, RunSummary.from_json(summary_of(tiny)), results)
     before = (out_dir / "report.html").read_bytes()
     for decoder in ("pano_mvs.report.view_cards.color_mapped", "pano_mvs.report.cloud_pictures.draw_cloud"):
         monkeypatch.setattr(decoder, lambda *_, **__: pytest.fail("drawn again"))
-    write_report(out_dir, summary_of(tiny), results)
+    write_report(out_dir, RunSummary.from_json(summary_of(tiny)), results)
     assert (out_dir / "report.html").read_bytes() == before
 
 
-def test_what_changed_is_drawn_again(out_dir, results, tiny):
+def test_what_changed_is_drawn_again(out_dir: Path, results: StoredValues, tiny: TinyCapture) -> None:
     """A view whose range map is another shows it; the others' pictures stay."""
     first = reported(out_dir, summary_of(tiny), results)
     names = tiny.names
     ranges = dict(results.refs["ranges"]) | {names[0]: results.refs["ranges"][names[1]]}
-    second = reported(out_dir, summary_of(tiny), Results(results.store, dict(results.refs) | {"ranges": ranges}))
+    second = reported(out_dir, summary_of(tiny), StoredValues(results.store, dict(results.refs) | {"ranges": ranges}))
     pictures = [{attrs["alt"]: attrs["src"] for attrs in page.all("img")} for page in (first, second)]
     changed = {str(alt).partition(":")[0] for alt in pictures[0] if pictures[0][alt] != pictures[1][alt]}
     assert changed == {names[0]}
 
 
-def test_a_page_that_was_tampered_with_is_no_source_of_markup(out_dir, results, tiny):
-    write_report(out_dir, summary_of(tiny), results)
+def test_a_page_that_was_tampered_with_is_no_source_of_markup(
+    out_dir: Path, results: StoredValues, tiny: TinyCapture
+) -> None:
+    write_report(out_dir, RunSummary.from_json(summary_of(tiny)), results)
     path = out_dir / "report.html"
     text = path.read_text()
     facts = text.index('id="facts">') + len('id="facts">')
@@ -77,21 +91,27 @@ def test_a_page_that_was_tampered_with_is_no_source_of_markup(out_dir, results, 
 
 
 @pytest.mark.parametrize("role", ["images", "pairs", "poses", "ranges", "cloud"])
-def test_what_is_damaged_or_gone_is_left_out_and_told(out_dir, results, tiny, role):
+def test_what_is_damaged_or_gone_is_left_out_and_told(
+    out_dir: Path, results: StoredValues, tiny: TinyCapture, role: str
+) -> None:
+    assert results.store is not None
     for ref in results.refs[role].values():
         for part in ref.parts.values():
             if not part.external:
                 results.store.blobs.path(part).unlink(missing_ok=True)
     store = Store(results.store.root)  # one that knows no paths of pictures either
-    page = reported(out_dir, summary_of(tiny), Results(store, results.refs))
+    page = reported(out_dir, summary_of(tiny), StoredValues(store, results.refs))
     assert_sound(page)
     assert "Not shown:" in page.words
 
 
-def test_a_folder_and_its_cache_give_the_page_of_the_run(out_dir, results, tiny):
-    """`Results.of_folder` finds by the book of runs what the run had in its hands."""
+def test_a_folder_and_its_cache_give_the_page_of_the_run(
+    out_dir: Path, results: StoredValues, tiny: TinyCapture
+) -> None:
+    """`StoredValues.of_folder` finds by the book of runs what the run had in its hands."""
     store = results.store
-    keys = {}
+    assert store is not None
+    keys: dict[str, dict[str, str]] = {}
     for role, refs in results.refs.items():
         keys[role] = {item: f"{number:064x}" for number, item in enumerate(refs, start=1000 * len(keys))}
     for role, items in keys.items():
@@ -100,13 +120,15 @@ def test_a_folder_and_its_cache_give_the_page_of_the_run(out_dir, results, tiny)
     store.runs.remember("f" * 64, keys, workflow="tiny", out=out_dir)
     summary = summary_of(tiny) | {"results": {role: role for role in keys}}
     summary["stages"] = [{"name": "images", "params": {"path": str(tiny.folder / "images")}}]
-    again = Results.of_folder(out_dir, summary, Store(store.root))
+    again = StoredValues.of_folder(out_dir, RunSummary.from_json(summary), Store(store.root))
     assert {role: dict(refs) for role, refs in again.refs.items()} == results.refs
-    assert again.panorama(tiny.names[0]).load().shape == (32, 64, 3)
+    panorama = again.panorama(tiny.names[0])
+    assert panorama is not None
+    assert panorama.load().shape == (32, 64, 3)
     assert again.notes == []
-    elsewhere = Results.of_folder(out_dir / "other", summary, store)
+    elsewhere = StoredValues.of_folder(out_dir / "other", RunSummary.from_json(summary), store)
     assert "knows no run" in elsewhere.notes[0]
-    assert "earlier version" in Results.of_folder(out_dir, {}, store).notes[0]
+    assert "earlier version" in StoredValues.of_folder(out_dir, RunSummary(), store).notes[0]
 
 
 def drawing(folder: Path, body: str) -> tuple[str, ...]:
@@ -122,31 +144,39 @@ def drawing(folder: Path, body: str) -> tuple[str, ...]:
      "for n in range(3): numpy.save(Path(sys.argv[1]) / f'picture{n}.npy', numpy.zeros((600, 960, 3), 'uint8'))"],
     ids=["fails", "crashes", "draws nothing", "draws black"],
 )  # fmt: skip
-def test_where_there_is_no_graphics_driver_plainer_pictures_are_drawn(tmp_path, results, monkeypatch, body):
+def test_where_there_is_no_graphics_driver_plainer_pictures_are_drawn(
+    tmp_path: Path, results: StoredValues, monkeypatch: pytest.MonkeyPatch, body: str
+) -> None:
     monkeypatch.setenv(RENDERER_VARIABLE, "")
-    made = cloud_pictures(results, Kept(), up=UP, command=drawing(tmp_path, body))
+    made = cloud_pictures(results, EarlierPage(), up=UP, command=drawing(tmp_path, body))
     assert len(made.shown) == 3
     assert "PyVista could not draw here" in made.note
 
 
-def test_a_missing_interpreter_is_no_reason_to_fail(tmp_path, results, monkeypatch):
+def test_a_missing_interpreter_is_no_reason_to_fail(
+    tmp_path: Path, results: StoredValues, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv(RENDERER_VARIABLE, "")
-    made = cloud_pictures(results, Kept(), up=UP, command=(str(tmp_path / "nowhere"),))
+    made = cloud_pictures(results, EarlierPage(), up=UP, command=(str(tmp_path / "nowhere"),))
     assert len(made.shown) == 3
 
 
-def decoded(picture):
+def decoded(picture: Picture) -> NDArray[Any]:
     data = base64.b64decode(picture.uri.partition(",")[2])
-    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    image: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    return image
 
 
 @pytest.mark.slow
-def test_pyvista_draws_the_cloud_as_the_plain_pictures_do(results, monkeypatch):
+def test_pyvista_draws_the_cloud_as_the_plain_pictures_do(
+    results: StoredValues, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Both show the same points from the same places: their pictures agree but for the size of the points."""
     monkeypatch.setenv(RENDERER_VARIABLE, "")
-    by_pyvista = cloud_pictures(results, Kept(), up=UP)
+    by_pyvista = cloud_pictures(results, EarlierPage(), up=UP)
     monkeypatch.setenv(RENDERER_VARIABLE, "software")
-    plain = cloud_pictures(results, Kept(), up=UP)
+    plain = cloud_pictures(results, EarlierPage(), up=UP)
     assert [title for title, _ in by_pyvista.shown] == [title for title, _ in plain.shown]
     for (_, drawn), (_, expected) in zip(by_pyvista.shown, plain.shown, strict=True):
         marks = [decoded(picture).astype(int).min(axis=-1) < 225 for picture in (drawn, expected)]

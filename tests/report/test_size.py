@@ -1,20 +1,25 @@
 """The page stays below 30 MB, whatever it shows."""
 
+from __future__ import annotations
+
 import base64
 import re
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from pano_mvs.report import cloud_pictures, thumbnails, view_cards, write_report
-from pano_mvs.report.pictures import picture, preview_panels
+from pano_mvs.results.pictures import picture, preview_panels
+from pano_mvs.results.summary import RunSummary
 from tests.report.html_page import Page
 
 MOST_BYTES = 30_000_000
 NAMES = [f"a folder with a rather long name/and another/picture {number:05d}.jpg" for number in range(5000)]
 
 
-def large(count):
+def large(count: int) -> dict[str, Any]:
     names = NAMES[:count]
     links = [[names[i], names[(i + k) % count], 50 * (k % 3), 99, 0.03] for i in range(count) for k in range(1, 9)]
     return {
@@ -30,28 +35,28 @@ def large(count):
 
 
 @pytest.mark.parametrize(("width", "most_bytes"), [(768, 80_000), (160, 9_000), (960, 300_000)])
-def test_a_picture_takes_no_more_than_its_share_though_it_be_noise(width, most_bytes):
+def test_a_picture_takes_no_more_than_its_share_though_it_be_noise(width: int, most_bytes: int) -> None:
     noise = np.random.default_rng(0).integers(0, 255, (width // 2, width, 3), np.uint8)
     made = picture(noise, width=width, most_bytes=most_bytes)
     assert len(base64.b64decode(made.uri.partition(",")[2])) <= most_bytes
 
 
-def test_tiny_pictures_end_too():
+def test_tiny_pictures_end_too() -> None:
     assert picture(np.zeros((1, 1, 3), np.uint8), width=8, most_bytes=1).size_hw == (1, 1)
 
 
-def test_five_thousand_views_fit_with_all_their_pictures(tmp_path):
+def test_five_thousand_views_fit_with_all_their_pictures(tmp_path: Path) -> None:
     """The text of the largest page, and all pictures at the largest size that each may have, base64 and all."""
-    write_report(tmp_path, large(5000))
+    write_report(tmp_path, RunSummary.from_json(large(5000)))
     text = (tmp_path / "report.html").stat().st_size
-    cards = view_cards.MOST_CARDS * 3 * view_cards.MOST_BYTES
-    small = thumbnails.MOST_THUMBNAILS * thumbnails.MOST_BYTES
-    assert text + (cards + small + 3 * cloud_pictures.MOST_BYTES) * 4 / 3 + 1000 * 300 < MOST_BYTES
+    cards = view_cards.MAX_CARDS * 3 * view_cards.MAX_BYTES
+    small = thumbnails.MAX_THUMBNAILS * thumbnails.MAX_BYTES
+    assert text + (cards + small + 3 * cloud_pictures.MAX_BYTES) * 4 / 3 + 1000 * 300 < MOST_BYTES
 
 
-def test_of_many_views_the_worst_and_some_others_are_shown_in_full(tmp_path):
+def test_of_many_views_the_worst_and_some_others_are_shown_in_full(tmp_path: Path) -> None:
     views = [{"name": f"view {idx}", "completeness": 0.2 if idx in (400, 411) else 0.9} for idx in range(1000)]
-    write_report(tmp_path, {"views": views})
+    write_report(tmp_path, RunSummary.from_json({"views": views}))
     page = Page((tmp_path / "report.html").read_text())
     assert "36 of 1000 views are shown in full" in page.words
     assert page.words.count("no preview") == 36
@@ -62,19 +67,19 @@ def test_of_many_views_the_worst_and_some_others_are_shown_in_full(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_thousand_views_of_noise_fit(tmp_path, monkeypatch):
+def test_a_thousand_views_of_noise_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(1)
     monkeypatch.setattr(thumbnails, "preview_panels", lambda *_, **__: tuple(
         rng.integers(0, 255, (80, 160, 3), np.uint8) for _ in range(2)))  # fmt: skip
     monkeypatch.setattr(view_cards, "preview_panels", lambda *_, **__: tuple(
         rng.integers(0, 255, (640, 1280, 3), np.uint8) for _ in range(2)))  # fmt: skip
-    write_report(tmp_path, large(1000))
+    write_report(tmp_path, RunSummary.from_json(large(1000)))
     page = (tmp_path / "report.html").read_text()
     assert page.count("<img ") == 1000 + 2 * 36
     assert len(page) < MOST_BYTES
 
 
-def test_previews_of_other_shapes_are_none_of_ours(tmp_path):
+def test_previews_of_other_shapes_are_none_of_ours(tmp_path: Path) -> None:
     (tmp_path / "1.jpg").write_bytes(b"")
     assert preview_panels(tmp_path, "1.jpg") == ()
     assert preview_panels(tmp_path, "") == ()

@@ -1,7 +1,12 @@
 """From where the cloud is shown, and the plain pictures of it."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.report.software_cloud import draw_cloud
 from pano_mvs.report.viewpoints import Viewpoint, facing, horizontal_axes, inside_camera, viewpoints
@@ -10,7 +15,9 @@ UP = np.array([0.0, -1.0, 0.0])
 SIZE_HW = (60, 96)
 
 
-def room(rng, count=20_000):
+def room(
+    rng: np.random.Generator, count: int = 20_000
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
     """Return points on the inside of a box 6 × 3 × 4 around the origin, their normals inwards, one colour a side."""
     points = rng.uniform(-1, 1, (count, 3))
     axis = rng.integers(0, 3, count)
@@ -22,7 +29,7 @@ def room(rng, count=20_000):
     return (points * (3, 1.5, 2)).astype(np.float32), normals.astype(np.float32), colors.astype(np.uint8)
 
 
-def test_from_above_the_floor_is_seen_and_no_ceiling():
+def test_from_above_the_floor_is_seen_and_no_ceiling() -> None:
     points, normals, colors = room(np.random.default_rng(1))
     above, outside, _ = viewpoints(points, np.zeros((1, 3)), UP, aspect=1.6)
     for viewpoint in (above, outside):
@@ -36,7 +43,7 @@ def test_from_above_the_floor_is_seen_and_no_ceiling():
     assert (seen == (50, 250, 50)).all(), "the floor in the middle"
 
 
-def test_from_above_it_is_true_to_scale_with_z_upwards():
+def test_from_above_it_is_true_to_scale_with_z_upwards() -> None:
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1], [-1, 0, -1]], np.float32)
     normals = np.tile(UP.astype(np.float32), (4, 1))
     colors = np.array([[9, 9, 9], [255, 0, 0], [0, 255, 0], [0, 0, 255]], np.uint8)
@@ -50,7 +57,7 @@ def test_from_above_it_is_true_to_scale_with_z_upwards():
     assert np.linalg.norm(red - green) == pytest.approx(np.sqrt(2) * (blue[0] - red[0]), abs=1.5)
 
 
-def test_from_inside_the_outermost_camera_looks_at_the_others():
+def test_from_inside_the_outermost_camera_looks_at_the_others() -> None:
     centers = np.array([[0, 0, 0], [0.2, 0, 0], [4, 0.5, 0]], float)
     assert inside_camera(centers) == 2
     *_, inside = viewpoints(np.eye(3, dtype=np.float32), centers, UP, aspect=1.6, place="2.jpg")
@@ -62,20 +69,22 @@ def test_from_inside_the_outermost_camera_looks_at_the_others():
 @pytest.mark.parametrize("points", [[[1, 2, 3]], [[1, 2, 3]] * 5, [[0, 0, 0], [0, 9, 0]], [[1e6, 0, 0], [1e6, 1, 0]]])
 @pytest.mark.parametrize("centers", [[], [[1, 2, 3]], [[1, 2, 3]] * 3, [[0, 0, 0], [0, 5, 0]]])
 @pytest.mark.parametrize("up", [[0, -1, 0], [0, 0, 1], [1, 0, 0]])
-def test_whatever_lies_where_there_is_a_picture(points, centers, up):
-    points = np.array(points, np.float32)
-    found = viewpoints(points, np.array(centers, float).reshape(-1, 3), np.array(up, float), aspect=1.6)
+def test_whatever_lies_where_there_is_a_picture(
+    points: Sequence[Sequence[float]], centers: Sequence[Sequence[float]], up: Sequence[float]
+) -> None:
+    places = np.array(points, np.float32)
+    found = viewpoints(places, np.array(centers, float).reshape(-1, 3), np.array(up, float), aspect=1.6)
     for viewpoint in found:
         for vector in (viewpoint.eye, viewpoint.target, viewpoint.up):
             assert np.isfinite(vector).all()
         assert np.linalg.norm(viewpoint.target - viewpoint.eye) > 0
         image = draw_cloud(
-            points, np.zeros_like(points), np.full(points.shape, 7, np.uint8), viewpoint, size_hw=SIZE_HW
+            places, np.zeros_like(places), np.full(places.shape, 7, np.uint8), viewpoint, size_hw=SIZE_HW
         )
         assert image.shape == (*SIZE_HW, 3)
 
 
-def test_the_nearer_point_hides_the_farther_one():
+def test_the_nearer_point_hides_the_farther_one() -> None:
     ahead = Viewpoint("", np.zeros(3), np.array([0.0, 0, 1]), UP, fov_deg=60)
     points = np.array([[0, 0, 2], [0, 0, 1], [0, 0, 3], [0, 0, -1]], np.float32)
     colors = np.array([[1, 1, 1], [250, 0, 0], [2, 2, 2], [3, 3, 3]], np.uint8)
@@ -86,9 +95,8 @@ def test_the_nearer_point_hides_the_farther_one():
 
 
 @pytest.mark.parametrize("up", [[0, -1, 0], [0, 0, 1], [0.6, 0, 0.8], [0, 0, -1]])
-def test_horizontal_axes_are_across_up_with_right_on_the_right(up):
-    up = np.array(up, float)
-    right, forward = horizontal_axes(up)
-    frame = np.stack([right, up, forward])
+def test_horizontal_axes_are_across_up_with_right_on_the_right(up: Sequence[float]) -> None:
+    right, forward = horizontal_axes(np.array(up, float))
+    frame = np.stack([right, np.array(up, float), forward])
     assert frame @ frame.T == pytest.approx(np.eye(3), abs=1e-12)
     assert np.linalg.det(frame) == pytest.approx(-1), "seen from above, forward up the page, right is to the right"

@@ -103,6 +103,6 @@ def test_want_of_memory_is_the_pictures_failure(tmp_path: Path, monkeypatch: pyt
     def fail(*_: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr(decoding.cv2, "imdecode", fail)
+    monkeypatch.setattr(cv2, "imdecode", fail)
     with pytest.raises(InputError, match=r"a\.png: there is not enough memory to decode a picture of 256×128 px"):
         decode_picture(encoded(".png"), tmp_path / "a.png", cv2.IMREAD_COLOR)

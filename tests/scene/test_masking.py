@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.scene.masking import decode_mask, painted_over, placed_mask
+from tests.stored import read_picture
 
 VALID = np.array([[True, True, False, True], [False, True, True, True]])
 
@@ -35,7 +36,7 @@ def palette_png(index: NDArray[np.uint8], colors_rgb: bytes) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*part) for part in parts)
 
 
-def test_grey_masks_of_any_depth(tmp_path):
+def test_grey_masks_of_any_depth(tmp_path: Path) -> None:
     for dtype, least in ((np.uint8, 1), (np.uint16, 1)):
         path = written(tmp_path / "mask.png", np.where(VALID, least, 0).astype(dtype))
         np.testing.assert_array_equal(decode_mask(path), VALID)
@@ -45,19 +46,19 @@ def test_grey_masks_of_any_depth(tmp_path):
     np.testing.assert_array_equal(decode_mask(path), VALID)
 
 
-def test_colours_count_where_any_is_not_black(tmp_path):
+def test_colours_count_where_any_is_not_black(tmp_path: Path) -> None:
     picture = np.zeros((2, 4, 3), np.uint8)
     picture[VALID, 0] = 7
     np.testing.assert_array_equal(decode_mask(written(tmp_path / "mask.png", picture)), VALID)
 
 
-def test_a_palette_counts_by_its_colours(tmp_path):
+def test_a_palette_counts_by_its_colours(tmp_path: Path) -> None:
     path = tmp_path / "mask.png"
     path.write_bytes(palette_png(np.where(VALID, np.uint8(0), np.uint8(1)), b"\x80\x00\x00" + b"\x00\x00\x00"))
     np.testing.assert_array_equal(decode_mask(path), VALID)
 
 
-def test_what_is_transparent_is_ignored(tmp_path):
+def test_what_is_transparent_is_ignored(tmp_path: Path) -> None:
     picture = np.full((2, 4, 4), 255, np.uint8)
     picture[..., 3] = np.where(VALID, 9, 0)
     np.testing.assert_array_equal(decode_mask(written(tmp_path / "mask.png", picture)), VALID)
@@ -70,16 +71,16 @@ def test_what_is_transparent_is_ignored(tmp_path):
     np.testing.assert_array_equal(decode_mask(written(tmp_path / "mask.png", opaque)), VALID)
 
 
-def test_the_blacks_of_a_jpeg_are_black(tmp_path):
+def test_the_blacks_of_a_jpeg_are_black(tmp_path: Path) -> None:
     drawn = np.full((32, 64), 255, np.uint8)
     drawn[5:19, 7:33] = 0
     path = written(tmp_path / "mask.jpg", drawn, cv2.IMWRITE_JPEG_QUALITY, 60)
-    stored = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    stored = read_picture(path, cv2.IMREAD_GRAYSCALE)
     assert stored[6:18, 8:32].max() > 0  # or the test shows nothing
     np.testing.assert_array_equal(decode_mask(path), drawn > 0)
 
 
-def test_a_mask_that_cannot_be_read_is_named(tmp_path):
+def test_a_mask_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"gone\.png: cannot be read .* Check"):
         decode_mask(tmp_path / "gone.png")
     for data in (b"", b"no picture"):
@@ -92,7 +93,9 @@ sizes = st.integers(1, 40)
 
 
 @given(seed=st.integers(0, 2**16), source=st.tuples(sizes, sizes), wanted=st.tuples(sizes, sizes), crop=st.booleans())
-def test_a_pixel_is_valid_if_all_that_it_touches_is(seed, source, wanted, crop):
+def test_a_pixel_is_valid_if_all_that_it_touches_is(
+    seed: int, source: tuple[int, int], wanted: tuple[int, int], crop: bool
+) -> None:
     rng = np.random.default_rng(seed)
     mask = rng.random(source) < 0.8
     whole = source if not crop else (source[0] + 11, source[1] + 7)
@@ -108,7 +111,7 @@ def test_a_pixel_is_valid_if_all_that_it_touches_is(seed, source, wanted, crop):
 
 
 @pytest.mark.parametrize("width", [17, 30, 64, 100, 250])
-def test_a_line_of_one_pixel_cuts_a_mask_in_two_at_any_size(width):
+def test_a_line_of_one_pixel_cuts_a_mask_in_two_at_any_size(width: int) -> None:
     mask = np.ones((100, 200), np.bool_)
     mask[61] = mask[:, 77] = False
     placed = placed_mask(mask, (width // 2, width), of=(0, 0, 200, 100), whole_hw=(100, 200))
@@ -127,7 +130,7 @@ def drawn(seed: int, size_hw: tuple[int, int] = (32, 64)) -> tuple[NDArray[np.ui
 
 
 @given(seed=st.integers(0, 2**16), shift=st.integers(-64, 64))
-def test_paint_knows_nothing_of_what_it_covers_and_rolls_with_the_picture(seed, shift):
+def test_paint_knows_nothing_of_what_it_covers_and_rolls_with_the_picture(seed: int, shift: int) -> None:
     picture, valid = drawn(seed)
     painted = painted_over(picture, valid)
     np.testing.assert_array_equal(painted[valid], picture[valid])
@@ -137,7 +140,7 @@ def test_paint_knows_nothing_of_what_it_covers_and_rolls_with_the_picture(seed, 
     np.testing.assert_array_equal(rolled, np.roll(painted, shift, axis=1))
 
 
-def test_paint_is_the_colour_around():
+def test_paint_is_the_colour_around() -> None:
     picture = np.zeros((64, 128, 3), np.uint8)
     picture[:, 32:96] = 200
     valid = np.ones((64, 128), np.bool_)
@@ -148,7 +151,7 @@ def test_paint_is_the_colour_around():
     np.testing.assert_array_equal(painted[:58, away], picture[:58, away])  # below, both sides of the pole are near
 
 
-def test_paint_where_little_or_nothing_is_valid():
+def test_paint_where_little_or_nothing_is_valid() -> None:
     picture, valid = np.full((256, 512, 3), 9, np.uint8), np.zeros((256, 512), np.bool_)
     assert (painted_over(picture, valid) == 128).all()
     valid[0, 0] = True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import pixel_from_ray, ray_from_pixel, ray_grid
 from pano_mvs.scene import FilePart, Panorama
+from pano_mvs.scene.cropping import Crop
 from pano_mvs.scene.image_files.image_file import write_png
 from pano_mvs.scene.record import Record
 
@@ -25,7 +27,7 @@ def panorama(
     mask: NDArray[np.bool_] | None = None,
     whole_hw: tuple[int, int] | None = None,
     crop_ltwh: tuple[int, int, int, int] | None = None,
-    **others: float,
+    **others: Any,
 ) -> Panorama:
     write_png(folder / "a.png", picture)
     if mask is not None:
@@ -42,11 +44,13 @@ def noise(seed: int, size_hw: tuple[int, int]) -> NDArray[np.uint8]:
 @given(
     seed=st.integers(0, 2**16), half=st.integers(8, 40), working=st.integers(2, 20), scale=st.sampled_from([1, 2, 3, 5])
 )
-def test_nothing_that_is_masked_is_seen_at_any_resolution(tmp_path_factory, seed, half, working, scale):
+def test_nothing_that_is_masked_is_seen_at_any_resolution(
+    tmp_path_factory: pytest.TempPathFactory, seed: int, half: int, working: int, scale: int
+) -> None:
     folder, rng = tmp_path_factory.getbasetemp(), np.random.default_rng(seed)
     whole, working_hw = (half, 2 * half), (2 * min(working, half // 2), 4 * min(working, half // 2))
     left, top = int(rng.integers(0, half)), int(rng.integers(0, half // 2))
-    crop = (left, top, int(rng.integers(1, 2 * half - left)) + 1, int(rng.integers(1, half - top)) + 1)
+    crop: Crop | None = (left, top, int(rng.integers(1, 2 * half - left)) + 1, int(rng.integers(1, half - top)) + 1)
     crop = crop if rng.random() < 0.7 else None
     file_hw = (crop[3], crop[2]) if crop else whole
     mask = np.repeat(np.repeat(rng.random(file_hw) < 0.9, scale, 0), scale, 1)
@@ -62,7 +66,7 @@ def test_nothing_that_is_masked_is_seen_at_any_resolution(tmp_path_factory, seed
     np.testing.assert_array_equal(again.load()[valid], again.load_unmasked()[valid])
 
 
-def test_cuts_around_the_poles_are_rows(tmp_path):
+def test_cuts_around_the_poles_are_rows(tmp_path: Path) -> None:
     shown = panorama(tmp_path, noise(0, (40, 80)), nadir_deg=45.0, zenith_deg=10.0)
     rows = shown.load_mask().all(axis=1)
     np.testing.assert_array_equal(rows, (np.arange(40) >= 3) & (np.arange(40) < 30))  # 10° are two rows and a bit
@@ -70,7 +74,7 @@ def test_cuts_around_the_poles_are_rows(tmp_path):
     np.testing.assert_array_equal(shown.load_unmasked(), noise(0, (40, 80)))
 
 
-def test_a_mask_of_a_cropped_picture_covers_the_picture_or_the_sphere(tmp_path):
+def test_a_mask_of_a_cropped_picture_covers_the_picture_or_the_sphere(tmp_path: Path) -> None:
     crop = (5, 4, 30, 12)
     inside = np.zeros((20, 40), np.bool_)
     inside[4:16, 5:35] = True
@@ -84,14 +88,16 @@ def test_a_mask_of_a_cropped_picture_covers_the_picture_or_the_sphere(tmp_path):
 
 
 @pytest.mark.parametrize(("mask_hw", "columns"), [((20, 40), 14), ((10, 20), 10), ((40, 80), 10)])
-def test_a_mask_in_the_shape_of_both_is_the_crops_unless_it_has_the_spheres_size(tmp_path, mask_hw, columns):
+def test_a_mask_in_the_shape_of_both_is_the_crops_unless_it_has_the_spheres_size(
+    tmp_path: Path, mask_hw: tuple[int, int], columns: int
+) -> None:
     drawn = np.ones(mask_hw, np.bool_)
     drawn[:, mask_hw[1] // 2 :] = False
     shown = panorama(tmp_path, noise(0, (10, 20)), whole_hw=(20, 40), crop_ltwh=(6, 4, 20, 10), mask=drawn)
     np.testing.assert_array_equal(shown.load_mask().sum(axis=0), np.where((np.arange(40) - 6) % 40 < columns, 10, 0))
 
 
-def test_a_mask_of_another_shape_is_refused(tmp_path):
+def test_a_mask_of_another_shape_is_refused(tmp_path: Path) -> None:
     shown = panorama(tmp_path, noise(0, (20, 40)), mask=np.ones((20, 30), np.bool_))
     with pytest.raises(InputError, match=r"mask\.png: the mask has 30×20 px, .* \(a\.png, 40×20 px\)\. Draw it over"):
         shown.load()
@@ -103,7 +109,9 @@ def test_a_mask_of_another_shape_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("crop_ltwh", [None, (3, 3, 14, 10)])
-def test_a_picture_that_changed_its_size_since_is_named(tmp_path, crop_ltwh):
+def test_a_picture_that_changed_its_size_since_is_named(
+    tmp_path: Path, crop_ltwh: tuple[int, int, int, int] | None
+) -> None:
     shown = panorama(tmp_path, noise(0, (20, 41)), whole_hw=(20, 40), crop_ltwh=crop_ltwh)
     with pytest.raises(InputError, match=r"a\.png: 41×20 px, but it had (40×20|14×10) when it was listed"):
         shown.load()
@@ -114,7 +122,7 @@ def stored(value: Record) -> Record:
 
 
 @pytest.mark.parametrize("crop_ltwh", [None, (5, 4, 30, 12), (6, 4, 20, 10)])
-def test_further_masks_add_to_those_that_are_there(tmp_path, crop_ltwh):
+def test_further_masks_add_to_those_that_are_there(tmp_path: Path, crop_ltwh: tuple[int, int, int, int] | None) -> None:
     rng = np.random.default_rng(1)
     file_hw = (crop_ltwh[3], crop_ltwh[2]) if crop_ltwh else (20, 40)
     first = panorama(
@@ -154,7 +162,9 @@ def spots(rays: NDArray[np.float64], centers: NDArray[np.float64], sigma_rad: fl
         ((0, 53, 800, 311), (311, 800), (150, 300)),
     ],
 )
-def test_a_known_ray_is_where_it_belongs_to_a_twentieth_of_a_pixel(tmp_path, crop_ltwh, file_hw, size_hw):
+def test_a_known_ray_is_where_it_belongs_to_a_twentieth_of_a_pixel(
+    tmp_path: Path, crop_ltwh: tuple[int, int, int, int] | None, file_hw: tuple[int, int], size_hw: tuple[int, int]
+) -> None:
     rng = np.random.default_rng(3)
     wanted = np.stack([rng.uniform(150, 650, 12), rng.uniform(120, 300, 12)], axis=-1)
     centers = ray_from_pixel(wanted, (400, 800))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ def _assert_same(first: Poses, second: Poses) -> None:
             assert a == b, field.name
 
 
-def test_joined_cameras_are_in_the_order_of_the_capture_and_the_largest_group_is_first():
+def test_joined_cameras_are_in_the_order_of_the_capture_and_the_largest_group_is_first() -> None:
     joined = _joined()
     joined.check()
     assert joined.names == _ORDER[:5]
@@ -43,33 +44,34 @@ def test_joined_cameras_are_in_the_order_of_the_capture_and_the_largest_group_is
     assert joined.doubts == {"c.jpg": "doubt 2", "e.jpg": "doubt 1"}
 
 
-def test_of_two_groups_of_one_size_the_one_with_the_earliest_image_is_first():
+def test_of_two_groups_of_one_size_the_one_with_the_earliest_image_is_first() -> None:
     other = drawn_group(("b.jpg", "e.jpg"), seed=3)
     assert join_groups([other, _SMALL], order=_ORDER).frame == _SMALL.frame
 
 
-def test_every_observation_still_points_at_its_point():
+def test_every_observation_still_points_at_its_point() -> None:
     joined = _joined()
     rays = joined.points_in_world[joined.track_point_idx] - joined.centers[joined.track_image_idx]
     seen = np.einsum("nij,nj->ni", joined.rotations[joined.track_image_idx], rays)
     assert angle_between(seen, joined.track_bearings).max() < 1e-6
 
 
-def test_split_gives_back_what_was_joined():
+def test_split_gives_back_what_was_joined() -> None:
     large, small = split_groups(_joined())
     _assert_same(large, _LARGE)
     _assert_same(small, _SMALL)
 
 
-def test_groups_survive_the_form_in_which_they_are_stored():
+def test_groups_survive_the_form_in_which_they_are_stored() -> None:
     joined = _joined()
     _assert_same(Poses.from_parts(joined.to_parts()), joined)
-    meta = dict(joined.to_parts()["meta"])  # type: ignore[arg-type]  # the part is a JSON object
-    meta["other_worlds"] = [list(world) for world in joined.other_worlds]
-    _assert_same(Poses.from_parts({**joined.to_parts(), "meta": meta}), joined)
+    meta = joined.to_parts()["meta"]
+    assert isinstance(meta, dict)
+    as_read = meta | {"other_worlds": [list(world) for world in joined.other_worlds]}
+    _assert_same(Poses.from_parts({**joined.to_parts(), "meta": as_read}), joined)
 
 
-def test_what_only_one_group_knows_is_unknown_of_the_other():
+def test_what_only_one_group_knows_is_unknown_of_the_other() -> None:
     joined = join_groups([_LARGE, replace(_SMALL, center_stds=None)], order=_ORDER)
     assert joined.center_stds is not None
     assert _LARGE.center_stds is not None
@@ -78,7 +80,7 @@ def test_what_only_one_group_knows_is_unknown_of_the_other():
     assert joined.confirmed_shares is None
 
 
-def test_one_group_is_passed_on_as_it_is():
+def test_one_group_is_passed_on_as_it_is() -> None:
     assert split_groups(_LARGE) == [_LARGE]
     assert per_group(_LARGE, lambda poses: poses) is _LARGE
     _assert_same(join_groups([_LARGE]), _LARGE)
@@ -88,7 +90,7 @@ def test_one_group_is_passed_on_as_it_is():
     np.testing.assert_array_equal(backwards.rotations, _LARGE.rotations[::-1])
 
 
-def test_per_group_treats_each_group_alone_and_joins_what_comes_out():
+def test_per_group_treats_each_group_alone_and_joins_what_comes_out() -> None:
     seen = []
 
     def moved(group: Poses) -> Poses:
@@ -101,7 +103,7 @@ def test_per_group_treats_each_group_alone_and_joins_what_comes_out():
     assert treated.rejected == {"f.jpg": "blurred", "x.jpg": "frame 2"}
 
 
-def test_a_camera_that_is_left_alone_is_rejected_and_an_empty_group_is_forgotten():
+def test_a_camera_that_is_left_alone_is_rejected_and_an_empty_group_is_forgotten() -> None:
     alone = drawn_group(("c.jpg",), seed=4)
     empty = Poses.without_points({}, frame="", scale="", metric=False, rejected={"a.jpg": "too few points"})
     joined = join_groups([_LARGE, alone, empty], order=_ORDER)
@@ -111,7 +113,7 @@ def test_a_camera_that_is_left_alone_is_rejected_and_an_empty_group_is_forgotten
     joined.check()
 
 
-def test_groups_that_cannot_be_joined_are_refused():
+def test_groups_that_cannot_be_joined_are_refused() -> None:
     with pytest.raises(UsageError, match="no group"):
         join_groups([])
     with pytest.raises(UsageError, match="split it first"):
@@ -132,12 +134,12 @@ def test_groups_that_cannot_be_joined_are_refused():
         ({"group_idx": np.array([1, 0, 0, 0, 1], np.int32)}, "seen from two groups"),
     ],
 )
-def test_groups_that_do_not_fit_break_the_contract(changes: dict[str, object], message: str):
+def test_groups_that_do_not_fit_break_the_contract(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ContractError, match=message):
-        replace(_joined(), **changes).check()  # type: ignore[arg-type]  # one field of each kind
+        replace(_joined(), **changes).check()
 
 
-def test_points_that_a_single_camera_is_left_of_go_with_the_others():
+def test_points_that_a_single_camera_is_left_of_go_with_the_others() -> None:
     large = replace(_LARGE, track_point_idx=_LARGE.track_point_idx[10:], track_image_idx=_LARGE.track_image_idx[10:],
                     track_bearings=_LARGE.track_bearings[10:], track_sigmas_rad=None)  # fmt: skip
     kept = with_cameras(large, np.array([True, True, False]))

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from pano_mvs.geometry import roll_panorama, rotation_from_rotvec
-from pano_mvs.testing.scenes import SCENES, write_scene
+from pano_mvs.testing.scenes import SCENES, Scene, write_scene
 from tests.benchmarks.dense_chain import DenseChain
-from tests.benchmarks.equivariance import Bad, bad_pixels, line, measure, relative_difference, smooth_truth
+from tests.benchmarks.equivariance import (
+    Bad,
+    Equivariance,
+    bad_pixels,
+    line,
+    measure,
+    relative_difference,
+    smooth_truth,
+)
 from tests.benchmarks.turned import FolderPlace, ScenePlace, turned_picture
 
 SMALL = ["depth.planes=48", "depth.near=1.0", "depth.far=6.0"]
@@ -16,40 +26,40 @@ SIZE = (80, 160)
 
 
 @pytest.fixture(scope="module")
-def scene():
+def scene() -> Scene:
     return SCENES["weak_room"](views=3, seed=2)
 
 
 @pytest.fixture(scope="module")
-def found(scene, tmp_path_factory):
+def found(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Equivariance]:
     folder = tmp_path_factory.mktemp("turned")
     return measure(DenseChain("quality", overrides=SMALL), ScenePlace(scene, folder, SIZE[1]), folder, seed=1)
 
 
 @pytest.mark.parametrize("stage", ["depth", "slanted", "checked", "planes"])
-def test_rolled_pictures_give_the_rolled_range(found, stage):
+def test_rolled_pictures_give_the_rolled_range(found: dict[str, Equivariance], stage: str) -> None:
     median, above_1_percent = found[stage].roll
     assert median <= 1e-3
     assert above_1_percent < 0.05
 
 
 @pytest.mark.parametrize(("stage", "most"), [("depth", 1.2e-2), ("slanted", 8e-3), ("planes", 8e-3)])
-def test_a_turned_reference_gives_the_turned_range(found, stage, most):
+def test_a_turned_reference_gives_the_turned_range(found: dict[str, Equivariance], stage: str, most: float) -> None:
     """At 80 rows; the benchmark holds larger pictures against the bar of 5e-3."""
     assert found[stage].turn[0] <= most
 
 
 @pytest.mark.parametrize("stage", ["depth", "checked", "planes"])
-def test_seam_and_poles_are_no_worse_than_the_middle(found, stage):
+def test_seam_and_poles_are_no_worse_than_the_middle(found: dict[str, Equivariance], stage: str) -> None:
     assert found[stage].seam.there <= 1.2 * found[stage].seam.elsewhere + 0.01
     assert found[stage].poles.there <= 1.2 * found[stage].poles.elsewhere + 0.02
 
 
-def test_a_line_tells_all(found):
+def test_a_line_tells_all(found: dict[str, Equivariance]) -> None:
     assert line("x", "depth", found["depth"]).count("|") == 13
 
 
-def test_ranges_that_did_not_turn_with_the_picture_are_told(scene):
+def test_ranges_that_did_not_turn_with_the_picture_are_told(scene: Scene) -> None:
     truth = scene.view(0, SIZE)[1]
     rolled, turn = roll_panorama(truth, 31)
     smooth = smooth_truth(truth)
@@ -58,14 +68,14 @@ def test_ranges_that_did_not_turn_with_the_picture_are_told(scene):
     assert np.median(relative_difference(truth, truth, turn, smooth)) > 0.05
 
 
-def test_wrong_and_missing_ranges_are_bad():
+def test_wrong_and_missing_ranges_are_bad() -> None:
     truth = np.full((4, 8), 2.0, np.float32)
     ranges = truth * np.array([1, 1.04, 1.06, 0.9, np.nan, 1, 1, 1], np.float32)
     np.testing.assert_array_equal(bad_pixels(ranges, truth)[0], [False, False, True, True, True, False, False, False])
     assert Bad(0.3, 0.2).ratio == pytest.approx(1.5)
 
 
-def test_a_capture_on_disk_turns_like_the_scene(scene, tmp_path):
+def test_a_capture_on_disk_turns_like_the_scene(scene: Scene, tmp_path: Path) -> None:
     """Resampled from twice the size, a picture differs from one rendered in the turned camera by a few grey levels."""
     turn = {"000.png": rotation_from_rotvec((0.7, -1.1, 0.4))}
     still = ScenePlace(scene, tmp_path, SIZE[1])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -32,6 +33,7 @@ from pano_mvs.stages.exports.colmap import (
 from pano_mvs.stages.points import SurfaceParams, TrackedParams, surface, tracked
 from pano_mvs.testing.room import capture_poses, default_room, range_along, render
 from tests.benchmarks.colmap_dense import context, deliver, fused_points, wall_distances, write_workspace
+from tests.stored import read_picture
 
 SIZE = (256, 512)
 NAMES = ("a/000.png", "a/b/001.png", "002.jpg")
@@ -107,8 +109,8 @@ def test_every_file_of_a_picture_is_where_colmap_looks(workspace: Path) -> None:
         assert sorted(image.name for image in model.images.values()) == sorted(names)
     for name in names:
         picture, mask = (
-            cv2.imread(str(workspace / "images" / name)),
-            cv2.imread(str(workspace / f"masks/{name}.png"), 0),
+            read_picture(workspace / "images" / name),
+            read_picture(workspace / f"masks/{name}.png", cv2.IMREAD_GRAYSCALE),
         )
         assert picture.shape == (120, 120, 3)
         assert mask.shape == (120, 120)
@@ -122,13 +124,13 @@ def test_what_is_masked_has_no_depth_and_no_point(workspace: Path, capture: Capt
     names = [path.relative_to(workspace / "masks").as_posix() for path in (workspace / "masks").rglob("*.png")]
     assert len(names) == 18
     for name in names:
-        mask = cv2.imread(str(workspace / "masks" / name), 0)
+        mask = read_picture(workspace / "masks" / name, cv2.IMREAD_GRAYSCALE)
         depth = read_colmap_map(workspace / "stereo/depth_maps" / name.replace(".png", ".geometric.bin"))
         assert (depth[mask == 0] == 0).all()
         assert (mask == 0).any() == (name in {"a/b/001_down.jpg.png"})
     model = pycolmap.Reconstruction(workspace / "sparse")
     masked = next(image for image in model.images.values() if image.name == "a/b/001_down.jpg")
-    mask = cv2.imread(str(workspace / "masks/a/b/001_down.jpg.png"), 0)
+    mask = read_picture(workspace / "masks/a/b/001_down.jpg.png", cv2.IMREAD_GRAYSCALE)
     for point in masked.points2D:
         x, y = np.floor(point.xy).astype(int)
         assert mask[max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3].any()
@@ -137,7 +139,7 @@ def test_what_is_masked_has_no_depth_and_no_point(workspace: Path, capture: Capt
 
 def test_no_file_of_a_face_depends_on_what_is_masked(capture: Capture, tmp_path: Path) -> None:
     image, ranges = capture.images[NAMES[1]], capture.ranges[NAMES[1]]
-    picture = cv2.imread(str(image.image.path))
+    picture = read_picture(image.image.path)
     picture[~image.load_mask()] = (255, 0, 255)
     cv2.imwrite(str(tmp_path / "painted.png"), picture)
     painted = dataclasses.replace(image, image=FilePart(tmp_path / "painted.png"))
@@ -177,7 +179,7 @@ def test_faces_follow_their_settings_and_the_model_follows_the_faces(capture: Ca
     for image in read.images.values():
         assert image.name.startswith("a/000_")
         assert image.name.endswith(".png")
-        assert cv2.imread(str(tmp_path / "colmap_dense/images" / image.name)).shape == (40, 40, 3)
+        assert read_picture(tmp_path / "colmap_dense/images" / image.name).shape == (40, 40, 3)
 
 
 def test_memory_goes_with_the_panorama_and_the_face(capture: Capture) -> None:
@@ -248,12 +250,14 @@ def test_too_few_points_are_told(capture: Capture, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("source_hw", [(256, 512), (600, 1200), (128, 256)])
-def test_masks_are_called_and_sized_as_colmap_wants_them(capture: Capture, tmp_path: Path, source_hw) -> None:
+def test_masks_are_called_and_sized_as_colmap_wants_them(
+    capture: Capture, tmp_path: Path, source_hw: tuple[int, int]
+) -> None:
     image = dataclasses.replace(capture.images[NAMES[1]], source_size_hw=source_hw)
     ctx = context(tmp_path / "scratch")
     files = colmap_masks(image=image, params=MasksParams(), ctx=ctx)
     assert list(files.files) == ["colmap/masks/{name}.png"]
-    mask = cv2.imread(str(next(iter(files.files.values()))), cv2.IMREAD_UNCHANGED)
+    mask = read_picture(next(iter(files.files.values())), cv2.IMREAD_UNCHANGED)
     assert mask.shape == source_hw
     down = ray_grid(source_hw)[..., 1] > np.cos(np.radians(30))
     assert (mask[down] == 0).all()
@@ -269,14 +273,16 @@ def test_cropped_pictures_are_written_as_the_spheres_that_the_cameras_are(captur
     files = colmap_masks(image=image, params=MasksParams(pictures=True), ctx=ctx)
     assert set(files.files) == {"colmap/masks/{name}.png", "colmap/images/{name}"}
     picture = decode_image(files.files["colmap/images/{name}"])
-    mask = cv2.imread(str(files.files["colmap/masks/{name}.png"]), cv2.IMREAD_UNCHANGED)
+    mask = read_picture(files.files["colmap/masks/{name}.png"], cv2.IMREAD_UNCHANGED)
     assert picture.shape == (*SIZE, 3)
     assert (mask > 0).sum() == 300 * 160
     np.testing.assert_array_equal(picture[40:200, 100:400], whole.load()[40:200, 100:400])
 
 
 @pytest.mark.parametrize("form", ["bin", "txt", "both"])
-def test_the_sparse_model_has_the_form_that_is_asked_for(capture: Capture, tmp_path: Path, form) -> None:
+def test_the_sparse_model_has_the_form_that_is_asked_for(
+    capture: Capture, tmp_path: Path, form: Literal["bin", "txt", "both"]
+) -> None:
     ctx = context(tmp_path / "scratch")
     files = colmap(poses=capture.poses, images=capture.images, params=ModelParams(format=form), ctx=ctx)
     suffixes = {"bin": {"bin"}, "txt": {"txt"}, "both": {"bin", "txt"}}[form]
@@ -288,7 +294,7 @@ def test_the_sparse_model_has_the_form_that_is_asked_for(capture: Capture, tmp_p
 
 @pytest.mark.parametrize(("form", "told"), [("bin", False), ("both", True)])
 def test_names_with_blanks_are_told_where_the_text_cannot_hold_them(
-    capture: Capture, tmp_path: Path, form, told
+    capture: Capture, tmp_path: Path, form: Literal["bin", "txt", "both"], told: bool
 ) -> None:
     """COLMAP itself writes such names into images.txt and reads them back as far as the blank."""
     poses = Poses.without_points({"a/1 b.png": capture.poses.cam_from_world(0)}, frame="", scale="", metric=False)

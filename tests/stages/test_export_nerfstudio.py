@@ -29,6 +29,7 @@ from pano_mvs.stages.exports.nerfstudio import (
 from pano_mvs.testing.room import default_room, range_along
 from pano_mvs.testing.tiny_capture import TinyCapture, Variant, tiny_capture
 from tests.oracles.nerfstudio import documented_rays, world_points
+from tests.stored import read_picture
 
 HEIGHT, WIDTH = 192, 384
 PLAIN = Variant((HEIGHT, WIDTH))
@@ -58,13 +59,14 @@ def exported(
         made = nerfstudio_frames(images[name], everywhere, params, Context(np.random.default_rng(0), scratch))
         ref = store.put_value(made)
         publisher.publish("frames", name, ref)
-        frames[name] = store.load(ref, NerfstudioFrames)
+        read = store.load(ref, NerfstudioFrames)
+        assert isinstance(read, NerfstudioFrames)
+        frames[name] = read
     scratch = folder / "scratch"
     scratch.mkdir()
-    poses = capture.wholes[Poses]
-    assert isinstance(poses, Poses)
-    params = NerfstudioParams(seed_points=seed_points)
-    files = nerfstudio(frames, poses, cloud, params, Context(np.random.default_rng(0), scratch))
+    poses = capture.whole(Poses)
+    seeds = NerfstudioParams(seed_points=seed_points)
+    files = nerfstudio(frames, poses, cloud, seeds, Context(np.random.default_rng(0), scratch))
     publisher.publish("nerfstudio", "", store.put_value(files))
     return folder / "out" / "nerfstudio"
 
@@ -131,7 +133,7 @@ def test_faces_look_where_their_cameras_say(plain: Path) -> None:
     differences = []
     for frame in document["frames"]:
         name = Path(frame["file_path"]).name.split(".png.")[0] + ".png"
-        picture = cv2.imread(str(plain / "faces" / frame["file_path"]))[..., ::-1].astype(int)
+        picture = read_picture(plain / "faces" / frame["file_path"])[..., ::-1].astype(int)
         assert picture.shape[1::-1] == (document["w"], document["h"])
         rays = documented_rays(document, frame, picture.shape[1::-1])
         pose = capture.poses[capture.names.index(name)]
@@ -165,7 +167,7 @@ def test_seed_points_are_in_the_world_of_the_cameras(plain: Path) -> None:
         seed = read_ply(plain / variant / document["ply_file_path"])
         assert 85 <= len(seed) <= 100
         sparse = tiny_capture(PLAIN).points_in_world
-        assert cKDTree(sparse).query(seed.points_in_world)[0].max() < 1e-5
+        assert np.max(cKDTree(sparse).query(seed.points_in_world)[0]) < 1e-5
 
 
 def test_a_picture_is_delivered_as_it_is_and_not_kept_twice(plain: Path) -> None:
@@ -184,9 +186,9 @@ def test_no_depth_comes_from_a_masked_pixel(masked: Path, variant: str) -> None:
     document = json.loads((masked / variant / "transforms.json").read_text())
     hidden = 0
     for frame in document["frames"]:
-        mask = cv2.imread(str(masked / variant / frame["mask_path"]), cv2.IMREAD_UNCHANGED)
-        steps = cv2.imread(str(masked / variant / frame["depth_file_path"]), cv2.IMREAD_UNCHANGED)
-        picture = cv2.imread(str(masked / variant / frame["file_path"]))
+        mask = read_picture(masked / variant / frame["mask_path"], cv2.IMREAD_UNCHANGED)
+        steps = read_picture(masked / variant / frame["depth_file_path"], cv2.IMREAD_UNCHANGED)
+        picture = read_picture(masked / variant / frame["file_path"])
         assert mask.shape == steps.shape == picture.shape[:2]
         assert set(np.unique(mask)) <= {0, 255}
         assert not steps[mask == 0].any()
@@ -229,7 +231,7 @@ def test_cropped_and_scaled_panoramas_are_written_whole(tmp_path: Path) -> None:
         made = nerfstudio_frames(image, None, params, Context(np.random.default_rng(0), scratch))
         assert not made.pictures
         path = made.files["nerfstudio/equirectangular/images/{name}.png"]
-        picture = cv2.imread(str(path))[..., ::-1]
+        picture = read_picture(path)[..., ::-1]
         assert picture.shape[:2] == size_hw
         np.testing.assert_array_equal(picture, image.load())
         assert made.frames[0].size_wh == size_hw[::-1]
@@ -258,7 +260,7 @@ def test_ranges_beyond_16_bits_are_unknown_and_told(tmp_path: Path) -> None:
     ctx = Context(np.random.default_rng(0), tmp_path)
     params = NerfstudioFramesParams(variants=("equirectangular",))
     made = nerfstudio_frames(image, RangeMap(far, doubtful), params, ctx)
-    steps = cv2.imread(str(made.files["nerfstudio/equirectangular/depths/{name}.png"]), cv2.IMREAD_UNCHANGED)
+    steps = read_picture(made.files["nerfstudio/equirectangular/depths/{name}.png"], cv2.IMREAD_UNCHANGED)
     assert np.unique(steps[:48]).tolist() == np.unique(steps[96:]).tolist() == [0]
     assert np.unique(steps[48:96]).tolist() == [2000]
     assert ctx.metrics["beyond_depth"] == pytest.approx(2 / 3)
@@ -268,8 +270,7 @@ def test_ranges_beyond_16_bits_are_unknown_and_told(tmp_path: Path) -> None:
 
 def test_panoramas_without_frames_are_told_and_none_at_all_is_refused(tmp_path: Path) -> None:
     capture = tiny_capture(PLAIN)
-    poses = capture.wholes[Poses]
-    assert isinstance(poses, Poses)
+    poses = capture.whole(Poses)
     (tmp_path / "a").mkdir()
     params = NerfstudioFramesParams(variants=("faces",), size_px=32)
     made = nerfstudio_frames(capture.images["002.png"], None, params, Context(np.random.default_rng(0), tmp_path / "a"))
@@ -290,7 +291,7 @@ def test_grey_16_bit_and_cmyk_pictures_are_written_anew(tmp_path: Path) -> None:
     CMYK JPEGs were delivered as they are, and trainers took the four channels for colours with transparency.
     """
     image = tiny_capture(PLAIN).images["000.png"]
-    deep = cv2.imread(str(image.image.path)).astype(np.uint16) * 257
+    deep = read_picture(image.image.path).astype(np.uint16) * 257
     cv2.imwrite(str(tmp_path / "deep.png"), deep)
     cv2.imwrite(str(tmp_path / "grey.png"), (deep[..., 0] >> 8).astype(np.uint8))
     PIL.Image.open(image.image.path).convert("CMYK").save(tmp_path / "cmyk.jpg")

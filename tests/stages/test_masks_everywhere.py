@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -42,7 +43,7 @@ VARIANTS: list[tuple[str, dict[str, Any]]] = [
 @pytest.mark.parametrize(
     ("name", "settings"), [*VARIANTS, *(pytest.param(*sweep, marks=pytest.mark.slow) for sweep in SWEEPS)], ids=str
 )
-def test_no_setting_lets_a_stage_see_what_is_masked(name, settings):
+def test_no_setting_lets_a_stage_see_what_is_masked(name: str, settings: dict[str, Any]) -> None:
     size_hw = (128, 256) if settings.get("levels", 1) > 1 else (32, 64)
     laws = [law for law in stage_laws(name, settings=settings, size_hw=size_hw) if "masked" in str(law)]
     assert len(laws) == 1
@@ -65,7 +66,7 @@ def everywhere(capture: TinyCapture, name: str) -> RangeMap:
 
 
 @pytest.mark.parametrize("min_views", [1, 2])
-def test_no_point_of_a_cloud_comes_from_a_masked_pixel(tmp_path, min_views):
+def test_no_point_of_a_cloud_comes_from_a_masked_pixel(tmp_path: Path, min_views: int) -> None:
     """Though the range maps have ranges there: a plugin may have put them."""
     capture = tiny_capture(Variant((64, 128), masked=True))
     ranges = {name: everywhere(capture, name) for name in capture.names}
@@ -80,7 +81,7 @@ def test_no_point_of_a_cloud_comes_from_a_masked_pixel(tmp_path, min_views):
     assert (np.sum(views, axis=0) >= min_views).all()
 
 
-def test_no_key_point_of_colmap_is_masked(tmp_path):
+def test_no_key_point_of_colmap_is_masked(tmp_path: Path) -> None:
     capture = tiny_capture(Variant((96, 192), masked=True))
     pictures = ((name, image.load(), image.load_mask()) for name, image in capture.images.items())
     features, _ = colmap_sift(pictures, rng=np.random.default_rng(0), scratch=tmp_path)
@@ -91,10 +92,10 @@ def test_no_key_point_of_colmap_is_masked(tmp_path):
 
 
 @pytest.mark.parametrize(("blank", "why"), [(True, "no view has any range"), (False, "at no pixel did 4 views agree")])
-def test_an_empty_cloud_is_told(tmp_path, blank, why):
+def test_an_empty_cloud_is_told(tmp_path: Path, blank: bool, why: str) -> None:
     capture = tiny_capture(Variant(blank=blank))
     poses = {name: Pose(pose) for name, pose in zip(capture.names, capture.poses, strict=True)}
-    ranges = {name: capture.items[RangeMap][name] for name in capture.names}
+    ranges = {name: capture.each(RangeMap)[name] for name in capture.names}
     if not blank:  # ranges that nobody else confirms
         ranges = {
             name: RangeMap(ranges[name].range * (3.0**idx), ranges[name].confidence)

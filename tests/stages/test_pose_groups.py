@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 import pycolmap
@@ -22,6 +23,7 @@ from pano_mvs.scene import Files, Panorama, PointCloud, Pose, Poses, RangeMap
 from pano_mvs.scene.face_files import FaceFiles
 from pano_mvs.scene.pose_groups import join_groups, split_groups, with_cameras
 from pano_mvs.scene.surface_samples import SurfaceSamples
+from pano_mvs.scene.tracked_points import TrackedPoints
 from pano_mvs.stages.depth import SweepParams, sweep
 from pano_mvs.stages.evaluate import TruthParams, truth
 from pano_mvs.stages.exports.colmap import (
@@ -42,6 +44,7 @@ from pano_mvs.stages.patchmatch import PatchMatchParams, patchmatch
 from pano_mvs.stages.points import TrackedParams, tracked
 from pano_mvs.stages.poses import known_poses
 from pano_mvs.testing.tiny_capture import TinyCapture, tiny_capture
+from tests.stored import write_npz
 
 _LARGE = ("000.png", "001.png", "003.png")
 # The smaller room is the same capture's, under other names, in a world that is turned, moved and half as large.
@@ -50,18 +53,20 @@ _ORDER = ("b0.png", "000.png", "001.png", "b1.png", "003.png")
 _MOVED = Similarity3(0.5, rotation_from_rotvec([0.1, 1.0, -0.2]), np.array([3.0, 1.0, -2.0]))
 
 
+Item = TypeVar("Item")
+
+
 class Rooms:
     """The values that stages take, of both rooms."""
 
     def __init__(self, tiny: TinyCapture) -> None:
-        whole = tiny.wholes[Poses]
-        assert isinstance(whole, Poses)
+        whole = tiny.whole(Poses)
         large, small = (_with(whole, names) for names in (_LARGE, tuple(_SMALL.values())))
         small = replace(moved_poses(small, _MOVED), names=tuple(_SMALL), frame="the small room's", scale="its own")
         self.poses = join_groups([small, large], order=_ORDER)
-        self.images = self._of(tiny.items[Panorama])
-        self.ranges = self._of(tiny.items[RangeMap])
-        self.samples = self._of(tiny.items[SurfaceSamples])
+        self.images = self._of(tiny.each(Panorama))
+        self.ranges = self._of(tiny.each(RangeMap))
+        self.samples = self._of(tiny.each(SurfaceSamples))
         for name in _SMALL:
             own = self.ranges[name]
             self.ranges[name] = replace(own, range=(0.5 * own.range).astype(np.float32))
@@ -71,7 +76,7 @@ class Rooms:
         self.pose_items: Mapping[str, Pose] = self.poses.explode()
 
     @staticmethod
-    def _of(items: Mapping[str, object]) -> dict:
+    def _of(items: Mapping[str, Item]) -> dict[str, Item]:
         return {name: items[_SMALL.get(name, name)] for name in _ORDER}
 
 
@@ -94,7 +99,7 @@ def _context(folder: Path) -> Context:
     return Context(np.random.default_rng(0), folder)
 
 
-def _fused(rooms: Rooms, names: tuple[str, ...] = _ORDER, **settings: object) -> PointCloud:
+def _fused(rooms: Rooms, names: tuple[str, ...] = _ORDER, **settings: Any) -> PointCloud:
     chosen = {name: rooms.ranges[name] for name in names}
     poses = {name: Pose(rooms.pose_items[name].cam_from_world, rooms.pose_items[name].group) for name in names}
     if set(names) == set(_SMALL):
@@ -103,16 +108,18 @@ def _fused(rooms: Rooms, names: tuple[str, ...] = _ORDER, **settings: object) ->
     return vote(ranges=chosen, poses=poses, images=rooms.images, params=VoteParams(**settings), ctx=ctx)
 
 
-def test_each_image_knows_its_group(rooms: Rooms):
+def test_each_image_knows_its_group(rooms: Rooms) -> None:
     assert {name: pose.group for name, pose in rooms.pose_items.items()} == {
         name: int(name in _SMALL) for name in _ORDER
     }
     pose = rooms.pose_items["b1.png"]
     assert Pose.from_parts(pose.to_parts()).group == 1
-    assert "group" not in rooms.pose_items["000.png"].to_parts()["meta"]  # as it is stored where there is one group
+    meta = rooms.pose_items["000.png"].to_parts()["meta"]
+    assert isinstance(meta, dict)
+    assert "group" not in meta  # as it is stored where there is one group
 
 
-def test_nothing_of_one_room_enters_the_cloud_of_the_other(rooms: Rooms):
+def test_nothing_of_one_room_enters_the_cloud_of_the_other(rooms: Rooms) -> None:
     cloud = _fused(rooms, min_views=3)
     cloud.check()
     assert PointCloud.from_parts(cloud.to_parts()).group_sizes == cloud.group_sizes
@@ -125,14 +132,14 @@ def test_nothing_of_one_room_enters_the_cloud_of_the_other(rooms: Rooms):
         np.testing.assert_array_equal(group.view_counts, alone.view_counts)
 
 
-def test_a_room_without_ranges_keeps_its_number(rooms: Rooms, ctx: Context):
+def test_a_room_without_ranges_keeps_its_number(rooms: Rooms, ctx: Context) -> None:
     ranges = {name: rooms.ranges[name] for name in _LARGE}
     cloud = vote(ranges=ranges, poses=rooms.pose_items, images=rooms.images, params=VoteParams(), ctx=ctx)
     assert [len(group) > 0 for group in cloud.groups()] == [True, False]
     assert any(note.startswith("group 1: the cloud is empty") for note in ctx.notes)
 
 
-def test_each_cloud_has_a_file(rooms: Rooms, ctx: Context):
+def test_each_cloud_has_a_file(rooms: Rooms, ctx: Context) -> None:
     cloud = _fused(rooms)
     files = ply(cloud=cloud, params=PlyParams(), ctx=ctx).files
     assert list(files) == ["cloud.ply", "cloud_1.ply"]
@@ -142,12 +149,12 @@ def test_each_cloud_has_a_file(rooms: Rooms, ctx: Context):
 
 
 @pytest.mark.slow
-def test_each_mesh_has_a_file(rooms: Rooms, ctx: Context):
+def test_each_mesh_has_a_file(rooms: Rooms, ctx: Context) -> None:
     files = mesh(cloud=_fused(rooms), params=MeshParams(min_confidence=0, depth=5, trim=0), ctx=ctx).files
     assert list(files) == ["mesh.ply", "mesh_1.ply"]
 
 
-def test_a_room_with_too_few_points_has_no_mesh_and_says_so(rooms: Rooms, ctx: Context):
+def test_a_room_with_too_few_points_has_no_mesh_and_says_so(rooms: Rooms, ctx: Context) -> None:
     large = _fused(rooms).groups()[0]
     few = replace(large, **{name: getattr(large, name)[:5] for name in vars(large) if name != "group_sizes"})
     files = mesh(cloud=PointCloud.of_groups([large, few]), params=MeshParams(depth=4, trim=0), ctx=ctx).files
@@ -167,7 +174,7 @@ def _model_images(folder: Path) -> dict[str, np.ndarray]:
     return {image.name: image.projection_center() for image in model.images.values()}
 
 
-def test_each_room_is_a_sparse_model(rooms: Rooms, ctx: Context, tmp_path: Path):
+def test_each_room_is_a_sparse_model(rooms: Rooms, ctx: Context, tmp_path: Path) -> None:
     out = _placed(colmap(poses=rooms.poses, images=rooms.images, params=ModelParams(), ctx=ctx), tmp_path)
     assert sorted(path.name for path in (out / "colmap" / "sparse").iterdir()) == ["0", "1"]
     for number, group in enumerate(split_groups(rooms.poses)):
@@ -179,7 +186,7 @@ def test_each_room_is_a_sparse_model(rooms: Rooms, ctx: Context, tmp_path: Path)
 
 def test_known_poses_are_those_of_the_largest_room_and_say_where_the_others_are(
     rooms: Rooms, ctx: Context, tmp_path: Path
-):
+) -> None:
     out = _placed(colmap(poses=rooms.poses, images=rooms.images, params=ModelParams(), ctx=ctx), tmp_path / "out")
     known = known_poses(out, (*_ORDER, "new.png"))
     assert set(known.names) == set(_LARGE)
@@ -188,12 +195,12 @@ def test_known_poses_are_those_of_the_largest_room_and_say_where_the_others_are(
     assert known_poses(out / "colmap" / "sparse" / "1", _ORDER).names == tuple(_SMALL)
 
 
-def _tracked(rooms: Rooms, ctx: Context, count: int = 100):
+def _tracked(rooms: Rooms, ctx: Context, count: int = 100) -> TrackedPoints:
     params = TrackedParams(count=count, min_confidence=1)
     return tracked(poses=rooms.poses, samples=rooms.samples, ranges=rooms.ranges, params=params, ctx=ctx)
 
 
-def test_tracked_points_are_seen_from_one_room_each(rooms: Rooms, ctx: Context):
+def test_tracked_points_are_seen_from_one_room_each(rooms: Rooms, ctx: Context) -> None:
     points = _tracked(rooms, ctx)
     points.check()
     in_small = np.array([name in _SMALL for name in points.names])[points.track_image_idx]
@@ -208,7 +215,7 @@ def test_tracked_points_are_seen_from_one_room_each(rooms: Rooms, ctx: Context):
     assert np.median(np.linalg.norm(in_cam - joined.track_bearings, axis=1)) < 0.02
 
 
-def test_points_that_lose_their_room_are_left_out(rooms: Rooms, ctx: Context):
+def test_points_that_lose_their_room_are_left_out(rooms: Rooms, ctx: Context) -> None:
     points = _tracked(rooms, ctx)
     third = drawn_room(rooms)
     joined = points.joined_to(third, keep_points=False)
@@ -222,7 +229,7 @@ def drawn_room(rooms: Rooms) -> Poses:
     return join_groups([large, replace(small, names=("c0.png", "c1.png"))])
 
 
-def test_splats_begin_with_a_model_of_each_room(rooms: Rooms, tmp_path: Path):
+def test_splats_begin_with_a_model_of_each_room(rooms: Rooms, tmp_path: Path) -> None:
     points = _tracked(rooms, _context(tmp_path / "points"))
     ctx = _context(tmp_path / "init")
     files = colmap_dense_init(
@@ -234,7 +241,7 @@ def test_splats_begin_with_a_model_of_each_room(rooms: Rooms, tmp_path: Path):
     assert min(sizes) > 10
 
 
-def test_a_dense_workspace_is_of_the_largest_room(rooms: Rooms, ctx: Context, tmp_path: Path):
+def test_a_dense_workspace_is_of_the_largest_room(rooms: Rooms, ctx: Context, tmp_path: Path) -> None:
     faces = {name: FaceFiles({}, size_px=12) for name in _ORDER}
     files = colmap_dense(
         poses=rooms.poses, faces=faces, images=Names(_ORDER), points=None, params=DenseParams(format="bin"), ctx=ctx
@@ -246,7 +253,7 @@ def test_a_dense_workspace_is_of_the_largest_room(rooms: Rooms, ctx: Context, tm
     assert any("group 1 (b0.png, b1.png) has a frame of its own" in note for note in ctx.notes)
 
 
-def test_each_room_has_transforms_and_a_seed(rooms: Rooms, ctx: Context, tmp_path: Path):
+def test_each_room_has_transforms_and_a_seed(rooms: Rooms, ctx: Context, tmp_path: Path) -> None:
     frame = NerfstudioFrame("equirectangular", "images/{name}", "", "", (64, 32), (32.0, 32.0),
                             ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))  # fmt: skip
     frames = {name: NerfstudioFrames({}, {}, (frame,), 0.001) for name in _ORDER}
@@ -261,7 +268,7 @@ def test_each_room_has_transforms_and_a_seed(rooms: Rooms, ctx: Context, tmp_pat
         assert len(read_ply(out / f"seed{suffix}.ply")) == sum(cloud.groups()[number].view_counts >= 2)
 
 
-def test_each_room_is_aligned_with_the_truth_on_its_own(rooms: Rooms, tmp_path: Path):
+def test_each_room_is_aligned_with_the_truth_on_its_own(rooms: Rooms, tmp_path: Path) -> None:
     tiny = tiny_capture()
     folder = _truth_of_rooms(tiny, tmp_path / "truth")
     scores = truth(images=rooms.images, poses=rooms.poses, ranges=rooms.ranges, params=TruthParams(truth=folder))
@@ -282,11 +289,11 @@ def _truth_of_rooms(tiny: TinyCapture, folder: Path) -> Path:
         for name, idx in of_image.items()
     ]
     (folder / "poses.json").write_text(json.dumps({"width": 64, "height": 32, "metric": True, "views": views}))
-    np.savez(folder / "depth.npz", **{Path(name).stem: tiny.ranges[idx] for name, idx in of_image.items()})
+    write_npz(folder / "depth.npz", {Path(name).stem: tiny.ranges[idx] for name, idx in of_image.items()})
     return folder
 
 
-def test_each_room_is_levelled_on_its_own(rooms: Rooms, ctx: Context):
+def test_each_room_is_levelled_on_its_own(rooms: Rooms, ctx: Context) -> None:
     levelled = level(poses=rooms.poses, images=rooms.images, params=LevelParams(evidence="sensors"), ctx=ctx)
     levelled.check()
     for number, group in enumerate(split_groups(levelled)):
@@ -301,14 +308,14 @@ def _metres(poses: Poses, first: str, second: str) -> float:
     return float(np.linalg.norm(positions[first] - positions[second]))
 
 
-def _scaled(rooms: Rooms, ctx: Context, **settings: object) -> Poses:
+def _scaled(rooms: Rooms, ctx: Context, **settings: Any) -> Poses:
     poses = scale(poses=rooms.poses, images=rooms.images, params=ScaleParams(**settings), ctx=ctx)
     poses.check()
     return poses
 
 
-def test_a_baseline_scales_the_room_that_holds_both_images(rooms: Rooms, ctx: Context):
-    baseline = BaselineParams(from_image="b0.png", to_image="b1.png", metres=7)
+def test_a_baseline_scales_the_room_that_holds_both_images(rooms: Rooms, ctx: Context) -> None:
+    baseline = BaselineParams.model_validate({"from": "b0.png", "to": "b1.png", "metres": 7})
     poses = _scaled(rooms, ctx, baseline=baseline)
     assert [world.metric for world in poses.worlds] == [False, True]
     assert _metres(poses, "b0.png", "b1.png") == pytest.approx(7)
@@ -320,31 +327,31 @@ def test_a_baseline_scales_the_room_that_holds_both_images(rooms: Rooms, ctx: Co
     assert ctx.notes[1].startswith("group 1: unit of length: metres, by the baseline of 7 m")
 
 
-def test_a_baseline_across_rooms_is_refused(rooms: Rooms, ctx: Context):
-    baseline = BaselineParams(from_image="000.png", to_image="b1.png", metres=7)
+def test_a_baseline_across_rooms_is_refused(rooms: Rooms, ctx: Context) -> None:
+    baseline = BaselineParams.model_validate({"from": "000.png", "to": "b1.png", "metres": 7})
     with pytest.raises(InputError, match=r"000\.png and b1\.png are in groups 0 and 1 .* Name two images of one group"):
         _scaled(rooms, ctx, baseline=baseline)
 
 
-def test_a_factor_is_of_the_largest_room(rooms: Rooms, ctx: Context):
+def test_a_factor_is_of_the_largest_room(rooms: Rooms, ctx: Context) -> None:
     poses = _scaled(rooms, ctx, factor=3)
     assert [world.metric for world in poses.worlds] == [True, False]
     assert _metres(poses, "000.png", "001.png") == pytest.approx(3 * _metres(rooms.poses, "000.png", "001.png"))
 
 
-def test_gps_scales_every_room_with_positions_enough(rooms: Rooms, ctx: Context):
+def test_gps_scales_every_room_with_positions_enough(rooms: Rooms, ctx: Context) -> None:
     """The small room has two positions, which are too few."""
     poses = _scaled(rooms, ctx, gps=True, gps_noise_m=0.001, vertical="sensors")
     assert [world.metric for world in poses.worlds] == [True, False]
     assert "group 1: keeps its own unit of length (its own): GPS gives no scale: 2 of 2 registered" in ctx.notes[1]
 
 
-def test_where_no_room_can_be_scaled_the_largest_says_why(rooms: Rooms, ctx: Context):
+def test_where_no_room_can_be_scaled_the_largest_says_why(rooms: Rooms, ctx: Context) -> None:
     with pytest.raises(InputError, match="GPS gives no scale: the GPS positions lie within"):
         _scaled(rooms, ctx, gps=True, vertical="sensors")
 
 
-def test_a_camera_height_scales_every_room_with_a_floor(rooms: Rooms, ctx: Context):
+def test_a_camera_height_scales_every_room_with_a_floor(rooms: Rooms, ctx: Context) -> None:
     poses = _scaled(rooms, ctx, camera_height_m=1.5, vertical="sensors")
     assert [world.metric for world in poses.worlds] == [True, True]
     assert _metres(poses, "b0.png", "b1.png") == pytest.approx(
@@ -361,7 +368,9 @@ def test_a_camera_height_scales_every_room_with_a_floor(rooms: Rooms, ctx: Conte
         (consistency, {"range_map": None, "params": ConsistencyParams()}),
     ],
 )
-def test_sources_of_another_room_are_refused(function, extras: dict, rooms: Rooms, ctx: Context):
+def test_sources_of_another_room_are_refused(
+    function: Callable[..., Any], extras: dict[str, Any], rooms: Rooms, ctx: Context
+) -> None:
     """A view selector of somebody's own may not know of groups."""
     poses = {"pose": rooms.pose_items["000.png"], "source_poses": [rooms.pose_items["b0.png"]]}
     with pytest.raises(UsageError, match=r"in groups 0, 1 of the poses, .* view selector must choose"):

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from pano_mvs.api import Features, GateError, Panorama, Poses, TwoView
+from pano_mvs.api import Features, Panorama, Poses, RunStoppedError, TwoView
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from pano_mvs.stages.poses import ScaledTranslationParams, VerifyParams, scaled_translation, verify
@@ -41,9 +42,9 @@ def verified(
 ) -> Poses:
     return verify(
         poses=poses_of(tiny, wrong=wrong),
-        images=tiny.items[Panorama],
-        features=tiny.items[Features] if matched else None,
-        matches=tiny.items[TwoView] if matched else None,
+        images=tiny.each(Panorama),
+        features=tiny.each(Features) if matched else None,
+        matches=tiny.each(TwoView) if matched else None,
         params=VerifyParams(correct=correct),
         ctx=ctx,
     )
@@ -83,8 +84,8 @@ def test_one_pose_is_no_model(tiny: TinyCapture, ctx: Context) -> None:
     alone = Poses.without_points(
         {"000.png": tiny.poses[0]}, rejected={"001.png": "no pair"}, frame="x", scale="x", metric=False
     )
-    with pytest.raises(GateError, match=r"001\.png: no pair"):
-        verify(poses=alone, images=tiny.items[Panorama], features=None, matches=None, params=VerifyParams(), ctx=ctx)
+    with pytest.raises(RunStoppedError, match=r"001\.png: no pair"):
+        verify(poses=alone, images=tiny.each(Panorama), features=None, matches=None, params=VerifyParams(), ctx=ctx)
     assert ctx.rejected == {"001.png": "no pair"}
 
 
@@ -93,13 +94,18 @@ def test_the_solver_opens_pictures_only_where_it_may(
     tiny: TinyCapture, ctx: Context, monkeypatch: pytest.MonkeyPatch, ask_images: bool
 ) -> None:
     """Nothing is ambiguous in the room, so the poses are the same either way."""
-    opened = []
+    opened: list[Panorama] = []
     load = Panorama.load
-    monkeypatch.setattr(Panorama, "load", lambda image: opened.append(image) or load(image))
+
+    def noted(image: Panorama) -> NDArray[np.uint8]:
+        opened.append(image)
+        return load(image)
+
+    monkeypatch.setattr(Panorama, "load", noted)
     poses = scaled_translation(
-        features=tiny.items[Features],
-        matches=tiny.items[TwoView],
-        images=tiny.items[Panorama],
+        features=tiny.each(Features),
+        matches=tiny.each(TwoView),
+        images=tiny.each(Panorama),
         params=ScaledTranslationParams(ask_images=ask_images),
         ctx=ctx,
     )

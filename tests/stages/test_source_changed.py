@@ -17,6 +17,7 @@ from pano_mvs.core.errors import ChangedFileError, InputError
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.scene import Panorama
 from pano_mvs.stages.source import FolderParams, folder, list_folder
+from tests.stored import read_picture
 
 
 @pytest.fixture
@@ -60,7 +61,7 @@ def test_file_that_is_not_the_listed_one_is_refused(item: SourceItem, role: str)
     panorama = read(item)
     assert panorama.image.digest
     path = item.files[role]
-    other = cv2.imread(str(path))
+    other = read_picture(path)
     other[0, 0] ^= 1
     cv2.imwrite(str(path), other)
     with pytest.raises(ChangedFileError, match=rf"{path.name} changed during the run; run again") as caught:

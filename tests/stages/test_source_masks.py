@@ -49,7 +49,7 @@ def masked_rows(panorama: Panorama) -> int:
     return int((~valid.any(axis=1)).sum())
 
 
-def test_masks_are_found_by_both_names_and_the_shared_one_serves_the_rest(capture):
+def test_masks_are_found_by_both_names_and_the_shared_one_serves_the_rest(capture: Path) -> None:
     write_mask(capture / "masks" / "a/1.jpg.png.png", masked=slice(0, 3))
     write_mask(capture / "masks" / "a/2.png", masked=slice(0, 4))
     write_mask(capture / "masks" / "a/2.png.png", masked=slice(0, 5))
@@ -63,14 +63,14 @@ def test_masks_are_found_by_both_names_and_the_shared_one_serves_the_rest(captur
     assert not any("mask" in note for note in notes)
 
 
-def test_masks_among_the_pictures_are_no_pictures(capture):
+def test_masks_among_the_pictures_are_no_pictures(capture: Path) -> None:
     write_mask(capture / "photos" / "no people" / "3.png.png")
     shared = write_mask(capture / "photos" / "shared.png")
     found, _ = read(capture / "photos", masks=capture / "photos" / "no people", mask=shared)
     assert sorted(found) == sorted(NAMES)
 
 
-def test_a_folder_of_masks_that_was_not_given_is_noted(capture):
+def test_a_folder_of_masks_that_was_not_given_is_noted(capture: Path) -> None:
     write_mask(capture / "photos" / "masks" / "3.png")
     found, notes = read(capture / "photos")
     assert sorted(found) == sorted(NAMES)
@@ -79,7 +79,7 @@ def test_a_folder_of_masks_that_was_not_given_is_noted(capture):
     assert not any("not used" in note for note in notes)
 
 
-def test_masks_that_fit_no_picture_are_named(capture):
+def test_masks_that_fit_no_picture_are_named(capture: Path) -> None:
     (capture / "masks").mkdir()
     with pytest.raises(InputError, match=r"masks: no mask in it belongs .* \(it is empty\)"):
         read(capture / "photos", masks=capture / "masks")
@@ -92,12 +92,12 @@ def test_masks_that_fit_no_picture_are_named(capture):
         read(capture / "photos", masks=capture / "masks" / "b.png")
 
 
-def test_a_mask_of_another_shape_is_refused_at_once(capture):
+def test_a_mask_of_another_shape_is_refused_at_once(capture: Path) -> None:
     with pytest.raises(InputError, match=r"shared\.png: the mask has 32×20 px"):
         read(capture / "photos", mask=write_mask(capture / "shared.png", (20, 32)))
 
 
-def test_any_resolution_will_do_and_all_that_is_masked_is_told(capture):
+def test_any_resolution_will_do_and_all_that_is_masked_is_told(capture: Path) -> None:
     shared = write_mask(capture / "shared.png", (160, 320), masked=slice(0, 41))
     found, notes = read(capture / "photos", mask=shared)
     assert {masked_rows(panorama) for panorama in found.values()} == {5}

@@ -71,7 +71,8 @@ def test_the_sharpest_frame_within_a_quarter_of_a_step_is_taken(tmp_path: Path) 
     def shaken(number: int) -> Picture:
         frame = counted(number)
         shake = cv2.blur(frame, (blur.get(number, 5), 1))
-        return np.clip(shake * (0.6 if number == 18 else 1.0), 0, 255).astype(np.uint8)  # in a dark moment
+        result: Picture = np.clip(shake * (0.6 if number == 18 else 1.0), 0, 255).astype(np.uint8)
+        return result  # in a dark moment
 
     path = write_video(tmp_path / "walk.avi", 50, shaken, per_s=10)
     found = taken(params(path, every_s=2.0), tmp_path)

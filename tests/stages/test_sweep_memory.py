@@ -1,6 +1,10 @@
 """What dense stages say that they take in memory."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,40 +18,42 @@ from pano_mvs.stages.patchmatch import patchmatch
 PIXELS = 512 * 1024
 
 
-def needed(**settings):
+def needed(**settings: Any) -> int:
     panoramas = [Panorama(FilePart(Path("x")), (512, 1024), (512, 1024)) for _ in range(4)]
     return sweep_memory_bytes(SweepParams(**settings), {"ref": panoramas[0], "sources": panoramas[1:]})
 
 
-def test_the_volume_of_semi_global_matching_is_what_counts():
+def test_the_volume_of_semi_global_matching_is_what_counts() -> None:
     assert needed(planes=256) - needed(planes=128) == 3 * 128 * PIXELS
     assert needed(planes=128, backend="numpy") > 6 * needed(planes=128)
     assert needed(planes=128) < 0.4e9
 
 
-def test_without_a_volume_planes_cost_nothing():
+def test_without_a_volume_planes_cost_nothing() -> None:
     assert needed(planes=256, aggregation="box") == needed(planes=128, aggregation="box") < 0.1e9
 
 
-def test_from_coarse_to_fine_the_volume_is_the_coarsest():
+def test_from_coarse_to_fine_the_volume_is_the_coarsest() -> None:
     plain, box = needed(), needed(aggregation="box")
     assert needed(levels=3) - box == (plain - box) // 16
 
 
-def test_the_engine_is_told():
+def test_the_engine_is_told() -> None:
     spec = spec_of(sweep)
     assert spec is not None
     assert spec.memory_needed is sweep_memory_bytes
 
 
-def test_volumes_end_at_their_limit():
+def test_volumes_end_at_their_limit() -> None:
     assert needed(planes=4096, volume_limit_gb=1.0) == needed(planes=1024, volume_limit_gb=1.0)
     assert needed(planes=512, volume_limit_gb=0.5) - needed(aggregation="box") == 500_000_000
 
 
 @pytest.mark.parametrize(("function", "least"), [(patchmatch, 163), (consistency, 115), (bilateral_solver, 166),
                                                  (fill, 83), (planes, 149)])  # fmt: skip
-def test_other_dense_stages_say_more_than_was_measured_with_three_sources(function, least):
+def test_other_dense_stages_say_more_than_was_measured_with_three_sources(
+    function: Callable[..., Any], least: int
+) -> None:
     spec = spec_of(function)
     assert spec is not None
     assert spec.memory_needed is not None

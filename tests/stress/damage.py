@@ -18,7 +18,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeAlias
 
-from pano_mvs.cli.session import open_session
 from pano_mvs.core.files import remove_whole
 from pano_mvs.engine.cache.blobs import BlobRef, DamagedBlobError
 from pano_mvs.engine.cache.maintenance import verify
@@ -26,6 +25,7 @@ from pano_mvs.engine.cache.store import Store, UnitRecord, record_from_bytes
 from pano_mvs.engine.executors.choose import make_executor
 from pano_mvs.engine.running.events import RunResult
 from pano_mvs.engine.running.run import Run
+from pano_mvs.session.session import open_session
 from tests.stress.captures import deliverables, write_toy
 
 _BATCH = 25
@@ -50,10 +50,10 @@ class Patient:
 
     def run(self) -> RunResult:
         session = open_session(str(self.folder / "wf.yaml"), cache=self.root, out=self.out)
-        store = Store(session.store_root, least_free_bytes=0)
+        store = Store(session.store_root, min_free_bytes=0)
         executor = make_executor(store, self.executor, workers=0 if self.executor == "serial" else 2)
         try:
-            return Run(session.workflow, session.graph, store, session.out, executor=executor).execute()
+            return Run(session.workflow, session.graph, store, out=session.out, executor=executor).execute()
         finally:
             executor.close()
 

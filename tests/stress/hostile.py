@@ -24,11 +24,11 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from pano_mvs.cli.session import open_session
 from pano_mvs.core.errors import PanoMvsError
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.running.run import Run
+from pano_mvs.session.session import open_session
 from tests.stress.hostile_crafted import crafted
 from tests.stress.hostile_samples import Sample, samples
 
@@ -96,7 +96,7 @@ def _extreme(data: bytes, rng: random.Random) -> bytes:
     size, value = rng.choice([1, 2, 4, 8]), rng.choice(_EXTREMES)
     place = _place(data, rng)
     number = (value & (256**size - 1)).to_bytes(size, rng.choice(["little", "big"]))
-    return data[:place] + number + data[place + size :]
+    return bytes(data[:place] + number + data[place + size :])
 
 
 def _text(data: bytes, rng: random.Random) -> bytes:
@@ -216,10 +216,10 @@ def faults_of_run(count: int, seed: int, folder: Path) -> tuple[int, list[str]]:
     workflow = folder / "w.yaml"
     workflow.write_text(f"pano_mvs: 1\nstages:\n  images: {{use: source.folder, path: {images}}}\n")
     session = open_session(str(workflow), cache=folder / "cache", out=folder / "out")
-    store = Store(session.store_root, least_free_bytes=0)
+    store = Store(session.store_root, min_free_bytes=0)
     executor = SerialExecutor(store)
     try:
-        result = Run(session.workflow, session.graph, store, session.out, executor=executor).execute()
+        result = Run(session.workflow, session.graph, store, out=session.out, executor=executor).execute()
     finally:
         executor.close()
     wrong = [f"{failure.item}: {failure.trace}" for failure in result.failures if failure.trace]

@@ -13,7 +13,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pano_mvs.cli.session import presets_folder
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.workflow import load_workflow
 from pano_mvs.io.clouds.ply import read_ply, write_ply
@@ -30,10 +29,12 @@ from pano_mvs.io.truth import read_truth
 from pano_mvs.scene import PointCloud
 from pano_mvs.scene.image_files.image_file import decode_image
 from pano_mvs.scene.masking import decode_mask
+from pano_mvs.session.session import presets_folder
 from pano_mvs.testing.room import capture_poses
 from pano_mvs.viewer.shown_scene import has_faces
 from tests.io.colmap.test_model import SIZES, noisy_poses
 from tests.io.images.pictures import full_sphere, png_chunk, xmp
+from tests.stored import write_npz
 
 HEIGHT, WIDTH = 64, 128
 
@@ -63,7 +64,8 @@ def samples(scratch: Path) -> dict[str, Sample]:
 def picture() -> np.ndarray:
     """Return a smooth picture."""
     noise = np.random.default_rng(0).integers(0, 256, (8, 16, 3)).astype(np.uint8)
-    return cv2.resize(noise, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+    result: np.ndarray = cv2.resize(noise, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+    return result
 
 
 def _pictures() -> dict[str, Sample]:
@@ -109,7 +111,7 @@ def _ranges(scratch: Path) -> dict[str, Sample]:
     data = (scratch / "map.bin").read_bytes()
     found["colmap_map"] = Sample({"map.bin": data}, lambda folder: read_colmap_map(folder / "map.bin"))
     depth = io.BytesIO()
-    np.savez(depth, **{f"{number:03d}": ranges for number in range(3)})
+    write_npz(depth, {f"{number:03d}": ranges for number in range(3)})
     found["truth"] = Sample({"depth.npz": depth.getvalue(), "poses.json": _poses_json()}, _read_truth, mutated=2)
     return found
 

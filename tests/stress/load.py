@@ -26,7 +26,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -112,8 +112,8 @@ def load(
     started, before = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
     with _small_disk(folder / "disk") as disk:
         options = ["--executor", executor, "--workers", str(workers), "--min-free", "0"]
-        cluster = _dask_cluster(folder / "cluster", workers, disk) if executor == "dask" else nullcontext(("", []))
-        with cluster as (address, others):
+        none: AbstractContextManager[tuple[str, list[int]]] = nullcontext(("", []))
+        with _dask_cluster(folder / "cluster", workers, disk) if executor == "dask" else none as (address, others):
             options += ["--scheduler", address] if address else []
             command = _command(capture.workflow, disk.folder / "cache", folder / "out", *options)
             _until_it_ends(command, others, disk, killer, verdict, folder=folder, half=2 * count + count // 10)
@@ -239,7 +239,8 @@ def _dask_cluster(folder: Path, workers: int, disk: Disk) -> Iterator[tuple[str,
         address = json.loads(address_file.read_text())["address"]
         from distributed import Client
 
-        with Client(address, timeout=60, set_as_default=False) as client:
+        connect: Any = Client  # which has no types
+        with connect(address, timeout=60, set_as_default=False) as client:
             client.wait_for_workers(workers, timeout=120)
         yield address, [process.pid for process in processes[1:]]
     finally:

@@ -8,18 +8,19 @@ results depend on arithmetic are run: tests/algorithms and tests/geometry.
 from __future__ import annotations
 
 import argparse
+import importlib
 import os
 import subprocess
 import sys
+from typing import Any
 
 NUMERIC = ("tests/algorithms", "tests/geometry")
 
 
 def dispatched_features() -> list[str]:
     """Return the instruction sets of this processor that numpy chooses at run time."""
-    from numpy._core._multiarray_umath import __cpu_dispatch__, __cpu_features__  # no public function returns them
-
-    return [name for name in __cpu_dispatch__ if __cpu_features__.get(name, False)]
+    numpy: Any = importlib.import_module("numpy._core._multiarray_umath")  # no public function returns them
+    return [name for name in numpy.__cpu_dispatch__ if numpy.__cpu_features__.get(name, False)]
 
 
 def threads(count: int) -> dict[str, str]:

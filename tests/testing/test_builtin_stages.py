@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from pano_mvs.engine.stages.registry import Registry
@@ -9,7 +11,7 @@ from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, NerfstudioFrames
 from pano_mvs.testing.conformance import Law, stage_laws
 from tests.io.images.videos import tiny_video
 
-SETTINGS = {
+SETTINGS: dict[str, dict[str, Any]] = {
     "poses.from_model": {"path": "{capture}/truth/poses.json"},
     "poses.extend": {"path": "{capture}/truth/poses.json"},
     "poses.scale": {"factor": 2.0},
@@ -18,7 +20,7 @@ SETTINGS = {
 FRAME = NerfstudioFrame(
     "equirectangular", "images/{name}", "", "", (64, 32), (32.0, 32.0), ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 )
-INPUTS = {
+INPUTS: dict[str, dict[str, Any]] = {
     "export.nerfstudio": {"frames": {f"{idx:03d}.png": NerfstudioFrames({}, frames=(FRAME,)) for idx in range(4)}},
 }
 SIZES_HW = {"poses.colmap_sift": (96, 192)}

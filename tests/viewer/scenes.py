@@ -31,7 +31,8 @@ def turned_poses(count: int, *, seed: int = 0, level: bool = False) -> dict[str,
 def world_color(directions: np.ndarray) -> np.ndarray:
     """Return a colour for each direction in the world, so that every panorama shows which way it looks."""
     unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-    return np.rint(128 + 100 * unit).astype(np.uint8)
+    result: np.ndarray = np.rint(128 + 100 * unit).astype(np.uint8)
+    return result
 
 
 def box_cloud(count: int, *, quality: bool) -> PointCloud:

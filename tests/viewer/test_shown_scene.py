@@ -88,8 +88,8 @@ def test_nothing_to_show_is_an_error_with_a_remedy(tmp_path: Path) -> None:
 def test_a_cloud_without_points_is_as_none(tmp_path: Path) -> None:
     """The window took it for a cloud, and ended as an internal error: masks that cover all make one."""
     out = write_output(tmp_path, turned_poses(2))
-    write_ply(out / "cloud.ply", PointCloud(*(np.zeros((0, 3), kind) for kind in (np.float32, np.float32, np.uint8)),
-                                            np.zeros(0, np.uint8)))  # fmt: skip
+    none = np.zeros((0, 3), np.float32)
+    write_ply(out / "cloud.ply", PointCloud(none, none, np.zeros((0, 3), np.uint8), np.zeros(0, np.uint8)))
     scene = open_scene(out)
     assert (scene.cloud, len(scene.cameras)) == (None, 2)
     assert "cloud.ply holds no points" in scene.notes[-1]

@@ -49,7 +49,8 @@ def window_on(out: Path, windows: list[SceneWindow], *, budget: int = 2_000_000,
 def seen_at(picture: np.ndarray, x: float, y: float) -> np.ndarray:
     """Return the median colour around a place: single pixels may be drawn otherwise."""
     column, row = int(x), int(y)
-    return np.median(picture[row - 1 : row + 2, column - 1 : column + 2].reshape(-1, 3), axis=0)
+    result: np.ndarray = np.median(picture[row - 1 : row + 2, column - 1 : column + 2].reshape(-1, 3), axis=0)
+    return result
 
 
 def off_at(picture: np.ndarray, point: np.ndarray, view: Viewpoint) -> float:
@@ -148,7 +149,7 @@ def test_the_mouse_of_the_window_steps_in_looks_around_and_steps_out(
     at(220, 590, "MouseWheelForwardEvent")
     assert tour.state.viewpoint.angle_deg < angle
     at(220, 590, "RightButtonPressEvent", "RightButtonReleaseEvent")
-    assert tour.state.inside is None
+    assert window.tour.state.inside is None
     np.testing.assert_allclose(window.plotter.camera.position, start.eye, atol=1e-5)
     at(100, 300, "LeftButtonPressEvent")
     at(160, 300, "MouseMoveEvent", "LeftButtonReleaseEvent")  # the trackball turns the scene
@@ -243,7 +244,7 @@ def test_a_mesh_faces_the_side_that_was_seen_and_can_be_chosen(tmp_path: Path, w
     """A floor that faces up: red from above, not there from below, behind the cloud's choice of surface."""
     out = write_output(tmp_path, {}, points=5000)
     corners = np.array([[-3, 1.5, -4], [3, 1.5, -4], [3, 1.5, 4], [-3, 1.5, 4]], np.float32)
-    red = np.tile(np.uint8([250, 10, 10]), (4, 1))
+    red = np.tile(np.array([250, 10, 10], np.uint8), (4, 1))
     write_ply_mesh(out / "mesh.ply", (corners, red, np.array([[0, 1, 2], [0, 2, 3]], np.int32)))
     window = window_on(out, windows, view="top")
 

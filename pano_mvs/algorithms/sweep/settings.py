@@ -36,7 +36,7 @@ class SweepSettings:
     )
     cost: str = setting(
         "census",
-        parts=SWEEP_COSTS,
+        registry=SWEEP_COSTS,
         doc="census, census_gradient (with grey levels and their gradients), zncc (correlation), sad (the "
         "paper's sum of absolute differences), sad_gradient (colours with their gradients), or a plugin's",
     )

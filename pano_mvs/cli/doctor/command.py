@@ -54,8 +54,9 @@ def all_findings(cache: Path | None = None, out: Path | None = None) -> Iterator
     from pano_mvs.cli.doctor.packages import package_findings
     from pano_mvs.cli.doctor.plugins import plugin_findings
     from pano_mvs.cli.doctor.probes import library_findings
-    from pano_mvs.cli.session import CACHE_VARIABLE, presets_folder
     from pano_mvs.engine.stages.registry import Registry
+    from pano_mvs.results.summary import CACHE_VARIABLE
+    from pano_mvs.session.session import presets_folder
 
     yield from package_findings()
     yield from library_findings()

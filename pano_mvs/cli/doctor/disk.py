@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from pano_mvs.cli.doctor.finding import Finding
+from pano_mvs.core.memory import size_text
 from pano_mvs.core.paths import exists, is_folder
-from pano_mvs.engine.running.memory import size_text
 
 _LITTLE_BYTES = 5_000_000_000
 

@@ -8,13 +8,13 @@ from difflib import get_close_matches
 from pathlib import Path
 
 from pano_mvs.cli.doctor.finding import Finding
-from pano_mvs.cli.session import CACHE_VARIABLE
 from pano_mvs.core.kernel_cache import VARIABLE as KERNEL_VARIABLE
 from pano_mvs.core.kernel_cache import kernel_cache_folder
+from pano_mvs.core.memory import free_memory_bytes, size_text
 from pano_mvs.core.paths import below
 from pano_mvs.engine.executors.threads import available_threads
-from pano_mvs.engine.running.memory import free_memory_bytes, size_text
 from pano_mvs.engine.stages.plugin_files import PLUGINS_VARIABLE
+from pano_mvs.results.summary import CACHE_VARIABLE
 
 KNOWN_VARIABLES = (CACHE_VARIABLE, PLUGINS_VARIABLE, "PANO_MVS_EXECUTOR", "PANO_MVS_MIN_FREE", "PANO_MVS_RENDERER")
 _THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")

@@ -1,1 +1,1 @@
-"""The disk cache: immutable blobs, records by key, and their maintenance."""
+"""The cache on disk: immutable blobs, records by key, and maintenance."""

@@ -1,4 +1,4 @@
-"""Immutable content-addressed files: a blob's name is the digest of its bytes."""
+"""Immutable content-addressed files: the name of a blob is the digest of its bytes."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from pano_mvs.scene import FilePart, Part
 from pano_mvs.scene.record import changed_text
 
 SUFFIX = re.compile(r"(\.[a-z0-9_+-]{1,16})?")
-_LARGEST_BYTES = 1 << 50
-# Smaller arrays are read whole: that is faster than to map them, and a mapped array keeps a file open.
-_MAPPED_FROM_BYTES = 1 << 18
+_MAX_BYTES = 1 << 50
+# Smaller arrays are read, which is faster than mapping them; a mapped array also keeps a file open.
+_MIN_MAPPED_BYTES = 1 << 18
 _MAGIC = np.lib.format.magic(1, 0)
 
 
 class DamagedBlobError(StoreError):
-    """A blob whose size or digest is not what its name promises; it has been removed, to be computed again."""
+    """A blob whose size or digest does not match its name; it has been removed and will be computed again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,8 +43,8 @@ class BlobRef:
     Attributes:
         digest: of the bytes.
         size_bytes: length.
-        suffix: `.npy`, `.json`, or the native file's.
-        external: whether the bytes are in a user's own file rather than in the store.
+        suffix: `.npy`, `.json`, or that of the stored file.
+        external: whether the bytes are in a file of the user rather than in the cache.
     """
 
     digest: str
@@ -59,26 +59,26 @@ class BlobRef:
     @property
     def is_mapped(self) -> bool:
         """Whether the part is an array that is memory-mapped when it is loaded."""
-        return self.suffix == ".npy" and not self.external and self.size_bytes >= _MAPPED_FROM_BYTES
+        return self.suffix == ".npy" and not self.external and self.size_bytes >= _MIN_MAPPED_BYTES
 
     @staticmethod
     def from_json(value: list[Any]) -> BlobRef:
-        """Return the reference that `to_json` gave.
+        """Return the reference from the result of `to_json`.
 
         Raises:
-            ValueError: if it is none: what it names could lie outside the store.
+            ValueError: if the value is not a reference, as such a path could lead out of the cache.
         """
         digest, size_bytes, suffix, external = value
-        sound = isinstance(digest, str) and IS_DIGEST.fullmatch(digest) and isinstance(suffix, str)
-        if not sound or not SUFFIX.fullmatch(suffix) or type(size_bytes) is not int or type(external) is not bool:
-            raise ValueError(f"no reference to a blob: {value!r}")
-        if not 0 <= size_bytes < _LARGEST_BYTES:
+        is_valid = isinstance(digest, str) and IS_DIGEST.fullmatch(digest) and isinstance(suffix, str)
+        if not is_valid or not SUFFIX.fullmatch(suffix) or type(size_bytes) is not int or type(external) is not bool:
+            raise ValueError(f"not a reference to a blob: {value!r}")
+        if not 0 <= size_bytes < _MAX_BYTES:
             raise ValueError(f"a blob of {size_bytes} bytes")
         return BlobRef(digest, size_bytes, suffix, external)
 
 
 class BlobStore:
-    """A folder of blobs. External files are known by digest and found through the paths registered in this run."""
+    """A folder of blobs. External files are found by digest through the paths that were registered in this run."""
 
     def __init__(self, root: Path, stat_cache: StatCache, *, durable: bool = False, folder_digits: int = 3) -> None:
         self.root = root
@@ -91,26 +91,27 @@ class BlobStore:
         self._verified: set[str] = set()
 
     def register_external(self, path: Path) -> str:
-        """Make a user's file findable by its digest, which is returned."""
+        """Register a file of the user under its digest, which is returned."""
         digest = self.stat_cache.digest(path)
         self._external[digest] = path
         return digest
 
     def place_external(self, digest: str, path: Path) -> None:
-        """Say where a user's file of a digest is, without reading it."""
+        """Register a file of the user under a given digest, without reading the file."""
         self._external[digest] = path
 
     def path(self, ref: BlobRef) -> Path:
-        """Return where a blob is or would be."""
+        """Return the path of a blob, whether or not it exists."""
         return Path(self._place(ref))
 
     def _place(self, ref: BlobRef) -> str | Path:
         if ref.external:
             return self._external.get(ref.digest, f"unregistered/{ref.digest}")
-        return f"{self._folder}/{ref.digest[: self._digits]}/{ref.digest}{ref.suffix}"  # a Path costs ten times as much
+        # A text, because creating a Path takes ten times as long.
+        return f"{self._folder}/{ref.digest[: self._digits]}/{ref.digest}{ref.suffix}"
 
     def exists(self, ref: BlobRef) -> bool:
-        """Return whether a blob is there with its right size (its bytes are checked when it is read)."""
+        """Return whether a blob exists and has the right size; its bytes are checked when it is read."""
         try:
             return os.stat(self._place(ref)).st_size == ref.size_bytes  # noqa: PTH116  # see `_place`
         except OSError:
@@ -127,16 +128,16 @@ class BlobStore:
         )
 
     def get(self, ref: BlobRef) -> Part:
-        """Return a stored part; arrays cannot be written to, and large ones are memory-mapped.
+        """Return a stored part; arrays are read-only, and large ones are memory-mapped.
 
-        A user's own file is not read here: `FilePart.read_bytes` checks its bytes each time that they are read.
+        A file of the user is not read here: `FilePart.read_bytes` checks its bytes every time it reads them.
 
         Raises:
-            DamagedBlobError: if the bytes are not those that were stored; the blob is removed.
+            DamagedBlobError: if the bytes are not those that were stored; the blob has been removed.
         """
         if ref.external:
             if not self.exists(ref):
-                raise self.discard(ref, "is gone or changed")
+                raise self.discard(ref, "is missing or changed")
             return FilePart(self.path(ref), external=True, digest=ref.digest)
         path = self.verified_path(ref)
         try:
@@ -147,14 +148,14 @@ class BlobStore:
                 if not isinstance(value, dict):
                     raise ValueError("not an object")
                 return value
-        except FileNotFoundError as error:  # somebody has collected it since it was verified
+        except FileNotFoundError as error:  # it was collected after it had been verified
             raise self.discard(ref, "is gone") from error
         except (ValueError, RecursionError) as error:
-            raise self.discard(ref, f"holds nothing that pano_mvs writes ({error})") from error
+            raise self.discard(ref, f"has content that pano_mvs does not write ({error})") from error
         return FilePart(path, digest=ref.digest)
 
     def discard(self, ref: BlobRef, why: str) -> DamagedBlobError:
-        """Remove a blob that is of no use, unless it is the user's own file, and return the error that says so."""
+        """Remove an unusable blob, unless it is a file of the user, and return the error to raise."""
         path = self.path(ref)
         if ref.external:
             self.stat_cache.forget(path)
@@ -164,18 +165,18 @@ class BlobStore:
         return DamagedBlobError(f"{path} {why}; the same command computes it again")
 
     def verified_path(self, ref: BlobRef) -> Path:
-        """Return a blob's path after checking its bytes, once in the life of this object."""
+        """Return the path of a blob after checking its bytes; this object checks each blob once."""
         path = self.path(ref)
         if str(path) in self._verified:
             return path
         if not ref.external:
             self._refuse_link(path)
         try:
-            sound = path.stat().st_size == ref.size_bytes and digest_from_file(path) == ref.digest
+            is_intact = path.stat().st_size == ref.size_bytes and digest_from_file(path) == ref.digest
         except OSError:
-            sound = False
-        if not sound:
-            raise self.discard(ref, "is damaged or gone")
+            is_intact = False
+        if not is_intact:
+            raise self.discard(ref, "is damaged or missing")
         self._verified.add(str(path))
         return path
 
@@ -220,7 +221,7 @@ class BlobStore:
         return ref
 
     def _keep(self, ref: BlobRef) -> bool:
-        """Return whether a sound copy is there already, and mark it as used now, so that no collection takes it."""
+        """Return whether an intact copy exists, and update its time stamp, so that garbage collection keeps it."""
         if not self.exists(ref):
             return False
         try:
@@ -233,35 +234,37 @@ class BlobStore:
     def _writing(self, ref: BlobRef) -> AbstractContextManager[Path]:
         path = self.path(ref)
         self._refuse_link(path)
-        self._verified.discard(str(path))  # it is not there, or not sound
+        self._verified.discard(str(path))  # it is missing or damaged
         return replacing(path, temporary_in=self.temporary, durable=self.durable)
 
     @staticmethod
     def _refuse_link(path: Path) -> None:
         if is_link(path.parent):
-            raise StoreError(f"{path.parent} is a link, which no cache has: remove it, or choose another cache "
-                             "with --cache DIR")  # fmt: skip
+            raise StoreError(
+                f"{path.parent} is a link, but caches have no links: remove it, or choose another cache "
+                "with --cache DIR"
+            )
 
 
 def _mapped(path: Path) -> np.ndarray[Any, Any]:
-    """Return the array of a .npy file; nothing in it is executed.
+    """Return the array of a .npy file, memory-mapped; nothing in the file is executed.
 
     Raises:
-        ValueError: if it is none, or one of Python objects.
+        ValueError: if the file is not valid, or holds Python objects.
     """
     try:
         return np.lib.format.open_memmap(path, mode="r")
     except OSError:
         raise
-    except Exception as error:  # numpy reads the header with Python's own parser, which fails in a dozen ways
+    except Exception as error:  # numpy reads the header with Python's parser, which raises many kinds of errors
         raise ValueError(str(error)) from error
 
 
 def _read(path: Path) -> np.ndarray[Any, Any]:
-    """Return the array of a small .npy file, which cannot be written to; see `_mapped`.
+    """Return the array of a small .npy file, read-only; see `_mapped`.
 
     Raises:
-        ValueError: if it is none, or one of Python objects, or does not hold as many values as it says.
+        ValueError: if the file is not valid, holds Python objects, or has not as many values as its header says.
     """
     data = path.read_bytes()
     if not data.startswith(_MAGIC):
@@ -274,7 +277,7 @@ def _read(path: Path) -> np.ndarray[Any, Any]:
     try:
         values = np.frombuffer(data, dtype, count, begin) if count else np.zeros(0, dtype)
         array = values.reshape(shape, order="F" if fortran_order else "C")
-    except Exception as error:  # a shape that no array can have
+    except Exception as error:  # an impossible shape
         raise ValueError(str(error)) from error
     array.flags.writeable = False
     return array
@@ -282,10 +285,10 @@ def _read(path: Path) -> np.ndarray[Any, Any]:
 
 @lru_cache(maxsize=4096)
 def _header(data: bytes) -> tuple[tuple[int, ...], np.dtype[Any], bool]:
-    """Return shape, type and whether columns come first, from the header of a .npy file after its magic string.
+    """Return shape, type and whether the order is Fortran's, from the header of a .npy file behind the magic.
 
     Raises:
-        ValueError: if it is none, or one of Python objects.
+        ValueError: if the header is not valid, or the array holds Python objects.
     """
     try:
         shape, fortran_order, dtype = np.lib.format.read_array_header_1_0(io.BytesIO(data))

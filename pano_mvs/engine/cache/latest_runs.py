@@ -1,4 +1,7 @@
-"""What the latest run of each workflow into each folder used: for the plan's reasons, and what a collection keeps."""
+"""The cache keys that the latest run of each workflow into each folder used, and pins.
+
+The plan compares them to give reasons, and garbage collection keeps what they name.
+"""
 
 from __future__ import annotations
 
@@ -23,14 +26,14 @@ _PIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 @dataclass(frozen=True, slots=True)
 class RunEntry:
-    """One run, or one pin.
+    """A run or a pin.
 
     Attributes:
-        name: under which it is listed: the run's id, or the pin's name.
+        name: the id of the run, or the name of the pin.
         workflow: name of the workflow.
         out: folder of the results.
-        when: the end of the run, ISO 8601, UTC.
-        keys: what it used.
+        when: end of the run, ISO 8601, UTC.
+        keys: cache keys of its units.
         pinned: whether it is a pin.
     """
 
@@ -43,24 +46,24 @@ class RunEntry:
 
     @property
     def units(self) -> int:
-        """The number of units that it used."""
+        """The number of its units."""
         return sum(len(units) for units in self.keys.values())
 
     def age_s(self) -> float:
-        """Return how long ago the run ended."""
+        """Return the time since the end of the run."""
         return (datetime.now(UTC) - datetime.fromisoformat(self.when)).total_seconds()
 
 
-class RunBook:
-    """The runs and the pins of one store."""
+class RunHistory:
+    """The runs and the pins of one cache."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
 
     def remember(self, workflow_id: str, keys: Keys, *, workflow: str, out: Path, finished: bool = True) -> None:
-        """Keep what a run used; it takes the place of the run before of the same workflow into the same folder.
+        """Store the keys of a run, replacing those of the last run of the same workflow into the same folder.
 
-        What a run that did not get to its end had not reached yet stays as it was known.
+        If the run did not finish, the earlier keys of the units that it had not reached are kept.
         """
         name = f"{workflow_id[:16]}-{digest_from_value(str(resolved(out)))[:16]}"
         if not finished:
@@ -71,7 +74,7 @@ class RunBook:
         self._write("runs", RunEntry(name, workflow, str(resolved(out)), when, keys))
 
     def last_keys(self, workflow_id: str) -> Keys:
-        """Return the keys of the latest run of a workflow, empty if there is none."""
+        """Return the keys of the latest run of a workflow; empty if there is none."""
         found = sorted(self._paths("runs", f"{workflow_id[:16]}-*.json"), key=lambda path: path.stat().st_mtime_ns)
         entry = _read(found[-1]) if found else None
         return entry.keys if entry is not None else {}
@@ -80,51 +83,58 @@ class RunBook:
         """Return all runs and pins, the latest first.
 
         Raises:
-            StoreError: if one is damaged: what it protects is not known.
+            StoreError: if one is damaged, so that it is not known what it protects.
         """
         return sorted(self.each(), key=lambda entry: (entry.when, entry.name), reverse=True)
 
     def each(self) -> Iterator[RunEntry]:
-        """Yield the runs and the pins one at a time, as a large one takes much memory.
+        """Yield the runs and the pins one at a time, because a large one takes much memory.
 
         Raises:
-            StoreError: if one is damaged: what it protects is not known.
+            StoreError: if one is damaged, so that it is not known what it protects.
         """
         for folder in ("runs", "pins"):
             for path in self._paths(folder, "*.json"):
                 entry = _read(path)
                 if entry is None:
-                    raise StoreError(f"{path} is damaged, so what it keeps is not known. Run its workflow again, or "
-                                     "delete the file if nothing of it is wanted")  # fmt: skip
+                    raise StoreError(
+                        f"{path} is damaged, so that it is not known which results it protects. Run its workflow "
+                        "again, or "
+                        "delete the file if you do not need these results"
+                    )
                 yield entry
 
     def pin(self, run: str, name: str) -> RunEntry:
-        """Keep what a run used, whatever runs after it.
+        """Protect the results of a run from garbage collection, also after later runs.
 
         Args:
             run: the beginning of its id, or its output folder.
             name: of the pin: letters, digits, dots, hyphens and underscores.
 
         Raises:
-            UsageError: if there is no such run, more than one, or no such name.
+            UsageError: if no run or several runs match, or the name is not valid or taken.
         """
         if not _PIN_NAME.fullmatch(name):
-            raise UsageError(f"{name!r} is no name for a pin: use letters, digits, dots, hyphens and underscores")
+            raise UsageError(
+                f"{name!r} is not a valid name of a pin: use letters, digits, dots, hyphens and underscores"
+            )
         runs = [entry for entry in self.entries() if not entry.pinned]
         found = [entry for entry in runs if entry.name.startswith(run) or entry.out == str(resolved(Path(run)))]
         if len(found) != 1:
             known = ", ".join(entry.name for entry in found or runs) or "none"
-            raise UsageError(f"{len(found)} runs are called {run!r}; there are: {known}")
+            raise UsageError(f"{len(found)} runs match {run!r}; existing runs: {known}")
         old = found[0]
         if any(entry.pinned and entry.name == name and entry.keys != old.keys for entry in self.entries()):
-            raise UsageError(f"there is a pin {name!r} already, of other results: choose another name, or give it up "
-                             f"with `cache unpin {name}`")  # fmt: skip
+            raise UsageError(
+                f"the pin {name!r} exists and protects other results: choose another name, or delete the pin "
+                f"with `cache unpin {name}`"
+            )
         pin = RunEntry(name, old.workflow, old.out, old.when, old.keys, pinned=True)
         self._write("pins", pin)
         return pin
 
     def forget(self, entry: RunEntry) -> None:
-        """Remove a run or a pin from the book; what it used stays until it is collected.
+        """Remove a run or a pin; its results stay until garbage collection deletes them.
 
         Raises:
             StoreError: if it cannot be removed.
@@ -133,12 +143,13 @@ class RunBook:
         try:
             path.unlink(missing_ok=True)
         except OSError as error:
-            raise StoreError(f"{path} cannot be deleted: {error.strerror}. Mend the permissions of the "
-                             "cache")  from error  # fmt: skip
+            raise StoreError(
+                f"{path} cannot be deleted: {error.strerror}. Check the permissions of the cache"
+            ) from error
 
     def _write(self, folder: str, entry: RunEntry) -> None:
         value = {"workflow": entry.workflow, "out": entry.out, "when": entry.when, "keys": entry.keys}
-        body = json.dumps(value, sort_keys=True).encode()  # 100 MB for a million units: no copy more than needed
+        body = json.dumps(value, sort_keys=True).encode()  # 100 MB for a million units, so avoid copies
         path = self.root / folder / f"{entry.name}.json"
         with replacing(path, temporary_in=self.root / "tmp") as temporary, temporary.open("wb") as stream:
             stream.write(f"{digest_from_bytes(body)}\n".encode())
@@ -159,7 +170,7 @@ def _read(path: Path) -> RunEntry | None:
         value = json.loads(body)
         workflow, out, when = (str(value[name]) for name in ("workflow", "out", "when"))
         if datetime.fromisoformat(when).utcoffset() is None or not "1970" < when[:4] < "9999":
-            raise ValueError("no time of a run")
+            raise ValueError("not the time of a run")
         return RunEntry(path.stem, workflow, out, when, _keys(value["keys"]), pinned=path.parent.name == "pins")
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None

@@ -1,8 +1,8 @@
-"""Look after a store: what it holds, whether it is sound, and what nothing needs any more.
+"""Maintenance of a cache: its contents by stage, verification, and garbage collection.
 
-A collection marks what the runs and the pins of the book name, and sweeps the rest once it has not been computed for a
-while. It takes no lock: what a run has just computed is too young to be swept, and a run that finds something gone
-computes it again.
+Garbage collection keeps what the remembered runs and pins name, and deletes everything else that is older than a given
+age. It takes no lock: what a run has just computed is too recent to be deleted, and a run computes again what is
+missing.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ _RECORD_NAME = re.compile(rf"({IS_DIGEST.pattern})\.json")
 
 @dataclass(frozen=True, slots=True)
 class StageUsage:
-    """What one stage has in a store.
+    """The results of one stage in a cache.
 
     Attributes:
-        stage: its name in the registry.
-        units: finished units.
-        size_bytes: of their blobs; what several units share counts for the first.
-        seconds: what they took to compute.
+        stage: name of the stage in the registry.
+        units: number of finished units.
+        size_bytes: size of their blobs; a blob that several units share counts once.
+        seconds: their computing time.
     """
 
     stage: str
@@ -44,17 +44,17 @@ class StageUsage:
 
 
 @dataclass(slots=True)
-class Damage:
+class Verification:
     """What a verification found.
 
     Attributes:
-        records: sound records.
-        blobs: sound blobs.
-        removed: damaged files, which were removed: the next run computes them again.
-        incomplete: records whose blobs are gone, which count as not there.
-        foreign: files that are none of the store's.
-        temporary: what lies in its folder for temporary files, and whose it is.
-        unproven: records of earlier versions that may be of other bytes of the user's files than their keys say.
+        records: number of intact records.
+        blobs: number of intact blobs.
+        removed: damaged files, which were removed; the next run computes them again.
+        incomplete: records with missing blobs, which runs ignore.
+        foreign: files that do not belong to the cache.
+        temporary: temporary files, each with the process that it belongs to.
+        unproven: records of earlier versions that may have been computed from other input files than their keys say.
     """
 
     records: int = 0
@@ -67,15 +67,15 @@ class Damage:
 
 
 @dataclass(slots=True)
-class Collection:
-    """What a collection would remove, or removed.
+class GarbageCollection:
+    """What a garbage collection deletes, or would delete.
 
     Attributes:
-        runs: entries of the book that are too old.
-        records: paths.
-        blobs: paths.
-        size_bytes: of both.
-        kept_bytes: of the blobs that stay.
+        runs: remembered runs that are too old.
+        records: paths of records.
+        blobs: paths of blobs.
+        size_bytes: size of both.
+        kept_bytes: size of the blobs that are kept.
     """
 
     runs: list[RunEntry] = field(default_factory=list)
@@ -86,7 +86,7 @@ class Collection:
 
 
 def usage_of(store: Store) -> list[StageUsage]:
-    """Return what each stage has in a store, the largest first."""
+    """Return the results of each stage in a cache, the largest first."""
     seen: set[str] = set()
     totals: dict[str, list[float]] = {}
     for _, record in _records(store):
@@ -102,87 +102,89 @@ def usage_of(store: Store) -> list[StageUsage]:
 
 
 def size_on_disk(store: Store) -> int:
-    """Return the bytes of all files of a store."""
+    """Return the size of all files of a cache."""
     stats = (_stat(file.path) for file in _files(store.root))
     return sum(stat.st_size for stat in stats if stat is not None)
 
 
-def verify(store: Store, *, drop_unproven: bool = False) -> Damage:
-    """Check every record and every blob against its digest; damaged ones are removed, what is foreign stays.
+def verify(store: Store, *, drop_unproven: bool = False) -> Verification:
+    """Check every record and every blob against its digest, and remove damaged ones; foreign files are kept.
 
-    Runs may go on meanwhile.
+    Runs may use the cache at the same time.
 
     Args:
-        store: the store.
-        drop_unproven: remove the records of earlier versions whose results cannot be proven, see `unproven`.
+        store: the cache.
+        drop_unproven: also remove the records of earlier versions whose results cannot be proven, see `unproven`.
 
     Raises:
         StoreError: if a file cannot be read or removed.
     """
-    damage, unproven = Damage(), Unproven()
-    sound: set[str] = set()
+    found, unproven = Verification(), Unproven()
+    intact: set[str] = set()
     for file in _files(store.root / "blobs"):
         name = _own_name(store, file, _BLOB_NAME)
         if not name:
-            damage.foreign.append(file.path)
+            found.foreign.append(file.path)
             continue
-        found = _digest(file.path)
-        if found == name:
-            sound.add(file.name)
-            damage.blobs += 1
-        elif found:
+        digest = _digest(file.path)
+        if digest == name:
+            intact.add(file.name)
+            found.blobs += 1
+        elif digest:
             _remove(Path(file.path))
-            damage.removed.append(file.path)
+            found.removed.append(file.path)
     for file in _files(store.root / "records"):
         key = _own_name(store, file, _RECORD_NAME)
         data = _read(file.path) if key else None
         if not key:
-            damage.foreign.append(file.path)
+            found.foreign.append(file.path)
         elif data is not None:
-            record = _verify_record(store, damage, sound, file.path, key=key, data=data)
+            record = _verify_record(store, file.path, found=found, intact=intact, key=key, data=data)
             stat = _stat(file.path)
             if record is not None and stat is not None:
                 unproven.add(file.path, stat.st_mtime, record)
-    damage.unproven = list(unproven.paths(store.stat_cache))
-    for path in damage.unproven if drop_unproven else ():
+    found.unproven = list(unproven.paths(store.stat_cache))
+    for path in found.unproven if drop_unproven else ():
         _remove(Path(path))
     for entry in _sorted(store.blobs.temporary):
-        damage.temporary.append(f"{entry.path} ({whose_temporary(Path(entry.path))})")
-    return damage
+        found.temporary.append(f"{entry.path} ({whose_temporary(Path(entry.path))})")
+    return found
 
 
 def _verify_record(
-    store: Store, damage: Damage, sound: set[str], path: str, *, key: str, data: bytes
+    store: Store, path: str, *, found: Verification, intact: set[str], key: str, data: bytes
 ) -> UnitRecord | None:
-    """Enter a record into what was found; return it if it and all its blobs are sound."""
+    """Check a record and enter it into what was found; return it if it and all its blobs are intact."""
     record = record_from_bytes(data)
     if record is None or record.key != key:
         _remove(Path(path))
-        damage.removed.append(path)
+        found.removed.append(path)
         return None
-    # What is not known to be sound may have come, from a run that goes on, after the blobs were checked.
-    blobs = (ref for ref in record.blobs() if not ref.external and f"{ref.digest}{ref.suffix}" not in sound)
+    # A running workflow may have written other blobs after the blobs were checked.
+    blobs = (ref for ref in record.blobs() if not ref.external and f"{ref.digest}{ref.suffix}" not in intact)
     if all(_digest(store.blobs.path(ref)) == ref.digest for ref in blobs):
-        damage.records += 1
+        found.records += 1
         return record
-    damage.incomplete.append(path)
+    found.incomplete.append(path)
     return None
 
 
-def collect(store: Store, *, unused_s: float, forget_after_s: float | None = None, delete: bool = False) -> Collection:
-    """Find, and if asked remove, what no run and no pin of the book names.
+def collect(
+    store: Store, *, unused_s: float, forget_after_s: float | None = None, delete: bool = False
+) -> GarbageCollection:
+    """Find, and optionally delete, what no remembered run and no pin names.
 
     Args:
-        store: the store.
-        unused_s: what was computed within this time stays, needed or not.
-        forget_after_s: forget runs that ended longer ago than this; None forgets none. Pins stay.
-        delete: remove; else only tell.
+        store: the cache.
+        unused_s: keep what was computed within this time.
+        forget_after_s: forget runs that ended longer ago than this; None forgets none. Pins are kept.
+        delete: delete what was found.
 
     Raises:
-        StoreError: if an entry of the book is damaged, since what it protects is not known; or a file cannot be read
-            or removed.
+        StoreError: if a remembered run is damaged, so that it is not known what it protects, or if a file cannot be
+            read or deleted.
     """
-    found = Collection()
+    found = GarbageCollection()
     newest = time.time() - unused_s
     kept_keys: set[bytes] = set()
     for entry in store.runs.each():
@@ -213,20 +215,20 @@ def collect(store: Store, *, unused_s: float, forget_after_s: float | None = Non
     return found
 
 
-def _delete(store: Store, found: Collection, newest: float) -> None:
-    """Remove records before the blobs that they name, so that no sound record is left without them."""
+def _delete(store: Store, found: GarbageCollection, newest: float) -> None:
+    """Delete records before the blobs that they name, so that no record is left without its blobs."""
     for entry in found.runs:
         store.runs.forget(entry)
     for path in (*found.records, *found.blobs):
         stat = _stat(path)
-        if stat is not None and stat.st_mtime <= newest:  # else a run has come to use it meanwhile
+        if stat is not None and stat.st_mtime <= newest:  # otherwise a run has used it in the meantime
             _remove(Path(path))
 
 
 def _packed(digest: str) -> bytes:
-    """Return the first half of a digest as bytes, which take half the memory; nothing if it is no digest.
+    """Return the first half of a digest as bytes, to save memory; empty if the text is not a digest.
 
-    Of millions of digests no two begin alike. If two did, a file too many would be kept.
+    Even among millions of digests no two begin alike. If two did, one file too many would be kept.
     """
     return bytes.fromhex(digest[:DIGEST_BYTES]) if IS_DIGEST.fullmatch(digest) else b""
 
@@ -235,11 +237,11 @@ def _remove(path: Path) -> None:
     try:
         path.unlink(missing_ok=True)
     except OSError as error:
-        raise StoreError(f"{path} cannot be deleted: {error.strerror}. Mend the permissions of the cache") from error
+        raise StoreError(f"{path} cannot be deleted: {error.strerror}. Check the permissions of the cache") from error
 
 
 def _records(store: Store) -> Iterator[tuple[os.DirEntry[str], UnitRecord]]:
-    """Yield every record that is sound."""
+    """Yield every intact record."""
     for file in _files(store.root / "records"):
         key = _own_name(store, file, _RECORD_NAME)
         record = record_from_bytes(_read(file.path) or b"") if key else None
@@ -252,7 +254,7 @@ def _stage_of(record: UnitRecord) -> str:
 
 
 def _own_name(store: Store, file: os.DirEntry[str], pattern: re.Pattern[str]) -> str:
-    """Return the digest in the name of a file that a store has written there, or nothing if it is no such file."""
+    """Return the digest in the name of a file of the cache; empty if the file does not belong to the cache."""
     match = pattern.fullmatch(file.name)
     if match is None or Path(file.path).parent.name != match[1][: store.folder_digits]:
         return ""
@@ -260,7 +262,7 @@ def _own_name(store: Store, file: os.DirEntry[str], pattern: re.Pattern[str]) ->
 
 
 def _read(path: str) -> bytes | None:
-    """Return the bytes of a file, None if it is gone: others look after the store too."""
+    """Return the bytes of a file, or None if another process has deleted it."""
     try:
         return Path(path).read_bytes()
     except FileNotFoundError:
@@ -288,11 +290,11 @@ def _stat(path: str | Path) -> os.stat_result | None:
 
 
 def _cannot_read(path: str | Path, error: OSError) -> StoreError:
-    return StoreError(f"{path} cannot be read: {error.strerror}. Mend the permissions of the cache, or check its disk")
+    return StoreError(f"{path} cannot be read: {error.strerror}. Check the permissions of the cache and its disk")
 
 
 def _files(folder: Path) -> Iterator[os.DirEntry[str]]:
-    """Yield the files below a folder in order of their names; links are not followed."""
+    """Yield the files below a folder, sorted by name; links are not followed."""
     for entry in _sorted(folder):
         if entry.is_dir(follow_symlinks=False):
             yield from _files(Path(entry.path))

@@ -1,4 +1,4 @@
-"""The parts of a stored value in a fifth of the memory: a run knows of a million values, whose parts have few names."""
+"""References to the parts of a stored value, in a fifth of the memory: a run may hold a million of them."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from typing import TypeAlias
 from pano_mvs.core.digest import DIGEST_BYTES
 from pano_mvs.engine.cache.blobs import BlobRef
 
-_SIZE_BYTES = 7  # no blob has 2⁵⁰ bytes
+_SIZE_BYTES = 7  # blobs are smaller than 2⁵⁰ bytes
 _PART_BYTES = DIGEST_BYTES + _SIZE_BYTES
 
 _Form: TypeAlias = "dict[str, tuple[int, str, bool]]"
-"""Name of a part to its position, its suffix and whether it is external."""
+"""Name of a part to its position, its suffix, and whether it is external."""
 
 _forms: dict[tuple[tuple[str, str, bool], ...], _Form] = {}
 
 
 class PackedParts(Mapping[str, BlobRef]):
-    """References to blobs by name; equal to a dict of the same."""
+    """References to blobs by name; equal to a dict with the same entries."""
 
     __slots__ = ("_form", "_packed")
 
     def __init__(self, parts: Mapping[str, BlobRef]) -> None:
-        """Pack references; their names, suffixes and kinds are shared with all that have the same ones."""
+        """Pack references; values with the same names and suffixes share these."""
         form = tuple((name, ref.suffix, ref.external) for name, ref in parts.items())
         if form not in _forms:
             _forms[form] = {name: (idx, suffix, external) for idx, (name, suffix, external) in enumerate(form)}
@@ -49,5 +49,5 @@ class PackedParts(Mapping[str, BlobRef]):
         return len(self._form)
 
     def __repr__(self) -> str:
-        """Return the references as a dict shows them."""
+        """Return the references as a dict prints them."""
         return repr(dict(self))

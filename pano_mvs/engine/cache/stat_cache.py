@@ -1,4 +1,4 @@
-"""Digests of user files, remembered while size, time stamps and inode stay the same."""
+"""Digests of the user's files, valid while size, time stamps and inode stay the same."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.core.files import CACHE_MARK, write_text
 from pano_mvs.core.paths import below, is_file, is_folder, reason_of, resolved
 
-# A file changed within this time of being hashed may change again without its time stamp showing it.
+# A file that changed this shortly before it was hashed may change again without a new time stamp.
 _SETTLE_S = 2.0
-_MOST_ENTRIES = 500_000
+_MAX_ENTRIES = 500_000
 
 Entry: TypeAlias = "list[int | str]"
-"""Size, time of the last change of the bytes and of the file in ns, inode; digest."""
+"""Size, modification time (mtime) and change time (ctime) in ns, inode, digest."""
 
 State: TypeAlias = "tuple[int, int, int, int]"
 """An entry without the digest."""
 
 
 class StatCache:
-    """Remembers file digests in one file, JSON under a digest of it; losing it costs time and nothing else."""
+    """Stores file digests in one JSON file, below a digest of its text. Losing it costs only time."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._entries = _read(path)
-        self._learnt: dict[str, Entry] = {}
+        self._new: dict[str, Entry] = {}
 
     def digest(self, path: Path) -> str:
-        """Return the digest of a file, or of a folder's relative names and files.
+        """Return the digest of a file, or of the relative names and the contents of the files in a folder.
 
         Raises:
             InputError: if it cannot be read.
@@ -43,23 +43,23 @@ class StatCache:
                 files = files_of_folder(path)
                 return digest_from_value([[file.relative_to(path).as_posix(), self._file(file)] for file in files])
             return self._file(path)
-        except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+        except (OSError, ValueError) as error:  # ValueError: an impossible file name
             raise InputError(
                 f"{path}: cannot be read ({reason_of(error)}). Check that it exists and may be read"
             ) from error
 
     @staticmethod
     def state(path: Path) -> State | None:
-        """Return what a file's digest is remembered by; None if the file cannot be looked at."""
+        """Return the state under which a file's digest is stored, or None if the file cannot be examined."""
         try:
             return _state(path.stat())
         except (OSError, ValueError):
             return None
 
     def times_of_change(self) -> dict[str, float]:
-        """Return, by digest, when the known files of these bytes were last touched, in seconds; the latest of several.
+        """Return by digest when the latest of the known files with this digest last changed, in seconds.
 
-        Files that are not as they were when they were read are left out.
+        Files that have changed since they were hashed are left out.
         """
         found: dict[str, float] = {}
         for name, (size, changed, touched, inode, digest) in self._entries.items():
@@ -70,22 +70,22 @@ class StatCache:
         return found
 
     def forget(self, path: Path) -> None:
-        """Forget a file whose bytes turned out to be others."""
-        self._learnt.pop(str(resolved(path)), None)
+        """Remove the entry of a file whose digest turned out to be wrong."""
+        self._new.pop(str(resolved(path)), None)
         self._entries.pop(str(resolved(path)), None)
 
     def save(self) -> None:
-        """Add what was learnt to the file, to which other runs may have added meanwhile.
+        """Add new digests to the file, to which other runs may have added in the meantime.
 
-        What was learnt long ago goes when there is too much: it may be of files that are long gone.
+        If there are too many entries, the oldest are dropped, as their files may no longer exist.
         """
-        if self._learnt:
-            kept = {name: entry for name, entry in _read(self._path).items() if name not in self._learnt}
-            entries = [*kept.items(), *self._learnt.items()][-_MOST_ENTRIES:]
+        if self._new:
+            kept = {name: entry for name, entry in _read(self._path).items() if name not in self._new}
+            entries = [*kept.items(), *self._new.items()][-_MAX_ENTRIES:]
             body = json.dumps(dict(entries))
             text = f"{digest_from_bytes(body.encode())}\n{body}"
             write_text(self._path, text, temporary_in=self._path.parent / "tmp")
-            self._entries, self._learnt = dict(entries), {}
+            self._entries, self._new = dict(entries), {}
 
     def _file(self, path: Path) -> str:
         stat = path.stat()
@@ -96,12 +96,12 @@ class StatCache:
             return str(known[4])
         digest = digest_from_file(path)
         if time.time() - max(stat.st_mtime, stat.st_ctime) > _SETTLE_S:
-            self._entries[key] = self._learnt[key] = [*state, digest]
+            self._entries[key] = self._new[key] = [*state, digest]
         return digest
 
 
 def files_of_folder(folder: Path) -> list[Path]:
-    """Return the files below a folder, in order of their paths, without those of a cache that lies in it."""
+    """Return the files below a folder, sorted by path, without those of a cache inside it."""
     found = below(folder)
     caches = [path.parent for path in found if path.name == CACHE_MARK and path.parent != folder]
     return [path for path in found if is_file(path) and not any(path.is_relative_to(cache) for cache in caches)]
@@ -112,7 +112,7 @@ def _state(stat: os.stat_result) -> State:
 
 
 def _read(path: Path) -> dict[str, Entry]:
-    """Return the entries of a file, none if it is damaged."""
+    """Return the entries in a file; none if it is damaged."""
     try:
         checksum, _, body = path.read_bytes().partition(b"\n")
         entries = json.loads(body) if checksum.decode() == digest_from_bytes(body) else None

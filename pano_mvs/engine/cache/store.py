@@ -1,12 +1,12 @@
-"""The cache: small records by key, written last and in one step, over immutable blobs.
+"""The cache: a small record for each finished unit, by key, and immutable blobs with the values.
 
-Layout under the root: `blobs/abc/<digest><suffix>`, `records/abc/<key>.json`, `runs/<id>.json` (which key each unit had
-in the latest run of a workflow into a folder: for the reasons that the plan gives, and what a collection keeps),
-`pins/` (runs kept whatever happens), `stat-cache.json`, `tmp/`, `layout.json`, and an empty file that marks the folder
-as a cache.
-What is cached is derived from the records: there is no status file that could be wrong and nothing to unlock.
-Names are taken in one step by renaming, nothing is ever changed in place, and no link is made: any number of runs, on
-several hosts, may share a store.
+Layout under the root: `blobs/abc/<digest><suffix>`, `records/abc/<key>.json`, `runs/<id>.json` (the key of each unit in
+the latest run of a workflow into a folder, for the reasons in plans and for garbage collection), `pins/` (protected
+runs), `stat-cache.json`, `tmp/`, `layout.json`, and an empty file that marks the folder as a cache.
+
+What is cached follows from the records alone: there is no status file that could be wrong, and no lock. A record is
+written after its blobs. Files get their names by renaming, are never changed, and are never links, so that any number
+of runs on several hosts can share a cache.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ from pano_mvs.core.errors import ContractError, StoreError, UsageError
 from pano_mvs.core.files import CACHE_MARK, clear_abandoned, is_older, remove_whole, write_text
 from pano_mvs.core.paths import children, exists, is_link, reason_of
 from pano_mvs.engine.cache.blobs import BlobRef, BlobStore, DamagedBlobError
-from pano_mvs.engine.cache.latest_runs import RunBook
+from pano_mvs.engine.cache.disk_guard import DiskGuard, is_full_disk
+from pano_mvs.engine.cache.latest_runs import RunHistory
 from pano_mvs.engine.cache.packed_parts import PackedParts
 from pano_mvs.engine.cache.stat_cache import StatCache
-from pano_mvs.engine.running.disk_guard import Room, is_full_disk
 from pano_mvs.scene import Record
 
 LAYOUT_VERSION = 2
 _FOLDER_DIGITS = {1: 2, 2: 3}
-"""Layout to the number of digits of a key or digest that name its folder. Older caches go on with their 256 folders."""
+"""Layout to the number of digits of a key or digest in a folder name. Older caches keep their 256 folders."""
 
-LEAST_FREE_BYTES = 200_000_000
+MIN_FREE_BYTES = 200_000_000
 _ABANDONED_AFTER_S = 7 * 24 * 3600.0
 _FOLDERS = ("blobs", "records", "runs", "pins", "tmp")
 
 
 @dataclass(frozen=True, slots=True)
 class ItemRef:
-    """A stored value: its kind, its parts, and the digest that stands for it in downstream keys."""
+    """A stored value: its kind, its parts, and the digest that represents it in the keys of other units."""
 
     kind: str
     digest: str
@@ -54,27 +54,26 @@ class ItemRef:
 
     @staticmethod
     def from_json(value: Mapping[str, Any]) -> ItemRef:
-        """Return the reference that `to_json` gave."""
+        """Return the reference from the result of `to_json`."""
         parts = {str(name): BlobRef.from_json(part) for name, part in value["parts"].items()}
         return ItemRef(intern(str(value["kind"])), str(value["digest"]), PackedParts(parts))
 
 
 @dataclass(frozen=True, slots=True)
 class UnitRecord:
-    """What one finished unit of work left.
+    """The result of one finished unit of work.
 
     Attributes:
         key: its cache key.
-        identity: what the key was made of, for the plan's reasons.
+        identity: what the key was made of, for the reasons in plans.
         output: the value.
         items: the items of a collection, by image.
         metrics: figures of the unit.
         notes: what a user should know.
-        rejected: image name to why the result leaves it out.
-        doubts: image name to why the value is doubtful there.
-        seconds: how long it took when it was computed.
-        checked: whether the user's files that it read were compared with the digests in its key, as earlier versions
-            did not.
+        rejected: image name to the reason why the result leaves it out.
+        doubts: image name to the reason why the result is doubtful there.
+        seconds: computing time.
+        checked: whether the input files were compared with the digests in the key; early versions did not do this.
     """
 
     key: str
@@ -105,10 +104,10 @@ class UnitRecord:
 
     @staticmethod
     def from_json(value: Mapping[str, Any]) -> UnitRecord:
-        """Return the record that `to_json` gave.
+        """Return the record from the result of `to_json`.
 
         Raises:
-            ValueError, KeyError, TypeError, AttributeError, OverflowError: if it is none.
+            ValueError, KeyError, TypeError, AttributeError, OverflowError: if the value is not a record.
         """
         identity, rejected, doubts = value["identity"], value["rejected"], value.get("doubts", {})
         if not all(isinstance(part, dict) for part in (identity, rejected, doubts)):
@@ -116,7 +115,7 @@ class UnitRecord:
         metrics = {intern(str(name)): float(metric) for name, metric in value["metrics"].items()}
         seconds = value["seconds"]
         if not all(map(math.isfinite, (*metrics.values(), seconds))):
-            raise ValueError("a figure that is none")
+            raise ValueError("a metric or a time is not finite")
         return UnitRecord(
             key=str(value["key"]),
             identity=identity,
@@ -131,7 +130,7 @@ class UnitRecord:
         )
 
     def blobs(self) -> Iterator[BlobRef]:
-        """Yield every blob that the record names."""
+        """Yield all blobs of the record."""
         for item in (self.output, *self.items.values()):
             yield from item.parts.values()
 
@@ -139,44 +138,45 @@ class UnitRecord:
 class Store:
     """The cache of one or many workflows."""
 
-    def __init__(self, root: Path, *, durable: bool = False, least_free_bytes: int = LEAST_FREE_BYTES,
-                 for_reading: bool = False) -> None:  # fmt: skip
+    def __init__(
+        self, root: Path, *, durable: bool = False, min_free_bytes: int = MIN_FREE_BYTES, for_reading: bool = False
+    ) -> None:
         """Open or create a store.
 
         Args:
             root: its folder.
-            durable: flush every blob and record to the disk before going on, for machines that lose power.
-            least_free_bytes: room on the disk below which no unit is begun; 0 for no such guard.
-            for_reading: take a folder that cannot be written, or made, for what it holds, instead of refusing it.
+            durable: flush every blob and record to the disk at once, so that they survive a power cut.
+            min_free_bytes: no unit is started with less free space on the disk; 0 to disable this.
+            for_reading: also accept a folder that cannot be written or created.
 
         Raises:
-            UsageError: if the folder cannot be written, or was made by a version with another layout.
+            UsageError: if the folder cannot be written, or has the layout of another version.
         """
         self.root = root
         self.durable = durable
-        self.least_free_bytes = least_free_bytes
+        self.min_free_bytes = min_free_bytes
         self.damaged: list[str] = []
         self._records = str(root / "records")
-        self._room = Room(root, least_free_bytes=least_free_bytes)
+        self._disk = DiskGuard(root, min_free_bytes=min_free_bytes)
         self.folder_digits = _FOLDER_DIGITS[LAYOUT_VERSION]
         self._open_layout(for_reading=for_reading)
         self._clear_abandoned()
-        self.runs = RunBook(root)
+        self.runs = RunHistory(root)
         self.stat_cache = StatCache(root / "stat-cache.json")
         self.blobs = BlobStore(root, self.stat_cache, durable=durable, folder_digits=self.folder_digits)
 
     def find(self, key: str) -> UnitRecord | None:
-        """Return the record of a key if it is sound and all its blobs are there, else None."""
+        """Return the record of a key if it is intact and all its blobs exist, otherwise None."""
         record = self.read_record(key)
         if record is None:
             return None
         return record if all(self.blobs.exists(ref) for ref in record.blobs()) else None
 
     def read_record(self, key: str) -> UnitRecord | None:
-        """Return the record of a key whether or not its blobs are there; a damaged record is a miss."""
+        """Return the record of a key, whether or not its blobs exist; None if it is missing or damaged."""
         path = f"{self._records}/{key[: self.folder_digits]}/{key}.json"
         try:
-            with open(path, "rb") as stream:  # noqa: PTH123  # a Path costs as much as the rest
+            with open(path, "rb") as stream:  # noqa: PTH123  # creating a Path takes as long as the rest
                 data = stream.read()
         except OSError:
             return None
@@ -187,17 +187,20 @@ class Store:
         return record
 
     def put(self, record: UnitRecord) -> None:
-        """Write a record; its blobs must be there already."""
+        """Write a record; its blobs must already exist."""
         body = json.dumps(record.to_json(), sort_keys=True)
         path = self.record_path(record.key)
         if is_link(path.parent):
-            raise StoreError(f"{path.parent} is a link, which no cache has: remove it, or choose another cache "
-                             "with --cache DIR")  # fmt: skip
-        write_text(path, f"{digest_from_bytes(body.encode())}\n{body}", temporary_in=self.blobs.temporary,
-                   durable=self.durable)  # fmt: skip
+            raise StoreError(
+                f"{path.parent} is a link, but caches have no links: remove it, or choose another cache "
+                "with --cache DIR"
+            )
+        write_text(
+            path, f"{digest_from_bytes(body.encode())}\n{body}", temporary_in=self.blobs.temporary, durable=self.durable
+        )
 
     def drop(self, key: str) -> None:
-        """Remove a record that turned out to be of no use."""
+        """Remove a record that turned out to be unusable."""
         path = self.record_path(key)
         if not is_link(path.parent):
             path.unlink(missing_ok=True)
@@ -206,7 +209,7 @@ class Store:
         """Store a value's parts and return its reference.
 
         Raises:
-            ContractError: if the value is not what its kind promises, or holds what cannot be stored.
+            ContractError: if the value violates the contract of its kind, or cannot be stored.
         """
         value.check()
         try:
@@ -221,7 +224,7 @@ class Store:
         """Return a stored value; its arrays are memory-mapped and read-only.
 
         Raises:
-            DamagedBlobError: if a blob is damaged; it has been removed, so that the next run computes it again.
+            DamagedBlobError: if a blob is damaged; it has been removed, and the next run computes it again.
         """
         try:
             parts = {name: self.blobs.get(part) for name, part in ref.parts.items()}
@@ -229,38 +232,36 @@ class Store:
                 return kind.from_parts(parts)
             except (TypeError, ValueError, KeyError, AttributeError, AssertionError) as error:
                 errors = [
-                    self.blobs.discard(part, f"is no part of a {kind.kind_name()}") for part in ref.parts.values()
+                    self.blobs.discard(part, f"is not a part of a {kind.kind_name()}") for part in ref.parts.values()
                 ]
                 raise errors[0] from error
         except DamagedBlobError as error:
             self.damaged.append(str(error))
             raise
 
-    def require_room(self) -> None:
-        """Raise StoreError if there is too little room on the disk to begin anything."""
-        self._room.require()
-
     def scratch(self) -> AbstractContextManager[Path]:
-        """Return a context with an empty folder inside the store, removed afterwards.
+        """Return a context with an empty folder in the cache, which is removed afterwards.
 
         Raises:
-            StoreError: if the disk is too full to begin, or was filled by what was done inside.
+            StoreError: if the disk is too full to start, or becomes full inside the context.
         """
-        return self._room.scratch(self.blobs.temporary)
+        return self._disk.scratch(self.blobs.temporary)
 
     def cannot_write(self, error: OSError) -> StoreError:
-        """Return the error that says that the store cannot be written, and whether for want of room."""
-        return self._room.cannot_write(error)
+        """Return the error for a cache that cannot be written, or whose disk is full."""
+        return self._disk.cannot_write(error)
 
     def record_path(self, key: str) -> Path:
-        """Return where the record of a key is or would be."""
+        """Return the path of the record of a key, whether or not it exists."""
         return self.root / "records" / key[: self.folder_digits] / f"{key}.json"
 
     def _open_layout(self, *, for_reading: bool) -> None:
         for name in _FOLDERS:
             if is_link(self.root / name):
-                raise UsageError(f"cache {self.root}: {name} is a link: what is written there would land elsewhere. "
-                                 "Remove it, or choose another cache with --cache DIR")  # fmt: skip
+                raise UsageError(
+                    f"cache {self.root}: {name} is a link, so that files would be written elsewhere. "
+                    "Remove it, or choose another cache with --cache DIR"
+                )
         path = self.root / "layout.json"
         try:
             layout = json.loads(path.read_bytes())
@@ -272,30 +273,33 @@ class Store:
                     raise
             return
         except OSError as error:
-            raise UsageError(f"cache {self.root} cannot be read ({reason_of(error)}). Mend its permissions, or choose "
-                             "another with --cache DIR")  from error  # fmt: skip
+            raise UsageError(
+                f"cache {self.root} cannot be read ({reason_of(error)}). Check its permissions, or choose "
+                "another cache with --cache DIR"
+            ) from error
         except (ValueError, RecursionError) as error:
-            raise UsageError(f"{path} cannot be read ({error}), so it is not known how the cache is laid out. If it "
-                             "is one of this version, delete that file and nothing is lost; else choose another "
-                             "folder with --cache DIR")  from error  # fmt: skip
+            raise UsageError(
+                f"{path} cannot be read ({error}), so that the layout of the cache is unknown. If this version made "
+                "the cache, delete the file, and nothing is lost; otherwise choose another cache with --cache DIR"
+            ) from error
         version = layout.get("layout") if isinstance(layout, dict) else None
         if type(version) is not int or version not in _FOLDER_DIGITS:
             raise UsageError(
-                f"cache {self.root} has layout {layout!r}, this version uses {LAYOUT_VERSION}. "
-                "Choose another with --cache DIR"
+                f"cache {self.root} has layout {layout!r}, but this version uses {LAYOUT_VERSION}. "
+                "Choose another cache with --cache DIR"
             )
         self.folder_digits = _FOLDER_DIGITS[version]
         self._mark()
 
     def _mark(self) -> None:
-        """Mark a cache that an earlier version made; one that cannot be written stays without the mark."""
+        """Mark a cache of an earlier version, if it can be written."""
         mark = self.root / CACHE_MARK
         with suppress(OSError):
             if not exists(mark) and not is_link(mark):
                 mark.touch()
 
     def _clear_abandoned(self) -> None:
-        """Remove what runs that were killed left half written."""
+        """Remove temporary files of runs that were killed."""
         folder = self.root / "tmp"
         clear_abandoned(folder)
         for path in children(folder):
@@ -309,12 +313,13 @@ class Store:
         except StoreError as error:
             if is_full_disk(error.__cause__):
                 raise
-            raise UsageError(f"cache {self.root} cannot be written ({error.__cause__ or error}). Choose another with "
-                             "--cache DIR") from error  # fmt: skip
+            raise UsageError(
+                f"cache {self.root} cannot be written ({error.__cause__ or error}). Choose another with --cache DIR"
+            ) from error
 
 
 def record_from_bytes(data: bytes) -> UnitRecord | None:
-    """Return the record in a file's bytes, or None if they are damaged: the first line is a digest of the rest."""
+    """Return the record in the bytes of a file, or None if they do not match the digest in the first line."""
     checksum, _, body = data.partition(b"\n")
     try:
         if checksum.decode() != digest_from_bytes(body):

@@ -1,8 +1,8 @@
-"""Find results of earlier versions that may be of other bytes than those under which they are kept.
+"""Find results of early versions that may have been computed from other input files than their keys say.
 
-Earlier versions did not compare the bytes that a unit read with the digests in its key; their records do not say
-`checked`. What such a unit read is certain only if the user's files have not been touched since it began: their time
-of change (ctime), which programs cannot set back, is earlier. Of all others it is not known whether they are right.
+Early versions did not compare the bytes that a unit read with the digests in its key; their records do not have
+`checked`. Such a result is certain only if the input files have not changed since the unit started, that is, if their
+change time (ctime), which programs cannot set back, is earlier. All other such results are unproven.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ class _Read:
 
 @dataclass(slots=True)
 class Unproven:
-    """Collects records, and says at the end which of them nothing proves."""
+    """Collects records, and determines which of them are unproven."""
 
-    _files_in: dict[str, set[str]] = field(default_factory=dict)  # digest of a value to those of the files in it
+    _files_in: dict[str, set[str]] = field(default_factory=dict)  # digest of a value to the digests of the files in it
     _reads: list[_Read] = field(default_factory=list)
 
     def add(self, path: str, written_s: float, record: UnitRecord) -> None:
-        """Take note of a record.
+        """Add a record.
 
         Args:
             path: its file.
             written_s: when the file was written, in seconds since the epoch.
-            record: what is in it.
+            record: the record.
         """
         for item in (record.output, *record.items.values()):
             files = {ref.digest for ref in item.parts.values() if ref.external}
@@ -49,7 +49,7 @@ class Unproven:
             self._reads.append(_Read(path, written_s - record.seconds - _SLACK_S, frozenset(named)))
 
     def paths(self, stat_cache: StatCache) -> Iterator[str]:
-        """Yield the records of which it is not certain that they are of the files in their keys."""
+        """Yield the paths of the records that are unproven."""
         changed_s = stat_cache.times_of_change()
         for read in self._reads:
             files = {file for name in read.named for file in self._files_in.get(name, ())}
@@ -62,7 +62,7 @@ _FILE = "file:"
 
 
 def _digests(value: Any) -> Iterator[str]:
-    """Yield all digests of values in a record's inputs, and those of a source's files, marked as such."""
+    """Yield the digests of all values in the inputs of a record, and, with a prefix, of the files of a source."""
     if isinstance(value, str):
         if IS_DIGEST.fullmatch(value):
             yield value
@@ -78,7 +78,7 @@ def _digests(value: Any) -> Iterator[str]:
 
 
 def _content_digests(params: Any) -> Iterator[str]:
-    """Yield the digests by which settings that name files count."""
+    """Yield the digests of the files that settings name."""
     for value in params.values() if isinstance(params, dict) else ():
         found = [*_digests(value)] if isinstance(value, list) else []
         yield from (f"{_FILE}{digest}" for digest in found)

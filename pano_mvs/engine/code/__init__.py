@@ -1,1 +1,1 @@
-"""Which code a stage reaches: functions, classes and constants, followed from one to the next without running them."""
+"""Find the code that a stage uses: functions, classes and constants, followed by name without importing them."""

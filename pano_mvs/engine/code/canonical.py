@@ -1,20 +1,20 @@
-"""The part of a syntax tree that can change a result, as text that is the same in every version of Python."""
+"""Write the part of a syntax tree that can affect results as text, which is the same in all versions of Python."""
 
 from __future__ import annotations
 
 import ast
 from typing import Any
 
-_HELP = frozenset({"description", "title", "examples", "doc"})
+_HELP_ARGUMENTS = frozenset({"description", "title", "examples", "doc"})
 _IGNORED_FIELDS = frozenset({"ctx", "kind", "type_comment", "type_ignores"})
 
 
 def strip(tree: ast.AST) -> None:
-    """Remove from a tree, in place, what changes no result.
+    """Remove from a tree, in place, what cannot affect results.
 
-    That is: docstrings and other bare strings, `pass`, the annotations of functions and of variables outside classes,
-    and the help texts of settings (`Field(description=…)`, `setting(doc=…)`). The annotations of a class stay: they
-    make the fields of dataclasses and settings.
+    This removes docstrings and other bare strings, `pass`, the annotations of functions and of variables outside
+    classes, and the help texts of settings (`Field(description=…)`, `setting(doc=…)`). The annotations in classes are
+    kept, because they define the fields of dataclasses and settings.
     """
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
@@ -22,13 +22,13 @@ def strip(tree: ast.AST) -> None:
         elif isinstance(node, ast.arg):
             node.annotation = None
         elif isinstance(node, ast.Call) and _name_of(node.func) in {"Field", "setting"}:
-            node.keywords = [keyword for keyword in node.keywords if keyword.arg not in _HELP]
+            node.keywords = [keyword for keyword in node.keywords if keyword.arg not in _HELP_ARGUMENTS]
         for block in ("body", "orelse", "finalbody"):
             statements = getattr(node, block, None)
             if isinstance(statements, list):
                 in_class = isinstance(node, ast.ClassDef)
-                kept = (one if in_class else _without_annotation(one) for one in statements)
-                setattr(node, block, [one for one in kept if one is not None and not _says_nothing(one)])
+                kept = (inner if in_class else _without_annotation(inner) for inner in statements)
+                setattr(node, block, [inner for inner in kept if inner is not None and not _has_no_effect(inner)])
 
 
 def _without_annotation(statement: Any) -> Any:
@@ -39,7 +39,7 @@ def _without_annotation(statement: Any) -> Any:
     return ast.Assign(targets=[statement.target], value=statement.value)
 
 
-def _says_nothing(statement: ast.AST) -> bool:
+def _has_no_effect(statement: ast.AST) -> bool:
     bare = statement.value if isinstance(statement, ast.Expr) else None
     return isinstance(statement, ast.Pass) or (isinstance(bare, ast.Constant) and isinstance(bare.value, str))
 
@@ -49,10 +49,10 @@ def _name_of(function: ast.expr) -> str:
 
 
 def canonical_text(tree: ast.AST) -> str:
-    """Return a tree as text: equal trees give equal texts.
+    """Return a tree as text; equal trees give equal texts.
 
-    `ast.dump` writes other texts in other versions of Python; this leaves out all that is empty, so that a field which
-    a later version adds makes no difference.
+    The text of `ast.dump` depends on the version of Python. This function leaves out empty fields, so that fields added
+    by later versions make no difference.
     """
     chunks: list[str] = []
     _write(tree, chunks)
@@ -84,7 +84,7 @@ def _write(value: Any, chunks: list[str]) -> None:
 
 
 def _merged(values: list[ast.expr]) -> list[ast.expr]:
-    """Return the pieces of an f-string with neighbouring texts joined; versions of Python split them differently."""
+    """Return the pieces of an f-string with adjacent texts joined; versions of Python split them differently."""
     merged: list[ast.expr] = []
     for one in values:
         last = merged[-1] if merged else None

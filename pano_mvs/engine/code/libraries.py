@@ -1,4 +1,4 @@
-"""The installed versions of the libraries on which results depend."""
+"""The installed versions of the libraries that results depend on."""
 
 from __future__ import annotations
 
@@ -11,27 +11,29 @@ _DISTRIBUTIONS: Mapping[str, tuple[str, ...]] = {
     "PIL": ("pillow",),
 }
 _SHOWN_AS = {"cv2": "OpenCV"}
-_WITHOUT_INFLUENCE = frozenset({
-    "pydantic",  # settings count by their values
-    "pillow_heif",  # reads HEIC alone, and OpenEXR reads EXR: to add or update one must not cost all other captures
-    "OpenEXR",
-    "typing_extensions",
-})  # fmt: skip
+_IGNORED = frozenset(
+    {
+        "pydantic",  # settings count by value
+        "pillow_heif",  # only reads HEIC, as OpenEXR only reads EXR: updates must not invalidate other captures
+        "OpenEXR",
+        "typing_extensions",
+    }
+)
 
 
 def library_versions(modules: Iterable[str]) -> dict[str, str]:
-    """Return the version of each library that counts, by the name under which it is shown.
+    """Return the version of each library that affects results, by its display name.
 
     Args:
-        modules: top-level names of the modules that are imported.
+        modules: top-level names of the imported modules.
     """
-    counted = sorted(set(modules) - _WITHOUT_INFLUENCE)
+    counted = sorted(set(modules) - _IGNORED)
     return {_SHOWN_AS.get(module, module): _version(module) for module in counted}
 
 
 @cache
 def _version(module: str) -> str:
-    """Return the version of the distribution that a module comes from, found by name where that is possible: faster."""
+    """Return the version of the distribution of a module; tries the module's name first, which is faster."""
     for names in _candidates(module):
         found = [one for name in names if (one := _version_of(name))]
         if found:

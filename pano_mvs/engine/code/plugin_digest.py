@@ -1,4 +1,4 @@
-"""Digest of a user's plugin file: what the code does counts, comments and layout do not."""
+"""Digest of a user's plugin file, which does not depend on comments and layout."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pano_mvs.core.digest import digest_from_value
 
 
 def code_digest(path: Path) -> str:
-    """Return the digest of a Python file's syntax tree and of those of the local files that it imports.
+    """Return the digest of the syntax trees of a Python file and the local files that it imports.
 
     Raises:
         OSError: if the file cannot be read.
@@ -22,9 +22,9 @@ def code_digest(path: Path) -> str:
 
 
 def code_texts(path: Path) -> tuple[str, dict[str, str]]:
-    """Return the name of a Python file and the texts, by name, of it and of the local files that it imports.
+    """Return the name of a Python file, and by name the texts of it and the local files that it imports.
 
-    The names are relative to one folder: written anywhere in the same places, the files are the same plugin.
+    The names are relative to a common folder, so that the files can be written to any other folder.
 
     Raises:
         OSError: if a file cannot be read.
@@ -39,11 +39,11 @@ def code_texts(path: Path) -> tuple[str, dict[str, str]]:
 
 @dataclass(frozen=True, slots=True)
 class _Roots:
-    """Where absolute imports are looked up.
+    """The folders in which absolute imports are looked up.
 
     Attributes:
-        folder: the file's own folder, on the path while a workflow's plugin file is imported.
-        package: the outermost package that the file is in, if any; what else is installed beside it does not count.
+        folder: folder of the file, which is on the path while a plugin file is imported.
+        package: the outermost package that contains the file, if any; other packages beside it are ignored.
     """
 
     folder: Path
@@ -59,7 +59,7 @@ class _Roots:
         return _Roots(path.parent, package)
 
     def name_of(self, path: Path) -> str:
-        """Return a file's name as it counts: not with the folder into which a package happens to be installed."""
+        """Return a file's name without the folder into which its package is installed."""
         base = self.package.parent if self.package is not None else self.folder
         return path.relative_to(base).as_posix() if path.is_relative_to(base) else str(path)
 
@@ -81,7 +81,7 @@ def _collect(path: Path, roots: _Roots, trees: dict[str, str]) -> None:
 
 
 def _imported_files(tree: ast.Module, folder: Path, roots: _Roots) -> list[Path]:
-    """Return the local files that a syntax tree imports, wherever in it: absolute names are looked up from the root."""
+    """Return the local files that a module imports anywhere; absolute names are looked up from the roots."""
     files: list[Path] = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -97,7 +97,7 @@ def _imported_files(tree: ast.Module, folder: Path, roots: _Roots) -> list[Path]
 
 
 def _module_files(base: Path, dotted: str) -> list[Path]:
-    """Return the files that importing a dotted name runs: its own, and the __init__.py of every package above it."""
+    """Return the files that run when a dotted name is imported, with the __init__.py of every package above it."""
     parts = [part for part in dotted.split(".") if part]
     candidates = [base.joinpath(*parts[: depth + 1], "__init__.py") for depth in range(len(parts))]
     if parts:
@@ -108,8 +108,7 @@ def _module_files(base: Path, dotted: str) -> list[Path]:
 def _without_docstrings(tree: ast.Module) -> ast.Module:
     for node in ast.walk(tree):
         if isinstance(node, ast.Module | ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-            first = node.body[0] if node.body else None
-            is_doc = isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant)
-            if is_doc and isinstance(first.value.value, str):  # type: ignore[union-attr]
-                node.body = node.body[1:] or [ast.Pass()]
+            match node.body:
+                case [ast.Expr(value=ast.Constant(value=str())), *rest]:
+                    node.body = rest or [ast.Pass()]
     return tree

@@ -1,8 +1,8 @@
-"""Follow code from a function to all that it may use, by name, over the modules of some packages.
+"""Follow code by name, from a function to everything that it may use in the modules of some packages.
 
-Nodes are definitions: the functions, classes and variables at the top of a module. What only a name tells at run time
-(`getattr` on a module, an import by a computed name) is not seen; a module that is used as a value counts whole. What a
-module does when it is imported counts wherever the module is loaded.
+Nodes are definitions: the functions, classes and variables at the top level of a module. Names computed at run time
+(`getattr` on a module, imports by a computed name) are not followed; a module that is used as a value counts as a
+whole. What a module does when it is imported counts wherever the module is loaded.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from pano_mvs.engine.code.sources import Sources
 from pano_mvs.engine.code.summary import Definition, ModuleSummary
 
 _IMPORT, _WHOLE = "<import>", "<all>"
-_DEEPEST = 50
+_MAX_DEPTH = 50
 
 
 @dataclass(frozen=True, slots=True)
 class Reach:
-    """What is reached.
+    """The code that a function reaches.
 
     Attributes:
-        digest: of all of it.
+        digest: of all definitions.
         definitions: `module:name` of each definition, to its digest.
-        libraries: top-level names of the modules of others that these use, the standard library's not among them.
+        libraries: top-level names of other packages that these use, except the standard library.
     """
 
     digest: str
@@ -44,19 +44,19 @@ class _Node:
 
 
 class CodeGraph:
-    """Which definition uses which, found as far as it is asked for.
+    """The graph of definitions and the definitions that they use, built on demand.
 
     Attributes:
         sources: the modules that are followed.
     """
 
     def __init__(self, sources: Sources, *, left_out: Iterable[str] = (), kept: Iterable[str] = ()) -> None:
-        """Prepare to follow.
+        """Create an empty graph.
 
         Args:
             sources: the modules that are followed; all others are libraries.
-            left_out: dotted names of packages and modules of which nothing counts.
-            kept: those inside of these that count nevertheless.
+            left_out: dotted names of packages and modules that are ignored.
+            kept: modules inside these that count nevertheless.
         """
         self.sources = sources
         self._is_out = dict.fromkeys(left_out, True) | dict.fromkeys(kept, False)
@@ -64,17 +64,17 @@ class CodeGraph:
         self._modules: dict[str, tuple[str, ...]] = {}
 
     def with_modules(self, known: Mapping[str, ModuleSummary]) -> CodeGraph:
-        """Return the graph of these modules and some others, which none of these uses."""
+        """Return the graph of these modules and some others, which the present ones do not use."""
         more = CodeGraph(self.sources.with_modules(known))
         more._is_out, more._nodes, more._modules = dict(self._is_out), dict(self._nodes), dict(self._modules)
         return more
 
     def reach_of(self, paths: Iterable[str], *, with_annotations: bool = False) -> Reach:
-        """Return all that some definitions or modules use, with themselves.
+        """Return some definitions or modules and everything that they use.
 
         Args:
-            paths: `package.module:name`, or `package.module:` for all of a module.
-            with_annotations: whether the kinds that their annotations name are used too, as those of a stage are.
+            paths: `package.module:name`, or `package.module:` for a whole module.
+            with_annotations: whether types in their annotations count too, as the kinds in those of a stage do.
         """
         libraries: set[str] = set()
         pending: set[str] = set()
@@ -119,22 +119,22 @@ class CodeGraph:
                 edges.append([reference, *(sorted(targets) or [path])])
         for path in definition.loads:
             node.targets.update(self._imports(path))
-        # What a name stands for counts with the text: another import of the same name changes what is called.
+        # Include what names refer to: another import of the same name changes what is called.
         node.digest = digest_from_value([definition.digest, edges])
         return node
 
     def _import_node(self, module: str, summary: ModuleSummary) -> _Node:
-        """Return the node of what happens when a module is imported: what it does itself, and what it imports."""
+        """Return the node for the import of a module: the statements that it executes, and its own imports."""
         node = _Node("")
         if summary.effects is not None:
             node = self._definition_node(module, summary, summary.effects)
-            node.libraries.clear()  # what is only loaded with a module does not depend on the library's version
+            node.libraries.clear()  # what a module only loads does not depend on the version of a library
         for path in (module, *summary.loads):
             node.targets.update(self._imports(path))
         return node
 
     def _imports(self, path: str) -> list[str]:
-        """Return the nodes of the imports of the modules that a dotted path leads through."""
+        """Return the import nodes of the modules on a dotted path."""
         modules = self._modules_on(path) if path in self.sources else ()
         return [f"{module}:{_IMPORT}" for module in modules if not self._is_left_out(module)]
 
@@ -148,7 +148,7 @@ class CodeGraph:
         return {one for path in paths if path for one in self._targets(path, libraries)}
 
     def _modules_on(self, path: str) -> tuple[str, ...]:
-        """Return the modules that a dotted path leads through, from the top on."""
+        """Return the modules on a dotted path, from the top down."""
         if path not in self._modules:
             above, _, _ = path.rpartition(".")
             modules = self._modules_on(above) if above else ()
@@ -158,7 +158,7 @@ class CodeGraph:
         return self._modules[path]
 
     def _targets(self, path: str, libraries: set[str], depth: int = 0) -> tuple[str, ...]:
-        """Return the nodes that a path stands for; enter the library if it leads out of the packages."""
+        """Return the nodes that a path refers to; if it leads out of the packages, add the library instead."""
         top = path.replace(":", ".").partition(".")[0]
         if top not in self.sources:
             if top and top not in sys.stdlib_module_names:
@@ -174,18 +174,18 @@ class CodeGraph:
             if name in summary.definitions:
                 return (f"{module}:{name}",)
             bound = summary.bindings.get(name, "")
-            if bound and bound != f"{module}:{name}" and depth < _DEEPEST:
+            if bound and bound != f"{module}:{name}" and depth < _MAX_DEPTH:
                 return self._targets(_joined(bound, further), libraries, depth + 1)
             if self.sources.summary(f"{module}.{name}") is None:
-                return self._by_other_means(module, summary, name, libraries, depth)
+                return self._targets_of_unbound(module, summary, name, libraries=libraries, depth=depth)
             module, rest = f"{module}.{name}", further
-        libraries.add(top)  # compiled, say
+        libraries.add(top)  # such as compiled modules
         return ()
 
-    def _by_other_means(
-        self, module: str, summary: ModuleSummary, name: str, libraries: set[str], depth: int
+    def _targets_of_unbound(
+        self, module: str, summary: ModuleSummary, name: str, *, libraries: set[str], depth: int
     ) -> tuple[str, ...]:
-        """Return the nodes of a name that a module neither defines nor imports by that name."""
+        """Return the nodes of a name that a module neither defines nor imports explicitly."""
         if name in summary.effect_names:
             return (f"{module}:{_IMPORT}",)
         for star in summary.stars:
@@ -194,7 +194,7 @@ class CodeGraph:
                 continue
             other = self.sources.summary(star)
             known = other is not None and (name in other.definitions or name in other.bindings or other.stars)
-            if known and depth < _DEEPEST:
+            if known and depth < _MAX_DEPTH:
                 return self._targets(f"{star}:{name}", libraries, depth + 1)
         return () if name in vars(builtins) else (f"{module}:{_WHOLE}",)
 
@@ -206,7 +206,7 @@ class CodeGraph:
 
 
 def _absolute(reference: str, module: str, summary: ModuleSummary) -> str:
-    """Return the path of a reference; empty for what Python itself defines."""
+    """Return the path of a reference; empty for builtins."""
     if reference.startswith(ABSOLUTE):
         return reference[len(ABSOLUTE) :]
     root, _, rest = reference.partition(".")

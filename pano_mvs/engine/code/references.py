@@ -1,4 +1,4 @@
-"""The names outside itself that a piece of code uses: of its module, or imported where it uses them."""
+"""Find the names that a piece of code uses from outside: of its module, or imported inside it."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 ABSOLUTE = "/"
-"""Begins a reference that is a path from the root, `module.name` or `module:name`; others begin with a name of their
-own module. Behind the colon is what is looked up in the module, which may be a module itself."""
+"""Prefix of references that are absolute paths, `module.name` or `module:name`; others begin with a name of their own
+module. The name behind the colon is looked up in the module, and may be a module itself."""
 
 Import: TypeAlias = ast.Import | ast.ImportFrom
 BindingsOf: TypeAlias = "Callable[[Import], Mapping[str, str]]"
-"""Returns the names that an import binds, each with the path that it stands for."""
+"""Returns the names that an import binds, each with the path that it refers to."""
 
 _DYNAMIC_IMPORTS = frozenset({"import_module", "find_spec", "__import__"})
 _COMPREHENSIONS = (ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
@@ -27,7 +27,7 @@ class References:
 
     Attributes:
         used: dotted references, see `ABSOLUTE`.
-        annotations: those of annotations of functions and variables, which no result depends on.
+        annotations: references in annotations of functions and variables, which do not affect results.
         imports: the imports inside functions.
     """
 
@@ -44,7 +44,7 @@ def references_of(statement: ast.stmt, bindings_of: BindingsOf) -> References:
 
 
 class _Finder(ast.NodeVisitor):
-    """Collects names that no enclosing function defines; a class is taken to define none, which finds too many."""
+    """Collects names that no enclosing function defines; names defined in classes are ignored, which finds too many."""
 
     def __init__(self, bindings_of: BindingsOf) -> None:
         self.found = References()
@@ -54,7 +54,7 @@ class _Finder(ast.NodeVisitor):
         self._in_class = False
 
     def visit_Name(self, node: ast.Name) -> None:
-        if not (self._in_class and isinstance(node.ctx, ast.Store)):  # a field's name refers to nothing
+        if not (self._in_class and isinstance(node.ctx, ast.Store)):  # the name of a field refers to nothing
             self._refer(node.id)
 
     def visit_Attribute(self, node: ast.Attribute) -> None:
@@ -109,7 +109,7 @@ class _Finder(ast.NodeVisitor):
 
     def generic_visit(self, node: ast.AST) -> None:
         if isinstance(node, _COMPREHENSIONS):
-            self.visit(node.generators[0].iter)  # which sees the names outside
+            self.visit(node.generators[0].iter)  # it is evaluated in the outer scope
             with self._scope(dict.fromkeys(_stored(node), "")):
                 super().generic_visit(node)
         else:
@@ -136,14 +136,14 @@ class _Finder(ast.NodeVisitor):
                 self.visit(default)
 
     def _annotation(self, node: ast.expr) -> None:
-        """Visit an annotation; one that is written as a string names things too."""
+        """Visit an annotation, including names in strings."""
         self.visit(node)
         for inner in ast.walk(node):
             if isinstance(inner, ast.Constant) and isinstance(inner.value, str):
                 try:
                     self.visit(ast.parse(inner.value, mode="eval").body)
                 except SyntaxError:
-                    continue  # a text beside the type, as in Annotated[int, "of the grid"]
+                    continue  # not an expression, as in Annotated[int, "of the grid"]
 
     def _refer(self, chain: str) -> None:
         root, _, rest = chain.partition(".")
@@ -168,7 +168,7 @@ class _Finder(ast.NodeVisitor):
 
 
 def dotted(node: ast.expr) -> str:
-    """Return `a.b.c` for an expression that is no more than that, else an empty string."""
+    """Return `a.b.c` for an expression of this form, otherwise an empty string."""
     names: list[str] = []
     while isinstance(node, ast.Attribute):
         names.append(node.attr)
@@ -177,7 +177,7 @@ def dotted(node: ast.expr) -> str:
 
 
 def _own_names(function: Any, bindings_of: BindingsOf) -> dict[str, str]:
-    """Return a function's own names: to the dotted path if one is imported there and nowhere else set, else to ""."""
+    """Return the local names of a function: to the path if it is only imported there, otherwise to ""."""
     arguments = function.args
     given = [*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs, arguments.vararg, arguments.kwarg]
     body = function.body if isinstance(function.body, list) else [function.body]
@@ -202,7 +202,7 @@ def _own_names(function: Any, bindings_of: BindingsOf) -> dict[str, str]:
 
 
 def _inside(nodes: list[Any]) -> Iterator[ast.AST]:
-    """Yield the nodes of a function's own scope: not those within other functions, classes and comprehensions."""
+    """Yield the nodes in the scope of a function, without those in inner functions, classes and comprehensions."""
     for node in nodes:
         yield node
         if isinstance(node, (*_FUNCTIONS, ast.ClassDef)):

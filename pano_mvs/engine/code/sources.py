@@ -1,4 +1,4 @@
-"""The summaries of the modules of some packages, kept on the disk by what their files say."""
+"""The summaries of the modules of some packages, cached on disk by the digest of their files."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from pano_mvs.core.paths import below as files_below
 from pano_mvs.core.paths import is_file
 from pano_mvs.engine.code.summary import ModuleSummary, summarize_module
 
-_PYTHON = f"{sys.version_info.major}.{sys.version_info.minor}"  # which decides what is Python at all
+_PYTHON = f"{sys.version_info.major}.{sys.version_info.minor}"  # it determines the valid syntax
 
 
 class Sources:
-    """The modules of some packages, read when they are asked for.
+    """The modules of some packages, read on demand.
 
-    To read a file's text takes microseconds, to find out what it says milliseconds: so the summaries are kept.
+    Reading a file takes microseconds, but analysing it takes milliseconds, so the summaries are cached.
     """
 
     def __init__(self, packages: Mapping[str, Path], kept_in: Path | None = None) -> None:
-        """Prepare to read.
+        """Prepare to read modules.
 
         Args:
-            packages: name of each top-level package, or module, to its folder, or file.
-            kept_in: folder for the summaries; None keeps none.
+            packages: name of each top-level package or module, to its folder or file.
+            kept_in: folder of the cached summaries; None to cache none.
         """
         self._packages = dict(packages)
         self._kept_in = kept_in
@@ -40,7 +40,7 @@ class Sources:
         self._changed: set[str] = set()
 
     def with_modules(self, known: Mapping[str, ModuleSummary]) -> Sources:
-        """Return these modules and some others, whose summaries, by their dotted names, are known."""
+        """Return these modules and some others, given the summaries of those by dotted name."""
         more = Sources(self._packages, self._kept_in)
         more._tops |= {module.partition(".")[0] for module in known}
         more._summaries = {**self._summaries, **known}
@@ -48,17 +48,17 @@ class Sources:
         return more
 
     def __contains__(self, path: str) -> bool:
-        """Return whether a dotted path leads into one of the packages."""
+        """Return whether a dotted path begins with one of the packages."""
         return path.partition(".")[0] in self._tops
 
     def summary(self, module: str) -> ModuleSummary | None:
-        """Return what a module says; None if there is no such module that can be read."""
+        """Return the summary of a module, or None if it does not exist or cannot be read."""
         if module not in self._summaries:
             self._summaries[module] = self._read(module)
         return self._summaries[module]
 
     def save(self) -> None:
-        """Keep what was found for the next process; that this is not possible harms nobody."""
+        """Store new summaries for later processes, if possible."""
         for top in sorted(self._changed):
             path = self._kept_path(top)
             if path is None:
@@ -121,7 +121,7 @@ class Sources:
 
 @cache
 def _our_texts() -> dict[str, bytes]:
-    """Return the files by which a summary is made: where they change, those kept are made anew."""
+    """Return the source of this package: when it changes, cached summaries become invalid."""
     return {path.name: path.read_bytes() for path in files_below(Path(__file__).parent, "*.py")}
 
 
@@ -130,4 +130,4 @@ def _load(path: Path) -> dict[str, tuple[str, ModuleSummary]]:
         kept = json.loads(path.read_bytes())
         return {module: (digest, ModuleSummary.from_json(one)) for module, (digest, one) in kept.items()}
     except (OSError, ValueError, TypeError, AttributeError):
-        return {}  # none, or none that we have written
+        return {}  # missing or damaged

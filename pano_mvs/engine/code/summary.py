@@ -1,4 +1,4 @@
-"""What a Python file defines and what each definition refers to, found in its text without importing it."""
+"""Find what a Python file defines, and what each definition refers to, without importing it."""
 
 from __future__ import annotations
 
@@ -14,23 +14,38 @@ from pano_mvs.engine.code.references import Import, dotted, references_of
 _STAGE_DECORATORS = frozenset(
     f"pano_mvs.{module}.{name}" for module in ("api", "engine.stages.stage") for name in ("stage", "source")
 )
-"""Do not count: what they say of a stage is in its key already, or cannot change its result."""
+"""These do not count: their arguments are already in the key of the stage, or cannot affect its result."""
 
-_PURE_DECORATORS = frozenset({
-    "njit", "jit", "vectorize", "guvectorize", "intrinsic", "dataclass", "cache", "lru_cache", "contextmanager",
-    "total_ordering", "wraps", "runtime_checkable", "final", "unique", "params_from",
-})  # fmt: skip
-"""Register nothing anywhere, unlike others for all that is known."""
+_PURE_DECORATORS = frozenset(
+    {
+        "njit",
+        "jit",
+        "vectorize",
+        "guvectorize",
+        "intrinsic",
+        "dataclass",
+        "cache",
+        "lru_cache",
+        "contextmanager",
+        "total_ordering",
+        "wraps",
+        "runtime_checkable",
+        "final",
+        "unique",
+        "params_from",
+    }
+)
+"""These do not register anything; other decorators might."""
 
 
 @dataclass(frozen=True, slots=True)
 class Definition:
-    """A top-level function, class or variable; or all that a module does when it is imported.
+    """A top-level function, class or variable, or everything that a module executes when it is imported.
 
     Attributes:
-        digest: of what it says.
+        digest: of its code.
         uses: references, see `references.ABSOLUTE`.
-        annotations: those that only annotations without influence on a result make.
+        annotations: references only in annotations that do not affect results.
         loads: dotted paths that it imports when it runs.
     """
 
@@ -42,14 +57,14 @@ class Definition:
 
 @dataclass(slots=True)
 class ModuleSummary:
-    """What a module says.
+    """The contents of a module.
 
     Attributes:
         definitions: by name.
-        bindings: imported names, to the path that each stands for: `package.module`, or `package.module:name`.
-        stars: modules of which all names are imported.
-        effects: what it does when it is imported beside defining names; None for nothing.
-        effect_names: names that are defined there.
+        bindings: imported name to the path that it refers to: `package.module`, or `package.module:name`.
+        stars: modules from which all names are imported.
+        effects: what it executes on import beside definitions; None if nothing.
+        effect_names: names that these statements define.
         loads: dotted paths that importing it imports.
     """
 
@@ -68,7 +83,7 @@ class ModuleSummary:
 
     @staticmethod
     def from_json(value: Sequence[Any]) -> ModuleSummary:
-        """Return the summary that `to_json` described."""
+        """Return the summary from the result of `to_json`."""
         definitions, bindings, stars, effects, effect_names, loads = value
         return ModuleSummary(
             {name: _from_json(one) for name, one in definitions.items()},
@@ -90,7 +105,7 @@ def _from_json(value: Sequence[str]) -> Definition:
 
 
 def summarize_module(text: str | bytes, module: str, *, is_package: bool = False) -> ModuleSummary:
-    """Return what a module's text says.
+    """Return the summary of a module.
 
     Args:
         text: the source.
@@ -99,7 +114,7 @@ def summarize_module(text: str | bytes, module: str, *, is_package: bool = False
 
     Raises:
         SyntaxError: if the text is not Python.
-        ValueError: if it holds a null character.
+        ValueError: if it contains a null character.
     """
     summarizer = _Summarizer(module if is_package else module.rpartition(".")[0])
     return summarizer.summarize(ast.parse(text))
@@ -123,14 +138,14 @@ class _Summarizer:
         return self._summary
 
     def _sort(self, statement: ast.stmt) -> None:
-        """Enter a top-level statement as an import, a definition, or something that is done on import."""
+        """Enter a top-level statement as an import, a definition, or an effect of the import."""
         match statement:
             case ast.Import() | ast.ImportFrom():
                 self._bind(statement)
             case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
                 self._named.setdefault(statement.name, []).append(statement)
                 if not all(self._is_pure(decorator) for decorator in statement.decorator_list):
-                    self._effects.append(statement)  # it may be registered somewhere
+                    self._effects.append(statement)  # the decorator may register it somewhere
             case ast.Assign() | ast.AnnAssign() | ast.AugAssign() if names := _assigned_names(statement):
                 for name in names:
                     self._named.setdefault(name, []).append(statement)
@@ -176,7 +191,7 @@ class _Summarizer:
         return [base if alias.name == "*" else f"{base}.{alias.name}" for alias in statement.names]
 
     def _base_of(self, statement: ast.ImportFrom) -> str:
-        """Return the dotted path, from the root, of the module from which names are imported."""
+        """Return the absolute dotted path of the module from which names are imported."""
         if not statement.level:
             return statement.module or ""
         parts = self._package.split(".")
@@ -188,7 +203,7 @@ class _Summarizer:
         return path in _STAGE_DECORATORS or path.rpartition(".")[2] in _PURE_DECORATORS
 
     def _path_of(self, decorator: ast.expr) -> str:
-        """Return the dotted path of a decorator, as far as the imports of the module say."""
+        """Return the dotted path of a decorator, resolved with the imports of the module."""
         chain = dotted(decorator.func if isinstance(decorator, ast.Call) else decorator)
         root, _, rest = chain.partition(".")
         path = self._summary.bindings.get(root, root).replace(":", ".")
@@ -221,7 +236,7 @@ def _joined(definitions: Sequence[Definition]) -> Definition:
 
 
 def _assigned_names(statement: ast.Assign | ast.AnnAssign | ast.AugAssign) -> list[str]:
-    """Return the names that an assignment defines; none if it also sets an attribute or an element of something."""
+    """Return the names that an assignment defines; none if it also sets an attribute or an element."""
     names: list[str] = []
     pending: list[ast.expr] = list(statement.targets) if isinstance(statement, ast.Assign) else [statement.target]
     while pending:

@@ -1,6 +1,5 @@
-"""Where units are computed: in this process, in worker processes, or on a dask cluster.
+"""Compute units: in this process, in worker processes, or on a dask cluster.
 
-All executors do the same thing with the same unit: `Workplace.run` or `perform` call the stage on what the store holds
-and put its result there. Values travel through the store alone; a worker is sent a description of the unit in JSON and
-answers in JSON. No object is pickled.
+All executors end in `perform`, which calls the stage on its inputs in the cache and stores the result there. Values are
+passed only through the cache. Workers receive a description of the unit as JSON and answer in JSON; nothing is pickled.
 """

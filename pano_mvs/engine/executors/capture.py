@@ -1,4 +1,4 @@
-"""Send everything that a unit prints to a file: Python's streams, logging, and what C and C++ write to descriptors."""
+"""Redirect everything that a unit prints to a file: Python's streams, logging, and the output of C and C++ code."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _TAIL_BYTES = 8192
 
 @contextmanager
 def captured(log: Path) -> Iterator[None]:
-    """Send what is written to the standard streams inside to a file, which is removed if nothing was.
+    """Redirect the standard streams to a file inside the context; an empty file is removed.
 
-    The descriptors 1 and 2 of the whole process are turned; who wants to be heard meanwhile writes to a duplicate.
+    This redirects the descriptors 1 and 2 of the whole process; to print meanwhile, use a duplicate made before.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
     target = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o666)
@@ -49,7 +49,7 @@ def captured(log: Path) -> Iterator[None]:
 
 
 def tail(log: Path, lines: int) -> tuple[str, ...]:
-    """Return the last lines of a log, or none if there is no log."""
+    """Return the last lines of a log; none if there is no log."""
     try:
         with log.open("rb") as file:
             file.seek(max(0, log.stat().st_size - _TAIL_BYTES))
@@ -75,7 +75,7 @@ def _logging_to(stream: io.TextIOBase) -> Iterator[None]:
 
 
 def _flush() -> None:
-    """Empty the buffers of Python's and of C's streams, so that each text lands on the side where it was written."""
+    """Flush the streams of Python and C, so that buffered text goes to the present target."""
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError, AttributeError):
             stream.flush()

@@ -1,16 +1,16 @@
-"""From what is asked for on the command line to an executor."""
+"""Make the executor that the command line asks for."""
 
 from __future__ import annotations
 
 import os
 
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.memory import free_memory_bytes
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.processes import ProcessExecutor
 from pano_mvs.engine.executors.protocol import Executor
 from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.executors.threads import available_threads, share_cores
-from pano_mvs.engine.running.memory import free_memory_bytes
 
 VARIABLE = "PANO_MVS_EXECUTOR"
 _WORKER_BYTES = 3_000_000_000
@@ -18,25 +18,25 @@ EXECUTORS = ("serial", "processes", "dask")
 
 
 def make_executor(store: Store, name: str = "", *, workers: int = 0, threads: int = 0, scheduler: str = "") -> Executor:
-    """Return an executor; whoever asks closes it.
+    """Return an executor; the caller closes it.
 
     Args:
-        store: where values are.
-        name: of the executor; by default dask if there is a scheduler, else what $PANO_MVS_EXECUTOR says (unless a
-            number of workers is given), else processes.
-        workers: units at a time; 0 for as many as there are cores for, and memory (3 GB each).
+        store: the cache.
+        name: of the executor; by default dask if a scheduler is given, else $PANO_MVS_EXECUTOR (unless a number of
+            workers is given), else processes.
+        workers: number of units at a time; 0 for as many as cores and memory (3 GB each) allow.
         threads: threads of each worker; 0 for an equal share of the cores.
         scheduler: address of a dask scheduler; without one, dask starts a cluster on this host.
 
     Raises:
-        UsageError: if the settings contradict each other, or the executor is not installed or cannot be reached.
+        UsageError: if the arguments contradict each other, or the executor is not installed or cannot be reached.
     """
     cores = available_threads()
     name = name or ("dask" if scheduler else "" if workers else os.environ.get(VARIABLE, "")) or "processes"
     if name not in EXECUTORS:
-        raise UsageError(f"there is no executor {name!r}; there are {', '.join(EXECUTORS)}")
+        raise UsageError(f"there is no executor {name!r}; choose one of {', '.join(EXECUTORS)}")
     if scheduler and name != "dask":
-        raise UsageError(f"--scheduler is dask's; --executor {name} has none")
+        raise UsageError(f"--scheduler requires --executor dask; {name} has no scheduler")
     if name == "serial":
         if workers > 1:
             raise UsageError("--executor serial runs one unit at a time; for more use --executor processes")

@@ -1,7 +1,7 @@
-"""Units on a dask cluster: one on this host, or one that exists and shares the store with us.
+"""Compute units on a dask cluster: a new one on this host, or an existing one that shares the cache.
 
-dask carries requests and answers, in JSON, and says who is free; values travel through the store alone. We keep a
-bounded number of units out, name each by its key, and try again ourselves: dask is asked not to.
+dask passes requests and answers, in JSON, and selects the workers; values are passed only through the cache. A bounded
+number of units is submitted at a time. Retries are made by the dispatcher, not by dask.
 """
 
 from __future__ import annotations
@@ -17,38 +17,37 @@ from urllib.parse import urlsplit
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.files import temporary_prefix
+from pano_mvs.core.memory import free_memory_bytes
 from pano_mvs.core.paths import children, is_file
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.code.plugin_digest import code_texts
 from pano_mvs.engine.executors.dask_task import differences, end_workers, introduce, run_unit, versions
-from pano_mvs.engine.executors.protocol import Job, Outcome
-from pano_mvs.engine.executors.unit_text import request_to_json
-from pano_mvs.engine.running.memory import free_memory_bytes
+from pano_mvs.engine.executors.protocol import Job, JobOutcome
+from pano_mvs.engine.executors.unit_json import request_to_json
 
 _LARGE_BYTES = 200_000
 _CONNECT_S = 20.0
 _LISTEN_S = 0.5
-_ANSWER_S = 60.0
 
 
 class DaskExecutor:
-    """Hands units to a dask scheduler."""
+    """Submits units to a dask scheduler."""
 
     name = "dask"
     enforces_timeouts = True
 
     def __init__(self, store: Store, *, workers: int = 1, threads: int = 0, scheduler: str = "") -> None:
-        """Connect, and see whether every worker can do our work.
+        """Connect to the cluster, and check every worker.
 
         Args:
-            store: where values are; for an existing cluster, in a folder that all hosts see under the same path.
-            workers: how many, of a cluster on this host.
-            threads: threads of each; 0 for an equal share of each host's cores.
+            store: the cache; for an existing cluster, in a folder with the same path on all hosts.
+            workers: number of workers, for a new cluster on this host.
+            threads: threads of each worker; 0 for an equal share of the cores of its host.
             scheduler: address of an existing scheduler.
 
         Raises:
             UsageError: if dask is not installed, the scheduler does not answer, or a worker has other versions or does
-                not see the store.
+                not see the cache.
         """
         distributed = _import_distributed()
         if scheduler:
@@ -56,13 +55,13 @@ class DaskExecutor:
         self._store = store
         self._run = uuid.uuid4().hex
         self._ended: queue.SimpleQueue[tuple[int, int, Any]] = queue.SimpleQueue()
-        self._out: dict[int, tuple[int, Any]] = {}  # job to its try and its future
-        self._tries = 0
-        self._requests: dict[int, Path] = {}  # job to the file that holds its request, where that is large
+        self._out: dict[int, tuple[int, Any]] = {}  # job to its attempt and its future
+        self._attempts = 0
+        self._requests: dict[int, Path] = {}  # job to the file with its request, for large requests
         self._sources: dict[str, Any] = {}
         self._cluster: Any = None
         if not scheduler:
-            # Threads will do for dask's own workers, as each has a process of ours that computes.
+            # Threads suffice for dask workers, because each starts one of our worker processes.
             self._cluster = distributed.LocalCluster(
                 n_workers=1, threads_per_worker=workers, processes=False, dashboard_address=None
             )
@@ -81,7 +80,7 @@ class DaskExecutor:
         self._is_remote = bool(scheduler)
 
     def submit(self, job: Job) -> None:
-        """Take a job."""
+        """Submit a job."""
         request = request_to_json(job, self._store)
         request["cores"] = self.cores
         request["plugin_texts"] = {str(path.absolute()): self._texts(path) for path in job.plugins}
@@ -91,15 +90,15 @@ class DaskExecutor:
             path.write_text(text, encoding="utf-8")
             self._requests[job.number] = path
             text = str(path)
-        self._tries += 1
-        number, attempt = job.number, self._tries
+        self._attempts += 1
+        number, attempt = job.number, self._attempts
         key = f"pano-mvs-{job.unit.key}-{self._run}-{attempt}"
         future = self._client.submit(run_unit, self._run, text, key=key, pure=False, retries=0)
         self._out[number] = attempt, future
         future.add_done_callback(lambda done: self._ended.put((number, attempt, done)))
 
-    def wait(self, timeout_s: float | None = None) -> tuple[int, Outcome] | None:
-        """Return a job that has ended."""
+    def wait(self, timeout_s: float | None = None) -> tuple[int, JobOutcome] | None:
+        """Return the number and the outcome of a job that has ended; see `Executor`."""
         while self._out:
             try:
                 number, attempt, future = self._ended.get(timeout=_LISTEN_S if timeout_s is None else timeout_s or 0.0)
@@ -115,21 +114,21 @@ class DaskExecutor:
         return None
 
     def free_memory_bytes(self) -> int:
-        """Return what is free on this host, or what the smallest worker of a cluster may use."""
+        """Return the free memory of this host, or, for a remote cluster, the smallest limit times the workers."""
         if not self._is_remote:
             return free_memory_bytes()
         limits = [worker["memory_limit"] for worker in self._client.scheduler_info(n_workers=-1)["workers"].values()]
         return int(min(limits, default=0)) * len(limits)
 
     def cancel(self) -> None:
-        """Forget all jobs, and end the processes that are at work."""
+        """Cancel all jobs and end their processes."""
         if self._out:
             self._client.cancel([future for _, future in self._out.values()], force=True)
             self._out.clear()
             self._client.run(end_workers, self._run, on_error="ignore")
 
     def close(self) -> None:
-        """End our processes, and the cluster if it is our own."""
+        """End the worker processes, and the cluster if this object has started it."""
         self._out.clear()
         self._client.run(end_workers, self._run, on_error="ignore")
         self._client.close()
@@ -143,7 +142,7 @@ class DaskExecutor:
         return self._sources[key]
 
     def _check_workers(self) -> tuple[int, int, int]:
-        """Return how many units the workers take at a time, how many threads each may use, and how many if alone."""
+        """Return the number of units at a time, the threads for each, and the threads for a unit that runs alone."""
         token = f"{temporary_prefix()}hello-{uuid.uuid4().hex}"
         folder = self._store.blobs.temporary
         try:
@@ -175,20 +174,23 @@ class DaskExecutor:
         place = f"dask worker {worker} on {answer['host']}"
         others = differences(versions(), answer["versions"])
         if others:
-            raise UsageError(f"{place}: {'; '.join(others)}. Results would depend on who computes them: install the "
-                             "same versions there")  # fmt: skip
+            raise UsageError(
+                f"{place}: {'; '.join(others)}. Results would depend on the worker: install the same versions there"
+            )
         if answer["token"] != token or not is_file(self._store.blobs.temporary / answer["answer"]):
             reason = answer["reason"] or "it is another folder there"
-            raise UsageError(f"{place} does not see the cache {self._store.root.absolute()} ({reason}). Choose "
-                             "one with --cache DIR that all hosts share under the same path")  # fmt: skip
+            raise UsageError(
+                f"{place} does not see the cache {self._store.root.absolute()} ({reason}). Choose "
+                "a cache with --cache DIR that all hosts share under the same path"
+            )
 
 
-def _outcome(future: Any) -> Outcome:
+def _outcome(future: Any) -> JobOutcome:
     if future.status == "finished":
-        return Outcome.from_json(json.loads(future.result()))
+        return JobOutcome.from_json(json.loads(future.result()))
     if future.status == "error":
-        return Outcome("failed", cause=f"its dask worker failed: {future.exception()}", died=True)
-    return Outcome("failed", cause=f"the dask cluster lost it ({future.status})", died=True)
+        return JobOutcome("failed", cause=f"its dask worker failed: {future.exception()}", died=True)
+    return JobOutcome("failed", cause=f"the dask cluster lost it ({future.status})", died=True)
 
 
 def _check_address(scheduler: str) -> None:

@@ -1,7 +1,7 @@
-"""What runs inside a dask worker: each of its threads keeps a worker process of ours, and hands it units.
+"""The code that runs inside a dask worker: each of its threads keeps a worker process and passes units to it.
 
-The process, rather than the dask worker itself, computes: so its threads are bounded, its output is captured, a unit
-that takes too long can be ended, and one that crashes takes nothing else with it, exactly as on a single host.
+Units are computed in that process rather than in the dask worker, exactly as on a single host: threads are limited,
+output is captured, a unit that takes too long can be ended, and a crash affects only its unit.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ _workers: dict[tuple[str, int], WorkerProcess] = {}
 
 
 def run_unit(run: str, text: str) -> str:
-    """Compute a unit in this thread's process.
+    """Compute a unit in the worker process of this thread.
 
     Args:
-        run: names the run; its processes end with it.
-        text: the request as JSON, or the path of a file in the store that holds it.
+        run: id of the run, to end its processes later.
+        text: the request as JSON, or the path of a file in the cache that contains it.
     """
     request = json.loads(text if text.startswith("{") else Path(text).read_bytes())
     worker = _workers.setdefault((run, threading.get_ident()), _new_worker(request["cores"]))
@@ -41,17 +41,17 @@ def run_unit(run: str, text: str) -> str:
 
 
 def end_workers(run: str) -> None:
-    """End the processes of a run, whatever they are doing."""
+    """End the worker processes of a run at once."""
     for key in [key for key in _workers if key[0] == run]:
         _workers.pop(key).kill()
 
 
 def introduce(store: str, token: str) -> dict[str, Any]:
-    """Return what the scheduler wants to know of a worker before it trusts it.
+    """Return what is checked about a worker before it gets units.
 
     Args:
-        store: folder of the store.
-        token: name of a file in its folder for temporary files; an answer is left beside it.
+        store: folder of the cache.
+        token: name of a file among the temporary files of the cache; an answer is written beside it.
     """
     path = Path(store) / "tmp" / token
     answer = path.with_name(f"{token}-{uuid.uuid4().hex}")
@@ -72,7 +72,7 @@ def introduce(store: str, token: str) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of all that can change a result."""
+    """Return the versions of everything that affects results."""
     found = {"python": ".".join(platform.python_version_tuple()[:2]), "pano_mvs": _own_version()}
     for name in _LIBRARIES:
         try:
@@ -83,7 +83,7 @@ def versions() -> dict[str, str]:
 
 
 def _own_version() -> str:
-    """Return the version with a digest of the code: two checkouts of the same version may differ."""
+    """Return the version of pano_mvs with a digest of the code, as two checkouts of a version may differ."""
     package = Path(pano_mvs.__file__).parent
     sources = {path.relative_to(package).as_posix(): path.read_bytes() for path in below(package, "*.py")}
     return f"{pano_mvs.__version__}+{digest_from_value(sources)[:12]}"
@@ -94,6 +94,6 @@ def _new_worker(threads: int) -> WorkerProcess:
 
 
 def differences(ours: Mapping[str, str], theirs: Mapping[str, str]) -> list[str]:
-    """Return what is not the same, in words."""
+    """Return the differences between two sets of versions, in words."""
     names = [name for name in ours if theirs.get(name) != ours[name]]
     return [f"{name} is {theirs.get(name)} there and {ours[name]} here" for name in names]

@@ -1,4 +1,4 @@
-"""What the scheduler asks of an executor, and what it is told of a unit that was tried."""
+"""The interface of executors: jobs in, outcomes out."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, Literal, Protocol
 from pano_mvs.engine.cache.store import UnitRecord
 from pano_mvs.engine.planning.units import Unit
 
-Status = Literal["done", "failed", "damaged", "changed", "stopped"]
+JobStatus = Literal["done", "failed", "damaged", "changed", "stopped"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,11 +18,11 @@ class Job:
     """A unit to be computed.
 
     Attributes:
-        number: names the job in this run.
-        unit: what to compute.
-        threads: how many threads it may use.
-        timeout_s: the time after which it is given up; 0 for none.
-        log: file for whatever the unit prints; it exists afterwards if there was anything.
+        number: identifies the job in this run.
+        unit: the unit.
+        threads: number of threads that it may use.
+        timeout_s: time after which it is ended; 0 for no limit.
+        log: file for everything that the unit prints; it does not exist afterwards if nothing was printed.
         plugins: the plugin files of the workflow, with the digests of their code.
     """
 
@@ -35,24 +35,24 @@ class Job:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class JobOutcome:
     """What became of a job.
 
     Attributes:
         status: `done`; `failed`: the unit has no result; `damaged`: an input turned out damaged and was removed;
-            `changed`: a user's file that it reads is not as it was listed; `stopped`: nothing can go on (the disk is
-            full, the stage closed a gate).
-        record: the stored result of a job that is done.
+            `changed`: an input file has changed since it was listed; `stopped`: the run cannot go on (the disk is full,
+            or the stage raised RunStoppedError).
+        record: the stored result, if the status is `done`.
         cause: what went wrong otherwise.
-        trace: the Python traceback, if the stage's own code broke.
-        error: name of the error's class, where the scheduler acts on it.
-        exit_code: of an error that is the user's to mend, else 0.
-        died: whether the process died of it, or took too long and was ended.
-        seconds: how long it took.
-        changed: the user's files that are not as they were listed, with the reason.
+        trace: the Python traceback, if the code of the stage failed.
+        error: name of the class of the error, if the run has to raise it again.
+        exit_code: exit code of an error that the user can fix, otherwise 0.
+        died: whether the worker process died.
+        seconds: how long the job took.
+        changed: input files that have changed since they were listed, with the reasons.
     """
 
-    status: Status
+    status: JobStatus
     record: UnitRecord | None = None
     cause: str = ""
     trace: str = ""
@@ -77,20 +77,20 @@ class Outcome:
         }
 
     @staticmethod
-    def from_json(value: Mapping[str, Any]) -> Outcome:
-        """Return the outcome that `to_json` gave."""
+    def from_json(value: Mapping[str, Any]) -> JobOutcome:
+        """Return the outcome from the result of `to_json`."""
         record = None if value["record"] is None else UnitRecord.from_json(value["record"])
-        return Outcome(**{**value, "record": record})
+        return JobOutcome(**{**value, "record": record})
 
 
 class Executor(Protocol):
     """Computes units, several at a time or one.
 
     Attributes:
-        name: as it is chosen on the command line.
-        capacity: how many jobs it takes at a time.
-        threads: how many threads a unit may use while as many others run as there can.
-        cores: how many threads a unit may use that runs alone.
+        name: as chosen on the command line.
+        capacity: number of jobs that it takes at a time.
+        threads: number of threads for a unit while `capacity` units run.
+        cores: number of threads for a unit that runs alone.
         enforces_timeouts: whether it can end a unit that takes too long.
     """
 
@@ -101,20 +101,20 @@ class Executor(Protocol):
     enforces_timeouts: bool
 
     def submit(self, job: Job) -> None:
-        """Take a job; the caller never has more than `capacity` of them out."""
+        """Start a job; the caller never submits more than `capacity` at a time."""
 
-    def wait(self, timeout_s: float | None = None) -> tuple[int, Outcome] | None:
-        """Return the number and the outcome of a job that has ended; None if none has within the time.
+    def wait(self, timeout_s: float | None = None) -> tuple[int, JobOutcome] | None:
+        """Wait for a job to end; return its number and outcome, or None if no job ended within the time.
 
         Raises:
             KeyboardInterrupt: if the user interrupts.
         """
 
     def free_memory_bytes(self) -> int:
-        """Return what all units that run at a time may use together; 0 if it is not known."""
+        """Return the memory for all running units together; 0 if unknown."""
 
     def cancel(self) -> None:
         """End all jobs at once and forget them."""
 
     def close(self) -> None:
-        """Let go of all processes; no job is out any more."""
+        """End all processes; no job is running."""

@@ -1,20 +1,19 @@
-"""One unit after another, in this process: nothing to start, and a debugger sees everything.
+"""Compute one unit after another in this process: nothing to start, and a debugger sees everything.
 
-Nothing separates a unit from the run: native code that crashes or exits ends both, and a unit that hangs
-cannot be ended.
+A unit is not isolated from the run: native code that crashes or exits ends both, and a unit that hangs cannot be ended.
 """
 
 from __future__ import annotations
 
+from pano_mvs.core.memory import free_memory_bytes
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.perform import perform
-from pano_mvs.engine.executors.protocol import Job, Outcome
+from pano_mvs.engine.executors.protocol import Job, JobOutcome
 from pano_mvs.engine.executors.threads import available_threads
-from pano_mvs.engine.running.memory import free_memory_bytes
 
 
 class SerialExecutor:
-    """Computes each job when it is waited for."""
+    """Computes each job when `wait` is called."""
 
     name = "serial"
     capacity = 1
@@ -26,18 +25,18 @@ class SerialExecutor:
         self._jobs: list[Job] = []
 
     def submit(self, job: Job) -> None:
-        """Take a job."""
+        """Keep a job for `wait`."""
         self._jobs.append(job)
 
-    def wait(self, timeout_s: float | None = None) -> tuple[int, Outcome] | None:
-        """Compute the job that was taken, however long it takes."""
+    def wait(self, timeout_s: float | None = None) -> tuple[int, JobOutcome] | None:
+        """Compute the submitted job; the timeout does not limit its time."""
         if not self._jobs or timeout_s == 0:
             return None
         job = self._jobs.pop(0)
         return job.number, perform(job.unit, self._store, threads=job.threads, log=job.log)
 
     def free_memory_bytes(self) -> int:
-        """Return what is free on this host."""
+        """Return the free memory of this host."""
         return free_memory_bytes()
 
     def cancel(self) -> None:
@@ -45,4 +44,4 @@ class SerialExecutor:
         self._jobs.clear()
 
     def close(self) -> None:
-        """There is nothing to let go of."""
+        """Do nothing."""

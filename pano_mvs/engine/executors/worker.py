@@ -1,7 +1,8 @@
-"""A worker process: reads requests from its standard input, answers on its standard output, a JSON object in a line.
+"""The main function of a worker process.
 
-It answers a request with `{"started": true}` and then with the outcome, and says `{"ready": true}` at its beginning.
-It ends at once when its input does, whatever it is doing: nobody would hear of the result.
+It reads requests from its standard input and answers on its standard output, one JSON object per line: first
+`{"ready": true}`, then for each request `{"started": true}` and the outcome. It exits at once when its input ends,
+because then nobody reads the result.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ from typing import Any, BinaryIO
 def main() -> None:
     """Serve requests until the input ends."""
     requests_in, answers_out = _take_streams()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the one who started us decides what an interrupt means
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process handles interrupts
     requests: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     threading.Thread(target=_read, args=(requests_in, requests), daemon=True).start()
-    from pano_mvs.engine.executors.workplace import run_request  # after the streams: what it imports may print
+    from pano_mvs.engine.executors.workplace import run_request  # after the streams, because imports may print
 
     _answer(answers_out, {"ready": True})
     while True:
@@ -31,7 +32,7 @@ def main() -> None:
 
 
 def _take_streams() -> tuple[BinaryIO, BinaryIO]:
-    """Keep the standard streams for ourselves: what a stage prints goes to the error stream, and it reads nothing."""
+    """Reserve the standard streams for requests: stages print to the error stream and read nothing."""
     requests_in, answers_out = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     nothing = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nothing, 0)

@@ -1,9 +1,8 @@
-"""One worker process, seen from the one who started it.
+"""One worker process, seen from the main process.
 
-Each has pipes of its own: whenever and however it dies, nobody else's words are lost and no lock is left behind. (The
-pools of the standard library and pebble share one pipe under one lock among all workers, and a worker that is killed
-with the lock in its hand takes the others with it.) It is started afresh by name, never forked: no thread, lock or open
-file of ours comes with it.
+Each worker has its own pipes, so that it can die at any moment without affecting others. (In the pools of the standard
+library and of pebble all workers share one pipe with one lock, and a worker that is killed while it holds the lock
+blocks the others.) Workers are new processes, not forks, so that they inherit no threads, locks or open files.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from pano_mvs.engine.executors.capture import tail
-from pano_mvs.engine.executors.protocol import Outcome
+from pano_mvs.engine.executors.protocol import JobOutcome
 from pano_mvs.engine.executors.threads import bound_environment
 
 _BOOT = (
@@ -30,19 +29,19 @@ _STOP_S = 5.0
 
 
 class WorkerProcess:
-    """A process that computes one unit at a time; it is started when the first comes.
+    """A process that computes one unit at a time; it is started for the first one.
 
     Attributes:
-        served: units that the present process has been given.
-        refused: whether the latest process gave up by itself before it had come so far as to wait for a unit.
+        served: number of units that the present process has received.
+        refused: whether the latest process exited by itself before it was ready for a unit.
     """
 
     def __init__(self, threads: int, errors: Path) -> None:
         """Prepare a worker.
 
         Args:
-            threads: how many threads a unit of it may use at most.
-            errors: file for what it prints outside units, such as why it cannot start.
+            threads: the most threads that a unit may use.
+            errors: file for what the process prints outside units, such as why it cannot start.
         """
         self.threads = threads
         self.errors = errors
@@ -52,8 +51,8 @@ class WorkerProcess:
         self._process: subprocess.Popen[bytes] | None = None
         self._too_late = False
 
-    def run(self, request: Mapping[str, Any]) -> Outcome:
-        """Compute a unit, and wait for it; a process that dies or takes too long costs this unit and no other."""
+    def run(self, request: Mapping[str, Any]) -> JobOutcome:
+        """Compute a unit and wait for it; if the process dies or takes too long, only this unit fails."""
         process = self._process or self._start()
         self.served += 1
         timeout_s = float(request["timeout_s"])
@@ -69,16 +68,16 @@ class WorkerProcess:
             timer.cancel()
         if outcome is None:
             return self._death(process, timeout_s)
-        if self._too_late:  # it was done at the very moment when it was ended
+        if self._too_late:  # it finished just when it was being ended
             self.stop()
         return outcome
 
     def stop(self) -> None:
-        """Let the process end; nothing is being computed."""
+        """End the process, which is idle."""
         process, self._process = self._process, None
         if process is not None:
             _close(process)
-        with suppress(OSError):  # in a store that cannot be written any more it stays
+        with suppress(OSError):  # it stays if the cache cannot be written any more
             self.errors.unlink(missing_ok=True)
 
     def kill(self) -> None:
@@ -90,30 +89,30 @@ class WorkerProcess:
     def _start(self) -> subprocess.Popen[bytes]:
         environment = dict(os.environ)
         bound_environment(environment, self.threads)
-        path = json.dumps([place for place in sys.path if place])  # "" would be the folder where it happens to run
+        path = json.dumps([place for place in sys.path if place])  # "" would mean the current folder
         self.served, self.refused, self._ready, self._too_late = 0, False, False, False
         with self.errors.open("wb") as errors:
-            self._process = subprocess.Popen(  # noqa: S603 (it is ourselves)
+            self._process = subprocess.Popen(  # noqa: S603 (our own code)
                 [sys.executable, "-P", "-X", "faulthandler", "-c", _BOOT, path],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=errors,
                 env=environment,
-                # Ctrl-C in a terminal goes to a whole group; it is for the one who started us to pass on.
+                # Ctrl-C in a terminal reaches a whole process group; only the main process should get it.
                 start_new_session=os.name == "posix",
                 creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
             )
         return self._process
 
-    def _listen(self, process: subprocess.Popen[bytes], timer: threading.Timer | None) -> Outcome | None:
-        """Return what the worker answers, or None if it dies first."""
+    def _listen(self, process: subprocess.Popen[bytes], timer: threading.Timer | None) -> JobOutcome | None:
+        """Return the outcome from the worker, or None if it dies first."""
         assert process.stdout is not None
         for line in process.stdout:
             if not line.endswith(b"\n"):
                 return None
             answer = json.loads(line)
             if "status" in answer:
-                return Outcome.from_json(answer)
+                return JobOutcome.from_json(answer)
             self._ready = True
             if "started" in answer and timer is not None:
                 timer.start()
@@ -123,27 +122,27 @@ class WorkerProcess:
         self._too_late = True
         self.kill()
 
-    def _death(self, process: subprocess.Popen[bytes], timeout_s: float) -> Outcome:
+    def _death(self, process: subprocess.Popen[bytes], timeout_s: float) -> JobOutcome:
         self._process = None
         _close(process)
         if self._too_late:
-            return Outcome(
+            return JobOutcome(
                 "failed", cause=f"it took longer than timeout_s: {timeout_s:g}, and was ended", error="Timeout"
             )
         self.refused = not self._ready and process.returncode >= 0
         said = () if self._ready else tail(self.errors, 3)
         cause = f"its worker process died ({_how(process.returncode)})" + "".join(f"\n  {line}" for line in said)
-        return Outcome("failed", cause=cause, died=True)
+        return JobOutcome("failed", cause=cause, died=True)
 
 
 def _close(process: subprocess.Popen[bytes]) -> None:
-    """Wait for a process to end, of itself or not, and let go of its pipes."""
+    """Close the pipes of a process and wait for its end; kill it if that takes too long."""
     for pipe in (process.stdin, process.stdout):
         try:
             if pipe is not None:
                 pipe.close()
         except OSError:
-            continue  # what was not sent is not wanted any more
+            continue  # unsent data is not needed any more
     try:
         process.wait(_STOP_S)
     except subprocess.TimeoutExpired:
@@ -155,5 +154,5 @@ def _how(code: int) -> str:
     if code >= 0:
         return f"exit code {code}"
     name = signal.Signals(-code).name if -code in {number.value for number in signal.Signals} else f"signal {-code}"
-    want = ", as the system does for want of memory: declare `memory:` or use fewer --workers"
+    want = ", as the system does when memory runs out: declare `memory:` or use fewer --workers"
     return f"killed by {name}{want if name == 'SIGKILL' else ''}"

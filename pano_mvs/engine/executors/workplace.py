@@ -1,4 +1,4 @@
-"""What a worker keeps between units: the stages that it has loaded and the stores that it has opened."""
+"""Serve requests in a worker, which keeps loaded stages and opened caches between units."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from pano_mvs.core.paths import resolved
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.code.plugin_digest import code_digest
 from pano_mvs.engine.executors.perform import perform
-from pano_mvs.engine.executors.protocol import Outcome
-from pano_mvs.engine.executors.unit_text import unit_from_json
+from pano_mvs.engine.executors.protocol import JobOutcome
+from pano_mvs.engine.executors.unit_json import unit_from_json
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import StageSpec
 
 
-def run_request(request: Mapping[str, Any]) -> Outcome:
-    """Compute the unit of a request, see `request_to_json`."""
+def run_request(request: Mapping[str, Any]) -> JobOutcome:
+    """Compute the unit of a request; see `request_to_json`."""
     try:
         store = _store(*request["store"])
         files = _with_texts(request["plugins"], request.get("plugin_texts", {}))
         plugins = {files[path]: digest for path, digest in request["plugins"].items()}
         unit = unit_from_json(request["unit"], _spec(request["unit"]["use"], plugins), store)
     except PanoMvsError as error:
-        return Outcome("stopped", cause=str(error), error="UsageError")
+        return JobOutcome("stopped", cause=str(error), error="UsageError")
     outcome = perform(unit, store, threads=request["threads"], log=Path(request["log"]))
-    for path, here in files.items():  # whoever reads of a failure knows the file where it came from
+    for path, here in files.items():  # name the original file rather than the copy here
         if here != path:
             outcome = replace(outcome, cause=outcome.cause.replace(here, path), trace=outcome.trace.replace(here, path))
     return outcome
 
 
 def _with_texts(plugins: Mapping[str, str], texts: Mapping[str, Any]) -> dict[str, str]:
-    """Return where each plugin file is: those whose text came along are in a folder of our own."""
+    """Return the path of each plugin file; files sent with the request are written to a temporary folder."""
     return {path: _written(digest, *texts[path]) if path in texts else path for path, digest in plugins.items()}
 
 
@@ -51,15 +51,17 @@ def _written(digest: str, name: str, texts: Mapping[str, str]) -> str:
         for relative, text in texts.items():
             path = Path(folder.name) / relative
             if not resolved(path).is_relative_to(resolved(Path(folder.name))):
-                raise UsageError(f"plugin {name} imports {relative}, which is not beside it: it cannot be sent along")
+                raise UsageError(
+                    f"plugin {name} imports {relative}, which is not beside it, so that it cannot be sent to workers"
+                )
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
     return str(Path(_folders[digest].name) / name)
 
 
 @cache
-def _store(root: str, durable: bool, least_free_bytes: int) -> Store:
-    return Store(Path(root), durable=durable, least_free_bytes=least_free_bytes)
+def _store(root: str, durable: bool, min_free_bytes: int) -> Store:
+    return Store(Path(root), durable=durable, min_free_bytes=min_free_bytes)
 
 
 @cache
@@ -69,26 +71,28 @@ def _installed() -> Registry:
 
 @cache
 def _of_files(plugins: tuple[tuple[str, str], ...]) -> Registry:
-    """Load plugin files; those whose code has changed are others.
+    """Load plugin files with the given digests of their code.
 
     Raises:
-        UsageError: if their code is not what was asked for.
+        UsageError: if a file has other code.
         PluginError: if one cannot be loaded.
     """
     registry = Registry()
     for path, digest in plugins:
         registry.add_file(Path(path))
         if code_digest(Path(path)) != digest:
-            raise UsageError(f"plugin {path} is not the same in the worker: it was changed while the workflow ran. Run "
-                             "the same command again")  # fmt: skip
+            raise UsageError(
+                f"plugin {path} is not the same in the worker: it was changed during the run. Run "
+                "the same command again"
+            )
     return registry
 
 
 def _spec(name: str, plugins: Mapping[str, str]) -> StageSpec:
-    """Return a stage, a plugin's or an installed one; whichever it is, it may use parts that plugins add."""
+    """Return a stage by name, from the plugin files or the installed ones, after loading what it may use."""
     spec = _of_files(tuple(plugins.items())).stages.get(name)
     if spec is None:
-        # Before its first unit: numba takes its greatest number of threads from the environment when it is loaded.
+        # Before the first unit, because numba reads its maximum number of threads when it is loaded.
         importlib.import_module("numba")
         spec = _installed().stages.get(name)
     if spec is None:

@@ -1,1 +1,1 @@
-"""From a wired workflow to units of work with cache keys: what is cached, what has to run and why."""
+"""Find the units of work of a workflow and their cache keys: which are cached, which must run, and why."""

@@ -1,4 +1,4 @@
-"""What a run would do: per unit cached, run (and why), or may run because it waits for an output."""
+"""What a run would do with each unit: find it in the cache, compute it (and why), or decide later."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.planning.reasons import reason_to_run
 from pano_mvs.engine.planning.resolve import resolve
+from pano_mvs.engine.planning.run_options import DEFAULT_OPTIONS, RunOptions
 from pano_mvs.engine.planning.units import StageState, Unit
-from pano_mvs.engine.running.options import NO_DEMANDS, Demands
 from pano_mvs.engine.workflows.wiring import Graph
 from pano_mvs.engine.workflows.workflow import Workflow
 
@@ -21,9 +21,9 @@ class StagePlan:
     Attributes:
         name: of the stage in the workflow.
         use: of the stage in the registry.
-        cached: units that would not run.
-        run: unit to the reason why it would.
-        may_run: units that wait for an output, which may turn out the same.
+        cached: units that are in the cache.
+        run: unit that would be computed, to the reason.
+        may_run: units that depend on units that would be computed; they run if these give other results.
         blocked: unit to the reason why it cannot run.
         open: whether the number of units is not known yet.
     """
@@ -41,42 +41,40 @@ def make_plan(
     workflow: Workflow,
     graph: Graph,
     store: Store,
-    workflow_id: str,
-    demands: Demands = NO_DEMANDS,
     *,
+    options: RunOptions = DEFAULT_OPTIONS,
     visit: Callable[[Unit, UnitRecord | None, str], None] | None = None,
 ) -> list[StagePlan]:
     """Return what a run would do, stage by stage, without running anything.
 
     Args:
-        workflow: as the run would see it, likewise its graph.
-        graph: wired.
-        store: where finished units are.
-        workflow_id: under which the latest run is remembered.
-        demands: what is asked of the run.
-        visit: called for each unit whose inputs are known, with its record if it has one, else the reason to run.
+        workflow: with the options applied.
+        graph: likewise.
+        store: the cache.
+        options: of the run.
+        visit: called for each unit whose inputs are known, with its record or None, and the reason to compute it.
 
     Raises:
         InputError: if the source cannot be listed.
     """
-    last = store.runs.last_keys(workflow_id)
+    last = store.runs.last_keys(workflow.id)
     states: dict[str, StageState] = {}
     plans: list[StagePlan] = []
     for name in graph.order:
         entry = workflow.stages[name]
         state, plan = StageState(graph.axes[name]), StagePlan(name, entry.spec.name)
-        units, resolution = resolve(entry, graph, states, store)
+        units, resolution = resolve(entry, graph, states=states, store=store)
         for unit in units:
             record = None
-            if not demands.refreshes(unit):
+            if not options.refreshes(unit):
                 last_key = last.get(name, {}).get(unit.item)
-                record = store.find(unit.key) or demands.acceptable(unit, last_key, store)
+                record = store.find(unit.key) or options.acceptable(unit, last_key, store)
             if record is not None:
                 settle(state, unit, record)
                 plan.cached.append(unit.item)
             else:
                 state.pending.add(unit.item)
-                plan.run[unit.item] = _reason(unit, last.get(name, {}), store, demands)
+                plan.run[unit.item] = _reason(unit, last.get(name, {}), store, is_asked=options.refreshes(unit))
             if visit is not None:
                 visit(unit, record, plan.run.get(unit.item, ""))
         state.members, state.failed = resolution.members, resolution.blocked
@@ -89,12 +87,12 @@ def make_plan(
 
 
 def settle(state: StageState, unit: Unit, record: UnitRecord) -> None:
-    """Enter a unit's stored value into its stage's state."""
+    """Enter a unit's result into the state of its stage."""
     state.items[unit.item] = record.output
     state.exploded.update(record.items)
 
 
-def _reason(unit: Unit, last: Mapping[str, str], store: Store, demands: Demands) -> str:
-    if demands.refreshes(unit):
-        return "asked for"
+def _reason(unit: Unit, last: Mapping[str, str], store: Store, *, is_asked: bool) -> str:
+    if is_asked:
+        return "--refresh"
     return reason_to_run(unit, last.get(unit.item), store)

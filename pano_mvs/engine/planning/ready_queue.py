@@ -1,8 +1,8 @@
-"""Which units can run now: each as soon as its own inputs exist, gathers when all that they gather does.
+"""The units of work that can run now: each becomes ready as soon as its own inputs exist.
 
-A unit waits for tokens: that one unit of a producer is settled (it has a result, or will have none), or that a whole
-stage is complete. A stage's list of units waits for the lists of its producers. Every order in here follows the
-workflow and the capture, never the clock.
+A unit waits for tokens. A token stands for one settled unit of a producing stage (it has a result, or cannot have one)
+or for a whole stage that is complete. The list of a stage's units waits for the lists of the stages that feed it. Every
+order in this module follows the workflow and the capture, never the time at which something happened.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Protocol, TypeAlias
 
 from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
 from pano_mvs.engine.planning.resolve import Resolver, resolve_source
-from pano_mvs.engine.planning.source_listing import Listing
+from pano_mvs.engine.planning.source_listing import SourceListing
 from pano_mvs.engine.planning.units import WHOLE, StageState, Unit
 from pano_mvs.engine.stages.ports import Cardinality
 from pano_mvs.engine.stages.stage import INDEX_PORT
@@ -23,23 +23,23 @@ from pano_mvs.engine.workflows.wiring import Edge, Graph
 from pano_mvs.engine.workflows.workflow import StageEntry, Workflow
 
 Token: TypeAlias = "tuple[str, str | None]"  # noqa: S105 (no password)
-"""A unit that is settled; with None for the unit, a stage that is complete."""
+"""Stage and unit, for a unit that is settled; stage and None, for a stage that is complete."""
 
 
 class Listener(Protocol):
-    """Hears how a run's stages come along."""
+    """Is notified of the progress of the stages."""
 
     def source_listed(self, entry: StageEntry, notes: Mapping[str, tuple[str, ...]]) -> None:
-        """A source's images are known, with what there is to say of each."""
+        """The images of a source are known, with the notes on each."""
 
     def stage_opened(self, entry: StageEntry) -> None:
-        """A stage's units are known."""
+        """The units of a stage are known."""
 
     def unit_blocked(self, entry: StageEntry, item: str, reason: str) -> None:
         """A unit cannot run."""
 
     def stage_complete(self, entry: StageEntry) -> None:
-        """All units of a stage are settled; to raise an error here keeps back what waits for the stage."""
+        """All units of a stage are settled; an error raised here stops what waits for the stage."""
 
 
 @dataclass(slots=True)
@@ -48,26 +48,31 @@ class _Stage:
     position: int
     edges: Mapping[str, Edge]
     resolver: Resolver
-    waits: set[str] = field(default_factory=set)  # producers whose list, or whose end, it needs to list its units
     rank: dict[str, int] = field(default_factory=dict)
-    missing: dict[str, int] = field(default_factory=dict)  # unit to the number of tokens that it still waits for
+    missing: dict[str, int] = field(default_factory=dict)  # unit to the number of tokens it still waits for
     found: dict[str, Unit] = field(default_factory=dict)  # a source's units
     collections: dict[str, Mapping[str, ItemRef]] = field(default_factory=dict)
     unsettled: int = 0
 
 
-class Board:
-    """What is known of all stages while a run goes on.
+class ReadyQueue:
+    """The state of all stages during a pass, and the units that can run.
 
     Attributes:
-        states: stage to what it has made, in the order of the workflow.
-        listing: what the sources offer.
+        states: stage to its results so far, in the order of the workflow.
+        listing: the items of the sources.
     """
 
     def __init__(
-        self, workflow: Workflow, graph: Graph, store: Store, listener: Listener, listing: Listing | None = None
+        self,
+        workflow: Workflow,
+        graph: Graph,
+        store: Store,
+        *,
+        listener: Listener,
+        listing: SourceListing | None = None,
     ) -> None:
-        self.listing = listing or Listing()
+        self.listing = listing or SourceListing()
         self.states = {name: StageState(graph.axes[name], open=True) for name in graph.order}
         self._store = store
         self._only = graph.only
@@ -77,7 +82,7 @@ class Board:
                 (entry := workflow.stages[name]),
                 position,
                 graph.edges[name],
-                Resolver(entry, graph, self.states, store),
+                Resolver(entry, graph, states=self.states, store=store),
             )
             for position, name in enumerate(graph.order)
         }
@@ -87,14 +92,14 @@ class Board:
         self._work: deque[Token] = deque()
 
     def start(self) -> None:
-        """Open the stages that wait for nothing; those behind them follow."""
+        """List the units of the stages that wait for nothing, and of those behind them as far as possible."""
         for name in self.states:
             if self.states[name].open:
                 self._open_if_known(name)
         self._spread()
 
     def next_unit(self) -> Unit | None:
-        """Return the first unit, in the order of the workflow, that can run; None if all others wait or are settled."""
+        """Return the first unit, in the order of the workflow, that can run; None if all wait or are settled."""
         while self._ready:
             _, _, name, item = heapq.heappop(self._ready)
             stage = self._stages[name]
@@ -106,7 +111,7 @@ class Board:
         return None
 
     def finish(self, unit: Unit, record: UnitRecord) -> None:
-        """Enter a unit's result."""
+        """Enter a unit's result, which may make other units ready."""
         name = unit.entry.name
         self.states[name].items[unit.item] = record.output
         if record.items:
@@ -115,13 +120,13 @@ class Board:
         self._spread()
 
     def fail(self, unit: Unit, cause: str) -> None:
-        """Enter that a unit has no result."""
+        """Record that a unit has no result."""
         self.states[unit.entry.name].failed[unit.item] = cause
         self._settle(unit.entry.name, unit.item)
         self._spread()
 
     def withdraw(self, stage: str, item: str, cause: str) -> None:
-        """Enter that a unit of a stage that is not complete yet has lost its result."""
+        """Record that a unit has lost its result; its stage must not be complete yet."""
         self.states[stage].items.pop(item, None)
         self.states[stage].failed[item] = cause
         self._stages[stage].collections.pop(item, None)
@@ -130,12 +135,12 @@ class Board:
         """Return the stages that feed a stage."""
         return {edge.producer for edge in self._stages[stage].edges.values()}
 
-    def place(self, stage: str, item: str) -> tuple[int, int]:
-        """Return where a unit stands in the order of the workflow and of the capture."""
+    def position_of(self, stage: str, item: str) -> tuple[int, int]:
+        """Return the position of a unit in the workflow and in the capture, for sorting."""
         return self._stages[stage].position, self._stages[stage].rank.get(item, 0)
 
     def _spread(self) -> None:
-        """Tell those that wait, until nothing follows any more."""
+        """Hand out the new tokens, until no further ones result."""
         while self._work:
             token = self._work.popleft()
             for name, item in self._waiting.pop(token, ()):
@@ -152,7 +157,7 @@ class Board:
                 self._open_if_known(name)
 
     def _open_if_known(self, name: str) -> None:
-        """List a stage's units, if those of its producers are listed and an index, or a collection, is there."""
+        """List a stage's units, if those of its producers are listed and its index, or collection, exists."""
         stage, state = self._stages[name], self.states[name]
         for port, edge in stage.edges.items():
             lists_units = port == INDEX_PORT or (edge.exploded and edge.port.cardinality is Cardinality.EACH)
@@ -164,7 +169,8 @@ class Board:
             members = stage.resolver.unit_names()
             assert members is not None, name
             blocked = stage.resolver.resolution.blocked
-            state.members = dict(members) if not isinstance(members, dict) else members  # no second one of a million
+            # There may be a million members: a dict is not copied.
+            state.members = members if isinstance(members, dict) else dict(members)
         items = [*state.members, *(item for item in blocked if item not in state.members)]
         stage.rank = {item: rank for rank, item in enumerate(items)}
         stage.unsettled, state.open = len(items), False
@@ -180,15 +186,17 @@ class Board:
         self._open_behind(name)
 
     def _list_source(self, stage: _Stage, state: StageState) -> Mapping[str, str]:
-        resolution = resolve_source(stage.entry, self._store, self._only.get(stage.entry.name), self.listing)
+        resolution = resolve_source(
+            stage.entry, self._store, only=self._only.get(stage.entry.name), listing=self.listing
+        )
         stage.found = {unit.item: unit for unit in resolution.units}
         state.members.update(resolution.members)
-        said = {unit.item: unit.source.notes for unit in resolution.units if unit.source}
-        self._listener.source_listed(stage.entry, {item: said.get(item, ()) for item in resolution.members})
+        notes = {unit.item: unit.source.notes for unit in resolution.units if unit.source}
+        self._listener.source_listed(stage.entry, {item: notes.get(item, ()) for item in resolution.members})
         return resolution.blocked
 
     def _wait(self, stage: _Stage, item: str) -> None:
-        tokens = {token for token in self._needs(stage, item) if not self._is_there(token)}
+        tokens = {token for token in self._needs(stage, item) if not self._is_available(token)}
         if not tokens:
             heapq.heappush(self._ready, (stage.position, stage.rank[item], stage.entry.name, item))
             return
@@ -199,19 +207,19 @@ class Board:
     def _needs(self, stage: _Stage, item: str) -> Iterator[Token]:
         for edge in stage.edges.values():
             producer, cardinality = edge.producer, edge.port.cardinality
-            if edge.exploded or cardinality in (Cardinality.ALL, Cardinality.NAMES) or self._is_gated(producer):
+            if edge.exploded or cardinality in (Cardinality.ALL, Cardinality.NAMES) or self._has_threshold(producer):
                 yield producer, None
             elif cardinality is Cardinality.NEAR:
                 yield from ((producer, near) for near in stage.resolver.near[item])
             else:
                 yield producer, item if cardinality is Cardinality.EACH else WHOLE
 
-    def _is_gated(self, name: str) -> bool:
-        """Return whether nothing may follow a stage before it has passed what its entry asks for."""
+    def _has_threshold(self, name: str) -> bool:
+        """Return whether the stages behind a stage must wait until it has reached its thresholds."""
         policy = self._stages[name].entry.policy
         return bool(policy.gate) or policy.min_success > 0
 
-    def _is_there(self, token: Token) -> bool:
+    def _is_available(self, token: Token) -> bool:
         name, item = token
         return name in self._complete if item is None else item not in self.states[name].pending
 
@@ -230,12 +238,12 @@ class Board:
             self._end(name)
 
     def _end(self, name: str) -> None:
-        """Put a stage's results in order, whatever the order in which they came."""
+        """Complete a stage: put its results in order, whichever came first."""
         stage, state = self._stages[name], self.states[name]
         state.items = {item: state.items[item] for item in stage.rank if item in state.items}
         state.failed = {item: state.failed[item] for item in stage.rank if item in state.failed}
         state.exploded = {key: ref for item in stage.rank for key, ref in stage.collections.get(item, {}).items()}
-        state.pending, stage.missing = set(), {}  # an empty set or dict keeps the room that it once needed
+        state.pending, stage.missing = set(), {}  # an emptied set or dict would keep its memory
         self._listener.stage_complete(stage.entry)
         self._complete.add(name)
         self._work.append((name, None))

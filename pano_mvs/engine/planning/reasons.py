@@ -1,4 +1,4 @@
-"""Why a unit has to run: the difference between what its key was made of last time and now."""
+"""Why a unit has to be computed: the difference between its identity in the last run and now."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ _SHOWN = 3
 
 
 def reason_to_run(unit: Unit, last_key: str | None, store: Store) -> str:
-    """Return in words why a unit is not cached.
+    """Return why a unit is not in the cache.
 
     Args:
-        unit: the unit, whose key the store does not have.
-        last_key: its key in the latest run of this workflow, if it was part of it.
-        store: where the record of that run may still be.
+        unit: the unit.
+        last_key: its key in the latest run of this workflow; None if it was not part of that run.
+        store: the cache, which may still have the record of that run.
     """
     if last_key is None:
         return "new"
     if last_key == unit.key:
-        return "its cached result is gone or damaged, or it did not finish"
+        return "its cached result is missing or damaged, or it did not finish"
     last = store.read_record(last_key)
     if last is None:
-        return "changed (its last record is gone)"
+        return "changed (the record of the last run is missing)"
     before, now = last.identity, unit.identity
     if before.get("schema") != now["schema"]:
-        return "its key is made differently in this version"
+        return "this version makes its key differently"
     differences = [
         *_differences("param", before.get("params", {}), now["params"]),
         *_inputs(unit, before.get("inputs", {}), now["inputs"]),
@@ -42,17 +42,17 @@ def reason_to_run(unit: Unit, last_key: str | None, store: Store) -> str:
         differences.insert(0, f"code of {now['stage']} changed{file}")
     differences.extend(_upgrades(before.get("libraries"), now["libraries"]))
     differences.extend(_differences("kind", before.get("kinds", {}), now["kinds"]))
-    return "; ".join(differences) or "its key is made differently in this version"
+    return "; ".join(differences) or "this version makes its key differently"
 
 
 def only_the_code_differs(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
-    """Return whether two identities are of the same stage, settings and inputs, and of different code or libraries."""
+    """Return whether two identities differ, and only in the code or the libraries."""
     parts = {*before, *now} - OF_CODE
     return before != now and all(name in before and name in now and before[name] == now[name] for name in parts)
 
 
 def _upgrades(before: object, now: Mapping[str, str]) -> list[str]:
-    """Return the libraries of another version; where the code changed too, it may use others than before."""
+    """Return the changed versions of the libraries that both identities name."""
     if not isinstance(before, Mapping):
         return []
     return [f"{name} {before[name]} → {now[name]}" for name in sorted({*before} & {*now}) if before[name] != now[name]]
@@ -77,11 +77,11 @@ def _inputs(unit: Unit, before: Mapping[str, Any], now: Mapping[str, Any]) -> li
         if unit.source is not None:
             changed.extend(f"input {path.name}" for path in unit.source.files.values())
         else:
-            changed.append(f"input {port}: {_changed_items(unit, port, old, new)}")
+            changed.append(f"input {port}: {_changed_items(unit, port, old=old, new=new)}")
     return changed
 
 
-def _changed_items(unit: Unit, port: str, old: Any, new: Any) -> str:
+def _changed_items(unit: Unit, port: str, *, old: Any, new: Any) -> str:
     value = unit.inputs.get(port)
     if value is None or isinstance(value, ItemRef):
         return unit.item or "changed"

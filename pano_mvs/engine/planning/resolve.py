@@ -1,4 +1,4 @@
-"""From a wired stage and what its producers made to the units of work, each with its cache key."""
+"""Find the units of work of a stage from the results of the stages that feed it, and make their cache keys."""
 
 from __future__ import annotations
 
@@ -11,37 +11,37 @@ from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.file_names import item_problem
 from pano_mvs.engine.cache.store import ItemRef, Store
-from pano_mvs.engine.code.stage_code import stage_code
-from pano_mvs.engine.planning.source_listing import Listing
+from pano_mvs.engine.planning.source_listing import SourceListing
 from pano_mvs.engine.planning.units import PENDING, WHOLE, Resolution, StageState, Unit, UnitInput
 from pano_mvs.engine.stages.params import key_fields
 from pano_mvs.engine.stages.ports import Cardinality
 from pano_mvs.engine.stages.stage import INDEX_PORT
+from pano_mvs.engine.stages.stage_code import stage_code
 from pano_mvs.engine.workflows.wiring import Edge, Graph
 from pano_mvs.engine.workflows.workflow import StageEntry
 from pano_mvs.scene import Axis, Pairs, Record, Views
 
 KEY_SCHEMA = 3
-"""Raise it when the engine gives stages other inputs, seeds or settings for the same key, or makes keys differently."""
+"""Raise this if the engine passes other inputs, seeds or settings for the same key, or makes keys differently."""
 
-_SHOWN = 20
+_MAX_SHOWN = 20
 
 
 def resolve_source(
-    entry: StageEntry, store: Store, only: frozenset[str] | None = None, listing: Listing | None = None
+    entry: StageEntry, store: Store, *, only: frozenset[str] | None = None, listing: SourceListing | None = None
 ) -> Resolution:
-    """List a source's items and return a unit for each, or for those that are asked for.
+    """List the items of a source, and return a unit for each.
 
     Args:
         entry: the source.
-        store: where its units are.
-        only: names of the items that are asked for; None for all.
-        listing: what the run has listed so far; None to list anew.
+        store: the cache.
+        only: names of the items to return; None for all.
+        listing: what the run has listed so far; None to list the items again.
 
     Raises:
         InputError: if the list cannot be made, or names an item twice.
     """
-    listing = listing or Listing()
+    listing = listing or SourceListing()
     resolution = Resolution()
     static = _static_identity(entry, store)
     common = digest_from_value(static)
@@ -61,36 +61,38 @@ def resolve_source(
             continue
         inputs = {"files": digests, "name": item.name}
         key = _key(common, inputs)
-        unit = Unit(entry, item.name, (item.name,), {}, key, static | {"inputs": inputs},
-                    replace(item, digests=digests))  # fmt: skip
+        unit = Unit(
+            entry, item.name, (item.name,), {}, key, static | {"inputs": inputs}, replace(item, digests=digests)
+        )
         resolution.units.append(unit)
     return resolution
 
 
 def resolve(
-    entry: StageEntry, graph: Graph, states: Mapping[str, StageState], store: Store
+    entry: StageEntry, graph: Graph, *, states: Mapping[str, StageState], store: Store
 ) -> tuple[Iterator[Unit], Resolution]:
-    """Return a stage's units one at a time, given the states of its producers.
+    """Return the units of a stage, given the states of the stages that feed it.
 
     Returns:
-        The units whose inputs are all known, and what is known of the others, which is complete once all units have
-        been taken. A stage may have a million units, whose inputs take more memory than all else.
+        An iterator over the units whose inputs are all known, and a resolution that describes the others once the
+        iterator is exhausted. The units come one at a time because a stage may have a million of them, whose inputs
+        take more memory than everything else.
     """
     if entry.spec.list_items is not None:
-        resolution = resolve_source(entry, store, graph.only.get(entry.name))
+        resolution = resolve_source(entry, store, only=graph.only.get(entry.name))
         return iter(resolution.units), resolution
-    resolver = Resolver(entry, graph, states, store)
+    resolver = Resolver(entry, graph, states=states, store=store)
     return resolver.resolve(), resolver.resolution
 
 
 class Resolver:
-    """Finds the units of a stage that is not a source: all at once for a plan, one by one in a run.
+    """Finds the units of a stage that is not a source: all in turn for a plan, or one by name in a run.
 
     Attributes:
-        near: unit to its neighbours, once the unit names are known and where the stage has an index.
+        near: unit to its neighbours, if the stage has an index and its unit names are known.
     """
 
-    def __init__(self, entry: StageEntry, graph: Graph, states: Mapping[str, StageState], store: Store) -> None:
+    def __init__(self, entry: StageEntry, graph: Graph, *, states: Mapping[str, StageState], store: Store) -> None:
         self.entry = entry
         self.axis = graph.axes[entry.name]
         self.edges = edges = graph.edges[entry.name]
@@ -116,25 +118,27 @@ class Resolver:
                 yield self.resolution.units.pop()
 
     def unit(self, name: str, members: tuple[str, ...]) -> Unit | str:
-        """Return a unit whose inputs have all been tried, or the reason why it cannot run."""
+        """Return a unit whose inputs are all settled, or the reason why it cannot run."""
         self.resolution = Resolution()
         self._add(name, members)
         assert not self.resolution.waiting, name
         return self.resolution.units[0] if self.resolution.units else self.resolution.blocked[name]
 
     def unit_names(self) -> Mapping[str, tuple[str, ...]] | None:
-        """Return the stage's units and the images each is about, or None if they are not known yet.
+        """Return the units of the stage and the images that each concerns, or None if they are not known yet.
 
         Raises:
-            UsageError: if the run is confined to a unit that there is not.
+            UsageError: if the run is limited to a unit that does not exist.
         """
         names = self._all_names()
         if names is None or self.only is None:
             return names
         missing = sorted(self.only - names.keys())
         if missing:
-            raise UsageError(f"{self.entry.name} has no unit {missing[0]!r}; it has: {', '.join(list(names)[:_SHOWN])}"
-                             f"{' …' if len(names) > _SHOWN else ''}")  # fmt: skip
+            raise UsageError(
+                f"{self.entry.name} has no unit {missing[0]!r}; it has: {', '.join(list(names)[:_MAX_SHOWN])}"
+                f"{' …' if len(names) > _MAX_SHOWN else ''}"
+            )
         return {name: names[name] for name in names if name in self.only}
 
     def _all_names(self) -> Mapping[str, tuple[str, ...]] | None:
@@ -167,7 +171,7 @@ class Resolver:
             return {}
         index = self.store.load(state.items[WHOLE], edge.port.kind)
         assert isinstance(index, Pairs | Views)
-        # Each name comes as often as the image has neighbours, each time as a string of its own.
+        # A name occurs once for each neighbour of the image, each time as a separate string: share them.
         self.near = {name: tuple(map(intern, members)) for name, members in index.units().items()}
         if self.axis is Axis.PAIR:
             return self.near
@@ -198,7 +202,7 @@ class Resolver:
         self.resolution.units.append(Unit(self.entry, name, members, inputs, _key(self._common, encoded), identity))
 
     def _input(self, edge: Edge, name: str) -> tuple[UnitInput, str, bool]:
-        """Return what a unit reads at a port, why it cannot, and whether that is not known yet."""
+        """Return a unit's input at a port, the reason why there is none, and whether it is not known yet."""
         state = self.states[edge.producer]
         items = state.exploded if edge.exploded else state.items
         match edge.port.cardinality:
@@ -209,11 +213,13 @@ class Resolver:
             case Cardinality.NEAR:
                 wanted = self._near(name)
             case Cardinality.NAMES if not state.open and not edge.exploded:
-                # A plan takes pending units for ones that will succeed: their names are known, their values are not.
+                # A plan assumes that pending units will succeed: their names are known, their values are not.
                 names = [item for item in state.members if item in items or item in state.pending]
-                return ({item: items.get(item, PENDING) for item in names}, "", False) if names else (
-                    None, self._why(edge, state, ""), False
-                )  # fmt: skip
+                return (
+                    ({item: items.get(item, PENDING) for item in names}, "", False)
+                    if names
+                    else (None, self._why(edge, state, ""), False)
+                )
             case Cardinality.ALL | Cardinality.NAMES:
                 if state.open or state.pending:
                     return None, "", True
@@ -232,7 +238,7 @@ class Resolver:
         return None, self._why(edge, state, wanted[0]), False
 
     def _near(self, name: str) -> list[str]:
-        """Return a unit's neighbours that every Near port has or may come to have, so that all ports stay in step."""
+        """Return a unit's neighbours that every Near port has or may still get, so that all ports agree."""
         return [item for item in self.near[name] if all(self._may_have(edge, item) for edge in self._near_edges)]
 
     def _may_have(self, edge: Edge, item: str) -> bool:
@@ -243,14 +249,14 @@ class Resolver:
 
     @staticmethod
     def _why(edge: Edge, state: StageState, item: str) -> str:
-        """Say what is missing; of a single item, whether others of its stage have failed meanwhile does not matter."""
+        """Return what is missing: for a single item, it does not matter whether others of its stage have failed."""
         item = WHOLE if WHOLE in state.failed else item
         what = f"{edge.producer}:{item}" if item else edge.producer
         failed = item in state.failed if item else bool(state.failed)
         return f"needs {what}, which {'failed' if failed else 'has no result'}"
 
     def _encode(self, port: str, value: UnitInput) -> Any:
-        """Return what of an input counts towards the key: its digests, with names only where the stage sees them."""
+        """Return the part of an input that counts towards the key: digests, and names where the stage sees them."""
         if value is None:
             return None
         if isinstance(value, ItemRef):
@@ -264,7 +270,7 @@ class Resolver:
 
 
 def _key(common: str, inputs: Mapping[str, Any]) -> str:
-    """Return a unit's key: what its stage has in common with all its units is encoded once, not for each."""
+    """Return a unit's key; `common` is the digest of what all units of the stage share, encoded only once."""
     return digest_from_value([common, inputs])
 
 

@@ -1,7 +1,7 @@
-"""What the sources of a run listed when it began: later passes of the same run use the same list.
+"""The items that the sources of a run listed at its start; later passes of the run use the same list.
 
-A file that changed or vanished after it was listed costs its item. The item is taken out, and the run goes over its
-stages once more: every result is then the same as that of a capture without the item, whenever the file changed.
+If a file changes or disappears after it was listed, its item is left out and the run makes another pass. All results
+are then those of a capture without the item, no matter when the file changed.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ class _ListedFile:
 
 
 @dataclass(slots=True)
-class Listing:
-    """The items of a run's sources, and the digests under which their files are used.
+class SourceListing:
+    """The items of the sources of a run, and the digests of their files.
 
     Attributes:
-        lost: file to the reason why it cannot be used any more in this run.
+        lost: file to the reason why this run cannot use it any more.
     """
 
     lost: dict[Path, str] = field(default_factory=dict)
@@ -38,7 +38,7 @@ class Listing:
     _reported: dict[Path, str] = field(default_factory=dict)
 
     def items(self, entry: StageEntry) -> tuple[SourceItem, ...]:
-        """Return what a source offers, as it was when it was first asked.
+        """Return the items of a source, as they were when it first listed them.
 
         Raises:
             InputError: if the list cannot be made.
@@ -49,10 +49,10 @@ class Listing:
         return self._items[entry.name]
 
     def digest(self, path: Path, store: Store) -> str:
-        """Return the digest of a listed file, and make the file findable by it.
+        """Return the digest of a listed file, and register the file with the store under it.
 
         Raises:
-            ChangedFileError: if the file is not the one that was listed.
+            ChangedFileError: if the file has changed since it was listed.
             InputError: if it cannot be read.
         """
         if path in self.lost:
@@ -63,7 +63,7 @@ class Listing:
         return known.digest
 
     def report(self, changed: Mapping[str, str]) -> bool:
-        """Take note of files that a unit did not find as they were listed; return whether any of them was listed."""
+        """Record files that a unit found changed; return whether any of them is a listed one."""
         known = {Path(path): reason for path, reason in changed.items()}
         by_absolute = {path.absolute(): path for path in self._files}
         found = {by_absolute[path.absolute()]: why for path, why in known.items() if path.absolute() in by_absolute}
@@ -71,7 +71,7 @@ class Listing:
         return bool(found)
 
     def _listed(self, path: Path, store: Store) -> _ListedFile:
-        state = store.stat_cache.state(path)  # first: what changes from here on is noticed
+        state = store.stat_cache.state(path)  # before the digest, so that later changes are noticed
         try:
             return _ListedFile(store.blobs.register_external(path), state)
         except InputError as error:
@@ -79,7 +79,7 @@ class Listing:
             raise
 
     def _checked(self, path: Path, known: _ListedFile, store: Store) -> _ListedFile:
-        """Return a file as it is listed from now on: as before, or as it really was if the stat cache was wrong."""
+        """Return the entry of a file: as before, or with the right digest if the stat cache had a wrong one."""
         reason = self._reported.pop(path, "")
         try:
             if reason:
@@ -90,7 +90,7 @@ class Listing:
             raise ChangedFileError(self.lost[path], path) from error
         state = store.stat_cache.state(path)
         if digest != known.digest and state == known.state and reason:
-            return _ListedFile(digest, state)  # nobody has touched it: a damaged stat cache had another digest for it
+            return _ListedFile(digest, state)  # the file is unchanged: a damaged stat cache had a wrong digest
         if digest != known.digest or reason:
             self.lost[path] = reason or changed_text(path)
             raise ChangedFileError(self.lost[path], path)

@@ -1,40 +1,41 @@
-"""Units of work, and what is known of a stage's in a run or in a plan."""
+"""Units of work, and the state of a stage's units in a run or in a plan."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
+from pano_mvs.engine.cache.blobs import BlobRef
 from pano_mvs.engine.cache.store import ItemRef
 from pano_mvs.engine.stages.stage import SourceItem
 from pano_mvs.engine.workflows.workflow import StageEntry
 from pano_mvs.scene import Axis
 
 WHOLE = ""
-"""The name of the one unit of a stage that has no fan-out."""
+"""The name of the unit of a stage that has only one."""
 
 PENDING = ItemRef("", "", {})
-"""Stands for an item of which only the name is known."""
+"""Placeholder for an item of which only the name is known."""
 
 OF_CODE = frozenset({"code", "libraries"})
-"""The parts of a unit's identity that say by which code it is computed, rather than what."""
+"""The parts of a unit's identity that describe the code that computes it."""
 
 UnitInput: TypeAlias = "ItemRef | dict[str, ItemRef] | None"
 
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """One unit of work: one image, pair, view, or a whole.
+    """One unit of work, for an image, a pair, a view, or the whole capture.
 
     Attributes:
         entry: its stage in the workflow.
-        item: its name within the stage; `WHOLE` if there is one only.
-        members: the images that it is about.
-        inputs: port to the item that it reads, or items by name for Near and All.
-        source: what to read, for units of a source.
+        item: its name within the stage; `WHOLE` if the stage has only one unit.
+        members: the images that it concerns.
+        inputs: port to the item that it reads, or to items by name for Near, All and Names.
         key: cache key.
-        identity: what the key was made of.
+        identity: what the key is made of.
+        source: the item to read, for units of a source.
     """
 
     entry: StageEntry
@@ -47,22 +48,29 @@ class Unit:
 
     @property
     def label(self) -> str:
-        """The unit as it is shown: `stage:item`."""
+        """The unit as messages show it: `stage:item`."""
         return f"{self.entry.name}:{self.item}" if self.item else self.entry.name
+
+    def input_blobs(self) -> Iterator[BlobRef]:
+        """Yield the blobs of all inputs."""
+        for value in self.inputs.values():
+            items = [value] if isinstance(value, ItemRef) else (value or {}).values()
+            for item in items:
+                yield from item.parts.values()
 
 
 @dataclass(slots=True)
 class StageState:
-    """What is known of a stage's output, in a run or in a plan.
+    """The results of a stage, in a run or in a plan.
 
     Attributes:
         axis: of its units.
         items: unit to its stored value.
         exploded: image to its item, where the value is a collection.
-        members: unit to the images that it is about.
+        members: unit to the images that it concerns.
         failed: unit to the reason why it has no value.
-        pending: units whose value is not known yet (plans only).
-        open: whether even the list of units is not known yet (plans only).
+        pending: units that are not settled.
+        open: whether the list of units is not known yet.
     """
 
     axis: Axis
@@ -79,11 +87,11 @@ class Resolution:
     """The units of a stage.
 
     Attributes:
-        units: those whose inputs are all there.
-        blocked: unit to the reason why it cannot run: an input failed.
+        units: units whose inputs all exist.
+        blocked: unit to the reason why it cannot run, such as an input that failed.
         waiting: units whose inputs are not known yet (plans only).
-        open: whether the list of units itself waits (plans only).
-        members: unit to the images that it is about.
+        open: whether the list of units is not known yet (plans only).
+        members: unit to the images that it concerns.
     """
 
     units: list[Unit] = field(default_factory=list)

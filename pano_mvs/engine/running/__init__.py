@@ -1,1 +1,1 @@
-"""Execute a workflow: start with `run`, which calls the scheduler, the dispatcher and the publisher."""
+"""Run a workflow: `run` has the whole flow and uses the dispatcher, the publisher and the statistics."""

@@ -1,4 +1,4 @@
-"""Hand units to an executor and take their outcomes back: numbers, memory, further tries, logs."""
+"""Pass units to an executor and collect the outcomes: job numbers, memory, retries, logs."""
 
 from __future__ import annotations
 
@@ -11,162 +11,168 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pano_mvs.core.files import temporary_prefix
+from pano_mvs.core.memory import size_text
 from pano_mvs.core.paths import resolved, stat_of
 from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.executors.capture import tail
-from pano_mvs.engine.executors.protocol import Executor, Job, Outcome
+from pano_mvs.engine.executors.execute import arguments_of
+from pano_mvs.engine.executors.protocol import Executor, Job, JobOutcome
 from pano_mvs.engine.planning.units import PENDING, Unit
-from pano_mvs.engine.running.execute import arguments_of
-from pano_mvs.engine.running.memory import size_text
 from pano_mvs.scene import Record
 
 LOG_FOLDER = "logs"
 _SHOWN_LINES = 20
-_TRIES_AFTER_DEATH = 2
-_COUNTED_BYTES = 300_000_000  # what reading inputs takes counts from here on; every worker has room for less
-_NOT_IN_NAMES = re.compile(r'[<>:"\\|?*\x00-\x1f]')
+_RETRIES_AFTER_DEATH = 2
+_MIN_COUNTED_BYTES = 300_000_000  # memory for reading inputs counts only above this; every worker has that much
+_INVALID_CHARACTERS = re.compile(r'[<>:"\\|?*\x00-\x1f]')
 
 
 @dataclass(frozen=True, slots=True)
-class Ended:
-    """A job that has ended, after all its tries.
+class FinishedJob:
+    """A job that has ended, after all its retries.
 
     Attributes:
-        unit: what was to be computed.
-        outcome: of the last try.
-        log: where what it printed is kept, if it printed anything.
-        said: the last lines of it.
+        unit: the unit that was to be computed.
+        outcome: what became of the last attempt.
+        log: file with what the unit printed; None if it printed nothing.
+        said: the last lines of the log.
     """
 
     unit: Unit
-    outcome: Outcome
-    log: Path | None
-    said: tuple[str, ...]
+    outcome: JobOutcome
+    log: Path | None = None
+    said: tuple[str, ...] = ()
 
 
 @dataclass(slots=True)
-class _Out:
+class _RunningJob:
     job: Job
     memory_bytes: int
-    tries: int = 1
+    attempts: int = 1
 
 
-class Desk:
-    """The jobs that are out."""
+class Dispatcher:
+    """Keeps track of the jobs that an executor is working on."""
 
-    def __init__(self, executor: Executor, store: Store, out: Path, plugins: Mapping[Path, str]) -> None:
+    def __init__(self, executor: Executor, store: Store, *, out: Path, plugins: Mapping[Path, str]) -> None:
         self._executor = executor
         self._plugins = plugins
         self._store = store
         self._logs = out / LOG_FOLDER
-        self._out: dict[int, _Out] = {}
-        self._next = 0
+        self._running: dict[int, _RunningJob] = {}
+        self._next_number = 0
         self._free_bytes = 0
-        self._loading_bytes: dict[str, int] = {}  # of inputs, by their digest
-        self._latest = ("", 0)  # the key of the unit that was asked for last, and its memory
+        self._loading_bytes: dict[str, int] = {}  # digest of an input to the memory that reading it takes
+        self._latest = ("", 0)  # key and memory of the unit that was asked for last
 
     def __len__(self) -> int:
-        """Return how many jobs are out."""
-        return len(self._out)
+        """Return the number of running jobs."""
+        return len(self._running)
 
     @property
-    def has_room(self) -> bool:
-        """Whether the executor takes a further job."""
-        return len(self._out) < self._executor.capacity
+    def has_capacity(self) -> bool:
+        """Whether the executor takes another job."""
+        return len(self._running) < self._executor.capacity
 
     def fits(self, unit: Unit) -> bool:
-        """Return whether a unit's declared memory is free beside that of those that are out."""
-        wanted = self._memory_of(unit)
-        if not wanted:
+        """Return whether the memory that a unit declares is free beside that of the running ones."""
+        needed = self._memory_of(unit)
+        if not needed:
             return True
-        used = sum(out.memory_bytes for out in self._out.values())
+        used = sum(running.memory_bytes for running in self._running.values())
         if not used:
             self._free_bytes = self._executor.free_memory_bytes()
-        return not self._free_bytes or used + wanted <= self._free_bytes
+        return not self._free_bytes or used + needed <= self._free_bytes
 
     def refusal(self, unit: Unit) -> str:
-        """Return why a unit that does not fit, though nothing else is out, cannot run at all."""
-        wanted, free = size_text(self._memory_of(unit)), size_text(self._free_bytes)
+        """Return the message for a unit that does not fit although no other one is running."""
+        needed, free = size_text(self._memory_of(unit)), size_text(self._free_bytes)
         return (
-            f"it declares {wanted} of memory, and {free} are free. Close other programs, use smaller pictures or "
-            f"settings, or say with `memory:` in stage {unit.entry.name!r} what it really needs"
+            f"it declares {needed} of memory, and {free} are free. Close other programs, use smaller images or "
+            f"settings, or state with `memory:` in stage {unit.entry.name!r} how much it really needs"
         )
 
-    def hand_out(self, unit: Unit, *, siblings: int) -> None:
-        """Give a unit to the executor; if its stage has few units, each of them may use the more threads."""
+    def submit(self, unit: Unit, *, siblings: int) -> None:
+        """Pass a unit to the executor.
+
+        Args:
+            unit: the unit.
+            siblings: number of units of its stage; if they are few, each may use more threads.
+        """
         threads = max(self._executor.threads, self._executor.cores // siblings)
         log = self._store.blobs.temporary / f"{temporary_prefix()}log-{uuid.uuid4().hex}.txt"
-        job = Job(self._next, unit, threads, unit.entry.policy.timeout_s, log, self._plugins)
-        self._next += 1
-        self._out[job.number] = _Out(job, self._memory_of(unit))
+        job = Job(self._next_number, unit, threads, unit.entry.policy.timeout_s, log, self._plugins)
+        self._next_number += 1
+        self._running[job.number] = _RunningJob(job, self._memory_of(unit))
         self._executor.submit(job)
 
-    def take(self, timeout_s: float | None = None) -> Ended | None:
-        """Return a job that has ended; one that may be tried again is, and does not count as ended."""
-        while self._out and (found := self._executor.wait(timeout_s)) is not None:
+    def next_finished(self, timeout_s: float | None = None) -> FinishedJob | None:
+        """Return a job that has ended; failed jobs are submitted again as long as they have retries left.
+
+        Args:
+            timeout_s: how long to wait for one; None waits until a job ends.
+
+        Returns:
+            The job, or None if none ended in time or none is running.
+        """
+        while self._running and (found := self._executor.wait(timeout_s)) is not None:
             number, outcome = found
-            out = self._out[number]
-            # A process may be killed for no fault of the unit: that alone costs none.
-            further = max(out.job.unit.entry.policy.retries, _TRIES_AFTER_DEATH if outcome.died else 0)
-            if outcome.status == "failed" and out.tries <= further:
-                out.tries += 1
-                self._executor.submit(out.job)
+            running = self._running[number]
+            # The system may kill a process through no fault of the unit.
+            retries = max(running.job.unit.entry.policy.retries, _RETRIES_AFTER_DEATH if outcome.died else 0)
+            if outcome.status == "failed" and running.attempts <= retries:
+                running.attempts += 1
+                self._executor.submit(running.job)
                 continue
-            del self._out[number]
-            log, said = self._keep_log(out.job)
-            return Ended(out.job.unit, outcome, log, said)
+            del self._running[number]
+            log, said = self._keep_log(running.job)
+            return FinishedJob(running.job.unit, outcome, log, said)
         return None
 
     def cancel(self) -> None:
         """End all jobs at once."""
         self._executor.cancel()
-        for out in self._out.values():
+        for running in self._running.values():
             with suppress(OSError):
-                out.job.log.unlink(missing_ok=True)
-        self._out.clear()
+                running.job.log.unlink(missing_ok=True)
+        self._running.clear()
 
     def _memory_of(self, unit: Unit) -> int:
-        """Return the bytes that a unit takes, as far as anybody says so; 0 if nobody does."""
+        """Return the bytes that a unit needs; 0 if neither the workflow, the stage nor the inputs state it."""
         if self._latest[0] != unit.key:
             loading = 0 if unit.entry.policy.memory_bytes else self._loading_of(unit)
-            counted = loading if loading >= _COUNTED_BYTES else 0
+            counted = loading if loading >= _MIN_COUNTED_BYTES else 0
             self._latest = unit.key, memory_of(unit, self._store) + counted
         return self._latest[1]
 
     def _loading_of(self, unit: Unit) -> int:
-        """Return the most that reading one of a unit's inputs takes for a moment."""
-        most = 0
-        for port in unit.entry.spec.ports:
-            value = unit.inputs.get(port.name)
-            if value is None or port.kind.loading_bytes is Record.loading_bytes:
-                continue
-            for ref in [value] if isinstance(value, ItemRef) else value.values():
-                if ref is PENDING:
-                    continue
-                if ref.digest not in self._loading_bytes:
-                    try:
-                        self._loading_bytes[ref.digest] = self._store.load(ref, port.kind).loading_bytes()
-                    except DamagedBlobError:
-                        continue  # the unit meets it too, and is computed again with what it reads
-                most = max(most, self._loading_bytes[ref.digest])
-        return most
+        """Return the temporary memory for reading the largest of a unit's inputs."""
+        return max((self._loading_of_item(ref, kind) for ref, kind in _inputs_of(unit)), default=0)
+
+    def _loading_of_item(self, ref: ItemRef, kind: type[Record]) -> int:
+        if ref.digest not in self._loading_bytes:
+            try:
+                self._loading_bytes[ref.digest] = self._store.load(ref, kind).loading_bytes()
+            except DamagedBlobError:
+                return 0  # the unit meets the damage too, and is computed again with its inputs
+        return self._loading_bytes[ref.digest]
 
     def _keep_log(self, job: Job) -> tuple[Path | None, tuple[str, ...]]:
-        """Move what a unit printed into the output folder; of an earlier run there is nothing left."""
+        """Move a unit's log into the output folder, where it replaces that of an earlier run."""
         unit = job.unit
         path = self._logs / f"{log_name(unit.entry.name, unit.item)}.log"
         said = tail(job.log, _SHOWN_LINES)
         if not resolved(path.parent).is_relative_to(resolved(self._logs.parent)):
-            return None, said  # a link, or a plugin's name of an item, leads outside
-        with suppress(OSError):  # a log is not worth failing for
+            return None, said  # a link, or the name of an item of a plugin, leads outside
+        with suppress(OSError):  # the run does not fail because of a log
             found = stat_of(job.log)
-            if found is None or found.st_size == 0:  # a process that died of it leaves an empty one
+            if found is None or found.st_size == 0:  # a process that died leaves an empty one
                 job.log.unlink(missing_ok=True)
                 path.unlink(missing_ok=True)
                 return None, said
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.unlink(missing_ok=True)  # a link there is not followed
+            path.unlink(missing_ok=True)  # so that a link there is not followed
             shutil.move(job.log, path)
             return path, said
         with suppress(OSError):
@@ -174,8 +180,20 @@ class Desk:
         return None, said
 
 
+def _inputs_of(unit: Unit) -> list[tuple[ItemRef, type[Record]]]:
+    """Return the inputs that take extra memory while they are read, each with its kind."""
+    found: list[tuple[ItemRef, type[Record]]] = []
+    for port in unit.entry.spec.ports:
+        value = unit.inputs.get(port.name)
+        if value is None or port.kind.loading_bytes is Record.loading_bytes:
+            continue
+        refs = [value] if isinstance(value, ItemRef) else value.values()
+        found.extend((ref, port.kind) for ref in refs if ref is not PENDING)
+    return found
+
+
 def memory_of(unit: Unit, store: Store) -> int:
-    """Return the bytes that a unit declares, in the workflow or else in its stage; 0 if it does not."""
+    """Return the bytes that the workflow, or else the stage, declares for a unit; 0 if neither does."""
     spec, stated = unit.entry.spec, unit.entry.policy.memory_bytes
     if stated or spec.memory_needed is None:
         return stated or spec.memory_bytes
@@ -183,10 +201,10 @@ def memory_of(unit: Unit, store: Store) -> int:
         inputs = {"item": unit.source} if unit.source is not None else arguments_of(unit, store)
         return spec.memory_needed(unit.entry.params, inputs)
     except DamagedBlobError:
-        return 0  # the unit meets it too, and is computed again with what it reads
+        return 0  # the unit meets the damage too, and is computed again with its inputs
 
 
 def log_name(stage: str, item: str) -> str:
-    """Return a unit's log relative to the folder of logs, without its suffix; every system takes such names."""
-    name = _NOT_IN_NAMES.sub("_", f"{stage}/{item}") if item else stage
+    """Return the path of a unit's log in the log folder, without its suffix, in characters that every system allows."""
+    name = _INVALID_CHARACTERS.sub("_", f"{stage}/{item}") if item else stage
     return "/".join("__" if part == ".." else part for part in name.split("/"))

@@ -1,4 +1,4 @@
-"""What a run tells while it goes on, and what it returns."""
+"""The events of a run, and its result."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
-Outcome = Literal["cached", "run", "failed", "blocked"]
+from pano_mvs.engine.workflows.workflow import StageEntry
+
+UnitStatus = Literal["cached", "run", "failed", "blocked"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,11 +19,11 @@ class Failure:
         stage: name of the stage in the workflow.
         item: the unit; empty if the stage has one only.
         cause: what went wrong and what to do.
-        trace: the Python traceback, if the stage's own code broke.
-        consequence: what the result lacks because of it.
-        blocked: whether the unit did not even run, for want of an input that failed.
-        log: file with what the unit printed, if it printed anything.
-        said: the last lines of it.
+        trace: the Python traceback, if the code of the stage failed.
+        consequence: what is missing in the results because of it.
+        blocked: whether the unit did not run because one of its inputs failed.
+        log: file with what the unit printed; empty if it printed nothing.
+        said: the last lines of the log.
     """
 
     stage: str
@@ -34,12 +36,29 @@ class Failure:
     said: tuple[str, ...] = ()
 
 
+def consequence_of(entry: StageEntry, item: str) -> str:
+    """Return what is missing in the results without a unit."""
+    kind = entry.spec.output.kind_name()
+    return f"there is no {kind} for {item}" if item else f"there is no {kind}"
+
+
 @dataclass(slots=True)
 class StageSummary:
-    """What happened in one stage; metrics are means over its units, `unit_metrics` each unit's own.
+    """What happened in one stage.
 
-    `seconds` passed from its first unit to its last, in which units of other stages may have run too; its own units
-    took `unit_seconds` together.
+    Attributes:
+        name: of the stage in the workflow.
+        use: of the stage in the registry.
+        units: number of its units.
+        cached: number of units that were found in the cache.
+        run: number of units that were computed.
+        failed: number of units that failed.
+        blocked: number of units that did not run because an input failed.
+        seconds: time from the start of its first unit to the end of its last, while other stages may have run too.
+        unit_seconds: computing time of its units together.
+        metrics: mean of each metric over the units.
+        unit_metrics: unit to its own metrics.
+        notes: what a user should know.
     """
 
     name: str
@@ -61,15 +80,17 @@ class RunResult:
     """What a run did.
 
     Attributes:
-        stages: those that were begun, in the order of the workflow.
+        stages: those that were started, in the order of the workflow.
         failures: units without a result.
-        rejected: image to the stage that left it out and why.
-        doubts: image to the stage that finds it doubtful and why; see `Record.doubted`.
+        rejected: image to the stage that left it out and the reason.
+        doubts: image to the stage that finds it doubtful and the reason; see `Record.doubted`.
         stopped: why the run ended early; empty if it did not.
-        exit_code: 0 ok, 3 finished with failed or doubtful items, 4 stopped by a gate.
-        left_over: files, with their digests, of earlier runs that this one did not write and that are still there.
-        written: files written into the output folder by this run.
-        warnings: damaged parts of the store that were computed again, and the like.
+        exit_code: 0 ok, 3 finished with failed or doubtful items, 4 stopped by a threshold or by `on_error: stop`.
+        written: files that this run wrote into the output folder.
+        removed: files of earlier runs that this run deleted.
+        published: every file of the results, with its digest.
+        left_over: files of earlier runs, with their digests, that are no part of the results and still exist.
+        warnings: such as damaged files of the cache that were computed again.
     """
 
     stages: list[StageSummary] = field(default_factory=list)
@@ -86,7 +107,7 @@ class RunResult:
 
     @property
     def complete(self) -> bool:
-        """Whether the run made all that it was to make; doubtful results count as made."""
+        """Whether nothing failed and no image was left out; doubtful results count as complete."""
         return not (self.stopped or self.failures or self.rejected)
 
     @property
@@ -101,47 +122,47 @@ class RunResult:
 
 
 class Observer(Protocol):
-    """Hears what a run does; the command line's progress bars are one.
+    """Is notified of what a run does, as the progress bars of the command line are.
 
-    Stages overlap. Where a damaged part of the store is found, the run starts over and its stages start again.
+    Stages overlap. If a damaged file is found in the cache, the run makes another pass and its stages start again.
     """
 
     def stage_started(self, name: str, units: int) -> None:
-        """A stage's units are known."""
+        """The units of a stage are known."""
 
     def unit_started(self, name: str, item: str) -> None:
-        """A unit is being computed; one that is cached or blocked is not."""
+        """A unit is being computed; this is not called for cached and blocked units."""
 
     def unit_failed(self, failure: Failure) -> None:
-        """A unit has failed, after all its tries; `unit_finished` follows."""
+        """A unit has failed, after all its retries; `unit_finished` follows."""
 
-    def unit_finished(self, name: str, item: str, outcome: Outcome, seconds: float) -> None:
-        """A unit is done; `seconds` is how long it took to compute."""
+    def unit_finished(self, name: str, item: str, *, status: UnitStatus, seconds: float) -> None:
+        """A unit is settled; `seconds` is its computing time, 0 if it was not computed."""
 
     def stage_finished(self, summary: StageSummary) -> None:
-        """A stage is done."""
+        """A stage is complete."""
 
     def warn(self, text: str) -> None:
-        """Something the user should know, though the run goes on."""
+        """There is a warning for the user; the run goes on."""
 
 
-class Silent:
-    """An observer that says nothing."""
+class SilentObserver:
+    """An observer that ignores all events."""
 
     def stage_started(self, name: str, units: int) -> None:
-        """Say nothing."""
+        """Do nothing."""
 
     def unit_started(self, name: str, item: str) -> None:
-        """Say nothing."""
+        """Do nothing."""
 
     def unit_failed(self, failure: Failure) -> None:
-        """Say nothing."""
+        """Do nothing."""
 
-    def unit_finished(self, name: str, item: str, outcome: Outcome, seconds: float) -> None:
-        """Say nothing."""
+    def unit_finished(self, name: str, item: str, *, status: UnitStatus, seconds: float) -> None:
+        """Do nothing."""
 
     def stage_finished(self, summary: StageSummary) -> None:
-        """Say nothing."""
+        """Do nothing."""
 
     def warn(self, text: str) -> None:
-        """Say nothing."""
+        """Do nothing."""

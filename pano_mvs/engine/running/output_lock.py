@@ -1,9 +1,9 @@
-"""One run at a time in an output folder: a lock file that names its owner.
+"""Allow one run at a time in an output folder, by a lock file that names its owner.
 
-The lock is a link to a file that was written before, so that it is complete from the moment at which it exists; to link
-is one step on network file systems too. A run that was killed leaves its lock behind. The next run on the same host
-sees that the process is gone, or that its number belongs to a process that was started at another time, and takes the
-lock over. Of a process on another host nothing is known: the user decides.
+The lock is created by linking a complete file, which is atomic on network file systems too. A run that was killed
+leaves its lock behind. The next run on the same host sees that the process has ended, or that its id now belongs to a
+process with another start time, and takes over the lock. Processes on other hosts cannot be checked, so the user has to
+decide.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ if os.name == "posix":
     import fcntl
 
 LOCK_NAME = ".pano-mvs-lock"
-_TRIES = 50
+_MAX_ATTEMPTS = 50
 _PAUSE_S = 0.02
 
 
 @contextmanager
 def output_lock(out: Path) -> Iterator[None]:
-    """Hold the lock of an output folder, which must exist.
+    """Hold the lock of an existing output folder inside the context.
 
     Raises:
-        StoreError: if another run holds it, or may hold it, or the folder cannot be written.
+        StoreError: if another run holds it or may hold it, or the folder cannot be written.
     """
     path, own = out / LOCK_NAME, _own_text()
     try:
@@ -44,8 +44,10 @@ def output_lock(out: Path) -> Iterator[None]:
     except OSError as error:
         if isinstance(error, StoreError):
             raise
-        raise StoreError(f"{path} cannot be written: {error.strerror or error}. Choose another folder with --out DIR, "
-                         "or mend its permissions")  from error  # fmt: skip
+        raise StoreError(
+            f"{path} cannot be written: {error.strerror or error}. Choose another folder with --out DIR, "
+            "or mend its permissions"
+        ) from error
     try:
         yield
     finally:
@@ -55,7 +57,7 @@ def output_lock(out: Path) -> Iterator[None]:
 
 
 def _acquire(path: Path, own: bytes) -> None:
-    for _ in range(_TRIES):
+    for _ in range(_MAX_ATTEMPTS):
         if _create(path, own):
             return
         text = _read(path)
@@ -65,20 +67,22 @@ def _acquire(path: Path, own: bytes) -> None:
         elif owner is not None:
             raise StoreError(_refusal(path, owner))
         elif text is not None:
-            time.sleep(_PAUSE_S)  # where links are not possible, it may be half written
-    raise StoreError(f"{path} does not say which run writes into the output folder. If none does, delete that file; "
-                     "else choose another folder with --out DIR")  # fmt: skip
+            time.sleep(_PAUSE_S)  # it may be incomplete on file systems without links
+    raise StoreError(
+        f"{path} does not name the run that writes into the output folder. If there is none, delete that file; "
+        "else choose another folder with --out DIR"
+    )
 
 
 def _create(path: Path, text: bytes) -> bool:
-    """Create the lock file with all its text in one step; return whether it was not there."""
+    """Create the lock file atomically; return False if it exists."""
     temporary = path.with_name(f"{temporary_prefix()}lock-{uuid.uuid4().hex}")
     temporary.write_bytes(text)
     try:
         os.link(temporary, path)
         return True
     except OSError as error:
-        if temporary.stat().st_nlink > 1:  # it was linked, though the answer of a file server was lost
+        if temporary.stat().st_nlink > 1:  # it was linked, but the reply of a file server was lost
             return True
         if isinstance(error, FileExistsError):
             return False
@@ -100,7 +104,7 @@ def _read(path: Path) -> bytes | None:
 
 
 def _remove_stale(path: Path, stale: bytes | None) -> None:
-    """Remove a lock whose owner is gone, unless another run has done so and perhaps put its own there."""
+    """Remove a lock whose owner has ended, unless another run has replaced it in the meantime."""
     try:
         handle = os.open(path, os.O_RDWR if os.access(path, os.W_OK) else os.O_RDONLY)
     except FileNotFoundError:
@@ -139,11 +143,11 @@ def _owner(text: bytes | None) -> dict[str, Any] | None:
 
 
 def _is_gone(owner: dict[str, Any]) -> bool:
-    """Return whether the process that holds a lock is known to have ended."""
+    """Return whether the owner of a lock is known to have ended."""
     if owner.get("place") == process_place():
         start = start_of(owner["process"])
         return start is None or bool(start and owner.get("process_started") and start != owner["process_started"])
-    # The same machine, started again since: nothing of it runs any more.
+    # The machine has been restarted since then.
     same = (socket.gethostname(), machine_id()) == (owner.get("host"), owner.get("machine") or None)
     return same and bool(owner.get("boot")) and owner["boot"] != boot_id().strip()
 
@@ -152,5 +156,5 @@ def _refusal(path: Path, owner: dict[str, Any]) -> str:
     who = f"process {owner['process']} on {owner.get('host')}, since {owner.get('since')}"
     remedy = "Wait until it has ended, or choose another folder with --out DIR"
     if owner.get("place") != process_place() or os.name != "posix":
-        remedy += f". If that process is gone, which cannot be seen from here, delete {path}"
+        remedy += f". If that process has ended, which cannot be checked from here, delete {path}"
     return f"another run is writing into {path.parent}: {who}. {remedy}"

@@ -1,4 +1,16 @@
-"""Run a workflow: unit by unit, each as soon as its inputs exist; what is cached is not computed again."""
+"""Run a workflow: the whole flow, from the options of the run to what the next run reads.
+
+`Run.execute` goes over the workflow in passes. If a pass finds a damaged file in the cache, or an input image that
+changed, a further pass computes what depends on it; otherwise it is the last one. Each pass (`RunPass`) does this:
+
+1. List the sources. The ready queue then finds the units of work whose inputs exist.
+2. Look up each ready unit in the cache, and dispatch it to the executor if it is not there.
+3. Record each result: publish its files into the output folder, count it, and enter it into the ready queue, which
+   releases the units that wait for it. Record each failure likewise.
+
+After the last pass the run deletes files of earlier runs that no longer belong to the results, and remembers the cache
+keys and the digests of the input files for the next run.
+"""
 
 from __future__ import annotations
 
@@ -8,44 +20,48 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from pano_mvs.core.digest import digest_from_value
-from pano_mvs.core.errors import GateError, StoreError
+from pano_mvs.core.errors import ContractError, PanoMvsError, RunStoppedError, StoreError, UsageError
 from pano_mvs.core.paths import is_file
 from pano_mvs.core.text import plural
 from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import Store, UnitRecord
-from pano_mvs.engine.executors.protocol import Executor
+from pano_mvs.engine.executors.protocol import Executor, JobOutcome
 from pano_mvs.engine.executors.serial import SerialExecutor
-from pano_mvs.engine.planning.ready_queue import Board
-from pano_mvs.engine.planning.source_listing import Listing
+from pano_mvs.engine.planning.ready_queue import ReadyQueue
+from pano_mvs.engine.planning.run_options import DEFAULT_OPTIONS, RunOptions
+from pano_mvs.engine.planning.source_listing import SourceListing
 from pano_mvs.engine.planning.units import StageState, Unit
-from pano_mvs.engine.running.dispatcher import Desk
-from pano_mvs.engine.running.events import Observer, RunResult, Silent
-from pano_mvs.engine.running.options import NO_DEMANDS, Demands
+from pano_mvs.engine.running.dispatcher import Dispatcher, FinishedJob
+from pano_mvs.engine.running.events import Failure, Observer, RunResult, SilentObserver, consequence_of
+from pano_mvs.engine.running.file_claims import NameClashError
 from pano_mvs.engine.running.publish import Publisher
-from pano_mvs.engine.running.scheduler import Scheduler
-from pano_mvs.engine.running.statistics import Tally
+from pano_mvs.engine.running.statistics import RunStatistics
 from pano_mvs.engine.workflows.wiring import Graph
-from pano_mvs.engine.workflows.workflow import Workflow
-from pano_mvs.scene import Record
+from pano_mvs.engine.workflows.workflow import StageEntry, Workflow
+from pano_mvs.scene import Axis, Files, Record
 
 GRACE_S = 10.0
-"""How long units in flight may go on after an interrupt, so that their work is not lost."""
+"""Time for which running units may go on after an interrupt, so that their results are not lost."""
 
-_HEALING_ROUNDS = 3
+_MAX_REPAIRS = 3
+_STOPPING_ERRORS = {error.__name__: error for error in (StoreError, RunStoppedError, UsageError)}
 
 
-def workflow_id(workflow: Workflow) -> str:
-    """Return the name under which a workflow's latest keys are remembered: its name and its stages' names."""
-    return digest_from_value([workflow.name, list(workflow.stages)])
+class UnusableInputError(RunStoppedError):
+    """A stage on which all others depend cannot use what the user gave it."""
+
+    def __init__(self, message: str, exit_code: int) -> None:
+        super().__init__(message)
+        self.exit_code = exit_code
 
 
 class Run:
-    """One run of a workflow.
+    """One run of a workflow: what its passes share, and what happens before and after them.
 
     Attributes:
-        states: stage to what it made; filled while the run goes on.
-        result: what happened.
+        keys: stage to unit to cache key, of all units that were looked up.
+        computed: keys of the units that this run computed.
+        refreshed: labels of the units that `--refresh` named and that were reached.
     """
 
     def __init__(
@@ -53,164 +69,364 @@ class Run:
         workflow: Workflow,
         graph: Graph,
         store: Store,
-        out: Path,
         *,
+        out: Path,
         observer: Observer | None = None,
         executor: Executor | None = None,
-        demands: Demands = NO_DEMANDS,
+        options: RunOptions = DEFAULT_OPTIONS,
     ) -> None:
-        """Prepare a run; the executor, by default a serial one with all threads, stays the caller's to close.
-
-        Raises:
-            UsageError: if the output folder cannot be written, or demands name a stage that there is not.
-        """
-        self.workflow, self.graph = demands.applied_to(workflow, graph)
-        self.demands = demands
-        self.store = store
-        self.out = out
-        self.observer = observer or Silent()
-        self.executor = executor or SerialExecutor(store)
-        self.states: dict[str, StageState] = {}
-        self.result = RunResult()
-        self._publisher = Publisher(out, store)
-        self._desk = Desk(self.executor, store, out, workflow.plugins)
-        self._listing = Listing()
-        self._keys: dict[str, dict[str, str]] = {}
-        self._computed: set[str] = set()
-        self._refreshed: set[str] = set()
-        self._last_keys = store.runs.last_keys(workflow_id(workflow)) if demands.accept_code else {}
-
-    def execute(self, *, earlier_files: Mapping[str, str] | None = None) -> RunResult:
-        """Run every stage; finished units are kept whatever happens.
+        """Prepare a run.
 
         Args:
-            earlier_files: file to digest as an earlier run into this folder wrote them; what this run does not
-                write any more is deleted, if it finished and nobody has changed the file.
+            workflow: what to run.
+            graph: how its stages are connected.
+            store: the cache.
+            out: folder of the results.
+            observer: is notified of progress.
+            executor: computes the units; by default one after another with all threads. The caller closes it.
+            options: what the user asked for beyond the workflow.
+
+        Raises:
+            UsageError: if the output folder cannot be written, or the options name a stage that does not exist.
+        """
+        self.workflow, self.graph = options.applied_to(workflow, graph)
+        self.options = options
+        self.store = store
+        self.out = out
+        self.observer = observer or SilentObserver()
+        self.executor = executor or SerialExecutor(store)
+        self.publisher = Publisher(out, store)
+        self.dispatcher = Dispatcher(self.executor, store, out=out, plugins=workflow.plugins)
+        self.listing = SourceListing()
+        self.keys: dict[str, dict[str, str]] = {}
+        self.computed: set[str] = set()
+        self.refreshed: set[str] = set()
+        self._warnings: list[str] = []
+        self._last_keys = store.runs.last_keys(workflow.id) if options.accept_code else {}
+        self._pass = RunPass(self, self._warnings)
+
+    @property
+    def result(self) -> RunResult:
+        """What happened, in the latest pass."""
+        return self._pass.result
+
+    @property
+    def states(self) -> Mapping[str, StageState]:
+        """Stage to its results so far, in the latest pass."""
+        return self._pass.queue.states
+
+    def execute(self, *, earlier_files: Mapping[str, str] | None = None) -> RunResult:
+        """Run every stage. Finished units stay in the cache, whatever happens.
+
+        Args:
+            earlier_files: file to digest, as an earlier run wrote them into this folder. If this run finishes, it
+                deletes those that it does not write itself, unless somebody has changed them.
 
         Raises:
             InputError: if the source cannot be listed.
-            StoreError: if the store or the output folder cannot be written.
-            KeyboardInterrupt: if the user interrupts; units in flight were given some time to finish.
+            StoreError: if the cache or the output folder cannot be written.
+            KeyboardInterrupt: if the user interrupts; running units get some time to finish.
         """
-        self._publisher.earlier = dict(earlier_files or {})
+        self.publisher.earlier = dict(earlier_files or {})
         self._warn_of_timeouts()
         try:
-            self._execute_healing()
-            for unit in self.demands.refresh:
-                if ":" in unit and unit not in self._refreshed:
-                    self._warn(f"--refresh {unit}: nothing was computed again, no unit of that name was reached")
+            self._execute_passes()
+            self._warn_of_unused_refresh()
             if self.result.complete and not self.graph.is_part:
-                self.result.removed = self._publisher.remove_stale(self._publisher.earlier)
+                self.result.removed = self.publisher.remove_stale(self.publisher.earlier)
         except KeyboardInterrupt:
             self.result.stopped = "interrupted"
-            self._let_finish()
+            self._wait_for_running_units()
             raise
         finally:
-            self._desk.cancel()
+            self.dispatcher.cancel()
             self._remember()
-            earlier = dict(self._publisher.earlier)
-            for name, aside in self._publisher.set_aside.items():
-                self._warn(f"{name} was not as a run had written it: what was there is kept as {aside}")
-            self.result.written = sorted(self._publisher.written)
-            self.result.published = self._publisher.published
-            self.result.left_over = {
-                name: digest
-                for name, digest in earlier.items()
-                if name not in self._publisher.published and is_file(self.out / name)
-            }
+            self._list_files()
         return self.result
 
     def load(self, stage: str, kind: type[Record], item: str = "") -> Record | None:
-        """Return a value that the run made, or None if there is none."""
+        """Return a value that the run made, or None if it did not make it."""
         ref = self.states[stage].items.get(item) if stage in self.states else None
         return self.store.load(ref, kind) if ref is not None else None
 
-    def _remember(self) -> None:
-        """Keep what makes the next plan better; a run does not fail for want of it."""
-        name = workflow_id(self.workflow)
-        try:
-            finished = self.result.exit_code in {0, 3} and not self.result.stopped and not self.graph.is_part
-            self.store.runs.remember(name, self._keys, workflow=self.workflow.name, out=self.out, finished=finished)
-            self.store.stat_cache.save()
-        except StoreError as error:
-            self._warn(f"the next run cannot be told why it computes something: {error}")
+    def find_record(self, unit: Unit) -> UnitRecord | None:
+        """Return a unit's record from the cache, unless the user asked to compute the unit again."""
+        if self.options.refreshes(unit):
+            self.refreshed.add(f"{unit.entry.name}:{unit.item}")
+            if unit.key not in self.computed:
+                return None
+        last = self._last_keys.get(unit.entry.name, {}).get(unit.item)
+        return self.store.find(unit.key) or self.options.accepted(unit, last, self.store)
 
-    def _execute_healing(self) -> None:
-        """Run; where a cached blob turns out damaged, it has been removed: start over, which recomputes only it."""
+    def warn(self, text: str) -> None:
+        """Add a warning to the result, and notify the observer."""
+        self._warnings.append(text)
+        self.observer.warn(text)
+
+    def _execute_passes(self) -> None:
+        """Repeat the pass until it finds nothing damaged; what it finds has been removed and is computed again."""
         found: Counter[str] = Counter()
         while True:
             try:
-                self._execute_once()
+                self._pass.execute()
                 return
             except DamagedBlobError as error:
-                for text in dict.fromkeys(self._scheduler.damaged or [str(error)]):
-                    self._warn(text)
+                for text in dict.fromkeys(self._pass.damaged or [str(error)]):
+                    self.warn(text)
                     found[text] += 1
-                    if found[text] > _HEALING_ROUNDS:
-                        raise StoreError(f"{text} again and again: check the disk, or choose another cache with "
-                                         "--cache DIR")  from error  # fmt: skip
-                self._scheduler.drain()
+                    if found[text] > _MAX_REPAIRS:
+                        raise StoreError(
+                            f"{text} again and again: check the disk, or choose another cache with --cache DIR"
+                        ) from error
+                self._pass.drain()
+                self._pass = RunPass(self, self._warnings)
 
-    def _execute_once(self) -> None:
-        result = self.result
-        result.stages, result.failures, result.rejected, result.doubts, result.stopped = [], [], {}, {}, ""
-        tally = Tally(result, self.observer, lambda name: self.states[name], self._publisher.name_items)
-        board = Board(self.workflow, self.graph, self.store, tally, self._listing)
-        self.states = board.states
-        self._scheduler = Scheduler(board, tally, self._desk, self._publisher, keys=self._keys,
-                                    computed=self._computed, finder=self._find, warn=self._warn)  # fmt: skip
-        stop: GateError | None = None
-        self._publisher.begin_pass()
+    def _remember(self) -> None:
+        """Store the keys and file digests for the next run; the run does not fail if that is impossible."""
+        finished = self.result.exit_code in {0, 3} and not self.result.stopped and not self.graph.is_part
         try:
-            board.start()
-            with suppress(StoreError):  # so that workers need not read whole files for their digests
-                self.store.stat_cache.save()
-            self._scheduler.work()
-        except GateError as error:
-            stop = error
-        finally:
-            clashes = self._publisher.clash_causes()
-            tally.put_in_order(board.place, replaced=self._replaced(), clashes=clashes)
-        if stop is not None:
-            result.stopped, result.exit_code = str(stop), stop.exit_code
-        else:
-            result.exit_code = 0 if result.complete and not result.doubts else 3
+            self.store.runs.remember(
+                self.workflow.id, self.keys, workflow=self.workflow.name, out=self.out, finished=finished
+            )
+            self.store.stat_cache.save()
+        except StoreError as error:
+            self.warn(f"the next plan cannot give the reasons why units are computed: {error}")
 
-    def _replaced(self) -> set[str]:
-        """Return the stages whose values another stage has made anew: it reads them, makes their kind, and finished."""
-        stages = self.workflow.stages
-        return {
-            edge.producer
-            for name in self.graph.order
-            if name in self.states and self.states[name].items
-            for edge in self.graph.edges[name].values()
-            if issubclass(stages[name].spec.output, stages[edge.producer].spec.output)
+    def _list_files(self) -> None:
+        """Enter into the result which files the run wrote and which ones of earlier runs are left."""
+        for name, new_name in self.publisher.set_aside.items():
+            self.warn(f"{name} was not as a run had written it: it was renamed to {new_name}")
+        published = self.publisher.published
+        self.result.written = sorted(self.publisher.written)
+        self.result.published = published
+        self.result.left_over = {
+            name: digest
+            for name, digest in self.publisher.earlier.items()
+            if name not in published and is_file(self.out / name)
         }
 
-    def _find(self, unit: Unit) -> UnitRecord | None:
-        """Return a unit's record if the store has it and nobody asked for it anew."""
-        if self.demands.refreshes(unit):
-            self._refreshed.add(f"{unit.entry.name}:{unit.item}")
-            if unit.key not in self._computed:
-                return None
-        last = self._last_keys.get(unit.entry.name, {}).get(unit.item)
-        return self.store.find(unit.key) or self.demands.accepted(unit, last, self.store)
-
-    def _let_finish(self) -> None:
-        """Give units in flight some time after an interrupt; a second interrupt ends it at once."""
+    def _wait_for_running_units(self) -> None:
+        """Give units that run in other processes some time after an interrupt; a second interrupt ends them."""
         deadline = time.monotonic() + GRACE_S
-        if self._desk and self.executor.enforces_timeouts:  # units run elsewhere, and go on
-            self.observer.warn(f"interrupted: {len(self._desk)} {plural(len(self._desk), 'unit')} may finish within "
-                               f"{GRACE_S:.0f} s; interrupt again to stop at once")  # fmt: skip
-            while self._desk and (left := deadline - time.monotonic()) > 0:
-                self._desk.take(left)
+        if self.dispatcher and self.executor.enforces_timeouts:
+            count = len(self.dispatcher)
+            self.observer.warn(
+                f"interrupted: {count} {plural(count, 'unit')} may finish within {GRACE_S:.0f} s; "
+                "interrupt again to stop at once"
+            )
+            while self.dispatcher and (left := deadline - time.monotonic()) > 0:
+                self.dispatcher.next_finished(left)
 
     def _warn_of_timeouts(self) -> None:
         names = [name for name, entry in self.workflow.stages.items() if entry.policy.timeout_s]
         if names and not self.executor.enforces_timeouts:
-            self._warn(f"timeout_s of {', '.join(names)} is not kept: a unit in this very process cannot be ended. "
-                       "Use --executor processes")  # fmt: skip
+            self.warn(
+                f"timeout_s of {', '.join(names)} has no effect: a unit that runs in the main process cannot be ended. "
+                "Use --executor processes"
+            )
 
-    def _warn(self, text: str) -> None:
-        self.result.warnings.append(text)
-        self.observer.warn(text)
+    def _warn_of_unused_refresh(self) -> None:
+        for unit in self.options.refresh:
+            if ":" in unit and unit not in self.refreshed:
+                self.warn(f"--refresh {unit}: nothing was computed again, because no unit of that name was reached")
+
+
+class RunPass:
+    """One pass over a workflow, with a result and statistics of its own.
+
+    Attributes:
+        result: what happened in this pass.
+        queue: the units that can run, and the results so far.
+        damaged: damaged files of the cache (which have been removed) and changed input files that this pass met.
+            Units that need any of them are left to the next pass, while the others go on, so that much damage takes no
+            more passes than little.
+    """
+
+    def __init__(self, run: Run, warnings: list[str]) -> None:
+        self.result = RunResult(warnings=warnings)
+        self.damaged: list[str] = []
+        self._run = run
+        self._store = run.store
+        self._statistics = RunStatistics(
+            self.result, run.observer, states=lambda name: self.queue.states[name], name_items=run.publisher.name_items
+        )
+        self.queue = ReadyQueue(run.workflow, run.graph, run.store, listener=self._statistics, listing=run.listing)
+        self._duplicates: dict[str, list[Unit]] = {}  # key that is being computed to other units with the same key
+
+    def execute(self) -> None:
+        """Settle every unit, and enter into the result how it ended.
+
+        Raises:
+            DamagedBlobError: if a stored file was damaged, once nothing else can be done.
+            StoreError: if the cache or the output folder cannot be written.
+            UsageError: if workers have another version of a stage.
+        """
+        stop: RunStoppedError | None = None
+        self._run.publisher.begin_pass()
+        try:
+            self.queue.start()
+            with suppress(StoreError):  # so that workers need not read whole files for their digests
+                self._store.stat_cache.save()
+            self._settle_all()
+        except RunStoppedError as error:
+            stop = error
+        finally:
+            refusals = self._run.publisher.refusals()
+            self._statistics.put_in_order(self.queue.position_of, replaced=self._replaced(), refusals=refusals)
+        if stop is not None:
+            self.result.stopped, self.result.exit_code = str(stop), stop.exit_code
+        else:
+            self.result.exit_code = 0 if self.result.complete and not self.result.doubts else 3
+
+    def drain(self) -> None:
+        """Wait until the running units have ended; their results are in the cache."""
+        while (finished := self._run.dispatcher.next_finished()) is not None:
+            if finished.outcome.record is not None:
+                self._run.computed.add(finished.unit.key)
+
+    def _settle_all(self) -> None:
+        """Take ready units and finished jobs in turn, until every unit has a result or cannot have one."""
+        dispatcher = self._run.dispatcher
+        held: Unit | None = None  # waits for memory, and all others behind it, so that a large unit gets its turn
+        while True:
+            none_ready = False
+            if held is None and dispatcher.has_capacity:
+                unit = self.queue.next_unit()
+                none_ready = unit is None
+                held = unit if unit is not None and not self._take_from_cache(unit) else None
+            if held is not None and self._dispatch(held):
+                held = None
+            if none_ready and not dispatcher:
+                if self.damaged:
+                    raise DamagedBlobError(self.damaged[0])
+                return
+            must_wait = none_ready or held is not None or not dispatcher.has_capacity
+            finished = dispatcher.next_finished(None if must_wait else 0)
+            if finished is not None:
+                self._end(finished)
+
+    def _take_from_cache(self, unit: Unit) -> bool:
+        """Settle a unit that is in the cache; return whether it is, or is being computed for another unit."""
+        if unit.key in self._duplicates:
+            self._duplicates[unit.key].append(unit)
+            return True
+        self._run.keys.setdefault(unit.entry.name, {})[unit.item] = unit.key
+        known = len(self._store.damaged)
+        record = self._run.find_record(unit)
+        for path in self._store.damaged[known:]:
+            self._run.warn(f"{path} is damaged; computing it again")
+        if record is not None:
+            self._record(unit, record, was_computed=unit.key in self._run.computed)
+        return record is not None
+
+    def _dispatch(self, unit: Unit) -> bool:
+        """Have a unit computed if there is memory for it; return False if it has to wait."""
+        dispatcher = self._run.dispatcher
+        if not dispatcher.fits(unit):
+            if dispatcher:
+                return False
+            self._statistics.unit_started(unit.entry, unit.item)
+            self._fail(FinishedJob(unit, JobOutcome("failed", cause=dispatcher.refusal(unit))))
+            return True
+        self._duplicates[unit.key] = []
+        self._statistics.unit_started(unit.entry, unit.item)
+        dispatcher.submit(unit, siblings=len(self.queue.states[unit.entry.name].members))
+        return True
+
+    def _end(self, finished: FinishedJob) -> None:
+        """Act on what became of a job."""
+        outcome, unit = finished.outcome, finished.unit
+        duplicates = self._duplicates.pop(unit.key)
+        if outcome.status == "damaged":
+            self._drop_producers(unit)
+            self.damaged.append(outcome.cause)
+            return
+        if outcome.status == "changed" and self._run.listing.report(outcome.changed):
+            self.damaged.append(outcome.cause)
+            return
+        if outcome.status == "stopped":
+            raise _STOPPING_ERRORS.get(outcome.error, PanoMvsError)(outcome.cause)
+        if outcome.record is not None:
+            self._run.computed.add(unit.key)
+            self._record(unit, outcome.record, was_computed=True)
+        else:
+            self._fail(finished)
+        for duplicate in duplicates:
+            if not self._take_from_cache(duplicate):
+                self._fail(FinishedJob(duplicate, outcome, finished.log, finished.said))
+
+    def _record(self, unit: Unit, record: UnitRecord, *, was_computed: bool) -> None:
+        """Publish a result, count it, and enter it into the queue."""
+        if issubclass(unit.entry.spec.output, Files) and not self._publish(unit, record):
+            return
+        self._statistics.unit_done(unit.entry, unit.item, record, status="run" if was_computed else "cached")
+        self.queue.finish(unit, record)
+
+    def _publish(self, unit: Unit, record: UnitRecord) -> bool:
+        """Write a unit's files into the output folder; return whether that was possible."""
+        entry = unit.entry
+        try:
+            losers = self._run.publisher.publish(entry.name, unit.item, record.output, to=entry.policy.to)
+        except (NameClashError, ContractError) as error:
+            self._fail(FinishedJob(unit, JobOutcome("failed", cause=str(error), seconds=record.seconds)))
+            for item, cause in error.losers.items() if isinstance(error, NameClashError) else ():
+                self._withdraw(entry, item, cause)
+            return False
+        except DamagedBlobError as error:
+            self._store.drop(record.key)
+            self.damaged.append(str(error))
+            return False
+        for item, cause in losers.items():
+            self._withdraw(entry, item, cause)
+        return True
+
+    def _withdraw(self, entry: StageEntry, item: str, cause: str) -> None:
+        """Count a unit as failed that had a result, because its files clash with those of an earlier image."""
+        was_computed = self._run.keys.get(entry.name, {}).get(item) in self._run.computed
+        failure = Failure(entry.name, item, cause, consequence=consequence_of(entry, item))
+        self._statistics.unit_withdrawn(failure, was_computed=was_computed)
+        self.queue.withdraw(entry.name, item, cause)
+        if entry.policy.on_error == "stop":
+            raise RunStoppedError(f"stage {entry.name!r} has on_error: stop, and {entry.name}:{item} failed: {cause}")
+
+    def _fail(self, finished: FinishedJob) -> None:
+        """Record a failed unit; stop the run if the workflow asks for it or if all other units depend on this one."""
+        unit, outcome = finished.unit, finished.outcome
+        entry = unit.entry
+        failure = Failure(
+            entry.name,
+            unit.item,
+            outcome.cause,
+            outcome.trace,
+            consequence_of(entry, unit.item),
+            log="" if finished.log is None else str(finished.log),
+            said=finished.said,
+        )
+        self._statistics.unit_failed(failure, outcome.seconds)
+        if outcome.exit_code and self.queue.states[entry.name].axis is Axis.ONE:
+            raise UnusableInputError(f"{entry.name}: {outcome.cause}", outcome.exit_code)
+        if entry.policy.on_error == "stop":
+            raise RunStoppedError(f"stage {entry.name!r} has on_error: stop, and {unit.label} failed: {outcome.cause}")
+        self.queue.fail(unit, outcome.cause)
+
+    def _drop_producers(self, unit: Unit) -> None:
+        """Drop the incomplete records that led a unit to a damaged file, so that they are computed again."""
+        for ref in unit.input_blobs():
+            if ref.external:
+                self._store.stat_cache.forget(self._store.blobs.path(ref))
+        for producer in self.queue.producers(unit.entry.name):
+            for key in self._run.keys.get(producer, {}).values():
+                record = self._store.read_record(key)
+                if record is not None and not all(self._store.blobs.exists(ref) for ref in record.blobs()):
+                    self._store.drop(key)
+
+    def _replaced(self) -> set[str]:
+        """Return the stages whose results a finished later stage reads and replaces by its own, of the same kind."""
+        stages, states = self._run.workflow.stages, self.queue.states
+        return {
+            edge.producer
+            for name in self._run.graph.order
+            if states[name].items
+            for edge in self._run.graph.edges[name].values()
+            if issubclass(stages[name].spec.output, stages[edge.producer].spec.output)
+        }

@@ -1,1 +1,1 @@
-"""Declare, configure and register stages; what a plugin author uses through `pano_mvs.api`."""
+"""Declare, configure and register stages; plugin authors use this through `pano_mvs.api`."""

@@ -1,4 +1,4 @@
-"""What a stage is given beside its inputs."""
+"""The context that a stage receives beside its inputs."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from pano_mvs.core.text import shortened
 
 @dataclass(slots=True)
 class Context:
-    """What a stage is given beside its inputs.
+    """What a stage receives beside its inputs.
 
     Attributes:
-        rng: random generator, seeded from the stage, the settings and the inputs: the same unit draws the same numbers
-            everywhere, and goes on to do so when code has been changed.
-        scratch: an empty folder for files that the stage writes; gone after the unit, unless returned in a record.
+        rng: random generator, seeded from the stage, the settings and the inputs: a unit draws the same numbers on
+            every machine, also after its code has changed.
+        scratch: an empty folder for files that the stage writes. It is deleted after the unit; files that the stage
+            returns are stored before.
         threads: number of threads that the unit may use.
-        metrics: figures of this unit, such as `registered`; shown in the report and read by quality gates.
-        notes: what a user should know of this unit.
+        metrics: figures of this unit, such as `registered`, for the report and for quality thresholds.
+        notes: what a user should know about this unit.
         rejected: image name to the reason why the result leaves it out.
     """
 
@@ -33,14 +34,14 @@ class Context:
     rejected: dict[str, str] = field(default_factory=dict)
 
     def metric(self, name: str, value: float) -> None:
-        """Record a figure of this unit; one that is not finite is left out, so that it passes no gate."""
+        """Record a figure of this unit; infinite values and NaN are left out, so that they meet no threshold."""
         if math.isfinite(value):
             self.metrics[name] = float(value)
 
     def note(self, text: str) -> None:
-        """Record what a user should know; a cached unit says it again."""
+        """Record what a user should know; the note is repeated if the unit is cached."""
         self.notes.append(shortened(text))
 
     def reject(self, image: str, reason: str) -> None:
-        """Record that the result leaves an image out; the run then ends with exit code 3."""
+        """Record that the result leaves out an image; the run then ends with exit code 3."""
         self.rejected[image] = shortened(reason)

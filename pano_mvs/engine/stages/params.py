@@ -17,7 +17,7 @@ from pydantic import (
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
 
-from pano_mvs.core.parts import Parts
+from pano_mvs.core.named_registry import NamedRegistry
 from pano_mvs.core.paths import expanded
 
 
@@ -28,15 +28,15 @@ class Params(BaseModel):
 
 
 class _NotInKey:
-    """Marks a field that cannot change the result."""
+    """Marks a setting that does not change the result."""
 
 
 class _KeyedByContent:
-    """Marks a path whose content, not whose name, counts."""
+    """Marks a path that counts by its content, not its name."""
 
 
 NOT_IN_KEY = _NotInKey()
-"""`threads: Annotated[int, NOT_IN_KEY] = 0`: changing this setting recomputes nothing."""
+"""Mark of a setting that is not in cache keys, such as `threads: Annotated[int, NOT_IN_KEY] = 0`."""
 
 
 def _resolve(path: Path, info: ValidationInfo) -> Path:
@@ -47,28 +47,28 @@ def _resolve(path: Path, info: ValidationInfo) -> Path:
 
 
 InputPath: TypeAlias = Annotated[Path, AfterValidator(_resolve), _KeyedByContent()]
-"""A file or folder that the stage reads; relative to the workflow file; in the cache key by its content."""
+"""A file or folder that the stage reads, relative to the workflow file; its content is in the cache key."""
 
 SourcePath: TypeAlias = Annotated[Path, AfterValidator(_resolve), NOT_IN_KEY]
-"""A file or folder that a source stage lists; its items count, one by one, not the path."""
+"""A file or folder that a source lists. Each item has its own cache key; the path is in none."""
 
 
 @dataclass(frozen=True)
-class PartOf:
-    """Marks a field that names a part, ours or a plugin's: `cost: Annotated[str, PartOf(SWEEP_COSTS)] = "census"`.
+class RegisteredIn:
+    """Marks a setting that holds a name from a registry: `cost: Annotated[str, RegisteredIn(SWEEP_COSTS)] = "census"`.
 
-    A name that there is not is a mistake in the workflow. The code of a plugin's part counts towards the cache key.
+    An unknown name is an error in the workflow. If a plugin registered the name, its code counts towards the cache key.
     """
 
-    parts: Parts[Any]
+    registry: NamedRegistry[Any]
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Return the schema of a name that is checked."""
-        return core_schema.no_info_after_validator_function(self.parts.check, handler(source))
+        """Return the schema of a string that is checked against the registry."""
+        return core_schema.no_info_after_validator_function(self.registry.check, handler(source))
 
     def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        """Return the schema of the names that there are now, plugins' among them."""
-        return handler(core) | {"enum": list(self.parts.names())}
+        """Return the schema with all registered names, including those of plugins."""
+        return handler(core) | {"enum": list(self.registry.names())}
 
 
 def key_fields(params: Params) -> tuple[dict[str, Any], dict[str, list[Path]]]:
@@ -88,18 +88,18 @@ def key_fields(params: Params) -> tuple[dict[str, Any], dict[str, list[Path]]]:
     return plain, paths
 
 
-def part_files(params: Params) -> dict[str, Path]:
-    """Return every setting that names a plugin's part, with the file that defines the part: its code counts too."""
+def registered_files(params: Params) -> dict[str, Path]:
+    """Return each setting that holds a name registered by a plugin, and the plugin's file, whose code counts."""
     found: dict[str, Path] = {}
     for name, field in type(params).model_fields.items():
         for mark in field.metadata:
-            if isinstance(mark, PartOf) and (file := mark.parts.code_file(getattr(params, name))) is not None:
+            if isinstance(mark, RegisteredIn) and (file := mark.registry.code_file(getattr(params, name))) is not None:
                 found[name] = file
     return found
 
 
 def files_of(params: Params) -> dict[str, list[Path]]:
-    """Return every setting that names files or folders to be read, with their paths."""
+    """Return each setting that names input files or folders, with their paths."""
     found: dict[str, list[Path]] = {}
     for name, field in type(params).model_fields.items():
         if _names_files(field.annotation, field.metadata):
@@ -124,7 +124,7 @@ def _names_files(annotation: Any, marks: list[Any]) -> bool:
 
 
 def _is_marked(annotation: Any, marks: list[Any], mark_type: type[_NotInKey | _KeyedByContent]) -> bool:
-    """Look for a mark on the field itself and inside of `InputPath | None` and the like."""
+    """Return whether a field has a mark, on itself or inside a type such as `InputPath | None`."""
     if any(isinstance(mark, mark_type) for mark in marks):
         return True
     inner = [*getattr(annotation, "__args__", ()), *getattr(annotation, "__metadata__", ())]

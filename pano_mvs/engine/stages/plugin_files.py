@@ -1,4 +1,4 @@
-"""What can be known of a plugin without importing it: where user plugins lie, and which names a source declares."""
+"""Find plugin files, and the names that they declare, without importing them."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from pano_mvs.core.paths import below, children, home_folder
 
 PLUGINS_VARIABLE = "PANO_MVS_PLUGINS"
 
-# A declaration is told by its text rather than by the syntax tree, since a broken file may have none.
+# Declarations are found in the text, because a broken file may have no syntax tree.
 _DECLARATION = re.compile(r"""^[ \t]*@(?:\w+\.)*(stage|source|register_\w+)\(\s*["']([^"'\n]+)["']""", re.MULTILINE)
 
 
 def user_plugin_folders(environment: Mapping[str, str] = os.environ) -> list[Path]:
-    """Return the folders whose files are the user's plugins: of $PANO_MVS_PLUGINS, else the one in the user's settings.
+    """Return the folders of the user's plugins: those in $PANO_MVS_PLUGINS, or else the one among the user's settings.
 
-    The variable holds one or more folders, separated as in PATH; set to nothing, there are none. Without it the folder
-    is `pano-mvs/plugins` in $XDG_CONFIG_HOME or ~/.config (Linux), ~/Library/Application Support (macOS), or %APPDATA%
-    (Windows). A relative folder would be another one wherever the command is typed, and is the caller's to refuse.
+    The variable holds folders separated as in PATH; if it is empty, there are none. Without the variable the folder is
+    `pano-mvs/plugins` in $XDG_CONFIG_HOME or ~/.config (Linux), ~/Library/Application Support (macOS), or %APPDATA%
+    (Windows). Relative folders depend on where the command is run; the caller must refuse them.
     """
     variable = environment.get(PLUGINS_VARIABLE)
     if variable is not None:
@@ -33,13 +33,13 @@ def user_plugin_folders(environment: Mapping[str, str] = os.environ) -> list[Pat
 
 
 def plugin_files_in(folder: Path) -> list[Path]:
-    """Return the plugin files of a folder, by name: all of Python but tests, and helpers, whose names begin with _."""
+    """Return the plugin files in a folder, by name: all Python files except tests and names that begin with _."""
     files = children(folder, "*.py")
     return [file for file in files if not file.name.startswith(("_", ".", "test_")) and file.name != "conftest.py"]
 
 
 def declared_names(text: str) -> list[tuple[str, str]]:
-    """Return what a source says that it declares: ("stage", name), or a part's kind and name."""
+    """Return the names that a source text declares: ("stage", name), or the kind and name of a registration."""
     return [
         ("stage" if what in ("stage", "source") else what.removeprefix("register_").replace("_", " "), name)
         for what, name in _DECLARATION.findall(text)
@@ -47,18 +47,18 @@ def declared_names(text: str) -> list[tuple[str, str]]:
 
 
 def names_in_files(files: Iterable[Path]) -> tuple[tuple[str, str], ...]:
-    """Return what files declare, as far as they can be read."""
+    """Return the names that files declare, as far as they can be read."""
     found: list[tuple[str, str]] = []
     for file in files:
         try:
             found.extend(declared_names(file.read_text(encoding="utf-8", errors="replace")))
         except OSError:
-            continue  # it is listed as broken in any case; only its names stay unknown
+            continue  # it is listed as broken anyway; only its names stay unknown
     return tuple(found)
 
 
 def names_in_package(entry: EntryPoint) -> tuple[tuple[str, str], ...]:
-    """Return what the package behind an entry point declares, without importing it."""
+    """Return the names that the package behind an entry point declares, without importing it."""
     try:
         spec = importlib.util.find_spec(entry.module.partition(".")[0])
     except (ImportError, ValueError):
@@ -71,7 +71,7 @@ def names_in_package(entry: EntryPoint) -> tuple[tuple[str, str], ...]:
 
 
 def _settings_folder(environment: Mapping[str, str]) -> Path | None:
-    """Return where programs keep a user's settings, if there is such a place."""
+    """Return the folder for user settings, or None if there is none."""
     home = home_folder()
     if sys.platform == "win32":
         given = Path(environment.get("APPDATA") or "")

@@ -1,8 +1,8 @@
-"""How a stage says what it reads: the cardinality of each port, written as a type.
+"""The ports of a stage: how many items it reads of which kind, written as type annotations.
 
-`Each[K]` is the unit's own item, `Near[K]` the items of its neighbours in order, `All[K]` every item by name,
-`One[K]` a whole value, `Names[K]` only the names of all items: a stage that needs no more does not run
-again when an item's content changes. A port annotated `Each[K] | None` may stay unconnected.
+`Each[K]` is the unit's own item, `Near[K]` are the items of its neighbours in order, `All[K]` are all items by name,
+and `One[K]` is the single value of a stage. `Names[K]` are only the names of all items: a stage that needs no more is
+not computed again when the content of an item changes. A port annotated `Each[K] | None` may stay unconnected.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pano_mvs.scene import Record
 
 
 class Cardinality(StrEnum):
-    """How many items of a kind one unit of work reads."""
+    """The number of items of a kind that one unit of work reads."""
 
     ONE = "One"
     EACH = "Each"
@@ -51,12 +51,12 @@ class Port:
     optional: bool = False
 
     def __str__(self) -> str:
-        """Return the port as it is written in code."""
+        """Return the port as it is annotated in code."""
         return f"{self.name}: {self.cardinality}[{self.kind.kind_name()}]{' | None' if self.optional else ''}"
 
 
 def port_from_annotation(name: str, annotation: Any) -> Port | None:
-    """Return the port that an annotation declares, or None if it is none."""
+    """Return the port that an annotation declares, or None if it does not declare one."""
     optional = False
     if get_origin(annotation) in (Union, types.UnionType):
         inner = [part for part in get_args(annotation) if part is not type(None)]

@@ -1,6 +1,6 @@
-"""Which stages, and other parts with names, there are: installed, in the user's plugin folder, or in a workflow's file.
+"""The stages and other named values of plugins: installed ones, those in the user's folder, and a workflow's own.
 
-A plugin that cannot be loaded, or a name that two of them give, harms nobody until the name is used.
+A plugin that cannot be loaded, or a name that two plugins define, causes an error only when the name is used.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from types import ModuleType
 
 from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import PluginError
-from pano_mvs.core.parts import PartMark, marks_of, set_unusable_parts
+from pano_mvs.core.named_registry import Registration, registrations_of, set_unavailable
 from pano_mvs.core.paths import is_file, resolved
 from pano_mvs.core.text import shortened
 from pano_mvs.engine.code.plugin_digest import code_digest
@@ -41,9 +41,10 @@ class Plugin:
 
     Attributes:
         origin: the distribution, or the file.
-        names: what it gives, or would give as far as its source tells: ("stage", name), or a part's kind and name.
-        error: why it could not be loaded, in one line; empty if it could.
-        trace: the original traceback of that.
+        names: what it defines, or, if it is broken, declares in its source: ("stage", name), or the kind and name of a
+            registration.
+        error: why it could not be loaded, in one line; empty if it was loaded.
+        trace: the traceback of that error.
     """
 
     origin: str
@@ -52,24 +53,24 @@ class Plugin:
     trace: str = ""
 
     def why_broken(self) -> str:
-        """Return what somebody who uses one of its names needs to know."""
+        """Return the error message for the use of one of its names."""
         return f"the plugin that defines it, {self.origin}, failed to load:\n{self.trace.rstrip()}"
 
 
 @dataclass(slots=True)
 class Registry:
-    """What there is by name, and the plugins that it comes from.
+    """The stages by name, and the plugins that define them.
 
     Attributes:
         stages: by name.
-        parts: what plugins add beside stages, by kind and name.
-        origins: stage name to the plugin that it comes from.
-        plugins: all that were found, the broken ones too.
-        clashes: ("stage", name), or a part's kind and name, to where it is defined twice; neither can be used.
+        registrations: what plugins registered beside stages, by kind and name.
+        origins: stage name to the plugin that defines it.
+        plugins: all that were found, including broken ones.
+        clashes: names that are defined twice, as in `Plugin.names`, to the two places; such names cannot be used.
     """
 
     stages: dict[str, StageSpec] = field(default_factory=dict)
-    parts: dict[tuple[str, str], PartMark] = field(default_factory=dict)
+    registrations: dict[tuple[str, str], Registration] = field(default_factory=dict)
     origins: dict[str, str] = field(default_factory=dict)
     plugins: list[Plugin] = field(default_factory=list)
     clashes: dict[tuple[str, str], str] = field(default_factory=dict)
@@ -77,7 +78,7 @@ class Registry:
 
     @staticmethod
     def installed() -> Registry:
-        """Return the registry of all installed plugins, ours and others', and of the user's plugin folder."""
+        """Return a registry with the built-in stages, all installed plugins, and those in the user's plugin folders."""
         registry = Registry()
         for entry in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda entry: (entry.value, entry.name)):
             registry._load_entry_point(entry)
@@ -92,20 +93,20 @@ class Registry:
         return [plugin for plugin in self.plugins if plugin.error]
 
     def add_module(self, module: ModuleType, origin: str, *, code: str = "") -> None:
-        """Register all stages and parts that a module holds.
+        """Register all stages and other registrations of a module.
 
         Raises:
-            PluginError: if a name is taken by another one; the message names both places.
+            PluginError: if a name is defined elsewhere too; the message names both places.
         """
         if clashes := self._clashes(module, own_only=bool(code)):
             raise PluginError("; ".join(clashes.values()))
         self._add(module, origin, code)
 
     def add_file(self, path: Path) -> None:
-        """Register the stages and parts of one user file; its code counts towards the cache keys of its stages.
+        """Register the stages and other registrations of a user's file; its code is in the cache keys of its stages.
 
         Raises:
-            PluginError: if the file cannot be read or imported, defines neither, or defines what there is already.
+            PluginError: if the file cannot be read or imported, defines nothing, or defines a name that exists.
         """
         loaded = self._load_file(path)
         if loaded is not None:
@@ -114,19 +115,19 @@ class Registry:
             self._remember_file(path, module, digest)
 
     def _load_file(self, path: Path) -> tuple[ModuleType, str] | None:
-        """Return a file's module and the digest of its code; None if it is registered as it is."""
+        """Return a file's module and the digest of its code, or None if the same code is registered already."""
         if not is_file(path):
             raise PluginError(f"plugin file {path} does not exist")
         try:
             digest = code_digest(path)
             if self._files.get(resolved(path), ("", None))[0] == digest:
-                return None  # named twice, or named by the workflow and in the user's folder
+                return None  # named twice, or by the workflow and in the user's folder
             module = _import_file(path)
         except KeyboardInterrupt:
             raise
-        except BaseException as error:  # also what is no Exception, such as pytest.skip() or a panic in Rust
+        except BaseException as error:  # also others than Exception, such as pytest.skip() or a panic in Rust
             raise PluginError(f"plugin file {path} failed to import: {_where(error, path)}") from error
-        if not any(_specs(module, own_only=True)) and not any(_marks(module, own_only=False)):
+        if not any(_specs(module, own_only=True)) and not any(_registrations(module, own_only=False)):
             raise PluginError(f'plugin file {path} defines no stage: decorate a function with @stage("kind.name")')
         return module, digest
 
@@ -137,7 +138,7 @@ class Registry:
     def files_behind(self, stages: Collection[str]) -> dict[Path, str]:
         """Return the plugin files that some stages need, with the digests of their code.
 
-        A file that gives parts is needed by any stage: which of them a stage uses is its own affair.
+        A file with registrations beside stages is always included, because any stage may use them.
         """
         return {
             path: digest
@@ -146,7 +147,7 @@ class Registry:
         }
 
     def suggest(self, name: str) -> str:
-        """Return what to do about an unknown stage name: why its plugin is broken, or what else may be meant."""
+        """Return a hint for an unknown stage name: why its plugin is broken, or similar names."""
         if ("stage", name) in self.clashes:
             return self.clashes["stage", name]
         for plugin in self.broken:
@@ -154,11 +155,11 @@ class Registry:
                 return plugin.why_broken()
         known = [*self.stages, *(given for plugin in self.broken for kind, given in plugin.names if kind == "stage")]
         close = get_close_matches(name, dict.fromkeys(known), n=3, cutoff=0.5)
-        parts = [f"did you mean {' or '.join(map(repr, close))}?"] if close else ["`pano-mvs plugins` lists all stages"]
-        parts.extend(
+        hints = [f"did you mean {' or '.join(map(repr, close))}?"] if close else ["`pano-mvs plugins` lists all stages"]
+        hints.extend(
             f"(plugin {plugin.origin} failed to load: {plugin.error})" for plugin in self.broken if not plugin.names
         )
-        return " ".join(parts)
+        return " ".join(hints)
 
     def _load_entry_point(self, entry: EntryPoint) -> None:
         origin = f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value
@@ -195,10 +196,10 @@ class Registry:
                 self._remember_file(path, module, digest)
 
     def _clashes(self, module: ModuleType, *, own_only: bool) -> dict[tuple[str, str], str]:
-        """Return which names of a module others have, with both places."""
-        places = {key: mark.origin for key, mark in self.parts.items()}
+        """Return the names of a module that are defined elsewhere too, with both places."""
+        places = {key: found.origin for key, found in self.registrations.items()}
         places |= {("stage", name): spec.origin for name, spec in self.stages.items()}
-        given = [((mark.kind, mark.name), mark.origin) for mark in _marks(module, own_only=own_only)]
+        given = [((found.kind, found.name), found.origin) for found in _registrations(module, own_only=own_only)]
         given += [(("stage", spec.name), spec.origin) for spec in _specs(module, own_only=own_only)]
         clashes: dict[tuple[str, str], str] = {}
         for (kind, name), origin in given:
@@ -208,20 +209,20 @@ class Registry:
         return clashes
 
     def _add(self, module: ModuleType, origin: str, code: str) -> None:
-        for mark in _marks(module, own_only=bool(code)):
-            self.parts.setdefault((mark.kind, mark.name), mark)
+        for found in _registrations(module, own_only=bool(code)):
+            self.registrations.setdefault((found.kind, found.name), found)
         for spec in _specs(module, own_only=bool(code)):
             if spec.name not in self.stages:
                 self.stages[spec.name] = spec.with_code(code) if code else spec
                 self.origins[spec.name] = origin
 
     def _withhold(self) -> None:
-        """Take away what is defined twice, and say of parts why they cannot be had."""
+        """Remove names that are defined twice, and make names of broken plugins unavailable."""
         for kind, name in self.clashes:
             if kind == "stage":
                 self.stages.pop(name, None)
         missing = {name: plugin.why_broken() for plugin in self.broken for name in plugin.names if name[0] != "stage"}
-        set_unusable_parts(missing | {name: why for name, why in self.clashes.items() if name[0] != "stage"})
+        set_unavailable(missing | {name: why for name, why in self.clashes.items() if name[0] != "stage"})
 
 
 def _broken(origin: str, names: tuple[tuple[str, str], ...], error: BaseException) -> Plugin:
@@ -230,7 +231,7 @@ def _broken(origin: str, names: tuple[tuple[str, str], ...], error: BaseExceptio
 
 
 def _trace(error: BaseException) -> str:
-    """Return the traceback from where the plugin's own code begins."""
+    """Return the traceback, beginning at the plugin's own code."""
     step = error.__traceback__
     while step is not None and (
         step.tb_frame.f_code.co_filename == __file__ or "importlib" in step.tb_frame.f_code.co_filename
@@ -240,31 +241,33 @@ def _trace(error: BaseException) -> str:
 
 
 def _names(module: ModuleType, *, own_only: bool) -> tuple[tuple[str, str], ...]:
-    """Return what a module gives."""
+    """Return the names that a module defines; see `Plugin.names`."""
     stages = [("stage", spec.name) for spec in _specs(module, own_only=own_only)]
-    return tuple(dict.fromkeys([*stages, *((mark.kind, mark.name) for mark in _marks(module, own_only=own_only))]))
+    return tuple(
+        dict.fromkeys([*stages, *((found.kind, found.name) for found in _registrations(module, own_only=own_only))])
+    )
 
 
 def _specs(module: ModuleType, *, own_only: bool) -> Iterator[StageSpec]:
-    """Find a module's stages; a user's file may also import stages of others, which are not its own."""
+    """Yield the stages of a module; with `own_only` not those that it imports."""
     for value in vars(module).values():
         spec = spec_of(value)
         if spec is not None and (not own_only or spec.function.__module__ == module.__name__):
             yield spec
 
 
-def _marks(module: ModuleType, *, own_only: bool) -> Iterator[PartMark]:
-    """Find what a module, or a helper of it, registers beside stages."""
+def _registrations(module: ModuleType, *, own_only: bool) -> Iterator[Registration]:
+    """Yield what a module registers beside stages; with `own_only` not what it imports."""
     for value in vars(module).values():
         if not own_only or getattr(value, "__module__", "") == module.__name__:
-            yield from marks_of(value)
+            yield from registrations_of(value)
 
 
 def _import_file(path: Path) -> ModuleType:
-    """Import a file under a name of its own; its folder is importable only meanwhile.
+    """Import a file under a unique name. Its folder is on the path only during the import.
 
-    The helpers that it imports from its folder are forgotten afterwards, so that another plugin's `helper.py` is not
-    taken for this one's.
+    Modules that it imports from its folder are removed from `sys.modules` afterwards, so that another plugin gets its
+    own `helper.py`.
     """
     name = f"pano_mvs_plugin_{digest_from_value(str(resolved(path)))[:12]}"
     spec = importlib.util.spec_from_file_location(name, path)
@@ -277,7 +280,7 @@ def _import_file(path: Path) -> ModuleType:
     sys.path.insert(0, folder)
     importlib.invalidate_caches()
     try:
-        with redirect_stdout(sys.stderr):  # the standard output is for what a command gives
+        with redirect_stdout(sys.stderr):  # commands write their results to the standard output
             spec.loader.exec_module(module)
     except BaseException:
         del sys.modules[name]
@@ -291,7 +294,7 @@ def _import_file(path: Path) -> ModuleType:
 
 
 def _where(error: BaseException, path: Path) -> str:
-    """Return the error with the line of the plugin's own file in which it was raised."""
+    """Return the error with the line of the plugin's own file that raised it."""
     if isinstance(error, SyntaxError):
         return f"{error.filename or path}:{error.lineno}: {error.msg}"
     frames = traceback.extract_tb(error.__traceback__)

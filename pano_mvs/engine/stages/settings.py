@@ -8,7 +8,7 @@ from typing import Annotated, Any, TypeVar, get_type_hints
 from pydantic import AfterValidator, Field, create_model
 
 from pano_mvs.core.settings import Setting, odd, settings_of
-from pano_mvs.engine.stages.params import Params, PartOf
+from pano_mvs.engine.stages.params import Params, RegisteredIn
 
 Model = TypeVar("Model", bound=Params)
 Settings = TypeVar("Settings")
@@ -34,8 +34,8 @@ def params_from(settings: type) -> Callable[[type[Model]], type[Model]]:
 
 
 def _field(kind: Any, told: Setting, default: Any) -> tuple[Any, Any]:
-    if told.parts is not None:
-        kind = Annotated[kind, PartOf(told.parts)]
+    if told.registry is not None:
+        kind = Annotated[kind, RegisteredIn(told.registry)]
     if told.odd:
         kind = Annotated[kind, AfterValidator(odd)]
     return kind, Field(default=default, ge=told.ge, gt=told.gt, le=told.le, description=told.doc)

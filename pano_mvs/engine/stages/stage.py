@@ -1,4 +1,4 @@
-"""Declare a stage: a function with typed ports, a `params` model and a kind as its result."""
+"""Declare stages: functions with typed ports, settings in a `params` model, and a kind as their result."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from pano_mvs.core.errors import PluginError
-from pano_mvs.engine.running.memory import bytes_from_size
+from pano_mvs.core.memory import bytes_from_size
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.params import Params
 from pano_mvs.engine.stages.ports import Cardinality, Port, port_from_annotation
@@ -22,14 +22,14 @@ _ATTRIBUTE = "__pano_mvs_stage__"
 
 @dataclass(frozen=True, slots=True)
 class SourceItem:
-    """One item that a source offers.
+    """One item of a source.
 
     Attributes:
         name: path relative to the capture, with forward slashes.
-        files: role to file; their content is what the item is known by.
-        problem: why the item cannot be used, if that is known already.
-        notes: what a user should know in each run, whether the item is read or its result cached: what hangs on where
-            files lie, which is no part of what the item is known by.
+        files: role to file; the cache key of the item is made of their content.
+        problem: why the item cannot be used, if that is known when it is listed.
+        notes: what a user should know in every run, even if the result is cached, such as notes on the location of
+            files, which is not part of the key.
         digests: role to the digest of the file when it was listed; filled in by the engine.
     """
 
@@ -40,32 +40,32 @@ class SourceItem:
     digests: Mapping[str, str] = field(default_factory=dict)
 
     def file(self, role: str) -> FilePart:
-        """Return a file as a part of a record: its `read_bytes` gives the bytes that were listed, or raises."""
+        """Return a file as part of a record; its `read_bytes` raises if the file has changed since it was listed."""
         return FilePart(self.files[role], external=True, digest=self.digests.get(role, ""))
 
 
 ListItems = Callable[[Any], Iterable[SourceItem]]
 MemoryNeeded = Callable[[Any, Mapping[str, Any]], int]
-"""Takes a unit's params and its inputs by port, those of a source as {"item": SourceItem}; returns bytes."""
+"""Returns the bytes that a unit needs, given its params and its inputs by port ({"item": SourceItem} for a source)."""
 
 
 @dataclass(frozen=True, slots=True)
 class StageSpec:
-    """What the engine knows of a stage.
+    """The declaration of a stage.
 
     Attributes:
         name: the `use:` name, such as `depth.sweep`.
-        version: raised by the author where the result changes for a reason that the code does not show.
+        version: the author raises it if results change for a reason that is not in the code.
         function: called with the ports by name, `params` and `ctx`.
         ports: what it reads.
-        params_type: its settings.
+        params_type: model of its settings.
         output: the kind that it returns.
-        list_items: for sources, what lists the items.
-        origin: where it was defined, `file:line`.
-        code_digest: digest of the code, for stages from user files; else empty. See `stage_code` for what is in keys.
-        extras: argument name to what it takes beside the ports.
-        memory_bytes: what one unit needs, if the author says so.
-        memory_needed: finds it for each unit, if it depends on settings and inputs.
+        list_items: the function that lists the items, for sources.
+        origin: where it is defined, `file:line`.
+        code_digest: digest of the code, for stages from user files; otherwise empty, see `stage_code`.
+        extras: name of each argument that is not a port, and its role.
+        memory_bytes: memory that one unit needs; 0 if not declared.
+        memory_needed: returns the memory that a unit needs, if it depends on settings and inputs.
     """
 
     name: str
@@ -88,20 +88,20 @@ class StageSpec:
 
     @property
     def index_kind(self) -> type[Record] | None:
-        """The index that says which items are near each other, if the stage has ports that need one."""
+        """The kind of index that the Near ports of the stage need; None if it has no such ports."""
         if all(port.cardinality is not Cardinality.NEAR for port in self.ports):
             return None
         return Pairs if self.output.axis is Axis.PAIR else Views
 
     @property
     def all_ports(self) -> tuple[Port, ...]:
-        """The declared ports, and `index` for the index if one is needed."""
+        """The declared ports, and the port `index` if the stage needs an index."""
         if self.index_kind is None:
             return self.ports
         return (*self.ports, Port(INDEX_PORT, self.index_kind, Cardinality.ONE))
 
     def with_code(self, code_digest: str) -> StageSpec:
-        """Return the stage as one whose code counts towards the cache key."""
+        """Return the stage with a digest of its code, which then counts towards the cache key."""
         return replace(self, code_digest=code_digest)
 
 
@@ -121,17 +121,17 @@ def stage(name: str, *, version: int = 1, memory: str | int | MemoryNeeded = 0) 
 
     The function takes ports annotated `One/Each/Near/All[Kind]`, `params` annotated with a `Params` model (optional),
     and `ctx: Context` (optional), and is annotated to return a kind. It is called with keywords. `memory`, such as
-    "2GB", is what one unit needs at most; no more of them run at a time than there is room for. Where that depends on
-    the unit it is a function `(params, inputs) -> bytes`, given what the stage itself would be given; it is called in
-    the main process, so it must be quick.
+    "2GB", is the most that one unit needs; only as many units run at a time as fit into memory. If it depends on the
+    unit, pass a function `(params, inputs) -> bytes`, which receives the same values as the stage. It is called in the
+    main process, so it must be fast.
 
     Raises:
-        PluginError: if the signature is not that of a stage.
+        PluginError: if the function does not have the signature of a stage.
     """
 
     def decorate(function: Function) -> Function:
         signature = _read_signature(function, name)
-        setattr(function, _ATTRIBUTE, _spec(name, version, function, signature, None, memory))
+        setattr(function, _ATTRIBUTE, _spec(name, function, signature, version=version, memory=memory))
         return function
 
     return decorate
@@ -140,16 +140,20 @@ def stage(name: str, *, version: int = 1, memory: str | int | MemoryNeeded = 0) 
 def source(
     name: str, *, list_items: ListItems, version: int = 1, memory: str | int | MemoryNeeded = 0
 ) -> Callable[[Function], Function]:
-    """Declare a function as a source: `list_items(params)` names the items, the function reads one of them.
+    """Declare a function as a source: `list_items(params)` lists the items, and the function reads one of them.
 
-    The function takes `item: SourceItem`, `params` and `ctx`, and returns a kind of the image axis. The list is made
-    anew at each run; reading an item is cached by the content of its files. `memory` is as in `stage`; a function is
-    given `{"item": item}` as inputs.
+    The function takes `item: SourceItem`, `params` and `ctx`, and returns a kind of the image axis. Items are listed in
+    each run; reading an item is cached by the content of its files. `memory` is as in `stage`; a function receives
+    `{"item": item}` as inputs.
     """
 
     def decorate(function: Function) -> Function:
         signature = _read_signature(function, name, leading="item")
-        setattr(function, _ATTRIBUTE, _spec(name, version, function, signature, list_items, memory))
+        setattr(
+            function,
+            _ATTRIBUTE,
+            _spec(name, function, signature, version=version, memory=memory, list_items=list_items),
+        )
         return function
 
     return decorate
@@ -163,11 +167,12 @@ def spec_of(value: object) -> StageSpec | None:
 
 def _spec(
     name: str,
-    version: int,
     function: Callable[..., Any],
     signature: _Signature,
-    list_items: ListItems | None,
-    memory: str | int | MemoryNeeded = 0,
+    *,
+    version: int,
+    memory: str | int | MemoryNeeded,
+    list_items: ListItems | None = None,
 ) -> StageSpec:
     return StageSpec(
         name=name,

@@ -1,1 +1,1 @@
-"""Workflow files: read, merged, validated and wired into a graph of stages."""
+"""Read, merge and validate workflow files, and connect their stages to a graph."""

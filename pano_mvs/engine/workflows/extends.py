@@ -1,4 +1,4 @@
-"""A workflow's files: the one that is given and those that it extends, read and laid over each other."""
+"""Read a workflow file and the files that it extends, and merge their stages."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ TOP_KEYS = ("pano_mvs", "name", "description", "extends", "plugins", "stages")
 
 
 @dataclass(frozen=True, slots=True)
-class Layer:
-    """One workflow file as it is written.
+class WorkflowFile:
+    """The content of one workflow file.
 
     Attributes:
-        shown_as: what it is called in messages.
-        base: the folder that its relative paths are relative to.
+        shown_as: its name in messages.
+        base: folder that its relative paths start from.
         text: the YAML.
-        root: the mapping at its top.
+        root: the top-level mapping.
     """
 
     shown_as: str
@@ -38,7 +38,7 @@ class Layer:
 
     @property
     def stages(self) -> Mapping[str, Located]:
-        """What it says of stages, by name."""
+        """Its entries under `stages:`, by name."""
         node = self.root.value.get("stages")
         return node.value if node is not None and isinstance(node.value, dict) else {}
 
@@ -47,60 +47,68 @@ def read_text(path: Path) -> str:
     """Return the text of a workflow file.
 
     Raises:
-        InputError: if it is no plain file, too large, or not text; with what to do.
+        InputError: if it is not a regular file, too large, or not text.
     """
     try:
         info = path.stat()
         if stat.S_ISDIR(info.st_mode):
-            raise InputError(f"workflow {path} is a folder: name the YAML file in it")
+            raise InputError(f"workflow {path} is a folder: give the path of a YAML file")
         if not stat.S_ISREG(info.st_mode):
-            raise InputError(f"workflow {path} is no plain file (a pipe, a socket or a device): name a YAML file")
+            raise InputError(
+                f"workflow {path} is not a regular file (a pipe, a socket or a device): give the path of a YAML file"
+            )
         if info.st_size > MAX_BYTES:
-            raise InputError(f"workflow {path} has {info.st_size} bytes, {MAX_BYTES} are allowed: is it a workflow?")
+            raise InputError(
+                f"workflow {path} has {info.st_size} bytes, but at most {MAX_BYTES} are allowed: is it a workflow?"
+            )
         with path.open("rb") as stream:
             return stream.read(MAX_BYTES + 1).decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
-        raise InputError(f"workflow {path} cannot be read: byte {error.start} is not UTF-8. Save it as UTF-8 text, or "
-                         "name another file")  from error  # fmt: skip
+        raise InputError(
+            f"workflow {path} cannot be read: byte {error.start} is not UTF-8. Save it as UTF-8 text, or "
+            "give another file"
+        ) from error
     except (OSError, ValueError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"workflow {path} cannot be read: {error}. Mend it, or name another file") from error
+        raise InputError(
+            f"workflow {path} cannot be read: {error}. Check its permissions, or give another file"
+        ) from error
 
 
 @dataclass(slots=True)
-class LayerReader:
-    """Reads a file and all that it extends: each once, those that are extended first.
+class ExtendsReader:
+    """Reads a workflow file and all files that it extends, each once, the extended ones first.
 
     Attributes:
-        problems: where mistakes go.
-        presets: folder of the workflows that may be extended by name, or None.
-        layers: what was read.
+        problems: the errors found.
+        presets: folder of the workflows that can be extended by name, or None.
+        files: the files that were read.
     """
 
     problems: Problems
     presets: Path | None = None
-    layers: list[Layer] = field(default_factory=list)
+    files: list[WorkflowFile] = field(default_factory=list)
     _seen: set[Path] = field(default_factory=set)
 
     def read(self, text: str, shown_as: str, base: Path, *, chain: tuple[Path, ...] = ()) -> None:
-        """Read a text and, before it, what it extends.
+        """Read a workflow and, before it, the files that it extends.
 
         Args:
             text: the YAML.
-            shown_as: what to call it in messages.
-            base: the folder that its relative paths are relative to.
-            chain: the files that led here, this one last; empty for a text that is no file.
+            shown_as: its name in messages.
+            base: folder that its relative paths start from.
+            chain: the files that extend each other up to this one, which is last; empty if the text is not a file.
         """
         root = parse_yaml(text, shown_as)
         if not isinstance(root.value, dict):
-            raise WorkflowError([f"{root.place}: a workflow is a mapping with the keys {', '.join(TOP_KEYS)}"])
+            raise WorkflowError([f"{root.place}: a workflow must be a mapping with the keys {', '.join(TOP_KEYS)}"])
         self._check_top(root)
         for item in self._extended(root):
             path = self._find(item, base)
             if path is not None:
                 self._follow(item, path, chain)
-        self.layers.append(Layer(shown_as, base, text, root))
+        self.files.append(WorkflowFile(shown_as, base, text, root))
 
     def _extended(self, root: Located) -> Iterator[Located]:
         node = root.value.get("extends")
@@ -110,7 +118,7 @@ class LayerReader:
             if isinstance(item.value, str) and item.value:
                 yield item
             else:
-                self.problems.add(item.place, "extends: name a workflow file or a preset, or a list of them")
+                self.problems.add(item.place, "extends: must be a workflow file or a preset, or a list of them")
 
     def _find(self, item: Located, base: Path) -> Path | None:
         name = str(item.value)
@@ -136,7 +144,7 @@ class LayerReader:
             return
         self._seen.add(real)
         if len(self._seen) > MAX_FILES:
-            raise WorkflowError([*self.problems.lines, f"{item.place}: extends: {MAX_FILES} files are allowed"])
+            raise WorkflowError([*self.problems.lines, f"{item.place}: extends: at most {MAX_FILES} files are allowed"])
         try:
             self.read(read_text(path), str(path), path.parent, chain=(*chain, real))
         except InputError as error:
@@ -148,40 +156,44 @@ class LayerReader:
                 self.problems.add(node.key_place, f"unknown key {key[:80]!r}.{did_you_mean(key, TOP_KEYS)}")
         version = root.value.get("pano_mvs")
         if version is None:
-            self.problems.add(root.place, f"the key `pano_mvs: {FORMAT_VERSION}` is missing (the version of the "
-                              "workflow format)")  # fmt: skip
+            self.problems.add(
+                root.place, f"the key `pano_mvs: {FORMAT_VERSION}` is missing (the version of the workflow format)"
+            )
         elif version.value != FORMAT_VERSION or isinstance(version.value, bool):
             shown = repr(version.plain())[:80]
-            self.problems.add(version.place, f"workflow format {shown} is not known; this version reads "
-                              f"{FORMAT_VERSION}")  # fmt: skip
+            self.problems.add(
+                version.place, f"workflow format {shown} is not supported; this version reads {FORMAT_VERSION}"
+            )
         if "name" in root.value and not is_plain_name(root.value["name"].plain()):
-            self.problems.add(root.value["name"].place, "name must be a word of letters, digits, '-', '_' and '.' "
-                              "that may name a folder")  # fmt: skip
+            self.problems.add(
+                root.value["name"].place,
+                "name must consist of letters, digits, '-', '_' and '.', and be a valid folder name",
+            )
         node = root.value.get("stages")
         missing = node is None and "extends" in root.value
         if not missing and (node is None or not isinstance(node.value, dict) or not node.value):
             self.problems.add((node or root).place, "`stages:` must be a mapping of stage names to {use: …}")
 
 
-def merge_stages(layers: Sequence[Layer], problems: Problems) -> dict[str, Located]:
-    """Lay the stages of files over each other; what comes later holds.
+def merge_stages(files: Sequence[WorkflowFile], problems: Problems) -> dict[str, Located]:
+    """Merge the stages of several files; later files override earlier ones.
 
-    A stage that is given again keeps its place and overrides setting by setting; with another `use` it is a new one;
-    `null` removes it. A new one goes behind the stage that stands before it in its file, else before the one that
-    stands behind it, else to the end.
+    An entry for an existing stage keeps the position of the stage and overrides single settings. With another `use` it
+    replaces the stage, and `null` removes it. A new stage is inserted behind the stage that precedes it in its file,
+    else before the one that follows it, else at the end.
     """
     stages: dict[str, Located] = {}
-    for layer in layers:
+    for file in files:
         order = list(stages)
-        written = list(layer.stages)
+        written = list(file.stages)
         for idx, name in enumerate(written):
             if name not in stages:
                 order.insert(_position(order, written, idx), name)
-        for name, node in layer.stages.items():
-            _lay(stages, name, node, problems)
+        for name, node in file.stages.items():
+            _merge_entry(stages, name, node, problems=problems)
         stages = {name: stages[name] for name in order if name in stages}
         if len(stages) > MAX_STAGES:
-            raise WorkflowError([*problems.lines, f"{layer.root.place}: {MAX_STAGES} stages are allowed"])
+            raise WorkflowError([*problems.lines, f"{file.root.place}: at most {MAX_STAGES} stages are allowed"])
     return stages
 
 
@@ -191,26 +203,30 @@ def _position(order: Sequence[str], written: Sequence[str], idx: int) -> int:
     return next((order.index(name) for name in written[1:] if name in order), len(order))
 
 
-def _lay(stages: dict[str, Located], name: str, node: Located, problems: Problems) -> None:
+def _merge_entry(stages: dict[str, Located], name: str, node: Located, *, problems: Problems) -> None:
     if not is_plain_name(name):
-        problems.add(node.key_place, f"stage name {name[:80]!r} must be a word of letters, digits, '-' and '_' that "
-                     "may name a folder")  # fmt: skip
+        problems.add(
+            node.key_place,
+            f"stage name {name[:80]!r} must consist of letters, digits, '-', '_' and '.', and be a valid folder name",
+        )
     elif node.value is None and name in stages:
         del stages[name]
     elif node.value is None:
         hint = did_you_mean(name, stages) if stages else " Write `{use: NAME}`"
-        problems.add(node.key_place, f"stage {name!r} needs `use: NAME`; there is none of that name to remove.{hint}")
+        problems.add(
+            node.key_place, f"stage {name!r} needs `use: NAME`; there is no stage of that name to remove.{hint}"
+        )
     elif not isinstance(node.value, dict):
         problems.add(node.key_place, f"stage {name!r} needs `use: NAME`: write `{name}: {{use: …}}`")
     elif "use" not in node.value and name not in stages:
         hint = f"; no file that is extended has a stage of that name.{did_you_mean(name, stages)}" if stages else ""
         problems.add(node.key_place, f"stage {name!r} needs `use: NAME`{hint}")
     else:
-        stages[name] = overlaid(stages.get(name), node)
+        stages[name] = merged_entry(stages.get(name), node)
 
 
-def overlaid(below: Located | None, above: Located) -> Located:
-    """Return a stage's entry with another laid over it; one with another `use` hides all that is below."""
+def merged_entry(below: Located | None, above: Located) -> Located:
+    """Return a stage's entry with overrides from a later file; another `use` replaces the entry."""
     mine = above.value.get("use")
     if below is None or (mine is not None and mine.value != below.value["use"].value):
         return above
@@ -219,7 +235,7 @@ def overlaid(below: Located | None, above: Located) -> Located:
 
 
 def did_you_mean(word: str, options: Sequence[str] | Mapping[str, object]) -> str:
-    """Return a hint at what a word that is not known may have meant, or at what there is."""
+    """Return a hint for an unknown word: similar options, or else all of them."""
     close = get_close_matches(word[:80], list(options), n=2, cutoff=0.6)
     if close:
         return f" Did you mean {' or '.join(map(repr, close))}?"

@@ -1,4 +1,4 @@
-"""What the command line changes in a workflow: `--set STAGE.PARAM=VALUE` and `--images DIR`."""
+"""Apply changes from the command line to a workflow: `--set STAGE.PARAM=VALUE` and `--images DIR`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pano_mvs.core.paths import resolved
 from pano_mvs.engine.workflows.extends import did_you_mean
 from pano_mvs.engine.workflows.yaml_text import Located, Problems, parse_yaml
 
-_HOW = "write STAGE.PARAM=VALUE, such as depth.planes=192"
+_SYNTAX = "write STAGE.PARAM=VALUE, such as depth.planes=192"
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,16 +24,16 @@ class _Override:
 def apply_overrides(
     stages: dict[str, Located], overrides: Sequence[str], problems: Problems, *, images: Path | None = None
 ) -> list[Located]:
-    """Change stages in place and return the plugin files that are added.
+    """Change stages in place, and return the plugin files to add.
 
-    `plugins` come first, then what changes a stage's `use` or removes a stage, then the folder of images, then the
-    rest in the order given: so a setting of the new stage may stand before the `use` that brings it.
+    Overrides that add plugins, remove a stage or change its `use` are applied first, then the folder of images, then
+    the others in the given order. So the settings of a new stage may precede its `use`.
 
     Args:
         stages: the merged entries.
-        overrides: `STAGE.PARAM=VALUE`, `STAGE.PARAM.KEY=VALUE`, `STAGE=null` or `plugins=FILE`, the value in YAML.
-        problems: where mistakes go.
-        images: a folder for the stage called `images` to read instead of its own.
+        overrides: `STAGE.PARAM=VALUE`, `STAGE.PARAM.KEY=VALUE`, `STAGE=null` or `plugins=FILE`, with values in YAML.
+        problems: receives the errors.
+        images: folder that replaces the path of the stage `images`; None to keep it.
     """
     plugins: list[Located] = []
     rest: list[_Override] = []
@@ -60,7 +60,7 @@ def _read(text: str, problems: Problems) -> _Override | None:
     target, equals, written = text.partition("=")
     target = target.strip()
     if not (equals and target) or (target != "plugins" and "." not in target and written.strip() not in {"null", "~"}):
-        problems.add(f"--set {text[:80]}", _HOW)
+        problems.add(f"--set {text[:80]}", _SYNTAX)
         return None
     origin = f"--set {target}"
     try:
@@ -72,7 +72,7 @@ def _read(text: str, problems: Problems) -> _Override | None:
 
 
 def _stage_of(target: str, stages: dict[str, Located]) -> str:
-    """Return the stage that a target begins with, the longest name of several (names may hold dots), or nothing."""
+    """Return the stage that a target begins with, the longest match as names may contain dots; empty if none."""
     found = [name for name in stages if target == name or target.startswith(f"{name}.")]
     return max(found, key=len, default="")
 
@@ -86,16 +86,17 @@ def _remove(stages: dict[str, Located], override: _Override, problems: Problems)
     if override.value.value is None:
         del stages[override.target]
     else:
-        problems.add(f"--set {override.text[:80]}", f"{_HOW}; {override.target}=null removes the stage")
+        problems.add(f"--set {override.text[:80]}", f"{_SYNTAX}; {override.target}=null removes the stage")
 
 
 def _replace(stages: dict[str, Located], override: _Override) -> None:
-    """Give a stage another `use`: what the workflow says of the old one does not hold for the new one."""
+    """Change the `use` of a stage; this drops the settings of the old stage."""
     name = _stage_of(override.target, stages)
     node = stages[name]
     kept = node.value if node.value["use"].value == override.value.value else {}
-    stages[name] = Located({**kept, "use": override.value}, node.line, node.column, node.key_line, node.key_column,
-                           node.origin, node.file)  # fmt: skip
+    stages[name] = Located(
+        {**kept, "use": override.value}, node.line, node.column, node.key_line, node.key_column, node.origin, node.file
+    )
 
 
 def _apply(stages: dict[str, Located], override: _Override, problems: Problems) -> None:
@@ -106,20 +107,20 @@ def _apply(stages: dict[str, Located], override: _Override, problems: Problems) 
         return
     steps = tuple(override.target[len(name) + 1 :].split("."))
     if not all(steps):
-        problems.add(f"--set {override.text[:80]}", _HOW)
+        problems.add(f"--set {override.text[:80]}", _SYNTAX)
     elif problem := _set(stages[name], steps, override.value):
         problems.add(f"--set {override.text[:80]}", problem)
 
 
 def _set(node: Located, steps: tuple[str, ...], value: Located) -> str:
-    """Put a value at a path of keys and of positions in lists; return why that cannot be."""
+    """Set a value at a path of keys and list positions; return why this is impossible, or ""."""
     here = node.value
     for number, step in enumerate(steps):
         last = number == len(steps) - 1
         shown = ".".join(steps[:number])
         if isinstance(here, list):
             if not step.isdecimal() or int(step[:9]) > len(here) - (not last):
-                return f"{shown} is a list of {len(here)}: write a position from 0, or the whole list in [ ]"
+                return f"{shown} is a list of {len(here)}: give a position from 0, or the whole list in [ ]"
             key: str | int = int(step[:9])
             if key == len(here):
                 here.append(value)
@@ -129,7 +130,7 @@ def _set(node: Located, steps: tuple[str, ...], value: Located) -> str:
             if not last and (key not in here or here[key].value is None):
                 here[key] = Located({}, 0, 0, origin=value.origin)
         else:
-            return f"{shown} is {here!r:.80}, which has no {step!r} in it"
+            return f"{shown} is {here!r:.80}, which has no {step!r}"
         if last:
             here[key] = value
         else:

@@ -1,4 +1,4 @@
-"""The JSON Schema (2020-12) of a workflow file, for editors that complete and check while one types."""
+"""The JSON Schema (2020-12) of workflow files, for completion and checks in editors."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def workflow_schema(registry: Registry, inherited: Mapping[str, Located] | None 
     """Return the schema of workflow files.
 
     Args:
-        registry: the stages there are; their settings, with those parts of plugins that are chosen by name.
-        inherited: the stages of the workflows that a file extends: what it says of them may leave `use` out, and is
-            completed by the settings of the stage that they use.
+        registry: the known stages.
+        inherited: the stages of the workflows that a file extends. Their entries in the file may omit `use`, and get
+            the settings of the stage that they use.
     """
     specs = dict(sorted(registry.stages.items()))
     return {
@@ -36,14 +36,14 @@ def workflow_schema(registry: Registry, inherited: Mapping[str, Located] | None 
         "additionalProperties": False,
         "properties": _top(specs, inherited or {}),
         "if": {"required": ["extends"]},
-        "then": {"properties": {"stages": {"additionalProperties": _ref("again")}}},
+        "then": {"properties": {"stages": {"additionalProperties": _ref("override")}}},
         "else": {
             "required": ["stages"],
             "properties": {"stages": {"minProperties": 1, "additionalProperties": _ref("stage")}},
         },
         "$defs": {
             "stage": _entry(specs),
-            "again": {"anyOf": [{"type": "null"}, _again(specs)]},
+            "override": {"anyOf": [{"type": "null"}, _override(specs)]},
             **{f"use.{name}": _settings(spec) for name, spec in specs.items()},
             **_reserved_definitions(),
         },
@@ -54,14 +54,14 @@ def _top(specs: Mapping[str, StageSpec], inherited: Mapping[str, Located]) -> Sc
     known = {name: _inherited(specs, str(node.value["use"].value)) for name, node in inherited.items()}
     return {
         "pano_mvs": {"const": FORMAT_VERSION, "description": "version of the workflow format"},
-        "name": _NAME | {"description": "names the output folder; by default as the file"},
+        "name": _NAME | {"description": "name of the output folder; by default that of the file"},
         "description": {"type": "string"},
         "extends": {
-            "description": "a preset or a file, or a list of them, over which this one is laid",
+            "description": "a preset or a file, or a list of them, whose stages this file inherits and overrides",
             "anyOf": [{"type": "string", "minLength": 1}, *_LIST],
         },
         "plugins": {
-            "description": "Python files with further stages or parts, relative to this file",
+            "description": "Python files with plugins, relative to this file",
             "anyOf": _LIST,
         },
         "stages": {
@@ -70,11 +70,11 @@ def _top(specs: Mapping[str, StageSpec], inherited: Mapping[str, Located]) -> Sc
             "properties": known,
             "propertyNames": _NAME,
         },
-    }  # fmt: skip
+    }
 
 
 def _entry(specs: Mapping[str, StageSpec]) -> Schema:
-    """Return the schema of a stage that stands for itself."""
+    """Return the schema of a complete stage entry."""
     return {
         "type": "object",
         "required": ["use"],
@@ -83,8 +83,8 @@ def _entry(specs: Mapping[str, StageSpec]) -> Schema:
     }
 
 
-def _again(specs: Mapping[str, StageSpec]) -> Schema:
-    """Return the schema of a stage that may be given again: nothing of it need be said, not even `use`."""
+def _override(specs: Mapping[str, StageSpec]) -> Schema:
+    """Return the schema of an entry that may override an inherited one: no key is required, not even `use`."""
     return {
         "type": "object",
         "properties": {"use": _use(specs), **_reserved()},
@@ -93,14 +93,14 @@ def _again(specs: Mapping[str, StageSpec]) -> Schema:
 
 
 def _inherited(specs: Mapping[str, StageSpec], use: str) -> Schema:
-    """Return the schema of a stage that is known from below: its settings, unless another `use` is given."""
+    """Return the schema of an entry that overrides a known stage: its settings, unless `use` is another one."""
     if use not in specs:
-        return _ref("again")
+        return _ref("override")
     same = {"properties": {"use": {"const": use}}}
     return {
         "if": {"type": "object", **same},
         "then": _ref(f"use.{use}"),
-        "else": _ref("again"),
+        "else": _ref("override"),
     }
 
 
@@ -117,7 +117,7 @@ def _use(specs: Mapping[str, StageSpec]) -> Schema:
 
 
 def _settings(spec: StageSpec) -> Schema:
-    """Return the schema of all keys of a stage's entry."""
+    """Return the schema of all keys of an entry that uses a stage."""
     own = spec.params_type.model_json_schema(
         by_alias=True, ref_template=f"{_pointer(f'use.{spec.name}')}/$defs/{{model}}"
     )
@@ -142,12 +142,12 @@ def _required(spec: StageSpec) -> list[str]:
 
 
 def _reserved() -> Schema:
-    """Return, for the keys that every stage takes, where their schemas are."""
+    """Return references to the schemas of the reserved keys."""
     return {name: _ref(f"key.{name}") for name in RESERVED_KEYS if name != "use"}
 
 
 def _reserved_definitions() -> Schema:
-    """Return the schemas of the keys that every stage takes; null stands for what holds if nothing is said."""
+    """Return the schemas of the reserved keys; null stands for the default."""
     own = Policy.model_json_schema(by_alias=True)
     keys = {
         f"key.{name}": {"description": value.pop("description", ""), "anyOf": [value, {"type": "null"}]}
@@ -162,20 +162,20 @@ def _ref(name: str) -> Schema:
 
 
 def _pointer(name: str) -> str:
-    """Return where a definition is, as RFC 6901 writes it in a URI."""
+    """Return the URI fragment of a definition, escaped by RFC 6901."""
     return f"#/$defs/{quote(name.replace('~', '~0').replace('/', '~1'))}"
 
 
 def _ports(spec: StageSpec) -> Schema:
     ports = {port.name: {"type": "string", "description": str(port)} for port in spec.all_ports}
     return {
-        "description": "port to the stage of this workflow that feeds it, where there is a choice",
+        "description": "port to the stage of this workflow that feeds it, if there are several candidates",
         "anyOf": [{"type": "object", "additionalProperties": False, "properties": ports}, {"type": "null"}],
     }
 
 
 def _without_titles(properties: Schema) -> Schema:
-    """Leave out the titles that pydantic makes of names; an editor would show them in place of the names."""
+    """Remove the titles that pydantic adds; editors would show them in place of the names."""
     return {name: {key: part for key, part in value.items() if key != "title"} for name, value in properties.items()}
 
 

@@ -1,4 +1,4 @@
-"""Connect the ports of a workflow's stages, or say what does not fit; nothing has run yet."""
+"""Connect the ports of a workflow's stages, and report what does not fit before anything runs."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from pano_mvs.scene import Axis
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """What feeds a port.
+    """A connection from a stage to a port of another one.
 
     Attributes:
         port: the port.
-        producer: name of the feeding stage in the workflow.
-        exploded: whether the items of the producer's collection are meant rather than the collection.
+        producer: name of the stage that feeds it.
+        exploded: whether it carries the items of the producer's collection instead of the collection.
     """
 
     port: Port
@@ -31,13 +31,13 @@ class Edge:
 
 @dataclass(frozen=True, slots=True)
 class Graph:
-    """A wired workflow.
+    """The connected stages of a workflow.
 
     Attributes:
         order: stage names, producers first, otherwise as in the file.
-        edges: stage name to port name to what feeds it.
+        edges: stage name to port name to the connection.
         axes: stage name to the axis of its units.
-        only: stage name to the units to which it is confined, where it is.
+        only: stage name to its units, for stages that are limited to some of them.
         is_part: whether some stages or units of the workflow are left out.
     """
 
@@ -47,8 +47,8 @@ class Graph:
     only: Mapping[str, frozenset[str]] = field(default_factory=dict)
     is_part: bool = False
 
-    def confined(self, ends: Collection[str], only: Mapping[str, frozenset[str]]) -> Graph:
-        """Return the part of the graph that the stages `ends` need, themselves included."""
+    def limited_to(self, ends: Collection[str], only: Mapping[str, frozenset[str]]) -> Graph:
+        """Return the graph of the stages `ends` and the stages that they need."""
         needed = set(ends)
         for name in reversed(self.order):
             if name in needed:
@@ -58,10 +58,10 @@ class Graph:
 
 
 def wire(workflow: Workflow) -> Graph:
-    """Connect every port: by `in:`, else to the nearest earlier stage that produces its kind.
+    """Connect every port as `in:` says, or else to the nearest earlier stage that produces its kind.
 
     Raises:
-        WorkflowError: with every mistake: unknown stages or ports in `in:`, kinds that do not fit, inputs that nobody
+        WorkflowError: with every error: unknown stages or ports in `in:`, kinds that do not fit, inputs that no stage
             produces, ambiguity, cycles.
     """
     wirer = _Wirer(workflow)
@@ -76,7 +76,7 @@ def wire(workflow: Workflow) -> Graph:
 
 
 def wiring_problems(stages: Mapping[str, StageEntry]) -> list[str]:
-    """Return the mistakes in the wiring of stages whose settings may be wrong."""
+    """Return the errors in the connections of stages, even if their settings are wrong."""
     try:
         wire(Workflow("", None, "", dict(stages)))
     except WorkflowError as error:
@@ -85,7 +85,7 @@ def wiring_problems(stages: Mapping[str, StageEntry]) -> list[str]:
 
 
 def _delivers(entry: StageEntry, port: Port) -> bool | None:
-    """Return whether a stage feeds a port by its items (True), as a whole (False), or not at all (None)."""
+    """Return True if a stage feeds a port with its items, False if as a whole, None if it cannot feed it."""
     output = entry.spec.output
     if port.cardinality is Cardinality.ONE:
         return False if issubclass(output, port.kind) and output.axis in (Axis.ONE, None) else None
@@ -146,8 +146,11 @@ class _Wirer:
         others = [stage.name for stage in candidates[:-1] if stage.name not in self.ancestors.get(nearest.name, set())]
         if others:
             options = ", ".join([*others, nearest.name])
-            self._problem(entry, "use", f"stage {entry.name!r}: port {port} could be fed by {options}; "
-                          f"say which with `in: {{{port.name}: …}}`")  # fmt: skip
+            self._problem(
+                entry,
+                "use",
+                f"stage {entry.name!r}: port {port} could be fed by {options}; choose with `in: {{{port.name}: …}}`",
+            )
             return None
         return Edge(port, nearest.name, bool(_delivers(nearest, port)))
 
@@ -193,8 +196,12 @@ class _Wirer:
         if Axis.PAIR in fed and len(set(fed)) > 1:
             self._problem(entry, "use", f"stage {entry.name!r} mixes Each inputs of pairs and of images")
         if output is not None and (output is Axis.ONE) != (found is Axis.ONE):
-            self._problem(entry, "use", f"stage {entry.spec.name!r} returns {entry.spec.output.kind_name()} (one per "
-                          f"{output}), but its inputs give one unit per {found}")  # fmt: skip
+            self._problem(
+                entry,
+                "use",
+                f"stage {entry.spec.name!r} returns {entry.spec.output.kind_name()} (one per "
+                f"{output}), but its inputs give one unit per {found}",
+            )
         return found
 
     def _problem(self, entry: StageEntry, place: str, message: str) -> None:

@@ -1,4 +1,4 @@
-"""A workflow file: parsed, its settings validated, every mistake found at once."""
+"""Load workflow files and validate their settings, reporting all errors at once."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.errors import PluginError, UsageError, WorkflowError
 from pano_mvs.core.file_names import is_plain_name
 from pano_mvs.core.paths import children, exists, is_denied, is_file, resolved
@@ -17,7 +18,7 @@ from pano_mvs.engine.code.plugin_digest import code_digest
 from pano_mvs.engine.stages.params import Params, files_of
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import StageSpec
-from pano_mvs.engine.workflows.extends import Layer, LayerReader, did_you_mean, merge_stages, read_text
+from pano_mvs.engine.workflows.extends import ExtendsReader, WorkflowFile, did_you_mean, merge_stages, read_text
 from pano_mvs.engine.workflows.overrides import apply_overrides
 from pano_mvs.engine.workflows.policy import RESERVED_KEYS, Policy
 from pano_mvs.engine.workflows.yaml_text import Located, Problems
@@ -31,7 +32,7 @@ class StageEntry:
         name: its name in this workflow.
         spec: the stage it uses.
         params: its settings.
-        policy: wiring and error handling.
+        policy: the reserved keys.
         place: `file:line:column` of its name.
         places: port or setting to `file:line:column`.
     """
@@ -51,10 +52,10 @@ class Workflow:
     Attributes:
         name: for the output folder and the report.
         path: the file, or None.
-        text: the YAML as written, with that of the files that it extends.
+        text: the YAML, followed by that of the files that it extends.
         stages: in the order of the file.
-        overrides: the `--set` and `--images` that were applied.
-        plugins: the plugin files that it names, with the digests of their code.
+        overrides: the `--set` and `--images` options that were applied.
+        plugins: its plugin files, with the digests of their code.
     """
 
     name: str
@@ -63,6 +64,11 @@ class Workflow:
     stages: dict[str, StageEntry]
     overrides: tuple[str, ...] = ()
     plugins: Mapping[Path, str] = field(default_factory=dict)
+
+    @property
+    def id(self) -> str:
+        """Digest under which the cache keys of its latest run are remembered: of its name and its stages' names."""
+        return digest_from_value([self.name, list(self.stages)])
 
 
 def load_workflow(
@@ -76,22 +82,22 @@ def load_workflow(
     """Read and validate a workflow file.
 
     Args:
-        path: the YAML file; relative paths in it are relative to its folder.
-        registry: the stages there are; the plugin files that the workflow names are added to it.
-        overrides: `STAGE.PARAM=VALUE`, the value in YAML.
-        images: a folder for the stage called `images` to read instead of its own.
-        presets: folder of the workflows that it may extend by name.
+        path: the YAML file; relative paths in it start from its folder.
+        registry: the known stages; the plugin files of the workflow are added to it.
+        overrides: `STAGE.PARAM=VALUE`, with values in YAML.
+        images: folder that replaces the path of the stage `images`; None to keep it.
+        presets: folder of the workflows that can be extended by name.
 
     Raises:
         InputError: if the file cannot be read.
-        WorkflowError: with every mistake found, each with its place.
+        WorkflowError: with every error and its location.
     """
     reader = WorkflowReader(str(path), path.parent, registry, presets=presets)
     return reader.read(read_text(path), overrides=overrides, images=images, path=path)
 
 
-class PartialWorkflowError(WorkflowError):
-    """A workflow with mistakes; `stages` are its entries where all could be named, for the wiring to be checked too."""
+class InvalidWorkflowError(WorkflowError):
+    """A workflow with errors; `stages` has its entries if all their stages exist, so that `wire` can check them too."""
 
     def __init__(self, problems: list[str], stages: dict[str, StageEntry]) -> None:
         self.stages = stages
@@ -99,7 +105,7 @@ class PartialWorkflowError(WorkflowError):
 
 
 class WorkflowReader:
-    """Turns YAML into a workflow, collecting problems."""
+    """Turns YAML into a workflow and collects errors."""
 
     def __init__(self, shown_as: str, base: Path, registry: Registry, *, presets: Path | None = None) -> None:
         self.shown_as = shown_as
@@ -113,42 +119,42 @@ class WorkflowReader:
     def read(
         self, text: str, *, overrides: Sequence[str] = (), images: Path | None = None, path: Path | None = None
     ) -> Workflow:
-        """Return the workflow, or raise WorkflowError with every mistake."""
-        layers = self._layers(text, path)
-        entries = merge_stages(layers, self.problems)
+        """Return the workflow, or raise WorkflowError with every error."""
+        files = self._read_files(text, path)
+        entries = merge_stages(files, self.problems)
         added = apply_overrides(entries, overrides, self.problems, images=images)
-        for layer in layers:
-            self._load_plugins(layer.root.value.get("plugins"))
+        for file in files:
+            self._load_plugins(file.root.value.get("plugins"))
         for item in added:
             self._load_plugin(item)
         if not entries and not self.problems.lines:
-            self.problems.add(layers[-1].root.place, "no stage is left")
+            self.problems.add(files[-1].root.place, "no stage is left")
         stages = {name: entry for name, node in entries.items() if (entry := self._stage(name, node)) is not None}
         if self.problems.lines:
-            raise PartialWorkflowError(self.problems.lines, stages if len(stages) == len(entries) else {})
-        root = layers[-1].root
+            raise InvalidWorkflowError(self.problems.lines, stages if len(stages) == len(entries) else {})
+        root = files[-1].root
         name = root.value["name"].plain() if "name" in root.value else _name_of(self.shown_as)
         shown = ([f"images.path={images}"] if images else []) + list(overrides)
-        return Workflow(name, path, _all_texts(layers), stages, tuple(shown), self.plugins)
+        return Workflow(name, path, _all_texts(files), stages, tuple(shown), self.plugins)
 
     def inherited(self, text: str, path: Path) -> dict[str, Located]:
-        """Return the stages that a file has from those that it extends, and load the plugins of all of them.
+        """Return the stages that a file inherits, and load the plugins of all its files.
 
-        Mistakes are passed over: this serves an editor in which the file is being written.
+        Errors are ignored, as this serves editors while the file is being written.
 
         Raises:
-            WorkflowError: if it is no YAML.
+            WorkflowError: if the text is not YAML.
         """
-        layers = self._layers(text, path)
-        for layer in layers:
-            self._load_plugins(layer.root.value.get("plugins"))
-        return merge_stages(layers[:-1], self.problems)
+        files = self._read_files(text, path)
+        for file in files:
+            self._load_plugins(file.root.value.get("plugins"))
+        return merge_stages(files[:-1], self.problems)
 
-    def _layers(self, text: str, path: Path | None) -> list[Layer]:
-        reader = LayerReader(self.problems, self.presets)
+    def _read_files(self, text: str, path: Path | None) -> list[WorkflowFile]:
+        reader = ExtendsReader(self.problems, self.presets)
         reader.read(text, self.shown_as, self.base, chain=(resolved(path),) if path is not None else ())
-        self.folders = {layer.shown_as: layer.base for layer in reader.layers}
-        return reader.layers
+        self.folders = {file.shown_as: file.base for file in reader.files}
+        return reader.files
 
     def _load_plugins(self, node: Located | None) -> None:
         if node is None or node.value is None:
@@ -161,7 +167,7 @@ class WorkflowReader:
 
     def _load_plugin(self, item: Located) -> None:
         if not isinstance(item.value, str):
-            self.problems.add(item.place, "a plugin is the path of a Python file")
+            self.problems.add(item.place, "a plugin must be the path of a Python file")
             return
         path = self._folder(item) / item.value
         if path in self.plugins:
@@ -173,7 +179,7 @@ class WorkflowReader:
             self.problems.add(item.place, str(error))
 
     def _folder(self, item: Located) -> Path:
-        """Return what a relative path is relative to: its file's folder, or where the command was typed."""
+        """Return the folder that a relative path starts from: that of its file, or the current one for overrides."""
         return resolved(Path()) if item.origin else self.folders.get(item.file, self.base)
 
     def _stage(self, name: str, node: Located) -> StageEntry | None:
@@ -185,39 +191,39 @@ class WorkflowReader:
             self.problems.add(use.place, f"stage {name!r}: there is no stage {shown}; {hint}")
             return None
         values = node.plain()
-        policy = self._validate(Policy, {key: values[key] for key in values if key in RESERVED_KEYS}, node, name)
+        policy = self._validate(Policy, {key: values[key] for key in values if key in RESERVED_KEYS}, node, name=name)
         own = {key: value for key, value in values.items() if key not in RESERVED_KEYS}
-        params = self._validate(spec.params_type, own, node, name)
+        params = self._validate(spec.params_type, own, node, name=name)
         if params is not None:
             self._check_files(params, node, name)
         places = {key: item.place for key, item in node.value.items()}
         wiring = node.value.get("in")
         if wiring is not None and isinstance(wiring.value, dict):
             places.update({f"in.{port}": item.place for port, item in wiring.value.items()})
-        # Mistakes in settings do not keep the wiring from being checked, so that all are found in one go.
+        # Continue after errors in settings, so that the connections are checked too.
         return StageEntry(name, spec, params or Params(), policy or Policy(use=spec.name), node.key_place, places)
 
     def _check_files(self, params: Params, node: Located, name: str) -> None:
         for key, paths in files_of(params).items():
             for path in paths:
                 if not exists(path):
-                    why = "may not be looked at (permission denied)" if is_denied(path) else "does not exist"
+                    why = "cannot be examined (permission denied)" if is_denied(path) else "does not exist"
                     self.problems.add(node.at((key,)).place, f"stage {name!r}: {key}: {path} {why}")
 
-    def _validate(self, model: type[Any], values: dict[str, Any], node: Located, name: str) -> Any:
+    def _validate(self, model: type[Any], values: dict[str, Any], node: Located, *, name: str) -> Any:
         try:
             return model.model_validate(values, context={"base": self.base, "bases": self._bases(node)})
         except ValidationError as error:
             known = [info.alias or field_name for field_name, info in model.model_fields.items()]
             for problem in error.errors(include_url=False):
-                self._report(problem, node, name, known)
+                self._report(problem, node, name=name, known=known)
             return None
 
     def _bases(self, node: Located) -> dict[str, Path]:
-        """Return what each setting's paths are relative to."""
+        """Return the folder that the paths in each setting start from."""
         return {key: self._folder(item) for key, item in node.value.items()}
 
-    def _report(self, problem: Any, node: Located, name: str, known: list[str]) -> None:
+    def _report(self, problem: Any, node: Located, *, name: str, known: list[str]) -> None:
         path = tuple(problem["loc"])
         found = node.at(path)
         key = ".".join(map(str, path))
@@ -235,22 +241,22 @@ class WorkflowReader:
 
 
 def _name_of(shown_as: str) -> str:
-    """Return a name for a workflow that has none, from its file's."""
+    """Return the name of a workflow that states none, from its file."""
     word = "".join(sign if sign.isalnum() or sign in "-_." else "_" for sign in Path(shown_as).stem)
     return word if is_plain_name(word) else "workflow"
 
 
-def _all_texts(layers: Sequence[Layer]) -> str:
-    """Return a workflow's text, with those of the files that it extends behind it."""
-    *below, own = layers
-    return own.text + "".join(f"\n---\n# extended: {layer.shown_as}\n{layer.text}" for layer in below)
+def _all_texts(files: Sequence[WorkflowFile]) -> str:
+    """Return the text of a workflow, followed by those of the files that it extends."""
+    *below, own = files
+    return own.text + "".join(f"\n---\n# extended: {file.shown_as}\n{file.text}" for file in below)
 
 
 def find_workflow(name: str, presets: Path) -> tuple[Path, bool]:
-    """Return the file of a workflow given as a path or as a preset's name, and whether it is a preset.
+    """Return the file of a workflow given as a path or as the name of a preset, and whether it is a preset.
 
     Raises:
-        UsageError: if there is neither.
+        UsageError: if there is no such file or preset.
     """
     path = Path(name)
     if is_file(path):
@@ -259,6 +265,6 @@ def find_workflow(name: str, presets: Path) -> tuple[Path, bool]:
     if is_plain_name(name) and is_file(preset):
         return preset, True
     if exists(path) or is_denied(path):
-        return path, False  # reading it says what is wrong with it
+        return path, False  # reading it reports the error
     names = [file.stem for file in children(presets, "*.yaml")]
     raise UsageError(f"there is no workflow file {name[:80]!r} and no preset of that name.{did_you_mean(name, names)}")

@@ -1,4 +1,4 @@
-"""Read YAML 1.2 into plain values that remember the file, line and column they were written at."""
+"""Read YAML 1.2 into plain values with the file, line and column at which they are written."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ MAX_DEPTH = 40
 MAX_VALUES = 100_000
 MAX_PROBLEMS = 100
 _MAX_DIGITS = 400
-_SHOWN = 40
+_SHOWN_CHARACTERS = 40
 _CORE = "tag:yaml.org,2002:"
 _KEY_TAGS = {f"{_CORE}{name}" for name in ("str", "null", "bool", "int", "float", "merge", "value")}
 
 
 @dataclass(frozen=True, slots=True)
 class Located:
-    """A YAML value and where it stands.
+    """A YAML value and its location.
 
     Attributes:
         value: a scalar, a dict of str to Located, or a list of Located.
@@ -33,8 +33,8 @@ class Located:
         column: 1-based column of the value.
         key_line: 1-based line of its key, if it is an entry of a mapping.
         key_column: likewise.
-        origin: what to show instead of the file and the place, for values from the command line.
-        file: what the text is called in messages.
+        origin: shown instead of the location, for values from the command line.
+        file: name of the text in messages.
     """
 
     value: Any
@@ -47,16 +47,16 @@ class Located:
 
     @property
     def place(self) -> str:
-        """Where the value stands: `file:line:column`, or its origin."""
+        """Location of the value: `file:line:column`, or its origin."""
         return self.origin or f"{self.file}:{self.line}:{self.column}"
 
     @property
     def key_place(self) -> str:
-        """Where its key stands, if it has one."""
+        """Location of its key, or of the value if it has no key."""
         return f"{self.file}:{self.key_line}:{self.key_column}" if self.key_line else self.place
 
     def plain(self) -> Any:
-        """Return the value without its places."""
+        """Return the value without locations."""
         if isinstance(self.value, dict):
             return {key: item.plain() for key, item in self.value.items()}
         if isinstance(self.value, list):
@@ -64,7 +64,7 @@ class Located:
         return self.value
 
     def at(self, path: tuple[Any, ...]) -> Located:
-        """Return what stands at a path of keys and positions, or the nearest thing above it."""
+        """Return the value at a path of keys and positions, or the nearest one above it."""
         here = self
         for step in path:
             try:
@@ -76,38 +76,36 @@ class Located:
 
 
 class Problems:
-    """Mistakes found so far, one line each; the search ends where there are too many."""
+    """The errors found so far, one line each; too many end the search."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
 
     def add(self, place: str, message: str) -> None:
-        """Note a mistake.
+        """Add an error.
 
         Raises:
-            WorkflowError: if this is one too many; with all of them.
+            WorkflowError: with all errors, if the maximum is reached.
         """
         self.lines.append(f"{place}: {message}")
         if len(self.lines) >= MAX_PROBLEMS:
-            raise WorkflowError(
-                [*self.lines, f"these are the first {MAX_PROBLEMS} mistakes; mend them, then look again"]
-            )
+            raise WorkflowError([*self.lines, f"these are the first {MAX_PROBLEMS} errors; fix them, then check again"])
 
     def raise_if_any(self) -> None:
-        """Raise WorkflowError if there are mistakes."""
+        """Raise WorkflowError if there are errors."""
         if self.lines:
             raise WorkflowError(self.lines)
 
 
 def parse_yaml(text: str, name: str) -> Located:
-    """Return the one document of a YAML 1.2 text.
+    """Return the document in a YAML 1.2 text.
 
     Args:
         text: the YAML.
-        name: what to call the text in messages, such as its path.
+        name: name of the text in messages, such as its path.
 
     Raises:
-        WorkflowError: for every mistake that can be seen, as `name:line:column: message`.
+        WorkflowError: with every error found, as `name:line:column: message`.
     """
     try:
         yaml = YAML(typ="safe", pure=True)
@@ -120,7 +118,7 @@ def parse_yaml(text: str, name: str) -> Located:
     except YAMLError as error:
         raise WorkflowError([f"{name}: {_unreadable(text) or 'not valid YAML: ' + _shortened(str(error))}"]) from None
     except (ValueError, IndexError, AssertionError, KeyError, TypeError, AttributeError) as error:
-        # ruamel.yaml's own slips over malformed directives, tags and escapes.
+        # Bugs of ruamel.yaml with malformed directives, tags and escapes.
         raise WorkflowError([f"{name}: not valid YAML ({type(error).__name__}: {_shortened(str(error))})"]) from None
     if root is None:
         raise WorkflowError([f"{name}:1:1: the file is empty"])
@@ -131,7 +129,7 @@ def parse_yaml(text: str, name: str) -> Located:
 
 
 class _Composer(Composer):
-    """ruamel's composer, which calls itself for every level, with an end to it."""
+    """ruamel's composer, which is recursive, with a maximum depth."""
 
     def __init__(self, loader: Any = None) -> None:
         super().__init__(loader)
@@ -142,12 +140,14 @@ class _Composer(Composer):
         """Return the next node.
 
         Raises:
-            MarkedYAMLError: if it lies too deep.
+            MarkedYAMLError: if it is nested too deeply.
         """
         self._level += 1
         if self._level > MAX_DEPTH + 1:
             mark = self.parser.peek_event().start_mark
-            raise MarkedYAMLError(problem=f"nested too deeply; {MAX_DEPTH} levels are allowed", problem_mark=mark)
+            raise MarkedYAMLError(
+                problem=f"nested too deeply; at most {MAX_DEPTH} levels are allowed", problem_mark=mark
+            )
         node = super().compose_node(parent, index)
         self._level -= 1
         return node
@@ -155,11 +155,11 @@ class _Composer(Composer):
 
 def _shortened(text: str) -> str:
     line = text.strip().split("\n")[0]
-    return line if len(line) <= 5 * _SHOWN else f"{line[: 5 * _SHOWN]}…"
+    return line if len(line) <= 5 * _SHOWN_CHARACTERS else f"{line[: 5 * _SHOWN_CHARACTERS]}…"
 
 
 def _unreadable(text: str) -> str:
-    """Return where the first character stands that YAML does not have."""
+    """Return a message with the location of the first character that YAML does not allow."""
     for number, line in enumerate(text.split("\n"), 1):
         for column, sign in enumerate(line.removesuffix("\r"), 1):
             if sign != "\t" and not is_printable(sign):
@@ -168,7 +168,7 @@ def _unreadable(text: str) -> str:
 
 
 class _Builder:
-    """Turn ruamel's nodes into located values, collecting every problem on the way."""
+    """Turns ruamel's nodes into located values, and collects errors."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -180,7 +180,9 @@ class _Builder:
         self.count += 1
         if depth > MAX_DEPTH or self.count > MAX_VALUES:
             limit = f"{MAX_DEPTH} levels" if depth > MAX_DEPTH else f"{MAX_VALUES} values"
-            raise WorkflowError([*self.problems.lines, f"{self.name}:{line}:{column}: too large; {limit} are allowed"])
+            raise WorkflowError(
+                [*self.problems.lines, f"{self.name}:{line}:{column}: too large; at most {limit} are allowed"]
+            )
         value: Any
         if isinstance(node, MappingNode):
             self._require_tag(node, "map")
@@ -198,15 +200,17 @@ class _Builder:
         for key_node, value_node in node.value:
             line, column = key_node.start_mark.line + 1, key_node.start_mark.column + 1
             if not isinstance(key_node, ScalarNode):
-                self._problem(key_node, "a key must be a plain word")
+                self._problem(key_node, "a key must be a plain scalar")
                 continue
             key = str(key_node.value)
             if str(key_node.tag) not in _KEY_TAGS:
                 self._problem(key_node, f"tag {_shown(key_node.tag)} is not allowed; write a plain key")
             elif not is_printable(key):
-                self._problem(key_node, f"key {key[:_SHOWN]!r} holds control characters")
+                self._problem(key_node, f"key {key[:_SHOWN_CHARACTERS]!r} contains control characters")
             elif key in entries:
-                self._problem(key_node, f"key {key[:_SHOWN]!r} is given twice (first in line {entries[key].key_line})")
+                self._problem(
+                    key_node, f"key {key[:_SHOWN_CHARACTERS]!r} occurs twice (first in line {entries[key].key_line})"
+                )
             else:
                 value = self.build(value_node, depth + 1)
                 entries[key] = Located(value.value, value.line, value.column, line, column, file=self.name)
@@ -222,7 +226,7 @@ class _Builder:
         match tag:
             case "str":
                 if not is_printable(text.replace("\n", "").replace("\t", "")):
-                    self._problem(node, f"{text[:_SHOWN]!r} holds control characters; remove them")
+                    self._problem(node, f"{text[:_SHOWN_CHARACTERS]!r} contains control characters; remove them")
                 return text
             case "null":
                 return None
@@ -240,10 +244,10 @@ class _Builder:
                 return int(digits, 0) if digits[:2] in ("0x", "0o") else int(digits)
             value = float(digits.replace(".inf", "inf").replace(".nan", "nan").replace(".Inf", "inf"))
         except ValueError:
-            self._problem(node, f"{text[:_SHOWN]!r} is not a number that can be used")
+            self._problem(node, f"{text[:_SHOWN_CHARACTERS]!r} is not a usable number")
             return None
         if not math.isfinite(value):
-            self._problem(node, f"{text[:_SHOWN]!r} is not a finite number")
+            self._problem(node, f"{text[:_SHOWN_CHARACTERS]!r} is not a finite number")
             return None
         return value
 
@@ -252,4 +256,4 @@ class _Builder:
 
 
 def _shown(tag: object) -> str:
-    return repr(str(tag) if len(str(tag)) <= 2 * _SHOWN else f"{str(tag)[: 2 * _SHOWN]}…")
+    return repr(str(tag) if len(str(tag)) <= 2 * _SHOWN_CHARACTERS else f"{str(tag)[: 2 * _SHOWN_CHARACTERS]}…")

@@ -65,7 +65,11 @@ class Kept:
 
 
 def chunks(count: int) -> Iterator[slice]:
-    """Yield the stretches in which a cloud of so many points is gone through."""
+    """Yield the stretches in which a cloud of so many points is gone through.
+
+    >>> list(chunks(300_000))
+    [slice(0, 262144, None), slice(262144, 300000, None)]
+    """
     for start in range(0, count, CHUNK_POINTS):
         yield slice(start, min(start + CHUNK_POINTS, count))
 

@@ -127,17 +127,21 @@ def _write_title(board: DrawingBoard, found: Inspection) -> None:
     settings, curve = found.settings, found.curve
     board.write(f"{found.image}, pixel ({found.column}, {found.row})", (24, 34), Letters(0.68, _INK))
     sure = f"confidence {curve.confidence}" if curve.confidence else "no range"
-    board.write(f"{found.sweep}: {settings.cost}, window {settings.window}, {settings.combination}, "
-                f"{settings.aggregation}, {settings.planes} planes ({settings.spacing}); {sure}, "
-                f"unique by {100 * curve.uniqueness:.0f} %",
-                (24, 62), Letters(0.46, _FAINT))  # fmt: skip
+    board.write(
+        f"{found.sweep}: {settings.cost}, window {settings.window}, {settings.combination}, "
+        f"{settings.aggregation}, {settings.planes} planes ({settings.spacing}); {sure}, "
+        f"unique by {100 * curve.uniqueness:.0f} %",
+        (24, 62),
+        Letters(0.46, _FAINT),
+    )
 
 
 def _write_legend(board: DrawingBoard, found: Inspection, y: float) -> None:
     board.write("virtual range, scene units", ((_LEFT + _RIGHT) / 2, y - 26), Letters(color=_FAINT, align=0.5))
     by_paths = found.curve.aggregated is not None
-    entries = [(source.name.rsplit("/", 1)[-1], _SOURCES[idx % len(_SOURCES)], 1)
-               for idx, source in enumerate(found.sources)]  # fmt: skip
+    entries = [
+        (source.name.rsplit("/", 1)[-1], _SOURCES[idx % len(_SOURCES)], 1) for idx, source in enumerate(found.sources)
+    ]
     entries.append((f"combined ({found.settings.combination})", _RAW if by_paths else _DECISIVE, 2))
     x = float(_LEFT)
     for text, color, weight in entries:

@@ -19,8 +19,8 @@ from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.sweep import sweep_input
 from pano_mvs.core.errors import UsageError
 from pano_mvs.engine.cache.store import Store, UnitRecord
+from pano_mvs.engine.executors.execute import arguments_of
 from pano_mvs.engine.planning.units import Unit
-from pano_mvs.engine.running.execute import arguments_of
 from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_from_pixel
 from pano_mvs.io.truth import read_truth
 from pano_mvs.scene import Panorama, Pose, RangeMap

@@ -3,8 +3,7 @@
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pano_mvs.api import Context, Each, Panorama, Params, stage
-from pano_mvs.geometry import pad_panorama
+from pano_mvs.api import Context, Each, Panorama, Params, pad_panorama, stage
 from pydantic import Field
 
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import uuid
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pano_mvs.api import PointCloud
-from pano_mvs.io.clouds.thinning import CHUNK_POINTS, Kept, chunks
+from pano_mvs.api import CHUNK_POINTS, KeptPoints, PointCloud, chunks
 from pye57 import libe57
 
 from pano_mvs_las.las_file import bounds
@@ -21,7 +21,7 @@ _NORMALS_URI = "http://www.libe57.org/E57_NOR_surface_normals.txt"
 _NAMESPACE = uuid.UUID("6c1f3a52-6d0e-4c43-9d6a-0c5f4a3c8c11")
 
 
-def write_e57(path: Path, cloud: PointCloud, placement: Placement, *, kept: Kept | None = None) -> None:
+def write_e57(path: Path, cloud: PointCloud, placement: Placement, *, kept: KeptPoints | None = None) -> None:
     """Write a cloud as one scan of an E57 file, in chunks: places in double precision, 8-bit colours, normals.
 
     The same cloud gives the same bytes: no date is written, and its identity follows from its points.
@@ -94,7 +94,7 @@ def _write_points(
     vector: libe57.CompressedVectorNode,
     cloud: PointCloud,
     placement: Placement,
-    kept: Kept | None,
+    kept: KeptPoints | None,
 ) -> None:
     held = {name: np.empty(CHUNK_POINTS, np.float64) for name in _PLACES}
     held |= {name: np.empty(CHUNK_POINTS, np.uint8) for name in _COLORS}
@@ -116,7 +116,7 @@ def _write_points(
     writer.close()
 
 
-def _structure(file: libe57.ImageFile, values: dict[str, float | int]) -> libe57.StructureNode:
+def _structure(file: libe57.ImageFile, values: Mapping[str, float]) -> libe57.StructureNode:
     node = libe57.StructureNode(file)
     for name, value in values.items():
         node.set(name, (libe57.FloatNode if isinstance(value, float) else libe57.IntegerNode)(file, value))

@@ -7,8 +7,7 @@ from pathlib import Path
 import laspy
 import numpy as np
 from numpy.typing import NDArray
-from pano_mvs.api import PointCloud, UsageError
-from pano_mvs.io.clouds.thinning import Kept, chunks
+from pano_mvs.api import KeptPoints, PointCloud, UsageError, chunks
 
 from pano_mvs_las.placement import Placement
 
@@ -20,7 +19,7 @@ _COLOR_16_FROM_8 = 257
 
 
 def write_las(
-    path: Path, cloud: PointCloud, placement: Placement, *, step: float = 0.0001, kept: Kept | None = None
+    path: Path, cloud: PointCloud, placement: Placement, *, step: float = 0.0001, kept: KeptPoints | None = None
 ) -> None:
     """Write a cloud as LAS, or as LAZ if the path says so, in chunks.
 
@@ -55,7 +54,7 @@ def write_las(
 
 
 def bounds(
-    cloud: PointCloud, placement: Placement, kept: Kept | None
+    cloud: PointCloud, placement: Placement, kept: KeptPoints | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the smallest and the largest coordinates, (3,) each, of the points as written; zeros if there are none."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -66,12 +65,12 @@ def bounds(
     return (low, high) if np.isfinite(low).all() else (np.zeros(3), np.zeros(3))
 
 
-def _within(kept: Kept | None, chunk: slice) -> NDArray[np.bool_]:
+def _within(kept: KeptPoints | None, chunk: slice) -> NDArray[np.bool_]:
     return np.ones(chunk.stop - chunk.start, np.bool_) if kept is None else kept.within(chunk)
 
 
 def _record(
-    header: laspy.LasHeader, cloud: PointCloud, chunk: slice, placement: Placement, kept: Kept | None
+    header: laspy.LasHeader, cloud: PointCloud, chunk: slice, placement: Placement, kept: KeptPoints | None
 ) -> laspy.ScaleAwarePointRecord:
     wanted = _within(kept, chunk)
     record = laspy.ScaleAwarePointRecord.zeros(int(wanted.sum()), header=header)

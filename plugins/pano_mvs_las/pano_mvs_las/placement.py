@@ -7,9 +7,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from pano_mvs.algorithms.poses.frame.geodesy import lla_from_local
-from pano_mvs.algorithms.poses.frame.georeference import origin_of_frame
-from pano_mvs.api import Poses, UsageError
+from pano_mvs.api import Poses, UsageError, lla_from_local, origin_of_frame
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
@@ -36,7 +34,7 @@ class Placement:
         """Return points (N, 3) as coordinates of the file."""
         world = points_in_world.astype(np.float64)
         if self.crs is None or self.origin_lla is None:
-            return world @ _UP_FROM_WORLD.T
+            return np.asarray(world @ _UP_FROM_WORLD.T)
         latitude, longitude, altitude = lla_from_local(world, self.origin_lla).T
         return np.stack(self._on_map.transform(longitude, latitude, altitude), axis=-1)
 

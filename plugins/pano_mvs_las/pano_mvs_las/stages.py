@@ -5,10 +5,22 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Literal
 
-from pano_mvs.api import Context, Files, InputError, One, Params, PointCloud, Poses, UsageError, stage
-from pano_mvs.io.clouds.thinning import Kept, Selection, select_points
-from pano_mvs.scene.files import group_file
-from pano_mvs.scene.pose_groups import split_groups
+from pano_mvs.api import (
+    Context,
+    Files,
+    InputError,
+    KeptPoints,
+    One,
+    Params,
+    PointCloud,
+    PointSelection,
+    Poses,
+    UsageError,
+    group_file,
+    select_points,
+    split_groups,
+    stage,
+)
 from pydantic import Field
 
 from pano_mvs_las.e57_file import write_e57
@@ -69,9 +81,9 @@ def e57(cloud: One[PointCloud], poses: One[Poses], params: CloudParams, ctx: Con
 
 def _prepared(
     cloud: PointCloud, poses: Poses, params: CloudParams, ctx: Context
-) -> Iterator[tuple[int, PointCloud, Kept | None, Placement]]:
+) -> Iterator[tuple[int, PointCloud, KeptPoints | None, Placement]]:
     """Yield the number and the cloud of each group that has points, which of them are written, and where."""
-    selection = Selection(params.min_confidence, params.min_views, params.voxel, params.max_points)
+    selection = PointSelection(params.min_confidence, params.min_views, params.voxel, params.max_points)
     total = 0
     for number, (group, own) in enumerate(zip(cloud.groups(), split_groups(poses), strict=False)):
         kept = select_points(group, selection, ctx.scratch)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import laspy
 import numpy as np
@@ -53,9 +53,9 @@ def test_keeps_the_contract(law: Law) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["las", "laz"])
-def test_a_las_file_holds_the_cloud_with_z_up(tmp_path: Path, suffix: str) -> None:
+def test_a_las_file_holds_the_cloud_with_z_up(tmp_path: Path, suffix: Literal["las", "laz"]) -> None:
     cloud = a_cloud()
-    path = written(las, tmp_path, cloud, the_poses(), LasParams(format=suffix))  # type: ignore[arg-type]
+    path = written(las, tmp_path, cloud, the_poses(), LasParams(format=suffix))
     read = laspy.read(path)
     assert read.header.version == laspy.header.Version(1, 4)
     x, y, z = cloud.points_in_world.T
@@ -82,8 +82,9 @@ def test_compressed_is_smaller_and_the_same(tmp_path: Path) -> None:
 
 def test_gps_puts_the_cloud_on_the_map_of_its_zone(tmp_path: Path) -> None:
     """Ten metres east, twenty north and three up of the origin are that on the map, to its scale and convergence."""
-    world = np.float32([[0, 0, 0], [10, -3, 20]])
-    cloud = PointCloud(world, world * 0 + np.float32([0, -1, 0]), np.zeros((2, 3), np.uint8), np.ones(2, np.uint8))
+    world = np.array([[0, 0, 0], [10, -3, 20]], np.float32)
+    up = np.array([[0, -1, 0]] * 2, np.float32)
+    cloud = PointCloud(world, up, np.zeros((2, 3), np.uint8), np.ones(2, np.uint8))
     read = laspy.read(written(las, tmp_path, cloud, the_poses(HERE), LasParams()))
     crs = read.header.parse_crs()
     assert crs is not None
@@ -149,7 +150,8 @@ def test_points_that_are_not_wanted_are_left_out_in_any_cut(
     wanted = params(min_views=4, min_confidence=60, voxel=3.0)
     whole = written(stage, tmp_path / "a", cloud, the_poses(), wanted)
     count = len(laspy.read(whole)) if stage is las else len(e57_points(whole)["cartesianX"])
-    good = int(((cloud.view_counts >= 4) & (cloud.confidence >= 60)).sum())  # type: ignore[operator]
+    assert cloud.confidence is not None
+    good = int(((cloud.view_counts >= 4) & (cloud.confidence >= 60)).sum())
     assert 0.5 * good < count <= good
     monkeypatch.setattr(thinning, "CHUNK_POINTS", 64)
     again = written(stage, tmp_path / "b", cloud, the_poses(), wanted)

@@ -16,4 +16,5 @@ def find_winners(work: SweepInput) -> Winners:
     """
     from pano_mvs_torch import sweep  # on use: torch is slow to import
 
-    return sweep.find_winners(work)
+    winners: Winners = sweep.find_winners(work)
+    return winners

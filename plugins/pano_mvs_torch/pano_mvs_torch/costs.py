@@ -7,16 +7,16 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pano_mvs.algorithms.sweep.costs.census_gradient import census_weight
-from pano_mvs.algorithms.sweep.numba.kernels_constants import (
+from pano_mvs.api import SweepInput, pad_panorama
+from pano_mvs.api.sweep import (
     GREY_WEIGHT,
     MAX_COLOR_COST,
     MAX_GRADIENT_COST,
     ZNCC_NOISE_VARIANCE,
+    WindowBands,
+    census_weight,
+    column_offsets,
 )
-from pano_mvs.algorithms.sweep.preparation import SweepInput
-from pano_mvs.algorithms.sweep.windows import WindowBands, column_offsets
-from pano_mvs.geometry import pad_panorama
 from torch import Tensor
 
 

@@ -11,8 +11,7 @@ import math
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pano_mvs.algorithms.sweep.preparation import SweepInput
-from pano_mvs.geometry import pad_panorama
+from pano_mvs.api import SweepInput, pad_panorama
 from torch import Tensor
 
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, step_penalties, warm_up
-from pano_mvs.algorithms.sweep.preparation import SweepInput
+from pano_mvs.api import SweepInput
+from pano_mvs.api.sweep import DIRECTIONS, step_penalties, warm_up
 from torch import Tensor
 
 # The cost of the planes before the first and after the last. A path costs at most 255 + P2; with P1 on top of this

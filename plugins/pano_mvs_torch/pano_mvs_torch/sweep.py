@@ -10,8 +10,8 @@ from math import ceil
 
 import numpy as np
 import torch
-from pano_mvs.algorithms.sweep.combination import source_weights
 from pano_mvs.api import SweepInput, Winners
+from pano_mvs.api.sweep import source_weights
 from torch import Tensor
 
 from pano_mvs_torch.costs import BandCost

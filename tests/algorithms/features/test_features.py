@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pano_mvs.algorithms.faces.sampling import sample_view
@@ -19,14 +22,15 @@ from pano_mvs.geometry import (
     rotate_panorama,
     rotation_from_rotvec,
 )
+from pano_mvs.scene import Features
 from pano_mvs.testing.room import default_room, render
 
 SIZE = (256, 512)
 PIXEL = 2 * np.pi / SIZE[1]
-EXTRACTORS = {"sift": extract_sift, "orb": extract_orb, "sphorb": extract_sphorb}
+EXTRACTORS: dict[str, Callable[..., Features]] = {"sift": extract_sift, "orb": extract_orb, "sphorb": extract_sphorb}
 
 
-def spread_directions(rng, count, *, apart):
+def spread_directions(rng: np.random.Generator, count: int, *, apart: float) -> NDArray[np.float64]:
     """Directions that keep their distance; both poles, the seam, and then any."""
     kept = [np.array(v, float) for v in ((0, 1, 0), (0, -1, 0), (0, 0, -1))]
     for v in rng.normal(size=(count, 3)):
@@ -36,7 +40,9 @@ def spread_directions(rng, count, *, apart):
     return np.array(kept)
 
 
-def blobs(centers, radii_px, *, size_hw=SIZE):
+def blobs(
+    centers: NDArray[np.float64], radii_px: NDArray[np.float64] | Sequence[float], *, size_hw: tuple[int, int] = SIZE
+) -> NDArray[np.uint8]:
     rays = ray_grid(size_hw)
     image = np.full(size_hw, 100.0)
     for center, radius_px in zip(centers, radii_px, strict=True):
@@ -45,15 +51,15 @@ def blobs(centers, radii_px, *, size_hw=SIZE):
 
 
 @pytest.fixture(scope="module")
-def room_image():
+def room_image() -> NDArray[np.uint8]:
     return render(default_room(), Rigid3.identity(), SIZE, supersample=1)[0]
 
 
-def everywhere(image):
+def everywhere(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
     return np.ones(image.shape[:2], np.bool_)
 
 
-def test_face_centers_are_twenty_and_evenly_spread():
+def test_face_centers_are_twenty_and_evenly_spread() -> None:
     centers = face_centers()
     np.testing.assert_allclose(np.linalg.norm(centers, axis=1), 1)
     gram = np.sort(centers @ centers.T, axis=1)
@@ -62,7 +68,7 @@ def test_face_centers_are_twenty_and_evenly_spread():
 
 
 @pytest.mark.parametrize("size_hw", [(64, 128), (512, 1024)])
-def test_every_direction_lies_well_inside_the_tile_that_owns_it(size_hw):
+def test_every_direction_lies_well_inside_the_tile_that_owns_it(size_hw: tuple[int, int]) -> None:
     rays = np.random.default_rng(0).normal(size=(2000, 3))
     rays = np.concatenate([rays, np.eye(3), -np.eye(3)])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -75,7 +81,7 @@ def test_every_direction_lies_well_inside_the_tile_that_owns_it(size_hw):
         np.testing.assert_allclose(tile.bearings_from_pixels(pixels), rays[owner == idx], atol=1e-12)
 
 
-def test_a_tile_shows_what_lies_in_its_directions():
+def test_a_tile_shows_what_lies_in_its_directions() -> None:
     """Of a picture whose brightness is linear in the ray, every tile is that function, at seam and poles too."""
     axis = np.array([0.5, 0.6, -0.62])
     image = np.rint(127 + 120 * (ray_grid(SIZE) @ axis)).astype(np.uint8)
@@ -86,7 +92,7 @@ def test_a_tile_shows_what_lies_in_its_directions():
 
 
 @pytest.mark.parametrize(("name", "bias_px", "rms_px"), [("sift", 0.02, 0.06), ("orb", 0.1, 0.8), ("sphorb", 0.1, 1.0)])
-def test_key_points_have_no_bias(name, bias_px, rms_px):
+def test_key_points_have_no_bias(name: str, bias_px: float, rms_px: float) -> None:
     """A quarter of a pixel is what SIFT without the precise upscale, or ORB without its half pixel, would show."""
     rng = np.random.default_rng(1)
     centers = spread_directions(rng, 600, apart=16 * PIXEL)
@@ -110,7 +116,7 @@ def test_key_points_have_no_bias(name, bias_px, rms_px):
 
 
 @pytest.mark.parametrize("name", EXTRACTORS)
-def test_poles_and_seam_are_places_like_any_other(name):
+def test_poles_and_seam_are_places_like_any_other(name: str) -> None:
     """The poles lie on the common edge of two tiles, which must not leave a key point to each other."""
     places = np.array([[0.0, 1, 0], [0, -1, 0], [0, 0, -1], [-1e-9, -0.4, -1]])
     places /= np.linalg.norm(places, axis=1, keepdims=True)
@@ -123,7 +129,7 @@ def test_poles_and_seam_are_places_like_any_other(name):
 
 
 @pytest.mark.parametrize("name", EXTRACTORS)
-def test_record_is_sound_sorted_and_the_same_again(name, room_image):
+def test_record_is_sound_sorted_and_the_same_again(name: str, room_image: NDArray[np.uint8]) -> None:
     first = EXTRACTORS[name](room_image, everywhere(room_image))
     again = EXTRACTORS[name](room_image, everywhere(room_image))
     first.check()
@@ -137,12 +143,12 @@ def test_record_is_sound_sorted_and_the_same_again(name, room_image):
 
 
 @pytest.mark.parametrize("name", EXTRACTORS)
-def test_no_two_key_points_at_one_place(name, room_image):
+def test_no_two_key_points_at_one_place(name: str, room_image: NDArray[np.uint8]) -> None:
     found = EXTRACTORS[name](room_image, everywhere(room_image))
     assert not cKDTree(found.bearings).query_pairs(0.49 * PIXEL)
 
 
-def test_sift_descriptors_are_whole_numbers_of_one_length(room_image):
+def test_sift_descriptors_are_whole_numbers_of_one_length(room_image: NDArray[np.uint8]) -> None:
     found = extract_sift(room_image, everywhere(room_image))
     np.testing.assert_array_equal(found.descriptors, np.rint(found.descriptors))
     np.testing.assert_allclose(np.linalg.norm(found.descriptors, axis=1), 512, rtol=0.01)
@@ -151,19 +157,19 @@ def test_sift_descriptors_are_whole_numbers_of_one_length(room_image):
     assert not np.array_equal(found.descriptors, plain.descriptors)
 
 
-def repeated_share(found, other, new_from_old):
+def repeated_share(found: Features, other: Features, new_from_old: NDArray[np.float64]) -> float:
     strong = found.bearings[: len(found) // 2] @ new_from_old.T
-    return np.mean(cKDTree(other.bearings).query(strong)[0] < 1.0 * PIXEL)
+    return float(np.mean(cKDTree(other.bearings).query(strong)[0] < 1.0 * PIXEL))
 
 
 @pytest.mark.parametrize("name", EXTRACTORS)
-def test_rolling_the_picture_rolls_the_key_points(name, room_image):
+def test_rolling_the_picture_rolls_the_key_points(name: str, room_image: NDArray[np.uint8]) -> None:
     rolled, new_from_old = roll_panorama(room_image, 201)
     found, other = (EXTRACTORS[name](i, everywhere(i), max_keypoints=20_000) for i in (room_image, rolled))
     assert repeated_share(found, other, new_from_old) > 0.7
 
 
-def test_turning_the_camera_turns_the_key_points(room_image):
+def test_turning_the_camera_turns_the_key_points(room_image: NDArray[np.uint8]) -> None:
     new_from_old = rotation_from_rotvec([1.2, 0.3, -0.8])
     turned = rotate_panorama(room_image, new_from_old)
     found, other = (extract_sift(i, everywhere(i), max_keypoints=20_000) for i in (room_image, turned))
@@ -171,7 +177,7 @@ def test_turning_the_camera_turns_the_key_points(room_image):
 
 
 @pytest.mark.parametrize("name", EXTRACTORS)
-def test_masked_pixels_and_their_border_have_no_key_points(name, room_image):
+def test_masked_pixels_and_their_border_have_no_key_points(name: str, room_image: NDArray[np.uint8]) -> None:
     rows = np.arange(SIZE[0])[:, None]
     columns = np.arange(SIZE[1])[None]
     mask = (rows < 200) & ~((columns > 100) & (columns < 180) & (rows > 90) & (rows < 150))
@@ -185,7 +191,7 @@ def test_masked_pixels_and_their_border_have_no_key_points(name, room_image):
     assert len(EXTRACTORS[name](room_image, everything)) == 0
 
 
-def test_the_edge_of_a_mask_makes_no_key_points():
+def test_the_edge_of_a_mask_makes_no_key_points() -> None:
     """A plain picture, half of it cut away: what the cut looks like is nobody's business."""
     image = np.full((*SIZE, 3), 180, np.uint8)
     mask = np.ones(SIZE, np.bool_)
@@ -195,14 +201,14 @@ def test_the_edge_of_a_mask_makes_no_key_points():
         assert len(extract(image, mask)) == 0
 
 
-def test_a_plain_picture_has_none():
+def test_a_plain_picture_has_none() -> None:
     for extract in EXTRACTORS.values():
         found = extract(np.full((*SIZE, 3), 90, np.uint8), np.ones(SIZE, np.bool_))
         found.check()
         assert len(found) == 0
 
 
-def test_few_key_points_are_spread_evenly(room_image):
+def test_few_key_points_are_spread_evenly(room_image: NDArray[np.uint8]) -> None:
     found = extract_sift(room_image, everywhere(room_image), max_keypoints=300)
     assert len(found) == 300
     counts = np.bincount(np.argmax(found.bearings @ face_centers().T, axis=1), minlength=20)
@@ -212,7 +218,7 @@ def test_few_key_points_are_spread_evenly(room_image):
     assert np.all(np.diff(found.scores) <= 0)
 
 
-def test_distinct_keypoints_keep_the_strongest_of_each_crowd():
+def test_distinct_keypoints_keep_the_strongest_of_each_crowd() -> None:
     bearings = np.array([[0, 0, 1.0], [0.001, 0, 1.0], [0.002, 0, 1.0], [1.0, 0, 0]])
     bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
     # The middle one is suppressed by the first; so it may not suppress the third.
@@ -221,7 +227,7 @@ def test_distinct_keypoints_keep_the_strongest_of_each_crowd():
     assert distinct_keypoints(np.zeros((0, 3)), np.zeros(0, np.float32), radius_rad=0.1).size == 0
 
 
-def test_spread_keypoints_take_the_best_of_every_cell_first():
+def test_spread_keypoints_take_the_best_of_every_cell_first() -> None:
     rng = np.random.default_rng(2)
     bearings = np.concatenate([[0, 0, 1] + 0.05 * rng.normal(size=(500, 3)), rng.normal(size=(100, 3))])
     bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
@@ -232,6 +238,6 @@ def test_spread_keypoints_take_the_best_of_every_cell_first():
     np.testing.assert_array_equal(spread_keypoints(bearings, scores, max_keypoints=600), np.argsort(-scores))
 
 
-def test_refuses_a_mask_of_another_size():
+def test_refuses_a_mask_of_another_size() -> None:
     with pytest.raises(UsageError, match="mask"):
         extract_sift(np.zeros((*SIZE, 3), np.uint8), np.ones((4, 8), np.bool_))

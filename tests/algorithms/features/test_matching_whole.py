@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.matching.nearest_two import NearestTwo, nearest_two
@@ -16,11 +17,11 @@ from tests.oracles.matching import match_one_by_one
 needs_vector = pytest.mark.skipif(not HAS_VECTOR, reason="no vector instructions, or numba compiles nothing")
 
 
-def draw(rng, count, size, *, low=0, high=256):
+def draw(rng: np.random.Generator, count: int, size: int, *, low: int = 0, high: int = 256) -> NDArray[np.float32]:
     return rng.integers(low, high, size=(count, size)).astype(np.float32)
 
 
-def assert_same(found: NearestTwo, expected: NearestTwo):
+def assert_same(found: NearestTwo, expected: NearestTwo) -> None:
     np.testing.assert_array_equal(found.nearest, expected.nearest)
     np.testing.assert_array_equal(found.squared, expected.squared)
     np.testing.assert_array_equal(found.next_squared, expected.next_squared)
@@ -31,7 +32,7 @@ def assert_same(found: NearestTwo, expected: NearestTwo):
 @needs_vector
 @pytest.mark.parametrize("counts", [(1, 2), (6, 64), (7, 65), (5, 63), (130, 517), (401, 129)])
 @pytest.mark.parametrize("size", [128, 33])
-def test_kernel_equals_the_plain_products(counts, size):
+def test_kernel_equals_the_plain_products(counts: tuple[int, int], size: int) -> None:
     """Counts at and beside full blocks of rows and columns; an odd number of components."""
     rng = np.random.default_rng([*counts, size])
     first, second = (draw(rng, count, size) for count in counts)
@@ -40,7 +41,7 @@ def test_kernel_equals_the_plain_products(counts, size):
 
 @pytest.mark.kernel("matching.kernels_vector_match")
 @needs_vector
-def test_kernel_settles_ties_as_the_plain_products_do():
+def test_kernel_settles_ties_as_the_plain_products_do() -> None:
     """Hardly any distances differ, so that every row has many nearest ones: the first is taken."""
     rng = np.random.default_rng(8)
     first, second = draw(rng, 90, 4, high=3), draw(rng, 300, 4, high=3)
@@ -51,7 +52,7 @@ def test_kernel_settles_ties_as_the_plain_products_do():
 
 @pytest.mark.kernel("matching.kernels_vector_match")
 @needs_vector
-def test_kernel_is_exact_up_to_the_greatest_numbers_that_fit():
+def test_kernel_is_exact_up_to_the_greatest_numbers_that_fit() -> None:
     """Opposite signs make the products most negative; squared distances are beyond what float32 counts singly."""
     rng = np.random.default_rng(9)
     first, second = draw(rng, 40, 128, low=900, high=1025), draw(rng, 70, 128, low=-1024, high=-900)
@@ -65,7 +66,7 @@ def test_kernel_is_exact_up_to_the_greatest_numbers_that_fit():
 
 
 @pytest.mark.parametrize("wrong", [0.5, np.nan, np.inf, 2000.0, 1e30])
-def test_other_numbers_are_left_to_the_plain_products(wrong):
+def test_other_numbers_are_left_to_the_plain_products(wrong: float) -> None:
     descriptors = np.full((3, 128), 7, np.float32)
     assert fits_whole_numbers(descriptors) == HAS_VECTOR
     descriptors[1, 5] = wrong
@@ -74,7 +75,7 @@ def test_other_numbers_are_left_to_the_plain_products(wrong):
 
 @pytest.mark.parametrize("mutual", [True, False])
 @pytest.mark.parametrize("fraction", [0.0, 0.25])
-def test_matches_equal_the_plain_search_with_and_without_whole_numbers(mutual, fraction):
+def test_matches_equal_the_plain_search_with_and_without_whole_numbers(mutual: bool, fraction: float) -> None:
     rng = np.random.default_rng(10)
     base = draw(rng, 200, 16, high=120) + np.float32(fraction)
     noisy = base + rng.integers(-12, 13, size=base.shape).astype(np.float32)
@@ -87,7 +88,7 @@ def test_matches_equal_the_plain_search_with_and_without_whole_numbers(mutual, f
 
 
 @needs_vector
-def test_refuses_what_it_cannot_compare():
+def test_refuses_what_it_cannot_compare() -> None:
     whole = np.ones((4, 8), np.float32)
     with pytest.raises(UsageError, match="nearest two among"):
         nearest_two_whole(whole, whole[:1])

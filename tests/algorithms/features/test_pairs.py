@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any, Literal
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.matching.neighbours import (
@@ -23,20 +26,20 @@ from pano_mvs.algorithms.matching.vlad import vlad_descriptor
 from pano_mvs.core.errors import UsageError
 from pano_mvs.scene import GlobalDescriptor
 from tests.algorithms.features.test_matching import features
-from tests.algorithms.poses.synthetic_path import SIGHT, path_capture
+from tests.algorithms.poses.synthetic_path import SIGHT, PathCapture, path_capture
 
 
 @pytest.fixture(scope="module")
-def walk():
+def walk() -> PathCapture:
     return path_capture(np.random.default_rng(1), 40, keypoints=300, described=True)
 
 
 @pytest.fixture(scope="module")
-def looks(walk):
+def looks(walk: PathCapture) -> dict[str, GlobalDescriptor]:
     return {name: vlad_descriptor(found) for name, found in walk.features.items()}
 
 
-def groups(names, pairs):
+def groups(names: Iterable[Any], pairs: Iterable[Sequence[Any]]) -> int:
     """Number of groups of images that hang together."""
     group = {name: {name} for name in names}
     for a, b in pairs:
@@ -45,13 +48,13 @@ def groups(names, pairs):
     return len({id(members) for members in group.values()})
 
 
-def test_position_pairs_are_the_nearest_of_either():
+def test_position_pairs_are_the_nearest_of_either() -> None:
     rng = np.random.default_rng(2)
     names = [f"{n}" for n in range(30)]
     places = {name: rng.normal(size=3) for name in names}
     pairs = position_pairs(names, places, neighbours=4)
     pairs.check()
-    near = set()
+    near: set[tuple[str, ...]] = set()
     for a in names:
         others = sorted((b for b in names if b != a), key=lambda b: np.linalg.norm(places[a] - places[b]))
         near |= {tuple(sorted((a, b), key=names.index)) for b in others[:4]}
@@ -59,27 +62,27 @@ def test_position_pairs_are_the_nearest_of_either():
     assert len(set(pairs.pairs) - near) == groups(names, near) - 1
 
 
-def test_groups_that_would_be_apart_are_joined_by_the_shortest_link():
-    places = {"a": [0.0, 0], "b": [1.0, 0], "c": [10.0, 0], "d": [11.5, 0]}
+def test_groups_that_would_be_apart_are_joined_by_the_shortest_link() -> None:
+    places = {name: np.array([x, 0.0]) for name, x in (("a", 0), ("b", 1), ("c", 10), ("d", 11.5))}
     pairs = position_pairs(list(places), places, neighbours=1)
     assert pairs.pairs == (("a", "b"), ("b", "c"), ("c", "d"))
 
 
-def test_images_at_one_place_hang_together_too():
+def test_images_at_one_place_hang_together_too() -> None:
     places = {f"{n}": np.zeros(2) for n in range(12)}
     pairs = position_pairs(list(places), places, neighbours=2)
     assert groups(places, pairs.pairs) == 1
 
 
-def test_an_image_without_position_has_its_neighbours_in_the_order():
+def test_an_image_without_position_has_its_neighbours_in_the_order() -> None:
     names = [f"{n}" for n in range(8)]
-    places = {name: [100.0 * int(name), 0] for name in names if name != "3"}
+    places = {name: np.array([100.0 * int(name), 0]) for name in names if name != "3"}
     pairs = position_pairs(names, places, neighbours=1, window=2).pairs
     assert {pair for pair in pairs if "3" in pair} == {("1", "3"), ("2", "3"), ("3", "4"), ("3", "5")}
     assert set(position_pairs(names, {}, neighbours=1, window=2).pairs) == set(sequential_pairs(names, window=2).pairs)
 
 
-def test_metres_east_and_north():
+def test_metres_east_and_north() -> None:
     """A thousandth of a degree of latitude is 110.6 to 111.7 m; heights do not count."""
     at = east_north_m([(60.0, 10.0, 0.0), (60.001, 10.0, 500.0), (60.0, 10.001, -20.0)])
     north, east = at[1] - at[0], at[2] - at[0]
@@ -89,7 +92,7 @@ def test_metres_east_and_north():
 
 
 @pytest.mark.parametrize("count", [2, 3, 50])
-def test_links_join_everything_and_are_listed_once(count):
+def test_links_join_everything_and_are_listed_once(count: int) -> None:
     rng = np.random.default_rng(count)
     distances = rng.random((count, count))
     distances += distances.T
@@ -100,7 +103,7 @@ def test_links_join_everything_and_are_listed_once(count):
     assert groups(range(count), links.tolist()) == 1
 
 
-def test_pictures_of_one_place_are_found_by_their_looks(walk, looks):
+def test_pictures_of_one_place_are_found_by_their_looks(walk: PathCapture, looks: dict[str, GlobalDescriptor]) -> None:
     names = list(walk.poses)
     pairs = retrieval_pairs(names, looks, neighbours=5).pairs
     apart = [np.linalg.norm(walk.poses[a].center - walk.poses[b].center) for a, b in pairs]
@@ -110,23 +113,23 @@ def test_pictures_of_one_place_are_found_by_their_looks(walk, looks):
     assert len(next_ones & set(pairs)) > 0.6 * len(next_ones)
 
 
-def test_a_sample_of_key_points_finds_neighbours_that_the_vectors_miss(walk):
+def test_a_sample_of_key_points_finds_neighbours_that_the_vectors_miss(walk: PathCapture) -> None:
     """Half of the neighbours' vectors are those of other places, as where all rooms have the same textures."""
     names = list(walk.poses)
     looks = {name: vlad_descriptor(walk.features[name], sample=200) for name in names}
     misled = {name: replace(looks[name], vector=looks[names[idx * 7 % 40]].vector) for idx, name in enumerate(names)}
     without = {name: replace(found, sample=np.zeros((0, 0), np.int16)) for name, found in misled.items()}
 
-    def share_near(descriptors):
+    def share_near(descriptors: Mapping[str, GlobalDescriptor]) -> float:
         pairs = retrieval_pairs(names, descriptors, neighbours=3).pairs
-        return np.mean([np.linalg.norm(walk.poses[a].center - walk.poses[b].center) < SIGHT for a, b in pairs])
+        return float(np.mean([np.linalg.norm(walk.poses[a].center - walk.poses[b].center) < SIGHT for a, b in pairs]))
 
     assert share_near(misled) > 0.95
     assert share_near(without) < 0.7
 
 
 @pytest.mark.parametrize("metric", ["l2", "hamming"])
-def test_matches_of_samples_are_those_of_matching_them(metric):
+def test_matches_of_samples_are_those_of_matching_them(metric: Literal["l2", "hamming"]) -> None:
     rng = np.random.default_rng(5)
     size, kind = (64, np.float32) if metric == "l2" else (32, np.uint8)
     common = rng.integers(0, 200, (30, size)).astype(kind)
@@ -143,12 +146,12 @@ def test_matches_of_samples_are_those_of_matching_them(metric):
         assert counts[0, 1] == len(match_features(found[0], found[1]))
 
 
-def test_samples_of_other_kinds_or_none_match_nothing():
+def test_samples_of_other_kinds_or_none_match_nothing() -> None:
     samples = [np.zeros((0, 0), np.int16), np.ones((4, 8), np.int16), np.ones((4, 16), np.int16)]
     assert not sample_matches(samples, np.zeros((3, 3)), neighbours=1).any()
 
 
-def test_compiled_and_plain_comparison_count_the_same(monkeypatch):
+def test_compiled_and_plain_comparison_count_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(6)
     samples = [rng.integers(0, 12, (50, 8)).astype(np.int16) for _ in range(4)]
     compiled = sample_matches(samples, np.zeros((4, 4)), neighbours=3)
@@ -156,7 +159,7 @@ def test_compiled_and_plain_comparison_count_the_same(monkeypatch):
     np.testing.assert_array_equal(sample_matches(samples, np.zeros((4, 4)), neighbours=3), compiled)
 
 
-def test_looks_of_a_picture_depend_on_this_picture_alone(walk, looks):
+def test_looks_of_a_picture_depend_on_this_picture_alone(walk: PathCapture, looks: dict[str, GlobalDescriptor]) -> None:
     name = list(walk.features)[7]
     again = vlad_descriptor(walk.features[name])
     again.check()
@@ -166,10 +169,10 @@ def test_looks_of_a_picture_depend_on_this_picture_alone(walk, looks):
 
 
 @pytest.mark.parametrize(("metric", "size"), [("l2", 128), ("hamming", 32), ("l2", 61), ("hamming", 64)])
-def test_common_key_points_make_pictures_alike(metric, size):
+def test_common_key_points_make_pictures_alike(metric: Literal["l2", "hamming"], size: int) -> None:
     rng = np.random.default_rng(3)
 
-    def draw(count):
+    def draw(count: int) -> NDArray[Any]:
         if metric == "l2":
             return rng.integers(0, 200, size=(count, size)).astype(np.float32)
         return rng.integers(0, 256, size=(count, size), dtype=np.uint8)
@@ -183,7 +186,7 @@ def test_common_key_points_make_pictures_alike(metric, size):
 
 
 @pytest.mark.parametrize(("metric", "dtype"), [("l2", np.float32), ("hamming", np.uint8)])
-def test_a_picture_without_key_points_looks_like_nothing(metric, dtype):
+def test_a_picture_without_key_points_looks_like_nothing(metric: Literal["l2", "hamming"], dtype: type[Any]) -> None:
     empty = vlad_descriptor(features(np.zeros((0, 32), dtype), metric))
     empty.check()
     assert not empty.vector.any()
@@ -192,7 +195,7 @@ def test_a_picture_without_key_points_looks_like_nothing(metric, dtype):
     assert retrieval_pairs(["a"], some).pairs == ()
 
 
-def test_a_walk_is_closed_where_it_comes_back(walk, looks):
+def test_a_walk_is_closed_where_it_comes_back(walk: PathCapture, looks: dict[str, GlobalDescriptor]) -> None:
     """The same walk twice: the second time its pictures look like those of the first."""
     names = list(walk.poses)[:10]
     twice = names + [f"again/{name}" for name in names]
@@ -206,28 +209,29 @@ def test_a_walk_is_closed_where_it_comes_back(walk, looks):
     assert list(pairs.pairs) == sorted(pairs.pairs, key=lambda pair: [twice.index(name) for name in pair])
 
 
-def test_without_loop_closure_only_the_window_counts(looks):
+def test_without_loop_closure_only_the_window_counts(looks: dict[str, GlobalDescriptor]) -> None:
     names = list(looks)
     assert (
         loop_closing_pairs(names, {}, window=3, loop=True).pairs == sequential_pairs(names, window=3, loop=True).pairs
     )
 
 
-def test_numbers_of_neighbours_are_checked(looks):
-    for wrong in (
+def test_numbers_of_neighbours_are_checked(looks: dict[str, GlobalDescriptor]) -> None:
+    calls: list[Callable[[], object]] = [
         lambda: position_pairs(["a"], {}, neighbours=0),
         lambda: position_pairs(["a"], {}, window=0),
         lambda: retrieval_pairs(list(looks), looks, neighbours=0),
-    ):
+    ]
+    for wrong in calls:
         with pytest.raises(UsageError, match="at least 1"):
             wrong()
 
 
 @pytest.mark.parametrize("metric", ["l2", "hamming"])
-def test_a_glance_tells_strangers_from_neighbours(metric):
+def test_a_glance_tells_strangers_from_neighbours(metric: Literal["l2", "hamming"]) -> None:
     rng = np.random.default_rng(4)
 
-    def draw(count):
+    def draw(count: int) -> NDArray[Any]:
         if metric == "l2":
             return rng.integers(0, 200, size=(count, 64)).astype(np.float32)
         return rng.integers(0, 256, size=(count, 32), dtype=np.uint8)
@@ -243,7 +247,7 @@ def test_a_glance_tells_strangers_from_neighbours(metric):
     assert hopeless_reason(here, replace(stranger, descriptors=base), preemptive=200) == ""
 
 
-def test_a_glance_at_everything_is_none():
+def test_a_glance_at_everything_is_none() -> None:
     """Where a picture has no more key points than the glance looks at, matching all costs the same."""
     rng = np.random.default_rng(5)
     a, b = (features(rng.integers(0, 200, size=(50, 16)).astype(np.float32)) for _ in range(2))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.features import kernels_sphorb as kernels
 from pano_mvs.algorithms.features.geodesic import NEIGHBOURS, GeodesicGrid, hexagon_ring
@@ -21,7 +22,7 @@ pytestmark = pytest.mark.kernel("features.kernels_sphorb")
 
 
 @pytest.fixture(scope="module")
-def pictures():
+def pictures() -> NDArray[np.uint8]:
     """Two faces of smooth noise, with plain areas that make ties."""
     noise = np.random.default_rng(5).integers(0, 256, size=(2, SIDE, SIDE)).astype(np.uint8)
     smooth = np.stack([cv2.GaussianBlur(face, (0, 0), 1.2) for face in noise])
@@ -29,17 +30,17 @@ def pictures():
     return smooth
 
 
-def owned_cells(reach):
+def owned_cells(reach: int) -> list[tuple[int, int]]:
     return [(v, u) for v in range(-reach, STEPS + reach + 1) for u in range(-reach, STEPS + reach - v + 1)]
 
 
-def test_ring_of_the_kernel_is_that_of_the_oracle():
+def test_ring_of_the_kernel_is_that_of_the_oracle() -> None:
     assert hexagon_ring(3)[:, ::-1].tolist() == [list(cell) for cell in oracle.ring_of_three()]
     assert [[c, r] for r, c in oracle.STEPS] == NEIGHBOURS.tolist()
 
 
 @pytest.mark.parametrize("threshold", [3, 12])
-def test_segment_test_equals_the_plain_one(pictures, threshold):
+def test_segment_test_equals_the_plain_one(pictures: NDArray[np.uint8], threshold: int) -> None:
     scores = np.zeros_like(pictures)
     kernels.score_corners(pictures, GRID.ring_offsets, MARGIN, 2, threshold, scores)
     expected = np.zeros_like(scores)
@@ -51,7 +52,7 @@ def test_segment_test_equals_the_plain_one(pictures, threshold):
     np.testing.assert_array_equal(scores, expected)
 
 
-def test_local_maxima_equal_the_plain_ones():
+def test_local_maxima_equal_the_plain_ones() -> None:
     """With few different scores, so that many are equal: exactly the first of equals stays."""
     scores = np.random.default_rng(6).integers(0, 4, size=(2, SIDE, SIDE)).astype(np.uint8)
     cells = np.empty((scores.size, 3), np.int64)
@@ -69,7 +70,7 @@ def test_local_maxima_equal_the_plain_ones():
     assert cells.tolist() == expected
 
 
-def test_refinement_equals_climbing_the_plain_response(pictures):
+def test_refinement_equals_climbing_the_plain_response(pictures: NDArray[np.uint8]) -> None:
     cells = np.array([[f, v, u] for f in range(2) for v, u in owned_cells(0)][::3], np.int64)
     window = np.concatenate([np.zeros((1, 2), np.int64), hexagon_ring(1), hexagon_ring(2)])
     plane = window @ np.array([[1.0, 0.0], [0.5, np.sqrt(0.75)]])
@@ -80,7 +81,7 @@ def test_refinement_equals_climbing_the_plain_response(pictures):
     moved = 0
     for (face, v, u), place, response in zip(cells, places, responses, strict=True):
 
-        def plain(cell, face=face):
+        def plain(cell: tuple[int, int], face: np.int64 = face) -> float:
             return oracle.harris_response(pictures[face], cell[0] + MARGIN, cell[1] + MARGIN, radius=2, sigma=1.1)
 
         cell = (int(v), int(u))
@@ -97,7 +98,7 @@ def test_refinement_equals_climbing_the_plain_response(pictures):
     assert moved > 20
 
 
-def test_peak_of_a_paraboloid_is_found_exactly():
+def test_peak_of_a_paraboloid_is_found_exactly() -> None:
     rng = np.random.default_rng(7)
     steps = NEIGHBOURS @ np.array([[1.0, 0.0], [0.5, np.sqrt(0.75)]])
     for _ in range(200):
@@ -106,19 +107,21 @@ def test_peak_of_a_paraboloid_is_found_exactly():
         top_uv = rng.uniform(-0.4, 0.4, size=2)
         top = top_uv @ np.array([[1.0, 0.0], [0.5, np.sqrt(0.75)]])
 
-        def value(place, top=top, curvature=curvature):
-            return 3.0 - (place - top) @ curvature @ (place - top)
+        def value(
+            place: NDArray[np.float64], top: NDArray[np.float64] = top, curvature: NDArray[np.float64] = curvature
+        ) -> float:
+            return float(3.0 - (place - top) @ curvature @ (place - top))
 
         around = np.array([value(step) for step in steps])
         np.testing.assert_allclose(kernels.hexagon_peak(value(np.zeros(2)), around), top_uv, atol=1e-9)
 
 
-def test_a_saddle_or_a_far_peak_moves_nothing():
+def test_a_saddle_or_a_far_peak_moves_nothing() -> None:
     assert kernels.hexagon_peak(0.0, np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0])) == (0.0, 0.0)
     assert kernels.hexagon_peak(0.0, np.array([1.0, 0.5, -0.6, -1.1, -0.6, 0.5])) == (0.0, 0.0)
 
 
-def test_descriptors_equal_the_plain_ones(pictures):
+def test_descriptors_equal_the_plain_ones(pictures: NDArray[np.uint8]) -> None:
     rng = np.random.default_rng(8)
     faces = np.array([0, 1, 1, 0], np.int64)
     places = rng.uniform(3, 5, size=(4, 2))
@@ -137,7 +140,7 @@ def test_descriptors_equal_the_plain_ones(pictures):
         assert 10 < np.sum(brighter > 0) < 54
 
 
-def test_clear_discs_equal_the_plain_ones():
+def test_clear_discs_equal_the_plain_ones() -> None:
     rng = np.random.default_rng(9)
     valid = (rng.random((2, SIDE, SIDE)) > 0.01).astype(np.uint8)
     faces, places = rng.integers(0, 2, 60), rng.uniform(0, 8, size=(60, 2))

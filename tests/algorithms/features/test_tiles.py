@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.sampling import sample_view
 from pano_mvs.algorithms.features import tangent, tile_sampling
@@ -16,12 +17,14 @@ SIZE = (128, 256)
 
 
 @pytest.fixture(scope="module")
-def room_image():
+def room_image() -> NDArray[np.uint8]:
     return render(default_room(), Rigid3.identity(), SIZE, supersample=1)[0]
 
 
 @pytest.mark.parametrize("max_width", [2048, 64], ids=["kept", "too large to keep"])
-def test_a_tile_is_sampled_as_any_view(monkeypatch, room_image, max_width):
+def test_a_tile_is_sampled_as_any_view(
+    monkeypatch: pytest.MonkeyPatch, room_image: NDArray[np.uint8], max_width: int
+) -> None:
     monkeypatch.setattr(tile_sampling, "_MAX_WIDTH", max_width)
     grey = np.ascontiguousarray(room_image[..., 1])
     for idx, tile in enumerate(tangent_tiles(SIZE)):
@@ -29,7 +32,7 @@ def test_a_tile_is_sampled_as_any_view(monkeypatch, room_image, max_width):
         assert owned_pixels(SIZE, idx).shape == tile.size_hw
 
 
-def test_beyond_a_face_is_where_another_centre_is_nearer():
+def test_beyond_a_face_is_where_another_centre_is_nearer() -> None:
     rays = np.random.default_rng(3).normal(size=(2000, 3))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     owner = np.argmax(rays @ face_centers().T, axis=1)
@@ -37,7 +40,7 @@ def test_beyond_a_face_is_where_another_centre_is_nearer():
         np.testing.assert_array_equal(beyond_face_rad(rays, idx) < 0, owner == idx)
 
 
-def test_the_masks_cover_the_sphere_hardly_twice():
+def test_the_masks_cover_the_sphere_hardly_twice() -> None:
     """Every direction is in the mask of the tile that owns it, and few are in another one's too."""
     rays = np.random.default_rng(4).normal(size=(4000, 3))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -52,7 +55,7 @@ def test_the_masks_cover_the_sphere_hardly_twice():
     assert masked.sum(axis=0).mean() < 1.4
 
 
-def test_masks_change_no_key_point(monkeypatch, room_image):
+def test_masks_change_no_key_point(monkeypatch: pytest.MonkeyPatch, room_image: NDArray[np.uint8]) -> None:
     """SIFT that describes the whole of every tile keeps the same key points, with the same descriptors."""
     everywhere = np.ones(SIZE, np.bool_)
     found = tangent.extract_sift(room_image, everywhere)

@@ -1,9 +1,13 @@
 """The bilateral solver: its cells, its linear system against dense elimination, and what it does to ranges."""
 
+from __future__ import annotations
+
 from functools import partial
+from typing import Any, Literal
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.bilateral_solver import fast_bilateral_solver, solve_bilateral
 from pano_mvs.algorithms.filters.confidence import confidence_weight
@@ -17,18 +21,20 @@ from tests.algorithms.range_scenes import as_map, rolled
 from tests.benchmarks.depth_metrics import depth_metrics
 from tests.oracles.bilateral import corner_weights, dense_system
 
+View = tuple[NDArray[np.uint8], NDArray[np.float32]]
+
 SIZE = (128, 256)
 
 smooth_all = partial(fast_bilateral_solver, keep_confidence=256, max_hole_deg=0)
 
 
 @pytest.fixture(scope="module")
-def view():
+def view() -> View:
     image, ranges = render(default_room(), Rigid3.identity(), SIZE)
     return image, ranges
 
 
-def harmed(ranges, seed=0):
+def harmed(ranges: NDArray[Any], seed: int = 0) -> RangeMap:
     """5 % noise, 20 % outliers of low confidence, holes."""
     rng = np.random.default_rng(seed)
     noisy = ranges * (1 + 0.05 * rng.standard_normal(ranges.shape))
@@ -43,7 +49,7 @@ def harmed(ranges, seed=0):
 @pytest.mark.parametrize("size", [(16, 32), (64, 128), (60, 100), (33, 66)])
 @pytest.mark.parametrize("cell_px", [4, 8])
 class TestCells:
-    def test_neighbours_are_mutual(self, size, cell_px):
+    def test_neighbours_are_mutual(self, size: tuple[int, int], cell_px: int) -> None:
         cells = sphere_cells(size, cell_px)
         count = len(cells.starts) - 1
         dense = np.zeros((count, count))
@@ -54,7 +60,7 @@ class TestCells:
         assert (np.diag(dense) == 0).all()
         assert dense.sum(axis=1).min() >= 4 - 1e-9  # left, right, above and below, everywhere on the sphere
 
-    def test_weights_place_a_pixel_between_cells(self, size, cell_px):
+    def test_weights_place_a_pixel_between_cells(self, size: tuple[int, int], cell_px: int) -> None:
         """A smooth function on the sphere, taken at the cells' middles, comes back at the pixels."""
         cells = sphere_cells(size, cell_px)
         rays = ray_grid(size)
@@ -78,7 +84,7 @@ class TestCells:
 @pytest.mark.kernel("filters.kernels_bilateral")
 @pytest.mark.parametrize("smoothness", [0.1, 4, 100])
 @pytest.mark.parametrize("holes", [0.0, 0.5])
-def test_the_solution_is_that_of_the_dense_system(smoothness, holes):
+def test_the_solution_is_that_of_the_dense_system(smoothness: float, holes: float) -> None:
     rng = np.random.default_rng(2)
     size = (16, 32)
     cells = sphere_cells(size, 4)
@@ -93,7 +99,7 @@ def test_the_solution_is_that_of_the_dense_system(smoothness, holes):
 
 
 @pytest.mark.parametrize("domain", ["inverse", "range"])
-def test_it_recovers_ranges_from_noise_outliers_and_holes(view, domain):
+def test_it_recovers_ranges_from_noise_outliers_and_holes(view: View, domain: Literal["range", "inverse"]) -> None:
     image, truth = view
     broken = harmed(truth)
     before = depth_metrics(np.nan_to_num(broken.range, nan=2.5), truth)
@@ -107,7 +113,7 @@ def test_it_recovers_ranges_from_noise_outliers_and_holes(view, domain):
     assert after.w_delta_105 > before.w_delta_105 + 0.2
 
 
-def test_it_keeps_an_edge_that_the_picture_shows_and_smooths_one_that_it_does_not():
+def test_it_keeps_an_edge_that_the_picture_shows_and_smooths_one_that_it_does_not() -> None:
     image = np.full((*SIZE, 3), 60, np.uint8)
     image[:, 64:128] = 180
     ranges = np.full(SIZE, 4.0)
@@ -121,13 +127,13 @@ def test_it_keeps_an_edge_that_the_picture_shows_and_smooths_one_that_it_does_no
 
 
 @pytest.mark.parametrize("domain", ["inverse", "range"])
-def test_a_sphere_stays_a_sphere(domain):
+def test_a_sphere_stays_a_sphere(domain: Literal["range", "inverse"]) -> None:
     image = np.random.default_rng(0).integers(0, 256, (64, 128, 3)).astype(np.uint8)
     solved = smooth_all(as_map(np.full((64, 128), 2.5)), image, domain=domain, smoothness=100)
     np.testing.assert_allclose(solved.range, 2.5, rtol=1e-5)
 
 
-def test_a_plane_keeps_its_slant():
+def test_a_plane_keeps_its_slant() -> None:
     """A ceiling all over the upper half, in one colour: linear weights and 1/range leave no staircase."""
     size = (256, 512)
     down = np.abs(ray_grid(size)[..., 1])
@@ -139,7 +145,7 @@ def test_a_plane_keeps_its_slant():
 
 
 @pytest.mark.parametrize("columns", [8, 64, 3, 125])
-def test_rolling_the_input_rolls_the_output(view, columns):
+def test_rolling_the_input_rolls_the_output(view: View, columns: int) -> None:
     """Cells begin somewhere, so a roll by part of a cell changes a little; a crack at the seam would be large."""
     image, truth = view
     broken = harmed(truth)
@@ -153,7 +159,7 @@ def test_rolling_the_input_rolls_the_output(view, columns):
     assert np.quantile(seam, 0.9) < 2 * np.quantile(change, 0.9) + 1e-3
 
 
-def test_no_crack_at_the_seam_and_the_poles():
+def test_no_crack_at_the_seam_and_the_poles() -> None:
     """Noise around a ball is smoothed over the seam and the poles as it is elsewhere."""
     noisy = harmed(np.full(SIZE, 2.0))
     solved = smooth_all(noisy, np.full((*SIZE, 3), 90, np.uint8)).range
@@ -164,7 +170,7 @@ def test_no_crack_at_the_seam_and_the_poles():
         assert over.mean() < 2 * np.abs(np.diff(solved, axis=0)).mean()
 
 
-def test_holes_are_filled_and_marked_and_nothing_else_is(view):
+def test_holes_are_filled_and_marked_and_nothing_else_is(view: View) -> None:
     image, truth = view
     broken = harmed(truth)
     filled = smooth_all(broken, image)
@@ -178,7 +184,7 @@ def test_holes_are_filled_and_marked_and_nothing_else_is(view):
     np.testing.assert_array_equal(left.range[~new], filled.range[~new])
 
 
-def test_a_colour_that_has_no_range_at_all_gets_one():
+def test_a_colour_that_has_no_range_at_all_gets_one() -> None:
     image = np.zeros((64, 128, 3), np.uint8)
     image[20:40, 30:60] = (250, 20, 20)
     ranges = np.full((64, 128), 3.0)
@@ -186,12 +192,12 @@ def test_a_colour_that_has_no_range_at_all_gets_one():
     np.testing.assert_allclose(smooth_all(as_map(ranges), image).range, 3.0, rtol=1e-3)
 
 
-def test_no_range_anywhere_is_returned_as_it_is():
+def test_no_range_anywhere_is_returned_as_it_is() -> None:
     empty = as_map(np.full((16, 32), np.nan))
     assert smooth_all(empty, np.zeros((16, 32, 3), np.uint8)) is empty
 
 
-def test_units_do_not_matter(view):
+def test_units_do_not_matter(view: View) -> None:
     image, truth = view
     broken = harmed(truth)
     thousand = RangeMap(broken.range * np.float32(1000), broken.confidence)
@@ -203,7 +209,7 @@ def test_units_do_not_matter(view):
         )
 
 
-def test_more_smoothness_is_smoother(view):
+def test_more_smoothness_is_smoother(view: View) -> None:
     image, truth = view
     broken = harmed(truth)
     rough = [
@@ -213,7 +219,7 @@ def test_more_smoothness_is_smoother(view):
     assert rough == sorted(rough, reverse=True)
 
 
-def test_weights_follow_the_bands():
+def test_weights_follow_the_bands() -> None:
     weight = confidence_weight(np.array([0, 1, 63, 64, 127, 128, 255], np.uint8))
     assert weight[0] == 0
     assert weight[-1] == 1
@@ -221,7 +227,7 @@ def test_weights_follow_the_bands():
     assert weight[5] > 20 * weight[4] > 20 * 5 * weight[2]
 
 
-def test_a_map_that_nobody_checked_is_solved_as_if_all_were_sure(view):
+def test_a_map_that_nobody_checked_is_solved_as_if_all_were_sure(view: View) -> None:
     image, truth = view
     weak, sure = as_map(harmed(truth).range, 100), as_map(harmed(truth).range, 200)
     np.testing.assert_allclose(smooth_all(weak, image).range, smooth_all(sure, image).range, rtol=1e-4)
@@ -235,12 +241,12 @@ def test_a_map_that_nobody_checked_is_solved_as_if_all_were_sure(view):
         ({"smoothness": -1}, "smoothness"),
     ],
 )
-def test_impossible_settings_are_named(view, settings, words):
+def test_impossible_settings_are_named(view: View, settings: dict[str, Any], words: str) -> None:
     with pytest.raises(UsageError, match=words):
         smooth_all(as_map(view[1]), view[0], **settings)
 
 
-def test_a_guide_of_another_size_is_refused(view):
+def test_a_guide_of_another_size_is_refused(view: View) -> None:
     with pytest.raises(UsageError, match="guide must be"):
         smooth_all(as_map(view[1]), view[0][::2, ::2])
 

@@ -1,5 +1,10 @@
 """Multi-view consistency: true ranges agree, wrong ones do not, and the compiled judge equals the plain one."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -15,22 +20,22 @@ from tests.oracles import range_filters as oracle
 SIZE = (128, 256)
 POSES = capture_poses(4, seed=1, spread=0.4)
 # At this size true ranges, too, are seen at less parallax than is asked for by default.
-LIMITS = {"max_relative_error": 0.02, "max_reprojection_px": 1.0, "min_motion_px": 0.01}
+LIMITS: dict[str, Any] = {"max_relative_error": 0.02, "max_reprojection_px": 1.0, "min_motion_px": 0.01}
 
 
 @pytest.fixture(scope="module")
-def true_maps():
+def true_maps() -> list[RangeMap]:
     room = default_room()
     return [as_map(room_range(room, pose, SIZE)) for pose in POSES]
 
 
-def checked(maps, **settings):
+def checked(maps: Sequence[RangeMap], **settings: Any) -> RangeMap:
     return check_consistency(maps[0], POSES[0], maps[1:], POSES[1:], **LIMITS | settings)
 
 
 @pytest.mark.kernel("filters.kernels_reprojection")
 @pytest.mark.parametrize("size", [(12, 24), (13, 20)])
-def test_compiled_verdicts_equal_the_plain_ones(size):
+def test_compiled_verdicts_equal_the_plain_ones(size: tuple[int, int]) -> None:
     """On maps without any order, seen from all over: every branch, the seam and the poles."""
     rng = np.random.default_rng(0)
     pose = capture_poses(2, seed=3, tilt_deg=60)[1]
@@ -49,14 +54,14 @@ def test_compiled_verdicts_equal_the_plain_ones(size):
         np.testing.assert_allclose(motions, expected_motions, rtol=1e-3, atol=1e-6)
 
 
-def test_true_ranges_confirm_each_other(true_maps):
+def test_true_ranges_confirm_each_other(true_maps: list[RangeMap]) -> None:
     result = checked(true_maps, remove_inconsistent=True)
     result.check()
     assert (result.confidence >= 128).mean() > 0.96
     assert result.valid.mean() > 0.995
 
 
-def test_wrong_ranges_are_not_confirmed_and_go_when_seen_through(true_maps):
+def test_wrong_ranges_are_not_confirmed_and_go_when_seen_through(true_maps: list[RangeMap]) -> None:
     rng = np.random.default_rng(1)
     wrong = rng.random(SIZE) < 0.2
     factor = np.where(wrong, rng.choice([0.6, 0.7, 1.4, 1.7], SIZE), 1)
@@ -73,7 +78,7 @@ def test_wrong_ranges_are_not_confirmed_and_go_when_seen_through(true_maps):
     assert removed[factor > 1].mean() < 0.1
 
 
-def test_confidence_grows_with_the_number_of_views_and_falls_with_the_error(true_maps):
+def test_confidence_grows_with_the_number_of_views_and_falls_with_the_error(true_maps: list[RangeMap]) -> None:
     few, many = checked(true_maps[:2] + [as_map(np.full(SIZE, np.nan))] * 2), checked(true_maps)
     both = few.confidence >= 128
     assert np.median(many.confidence[both]) > np.median(few.confidence[both])
@@ -82,7 +87,7 @@ def test_confidence_grows_with_the_number_of_views_and_falls_with_the_error(true
     assert np.median(off.confidence[both]) < np.median(many.confidence[both])
 
 
-def test_along_the_baseline_nothing_is_consistent_however_well_it_agrees(true_maps):
+def test_along_the_baseline_nothing_is_consistent_however_well_it_agrees(true_maps: list[RangeMap]) -> None:
     """Forward and backward meet at the epipoles whatever the range is."""
     result = check_consistency(true_maps[0], POSES[0], true_maps[1:2], POSES[1:2], min_motion_px=0.1)
     rays = ray_grid(SIZE)
@@ -95,7 +100,7 @@ def test_along_the_baseline_nothing_is_consistent_however_well_it_agrees(true_ma
     assert np.median(even.confidence[both & (sine > 0.9)]) > np.median(even.confidence[both & (sine < 0.3)]) + 10
 
 
-def test_agreement_by_a_hair_is_not_enough(true_maps):
+def test_agreement_by_a_hair_is_not_enough(true_maps: list[RangeMap]) -> None:
     """A range that misses the sources by nearly what is allowed has little support, one that misses by little much."""
     shares = {}
     for factor in (1.0, 1.012):
@@ -107,7 +112,7 @@ def test_agreement_by_a_hair_is_not_enough(true_maps):
     assert shares[1.012, 0.9] < 0.8
 
 
-def test_beside_a_step_sides_are_doubtful_and_normals_are_kept(true_maps):
+def test_beside_a_step_sides_are_doubtful_and_normals_are_kept(true_maps: list[RangeMap]) -> None:
     edge = np.where(np.arange(SIZE[1]) < 100, 2.0, 4.0) * np.ones(SIZE)
     step = _step_around(as_map(edge).range)
     np.testing.assert_allclose(step[:, 98:102], np.log(2), rtol=1e-6)
@@ -120,14 +125,14 @@ def test_beside_a_step_sides_are_doubtful_and_normals_are_kept(true_maps):
     np.testing.assert_array_equal(checked([with_normals, *true_maps[1:]]).normals_in_cam, normals)
 
 
-def test_min_views_is_the_number_that_must_confirm(true_maps):
+def test_min_views_is_the_number_that_must_confirm(true_maps: list[RangeMap]) -> None:
     shares = [(checked(true_maps, min_views=views).confidence >= 128).mean() for views in (1, 2, 3, 4)]
     assert shares == sorted(shares, reverse=True)
     assert shares[2] > 0.5
     assert shares[3] == 0
 
 
-def test_the_order_of_the_sources_does_not_matter(true_maps):
+def test_the_order_of_the_sources_does_not_matter(true_maps: list[RangeMap]) -> None:
     order = [2, 0, 1]
     turned = check_consistency(
         true_maps[0], POSES[0], [true_maps[1:][i] for i in order], [POSES[1:][i] for i in order], **LIMITS
@@ -135,7 +140,7 @@ def test_the_order_of_the_sources_does_not_matter(true_maps):
     np.testing.assert_array_equal(turned.confidence, checked(true_maps).confidence)
 
 
-def test_the_world_frame_does_not_matter(true_maps):
+def test_the_world_frame_does_not_matter(true_maps: list[RangeMap]) -> None:
     world_from_other = Rigid3(POSES[3].rotation, np.array([5.0, -3, 2]))
     poses = [pose @ world_from_other for pose in POSES]
     turned = check_consistency(true_maps[0], poses[0], true_maps[1:], poses[1:], **LIMITS)
@@ -143,7 +148,7 @@ def test_the_world_frame_does_not_matter(true_maps):
 
 
 @pytest.mark.parametrize("columns", [1, 100, 255])
-def test_rolling_the_reference_rolls_the_result(true_maps, columns):
+def test_rolling_the_reference_rolls_the_result(true_maps: list[RangeMap], columns: int) -> None:
     _, new_from_old = roll_panorama(true_maps[0].range, columns)
     pose = Rigid3(new_from_old, np.zeros(3)) @ POSES[0]
     result = check_consistency(rolled(true_maps[0], columns), pose, true_maps[1:], POSES[1:], **LIMITS)
@@ -153,7 +158,7 @@ def test_rolling_the_reference_rolls_the_result(true_maps, columns):
 
 
 @pytest.mark.parametrize("columns", [1, 100, 255])
-def test_rolling_a_source_changes_nothing(true_maps, columns):
+def test_rolling_a_source_changes_nothing(true_maps: list[RangeMap], columns: int) -> None:
     _, new_from_old = roll_panorama(true_maps[1].range, columns)
     maps = [true_maps[0], rolled(true_maps[1], columns), *true_maps[2:]]
     poses = [POSES[0], Rigid3(new_from_old, np.zeros(3)) @ POSES[1], *POSES[2:]]
@@ -161,19 +166,19 @@ def test_rolling_a_source_changes_nothing(true_maps, columns):
     assert (np.abs(result.confidence.astype(int) - checked(true_maps).confidence) > 1).mean() < 1e-3
 
 
-def test_filled_pixels_neither_vote_nor_are_promoted(true_maps):
+def test_filled_pixels_neither_vote_nor_are_promoted(true_maps: list[RangeMap]) -> None:
     filled = [RangeMap(m.range, np.full(SIZE, 40, np.uint8)) for m in true_maps]
     assert (checked([true_maps[0], *filled[1:]]).confidence < 128).all()
     np.testing.assert_array_equal(checked([filled[0], *true_maps[1:]]).confidence, 40)
     assert np.isnan(seen_ranges(filled[0], min_confidence=64)).all()
 
 
-def test_what_was_consistent_before_is_weak_when_nobody_confirms_it(true_maps):
+def test_what_was_consistent_before_is_weak_when_nobody_confirms_it(true_maps: list[RangeMap]) -> None:
     alone = check_consistency(RangeMap(true_maps[0].range, np.full(SIZE, 250, np.uint8)), POSES[0], [], [])
     np.testing.assert_array_equal(alone.confidence, 127)
 
 
-def test_any_number_of_threads_gives_the_same_bytes(true_maps):
+def test_any_number_of_threads_gives_the_same_bytes(true_maps: list[RangeMap]) -> None:
     numba = pytest.importorskip("numba")
     before = numba.get_num_threads()
     results = []
@@ -184,7 +189,7 @@ def test_any_number_of_threads_gives_the_same_bytes(true_maps):
     assert len(set(results)) == 1
 
 
-def test_impossible_calls_are_named(true_maps):
+def test_impossible_calls_are_named(true_maps: list[RangeMap]) -> None:
     with pytest.raises(UsageError, match="one pose for each"):
         check_consistency(true_maps[0], POSES[0], true_maps[1:], POSES[2:])
     with pytest.raises(UsageError, match="must be positive"):

@@ -1,5 +1,10 @@
 """Median, Gaussian, speckles and fill: laws, recovery, and equality with the slow versions."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,11 +17,12 @@ from pano_mvs.algorithms.filters.speckle import remove_speckles
 from pano_mvs.algorithms.filters.sphere_steps import columns_per_step
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import pixel_solid_angle
+from pano_mvs.scene import RangeMap
 from tests.algorithms.range_scenes import TRUSTED, as_map, box_range, random_map, rolled
 from tests.oracles import range_filters as oracle
 
 SIZE = (24, 48)
-FILTERS = {
+FILTERS: dict[str, Callable[[RangeMap], RangeMap]] = {
     "median": median_range,
     "median_7": lambda range_map: median_range(range_map, window=7),
     "gaussian": gaussian_range,
@@ -28,7 +34,7 @@ FILTERS = {
 @pytest.mark.parametrize("name", FILTERS)
 @settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 1000), columns=st.integers(-60, 60))
-def test_rolling_the_input_rolls_the_output(name, seed, columns):
+def test_rolling_the_input_rolls_the_output(name: str, seed: int, columns: int) -> None:
     range_map = random_map(np.random.default_rng(seed), SIZE)
     filtered = FILTERS[name](range_map)
     filtered.check()
@@ -38,7 +44,7 @@ def test_rolling_the_input_rolls_the_output(name, seed, columns):
 
 
 @pytest.mark.parametrize("name", FILTERS)
-def test_turning_the_picture_upside_down_turns_the_output(name):
+def test_turning_the_picture_upside_down_turns_the_output(name: str) -> None:
     """Both poles are treated alike."""
     range_map = random_map(np.random.default_rng(3), SIZE)
     flipped = as_map(range_map.range[::-1], range_map.confidence[::-1])
@@ -46,7 +52,7 @@ def test_turning_the_picture_upside_down_turns_the_output(name):
 
 
 @pytest.mark.parametrize("name", FILTERS)
-def test_a_sphere_around_the_camera_stays_as_it_is(name):
+def test_a_sphere_around_the_camera_stays_as_it_is(name: str) -> None:
     range_map = as_map(np.full(SIZE, 2.5))
     filtered = FILTERS[name](range_map)
     np.testing.assert_allclose(filtered.range, 2.5, rtol=1e-6)
@@ -55,12 +61,12 @@ def test_a_sphere_around_the_camera_stays_as_it_is(name):
 
 @pytest.mark.parametrize("window", [1, 3, 5, 7])
 @pytest.mark.parametrize("holes", [0.0, 0.2, 0.9])
-def test_median_equals_the_sorted_window(window, holes):
+def test_median_equals_the_sorted_window(window: int, holes: float) -> None:
     range_map = random_map(np.random.default_rng(window), SIZE, holes)
     np.testing.assert_array_equal(median_range(range_map, window=window).range, oracle.median(range_map.range, window))
 
 
-def test_median_removes_single_outliers_and_keeps_steps():
+def test_median_removes_single_outliers_and_keeps_steps() -> None:
     ranges, _ = box_range((64, 128))
     ranges[:, 40:60] = 1.0
     broken = ranges.copy()
@@ -72,20 +78,20 @@ def test_median_removes_single_outliers_and_keeps_steps():
     np.testing.assert_array_equal(filtered[2:-2, 42:58], 1.0)
 
 
-def test_gaussian_equals_the_plain_convolution():
+def test_gaussian_equals_the_plain_convolution() -> None:
     range_map = random_map(np.random.default_rng(5), SIZE)
     np.testing.assert_allclose(gaussian_range(range_map).range, oracle.gaussian(range_map.range, 5, 1.1), rtol=1e-6)
 
 
 @pytest.mark.parametrize("filtered", [median_range, gaussian_range])
-def test_invalid_pixels_stay_invalid_and_no_others_become_so(filtered):
+def test_invalid_pixels_stay_invalid_and_no_others_become_so(filtered: Callable[..., Any]) -> None:
     range_map = random_map(np.random.default_rng(6), SIZE, holes=0.7)
     np.testing.assert_array_equal(filtered(range_map).valid, range_map.valid)
 
 
 @pytest.mark.kernel("filters.kernels_components")
 @pytest.mark.parametrize("step", [0.1, 0.5, 2.0])
-def test_speckles_are_the_surfaces_that_flooding_finds(step):
+def test_speckles_are_the_surfaces_that_flooding_finds(step: float) -> None:
     range_map = random_map(np.random.default_rng(7), SIZE)
     labels = oracle.surfaces(range_map.range, step)
     area = np.broadcast_to(pixel_solid_angle(SIZE)[:, None], SIZE) / (2 * np.pi**2 / np.prod(SIZE))
@@ -94,7 +100,7 @@ def test_speckles_are_the_surfaces_that_flooding_finds(step):
     np.testing.assert_array_equal(cleaned.valid, range_map.valid & (size > 5))
 
 
-def test_a_speckle_goes_and_a_surface_across_the_seam_and_the_pole_stays():
+def test_a_speckle_goes_and_a_surface_across_the_seam_and_the_pole_stays() -> None:
     ranges = np.full((32, 64), 4.0)
     ranges[20:23, 30:33] = 1.0  # 9 pixels
     ranges[15:20, [62, 63, 0, 1, 2]] = 2.0  # 25 pixels in two parts of 10 and 15
@@ -110,7 +116,7 @@ def test_a_speckle_goes_and_a_surface_across_the_seam_and_the_pole_stays():
 
 
 @pytest.mark.kernel("filters.kernels_fill")
-def test_fill_equals_the_plain_paths():
+def test_fill_equals_the_plain_paths() -> None:
     range_map = random_map(np.random.default_rng(8), SIZE, holes=0.6)
     trusted = range_map.valid & (range_map.confidence >= 128)
     expected = oracle.fill(range_map.range, trusted, columns_per_step(SIZE, steps=8), 6, 1.25)
@@ -122,7 +128,7 @@ def test_fill_equals_the_plain_paths():
     np.testing.assert_array_equal(filled.range[range_map.valid], range_map.range[range_map.valid])
 
 
-def test_fill_restores_walls_over_seam_and_poles():
+def test_fill_restores_walls_over_seam_and_poles() -> None:
     ranges, _ = box_range((64, 128))
     holed = ranges.copy()
     holed[:5], holed[-4:], holed[20:30, -4:], holed[20:30, :5] = np.nan, np.nan, np.nan, np.nan
@@ -134,7 +140,7 @@ def test_fill_restores_walls_over_seam_and_poles():
     assert np.quantile(error[20:30], 0.97) < 0.02
 
 
-def test_fill_takes_the_background_beside_an_occluder():
+def test_fill_takes_the_background_beside_an_occluder() -> None:
     ranges = np.full((64, 128), 4.0)
     ranges[20:40, 50:70] = 1.0
     ranges[18:42, 70:76] = np.nan  # what another view does not see, right of the near thing
@@ -142,7 +148,7 @@ def test_fill_takes_the_background_beside_an_occluder():
     np.testing.assert_allclose(filled[18:42, 70:76], 4.0)
 
 
-def test_fill_does_not_trust_weak_pixels():
+def test_fill_does_not_trust_weak_pixels() -> None:
     ranges = np.full(SIZE, 3.0)
     ranges[10:14, 10:14] = np.nan
     assert not fill_from_neighbours(as_map(ranges, 127), max_hole_deg=0).valid[10:14, 10:14].any()
@@ -159,6 +165,6 @@ def test_fill_does_not_trust_weak_pixels():
         (lambda m: fill_from_neighbours(m, max_distance_px=0), "max_distance_px"),
     ],
 )
-def test_impossible_settings_are_named(call, words):
+def test_impossible_settings_are_named(call: Callable[..., Any], words: str) -> None:
     with pytest.raises(UsageError, match=words):
         call(as_map(np.ones(SIZE)))

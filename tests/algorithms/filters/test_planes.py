@@ -1,25 +1,33 @@
 """Planes on plain surfaces: recovered from their outline, never carried on beyond it, never laid across texture."""
 
+from __future__ import annotations
+
+from typing import Any
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.planes import fit_plane, lay_planes, plain_surfaces
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, ray_grid, rotation_from_rotvec
+from pano_mvs.scene import RangeMap
 from pano_mvs.testing.room import default_room, render
 from pano_mvs.testing.scenes import white_room
 from tests.algorithms.range_scenes import TRUSTED, as_map, rolled
+
+Wall = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_], RangeMap]
 
 SIZE = (128, 256)
 HIDDEN = 90
 
 
-def rng():
+def rng() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
 @pytest.fixture(scope="module")
-def white():
+def white() -> Wall:
     """A view of the white room, its ranges, and the map that chance makes of plain paint; the outline is seen."""
     image, ranges = white_room(turned=False).view(0, SIZE)
     _, bare = plain_surfaces(image, 8.0)
@@ -29,11 +37,11 @@ def white():
     return image, ranges, bare, as_map(found, np.where(bare & ~chance, HIDDEN, TRUSTED))
 
 
-def bad_share(ranges, truth, where):
+def bad_share(ranges: NDArray[np.float32], truth: NDArray[np.float32], where: NDArray[np.bool_]) -> float:
     return float((~(np.abs(ranges / truth - 1) < 0.05))[where].mean())
 
 
-def test_a_plane_is_found_among_outliers():
+def test_a_plane_is_found_among_outliers() -> None:
     noise = rng()
     rays = noise.normal(size=(400, 3))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -49,7 +57,7 @@ def test_a_plane_is_found_among_outliers():
     assert not degenerate[1].any()
 
 
-def test_the_ceiling_of_a_white_room_is_found_from_its_outline(white):
+def test_the_ceiling_of_a_white_room_is_found_from_its_outline(white: Wall) -> None:
     image, truth, bare, found = white
     laid = lay_planes(found, image, rng=rng())
     laid.check()
@@ -65,7 +73,7 @@ def test_the_ceiling_of_a_white_room_is_found_from_its_outline(white):
 
 
 @pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (1.4, 0.3, -0.2), (0.2, 2.0, 1.0)])
-def test_it_does_not_matter_how_the_camera_is_turned(turn):
+def test_it_does_not_matter_how_the_camera_is_turned(turn: tuple[float, float, float]) -> None:
     """The ceiling may lie about a pole or across the seam."""
     scene = white_room(turned=False)
     pose = Rigid3(rotation_from_rotvec(turn), np.zeros(3))
@@ -77,7 +85,7 @@ def test_it_does_not_matter_how_the_camera_is_turned(turn):
     assert bad_share(laid.range, truth, ceiling) < 0.03
 
 
-def test_rolling_the_input_rolls_the_surfaces(white):
+def test_rolling_the_input_rolls_the_surfaces(white: Wall) -> None:
     image, *_, found = white
     laid = lay_planes(found, image, rng=rng())
     again = rolled(lay_planes(rolled(found, 61), np.roll(image, 61, 1), rng=rng()), -61)
@@ -85,7 +93,7 @@ def test_rolling_the_input_rolls_the_surfaces(white):
     assert same.mean() > 0.97
 
 
-def test_textured_surfaces_and_balls_are_left_alone():
+def test_textured_surfaces_and_balls_are_left_alone() -> None:
     image, truth = render(default_room(), Rigid3.identity(), SIZE)
     found = as_map(truth * (1 + 0.05 * rng().standard_normal(SIZE)), TRUSTED)
     np.testing.assert_array_equal(lay_planes(found, image, rng=rng()).range, found.range)
@@ -94,7 +102,7 @@ def test_textured_surfaces_and_balls_are_left_alone():
     np.testing.assert_array_equal(lay_planes(sphere, plain, rng=rng()).range, sphere.range)
 
 
-def test_a_wall_is_not_carried_on_into_the_sky():
+def test_a_wall_is_not_carried_on_into_the_sky() -> None:
     """A plain patch above a wall: all that is seen around it lies on one plane, but on one side of it alone."""
     image = np.random.default_rng(2).integers(0, 256, (*SIZE, 3), np.uint8)
     image[30:46, 104:152] = 200
@@ -109,7 +117,7 @@ def test_a_wall_is_not_carried_on_into_the_sky():
     np.testing.assert_allclose(laid.range[sky], wall[sky], rtol=1e-3)
 
 
-def test_small_holes_of_a_plane_are_filled_and_large_ones_only_when_asked(white):
+def test_small_holes_of_a_plane_are_filled_and_large_ones_only_when_asked(white: Wall) -> None:
     image, truth, bare, _ = white
     hole = bare & (np.arange(SIZE[0])[:, None] < 25)
     found = as_map(np.where(hole, np.nan, truth), TRUSTED)
@@ -119,9 +127,11 @@ def test_small_holes_of_a_plane_are_filled_and_large_ones_only_when_asked(white)
     assert np.all(filled.confidence[hole & filled.valid] == 63)
 
 
-def test_bad_settings_are_refused(white):
+def test_bad_settings_are_refused(white: Wall) -> None:
     image, *_, found = white
-    for harm in ({"contrast": 0.0}, {"min_share": 1.5}, {"max_relative_error": 0.0}, {"min_area_deg2": -1.0}):
+    harms = {"contrast": 0.0, "min_share": 1.5, "max_relative_error": 0.0, "min_area_deg2": -1.0}
+    for name, value in harms.items():
+        harm: dict[str, Any] = {name: value}
         with pytest.raises(UsageError, match="must be positive"):
             lay_planes(found, image, rng=rng(), **harm)
     with pytest.raises(UsageError, match="guide must be"):

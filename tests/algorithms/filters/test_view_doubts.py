@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,8 +16,15 @@ from pano_mvs.testing.room import capture_poses, default_room
 from tests.algorithms.range_scenes import as_map, room_range
 
 SIZE = (32, 64)
-LIMITS = {"max_relative_error": 0.02, "max_reprojection_px": 1.0, "min_support": 0.85, "min_motion_px": 0.01,
-          "min_views": 1, "remove_inconsistent": False, "min_contradictions": 2}  # fmt: skip
+LIMITS: dict[str, Any] = {
+    "max_relative_error": 0.02,
+    "max_reprojection_px": 1.0,
+    "min_support": 0.85,
+    "min_motion_px": 0.01,
+    "min_views": 1,
+    "remove_inconsistent": False,
+    "min_contradictions": 2,
+}
 POSES = capture_poses(5, seed=2, spread=0.5)
 GOOD = Agreement(compared=0.9, agreed=0.5, seen_through=0.1, hidden=0.1)
 WRONG = Agreement(compared=0.9, agreed=0.2, seen_through=0.5, hidden=0.1)

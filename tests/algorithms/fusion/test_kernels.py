@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.sphere_steps import columns_per_step
 from pano_mvs.algorithms.fusion.kernels_support import find_supported
@@ -36,7 +39,7 @@ def test_votes_of_a_source_equal_the_plain_ones() -> None:
     confidence = rng.integers(30, 200, SOURCE_SIZE).astype(np.uint8)
     image = rng.integers(0, 256, (*SOURCE_SIZE, 3)).astype(np.uint8)
     pose = Rigid3(rotation_from_rotvec((0.4, -1.9, 0.7)), np.array([0.05, -0.03, 0.06]))
-    found = {
+    found: dict[str, NDArray[Any]] = {
         "yields": np.zeros(SIZE, np.bool_), "counts": np.zeros(SIZE, np.uint8), "violations": np.zeros(SIZE, np.uint8),
         "confidence": np.zeros(SIZE, np.uint8), "sums": np.zeros((*SIZE, 4)), "colors": np.zeros((*SIZE, 4)),
     }  # fmt: skip

@@ -42,7 +42,8 @@ def room_cloud(count: int = 6_000, *, window: bool = True) -> PointCloud:
 def distance_to_walls(points: np.ndarray) -> np.ndarray:
     beyond = np.abs(points) - HALF_SIZE
     outside = np.linalg.norm(np.maximum(beyond, 0), axis=1)
-    return np.where(outside > 0, outside, -beyond.max(axis=1))
+    result: np.ndarray = np.where(outside > 0, outside, -beyond.max(axis=1))
+    return result
 
 
 def context(folder: Path) -> Context:
@@ -115,9 +116,11 @@ def test_points_without_a_surface_are_refused(tmp_path: Path) -> None:
     """All in one place: the solver gives a file without faces."""
     count = 200
     same = PointCloud(
-        np.ones((count, 3), np.float32), np.tile(np.float32([0, 0, 1]), (count, 1)), np.zeros((count, 3), np.uint8),
+        np.ones((count, 3), np.float32),
+        np.tile(np.array([0, 0, 1], np.float32), (count, 1)),
+        np.zeros((count, 3), np.uint8),
         np.full(count, 3, np.uint8),
-    )  # fmt: skip
+    )
     with pytest.raises(InputError, match="the mesh has no faces"):
         mesh(same, MeshParams(max_points=0), context(tmp_path))
 
@@ -144,15 +147,15 @@ def test_trimming_follows_the_density_and_strays_keep_little() -> None:
     line[100] = (0, 1e6, 0)
     assert point_spacings(line)[50] == 2
     assert point_spacings(line)[100] == 20
-    vertices = np.float32([[50, 3, 0], [51, 3, 0], [50.5, 3.9, 0], [50, 9, 0], [39, 1e6, 0], [41, 1e6, 0]])
-    whole = Mesh(vertices, np.zeros((6, 3), np.uint8), np.int32([[0, 1, 2], [0, 1, 3], [4, 4, 4], [5, 5, 5]]))
+    vertices = np.array([[50, 3, 0], [51, 3, 0], [50.5, 3.9, 0], [50, 9, 0], [39, 1e6, 0], [41, 1e6, 0]], np.float32)
+    whole = Mesh(vertices, np.zeros((6, 3), np.uint8), np.array([[0, 1, 2], [0, 1, 3], [4, 4, 4], [5, 5, 5]], np.int32))
     kept = trimmed_mesh(whole, line, max_spacings=2)
     np.testing.assert_array_equal(kept.vertices_in_world, vertices[[0, 1, 2, 4]])
     np.testing.assert_array_equal(kept.faces, [[0, 1, 2], [3, 3, 3]])
 
 
 def test_crumbs_go() -> None:
-    faces = np.int32([[0, 1, 2], [1, 2, 3], [2, 3, 4], [5, 6, 7]])
+    faces = np.array([[0, 1, 2], [1, 2, 3], [2, 3, 4], [5, 6, 7]], np.int32)
     whole = Mesh(np.zeros((9, 3), np.float32), np.zeros((9, 3), np.uint8), faces)
     np.testing.assert_array_equal(without_crumbs(whole, smallest_share=0.5).faces, faces[:3])
     assert len(without_crumbs(whole, smallest_share=0.2).faces) == 4
@@ -161,7 +164,7 @@ def test_crumbs_go() -> None:
 
 
 def test_other_files_are_no_meshes(tmp_path: Path) -> None:
-    arrays = np.zeros((3, 3), np.float32), np.zeros((3, 3), np.uint8), np.int32([[0, 1, 2]])
+    arrays = np.zeros((3, 3), np.float32), np.zeros((3, 3), np.uint8), np.array([[0, 1, 2]], np.int32)
     write_ply_mesh(tmp_path / "a.ply", arrays)
     whole = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "cut.ply").write_bytes(whole[:-1])

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pano_mvs.algorithms.points.kernels_seen import see_points
@@ -13,15 +16,19 @@ from pano_mvs.algorithms.points.tracking import track_points
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import ray_grid
 from pano_mvs.scene import Poses, RangeMap
+from pano_mvs.scene.surface_samples import SurfaceSamples
+from pano_mvs.scene.tracked_points import TrackedPoints
 from pano_mvs.testing.room import capture_poses, default_room, range_along, render
 from tests.oracles.points import sees
+
+Room = tuple[Poses, dict[str, RangeMap], dict[str, SurfaceSamples]]
 
 SIZE = (128, 256)
 NAMES = ("a/1.png", "a/2.png", "b/1.png")
 
 
 @pytest.fixture(scope="module")
-def room():
+def room() -> Room:
     """Poses, true range maps and samples of three views."""
     cameras = capture_poses(3, seed=4)
     views = [render(default_room(), camera, SIZE, supersample=1) for camera in cameras]
@@ -34,18 +41,18 @@ def room():
     return poses, maps, samples
 
 
-def tracked(room, **settings):
+def tracked(room: Room, **settings: Any) -> TrackedPoints:
     poses, maps, samples = room
     return track_points(samples, poses, maps.__getitem__, rng=np.random.default_rng(1), **settings)
 
 
-def unevenness(points, spacing=1.0):
+def unevenness(points: NDArray[Any], spacing: float | NDArray[Any] = 1.0) -> float:
     """Standard deviation of the distance to the nearest neighbour in units of its mean; 0.52 if thrown."""
-    nearest = cKDTree(points).query(points, k=2)[0][:, 1] / spacing
-    return nearest.std() / nearest.mean()
+    nearest = np.asarray(cKDTree(points).query(points, k=2)[0])[:, 1] / spacing
+    return float(nearest.std() / nearest.mean())
 
 
-def test_samples_are_even_over_the_sphere_and_on_the_surfaces(room):
+def test_samples_are_even_over_the_sphere_and_on_the_surfaces(room: Room) -> None:
     poses, _, samples = room
     sample = samples[NAMES[1]]
     pose = poses.cam_from_world(1)
@@ -60,7 +67,7 @@ def test_samples_are_even_over_the_sphere_and_on_the_surfaces(room):
     )
 
 
-def test_masked_and_doubtful_pixels_give_no_samples():
+def test_masked_and_doubtful_pixels_give_no_samples() -> None:
     valid = ray_grid(SIZE)[..., 1] < 0.5
     confidence = np.where(ray_grid(SIZE)[..., 0] < 0, 90, 200).astype(np.uint8)
     image = np.zeros((*SIZE, 3), np.uint8)
@@ -73,7 +80,7 @@ def test_masked_and_doubtful_pixels_give_no_samples():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_points_are_spread_like_discs(seed):
+def test_points_are_spread_like_discs(seed: int) -> None:
     """On a plane sampled ever more densely to one side."""
     rng = np.random.default_rng(seed)
     points = np.column_stack([rng.random((30_000, 2)) ** (3, 1), np.zeros(30_000)])
@@ -85,7 +92,7 @@ def test_points_are_spread_like_discs(seed):
     assert (points[kept, 0] > 0.5).mean() == pytest.approx(0.5, abs=0.06)
 
 
-def test_distances_go_with_the_spacing():
+def test_distances_go_with_the_spacing() -> None:
     rng = np.random.default_rng(5)
     points = np.column_stack([rng.random((40_000, 2)), np.zeros(40_000)])
     spacing = np.where(points[:, 0] < 0.5, 1.0, 3.0)
@@ -95,22 +102,22 @@ def test_distances_go_with_the_spacing():
 
 
 @pytest.mark.parametrize("total", [0, 1, 2, 7, 40])
-def test_no_more_points_than_there_are(total):
+def test_no_more_points_than_there_are(total: int) -> None:
     points = np.random.default_rng(0).random((total, 3))
     assert spread_points(points, np.ones(total), 40, np.random.default_rng(0)).tolist() == list(range(total))
 
 
-def test_points_in_one_place_are_one():
+def test_points_in_one_place_are_one() -> None:
     points = np.zeros((100, 3))
     assert 1 <= len(spread_points(points, np.ones(100), 5, np.random.default_rng(0))) <= 5
 
 
-def test_wrong_spacings_are_refused():
+def test_wrong_spacings_are_refused() -> None:
     with pytest.raises(UsageError, match="positive spacings"):
         spread_points(np.zeros((3, 3)), np.array([1.0, 0.0, 1.0]), 2, np.random.default_rng(0))
 
 
-def test_points_are_on_the_walls_even_and_seen_where_the_tracks_say(room):
+def test_points_are_on_the_walls_even_and_seen_where_the_tracks_say(room: Room) -> None:
     poses, _, _ = room
     found = tracked(room, count=3000)
     found.check()
@@ -135,7 +142,7 @@ def test_points_are_on_the_walls_even_and_seen_where_the_tracks_say(room):
     assert unevenness(found.points_in_world, np.sqrt(nearest)) < 0.25
 
 
-def test_what_a_view_does_not_see_is_not_in_its_tracks(room):
+def test_what_a_view_does_not_see_is_not_in_its_tracks(room: Room) -> None:
     """A view whose ranges are nearer everywhere sees nothing; one that is not sure does not count."""
     poses, maps, samples = room
     nearer = RangeMap(0.8 * maps[NAMES[2]].range, maps[NAMES[2]].confidence)
@@ -147,20 +154,20 @@ def test_what_a_view_does_not_see_is_not_in_its_tracks(room):
         assert set(found.track_image_idx.tolist()) == {0, 1}
 
 
-def test_few_neighbours_make_short_tracks_that_have_the_own_view(room):
+def test_few_neighbours_make_short_tracks_that_have_the_own_view(room: Room) -> None:
     found = tracked(room, count=500, neighbours=2)
     assert np.bincount(found.track_point_idx).max() <= 3
     alone = tracked(room, count=500, neighbours=1, min_views=1)
     assert np.bincount(alone.track_point_idx).min() >= 1
 
 
-def test_the_same_draw_is_the_same_points(room):
+def test_the_same_draw_is_the_same_points(room: Room) -> None:
     one, other = tracked(room, count=700), tracked(room, count=700)
     np.testing.assert_array_equal(one.points_in_world, other.points_in_world)
     np.testing.assert_array_equal(one.track_bearings, other.track_bearings)
 
 
-def test_views_without_samples_or_pose_are_left_out(room):
+def test_views_without_samples_or_pose_are_left_out(room: Room) -> None:
     poses, maps, samples = room
     found = tracked((poses, maps, {NAMES[0]: samples[NAMES[0]], "c.png": samples[NAMES[1]]}), count=50, min_views=1)
     assert found.names == NAMES[:1]
@@ -169,7 +176,7 @@ def test_views_without_samples_or_pose_are_left_out(room):
     assert len(nothing) == 0
 
 
-def test_points_join_poses_behind_or_in_place_of_theirs(room):
+def test_points_join_poses_behind_or_in_place_of_theirs(room: Room) -> None:
     poses = room[0]
     found = tracked(room, count=300)
     both = found.joined_to(found.joined_to(poses, keep_points=False), keep_points=True)
@@ -183,13 +190,13 @@ def test_points_join_poses_behind_or_in_place_of_theirs(room):
 
 
 @pytest.mark.parametrize("wrong", [{"count": 0}, {"min_views": 0}, {"neighbours": 0}, {"max_relative_error": 0.0}])
-def test_settings_out_of_bounds_are_refused(room, wrong):
+def test_settings_out_of_bounds_are_refused(room: Room, wrong: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match="must be positive"):
         tracked(room, **wrong)
 
 
 @pytest.mark.kernel("points.kernels_seen")
-def test_the_compiled_test_is_the_plain_one(room):
+def test_the_compiled_test_is_the_plain_one(room: Room) -> None:
     """On points of the room, some moved, and a range map with holes and doubtful pixels."""
     poses, maps, samples = room
     rng = np.random.default_rng(6)

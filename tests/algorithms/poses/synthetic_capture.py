@@ -30,7 +30,8 @@ def points_in_box(rng: np.random.Generator, count: int) -> FloatArray:
     rows = np.flatnonzero(on_wall)
     points[rows, axis[rows]] = np.sign(points[rows, axis[rows]])
     points = points * half
-    return points[np.linalg.norm(points, axis=1) > 1.2]
+    result: FloatArray = points[np.linalg.norm(points, axis=1) > 1.2]
+    return result
 
 
 def noisy_bearings(rng: np.random.Generator, pose: Rigid3, points: FloatArray, *, noise_deg: float) -> FloatArray:
@@ -38,7 +39,8 @@ def noisy_bearings(rng: np.random.Generator, pose: Rigid3, points: FloatArray, *
     rays = pose.apply(points)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     rays += np.deg2rad(noise_deg) * rng.normal(size=rays.shape)
-    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    result: FloatArray = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return result
 
 
 def features_from_bearings(bearings: FloatArray) -> Features:

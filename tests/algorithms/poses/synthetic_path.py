@@ -39,7 +39,7 @@ def path_capture(
     rng: np.random.Generator, count: int, *, keypoints: int = 300, noise_deg: float = 0.03, described: bool = False
 ) -> PathCapture:
     """Cameras 0.7 apart, each turned at random, that find about so many points of walls within 6; the path meanders."""
-    along = STEP * np.arange(count)
+    along = STEP * np.arange(count, dtype=np.float64)
     centers = _path(along) + rng.normal(0, 0.05, (count, 3))
     points = _walls(rng, along[-1], density=3.0 * keypoints / (2 * SIGHT))
     names = [f"{n:04d}.jpg" for n in range(count)]

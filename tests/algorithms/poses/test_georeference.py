@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.algorithms.poses.frame.geodesy import lla_from_local, local_from_lla
@@ -19,7 +21,7 @@ UP = np.array([0.0, -1.0, 0.0])
 HOME = np.array([47.5, 8.25, 410.0])
 
 
-def street(rng, count: int, *, step_m: float = 8.0, bend_deg: float = 4.0) -> Poses:
+def street(rng: np.random.Generator, count: int, *, step_m: float = 8.0, bend_deg: float = 4.0) -> Poses:
     """A walk north-east along a bending street, in metres east, down, north; cameras turned about the vertical."""
     headings = np.cumsum(np.deg2rad(rng.normal(bend_deg, 3, count))) + 0.6
     steps = step_m * np.stack([np.sin(headings), 0.02 * rng.normal(size=count), np.cos(headings)], axis=1)
@@ -37,12 +39,12 @@ def street(rng, count: int, *, step_m: float = 8.0, bend_deg: float = 4.0) -> Po
     )
 
 
-def positions(poses: Poses, rng, noise_m: float) -> dict[str, tuple[float, ...]]:
+def positions(poses: Poses, rng: np.random.Generator, noise_m: float) -> dict[str, tuple[float, ...]]:
     noise = noise_m * rng.normal(size=(len(poses.names), 3)) * (1, 3, 1)
     return dict(zip(poses.names, map(tuple, lla_from_local(poses.centers + noise, HOME)), strict=True))
 
 
-def test_axes_are_east_down_north_in_metres():
+def test_axes_are_east_down_north_in_metres() -> None:
     """One second of latitude is 30.9 m, one of longitude 30.9 m times the cosine, at 47.5° north."""
     second = 1 / 3600
     north = local_from_lla(HOME + np.array([second, 0, 0]), HOME)
@@ -52,7 +54,7 @@ def test_axes_are_east_down_north_in_metres():
     np.testing.assert_allclose(local_from_lla(HOME + np.array([0, 0, 5]), HOME), [0, -5, 0], atol=1e-6)
 
 
-def test_the_ellipsoid_is_that_of_wgs_84():
+def test_the_ellipsoid_is_that_of_wgs_84() -> None:
     """A quarter of the meridian and of the equator, as the chords of known radii."""
     pole = local_from_lla([90.0, 0, 0], [0.0, 0, 0])
     np.testing.assert_allclose(pole, [0, 6378137.0, 6356752.3142], atol=1e-3)
@@ -60,14 +62,14 @@ def test_the_ellipsoid_is_that_of_wgs_84():
 
 
 @pytest.mark.parametrize("origin", [(47.5, 8.25, 410.0), (-33.9, 151.2, 10.0), (89.9, 10.0, 0.0), (0.0, 180.0, -50.0)])
-def test_there_and_back(origin):
+def test_there_and_back(origin: tuple[float, float, float]) -> None:
     offsets = np.random.default_rng(1).normal(size=(50, 3)) * (2000, 100, 2000)
     there = lla_from_local(offsets, origin)
     np.testing.assert_allclose(local_from_lla(there, origin), offsets, atol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_fit_recovers_scale_and_heading_despite_wrong_positions(seed):
+def test_fit_recovers_scale_and_heading_despite_wrong_positions(seed: int) -> None:
     rng = np.random.default_rng(seed)
     true = street(rng, 24)
     known = positions(true, rng, 1.5)
@@ -94,7 +96,7 @@ def test_fit_recovers_scale_and_heading_despite_wrong_positions(seed):
     world.check()
 
 
-def test_exact_positions_give_the_exact_world():
+def test_exact_positions_give_the_exact_world() -> None:
     rng = np.random.default_rng(9)
     true = street(rng, 6)
     turn = random_rotation(rng)
@@ -111,7 +113,7 @@ def test_exact_positions_give_the_exact_world():
     np.testing.assert_allclose(float(told.group(1)), latitude, atol=2e-7)
 
 
-def test_many_positions_are_fitted_by_a_draw_of_pairs():
+def test_many_positions_are_fitted_by_a_draw_of_pairs() -> None:
     rng = np.random.default_rng(2)
     true = street(rng, 200, bend_deg=1.0)
     known = positions(true, rng, 2.0)
@@ -123,7 +125,7 @@ def test_many_positions_are_fitted_by_a_draw_of_pairs():
     assert again.local_from_world.scale == fit.local_from_world.scale
 
 
-def test_a_room_is_too_small_for_gps():
+def test_a_room_is_too_small_for_gps() -> None:
     rng = np.random.default_rng(3)
     true = street(rng, 6, step_m=0.7)
     fit = fit_gps(true, positions(true, rng, 2.0), UP, rng=rng)
@@ -132,7 +134,7 @@ def test_a_room_is_too_small_for_gps():
     assert fit_gps(true, positions(true, rng, 0.01), UP, gps_noise_m=0.01, rng=rng)
 
 
-def test_positions_that_have_nothing_to_do_with_the_poses_are_refused():
+def test_positions_that_have_nothing_to_do_with_the_poses_are_refused() -> None:
     rng = np.random.default_rng(4)
     true = street(rng, 12)
     shuffled = dict(zip(true.names, rng.permutation(list(positions(true, rng, 0.1).values())), strict=True))
@@ -140,7 +142,7 @@ def test_positions_that_have_nothing_to_do_with_the_poses_are_refused():
 
 
 @pytest.mark.parametrize("same", ["poses", "positions"])
-def test_one_place_is_no_scale(same):
+def test_one_place_is_no_scale(same: str) -> None:
     rng = np.random.default_rng(5)
     true = street(rng, 5)
     known = positions(true, rng, 0.0)
@@ -153,7 +155,7 @@ def test_one_place_is_no_scale(same):
     assert fit.reason
 
 
-def test_two_positions_are_too_few():
+def test_two_positions_are_too_few() -> None:
     rng = np.random.default_rng(6)
     true = street(rng, 5)
     known = dict(list(positions(true, rng, 0.0).items())[:2])
@@ -161,7 +163,7 @@ def test_two_positions_are_too_few():
 
 
 @pytest.mark.parametrize("home", [HOME, np.array([-33.9, -70.65, -12.3]), np.array([0.0000001, 179.9, 0.0])])
-def test_the_world_tells_where_its_origin_is(home):
+def test_the_world_tells_where_its_origin_is(home: NDArray[Any]) -> None:
     rng = np.random.default_rng(11)
     poses = street(rng, 12)
     lla = {name: tuple(lla_from_local(center, home)) for name, center in zip(poses.names, poses.centers, strict=True)}

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.algorithms.poses.frame.levelling import level_poses
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec
+from pano_mvs.scene import Poses
 from tests.algorithms.poses.synthetic_capture import random_rotation
 from tests.algorithms.poses.test_vertical import UP, room_poses, sensed
 
 
-def in_cameras(poses):
+def in_cameras(poses: Poses) -> list[NDArray[np.float64]]:
     return [poses.cam_from_world(idx).apply(poses.points_in_world) for idx in range(len(poses.names))]
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_levelling_undoes_any_tilt_and_changes_nothing_else(seed):
+def test_levelling_undoes_any_tilt_and_changes_nothing_else(seed: int) -> None:
     rng = np.random.default_rng(seed)
     poses = room_poses(seed)
     tilted = moved_poses(poses, Similarity3(1.0, random_rotation(rng), rng.normal(size=3)))
@@ -33,7 +35,7 @@ def test_levelling_undoes_any_tilt_and_changes_nothing_else(seed):
     level.check()
 
 
-def test_levelling_twice_is_levelling_once():
+def test_levelling_twice_is_levelling_once() -> None:
     readings = sensed(room_poses(1), np.random.default_rng(1), 0.3)
     once, _ = level_poses(
         moved_poses(room_poses(1), Similarity3(1.0, rotation_from_rotvec([0.2, 0.1, -0.3]), UP)), readings
@@ -43,14 +45,14 @@ def test_levelling_twice_is_levelling_once():
     np.testing.assert_allclose(twice.translations, once.translations, atol=1e-9)
 
 
-def test_a_level_world_keeps_its_z_axis():
+def test_a_level_world_keeps_its_z_axis() -> None:
     poses = room_poses(2)
     level, _ = level_poses(poses, sensed(poses, np.random.default_rng(0), 0.0))
     np.testing.assert_allclose(level.rotations, poses.rotations, atol=1e-7)
 
 
 @pytest.mark.parametrize("north_deg", [-170.0, 0.0, 35.0, 179.0])
-def test_agreeing_headings_turn_z_north(north_deg):
+def test_agreeing_headings_turn_z_north(north_deg: float) -> None:
     rng = np.random.default_rng(5)
     poses = room_poses(3, cameras=6, points=1)
     forward = poses.rotations[:, 2]
@@ -70,7 +72,7 @@ def test_agreeing_headings_turn_z_north(north_deg):
     [({"0.jpg": 0.0, "1.jpg": 0.0, "2.jpg": 0.0}, "z close to"), ({"0.jpg": 12.0}, "z close to"),
      ({f"{n}.jpg": 60.0 * n * n for n in range(6)}, "the compass headings disagree by")],
 )  # fmt: skip
-def test_headings_that_say_nothing_turn_nothing(headings, words):
+def test_headings_that_say_nothing_turn_nothing(headings: dict[str, float], words: str) -> None:
     poses = room_poses(3, cameras=6, points=1)
     readings = sensed(poses, np.random.default_rng(0), 0.0)
     level, _ = level_poses(poses, readings, headings)

@@ -15,7 +15,7 @@ from tests.algorithms.poses.test_vertical import FLOOR_Y, UP, room_poses, with_p
 
 
 @pytest.mark.parametrize("factor", [0.01, 1.0, 37.5])
-def test_all_lengths_grow_alike_and_no_angle_changes(factor):
+def test_all_lengths_grow_alike_and_no_angle_changes(factor: float) -> None:
     poses = room_poses(1)
     scaled = scaled_poses(poses, factor, origin="a test")
     np.testing.assert_allclose(in_cameras(scaled), factor * np.array(in_cameras(poses)), rtol=1e-9, atol=1e-9)
@@ -25,13 +25,13 @@ def test_all_lengths_grow_alike_and_no_angle_changes(factor):
     scaled.check()
 
 
-def test_a_baseline_gets_its_length():
+def test_a_baseline_gets_its_length() -> None:
     scaled = scaled_by_baseline(room_poses(2), "3.jpg", "1.jpg", metres=1.2)
     assert np.linalg.norm(scaled.centers[3] - scaled.centers[1]) == pytest.approx(1.2)
     assert "the baseline of 1.2 m from 3.jpg to 1.jpg" in scaled.scale
 
 
-def test_what_gives_no_scale_is_refused():
+def test_what_gives_no_scale_is_refused() -> None:
     poses = room_poses(2)
     with pytest.raises(UsageError, match=r"image nothing.jpg is not registered \(no such image\)"):
         scaled_by_baseline(poses, "nothing.jpg", "1.jpg", metres=1)
@@ -45,7 +45,7 @@ def test_what_gives_no_scale_is_refused():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_height_above_the_floor_gives_the_scale(seed):
+def test_the_height_above_the_floor_gives_the_scale(seed: int) -> None:
     poses = room_poses(seed)
     height_m = FLOOR_Y - float(np.median(poses.centers[:, 1]))
     turn = random_rotation(np.random.default_rng(seed))
@@ -57,7 +57,7 @@ def test_the_height_above_the_floor_gives_the_scale(seed):
     assert "above a floor of" in scaled.scale
 
 
-def test_without_a_floor_the_poses_stay():
+def test_without_a_floor_the_poses_stay() -> None:
     poses = with_points([Rigid3.identity(), Rigid3.from_center(np.eye(3), [1.0, 0, 0])], np.zeros((0, 3)))
     same, floor = scaled_by_camera_height(poses, UP, metres=1.6)
     assert same is poses

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
+from typing import NoReturn
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, pairs_of
 from pano_mvs.algorithms.poses.verification import pair_weights
@@ -43,7 +45,7 @@ def pairs(*, true: int = 60, false: int = 150) -> Pairs:
     return pairs_of(features, views)
 
 
-def confirmation_of(pictures=PICTURES) -> Confirmation:
+def confirmation_of(pictures: Sequence[NDArray[np.uint8]] = PICTURES) -> Confirmation:
     return Confirmation(lambda image: (pictures[image], WHOLE))
 
 
@@ -77,7 +79,7 @@ def test_clear_pairs_keep_their_weights() -> None:
 def test_a_capture_with_few_ambiguous_pairs_is_not_asked_for() -> None:
     """The other pairs outvote them, and a sweep of every pair costs more than all of its matching."""
 
-    def load(image: int):
+    def load(image: int) -> NoReturn:
         raise AssertionError("nobody should look at the images")
 
     before = pairs()

@@ -70,7 +70,7 @@ def _joined() -> Poses:
     [_triangulated, normalised_poses, unit_translations, lambda poses: refine_poses(_triangulated(poses))],
     ids=["triangulate", "normalise", "unit_translations", "refine"],
 )
-def test_a_step_on_groups_is_the_step_on_each(step: Callable[[Poses], Poses]):
+def test_a_step_on_groups_is_the_step_on_each(step: Callable[[Poses], Poses]) -> None:
     together = step(_joined())
     together.check()
     assert together.names == _ORDER
@@ -85,14 +85,14 @@ def test_a_step_on_groups_is_the_step_on_each(step: Callable[[Poses], Poses]):
                 assert found == wanted, field.name
 
 
-def test_sources_are_of_the_references_own_group():
+def test_sources_are_of_the_references_own_group() -> None:
     views = select_views(_joined(), count=4)
     assert list(views.neighbours) == list(_ORDER)
     for reference, sources in views.neighbours.items():
         assert sorted(sources) == sorted(name for name in _ORDER if name[0] == reference[0] and name != reference)
 
 
-def test_a_group_in_one_place_does_not_disturb_the_others():
+def test_a_group_in_one_place_does_not_disturb_the_others() -> None:
     together = replace(_small()[0], translations=np.array(_small()[0].translations))
     together.translations[:] = 0.0
     views = select_views(join_groups([_large()[0], together], order=_ORDER))

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -23,7 +25,7 @@ from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translatio
 from pano_mvs.algorithms.two_view.refinement import tangent_basis
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, Similarity3, geodesic_angle, rotation_from_rotvec
-from pano_mvs.scene import Poses, TwoView
+from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import split_groups
 from tests.algorithms.poses.synthetic_capture import (
     noisy_bearings,
@@ -35,17 +37,19 @@ from tests.algorithms.poses.synthetic_capture import (
 )
 from tests.oracles.bundle import reduced_system_dense
 
+Capture = tuple[dict[str, Rigid3], dict[str, Features], dict[tuple[str, str], TwoView]]
+
 
 def cameras(poses: Poses) -> dict[str, Rigid3]:
     return {name: poses.cam_from_world(idx) for idx, name in enumerate(poses.names)}
 
 
-def solve(features, views, **settings):
+def solve(features: Mapping[str, Features], views: Mapping[tuple[str, str], TwoView], **settings: Any) -> Poses:
     return solve_scaled_translation(features, views, rng=np.random.default_rng(0), **settings)
 
 
 @pytest.fixture(scope="module")
-def capture():
+def capture() -> Capture:
     rng = np.random.default_rng(11)
     truth = random_poses(rng, 5)
     features = synthetic_features(rng, truth)
@@ -53,7 +57,7 @@ def capture():
 
 
 @pytest.mark.parametrize("estimator", ["kappa", "log_median", "cauchy"])
-def test_recovers_a_capture_under_noise_and_outliers(capture, estimator):
+def test_recovers_a_capture_under_noise_and_outliers(capture: Capture, estimator: str) -> None:
     truth, features, views = capture
     poses = solve(features, views, scale_estimator=estimator)
     poses.check()
@@ -66,7 +70,7 @@ def test_recovers_a_capture_under_noise_and_outliers(capture, estimator):
     assert len(poses.points_in_world) > 300
 
 
-def test_the_chain_alone_is_sound_and_adjustment_better(capture):
+def test_the_chain_alone_is_sound_and_adjustment_better(capture: Capture) -> None:
     truth, features, views = capture
     chained, adjusted = (
         relative_pose_errors(cameras(solve(features, views, adjust=adjust)), truth) for adjust in (False, True)
@@ -76,7 +80,7 @@ def test_the_chain_alone_is_sound_and_adjustment_better(capture):
     assert adjusted.median_pair_deg < chained.median_pair_deg
 
 
-def test_world_is_the_first_camera_and_its_first_baseline_is_one(capture):
+def test_world_is_the_first_camera_and_its_first_baseline_is_one(capture: Capture) -> None:
     _, features, views = capture
     poses = solve(features, views)
     np.testing.assert_array_equal(poses.rotations[0], np.eye(3))
@@ -88,7 +92,7 @@ def test_world_is_the_first_camera_and_its_first_baseline_is_one(capture):
     assert np.linalg.norm(refined.centers[1]) == pytest.approx(1.0, abs=1e-9)
 
 
-def test_refinement_halves_the_error_and_keeps_the_points(capture):
+def test_refinement_halves_the_error_and_keeps_the_points(capture: Capture) -> None:
     truth, features, views = capture
     poses = solve(features, views, scale_estimator="kappa")
     bent = {
@@ -110,14 +114,14 @@ def test_refinement_halves_the_error_and_keeps_the_points(capture):
     assert np.rad2deg(refined.point_errors_rad.max()) < 0.4
 
 
-def test_the_same_bytes_again(capture):
+def test_the_same_bytes_again(capture: Capture) -> None:
     _, features, views = capture
     first, second = (refine_poses(solve(features, views)) for _ in range(2))
     assert first.rotations.tobytes() == second.rotations.tobytes()
     assert first.points_in_world.tobytes() == second.points_in_world.tobytes()
 
 
-def test_the_order_of_the_capture_does_not_change_the_scene(capture):
+def test_the_order_of_the_capture_does_not_change_the_scene(capture: Capture) -> None:
     truth, features, views = capture
     backwards = {name: features[name] for name in reversed(features)}
     poses = solve(backwards, views)
@@ -125,7 +129,7 @@ def test_the_order_of_the_capture_does_not_change_the_scene(capture):
     assert relative_pose_errors(cameras(poses), truth).median_pair_deg < 0.06
 
 
-def test_no_image_need_see_the_first():
+def test_no_image_need_see_the_first() -> None:
     """A corridor: each camera shares pairs with the two before it alone."""
     rng = np.random.default_rng(12)
     truth = {
@@ -141,7 +145,7 @@ def test_no_image_need_see_the_first():
     assert relative_pose_errors(cameras(poses), truth).median_pair_deg < 0.06
 
 
-def test_an_image_without_pairs_is_rejected_with_its_best_partner(capture):
+def test_an_image_without_pairs_is_rejected_with_its_best_partner(capture: Capture) -> None:
     _, features, views = capture
     cut = {
         pair: TwoView.failed("23 matches, 60 needed", candidates=23) if "3.jpg" in pair else view
@@ -153,7 +157,7 @@ def test_an_image_without_pairs_is_rejected_with_its_best_partner(capture):
     assert "23 matches, 60 needed" in poses.rejected["3.jpg"]
 
 
-def test_an_image_with_a_wrong_pair_alone_is_rejected(capture):
+def test_an_image_with_a_wrong_pair_alone_is_rejected(capture: Capture) -> None:
     """Its only pair is false (a repeated room, say): the points known from the others speak against it."""
     _, features, views = capture
     rng = np.random.default_rng(13)
@@ -166,7 +170,7 @@ def test_an_image_with_a_wrong_pair_alone_is_rejected(capture):
     assert set(poses.rejected) == {"3.jpg"}
 
 
-def test_an_image_that_fits_a_third_of_the_known_points_is_rejected(capture):
+def test_an_image_that_fits_a_third_of_the_known_points_is_rejected(capture: Capture) -> None:
     """Enough to compute a pose from, too few to believe it."""
     _, features, views = capture
     rng = np.random.default_rng(24)
@@ -182,7 +186,7 @@ def test_an_image_that_fits_a_third_of_the_known_points_is_rejected(capture):
     assert "or an image that is no panorama" in poses.rejected["3.jpg"]
 
 
-def test_every_group_is_solved_in_its_own_frame():
+def test_every_group_is_solved_in_its_own_frame() -> None:
     rng = np.random.default_rng(14)
     truth = random_poses(rng, 5)
     features = synthetic_features(rng, truth)
@@ -200,7 +204,7 @@ def test_every_group_is_solved_in_its_own_frame():
         assert relative_pose_errors(cameras(group), known).median_pair_deg < 0.15
 
 
-def test_two_images_are_a_capture(capture):
+def test_two_images_are_a_capture(capture: Capture) -> None:
     truth, features, views = capture
     two = {name: features[name] for name in ("0.jpg", "1.jpg")}
     poses = refine_poses(solve(two, {("0.jpg", "1.jpg"): views["0.jpg", "1.jpg"]}))
@@ -210,7 +214,7 @@ def test_two_images_are_a_capture(capture):
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])
-def test_nothing_to_register_is_no_exception(count):
+def test_nothing_to_register_is_no_exception(count: int) -> None:
     rng = np.random.default_rng(15)
     features = synthetic_features(rng, random_poses(rng, count))
     names = list(features)
@@ -223,7 +227,7 @@ def test_nothing_to_register_is_no_exception(count):
     refine_poses(poses).check()
 
 
-def bundle_of(rng, *, cameras=4, points=60, noise_deg=0.05):
+def bundle_of(rng: np.random.Generator, *, cameras: int = 4, points: int = 60, noise_deg: float = 0.05) -> Bundle:
     poses = list(random_poses(rng, cameras).values())
     world = points_in_box(rng, points)
     seen = rng.random((len(world), cameras)) < 0.8
@@ -241,7 +245,7 @@ def bundle_of(rng, *, cameras=4, points=60, noise_deg=0.05):
 
 
 @pytest.mark.kernel("poses.adjustment.kernels_bundle")
-def test_kernel_equals_the_dense_system():
+def test_kernel_equals_the_dense_system() -> None:
     rng = np.random.default_rng(16)
     bundle = bundle_of(rng, points=15, noise_deg=3.0)
     bases = tangent_basis(bundle.bearings)
@@ -260,7 +264,7 @@ def test_kernel_equals_the_dense_system():
 
 
 @pytest.mark.kernel("poses.adjustment.kernels_bundle")
-def test_compiled_errors_are_those_of_the_bundle():
+def test_compiled_errors_are_those_of_the_bundle() -> None:
     bundle = bundle_of(np.random.default_rng(21), points=15, noise_deg=3.0)
     found = ray_errors(
         bundle.rotations, bundle.centers, bundle.points, bundle.point_idx, bundle.image_idx, bundle.bearings
@@ -269,7 +273,7 @@ def test_compiled_errors_are_those_of_the_bundle():
 
 
 @pytest.mark.kernel("poses.adjustment.kernels_bundle")
-def test_points_move_by_back_substitution():
+def test_points_move_by_back_substitution() -> None:
     rng = np.random.default_rng(22)
     bundle = bundle_of(rng, points=15, noise_deg=3.0)
     system = reduced_cameras(bundle, np.ones(len(bundle.bearings)), damping=0.01)
@@ -286,7 +290,7 @@ def test_points_move_by_back_substitution():
 
 
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])
-def test_adjustment_finds_back_from_a_disturbed_start(loss):
+def test_adjustment_finds_back_from_a_disturbed_start(loss: Literal["huber", "cauchy"]) -> None:
     rng = np.random.default_rng(17)
     true = bundle_of(rng, noise_deg=0.0)
     turns = rotation_from_rotvec(0.01 * rng.normal(size=(4, 3)))
@@ -306,7 +310,7 @@ def test_adjustment_finds_back_from_a_disturbed_start(loss):
     assert np.rad2deg(geodesic_angle(found.rotations, true.rotations).max()) < 1e-3
 
 
-def test_a_camera_without_observations_stays():
+def test_a_camera_without_observations_stays() -> None:
     rng = np.random.default_rng(18)
     bundle = bundle_of(rng)
     kept = bundle.image_idx != 3
@@ -318,21 +322,21 @@ def test_a_camera_without_observations_stays():
     assert np.isfinite(found.points).all()
 
 
-def test_adjustment_never_raises_the_cost():
+def test_adjustment_never_raises_the_cost() -> None:
     bundle = bundle_of(np.random.default_rng(19), noise_deg=1.0)
     found = adjust_bundle(bundle, loss="cauchy", scale_rad=0.01)
     costs = [robust_cost(b.errors_rad(), loss="cauchy", scale_rad=0.01) for b in (found, bundle)]
     assert costs[0] < costs[1]
 
 
-def test_adjustment_wants_observations_sorted_by_point():
+def test_adjustment_wants_observations_sorted_by_point() -> None:
     bundle = bundle_of(np.random.default_rng(20))
     with pytest.raises(UsageError, match="sorted by point"):
         adjust_bundle(replace(bundle, point_idx=bundle.point_idx[::-1].copy()), loss="huber", scale_rad=0.01)
 
 
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])
-def test_weights_are_the_derivative_of_the_loss(loss):
+def test_weights_are_the_derivative_of_the_loss(loss: Literal["huber", "cauchy"]) -> None:
     for error in (0.001, 0.009, 0.02, 0.3):
         h = 1e-7
         above, below = (robust_cost(np.array([error + s * h]), loss=loss, scale_rad=0.01) for s in (1, -1))
@@ -340,7 +344,7 @@ def test_weights_are_the_derivative_of_the_loss(loss):
         assert (above - below) / (2 * h) == pytest.approx(2 * weight * error / 0.01**2, rel=1e-4)
 
 
-def test_metric_poses_keep_their_place_and_scale(capture):
+def test_metric_poses_keep_their_place_and_scale(capture: Capture) -> None:
     truth, features, views = capture
     there = Similarity3(7.0, random_rotation(np.random.default_rng(21)), np.array([10.0, -4.0, 2.0]))
     known = {name: there.move_camera(pose) for name, pose in truth.items()}
@@ -351,7 +355,7 @@ def test_metric_poses_keep_their_place_and_scale(capture):
     assert len(refined.points_in_world) > 300
 
 
-def test_poses_without_points_come_back_as_they_are(capture):
+def test_poses_without_points_come_back_as_they_are(capture: Capture) -> None:
     truth, *_ = capture
     given = Poses.without_points(truth, frame="x", scale="x", metric=False)
     refined = refine_poses(given)
@@ -359,20 +363,20 @@ def test_poses_without_points_come_back_as_they_are(capture):
     np.testing.assert_allclose(refined.translations, given.translations, atol=1e-9)
 
 
-def test_refinement_refuses_senseless_limits(capture):
+def test_refinement_refuses_senseless_limits(capture: Capture) -> None:
     truth, *_ = capture
     with pytest.raises(UsageError, match="positive"):
         refine_poses(Poses.without_points(truth, frame="x", scale="x", metric=False), loss_scale_deg=0.0)
 
 
-def test_a_camera_beside_the_first_is_no_unit_of_length():
+def test_a_camera_beside_the_first_is_no_unit_of_length() -> None:
     centers = np.array([[0.0, 0, 0], [0.001, 0, 0], [1.0, 0, 0], [0, 1.2, 0]])
     assert first_neighbour(centers) == 2
     assert first_neighbour(np.zeros((3, 3))) == 0
     assert first_neighbour(np.zeros((0, 3))) == 0
 
 
-def test_gauge_comes_back_after_any_move(capture):
+def test_gauge_comes_back_after_any_move(capture: Capture) -> None:
     truth, *_ = capture
     given = Poses.without_points(truth, frame="x", scale="x", metric=True)
     moved = moved_poses(given, Similarity3(2.0, random_rotation(np.random.default_rng(22)), np.ones(3)))
@@ -381,7 +385,7 @@ def test_gauge_comes_back_after_any_move(capture):
     np.testing.assert_allclose(back.rotations, given.rotations, atol=1e-9)
 
 
-def test_resection_finds_the_camera_despite_wrong_points():
+def test_resection_finds_the_camera_despite_wrong_points() -> None:
     rng = np.random.default_rng(23)
     pose = Rigid3.from_center(random_rotation(rng), [0.3, -0.2, 0.1])
     points = points_in_box(rng, 200)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ FALSE = {(0, 3): 1, (1, 3): 1, (2, 3): 1, (0, 2): -1}
 CONTRADICTED = {(0, 5): 1, (1, 5): -2, (2, 5): 3, (3, 5): -4, (4, 5): 5}
 
 
-def solve(capture: AliasedCapture, two_views: dict[tuple[str, str], TwoView] | None = None, **settings) -> Poses:
+def solve(capture: AliasedCapture, two_views: dict[tuple[str, str], TwoView] | None = None, **settings: Any) -> Poses:
     return solve_scaled_translation(
         capture.features, two_views or capture.two_views, rng=np.random.default_rng(0), **settings
     )

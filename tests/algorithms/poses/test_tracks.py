@@ -1,15 +1,19 @@
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any, Literal
+
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike, NDArray
 
 from pano_mvs.algorithms.poses.adjustment.points import triangulate_observations
-from pano_mvs.algorithms.poses.adjustment.tracks import build_tracks, triangulate_tracks
+from pano_mvs.algorithms.poses.adjustment.tracks import Tracks, build_tracks, triangulate_tracks
 from pano_mvs.algorithms.poses.placement.scale import estimate_scale
 from pano_mvs.algorithms.poses.placement.view_graph import connected_groups, consistent_edges, relative_pose
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
-from pano_mvs.scene import Poses, TwoView
+from pano_mvs.scene import Features, Poses, TwoView
 from tests.algorithms.poses.synthetic_capture import (
     features_from_bearings,
     points_in_box,
@@ -20,7 +24,12 @@ from tests.algorithms.poses.synthetic_capture import (
 from tests.oracles.triangulation_numpy import triangulate_numpy
 
 
-def pair(matches, residuals=None, pose=None, geometry="general"):
+def pair(
+    matches: ArrayLike,
+    residuals: ArrayLike | None = None,
+    pose: Rigid3 | None = None,
+    geometry: Literal["general", "rotation", "none"] = "general",
+) -> TwoView:
     pose = pose or Rigid3(np.eye(3), np.array([1.0, 0, 0]))
     matches = np.array(matches, np.int32).reshape(-1, 2)
     errors = np.zeros(len(matches)) if residuals is None else np.array(residuals)
@@ -28,19 +37,19 @@ def pair(matches, residuals=None, pose=None, geometry="general"):
     return TwoView(matches, pose.rotation, direction, errors.astype(np.float32), geometry)
 
 
-def any_features(count):
+def any_features(count: int) -> Features:
     bearings = np.random.default_rng(count).normal(size=(count, 3))
     return features_from_bearings(bearings / np.linalg.norm(bearings, axis=1, keepdims=True))
 
 
-def as_sets(tracks):
-    found = [set() for _ in range(tracks.count)]
+def as_sets(tracks: Tracks) -> list[set[tuple[str, int]]]:
+    found: list[set[tuple[str, int]]] = [set() for _ in range(tracks.count)]
     for track, image, keypoint in zip(tracks.track_idx, tracks.image_idx, tracks.keypoint_idx, strict=True):
         found[track].add((tracks.names[image], int(keypoint)))
     return found
 
 
-def test_tracks_join_matches_over_images():
+def test_tracks_join_matches_over_images() -> None:
     features = {name: any_features(5) for name in "abc"}
     tracks = build_tracks(features, {("a", "b"): pair([(0, 1), (2, 2)]), ("b", "c"): pair([(1, 4)])})
     assert as_sets(tracks) == [{("a", 0), ("b", 1), ("c", 4)}, {("a", 2), ("b", 2)}]
@@ -48,7 +57,7 @@ def test_tracks_join_matches_over_images():
     assert np.all(np.diff(tracks.track_idx) >= 0)
 
 
-def test_a_conflict_is_settled_for_the_better_match():
+def test_a_conflict_is_settled_for_the_better_match() -> None:
     features = {name: any_features(5) for name in "abc"}
     views = {
         ("a", "b"): pair([(0, 0)], [0.001]),
@@ -60,14 +69,14 @@ def test_a_conflict_is_settled_for_the_better_match():
     assert as_sets(build_tracks(features, views)) == [{("a", 0), ("b", 0)}, {("a", 1), ("c", 0)}]
 
 
-def test_pairs_without_general_geometry_join_nothing():
+def test_pairs_without_general_geometry_join_nothing() -> None:
     features = {name: any_features(3) for name in "ab"}
     views = {("a", "b"): pair([(0, 0)], geometry="rotation")}
     assert build_tracks(features, views).count == 0
     assert build_tracks({}, {}).count == 0
 
 
-def test_no_track_ever_has_two_key_points_in_one_image():
+def test_no_track_ever_has_two_key_points_in_one_image() -> None:
     rng = np.random.default_rng(3)
     features = {name: any_features(30) for name in "abcde"}
     names = list(features)
@@ -81,11 +90,11 @@ def test_no_track_ever_has_two_key_points_in_one_image():
     assert np.bincount(tracks.track_idx).min() >= 2
 
 
-def known_poses(poses):
+def known_poses(poses: Mapping[str, Rigid3]) -> Poses:
     return Poses.without_points(poses, frame="given", scale="given", metric=True)
 
 
-def test_known_poses_get_points_and_do_not_move():
+def test_known_poses_get_points_and_do_not_move() -> None:
     rng = np.random.default_rng(4)
     poses = random_poses(rng, 4)
     features = synthetic_features(rng, poses, points=400)
@@ -103,7 +112,7 @@ def test_known_poses_get_points_and_do_not_move():
     assert np.all(found.point_colors_rgb == 128)
 
 
-def test_triangulation_drops_the_wrong_observation_and_keeps_the_point():
+def test_triangulation_drops_the_wrong_observation_and_keeps_the_point() -> None:
     rng = np.random.default_rng(5)
     centers = rng.normal(size=(6, 3)) * 0.5
     point = np.array([2.0, -1.0, 3.0])
@@ -117,7 +126,9 @@ def test_triangulation_drops_the_wrong_observation_and_keeps_the_point():
     assert found.used.tolist() == [True, True, True, True, False, True]
 
 
-def many_tracks(rng, count=400):
+def many_tracks(
+    rng: np.random.Generator, count: int = 400
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int32]]:
     """Observations of tracks of 1 to 6 views with noise, wrong rays, far points and cameras in one place."""
     sizes = rng.integers(1, 7, count)
     point_idx = np.repeat(np.arange(count), sizes).astype(np.int32)
@@ -127,18 +138,19 @@ def many_tracks(rng, count=400):
     rays = points[point_idx] - centers
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     rays += rng.normal(0, 0.002, rays.shape) + rng.normal(0, 0.3, rays.shape) * (rng.random((len(rays), 1)) < 0.15)
-    return centers, rays / np.linalg.norm(rays, axis=1, keepdims=True), point_idx
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    return centers, rays, point_idx
 
 
 @pytest.mark.kernel("poses.adjustment.kernels_points")
 @pytest.mark.parametrize("shuffled", [False, True])
-def test_triangulation_is_that_of_numpy(shuffled):
+def test_triangulation_is_that_of_numpy(shuffled: bool) -> None:
     rng = np.random.default_rng(31)
     given = many_tracks(rng)
     if shuffled:
         order = rng.permutation(len(given[0]))
-        given = tuple(column[order] for column in given)
-    limits = {"count": 400, "max_error_rad": 0.01, "min_angle_rad": 0.02}
+        given = given[0][order], given[1][order], given[2][order]
+    limits: dict[str, Any] = {"count": 400, "max_error_rad": 0.01, "min_angle_rad": 0.02}
     found, expected = triangulate_observations(*given, **limits), triangulate_numpy(*given, **limits)
     assert 150 < expected.valid.sum() < 350
     assert (expected.valid[given[2]] & ~expected.used).sum() > 0
@@ -149,7 +161,7 @@ def test_triangulation_is_that_of_numpy(shuffled):
 
 
 @pytest.mark.parametrize("point", [(0, 0, 400.0), (0, 0, -3.0)])
-def test_far_points_and_points_behind_are_no_points(point):
+def test_far_points_and_points_behind_are_no_points(point: tuple[int, int, float]) -> None:
     centers = np.array([[0.0, 0, 0], [1.0, 0, 0]])
     rays = np.abs(np.sign(point[2])) * (np.array(point) - centers) * np.sign(point[2])
     rays = np.array([[0.0, 0, 1], [-0.3, 0, 1.0]]) if point[2] < 0 else rays
@@ -166,14 +178,14 @@ def test_far_points_and_points_behind_are_no_points(point):
 
 
 @pytest.mark.parametrize("estimator", ["kappa", "log_median", "cauchy"])
-def test_scale_survives_outliers(estimator):
+def test_scale_survives_outliers(estimator: Literal["kappa", "log_median", "cauchy"]) -> None:
     rng = np.random.default_rng(6)
     ratios = np.concatenate([1.7 * np.exp(0.004 * rng.normal(size=100)), rng.uniform(0.1, 5, size=40)])
     scale = estimate_scale(ratios, np.ones(140), estimator=estimator, kappa=0.01)
     assert scale == pytest.approx(1.7, rel=0.02 if estimator == "kappa" else 0.004)
 
 
-def test_scale_listens_to_those_who_see_well():
+def test_scale_listens_to_those_who_see_well() -> None:
     rng = np.random.default_rng(7)
     sigma = np.where(np.arange(400) < 200, 0.002, 0.2)
     ratios = 0.6 * np.exp(sigma * rng.normal(size=400))
@@ -185,11 +197,11 @@ def test_scale_listens_to_those_who_see_well():
         estimate_scale(np.zeros(0), np.zeros(0), estimator="cauchy", kappa=0.01)
 
 
-def view_of(poses, a, b, matches=100):
+def view_of(poses: Mapping[str, Rigid3], a: str, b: str, matches: int = 100) -> TwoView:
     return pair(np.tile(np.arange(matches)[:, None], 2), pose=poses[b] @ poses[a].inverse())
 
 
-def test_the_pair_that_contradicts_the_others_goes():
+def test_the_pair_that_contradicts_the_others_goes() -> None:
     poses = random_poses(np.random.default_rng(8), 4)
     names = tuple(poses)
     views = {(a, b): view_of(poses, a, b) for i, a in enumerate(names) for b in names[i + 1 :]}
@@ -203,7 +215,7 @@ def test_the_pair_that_contradicts_the_others_goes():
     assert len(consistent_edges(names, views)) == 5
 
 
-def test_edges_are_the_same_whichever_way_a_pair_is_stored():
+def test_edges_are_the_same_whichever_way_a_pair_is_stored() -> None:
     poses = random_poses(np.random.default_rng(9), 2)
     a, b = poses
     there = consistent_edges((a, b), {(a, b): view_of(poses, a, b)})
@@ -218,5 +230,5 @@ def test_edges_are_the_same_whichever_way_a_pair_is_stored():
             )
 
 
-def test_groups_are_sorted_by_size():
+def test_groups_are_sorted_by_size() -> None:
     assert connected_groups([(1, 4), (4, 5), (0, 2)], 6) == [[1, 4, 5], [0, 2], [3]]

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike, NDArray
 
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.algorithms.poses.frame.horizontal_layers import floor_below, sharpest_up
@@ -26,17 +27,18 @@ UP = np.array([0.0, -1.0, 0.0])
 FLOOR_Y = 1.3
 
 
-def angle_deg(first, second) -> float:
+def angle_deg(first: ArrayLike, second: ArrayLike) -> float:
     return float(np.rad2deg(angle_between(first, second)))
 
 
-def with_points(poses: list[Rigid3], points) -> Poses:
+def with_points(poses: list[Rigid3], points: ArrayLike) -> Poses:
     named = {f"{number}.jpg": pose for number, pose in enumerate(poses)}
     bare = Poses.without_points(named, frame="", scale="", metric=False)
-    count = len(points)
+    xyz = np.asarray(points, np.float64)
+    count = len(xyz)
     return replace(
         bare,
-        points_in_world=np.asarray(points, np.float64),
+        points_in_world=xyz,
         point_colors_rgb=np.zeros((count, 3), np.uint8),
         point_errors_rad=np.full(count, 0.001, np.float32),
     )
@@ -56,7 +58,7 @@ def room_poses(seed: int, *, cameras: int = 4, tilt_deg: float = 5.0, points: in
     return with_points(poses, np.concatenate(found))
 
 
-def sensed(poses: Poses, rng, noise_deg: float) -> dict[str, tuple[float, float, float]]:
+def sensed(poses: Poses, rng: np.random.Generator, noise_deg: float) -> dict[str, tuple[float, float, float]]:
     """What the sensors of level-world cameras read."""
     tilts = rotation_from_rotvec(np.deg2rad(noise_deg) * rng.normal(size=(len(poses.names), 3)))
     readings = np.einsum("nij,njk,k->ni", tilts, poses.rotations, UP)
@@ -64,7 +66,7 @@ def sensed(poses: Poses, rng, noise_deg: float) -> dict[str, tuple[float, float,
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_mean_direction_ignores_a_third_of_wild_readings(seed):
+def test_mean_direction_ignores_a_third_of_wild_readings(seed: int) -> None:
     rng = np.random.default_rng(seed)
     true = random_rotation(rng)[0]
     good = true + np.deg2rad(0.3) * rng.normal(size=(20, 3))
@@ -77,7 +79,7 @@ def test_mean_direction_ignores_a_third_of_wild_readings(seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_sensors_find_the_vertical_in_any_world_despite_wrong_ones(seed):
+def test_sensors_find_the_vertical_in_any_world_despite_wrong_ones(seed: int) -> None:
     rng = np.random.default_rng(seed)
     poses = room_poses(seed, cameras=8, points=1)
     readings = sensed(poses, rng, 0.5) | {
@@ -93,7 +95,7 @@ def test_sensors_find_the_vertical_in_any_world_despite_wrong_ones(seed):
     assert vertical.disagreement_deg < 1.5
 
 
-def test_sensors_that_contradict_each_other_are_no_evidence():
+def test_sensors_that_contradict_each_other_are_no_evidence() -> None:
     poses = room_poses(0, cameras=6, points=1)
     rng = np.random.default_rng(0)
     readings = {name: tuple(random_rotation(rng)[0]) for name in poses.names}
@@ -104,7 +106,7 @@ def test_sensors_that_contradict_each_other_are_no_evidence():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_level_surfaces_find_the_vertical_where_cameras_are_tilted(seed):
+def test_level_surfaces_find_the_vertical_where_cameras_are_tilted(seed: int) -> None:
     poses = room_poses(seed)
     turn = random_rotation(np.random.default_rng(seed))
     moved = moved_poses(poses, Similarity3(0.3, turn, np.ones(3)))
@@ -114,7 +116,7 @@ def test_level_surfaces_find_the_vertical_where_cameras_are_tilted(seed):
     assert find_vertical(moved).source == "structure"
 
 
-def test_without_level_surfaces_the_cameras_decide():
+def test_without_level_surfaces_the_cameras_decide() -> None:
     rng = np.random.default_rng(1)
     poses = room_poses(1, cameras=6)
     ball = rng.normal(size=(1000, 3))
@@ -126,7 +128,7 @@ def test_without_level_surfaces_the_cameras_decide():
     assert "100 are needed" in vertical_from_structure(with_points([Rigid3.identity()] * 2, np.ones((3, 3)))).reason
 
 
-def test_a_slope_is_not_taken_for_a_level_floor():
+def test_a_slope_is_not_taken_for_a_level_floor() -> None:
     """Cameras that agree within a degree outweigh a ramp that is twelve degrees off."""
     poses = room_poses(2, cameras=6, tilt_deg=0.5)
     ramp = rotation_from_rotvec([np.deg2rad(12.0), 0, 0])
@@ -135,7 +137,7 @@ def test_a_slope_is_not_taken_for_a_level_floor():
     assert angle_deg(find_vertical(tilted).up_in_world, UP) < 1
 
 
-def test_cameras_held_at_random_tell_nothing():
+def test_cameras_held_at_random_tell_nothing() -> None:
     rng = np.random.default_rng(3)
     poses = with_points(
         [Rigid3.from_center(random_rotation(rng), rng.normal(size=3)) for _ in range(6)], np.zeros((0, 3))
@@ -149,7 +151,7 @@ def test_cameras_held_at_random_tell_nothing():
 
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 40.0])
-def test_floor_is_found_under_tables_in_any_unit_and_world(scale):
+def test_floor_is_found_under_tables_in_any_unit_and_world(scale: float) -> None:
     for seed in range(3):
         turn = random_rotation(np.random.default_rng(seed))
         poses = room_poses(seed)
@@ -160,13 +162,13 @@ def test_floor_is_found_under_tables_in_any_unit_and_world(scale):
         assert floor.points > 100
 
 
-def plate(rng, depth: float, half: float, count: int):
+def plate(rng: np.random.Generator, depth: float, half: float, count: int) -> NDArray[np.float64]:
     return np.stack(
         [rng.uniform(-half, half, count), rng.normal(depth, 0.004, count), rng.uniform(-half, half, count)], 1
     )
 
 
-def test_a_table_with_more_points_than_the_floor_is_not_the_floor():
+def test_a_table_with_more_points_than_the_floor_is_not_the_floor() -> None:
     rng = np.random.default_rng(5)
     points = np.concatenate([plate(rng, 0.7, 0.8, 400), plate(rng, 1.5, 3.0, 200), plate(rng, 2.6, 3.0, 10)])
     floor = floor_below(points, rng.normal(size=(4, 3)) * 0.1, UP)
@@ -174,7 +176,7 @@ def test_a_table_with_more_points_than_the_floor_is_not_the_floor():
     assert floor.points == pytest.approx(200, abs=20)
 
 
-def test_a_floor_lies_below_the_lowest_camera():
+def test_a_floor_lies_below_the_lowest_camera() -> None:
     rng = np.random.default_rng(6)
     centers = np.array([[0, 0, 0], [0.5, 0, 0], [1.0, 0, 0], [0.5, 1.2, 0]])
     floor = floor_below(np.concatenate([plate(rng, 0.7, 0.8, 400), plate(rng, 2.0, 3.0, 50)]), centers, UP)
@@ -182,13 +184,13 @@ def test_a_floor_lies_below_the_lowest_camera():
     assert not floor_below(plate(rng, 0.7, 0.8, 400), centers, UP)
 
 
-def test_where_nothing_lies_below_there_is_no_floor():
+def test_where_nothing_lies_below_there_is_no_floor() -> None:
     above = np.random.default_rng(0).uniform(-1, 0, (200, 3))
     assert "lie below" in floor_below(above, np.zeros((2, 3)), UP).reason
     assert not floor_below(np.zeros((0, 3)), np.zeros((2, 3)), UP)
 
 
-def test_layers_of_a_slanted_board_are_found_to_a_tenth_of_a_degree():
+def test_layers_of_a_slanted_board_are_found_to_a_tenth_of_a_degree() -> None:
     rng = np.random.default_rng(4)
     board = np.stack([rng.uniform(-4, 4, 800), rng.normal(1.5, 0.005, 800), rng.uniform(-4, 4, 800)], axis=1)
     clutter = rng.uniform(-2, 2, (400, 3))
@@ -198,7 +200,7 @@ def test_layers_of_a_slanted_board_are_found_to_a_tenth_of_a_degree():
 
 
 @pytest.mark.parametrize("count", [150, 600, 3000])
-def test_points_without_level_surfaces_have_no_layers(count):
+def test_points_without_level_surfaces_have_no_layers(count: int) -> None:
     rng = np.random.default_rng(count)
     ball = rng.normal(size=(count, 3))
     walls = rng.uniform(-3, 3, (count, 3))

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.backends.numpy_backend import find_winners, winners_of
 from pano_mvs.algorithms.sweep.backends.registry import (
@@ -18,8 +20,10 @@ from pano_mvs.algorithms.sweep.backends.registry import (
 from pano_mvs.algorithms.sweep.backends.running_winner import RunningWinner
 from pano_mvs.algorithms.sweep.costs.registry import SWEEP_COSTS, register_sweep_cost
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
+from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.algorithms.sweep.windows import CostWindow, WindowBands, column_offsets
+from pano_mvs.algorithms.sweep.winner import Winners
 from pano_mvs.core.errors import ContractError, PluginError, UsageError
 from pano_mvs.geometry import Rigid3
 from pano_mvs.testing.room import capture_poses, default_room, render
@@ -27,7 +31,7 @@ from pano_mvs.testing.sweep_backends import CASES, agreement, share_alike, sweep
 
 
 @pytest.mark.parametrize("backend", ["numba", "opencv"])
-def test_every_backend_gives_the_winners_of_the_readable_one(backend):
+def test_every_backend_gives_the_winners_of_the_readable_one(backend: str) -> None:
     shares = [agreement(number, backend) for number in range(CASES)]
     assert np.mean(shares) >= 0.99
     # From tiny pictures each backend's own rough ranges match exposures, to a grey level more or less.
@@ -35,7 +39,7 @@ def test_every_backend_gives_the_winners_of_the_readable_one(backend):
     assert min(share for number, share in enumerate(shares) if not sweep_case(number).settings.exposure) >= 0.97
 
 
-def test_bands_find_every_place_of_the_window():
+def test_bands_find_every_place_of_the_window() -> None:
     rng = np.random.default_rng(0)
     picture = rng.integers(0, 255, (24, 48), dtype=np.uint8)
     bands = WindowBands.of((24, 48), 3, spherical=True)
@@ -50,7 +54,7 @@ def test_bands_find_every_place_of_the_window():
 
 
 @pytest.mark.parametrize("levels", [4, 1000])
-def test_the_running_winner_is_that_of_the_volume(levels):
+def test_the_running_winner_is_that_of_the_volume(levels: int) -> None:
     """With four levels many planes are equally cheap."""
     volume = np.random.default_rng(levels).integers(0, levels, (9, 17, 14)).astype(np.float64)
     running = RunningWinner((9, 14))
@@ -60,7 +64,7 @@ def test_the_running_winner_is_that_of_the_volume(levels):
         np.testing.assert_array_equal(getattr(running.result(), name), expected)
 
 
-def test_opencv_says_how_wide_a_picture_may_be():
+def test_opencv_says_how_wide_a_picture_may_be() -> None:
     wide = np.zeros((16, 32_002, 3), np.uint8)
     pose = Rigid3(np.eye(3), np.array([0.3, 0, 0]))
     with pytest.raises(UsageError, match="at most 32000 columns"):
@@ -75,16 +79,17 @@ def ours() -> Iterator[None]:
     SWEEP_BACKENDS._added, SWEEP_COSTS._added = before
 
 
-def census_like(reference, warped, window):
+def census_like(reference: NDArray[Any], warped: NDArray[Any], window: CostWindow) -> NDArray[np.float64]:
     """The census cost, as a stranger would write it."""
     pairs = zip(window.neighbours(reference[..., 0]), window.neighbours(warped[..., 0]), strict=True)
     differs = [(ours > reference[..., 0]) != (theirs > warped[..., 0]) for ours, theirs in pairs]
-    return np.sum(differs, axis=0) / (len(differs) - 1)
+    result: NDArray[np.float64] = np.sum(differs, axis=0) / (len(differs) - 1)
+    return result
 
 
 @pytest.mark.parametrize("backend", ["numpy", "opencv"])
 @pytest.mark.parametrize("number", [2, 3])
-def test_census_from_a_plugin_is_census(ours, backend, number):
+def test_census_from_a_plugin_is_census(ours: None, backend: str, number: int) -> None:
     case = sweep_case(number)
     assert case.settings.cost == "census"
     register_sweep_cost("census-like")(census_like)
@@ -93,10 +98,10 @@ def test_census_from_a_plugin_is_census(ours, backend, number):
     assert share_alike(found, case.swept("numpy"), settings) >= 0.99
 
 
-def test_a_colour_cost_is_given_colours_and_grey_is_the_default(ours):
+def test_a_colour_cost_is_given_colours_and_grey_is_the_default(ours: None) -> None:
     seen = []
 
-    def cost(reference, warped, window):
+    def cost(reference: NDArray[Any], warped: NDArray[Any], window: CostWindow) -> NDArray[np.float64]:
         seen.append((reference.shape, warped.shape, warped.dtype, window.radius))
         return np.full(reference.shape[:2], 0.5)
 
@@ -112,7 +117,7 @@ def test_a_colour_cost_is_given_colours_and_grey_is_the_default(ours):
 
 
 @pytest.mark.parametrize("value", [1.5, -0.1, np.nan])
-def test_a_cost_out_of_bounds_is_blamed(ours, value):
+def test_a_cost_out_of_bounds_is_blamed(ours: None, value: float) -> None:
     register_sweep_cost("wrong")(lambda reference, warped, window: np.full(reference.shape[:2], value))
     picture = np.zeros((16, 32, 3), np.uint8)
     pose = Rigid3(np.eye(3), np.array([0.3, 0, 0]))
@@ -121,11 +126,11 @@ def test_a_cost_out_of_bounds_is_blamed(ours, value):
                     settings=SweepSettings(planes=3, cost="wrong"), backend="opencv")  # fmt: skip
 
 
-def test_the_small_sweeps_behind_a_sweep_need_not_be_the_backends_own(ours):
+def test_the_small_sweeps_behind_a_sweep_need_not_be_the_backends_own(ours: None) -> None:
     """A backend that has differences only: limits and exposures are found by census, with numba."""
 
     @register_sweep_backend("differences", costs=["sad"])
-    def find(work):
+    def find(work: SweepInput) -> Winners:
         assert work.settings.cost == "sad"
         assert work.device == "cuda:3"
         return find_winners(work)
@@ -146,7 +151,7 @@ def test_the_small_sweeps_behind_a_sweep_need_not_be_the_backends_own(ours):
         backend_for("differences", SweepSettings())
 
 
-def test_built_in_names_are_not_to_be_taken(ours):
+def test_built_in_names_are_not_to_be_taken(ours: None) -> None:
     with pytest.raises(PluginError, match="'numba' is built in"):
         register_sweep_backend("numba")(find_winners)
     assert SWEEP_BACKENDS.code_file("numba") is None

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numba
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.coarse_to_fine.guided import STEPS, GuidedSweep
 from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guided_paths import follow_guided_rows, follow_guided_strip
@@ -21,6 +24,7 @@ from pano_mvs.algorithms.sweep.preparation import SweepInput, prepare_picture
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pad_panorama, roll_panorama
+from pano_mvs.scene import RangeMap
 from pano_mvs.testing.room import Room, capture_poses, default_room, render
 from pano_mvs.testing.scenes import poles
 from tests.oracles.tube import follow
@@ -30,14 +34,16 @@ PLAIN = SweepSettings(planes=48, no_match="keep")
 
 
 @functools.cache
-def _capture(height: int):
+def _capture(height: int) -> tuple[list[NDArray[np.uint8]], list[Rigid3], NDArray[np.float32]]:
     """Return pictures, source_from_reference and the true range of view 0 of a room."""
     views_at = capture_poses(3, seed=5)
     views = [render(default_room(1), pose, (height, 2 * height)) for pose in views_at]
     return [view[0] for view in views], [pose @ views_at[0].inverse() for pose in views_at[1:]], views[0][1]
 
 
-def _sweep(pictures, poses, settings, **options):
+def _sweep(
+    pictures: Sequence[NDArray[np.uint8]], poses: Sequence[Rigid3], settings: SweepSettings, **options: Any
+) -> RangeMap:
     return sweep_range(pictures[0], pictures[1:], poses, near=NEAR, far=FAR, settings=settings, **options)
 
 
@@ -48,22 +54,23 @@ def _work(height: int, settings: SweepSettings) -> SweepInput:
     return SweepInput(prepared[0], tuple(prepared[1:]), tuple(poses), None, ranges, settings)
 
 
-def _good(result, truth):
-    return np.abs(result - truth) < 0.05 * truth
+def _good(result: NDArray[np.float32], truth: NDArray[np.float32]) -> NDArray[np.bool_]:
+    found: NDArray[np.bool_] = np.abs(result - truth) < 0.05 * truth
+    return found
 
 
 @pytest.mark.parametrize("changes", [{}, {"cost": "sad", "spacing": "log"}, {"combination": "parallax_weighted"}])
-def test_around_a_flat_guide_costs_are_those_of_the_plain_sweep(changes):
+def test_around_a_flat_guide_costs_are_those_of_the_plain_sweep(changes: dict[str, Any]) -> None:
     _compare_with_the_plain_sweep(64, SweepSettings(planes=20, exposure=False, **changes))
 
 
 @pytest.mark.kernel("sweep.coarse_to_fine.kernels_guided", "sweep.numba.kernels_band")
-def test_around_a_flat_guide_costs_of_a_tiny_picture_are_those_of_the_plain_sweep():
+def test_around_a_flat_guide_costs_of_a_tiny_picture_are_those_of_the_plain_sweep() -> None:
     """Small enough to run as plain Python too."""
     _compare_with_the_plain_sweep(16, SweepSettings(planes=14, window=3, exposure=False))
 
 
-def _compare_with_the_plain_sweep(height, settings):
+def _compare_with_the_plain_sweep(height: int, settings: SweepSettings) -> None:
     work, bands = _work(height, settings), range(0, height, 32)
     plain = np.empty((height, settings.planes, 2 * height), np.uint8)
     shared = sweep_arguments(work)
@@ -78,7 +85,7 @@ def _compare_with_the_plain_sweep(height, settings):
     assert (np.abs(sweep.volume[:, : 2 * STEPS + 1] - around) <= 4).mean() > 0.99
 
 
-def test_parts_of_a_band_cost_the_same_as_the_whole():
+def test_parts_of_a_band_cost_the_same_as_the_whole() -> None:
     rng = np.random.default_rng(3)
     work = _work(96, SweepSettings(planes=20))
     guides = np.repeat(9 + np.cumsum(rng.normal(0, 0.1, (1, 96, 192)), axis=2).astype(np.float32), 2, axis=0)
@@ -96,7 +103,7 @@ def test_parts_of_a_band_cost_the_same_as_the_whole():
     assert not np.moveaxis(parts.volume[:, :count], 1, -1)[~swept].any()
 
 
-def test_runs_cover_the_tiles_that_are_set_and_no_others():
+def test_runs_cover_the_tiles_that_are_set_and_no_others() -> None:
     rng = np.random.default_rng(1)
     size_hw = (80, 400)
     tiles = rng.random((3, 7)) < 0.4
@@ -114,7 +121,7 @@ def test_runs_cover_the_tiles_that_are_set_and_no_others():
 @pytest.mark.kernel("sweep.coarse_to_fine.kernels_guided_paths")
 @pytest.mark.parametrize("upward", [False, True])
 @pytest.mark.parametrize("drift", [0, 1, -1])
-def test_paths_among_candidates_follow_the_definition(drift, upward):
+def test_paths_among_candidates_follow_the_definition(drift: int, upward: bool) -> None:
     rng = np.random.default_rng(7)
     height, width, count = 10, 12, 3
     volume = rng.integers(0, 200, (height, 2 * count, width)).astype(np.uint8)
@@ -135,7 +142,7 @@ def test_paths_among_candidates_follow_the_definition(drift, upward):
 
 
 @pytest.mark.kernel("sweep.coarse_to_fine.kernels_guided_paths")
-def test_paths_along_rows_go_around_the_sphere():
+def test_paths_along_rows_go_around_the_sphere() -> None:
     rng = np.random.default_rng(8)
     height, width, count = 3, 20, 3
     volume = rng.integers(0, 200, (height, 2 * count, width)).astype(np.uint8)
@@ -154,7 +161,7 @@ def test_paths_along_rows_go_around_the_sphere():
 
 
 @pytest.mark.kernel("sweep.coarse_to_fine.kernels_guides")
-def test_two_surfaces_are_told_apart_and_one_is_not_split():
+def test_two_surfaces_are_told_apart_and_one_is_not_split() -> None:
     positions = np.full((12, 16), 10.0, np.float32)
     positions[:, 8:] = 30.0
     layers = np.empty((2, 12, 16), np.float32)
@@ -168,7 +175,7 @@ def test_two_surfaces_are_told_apart_and_one_is_not_split():
 
 
 @pytest.mark.kernel("sweep.coarse_to_fine.kernels_guides")
-def test_candidates_are_adopted_with_those_that_agree():
+def test_candidates_are_adopted_with_those_that_agree() -> None:
     found, costs = np.full((9, 9), 50.0, np.float32), np.full((9, 9), np.inf, np.float32)
     found[4, 4:6], costs[4, 4:6] = (10, 12), (1, 2)
     found[4, 3], costs[4, 3] = 40, 5
@@ -181,7 +188,7 @@ def test_candidates_are_adopted_with_those_that_agree():
 @pytest.mark.parametrize(
     "settings", [PLAIN, PLAIN.replace(aggregation="box"), PLAIN.replace(cost="sad", aggregation="box")]
 )
-def test_it_finds_what_the_plain_sweep_finds(settings):
+def test_it_finds_what_the_plain_sweep_finds(settings: SweepSettings) -> None:
     pictures, poses, truth = _capture(160)
     plain, guided = (_sweep(pictures, poses, settings.replace(levels=levels)) for levels in (1, 2))
     guided.check()
@@ -189,13 +196,13 @@ def test_it_finds_what_the_plain_sweep_finds(settings):
 
 
 @pytest.mark.slow
-def test_three_levels_are_not_much_worse_than_two():
+def test_three_levels_are_not_much_worse_than_two() -> None:
     pictures, poses, truth = _capture(256)
     two, three = (_sweep(pictures, poses, PLAIN.replace(levels=levels)) for levels in (2, 3))
     assert _good(three.range, truth).mean() > _good(two.range, truth).mean() - 0.03
 
 
-def test_it_turns_with_the_pictures():
+def test_it_turns_with_the_pictures() -> None:
     """By whole tiles exactly; by even numbers of pixels nearly; else the half resolution sees other pixels."""
     pictures, poses, _ = _capture(160)
     settings = PLAIN.replace(levels=2)
@@ -207,13 +214,15 @@ def test_it_turns_with_the_pictures():
         assert (difference < 1e-2).mean() > share
 
 
-def _rolled_reference(pictures, poses, settings, columns):
+def _rolled_reference(
+    pictures: Sequence[NDArray[np.uint8]], poses: Sequence[Rigid3], settings: SweepSettings, columns: int
+) -> NDArray[np.float32]:
     rolled, rotation = roll_panorama(pictures[0], columns)
     turn = Rigid3(rotation, np.zeros(3))
     return _sweep([rolled, *pictures[1:]], [pose @ turn.inverse() for pose in poses], settings).range
 
 
-def test_masks_hold_and_sizes_that_cannot_be_halved_are_swept_plainly():
+def test_masks_hold_and_sizes_that_cannot_be_halved_are_swept_plainly() -> None:
     pictures, poses, _ = _capture(160)
     mask = np.ones((160, 320), np.bool_)
     mask[-40:] = False
@@ -227,7 +236,7 @@ def test_masks_hold_and_sizes_that_cannot_be_halved_are_swept_plainly():
     )
 
 
-def test_the_number_of_threads_changes_no_bit():
+def test_the_number_of_threads_changes_no_bit() -> None:
     pictures, poses, _ = _capture(160)
     threads = numba.get_num_threads()
     results = []
@@ -239,7 +248,7 @@ def test_the_number_of_threads_changes_no_bit():
     assert np.array_equal(results[0].confidence, results[1].confidence)
 
 
-def test_only_the_compiled_backend_has_levels():
+def test_only_the_compiled_backend_has_levels() -> None:
     pictures, poses, _ = _capture(64)
     with pytest.raises(UsageError, match="needs the sweep backend numba, got 'numpy'"):
         _sweep(pictures, poses, PLAIN.replace(levels=2), backend="numpy")
@@ -248,7 +257,7 @@ def test_only_the_compiled_backend_has_levels():
 
 
 @pytest.mark.slow
-def test_thin_rods_are_seen_where_the_plain_sweep_sees_them():
+def test_thin_rods_are_seen_where_the_plain_sweep_sees_them() -> None:
     scene, size_hw = poles(seed=2), (192, 384)
     views = [scene.view(idx, size_hw) for idx in range(3)]
     relative = [pose @ scene.poses[0].inverse() for pose in scene.poses[1:3]]

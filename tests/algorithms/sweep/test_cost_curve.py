@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.backends.numpy_backend import _aggregate, _source_cost, find_winners
 from pano_mvs.algorithms.sweep.cost_curve import cost_curve
@@ -12,6 +15,7 @@ from pano_mvs.algorithms.sweep.numba.arguments import fresh_state, sweep_argumen
 from pano_mvs.algorithms.sweep.numba.kernels_band import sweep_band
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_input, sweep_range
+from pano_mvs.algorithms.sweep.windows import CostWindow
 from pano_mvs.core.errors import UsageError
 from pano_mvs.testing.room import capture_poses, default_room, render
 from pano_mvs.testing.sweep_backends import CASES, FAR, NEAR, SweepCase, sweep_case
@@ -25,7 +29,7 @@ def work_of(case: SweepCase) -> SweepInput:
 
 
 @pytest.mark.parametrize("number", range(0, CASES, 5))
-def test_the_winner_of_the_curve_is_that_of_the_sweep(number):
+def test_the_winner_of_the_curve_is_that_of_the_sweep(number: int) -> None:
     case = sweep_case(number)
     swept, work = case.swept("numba"), work_of(case)
     height, width = swept.range.shape
@@ -38,7 +42,7 @@ def test_the_winner_of_the_curve_is_that_of_the_sweep(number):
         assert bool(curve.reason) == np.isnan(curve.range)
 
 
-def test_costs_and_sums_are_those_of_the_whole_volume():
+def test_costs_and_sums_are_those_of_the_whole_volume() -> None:
     case = sweep_case(4)
     work = work_of(case)
     assert work.settings.aggregation == "box"
@@ -52,7 +56,7 @@ def test_costs_and_sums_are_those_of_the_whole_volume():
     assert curve.raw[curve.winner] * work.settings.worst_cost == pytest.approx(winners.cost[row, column], rel=0.05)
 
 
-def test_paths_end_in_the_pixel_with_the_sums_of_the_volume():
+def test_paths_end_in_the_pixel_with_the_sums_of_the_volume() -> None:
     poses = capture_poses(2, spread=0.4)
     pictures = [render(default_room(), pose, (24, 48))[0] for pose in poses]
     settings = SweepSettings(planes=9, support=1, window=3)
@@ -76,7 +80,7 @@ def test_paths_end_in_the_pixel_with_the_sums_of_the_volume():
             np.testing.assert_array_equal(np.rint(found * 8 * 255), total[row, :, column])
 
 
-def test_a_distinct_surface_has_a_sharp_curve_at_its_true_range():
+def test_a_distinct_surface_has_a_sharp_curve_at_its_true_range() -> None:
     poses = capture_poses(3, spread=0.4)
     room = default_room()
     views = [render(room, pose, (96, 192)) for pose in poses]
@@ -101,13 +105,14 @@ def test_a_distinct_surface_has_a_sharp_curve_at_its_true_range():
     assert np.median(sharp) > 0.2
 
 
-def test_a_plugins_cost_has_a_curve_too():
+def test_a_plugins_cost_has_a_curve_too() -> None:
     before = dict(SWEEP_COSTS._added)
     try:
 
         @register_sweep_cost("darker")
-        def darker(reference, warped, window):
-            return np.abs(reference[..., 0] - warped[..., 0]) / 255
+        def darker(reference: NDArray[Any], warped: NDArray[Any], window: CostWindow) -> NDArray[Any]:
+            result: NDArray[Any] = np.abs(reference[..., 0] - warped[..., 0]) / 255
+            return result
 
         case = sweep_case(0)
         settings = SweepSettings(planes=7, cost="darker", support=3, no_match="keep")
@@ -120,7 +125,7 @@ def test_a_plugins_cost_has_a_curve_too():
         SWEEP_COSTS._added = before
 
 
-def test_a_pixel_outside_is_refused():
+def test_a_pixel_outside_is_refused() -> None:
     work = work_of(sweep_case(0))
     with pytest.raises(UsageError, match=r"pixel \(99, 2\) is not in a picture of"):
         cost_curve(work, column=99, row=2)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.sweep import sweep_range
 from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_grid
 from pano_mvs.scene import Features, FilePart, Panorama
+from pano_mvs.scene.cropping import Crop
 from pano_mvs.scene.image_files.image_file import write_png
 from pano_mvs.testing.room import default_room, render
 
@@ -57,7 +60,9 @@ def inside(pixels: NDArray[np.float64], crop: tuple[int, int, int, int]) -> NDAr
 @pytest.mark.parametrize("cost", ["sad", *(pytest.param(cost, marks=pytest.mark.slow) for cost in ("census", "zncc"))])
 @pytest.mark.parametrize("crop", CROPS.values(), ids=list(CROPS))
 @pytest.mark.parametrize("cropped_sources", [False, True], ids=["reference", "all"])
-def test_ranges_are_those_of_the_whole_panorama(tmp_path, views, cost, crop, cropped_sources):
+def test_ranges_are_those_of_the_whole_panorama(
+    tmp_path: Path, views: Views, cost: str, crop: Crop, cropped_sources: bool
+) -> None:
     settings = SweepSettings(planes=32, cost=cost, aggregation="box")
     pictures, truths, poses = zip(*views, strict=True)
     whole = swept([panorama(tmp_path, picture, None) for picture in pictures], list(poses), settings)
@@ -77,7 +82,9 @@ def test_ranges_are_those_of_the_whole_panorama(tmp_path, views, cost, crop, cro
 
 
 @pytest.mark.parametrize(("extract", "clear_px"), [(extract_sift, 2), (extract_orb, 12), (extract_sphorb, 15)])
-def test_key_points_are_those_of_the_whole_panorama(tmp_path, views, extract, clear_px):
+def test_key_points_are_those_of_the_whole_panorama(
+    tmp_path: Path, views: Views, extract: Callable[..., Any], clear_px: int
+) -> None:
     """None is on the edge of the crop, and nearly all small ones that lie well inside are found again."""
     picture, (left, top, width, height) = views[0][0], CROPS["narrow"]
     part, whole = (panorama(tmp_path, picture, crop) for crop in (CROPS["narrow"], None))

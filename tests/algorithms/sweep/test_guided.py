@@ -1,11 +1,16 @@
 """The guided filter, windows and holes on the sphere, and what filters leave alone."""
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.bilateral_solver import fast_bilateral_solver
 from pano_mvs.algorithms.filters.confidence import confidence_weight, require_confidence
@@ -22,12 +27,13 @@ from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.testing.room import default_room, render
 from tests.algorithms.range_scenes import SEEN, TRUSTED, as_map, random_map, rolled
+from tests.known import known
 
 SIZE = (24, 48)
 COLORS = np.random.default_rng(7).integers(0, 256, (*SIZE, 3), np.uint8)
 
 
-def window(row, column, radius, size_hw):
+def window(row: int, column: int, radius: int, size_hw: tuple[int, int]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """The pixels of a window, by the definition: rows over the poles, columns as wide as at the window's centre."""
     height, width = size_hw
     half = min(radius * columns_per_step(size_hw, steps=2 * radius + 1)[row], (width - 1) // 2)
@@ -41,7 +47,7 @@ def window(row, column, radius, size_hw):
 
 @pytest.mark.parametrize("radius", [1, 4])
 @pytest.mark.parametrize("shape", [SIZE, (*SIZE, 2)])
-def test_sums_are_those_of_the_windows(radius, shape):
+def test_sums_are_those_of_the_windows(radius: int, shape: tuple[int, ...]) -> None:
     values = np.random.default_rng(0).normal(size=shape)
     plain = [[values[window(y, x, radius, SIZE)].sum(axis=0) for x in range(SIZE[1])] for y in range(SIZE[0])]
     np.testing.assert_allclose(box_sum(values, radius), plain, atol=1e-10)
@@ -49,12 +55,12 @@ def test_sums_are_those_of_the_windows(radius, shape):
     assert np.sum(box_sum(values, radius) * other) == pytest.approx(np.sum(values * box_spread(other, radius)))
 
 
-def test_guided_values_are_least_squares_in_every_window():
+def test_guided_values_are_least_squares_in_every_window() -> None:
     rng = np.random.default_rng(1)
     target, weight = rng.uniform(0.2, 1, SIZE), rng.uniform(0, 1, SIZE) * (rng.random(SIZE) < 0.6)
     radius, epsilon = 2, 10.0
     lines, share = np.zeros((*SIZE, 4)), np.zeros(SIZE)
-    holders = {place: [] for place in np.ndindex(SIZE)}
+    holders: dict[tuple[int, ...], list[Any]] = {place: [] for place in np.ndindex(SIZE)}
     for y in range(SIZE[0]):
         for x in range(SIZE[1]):
             at = window(y, x, radius, SIZE)
@@ -74,7 +80,7 @@ def test_guided_values_are_least_squares_in_every_window():
         assert support[y, x] == pytest.approx(share[at].mean())
 
 
-def test_guided_smooths_noise_within_what_looks_alike_and_keeps_edges():
+def test_guided_smooths_noise_within_what_looks_alike_and_keeps_edges() -> None:
     image, ranges = render(default_room(texture="weak"), Rigid3.identity(), (96, 192))
     noisy = ranges * (1 + 0.05 * np.random.default_rng(0).standard_normal(ranges.shape)).astype(np.float32)
     inner = np.s_[20:76]
@@ -91,7 +97,7 @@ def test_guided_smooths_noise_within_what_looks_alike_and_keeps_edges():
     assert 1.2 < flat[48, 96] < 2.5, "without an edge in the picture there is none in the ranges"
 
 
-def test_guided_follows_the_sure_pixels_and_fills_only_when_asked():
+def test_guided_follows_the_sure_pixels_and_fills_only_when_asked() -> None:
     confidence, ranges = np.full(SIZE, TRUSTED), np.full(SIZE, 2.0)
     ranges[10:13, 20:23], confidence[10:13, 20:23] = 7.0, 70
     ranges[5, 5] = np.nan
@@ -106,30 +112,31 @@ def test_guided_follows_the_sure_pixels_and_fills_only_when_asked():
     filled.check()
 
 
-def brute_holes(valid, max_hole_deg):
+def brute_holes(valid: NDArray[np.bool_], max_hole_deg: float) -> NDArray[np.bool_]:
     """Opening of the hole by a disc, by all pairs of pixels."""
     rays = ray_grid(valid.shape).reshape(-1, 3)
     angle_deg = np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1)))
     within = angle_deg <= max_hole_deg / 2
-    core = ~(within & valid.ravel()[None]).any(axis=1)
-    return (within & core[None]).any(axis=1).reshape(valid.shape) & ~valid
+    core = ~np.asarray((within & valid.ravel()[None]).any(axis=1))
+    near = np.asarray((within & core[None]).any(axis=1))
+    return near.reshape(valid.shape) & ~valid
 
 
 @pytest.mark.parametrize("diameter", [5.1, 13.3, 40.7, 121.9])  # no two pixels are as far apart as half of these
 @pytest.mark.parametrize("share", [0.02, 0.2, 0.5, 0.9])
-def test_large_holes_are_the_opening_by_a_disc(diameter, share):
+def test_large_holes_are_the_opening_by_a_disc(diameter: float, share: float) -> None:
     rng = np.random.default_rng(round(100 * share))
     valid = np.kron(rng.random((6, 12)) < share, np.ones((4, 4))) > 0
     assert valid.any()
     np.testing.assert_array_equal(large_holes(valid, diameter), brute_holes(valid, diameter))
 
 
-def test_rims_of_single_pixels_are_found():
+def test_rims_of_single_pixels_are_found() -> None:
     valid = np.random.default_rng(5).random(SIZE) < 0.7
     np.testing.assert_array_equal(large_holes(valid, 15.7), brute_holes(valid, 15.7))
 
 
-def test_no_hole_is_large_at_zero_and_all_is_where_nothing_is_valid():
+def test_no_hole_is_large_at_zero_and_all_is_where_nothing_is_valid() -> None:
     valid = np.zeros(SIZE, bool)
     assert not large_holes(valid, 0).any()
     assert large_holes(valid, 20).all()
@@ -139,7 +146,7 @@ def test_no_hole_is_large_at_zero_and_all_is_where_nothing_is_valid():
 
 
 @pytest.mark.parametrize("solve", [fast_bilateral_solver, lambda m, _, **settings: fill_from_neighbours(m, **settings)])
-def test_a_sky_stays_a_hole_and_cracks_are_filled(solve):
+def test_a_sky_stays_a_hole_and_cracks_are_filled(solve: Callable[..., RangeMap]) -> None:
     ranges = np.full((64, 128), 3.0)
     ranges[:20] = np.nan  # all above 34° elevation
     ranges[40:43, 50:53] = np.nan
@@ -152,7 +159,7 @@ def test_a_sky_stays_a_hole_and_cracks_are_filled(solve):
     assert everything.valid[12:].all()
 
 
-def test_what_is_confirmed_keeps_its_range_in_the_solver():
+def test_what_is_confirmed_keeps_its_range_in_the_solver() -> None:
     rng = np.random.default_rng(3)
     confidence = np.where(rng.random(SIZE) < 0.5, TRUSTED, SEEN)
     range_map = as_map(rng.uniform(1, 4, SIZE), confidence)
@@ -167,7 +174,7 @@ def test_what_is_confirmed_keeps_its_range_in_the_solver():
 
 
 @pytest.mark.parametrize("least", [64, 128, 200])
-def test_only_what_is_sure_enough_is_left(least):
+def test_only_what_is_sure_enough_is_left(least: int) -> None:
     range_map = random_map(np.random.default_rng(0), SIZE)
     left = require_confidence(range_map, min_confidence=least)
     left.check()
@@ -176,7 +183,7 @@ def test_only_what_is_sure_enough_is_left(least):
     assert np.all(np.diff(confidence_weight(np.arange(256, dtype=np.uint8))) > 0)
 
 
-FILTERS = {
+FILTERS: dict[str, Callable[[RangeMap], RangeMap]] = {
     "median": median_range,
     "gaussian": gaussian_range,
     "speckle": partial(remove_speckles, max_size_px=4, max_relative_step=0.5),
@@ -188,21 +195,22 @@ FILTERS = {
 
 
 @pytest.mark.parametrize("name", FILTERS)
-def test_normals_stay_where_the_range_stayed_and_are_unknown_elsewhere(name):
+def test_normals_stay_where_the_range_stayed_and_are_unknown_elsewhere(name: str) -> None:
     range_map = random_map(np.random.default_rng(2), SIZE)
     normals = np.where(range_map.valid[..., None], -ray_grid(SIZE), np.nan).astype(np.float16)
     given = RangeMap(range_map.range, range_map.confidence, normals)
     filtered = FILTERS[name](given)
     filtered.check()
     stayed = filtered.range == range_map.range
-    np.testing.assert_array_equal(filtered.normals_in_cam[stayed], normals[stayed])
-    assert np.isnan(filtered.normals_in_cam[~stayed]).all()
+    found = known(filtered.normals_in_cam)
+    np.testing.assert_array_equal(found[stayed], normals[stayed])
+    assert np.isnan(found[~stayed]).all()
 
 
 @pytest.mark.parametrize(
     "order", [list(FILTERS), list(FILTERS)[::-1], ["solver", "fill", "guided", "speckle", "median"]]
 )
-def test_any_chain_of_filters_gives_a_sound_map(order):
+def test_any_chain_of_filters_gives_a_sound_map(order: Sequence[str]) -> None:
     range_map = random_map(np.random.default_rng(4), SIZE)
     for name in order:
         range_map = FILTERS[name](range_map)
@@ -211,12 +219,13 @@ def test_any_chain_of_filters_gives_a_sound_map(order):
 
 @settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 1000), columns=st.integers(-60, 60))
-def test_rolling_rolls_guided_and_limited_fill(seed, columns):
+def test_rolling_rolls_guided_and_limited_fill(seed: int, columns: int) -> None:
     range_map = random_map(np.random.default_rng(seed), SIZE, holes=0.7)
-    for run in (
+    filters: list[Callable[[RangeMap, NDArray[np.uint8]], RangeMap]] = [
         lambda m, colors: guided_range(m, colors, radius=2, fill=True),
         lambda m, _: fill_from_neighbours(m, max_distance_px=6, max_hole_deg=25),
-    ):
+    ]
+    for run in filters:
         expected = rolled(run(range_map, COLORS), columns)
         got = run(rolled(range_map, columns), np.roll(COLORS, columns, 1))
         np.testing.assert_allclose(got.range, expected.range, rtol=1e-4)
@@ -224,7 +233,7 @@ def test_rolling_rolls_guided_and_limited_fill(seed, columns):
 
 
 @pytest.mark.parametrize("harm", [{"radius": 0}, {"radius": 12}, {"epsilon": 0.0}])
-def test_bad_settings_are_refused(harm):
+def test_bad_settings_are_refused(harm: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match="guided filter needs"):
         guided_range(as_map(np.ones(SIZE)), COLORS, **harm)
     with pytest.raises(UsageError, match="guide must be"):

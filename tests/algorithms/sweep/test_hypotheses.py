@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pano_mvs.algorithms.sweep.hypotheses import range_at, range_limits, virtual_ranges
+from pano_mvs.algorithms.sweep.hypotheses import Spacing, range_at, range_limits, virtual_ranges
 from pano_mvs.core.errors import UsageError
 
 SPACINGS = ("inverse", "log", "uniform")
@@ -16,7 +19,7 @@ SPACINGS = ("inverse", "log", "uniform")
 @given(
     near=st.floats(1e-3, 1e3), ratio=st.floats(1.01, 1e4), planes=st.integers(3, 300), spacing=st.sampled_from(SPACINGS)
 )
-def test_virtual_ranges_ascend_from_near_to_far(near, ratio, planes, spacing):
+def test_virtual_ranges_ascend_from_near_to_far(near: float, ratio: float, planes: int, spacing: Spacing) -> None:
     ranges = virtual_ranges(near, near * ratio, planes=planes, spacing=spacing)
     assert ranges.shape == (planes,)
     assert ranges[0] == pytest.approx(near)
@@ -25,18 +28,18 @@ def test_virtual_ranges_ascend_from_near_to_far(near, ratio, planes, spacing):
 
 
 @pytest.mark.parametrize(("spacing", "even"), [("inverse", np.reciprocal), ("log", np.log), ("uniform", np.array)])
-def test_virtual_ranges_are_even_in_what_the_spacing_names(spacing, even):
+def test_virtual_ranges_are_even_in_what_the_spacing_names(spacing: Spacing, even: Callable[..., Any]) -> None:
     steps = np.diff(even(virtual_ranges(0.3, 9.0, planes=50, spacing=spacing)))
     np.testing.assert_allclose(steps, steps[0])
 
 
 @pytest.mark.parametrize("limits", [(0.0, 1.0), (2.0, 1.0), (1.0, np.inf), (np.nan, 1.0)])
-def test_limits_that_are_none_are_refused(limits):
+def test_limits_that_are_none_are_refused(limits: tuple[float, float]) -> None:
     with pytest.raises(UsageError, match="0 < near < far"):
         range_at([0.0], *limits, planes=8, spacing="inverse")
 
 
-def test_the_longest_baseline_and_the_resolution_decide():
+def test_the_longest_baseline_and_the_resolution_decide() -> None:
     near, far = range_limits([0.2, 1.0], width=1024)
     assert near == pytest.approx(0.3)
     parallax_px = np.arctan(1.0 / far) / (2 * np.pi / 1024)
@@ -45,6 +48,6 @@ def test_the_longest_baseline_and_the_resolution_decide():
 
 
 @pytest.mark.parametrize("baselines", [[], [0.0], [np.nan]])
-def test_a_capture_from_one_place_is_refused(baselines):
+def test_a_capture_from_one_place_is_refused(baselines: Sequence[float]) -> None:
     with pytest.raises(UsageError, match="all baselines are zero"):
         range_limits(baselines, width=1024)

@@ -39,7 +39,7 @@ def _picture(seed: int, size_hw: tuple[int, int] = SIZE) -> np.ndarray:
 
 @pytest.mark.kernel("sweep.numba.kernels_cost")
 @pytest.mark.parametrize("row", [0, 1, 8, 15])
-def test_census_counts_what_the_definition_counts(row):
+def test_census_counts_what_the_definition_counts(row: int) -> None:
     reference, warped = _picture(3) // 16, _picture(4) // 16  # few levels: ties
     offsets = column_offsets(SIZE, 2, spherical=True)
     pad = 8
@@ -52,7 +52,7 @@ def test_census_counts_what_the_definition_counts(row):
 
 
 @pytest.mark.kernel("sweep.numba.kernels_cost")
-def test_differences_add_up_over_colours():
+def test_differences_add_up_over_colours() -> None:
     reference, warped = _picture(5), _picture(6)
     total = np.full(SIZE[1], 7, np.uint16)
     difference_row(pad_panorama(reference, 2), 5, pad_panorama(warped, 2), 6, 2, total)
@@ -62,7 +62,7 @@ def test_differences_add_up_over_colours():
 
 @pytest.mark.kernel("sweep.numba.kernels_cost")
 @pytest.mark.parametrize("radius", [1, 3])
-def test_running_sums_equal_the_mean_over_each_window(radius):
+def test_running_sums_equal_the_mean_over_each_window(radius: int) -> None:
     cost = np.random.default_rng(7).integers(0, 766, SIZE).astype(np.uint16)
     reach = column_offsets(SIZE, radius, spherical=True)[:, -1].copy()
     pad = int(reach.max()) + 1
@@ -83,7 +83,9 @@ def test_running_sums_equal_the_mean_over_each_window(radius):
     [(3, 1.0, 3, 4, True), (3, 0.5, 3, 4, False), (3, 1.0, 2, 4, False), (3, 0.5, 1, 4, False), (1, 0.5, 1, 4, True),
      (85, 1.0, 85, 4, True), (86, 1.0, 86, 4, False), (80, 1.0, 80, 4096, False)],
 )  # fmt: skip
-def test_one_box_serves_where_all_sources_count_and_nothing_overflows(sources, share, most, pad, serves):
+def test_one_box_serves_where_all_sources_count_and_nothing_overflows(
+    sources: int, share: float, most: int, pad: int, serves: bool
+) -> None:
     combination = Combination(np.zeros((0, 0, 0), np.float32), share, most, np.float32(9))
     assert one_box_serves(sources, combination, 3, pad) == serves
     weighted = combination._replace(weights=np.ones((sources, 1, 1), np.float32))
@@ -92,7 +94,7 @@ def test_one_box_serves_where_all_sources_count_and_nothing_overflows(sources, s
 
 @pytest.mark.kernel("sweep.numba.kernels_sad")
 @pytest.mark.parametrize("radius", [0, 2])
-def test_differences_are_averaged_over_seams(radius):
+def test_differences_are_averaged_over_seams(radius: int) -> None:
     costs = np.random.default_rng(7).integers(0, 65536, (4 + 2 * radius, 20)).astype(np.uint16)
     pad, reach = 5, np.array([0, 1, 2, 4]) if radius else np.zeros(4, np.int64)
     padded = np.zeros((len(costs), 20 + 2 * pad), np.uint16)
@@ -110,7 +112,9 @@ def test_differences_are_averaged_over_seams(radius):
 @pytest.mark.parametrize(("share", "most"), [(0.5, 9), (1.0, 9), (1.0, 2)])
 @pytest.mark.parametrize("all_vote", [True, False])
 @pytest.mark.parametrize("weighted", [True, False])
-def test_sources_combine_to_the_mean_of_those_that_count(sources, share, most, all_vote, weighted):
+def test_sources_combine_to_the_mean_of_those_that_count(
+    sources: int, share: float, most: int, all_vote: bool, weighted: bool
+) -> None:
     rng = np.random.default_rng(sources)
     costs = rng.random((sources, 2, 40)).astype(np.float32)
     weights = rng.random((sources, 3, 40)).astype(np.float32) if weighted else np.zeros((0, 0, 0), np.float32)
@@ -130,7 +134,9 @@ def test_sources_combine_to_the_mean_of_those_that_count(sources, share, most, a
 @pytest.mark.kernel("sweep.numba.kernels_winner", "sweep.numba.x86.kernels_vector_winner")
 @pytest.mark.parametrize("kinds", [(np.float32, np.int32), (np.uint16, np.uint16)])
 @pytest.mark.parametrize("at_once", [1, 4, 9])
-def test_winners_of_a_stream_equal_those_of_the_volume(kinds, at_once):
+def test_winners_of_a_stream_equal_those_of_the_volume(
+    kinds: tuple[type[np.generic], type[np.generic]], at_once: int
+) -> None:
     volume = np.random.default_rng(8).integers(0, 12, (3, 9, 500)).astype(kinds[0])  # few levels: ties, both ends
     expected = winners_of(volume.astype(np.float64))
     largest = np.inf if kinds[0] is np.float32 else 65535
@@ -150,7 +156,7 @@ def test_winners_of_a_stream_equal_those_of_the_volume(kinds, at_once):
 
 
 @pytest.mark.kernel("sweep.numba.kernels_winner", "sweep.numba.x86.kernels_vector_winner")
-def test_winners_of_rows_are_those_of_the_volume():
+def test_winners_of_rows_are_those_of_the_volume() -> None:
     volume = np.random.default_rng(9).integers(0, 60000, (5, 21, 45)).astype(np.uint16)
     expected = winners_of(volume.astype(np.float64))
     state, plane = np.full((STATES, 2, 45), 65535, np.uint16), np.zeros((2, 45), np.uint16)
@@ -160,7 +166,7 @@ def test_winners_of_rows_are_those_of_the_volume():
 
 
 @pytest.mark.kernel("sweep.numba.kernels_source_cost")
-def test_costs_are_stored_rounded_and_saturated():
+def test_costs_are_stored_rounded_and_saturated() -> None:
     voxels = np.zeros(5, np.uint8)
     store_row(np.array([0.0, 1.24, 1.26, 100.0, 1e6], np.float32), np.float32(2.0), voxels)
     assert voxels.tolist() == [0, 2, 3, 200, 255]
@@ -168,7 +174,7 @@ def test_costs_are_stored_rounded_and_saturated():
 
 @pytest.mark.kernel("sweep.numba.kernels_sgm")
 @pytest.mark.parametrize("direction", DIRECTIONS)
-def test_paths_over_the_poles_equal_a_walk_pixel_by_pixel(direction):
+def test_paths_over_the_poles_equal_a_walk_pixel_by_pixel(direction: tuple[int, int]) -> None:
     rng = np.random.default_rng(9)
     (height, width), depth, p1, warm = (8, 20), 5, 9, 3
     volume = rng.integers(0, 200, (height, depth, width)).astype(np.uint8)
@@ -184,7 +190,7 @@ def test_paths_over_the_poles_equal_a_walk_pixel_by_pixel(direction):
 
 
 @pytest.mark.kernel("sweep.numba.kernels_sgm")
-def test_paths_along_a_row_equal_a_walk_pixel_by_pixel():
+def test_paths_along_a_row_equal_a_walk_pixel_by_pixel() -> None:
     rng = np.random.default_rng(10)
     (height, width), depth, p1, warm = (3, 20), 5, 9, 10
     volume = rng.integers(0, 200, (height, depth, width)).astype(np.uint8)
@@ -200,7 +206,7 @@ def test_paths_along_a_row_equal_a_walk_pixel_by_pixel():
     np.testing.assert_array_equal(total, expected)
 
 
-def test_one_step_of_many_paths_equals_each_alone():
+def test_one_step_of_many_paths_equals_each_alone() -> None:
     rng = np.random.default_rng(11)
     costs, before = rng.integers(0, 200, (2, 5, 30))
     penalty = rng.integers(20, 90, 30)
@@ -216,7 +222,9 @@ def test_one_step_of_many_paths_equals_each_alone():
 @pytest.mark.skipif(not HAS_VECTOR, reason="there is nothing but loops")
 @pytest.mark.parametrize(("drift", "upward"), [(0, False), (1, False), (-1, True)])
 @pytest.mark.parametrize(("lines", "first"), [(100, 0), (40, 70), (5, 99), (33, 1)])
-def test_paths_by_vector_instructions_equal_those_by_loops(drift, upward, lines, first, monkeypatch):
+def test_paths_by_vector_instructions_equal_those_by_loops(
+    drift: int, upward: bool, lines: int, first: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rng = np.random.default_rng(lines)
     (height, width), depth = (9, 100), 7
     volume = rng.integers(1, 256, (height, depth, width), dtype=np.uint8)

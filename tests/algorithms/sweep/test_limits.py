@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.hypotheses import range_limits
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
@@ -9,21 +10,23 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, roll_panorama
 from pano_mvs.testing.room import capture_poses, default_room, render
 
+Capture = tuple[list[NDArray[np.uint8]], list[Rigid3], list[NDArray[np.float32]]]
+
 SIZE_HW = (96, 192)
 
 
 @pytest.fixture(scope="module")
-def capture():
+def capture() -> Capture:
     poses = capture_poses(4, spread=0.4)
     views = [render(default_room(), pose, SIZE_HW) for pose in poses]
     return [image for image, _ in views], poses, [truth for _, truth in views]
 
 
-def no_masks(count):
+def no_masks(count: int) -> list[NDArray[np.bool_]]:
     return [np.ones(SIZE_HW, np.bool_)] * count
 
 
-def test_limits_hold_what_there_is_without_wasting_planes(capture):
+def test_limits_hold_what_there_is_without_wasting_planes(capture: Capture) -> None:
     pictures, poses, truth = capture
     near, far = limits_by_sweeping(pictures, poses, masks=no_masks(4))
     nearest, farthest = np.nanquantile(truth[0], [0.01, 0.99])
@@ -31,14 +34,14 @@ def test_limits_hold_what_there_is_without_wasting_planes(capture):
     assert farthest < far < 3 * farthest
 
 
-def test_limits_follow_the_unit_of_length(capture):
+def test_limits_follow_the_unit_of_length(capture: Capture) -> None:
     pictures, poses, _ = capture
     longer = [Rigid3(pose.rotation, 4 * pose.translation) for pose in poses]
     near, far = limits_by_sweeping(pictures, poses, masks=no_masks(4))
     assert limits_by_sweeping(pictures, longer, masks=no_masks(4)) == pytest.approx((4 * near, 4 * far))
 
 
-def test_rolling_all_pictures_changes_nothing(capture):
+def test_rolling_all_pictures_changes_nothing(capture: Capture) -> None:
     pictures, poses, _ = capture
     rolled = [roll_panorama(picture, 48) for picture in pictures]
     turned = [Rigid3(new_from_old @ pose.rotation, new_from_old @ pose.translation)
@@ -47,7 +50,7 @@ def test_rolling_all_pictures_changes_nothing(capture):
     assert limits_by_sweeping([picture for picture, _ in rolled], turned, masks=no_masks(4)) == expected
 
 
-def test_pictures_that_agree_on_nothing_get_the_limits_of_the_cameras(capture):
+def test_pictures_that_agree_on_nothing_get_the_limits_of_the_cameras(capture: Capture) -> None:
     _, poses, _ = capture
     rng = np.random.default_rng(0)
     noise = [rng.integers(0, 255, (*SIZE_HW, 3), dtype=np.uint8) for _ in poses]
@@ -56,7 +59,7 @@ def test_pictures_that_agree_on_nothing_get_the_limits_of_the_cameras(capture):
     assert limits_by_sweeping(noise, poses, masks=dark) == range_limits(baselines, width=SIZE_HW[1])
 
 
-def test_a_reference_without_sources_is_refused(capture):
+def test_a_reference_without_sources_is_refused(capture: Capture) -> None:
     pictures, poses, _ = capture
     with pytest.raises(UsageError, match="at least one source"):
         limits_by_sweeping(pictures[:1], poses[:1], masks=no_masks(1))

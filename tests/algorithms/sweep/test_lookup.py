@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.numba.kernels_census import count_census_row
 from pano_mvs.algorithms.sweep.numba.kernels_cost import census_row
@@ -27,7 +30,18 @@ def _picture(seed: int, shape: tuple[int, ...]) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
 
 
-def _warped(source, translation, size_hw, *, vector, halo=3, pad=4, first=0, rows=None, against=None):
+def _warped(
+    source: NDArray[np.uint8],
+    translation: tuple[float, float, float],
+    size_hw: tuple[int, int],
+    *,
+    vector: bool,
+    halo: int = 3,
+    pad: int = 4,
+    first: int = 0,
+    rows: int | None = None,
+    against: NDArray[Any] | None = None,
+) -> NDArray[Any]:
     height, width = size_hw
     rows = rows or height
     azimuth = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
@@ -52,7 +66,9 @@ def _warped(source, translation, size_hw, *, vector, halo=3, pad=4, first=0, row
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("translation", TRANSLATIONS)
 @pytest.mark.parametrize("vector", [False, pytest.param(True, marks=needs_vector)])
-def test_a_warped_band_equals_exact_sampling_even_beyond_the_poles(source_hw, channels, translation, vector):
+def test_a_warped_band_equals_exact_sampling_even_beyond_the_poles(
+    source_hw: tuple[int, int], channels: int, translation: tuple[float, float, float], vector: bool
+) -> None:
     source = _picture(1, (*source_hw, channels))
     warped = _warped(source, translation, SIZE, vector=vector)
     exact = sample_panorama(source, pixel_from_ray(ray_grid(SIZE) * 1.3 @ ROTATION.T + translation, source_hw))
@@ -63,7 +79,7 @@ def test_a_warped_band_equals_exact_sampling_even_beyond_the_poles(source_hw, ch
 
 
 @pytest.mark.parametrize("translation", TRANSLATIONS)
-def test_interpolated_positions_miss_by_little(translation):
+def test_interpolated_positions_miss_by_little(translation: tuple[float, float, float]) -> None:
     height, width = 256, 16  # positions are interpolated along columns
     ramp = (np.arange(height)[:, None] % 32 * 4 + np.abs(np.arange(512) % 64 - 32) * 3).astype(np.uint8)[..., None]
     warped = _warped(ramp, translation, (height, width), vector=HAS_VECTOR)
@@ -76,7 +92,9 @@ def test_interpolated_positions_miss_by_little(translation):
 @pytest.mark.parametrize(
     ("features", "lanes"), [("", 0), ("+sse2", 0), ("+ssse3,-avx2", 1), ("+avx2, +ssse3", 2), ("+avx512bw,+avx2", 4)]
 )
-def test_instructions_that_numba_must_not_use_are_left_unused(features, lanes, monkeypatch):
+def test_instructions_that_numba_must_not_use_are_left_unused(
+    features: str, lanes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """NUMBA_CPU_NAME=generic once ended the process: the instructions of the processor could not be compiled."""
     monkeypatch.setattr(numba.config, "CPU_FEATURES", features)
     assert _lanes_of_this_machine() == lanes
@@ -85,7 +103,7 @@ def test_instructions_that_numba_must_not_use_are_left_unused(features, lanes, m
 @needs_vector
 @pytest.mark.kernel("sweep.numba.kernels_lookup", "sweep.numba.x86.kernels_vector")
 @pytest.mark.parametrize("channels", [1, 3])
-def test_vector_instructions_give_what_loops_give(channels):
+def test_vector_instructions_give_what_loops_give(channels: int) -> None:
     source = _picture(2, (64, 128, channels))
     loops = _warped(source, TRANSLATIONS[1], (48, 100), vector=False, first=5, rows=8)
     instructions = _warped(source, TRANSLATIONS[1], (48, 100), vector=True, first=5, rows=8)
@@ -95,7 +113,7 @@ def test_vector_instructions_give_what_loops_give(channels):
 
 @needs_vector
 @pytest.mark.kernel("sweep.numba.kernels_lookup", "sweep.numba.x86.kernels_vector")
-def test_differences_added_while_sampling_are_those_of_what_is_sampled():
+def test_differences_added_while_sampling_are_those_of_what_is_sampled() -> None:
     reference, source = _picture(4, (3, 56, 72)), _picture(5, (64, 128, 3))
     warped = _warped(source, TRANSLATIONS[1], (48, 64), vector=True, first=5, rows=8)
     expected = np.zeros(warped.shape[1:], np.uint16)
@@ -107,7 +125,7 @@ def test_differences_added_while_sampling_are_those_of_what_is_sampled():
     assert added[:, 4:-4].tolist() == whole.tolist()
 
 
-def test_packed_patches_hold_the_four_neighbours_over_seam_and_poles():
+def test_packed_patches_hold_the_four_neighbours_over_seam_and_poles() -> None:
     source = _picture(2, (*SIZE, 3))
     packed, colors = pack_plane(source[..., 1]), pack_colors(source)
     assert packed.shape == colors.shape == (SIZE[0] + 1, SIZE[1] + 2)
@@ -121,7 +139,7 @@ def test_packed_patches_hold_the_four_neighbours_over_seam_and_poles():
 @pytest.mark.kernel("sweep.numba.kernels_census")
 @pytest.mark.parametrize("side", [3, 7, 15])
 @pytest.mark.parametrize("width", [20, 64, 100])
-def test_census_by_vector_instructions_counts_what_loops_count(side, width):
+def test_census_by_vector_instructions_counts_what_loops_count(side: int, width: int) -> None:
     pad = 40
     reference, warped = _picture(3, (side + 2, width + 2 * pad)) // 16, _picture(4, (side, width + 2 * pad)) // 16
     offsets = np.rint(np.linspace(-30, 30, side)).astype(np.int64)

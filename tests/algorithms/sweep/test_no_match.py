@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
 from pano_mvs.algorithms.sweep.no_match import is_bare
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
+from pano_mvs.geometry import Rigid3
+from pano_mvs.scene import RangeMap
 from pano_mvs.testing.room import capture_poses, default_room, render
 from pano_mvs.testing.scenes import courtyard
 
@@ -15,13 +21,15 @@ SIZE = 96, 192
 
 
 @pytest.fixture(scope="module")
-def outdoors():
+def outdoors() -> tuple[list[NDArray[np.uint8]], tuple[Rigid3, ...], NDArray[np.float32]]:
     scene = courtyard(seed=3, views=3)
     views = [scene.view(idx, SIZE) for idx in range(3)]
     return [picture for picture, _ in views], scene.poses, views[0][1]
 
 
-def swept(pictures, poses, limits, **settings):
+def swept(
+    pictures: Sequence[NDArray[np.uint8]], poses: Sequence[Rigid3], limits: tuple[float, float], **settings: Any
+) -> RangeMap:
     relative = [pose @ poses[0].inverse() for pose in poses[1:]]
     return sweep_range(
         pictures[0], pictures[1:], relative, near=limits[0], far=limits[1],
@@ -29,14 +37,18 @@ def swept(pictures, poses, limits, **settings):
     )  # fmt: skip
 
 
-def test_limits_outdoors_reach_as_far_as_the_pictures_can_tell(outdoors):
+def test_limits_outdoors_reach_as_far_as_the_pictures_can_tell(
+    outdoors: tuple[list[NDArray[np.uint8]], list[Rigid3], NDArray[np.float32]],
+) -> None:
     pictures, poses, truth = outdoors
     near, far = limits_by_sweeping(pictures, poses, masks=[np.ones(SIZE, np.bool_)] * 3)
     assert 0.3 * np.nanmin(truth) < near < np.nanquantile(truth, 0.02)
     assert far > np.nanmax(truth)
 
 
-def test_the_sky_is_invalid_and_the_court_is_not(outdoors):
+def test_the_sky_is_invalid_and_the_court_is_not(
+    outdoors: tuple[list[NDArray[np.uint8]], list[Rigid3], NDArray[np.float32]],
+) -> None:
     pictures, poses, truth = outdoors
     limits = limits_by_sweeping(pictures, poses, masks=[np.ones(SIZE, np.bool_)] * 3)
     found, kept = swept(pictures, poses, limits), swept(pictures, poses, limits, no_match="keep")
@@ -50,7 +62,7 @@ def test_the_sky_is_invalid_and_the_court_is_not(outdoors):
     assert np.isfinite(found.range[right]).mean() > 0.995
 
 
-def test_no_wall_is_lost_indoors():
+def test_no_wall_is_lost_indoors() -> None:
     poses = capture_poses(3, seed=2)
     views = [render(default_room(2, "weak"), pose, SIZE) for pose in poses]
     pictures = [picture for picture, _ in views]
@@ -58,7 +70,7 @@ def test_no_wall_is_lost_indoors():
     assert found.valid.mean() > 0.999
 
 
-def test_bare_pixels_at_a_limit_are_invalid_and_textured_ones_are_not():
+def test_bare_pixels_at_a_limit_are_invalid_and_textured_ones_are_not() -> None:
     """All planes cost the same on what is bare: the first of equals wins, by nothing but its place."""
     plain, pictures = np.full((32, 64, 3), 90, np.uint8), np.full((2, 32, 64, 3), 90, np.uint8)
     pictures[0, :, :20] = np.random.default_rng(0).integers(0, 256, (32, 20, 3))
@@ -69,7 +81,9 @@ def test_bare_pixels_at_a_limit_are_invalid_and_textured_ones_are_not():
     assert (found.valid == ~bare).all()
 
 
-def test_a_plane_that_can_be_told_from_infinity_keeps_what_has_texture(outdoors):
+def test_a_plane_that_can_be_told_from_infinity_keeps_what_has_texture(
+    outdoors: tuple[list[NDArray[np.uint8]], list[Rigid3], NDArray[np.float32]],
+) -> None:
     pictures, poses, truth = outdoors
     near = swept(pictures, poses, (1.0, 20.0))
     beyond = truth > 30

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import itertools
-from typing import get_args, get_type_hints
+from collections.abc import Callable, Sequence
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.combination import parallax_weights
 from pano_mvs.algorithms.sweep.costs.census_gradient import census_weight
@@ -23,8 +25,11 @@ from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.algorithms.sweep.windows import column_offsets
 from pano_mvs.algorithms.sweep.winner import Winners, confidence, subplane_offset
 from pano_mvs.geometry import Rigid3, pad_panorama, ray_grid, rotate_panorama, rotation_from_rotvec
+from pano_mvs.scene import RangeMap
 from pano_mvs.testing.room import capture_poses, default_room, render
 from tests.oracles import sweep as oracle
+
+Capture = tuple[list[NDArray[np.uint8]], list[Rigid3], NDArray[np.float32]]
 
 SIZE = 16, 32
 NAMES = {"cost": tuple(BUILTIN)} | {
@@ -33,7 +38,7 @@ NAMES = {"cost": tuple(BUILTIN)} | {
 
 
 @pytest.fixture(scope="module")
-def capture():
+def capture() -> Capture:
     poses = capture_poses(4, seed=11)
     views = [render(default_room(4), pose, (64, 128)) for pose in poses]
     pictures = [np.clip(picture + np.random.default_rng(3).normal(0, 1, picture.shape), 0, 255).astype(np.uint8)
@@ -41,7 +46,12 @@ def capture():
     return pictures, [pose @ poses[0].inverse() for pose in poses[1:]], views[0][1]
 
 
-def swept(capture, sources=None, poses=None, **settings):
+def swept(
+    capture: tuple[list[NDArray[np.uint8]], list[Rigid3], Any],
+    sources: Sequence[NDArray[np.uint8]] | None = None,
+    poses: Sequence[Rigid3] | None = None,
+    **settings: Any,
+) -> RangeMap:
     pictures, own_poses, _ = capture
     return sweep_range(
         pictures[0], sources or pictures[1:], poses or own_poses, near=0.6, far=6.0,
@@ -49,13 +59,13 @@ def swept(capture, sources=None, poses=None, **settings):
     )  # fmt: skip
 
 
-def good_share(result, truth, ratio=1.07):
+def good_share(result: RangeMap, truth: NDArray[np.float32], ratio: float = 1.07) -> float:
     return float((np.maximum(result.range / truth, truth / result.range) < ratio).mean())
 
 
 @pytest.mark.kernel("sweep.numba.kernels_zncc")
 @pytest.mark.parametrize("first", [0, 6, 13])
-def test_correlation_by_running_sums_equals_the_definition(first):
+def test_correlation_by_running_sums_equals_the_definition(first: int) -> None:
     rng = np.random.default_rng(first)
     reference, warped = rng.integers(0, 256, (2, *SIZE), dtype=np.uint8)
     warped[4:9] = reference[4:9] // 2 + 40
@@ -81,7 +91,7 @@ def test_correlation_by_running_sums_equals_the_definition(first):
 
 @pytest.mark.kernel("sweep.numba.kernels_gradient")
 @pytest.mark.parametrize("row", [0, 7, 15])
-def test_differences_of_colours_and_gradients_equal_the_definition(row):
+def test_differences_of_colours_and_gradients_equal_the_definition(row: int) -> None:
     rng = np.random.default_rng(row)
     reference = rng.integers(0, 256, (*SIZE, 3), dtype=np.uint8)
     warped = np.clip(reference + rng.integers(-9, 10, reference.shape), 0, 255).astype(np.uint8)
@@ -97,7 +107,7 @@ def test_differences_of_colours_and_gradients_equal_the_definition(row):
 
 
 @pytest.mark.kernel("sweep.numba.kernels_gradient")
-def test_census_beside_grey_levels_equals_the_definition():
+def test_census_beside_grey_levels_equals_the_definition() -> None:
     rng = np.random.default_rng(5)
     reference = rng.integers(0, 256, SIZE, dtype=np.uint8)
     warped = np.clip(reference + rng.integers(-9, 10, SIZE), 0, 255).astype(np.uint8)
@@ -117,7 +127,7 @@ def test_census_beside_grey_levels_equals_the_definition():
 
 
 @pytest.mark.parametrize("window", [3, 5, 7, 9, 15])
-def test_census_counts_four_times_as_much_as_grey_levels_at_their_worst(window):
+def test_census_counts_four_times_as_much_as_grey_levels_at_their_worst(window: int) -> None:
     settings = SweepSettings(cost="census_gradient", window=window)
     census = census_weight(window // 2) * (window**2 - 1)
     assert census == pytest.approx(0.8 * settings.worst_cost, rel=0.1)
@@ -125,14 +135,14 @@ def test_census_counts_four_times_as_much_as_grey_levels_at_their_worst(window):
 
 @pytest.mark.parametrize("cost", NAMES["cost"])
 @pytest.mark.parametrize("aggregation", NAMES["aggregation"])
-def test_every_cost_recovers_the_room(capture, cost, aggregation):
+def test_every_cost_recovers_the_room(capture: Capture, cost: str, aggregation: str) -> None:
     assert good_share(swept(capture, cost=cost, aggregation=aggregation), capture[2]) > 0.75
 
 
 @pytest.mark.parametrize(
     ("cost", "exposure"), [("census", False), ("zncc", False), ("sad_gradient", True), ("census_gradient", True)]
 )
-def test_no_cost_minds_another_exposure(capture, cost, exposure):
+def test_no_cost_minds_another_exposure(capture: Capture, cost: str, exposure: bool) -> None:
     pictures, _, truth = capture
     others = [np.clip(np.rint(0.8 * picture + 10), 0, 255).astype(np.uint8) for picture in pictures[1:]]
     usual, changed = swept(capture, cost=cost), swept(capture, sources=others, cost=cost, exposure=exposure)
@@ -141,7 +151,7 @@ def test_no_cost_minds_another_exposure(capture, cost, exposure):
 
 
 @pytest.mark.slow
-def test_all_names_go_together(capture):
+def test_all_names_go_together(capture: Capture) -> None:
     tiny = [picture[::4, ::4] for picture in capture[0]], capture[1], None
     for names in itertools.product(*NAMES.values()):
         settings = dict(zip(NAMES, names, strict=True))
@@ -151,7 +161,7 @@ def test_all_names_go_together(capture):
             swept(tiny, planes=5, **settings).check()
 
 
-def test_a_source_weighs_by_the_parallax_it_sees():
+def test_a_source_weighs_by_the_parallax_it_sees() -> None:
     centers = np.array([[1.0, 0, 0], [0, 0, 2.0], [0.3, -0.4, 0]])
     turns = [rotation_from_rotvec(axis) for axis in ((0.2, 1.5, 0), (2.0, 0, -1), (0, 0, 0))]
     poses = [Rigid3.from_center(turn, center) for turn, center in zip(turns, centers, strict=True)]
@@ -167,21 +177,21 @@ def test_a_source_weighs_by_the_parallax_it_sees():
     np.testing.assert_allclose(weights, np.array(seen) / np.sum(seen, axis=0), atol=0.02)
 
 
-def test_a_source_whose_epipole_lies_in_the_pixel_does_not_decide():
+def test_a_source_whose_epipole_lies_in_the_pixel_does_not_decide() -> None:
     """It matches equally well at every range, and its cost, the cheapest, would count at all of them."""
     weights = parallax_weights((64, 128), [Rigid3.from_center(np.eye(3), c) for c in ((0, 0, 1.0), (0.7, 0, 0))])
     assert weights[0, 31:33, 63:65].max() < 0.05
     assert weights[1, 31:33, 63:65].min() > 0.95
 
 
-def test_sources_turned_first_give_the_same_but_for_resampling(capture):
+def test_sources_turned_first_give_the_same_but_for_resampling(capture: Capture) -> None:
     plain, turned = swept(capture), swept(capture, derotate=True)
     assert good_share(turned, plain.range) > 0.85
     assert good_share(turned, capture[2]) > good_share(plain, capture[2]) - 0.05
     assert np.median(np.abs(turned.range / plain.range - 1)) < 0.01
 
 
-def test_sources_that_are_not_turned_give_the_very_same_either_way(capture):
+def test_sources_that_are_not_turned_give_the_very_same_either_way(capture: Capture) -> None:
     pictures, poses, _ = capture
     upright = [rotate_panorama(picture, pose.rotation.T) for picture, pose in zip(pictures[1:], poses, strict=True)]
     shifts = [Rigid3(np.eye(3), pose.rotation.T @ pose.translation) for pose in poses]
@@ -189,7 +199,9 @@ def test_sources_that_are_not_turned_give_the_very_same_either_way(capture):
     assert given.range.tobytes() == swept(capture, derotate=True).range.tobytes()
 
 
-def _winners_of_curve(curve, planes=41):
+def _winners_of_curve(
+    curve: Callable[[NDArray[np.float64]], NDArray[np.float64]], planes: int = 41
+) -> tuple[Winners, NDArray[np.float64]]:
     """Return the winners of one row of pixels with a minimum at 20 plus each offset."""
     offsets = np.linspace(-0.49, 0.49, 15)
     volume = curve(np.arange(planes)[None, :] - 20 - offsets[:, None])
@@ -200,15 +212,15 @@ def _winners_of_curve(curve, planes=41):
 
 
 @pytest.mark.parametrize(("shape", "curve"), [("parabola", np.square), ("vfit", np.abs)])
-def test_a_fit_finds_the_minimum_of_its_own_curve(shape, curve):
+def test_a_fit_finds_the_minimum_of_its_own_curve(shape: Any, curve: Callable[..., Any]) -> None:
     winners, offsets = _winners_of_curve(lambda x: 3 + 5 * curve(x))
     np.testing.assert_allclose(winners.plane[0] - 20 + subplane_offset(winners, planes=41, shape=shape)[0], offsets,
                                atol=1e-5)  # fmt: skip
 
 
 @pytest.mark.parametrize("measure", NAMES["confidence"])
-def test_a_sharp_and_lonely_minimum_is_surer(measure):
-    def one(cost, beside, rival):
+def test_a_sharp_and_lonely_minimum_is_surer(measure: Any) -> None:
+    def one(cost: float, beside: float, rival: float) -> int:
         values = [np.full((1, 1), value, np.float32) for value in (cost, beside, beside, rival)]
         return int(confidence(Winners(np.ones((1, 1), np.int32), *values), measure=measure)[0, 0])
 

@@ -13,7 +13,7 @@ LIMITS = [(128, 0.02), (160, 0.005), (512, 0.1), (4096, 4.0), (4096, 8.0), (64, 
 
 
 @pytest.mark.parametrize(("rows", "limit"), LIMITS)
-def test_parts_cover_all_rows_once_and_know_what_is_around_them(rows, limit):
+def test_parts_cover_all_rows_once_and_know_what_is_around_them(rows: int, limit: float) -> None:
     settings = SweepSettings(volume_limit_gb=limit)
     parts = volume_parts((rows, 2 * rows), settings)
     assert [row for part in parts for row in range(part.rows.start, part.rows.stop)] == list(range(rows))
@@ -24,7 +24,7 @@ def test_parts_cover_all_rows_once_and_know_what_is_around_them(rows, limit):
         assert volume <= limit * 1e9 or part.rows.stop - part.rows.start <= 32
 
 
-def test_matching_in_parts_finds_what_matching_at_once_does():
+def test_matching_in_parts_finds_what_matching_at_once_does() -> None:
     views_at = capture_poses(2, seed=5)
     pictures = [render(default_room(1), pose, (256, 512))[0] for pose in views_at]
     poses = [views_at[1] @ views_at[0].inverse()]

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numba
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pixel_solid_angle, roll_panorama, rotate_panorama, rotation_from_rotvec
+from pano_mvs.scene import RangeMap
+from pano_mvs.testing.paint import Texture
 from pano_mvs.testing.room import capture_poses, default_room, render
 
 NEAR, FAR = 0.5, 6.0
@@ -22,7 +27,9 @@ PAPER = SweepSettings(
 
 
 @functools.cache
-def _capture(height: int, count: int = 3, texture: str = "strong"):
+def _capture(
+    height: int, count: int = 3, texture: Texture = "strong"
+) -> tuple[tuple[NDArray[np.uint8], ...], tuple[Rigid3, ...], NDArray[np.float32]]:
     """Return pictures, source_from_reference and the true range of view 0 of a room."""
     poses = capture_poses(count, seed=5)
     views = [render(default_room(1, texture), pose, (height, 2 * height)) for pose in poses]
@@ -30,12 +37,14 @@ def _capture(height: int, count: int = 3, texture: str = "strong"):
     return tuple(picture for picture, _ in views), relative, views[0][1]
 
 
-def _sweep(pictures, poses, settings=FAST, **options):
+def _sweep(
+    pictures: Sequence[NDArray[np.uint8]], poses: Sequence[Rigid3], settings: SweepSettings = FAST, **options: Any
+) -> RangeMap:
     limits = {"near": NEAR, "far": FAR} | options
     return sweep_range(pictures[0], pictures[1:], poses, settings=settings, **limits)
 
 
-def _share_within(result, truth, ratio):
+def _share_within(result: RangeMap, truth: NDArray[np.float32], ratio: float) -> float:
     weight = np.broadcast_to(pixel_solid_angle(truth.shape)[:, None], truth.shape)
     with np.errstate(invalid="ignore"):
         good = np.maximum(result.range / truth, truth / result.range) < ratio
@@ -60,7 +69,7 @@ def _share_within(result, truth, ratio):
         (PAPER.replace(selection="parabola", combination="best_half", spherical_window=True, exposure=False), True, 24),
     ],
 )
-def test_the_compiled_sweep_equals_the_readable_one(settings, masked, source_height):
+def test_the_compiled_sweep_equals_the_readable_one(settings: SweepSettings, masked: bool, source_height: int) -> None:
     pictures, poses, _ = _capture(32, 4)
     others, _, _ = _capture(source_height, 4)
     pictures = (pictures[0], others[1], *pictures[2:])
@@ -86,7 +95,7 @@ def test_the_compiled_sweep_equals_the_readable_one(settings, masked, source_hei
     "sweep.numba.kernels_winner",
 )
 @pytest.mark.parametrize("changes", [{}, {"cost": "sad", "aggregation": "box"}])
-def test_a_tiny_sweep_equals_the_readable_one(changes):
+def test_a_tiny_sweep_equals_the_readable_one(changes: dict[str, str]) -> None:
     """Small enough to run as plain Python too."""
     settings = SweepSettings(planes=6, window=3, support=3).replace(**changes)
     pictures, poses, _ = _capture(16)
@@ -96,14 +105,16 @@ def test_a_tiny_sweep_equals_the_readable_one(changes):
     assert np.isfinite(fast.range).mean() > 0.7
 
 
-def _position(ranges, settings):
-    scale = {"inverse": lambda r: 1 / r, "log": np.log, "uniform": lambda r: r}[settings.spacing]
-    return (scale(ranges) - scale(NEAR)) / (scale(FAR) - scale(NEAR)) * (settings.planes - 1)
+def _position(ranges: NDArray[np.float32], settings: SweepSettings) -> NDArray[np.float64]:
+    scales: dict[str, Callable[[Any], Any]] = {"inverse": lambda r: 1 / r, "log": np.log, "uniform": lambda r: r}
+    scale = scales[settings.spacing]
+    result: NDArray[np.float64] = (scale(ranges) - scale(NEAR)) / (scale(FAR) - scale(NEAR)) * (settings.planes - 1)
+    return result
 
 
 @pytest.mark.parametrize("settings", [FAST, PAPER, FAST.replace(aggregation="box")])
 @pytest.mark.parametrize("columns", [1, 17, 64])
-def test_rolling_all_pictures_rolls_the_range(settings, columns):
+def test_rolling_all_pictures_rolls_the_range(settings: SweepSettings, columns: int) -> None:
     pictures, poses, _ = _capture(64)
     turn = Rigid3(roll_panorama(pictures[0], columns)[1], np.zeros(3))
     rolled = tuple(np.roll(picture, columns, axis=1) for picture in pictures)
@@ -114,7 +125,7 @@ def test_rolling_all_pictures_rolls_the_range(settings, columns):
     assert (difference[:, :4] > 1e-3).mean() < 0.03
 
 
-def test_turning_a_source_about_its_centre_changes_little():
+def test_turning_a_source_about_its_centre_changes_little() -> None:
     pictures, poses, truth = _capture(64)
     turn = rotation_from_rotvec((0.9, 0.5, -0.3))
     turned = (pictures[0], rotate_panorama(pictures[1], turn), pictures[2])
@@ -123,14 +134,14 @@ def test_turning_a_source_about_its_centre_changes_little():
     assert _share_within(result, truth, 1.1) > 0.95 * _share_within(_sweep(pictures, poses), truth, 1.1)
 
 
-def test_a_world_twice_as_large_has_twice_the_range():
+def test_a_world_twice_as_large_has_twice_the_range() -> None:
     pictures, poses, _ = _capture(32)
     larger = [Rigid3(pose.rotation, 2 * pose.translation) for pose in poses]
     result = _sweep(pictures, larger, near=2 * NEAR, far=2 * FAR)
     np.testing.assert_allclose(result.range, 2 * _sweep(pictures, poses).range, rtol=1e-5)
 
 
-def test_the_number_of_threads_changes_no_byte():
+def test_the_number_of_threads_changes_no_byte() -> None:
     pictures, poses, _ = _capture(64)
     threads = numba.get_num_threads()
     results = []
@@ -143,7 +154,7 @@ def test_the_number_of_threads_changes_no_byte():
         assert one.confidence.tobytes() == many.confidence.tobytes()
 
 
-def test_the_room_is_recovered_up_to_the_poles_and_the_seam():
+def test_the_room_is_recovered_up_to_the_poles_and_the_seam() -> None:
     pictures, poses, truth = _capture(128, 4)
     result = _sweep(pictures, poses, SweepSettings(planes=64))
     result.check()
@@ -157,7 +168,7 @@ def test_the_room_is_recovered_up_to_the_poles_and_the_seam():
     assert result.confidence.max() <= 127
 
 
-def test_census_and_paths_beat_the_paper_on_plain_walls():
+def test_census_and_paths_beat_the_paper_on_plain_walls() -> None:
     pictures, poses, truth = _capture(64, 4, "weak")
     paper = _sweep(pictures, poses, PAPER.replace(planes=64))
     ours = _sweep(pictures, poses, SweepSettings(planes=64))
@@ -165,7 +176,7 @@ def test_census_and_paths_beat_the_paper_on_plain_walls():
 
 
 @pytest.mark.parametrize("settings", [SweepSettings(planes=64), SweepSettings(planes=64, aggregation="box")])
-def test_the_surer_half_is_much_the_better_one(settings):
+def test_the_surer_half_is_much_the_better_one(settings: SweepSettings) -> None:
     pictures, poses, truth = _capture(64, 4, "weak")
     result = _sweep(pictures, poses, settings)
     error = np.abs(np.log(result.range / truth))
@@ -173,7 +184,7 @@ def test_the_surer_half_is_much_the_better_one(settings):
     assert error[sure].mean() < 0.5 * error[~sure].mean()
 
 
-def test_nothing_is_sure_where_there_is_nothing_to_see():
+def test_nothing_is_sure_where_there_is_nothing_to_see() -> None:
     plain = np.full((32, 64, 3), 128, np.uint8)
     pose = Rigid3(np.eye(3), np.array([0.3, 0, 0]))
     assert _sweep((plain, plain), [pose], FAST.replace(no_match="keep")).confidence.max() == 64
@@ -181,14 +192,14 @@ def test_nothing_is_sure_where_there_is_nothing_to_see():
 
 
 @pytest.mark.parametrize("backend", ["numba", "numpy"])
-def test_masked_pixels_have_no_range_and_no_vote(backend):
+def test_masked_pixels_have_no_range_and_no_vote(backend: str) -> None:
     pictures, poses, _ = _capture(32)
     spoilt = tuple(picture.copy() for picture in pictures)
     mask = np.ones((32, 64), np.bool_)
     mask[24:] = False
     for picture in spoilt:
         picture[24:] = np.random.default_rng(0).integers(0, 255, picture[24:].shape)
-    masks = {"reference_mask": mask, "source_masks": [mask, None]}
+    masks: dict[str, Any] = {"reference_mask": mask, "source_masks": [mask, None]}
     result = _sweep(spoilt, poses, backend=backend, **masks)
     result.check()
     assert np.isnan(result.range[24:]).all()
@@ -200,7 +211,7 @@ def test_masked_pixels_have_no_range_and_no_vote(backend):
     np.testing.assert_allclose(only_second.range, alone.range, rtol=1e-5)
 
 
-def test_another_exposure_does_not_ruin_differences():
+def test_another_exposure_does_not_ruin_differences() -> None:
     pictures, poses, truth = _capture(64)
     brighter = tuple(
         np.clip(np.rint(picture * (1.12, 1.1, 1.15) + 6), 0, 255).astype(np.uint8) for picture in pictures[1:]
@@ -215,9 +226,9 @@ def test_another_exposure_does_not_ruin_differences():
 
 @pytest.mark.parametrize("size_hw", [(16, 32), (18, 36), (50, 100)])
 @pytest.mark.parametrize("settings", [SweepSettings(planes=3, window=15, support=15), FAST, PAPER])
-def test_small_pictures_and_large_windows_work(size_hw, settings):
+def test_small_pictures_and_large_windows_work(size_hw: tuple[int, int], settings: SweepSettings) -> None:
     rng = np.random.default_rng(0)
-    pictures = rng.integers(0, 256, (2, *size_hw, 3), dtype=np.uint8)
+    pictures = list(rng.integers(0, 256, (2, *size_hw, 3), dtype=np.uint8))
     result = _sweep(pictures, [Rigid3(np.eye(3), np.array([0.3, 0.1, 0]))], settings.replace(no_match="keep"))
     result.check()
     assert np.isfinite(result.range).all()
@@ -225,7 +236,7 @@ def test_small_pictures_and_large_windows_work(size_hw, settings):
     assert result.range.max() <= np.float32(FAR)
 
 
-def test_calls_that_cannot_work_say_why():
+def test_calls_that_cannot_work_say_why() -> None:
     pictures, poses, _ = _capture(32)
     with pytest.raises(UsageError, match="0 < near < far"):
         _sweep(pictures, poses, near=2.0, far=1.0)
@@ -255,6 +266,6 @@ def test_calls_that_cannot_work_say_why():
         ({"prefilter_diameter": -1}, "prefilter_diameter"),
     ],
 )
-def test_settings_that_no_sweep_can_use_are_refused(change, what):
+def test_settings_that_no_sweep_can_use_are_refused(change: dict[str, Any], what: str) -> None:
     with pytest.raises(UsageError, match=what):
         SweepSettings(**change)

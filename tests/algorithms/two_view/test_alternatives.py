@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view import verify_pair
 from pano_mvs.algorithms.two_view.alternatives import distinct_geometries
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
+from pano_mvs.scene import TwoView
 from tests.algorithms.poses.synthetic_capture import features_from_bearings, noisy_bearings
 from tests.algorithms.two_view.test_solvers import wall_seen_twice
 from tests.algorithms.two_view.test_two_view import HARD, draw, errors_deg, rng_of
@@ -15,7 +19,9 @@ from tests.algorithms.two_view.test_two_view import HARD, draw, errors_deg, rng_
 TILE = 0.6
 
 
-def tiled_hall(name, *, tiles=260, others=110, wrong=60, noise_deg=0.04):
+def tiled_hall(
+    name: str, *, tiles: int = 260, others: int = 110, wrong: int = 60, noise_deg: float = 0.04
+) -> tuple[NDArray[np.float64], NDArray[np.float64], Rigid3, Rigid3]:
     """A floor whose matches are all shifted by one tile, a smaller true structure, and wrong matches.
 
     Returns rays of both pictures, n matching n, the true pose, and the one that the floor feigns: the same rotation,
@@ -30,29 +36,31 @@ def tiled_hall(name, *, tiles=260, others=110, wrong=60, noise_deg=0.04):
     shift = np.array([TILE, 0.0, 0.0])
     p = [noisy_bearings(rng, Rigid3.identity(), points, noise_deg=noise_deg) for points in (floor, furniture)]
     q = [noisy_bearings(rng, pose, points, noise_deg=noise_deg) for points in (floor + shift, furniture)]
-    rays = [np.concatenate([*seen, noise / np.linalg.norm(noise, axis=1, keepdims=True)])
-            for seen, noise in zip((p, q), elsewhere, strict=True)]  # fmt: skip
+    first, second = (
+        np.concatenate([*seen, noise / np.linalg.norm(noise, axis=1, keepdims=True)])
+        for seen, noise in zip((p, q), elsewhere, strict=True)
+    )
     feigned = Rigid3(pose.rotation, pose.apply(shift[None])[0])
-    return *rays, pose, feigned
+    return first, second, pose, feigned
 
 
-def all_matches(count):
+def all_matches(count: int) -> NDArray[np.int32]:
     return np.stack([np.arange(count)] * 2, axis=1).astype(np.int32)
 
 
-def verified(p, q, seed="alternatives", **settings):
+def verified(p: NDArray[np.float64], q: NDArray[np.float64], seed: str = "alternatives", **settings: Any) -> TwoView:
     return verify_pair(
         features_from_bearings(p), features_from_bearings(q), all_matches(len(p)), rng=rng_of(seed), **settings
     )
 
 
-def nearest_deg(view, pose):
+def nearest_deg(view: TwoView, pose: Rigid3) -> tuple[float, int]:
     """How far the nearest of all geometries is from a pose, and how many matches support it."""
     return min((max(errors_deg(one.rotation, one.direction, pose)), len(one)) for one in (view, *view.alternatives))
 
 
 @pytest.mark.parametrize("trial", range(4))
-def test_the_truth_comes_out_beside_what_repeated_tiles_feign(trial):
+def test_the_truth_comes_out_beside_what_repeated_tiles_feign(trial: int) -> None:
     p, q, pose, feigned = tiled_hall(f"tiled {trial}")
     view = verified(p, q)
     view.check()
@@ -68,7 +76,7 @@ def test_the_truth_comes_out_beside_what_repeated_tiles_feign(trial):
         assert (one.residuals_rad < np.deg2rad(0.2)).all()
 
 
-def test_a_minority_with_another_rotation_is_found_too():
+def test_a_minority_with_another_rotation_is_found_too() -> None:
     """Two rooms alike: a third of the matches tell of another pose altogether."""
     rng = rng_of("twin rooms")
     p, q, _, pose = draw(rng, (0.4, 0.1, 0.2), (0.2, 0.3, 0.1), points=300)
@@ -80,7 +88,7 @@ def test_a_minority_with_another_rotation_is_found_too():
 
 
 @pytest.mark.parametrize("name", HARD)
-def test_without_repetition_there_is_no_alternative(name):
+def test_without_repetition_there_is_no_alternative(name: str) -> None:
     for trial in range(3):
         rng = rng_of(f"{name} {trial}")
         p, q, matches, _ = draw(rng, *HARD[name], outliers=0.4)
@@ -89,7 +97,7 @@ def test_without_repetition_there_is_no_alternative(name):
         assert not view.alternatives
 
 
-def test_a_wall_alone_has_no_alternative():
+def test_a_wall_alone_has_no_alternative() -> None:
     """The matches of a plane fit two poses; but the second explains no match that the first does not."""
     p, q, matches, _ = wall_seen_twice(0)
     view = verify_pair(features_from_bearings(p), features_from_bearings(q), matches, rng=rng_of("wall alone"))
@@ -97,7 +105,7 @@ def test_a_wall_alone_has_no_alternative():
     assert not view.alternatives
 
 
-def test_the_reversed_pair_has_the_inverse_geometries():
+def test_the_reversed_pair_has_the_inverse_geometries() -> None:
     p, q, pose, feigned = tiled_hall("reversed")
     there, back = verified(p, q), verified(q, p)
     for expected in (pose, feigned):
@@ -107,7 +115,7 @@ def test_the_reversed_pair_has_the_inverse_geometries():
     assert len(there.alternatives) == len(back.alternatives)
 
 
-def test_the_order_of_matches_does_not_matter():
+def test_the_order_of_matches_does_not_matter() -> None:
     p, q, pose, feigned = tiled_hall("order")
     order = rng_of("shuffle").permutation(len(p))
     for view in (verified(p, q), verified(p[order], q[order])):
@@ -115,7 +123,7 @@ def test_the_order_of_matches_does_not_matter():
         assert nearest_deg(view, feigned)[0] < 0.5
 
 
-def test_same_seed_gives_the_same_alternatives():
+def test_same_seed_gives_the_same_alternatives() -> None:
     p, q, _, _ = tiled_hall("repeated")
     views = [verified(p, q) for _ in range(2)]
     assert len(views[0].alternatives) == len(views[1].alternatives) > 0
@@ -124,7 +132,7 @@ def test_same_seed_gives_the_same_alternatives():
         assert one.matches_idx.tobytes() == other.matches_idx.tobytes()
 
 
-def test_no_alternatives_on_request_nor_without_refinement():
+def test_no_alternatives_on_request_nor_without_refinement() -> None:
     p, q, _, _ = tiled_hall("settings")
     assert verified(p, q).alternatives
     assert not verified(p, q, max_alternatives=0).alternatives
@@ -134,7 +142,7 @@ def test_no_alternatives_on_request_nor_without_refinement():
 
 
 @pytest.mark.parametrize("trial", range(3))
-def test_what_many_wrong_matches_agree_on_by_chance_is_no_alternative(trial):
+def test_what_many_wrong_matches_agree_on_by_chance_is_no_alternative(trial: int) -> None:
     """Of 1500 wrong matches between key points near the horizon a few dozen agree with some pose."""
     rng = rng_of(f"horizon {trial}")
     p, q, _, pose = draw(rng, (0.4, 0.1, 0.2), (0.0, 0.3, 0.0), points=120, outliers=0.0)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs, facing_pose, least_essentials
 from pano_mvs.algorithms.two_view.five_point import essentials_from_five
@@ -21,11 +24,14 @@ from tests.oracles.five_point import essentials_by_eigenvectors
 THRESHOLD_RAD = 0.0035
 
 
-def unit(vectors):
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+def unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    result: NDArray[np.float64] = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return result
 
 
-def paired(name, *, points=150, noise_deg=0.05):
+def paired(
+    name: str, *, points: int = 150, noise_deg: float = 0.05
+) -> tuple[NDArray[np.float64], NDArray[np.float64], Rigid3, np.random.Generator]:
     """Matched rays, a third of them wrong and some at the end so far away that they only turn; and the pose."""
     rng = rng_of(name)
     p, q, matches, pose = draw(rng, (0.4, -0.1, 0.3), (0.3, 1.0, -0.4), points=points, noise_deg=noise_deg)
@@ -37,7 +43,7 @@ def paired(name, *, points=150, noise_deg=0.05):
 
 @pytest.mark.kernel("two_view.kernels_five_point")
 @pytest.mark.parametrize("flat", [False, True])
-def test_five_point_kernel_finds_what_the_oracle_finds(flat):
+def test_five_point_kernel_finds_what_the_oracle_finds(flat: bool) -> None:
     p, q, _, _ = samples_of_five(rng_of(f"five kernel {flat}"), count=60, flat=flat)
     found, sample_idx = essentials_from_five(p, q)
     expected, expected_idx = essentials_by_eigenvectors(p, q)
@@ -51,14 +57,14 @@ def test_five_point_kernel_finds_what_the_oracle_finds(flat):
 
 
 @pytest.mark.kernel("two_view.kernels_five_point")
-def test_five_point_kernel_takes_any_memory_layout():
+def test_five_point_kernel_takes_any_memory_layout() -> None:
     p, q, _, _ = samples_of_five(rng_of("kernel layout"), count=4, flat=False)
     twisted = (np.asfortranarray(p), np.asfortranarray(q))
     np.testing.assert_array_equal(essentials_from_five(*twisted)[0], essentials_from_five(p, q)[0])
 
 
 @pytest.mark.kernel("two_view.kernels_agreement")
-def test_agreement_kernel_equals_the_oracle():
+def test_agreement_kernel_equals_the_oracle() -> None:
     p, q, pose, _ = paired("agreement")
     for candidate in (pose, Rigid3(pose.rotation, -pose.translation)):
         residuals, agreeing = agreement(candidate, p, q, THRESHOLD_RAD)
@@ -69,7 +75,7 @@ def test_agreement_kernel_equals_the_oracle():
 
 
 @pytest.mark.kernel("two_view.kernels_agreement")
-def test_facing_kernels_equal_the_oracle():
+def test_facing_kernels_equal_the_oracle() -> None:
     p, q, pose, rng = paired("facing kernels")
     poses = [pose, Rigid3(pose.rotation, -pose.translation), Rigid3(random_rotation(rng), pose.translation)]
     np.testing.assert_allclose(
@@ -85,7 +91,7 @@ def test_facing_kernels_equal_the_oracle():
 
 
 @pytest.mark.kernel("two_view.kernels_agreement")
-def test_ranking_kernel_keeps_the_order_of_plain_costs():
+def test_ranking_kernel_keeps_the_order_of_plain_costs() -> None:
     p, q, pose, rng = paired("ranking kernel", points=600)
     turns = [rotation_from_rotvec(scale * rng.normal(size=3)) for scale in np.geomspace(1e-4, 0.1, 40)]
     essentials = rng.permutation(np.array([skew(pose.translation) @ turn @ pose.rotation for turn in turns]))
@@ -102,12 +108,12 @@ def test_ranking_kernel_keeps_the_order_of_plain_costs():
 
 @pytest.mark.kernel("two_view.kernels_refinement")
 @pytest.mark.parametrize("iterations", [1, 4, 20])
-def test_refinement_kernel_takes_the_steps_of_the_oracle(iterations):
+def test_refinement_kernel_takes_the_steps_of_the_oracle(iterations: int) -> None:
     p, q, pose, rng = paired("refinement kernel", noise_deg=0.1)
     start = Rigid3(
         rotation_from_rotvec([0.01, -0.02, 0.01]) @ pose.rotation, unit(pose.translation + 0.05 * rng.normal(size=3))
     )
-    settings = {"scale_rad": 0.01, "max_iterations": iterations}
+    settings: dict[str, Any] = {"scale_rad": 0.01, "max_iterations": iterations}
     found, expected = refine_relative_pose(start, p, q, **settings), plain.refine_relative_pose(start, p, q, **settings)
     assert max(errors_deg(found.rotation, found.translation, expected)) < 1e-4
     np.testing.assert_allclose(found.rotation @ found.rotation.T, np.eye(3), atol=1e-12)
@@ -115,7 +121,7 @@ def test_refinement_kernel_takes_the_steps_of_the_oracle(iterations):
 
 
 @pytest.mark.kernel("two_view.kernels_refinement")
-def test_refinement_kernel_leaves_its_input_alone():
+def test_refinement_kernel_leaves_its_input_alone() -> None:
     p, q, pose, _ = paired("input")
     rotation, translation = pose.rotation.copy(), pose.translation.copy()
     refine_relative_pose(pose, p, q, scale_rad=0.01)
@@ -124,7 +130,7 @@ def test_refinement_kernel_leaves_its_input_alone():
 
 
 @pytest.mark.kernel("two_view.kernels_agreement")
-def test_kernel_costs_of_directions_are_those_of_plain_poses():
+def test_kernel_costs_of_directions_are_those_of_plain_poses() -> None:
     p, q, pose, rng = paired("directions kernel")
     directions, costs = voted_directions(pose.rotation, p, q, rng=rng, threshold_rad=THRESHOLD_RAD, count=30)
     both = [plain.facing_costs([Rigid3(pose.rotation, sign * d) for d in directions], p, q, THRESHOLD_RAD)
@@ -134,7 +140,7 @@ def test_kernel_costs_of_directions_are_those_of_plain_poses():
 
 
 @pytest.mark.kernel("two_view.kernels_agreement")
-def test_kernel_counts_chance_as_plain_numpy_does():
+def test_kernel_counts_chance_as_plain_numpy_does() -> None:
     p, q, pose, _ = paired("chance kernel")
     found = chance_of_pose(pose, p, q, rng=rng_of("pairs"), threshold_rad=0.02, draws=3000)
     pairs = rng_of("pairs").integers(len(p), size=(3000, 2))
@@ -146,7 +152,7 @@ def test_kernel_counts_chance_as_plain_numpy_does():
 
 
 @pytest.mark.kernel("two_view.kernels_agreement")
-def test_turning_kernel_passes_over_a_match_drawn_twice():
+def test_turning_kernel_passes_over_a_match_drawn_twice() -> None:
     """The same match twice determines no turn; and of two matches a few pairs of draws are such."""
     rng = rng_of("twice kernel")
     turn, p = random_rotation(rng), unit(rng.normal(size=(2, 3)))

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view import estimate_two_view, verify_pair
 from pano_mvs.algorithms.two_view.cheirality import facing_costs, facing_pose
 from pano_mvs.algorithms.two_view.essential import sampson_angles
 from pano_mvs.algorithms.two_view.five_point import essentials_from_five
-from pano_mvs.algorithms.two_view.hypotheses import SOLVERS, draw_samples, samples_needed
+from pano_mvs.algorithms.two_view.hypotheses import SOLVERS, Solver, draw_samples, samples_needed
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, ranges_from_bearings, skew
 from tests.algorithms.poses.synthetic_capture import (
@@ -23,7 +26,9 @@ from tests.oracles.five_point import MONOMIALS, cubic_equations
 from tests.oracles.two_view import in_front
 
 
-def samples_of_five(rng, *, count, flat):
+def samples_of_five(
+    rng: np.random.Generator, *, count: int, flat: bool
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], Rigid3]:
     """Exact bearings of five points each, all on one plane if flat, and the true essential matrix of norm √2."""
     pose = Rigid3.from_center(random_rotation(rng), rng.normal(size=3))
     points = 2 * rng.normal(size=(count, 5, 3))
@@ -35,7 +40,9 @@ def samples_of_five(rng, *, count, flat):
     return p, q, essential, pose
 
 
-def wall_seen_twice(trial, *, noise_deg=0.02):
+def wall_seen_twice(
+    trial: object, *, noise_deg: float = 0.02
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int32], Rigid3]:
     """A picture wall and nothing else, two fifths of the matches wrong."""
     rng = rng_of(f"wall {trial}")
     pose = Rigid3.from_center(random_rotation(rng), np.array([0.5, -0.2, 0.3]))
@@ -47,7 +54,7 @@ def wall_seen_twice(trial, *, noise_deg=0.02):
 
 
 @pytest.mark.parametrize("flat", [False, True])
-def test_five_points_give_the_true_matrix_among_others(flat):
+def test_five_points_give_the_true_matrix_among_others(flat: bool) -> None:
     p, q, essential, _ = samples_of_five(rng_of(f"five {flat}"), count=200, flat=flat)
     found, sample_idx = essentials_from_five(p, q)
     distance = np.minimum(*(np.linalg.norm(found - sign * essential, axis=(1, 2)) for sign in (1, -1)))
@@ -58,7 +65,7 @@ def test_five_points_give_the_true_matrix_among_others(flat):
     assert np.bincount(sample_idx).max() <= 10
 
 
-def test_every_solution_is_an_essential_matrix_that_all_five_pairs_obey():
+def test_every_solution_is_an_essential_matrix_that_all_five_pairs_obey() -> None:
     p, q, _, _ = samples_of_five(rng_of("obey"), count=100, flat=False)
     found, sample_idx = essentials_from_five(p, q)
     left_over = np.einsum("kmi,kij,kmj->km", q[sample_idx], found, p[sample_idx])
@@ -66,7 +73,7 @@ def test_every_solution_is_an_essential_matrix_that_all_five_pairs_obey():
     np.testing.assert_allclose(np.linalg.svd(found)[1], np.tile([1, 1, 0], (len(found), 1)), atol=1e-6)
 
 
-def test_turning_the_cameras_turns_the_solutions():
+def test_turning_the_cameras_turns_the_solutions() -> None:
     rng = rng_of("turned solutions")
     p, q, _, _ = samples_of_five(rng, count=1, flat=False)
     first, second = random_rotation(rng), random_rotation(rng)
@@ -77,7 +84,7 @@ def test_turning_the_cameras_turns_the_solutions():
         assert min(np.linalg.norm(turned - s * matrix, axis=(1, 2)).min() for s in (1, -1)) < 1e-6
 
 
-def testcubic_equations_are_the_constraints_of_an_essential_matrix():
+def testcubic_equations_are_the_constraints_of_an_essential_matrix() -> None:
     rng = rng_of("cubic")
     basis = rng.normal(size=(3, 4, 3, 3))
     x, y, z = unknowns = rng.normal(size=3)
@@ -89,16 +96,16 @@ def testcubic_equations_are_the_constraints_of_an_essential_matrix():
     np.testing.assert_allclose(cubic_equations(basis) @ monomials, expected, atol=1e-9)
 
 
-def test_samples_without_a_solution_give_none():
+def test_samples_without_a_solution_give_none() -> None:
     p = np.tile([0.0, 0.0, 1.0], (2, 5, 1))
     found, sample_idx = essentials_from_five(p, p)
     assert np.isfinite(found).all()
     assert len(found) == len(sample_idx)
 
 
-def test_a_wall_defeats_eight_points_and_not_five():
+def test_a_wall_defeats_eight_points_and_not_five() -> None:
     """Many matrices fit a plane in the linear equations; the ten cubic ones leave two, and one is behind a camera."""
-    errors = {solver: [] for solver in SOLVERS}
+    errors: dict[Solver, list[float]] = {solver: [] for solver in SOLVERS}
     for trial in range(3):
         p, q, matches, pose = wall_seen_twice(trial)
         for solver in SOLVERS:
@@ -110,7 +117,7 @@ def test_a_wall_defeats_eight_points_and_not_five():
     assert np.median(errors["eight_point"]) > 5
 
 
-def test_what_lies_behind_tells_the_two_matrices_of_a_plane_apart():
+def test_what_lies_behind_tells_the_two_matrices_of_a_plane_apart() -> None:
     p, q, _, pose = samples_of_five(rng_of("twins"), count=40, flat=True)
     flat_p, flat_q = p.reshape(-1, 3), q.reshape(-1, 3)
     found, _ = essentials_from_five(p[:1], q[:1])
@@ -125,7 +132,7 @@ def test_what_lies_behind_tells_the_two_matrices_of_a_plane_apart():
 
 
 @pytest.mark.parametrize("name", ["along x", "straight up", "backward over the seam", "half turn about a slanted axis"])
-def test_eight_points_recover_hard_poses_too(name):
+def test_eight_points_recover_hard_poses_too(name: str) -> None:
     rng = rng_of(name)
     p, q, matches, pose = draw(rng, *HARD[name])
     first, second = features_from_bearings(p), features_from_bearings(q)
@@ -135,8 +142,9 @@ def test_eight_points_recover_hard_poses_too(name):
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_the_minimal_model_as_it_comes_is_right_but_coarse(solver):
-    coarse, fine = [], []
+def test_the_minimal_model_as_it_comes_is_right_but_coarse(solver: Solver) -> None:
+    coarse: list[float] = []
+    fine: list[float] = []
     for trial in range(3):
         rng = rng_of(f"coarse {trial}")
         p, q, matches, pose = draw(rng, (0.5, 0, 0.1), (0, 0.5, 0))
@@ -149,7 +157,7 @@ def test_the_minimal_model_as_it_comes_is_right_but_coarse(solver):
     assert np.mean(coarse) > 3 * np.mean(fine)
 
 
-def test_exact_bearings_need_no_refinement():
+def test_exact_bearings_need_no_refinement() -> None:
     rng = rng_of("exact minimal")
     p, q, _, pose = draw(rng, (0.3, -0.2, 0.4), (0.5, 2.0, -1.0), noise_deg=0.0)
     for solver in SOLVERS:
@@ -157,9 +165,10 @@ def test_exact_bearings_need_no_refinement():
         assert max(errors_deg(found.rotation, found.translation, pose)) < 1e-4
 
 
-def test_a_pair_tells_how_well_it_is_determined():
+def test_a_pair_tells_how_well_it_is_determined() -> None:
     """What the record foretells is as large as the errors, and grows as the baseline shrinks."""
-    actual, foretold = [], {0.5: [], 0.1: []}
+    actual: list[tuple[float, float]] = []
+    foretold: dict[float, list[tuple[float, float]]] = {0.5: [], 0.1: []}
     for trial in range(10):
         for length, found in foretold.items():
             rng = rng_of(f"determined {trial}")
@@ -174,7 +183,7 @@ def test_a_pair_tells_how_well_it_is_determined():
     assert np.mean(foretold[0.1], axis=0)[1] > 3 * np.mean(foretold[0.5], axis=0)[1]
 
 
-def test_no_geometry_claims_no_precision():
+def test_no_geometry_claims_no_precision() -> None:
     p, _, _, _ = draw(rng_of("claims"), (0, 0, 0), (0, 0, 0))
     features = features_from_bearings(p)
     matches = np.stack([np.arange(len(p))] * 2, axis=1).astype(np.int32)
@@ -182,7 +191,7 @@ def test_no_geometry_claims_no_precision():
     assert (view.rotation_std_deg, view.direction_std_deg) == (0, 0)
 
 
-def test_sides_are_the_signs_of_the_ranges():
+def test_sides_are_the_signs_of_the_ranges() -> None:
     rng = rng_of("sides")
     p, q = rng.normal(size=(2, 5000, 3))
     p, q = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (p, q))
@@ -191,20 +200,21 @@ def test_sides_are_the_signs_of_the_ranges():
     np.testing.assert_array_equal(in_front(p, q, pose), (ranges[0] > 0) & (ranges[1] > 0))
 
 
-def test_samples_hold_distinct_matches():
+def test_samples_hold_distinct_matches() -> None:
     samples = draw_samples(rng_of("samples"), 9, batch=500, sample=8)
     assert samples.shape == (500, 8)
     assert all(len(set(row)) == 8 for row in samples)
     assert set(samples.ravel()) == set(range(9))
 
 
-def test_smaller_samples_are_needed_fewer_times():
+def test_smaller_samples_are_needed_fewer_times() -> None:
     assert samples_needed(0.5, 0.9999, sample=5) < samples_needed(0.5, 0.9999, sample=8) / 7
     assert samples_needed(1.0, 0.9999, sample=5) == 0
     assert samples_needed(0.0, 0.9999, sample=5) == np.inf
 
 
-def test_an_unknown_solver_is_named():
+def test_an_unknown_solver_is_named() -> None:
     p, q, _, _ = draw(rng_of("unknown"), (0.5, 0, 0), (0, 0, 0))
+    unknown: Any = "six"
     with pytest.raises(UsageError, match=r"no solver 'six'; choose one of five_point, eight_point"):
-        estimate_two_view(p, q, rng=rng_of("unknown"), threshold_rad=0.01, solver="six")
+        estimate_two_view(p, q, rng=rng_of("unknown"), threshold_rad=0.01, solver=unknown)

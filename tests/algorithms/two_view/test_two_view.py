@@ -1,9 +1,11 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view import estimate_two_view, verify_pair
 from pano_mvs.algorithms.two_view.essential import essential_from_bearings, sampson_angles
@@ -39,7 +41,15 @@ def rng_of(name: str) -> np.random.Generator:
     return np.random.default_rng(zlib.crc32(name.encode()))
 
 
-def draw(rng, center, rotvec, *, points=400, noise_deg=0.05, outliers=0.3):
+def draw(
+    rng: np.random.Generator,
+    center: Sequence[float],
+    rotvec: Sequence[float],
+    *,
+    points: int = 400,
+    noise_deg: float = 0.05,
+    outliers: float = 0.3,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int32], Rigid3]:
     pose = Rigid3.from_center(rotation_from_rotvec(rotvec), np.array(center))
     world = points_in_box(rng, points)
     p = noisy_bearings(rng, Rigid3.identity(), world, noise_deg=noise_deg)
@@ -47,7 +57,7 @@ def draw(rng, center, rotvec, *, points=400, noise_deg=0.05, outliers=0.3):
     return p, q, synthetic_matches(rng, len(world), seen=1.0, outliers=outliers), pose
 
 
-def errors_deg(rotation, direction, pose):
+def errors_deg(rotation: NDArray[np.float64], direction: NDArray[np.float64], pose: Rigid3) -> tuple[float, float]:
     return (
         float(np.rad2deg(geodesic_angle(rotation, pose.rotation))),
         float(np.rad2deg(angle_between(direction, pose.translation))),
@@ -55,7 +65,7 @@ def errors_deg(rotation, direction, pose):
 
 
 @pytest.mark.parametrize("name", HARD)
-def test_recovers_hard_poses_under_noise_and_outliers(name):
+def test_recovers_hard_poses_under_noise_and_outliers(name: str) -> None:
     rng = rng_of(name)
     p, q, matches, pose = draw(rng, *HARD[name])
     view = verify_pair(features_from_bearings(p), features_from_bearings(q), matches, rng=rng)
@@ -70,7 +80,7 @@ def test_recovers_hard_poses_under_noise_and_outliers(name):
 
 
 @pytest.mark.parametrize("trial", range(4))
-def test_recovers_where_three_quarters_of_the_matches_are_wrong(trial):
+def test_recovers_where_three_quarters_of_the_matches_are_wrong(trial: int) -> None:
     """Eight true ones at once are met once in 65,000 draws; a nearly right rotation far sooner."""
     rng = rng_of(f"outliers {trial}")
     p, q, matches, pose = draw(rng, (0.4, -0.1, 0.3), (0.3, 1.0, -0.4), outliers=0.75)
@@ -79,7 +89,7 @@ def test_recovers_where_three_quarters_of_the_matches_are_wrong(trial):
     assert max(errors_deg(view.rotation, view.direction, pose)) < 0.4
 
 
-def test_redirection_leaves_a_local_optimum():
+def test_redirection_leaves_a_local_optimum() -> None:
     """Nearly the right rotation, and a direction that is far off."""
     rng = rng_of("redirected")
     p, q, matches, pose = draw(rng, (0.4, -0.1, 0.3), (0.3, 1.0, -0.4), outliers=0.6)
@@ -88,7 +98,7 @@ def test_redirection_leaves_a_local_optimum():
     assert max(errors_deg(found.rotation, found.translation, pose)) < 0.3
 
 
-def test_exact_bearings_give_the_exact_pose():
+def test_exact_bearings_give_the_exact_pose() -> None:
     rng = rng_of("exact")
     p, q, _, pose = draw(rng, (0.3, -0.2, 0.4), (0.5, 2.0, -1.0), noise_deg=0.0)
     found = estimate_two_view(p, q, rng=rng, threshold_rad=1e-3)
@@ -96,7 +106,7 @@ def test_exact_bearings_give_the_exact_pose():
     assert found.inliers.all()
 
 
-def test_turning_both_cameras_turns_the_result():
+def test_turning_both_cameras_turns_the_result() -> None:
     rng = rng_of("turned")
     p, q, matches, _ = draw(rng, (0.4, 0.1, 0.2), (0.2, 0.3, 0.1))
     first_turn, second_turn = random_rotation(rng), random_rotation(rng)
@@ -109,7 +119,7 @@ def test_turning_both_cameras_turns_the_result():
     assert max(errors_deg(turned.rotation, turned.translation, expected)) < 1e-3
 
 
-def test_same_seed_same_bytes():
+def test_same_seed_same_bytes() -> None:
     p, q, matches, _ = draw(rng_of("bytes"), (0.4, 0.1, 0.2), (0.2, 0.3, 0.1))
     first, second = features_from_bearings(p), features_from_bearings(q)
     views = [verify_pair(first, second, matches, rng=np.random.default_rng(7)) for _ in range(2)]
@@ -119,7 +129,7 @@ def test_same_seed_same_bytes():
 
 @pytest.mark.parametrize("count", [40, 150, 600, 3000])
 @pytest.mark.parametrize("crowd", [0.0, 8.0])
-def test_random_matches_have_no_geometry(count, crowd):
+def test_random_matches_have_no_geometry(count: int, crowd: float) -> None:
     """Also where key points crowd at the horizon, which makes chance agreement far more likely."""
     rng = rng_of(f"random {count} {crowd}")
     for _ in range(3):
@@ -132,7 +142,7 @@ def test_random_matches_have_no_geometry(count, crowd):
         assert view.reason
 
 
-def test_one_crowded_detail_is_no_evidence():
+def test_one_crowded_detail_is_no_evidence() -> None:
     """A hundred key points on one detail of half a degree agree with many poses and prove none."""
     rng = rng_of("crowd")
     p = np.concatenate([rng.normal(size=(60, 3)), [0, 0, 1] + 0.004 * rng.normal(size=(100, 3))])
@@ -144,7 +154,7 @@ def test_one_crowded_detail_is_no_evidence():
 
 
 @pytest.mark.parametrize("rotvec", [(0, 0, 0), (0, np.pi, 0), (0.4, -1.0, 2.0)])
-def test_pictures_from_one_place_are_a_rotation(rotvec):
+def test_pictures_from_one_place_are_a_rotation(rotvec: tuple[float, float, float]) -> None:
     rng = rng_of(f"rotation {rotvec}")
     p, q, matches, pose = draw(rng, (0, 0, 0), rotvec)
     view = verify_pair(features_from_bearings(p), features_from_bearings(q), matches, rng=rng)
@@ -154,7 +164,7 @@ def test_pictures_from_one_place_are_a_rotation(rotvec):
     assert np.rad2deg(geodesic_angle(view.rotation, pose.rotation)) < 0.03
 
 
-def test_identical_pictures_are_a_rotation():
+def test_identical_pictures_are_a_rotation() -> None:
     p, _, _, _ = draw(rng_of("identical"), (0, 0, 0), (0, 0, 0))
     features = features_from_bearings(p)
     matches = np.stack([np.arange(len(p))] * 2, axis=1).astype(np.int32)
@@ -162,14 +172,14 @@ def test_identical_pictures_are_a_rotation():
     assert view.geometry == "rotation"
 
 
-def test_a_step_too_short_for_the_noise_is_no_baseline():
+def test_a_step_too_short_for_the_noise_is_no_baseline() -> None:
     rng = rng_of("short")
     p, q, matches, _ = draw(rng, (0.002, 0, 0.001), (0, 1, 0))
     view = verify_pair(features_from_bearings(p), features_from_bearings(q), matches, rng=rng)
     assert view.geometry == "rotation"
 
 
-def test_few_matches_are_refused_with_their_number():
+def test_few_matches_are_refused_with_their_number() -> None:
     features = features_from_bearings(np.eye(3))
     view = verify_pair(features, features, np.zeros((3, 2), np.int32), rng=np.random.default_rng(0))
     assert not view
@@ -177,18 +187,18 @@ def test_few_matches_are_refused_with_their_number():
     assert view.candidates == 3
 
 
-def test_estimation_refuses_bad_shapes():
+def test_estimation_refuses_bad_shapes() -> None:
     with pytest.raises(UsageError, match="paired bearings"):
         estimate_two_view(np.zeros((4, 3)), np.zeros((5, 3)), rng=np.random.default_rng(0), threshold_rad=0.01)
 
 
-def test_fewer_matches_than_two_samples_give_a_reason():
+def test_fewer_matches_than_two_samples_give_a_reason() -> None:
     found = estimate_two_view(np.eye(3), np.eye(3), rng=np.random.default_rng(0), threshold_rad=0.01)
     assert not found
     assert "only 3 matches" in found.reason
 
 
-def test_sampson_error_is_the_formula():
+def test_sampson_error_is_the_formula() -> None:
     rng = rng_of("sampson")
     essential = skew(rng.normal(size=3)) @ random_rotation(rng)
     p, q = rng.normal(size=(2, 20, 3))
@@ -201,7 +211,7 @@ def test_sampson_error_is_the_formula():
     np.testing.assert_allclose(sampson_angles(np.stack([essential, 5 * essential]), p, q)[1], expected, rtol=1e-9)
 
 
-def test_sampson_error_is_the_angle_that_the_rays_must_move():
+def test_sampson_error_is_the_angle_that_the_rays_must_move() -> None:
     """To first order the two rays share the way to a meeting, so moving one by α shows as about α / √2."""
     p, q, _, pose = draw(rng_of("angle"), (0.5, 0, 0), (0, 0, 0), noise_deg=0.0)
     essential = skew(pose.translation) @ pose.rotation
@@ -213,7 +223,7 @@ def test_sampson_error_is_the_angle_that_the_rays_must_move():
     assert 0.4e-4 < angles.min() <= angles.max() < 1.0e-4
 
 
-def test_linear_solution_and_its_four_decompositions():
+def test_linear_solution_and_its_four_decompositions() -> None:
     rng = rng_of("linear")
     p, q, _, pose = draw(rng, (0.3, 0.2, -0.4), (0.3, -2.0, 0.5), noise_deg=0.0)
     poses = poses_from_essential(essential_from_bearings(p, q))
@@ -224,7 +234,7 @@ def test_linear_solution_and_its_four_decompositions():
         assert np.linalg.det(found.rotation) == pytest.approx(1)
 
 
-def test_derivatives_of_the_sampson_error():
+def test_derivatives_of_the_sampson_error() -> None:
     rng = rng_of("derivatives")
     p, q, _, pose = draw(rng, (0.3, 0.2, -0.4), (0.3, -2.0, 0.5), noise_deg=2.0, points=50)
     pose = Rigid3(pose.rotation, pose.translation / np.linalg.norm(pose.translation))
@@ -234,7 +244,7 @@ def test_derivatives_of_the_sampson_error():
         np.testing.assert_allclose(jacobian[:, column], numeric, atol=1e-7)
 
 
-def test_uncertainty_foretells_the_spread_of_errors():
+def test_uncertainty_foretells_the_spread_of_errors() -> None:
     rng = rng_of("uncertainty")
     found = []
     for _ in range(30):
@@ -246,14 +256,14 @@ def test_uncertainty_foretells_the_spread_of_errors():
     assert 0.5 < np.sqrt(np.mean(actual**2)) / predicted.mean() < 2.0
 
 
-def test_tangent_basis_is_orthonormal():
+def test_tangent_basis_is_orthonormal() -> None:
     directions = np.concatenate([np.eye(3), -np.eye(3), [[0.6, 0.8, 0.0]]])
     basis = tangent_basis(directions)
     np.testing.assert_allclose(np.swapaxes(basis, 1, 2) @ basis, np.tile(np.eye(2), (7, 1, 1)), atol=1e-12)
     np.testing.assert_allclose(np.einsum("nij,ni->nj", basis, directions), 0, atol=1e-12)
 
 
-def test_rotation_alone_is_recovered():
+def test_rotation_alone_is_recovered() -> None:
     rng = rng_of("alone")
     p, q, matches, pose = draw(rng, (0, 0, 0), (1.0, 2.0, 0.5))
     rotation, agreeing = estimate_rotation(p[matches[:, 0]], q[matches[:, 1]], rng=rng, threshold_rad=0.004)
@@ -261,8 +271,8 @@ def test_rotation_alone_is_recovered():
     assert agreeing.mean() > 0.65
 
 
-def test_false_alarms_fall_with_inliers_and_rise_with_chance():
-    def alarms(k, p):
+def test_false_alarms_fall_with_inliers_and_rise_with_chance() -> None:
+    def alarms(k: int, p: float) -> float:
         return log10_false_alarms(k, 100, chance=p, sample=8)
 
     assert alarms(60, 0.01) < alarms(30, 0.01) < alarms(30, 0.1)
@@ -270,7 +280,7 @@ def test_false_alarms_fall_with_inliers_and_rise_with_chance():
     assert alarms(12, 0.1) > 0
 
 
-def test_crowds_count_once():
+def test_crowds_count_once() -> None:
     crowd = np.tile([0.0, 0.0, 1.0], (50, 1))
     assert independent_count(crowd, crowd) == 1
     assert independent_count(np.eye(3), np.eye(3)) == 3

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 
 from pano_mvs.algorithms.metrics.surface import TrueView, view_points
 from pano_mvs.cli.evaluate_cloud import CloudRequest, judge_cloud
@@ -21,11 +20,12 @@ from pano_mvs.scene import PointCloud
 from tests.algorithms.poses.synthetic_capture import random_rotation
 from tests.cli.conftest import Command
 from tests.cli.evaluate.test_evaluate_poses import write_json
+from tests.stored import read_picture
 
 
-def save(path: Path, points: np.ndarray, normal: Sequence[float] = (0, -1, 0)) -> Path:
+def save(path: Path, points: np.ndarray, normal: ArrayLike = (0, -1, 0)) -> Path:
     count = len(points)
-    up = np.tile(np.float32(normal), (count, 1))
+    up = np.tile(np.array(normal, np.float32), (count, 1))
     grey = np.full((count, 3), 99, np.uint8)
     write_ply(path, PointCloud(points.astype(np.float32), up, grey, np.ones(count, np.uint8)))
     return path
@@ -111,7 +111,7 @@ def test_the_picture_shows_each_view_and_the_cloud(
     off = np.where(surface[:, :1] > 0, surface, surface * 1.2)
     arguments = (save(tmp_path / "a.ply", off), "--truth", folder, "--picture", tmp_path / "new" / "a.png")
     assert pano_mvs("evaluate", "cloud", *arguments).code == 0
-    picture = cv2.imread(str(tmp_path / "new" / "a.png"))
+    picture = read_picture(tmp_path / "new" / "a.png")
     assert picture is not None
     height, width = picture.shape[:2]
     assert (width, height > 4 * 512) == (1024, True)
@@ -187,7 +187,7 @@ def test_errors_are_written_as_clouds_and_drawn(
     missed = open_ply_points(tmp_path / "e" / "completeness.ply").vertices
     assert missed["distance"][missed["x"] > 0.5].mean() > 5 * missed["distance"][missed["x"] < -0.5].mean()
     for name in ("accuracy.png", "completeness.png"):
-        picture = cv2.imread(str(tmp_path / "e" / name))
+        picture = read_picture(tmp_path / "e" / name)
         assert picture is not None
         assert picture.shape == (28 + 3 * (28 + 640), 1024, 3)
         above = picture[56 : 56 + 640]

@@ -6,6 +6,7 @@ import csv
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,7 +20,8 @@ from pano_mvs.io.colmap.model import write_colmap_model
 from pano_mvs.io.ranges.files import write_confidence_png, write_range_tiff
 from pano_mvs.io.truth import read_truth
 from pano_mvs.scene import PointCloud, Poses
-from tests.cli.conftest import SIZE_HW, Command
+from tests.cli.conftest import SIZE_HW, Command, Outcome
+from tests.stored import read_picture, write_npz
 
 SCALE = 2.5
 
@@ -50,9 +52,10 @@ def output(tmp_path: Path, truth: Path) -> Path:
     return folder
 
 
-def told(outcome: object) -> dict:
-    assert outcome.code == 0, outcome.text  # type: ignore[attr-defined]
-    return json.loads(outcome.text)  # type: ignore[attr-defined]
+def told(outcome: Outcome) -> dict[str, Any]:
+    assert outcome.code == 0, outcome.text
+    scores: dict[str, Any] = json.loads(outcome.text)
+    return scores
 
 
 def test_scores_are_those_of_the_library_with_the_scale_of_the_cameras(
@@ -121,7 +124,7 @@ def test_pictures_json_and_csv_are_written(pano_mvs: Command, output: Path, trut
         assert float(rows[1][name]) == scores["views"]["001"]["scores"][name]
         assert float(rows[3][f"best_constant_{name}"]) == scores["mean_constant"]["best"][name]
     # 10 % too far: red, missing above: black; the panorama was found beside the truth
-    picture = cv2.imread(str(tmp_path / "e" / "000.jpg"))
+    picture = read_picture(tmp_path / "e" / "000.jpg")
     assert np.abs(picture[34 + 300, 1032 + 500].astype(int) - (18, 18, 116)).max() < 25
     assert np.abs(picture[34 + 5, 1032 + 500].astype(int) - 25).max() < 25
     assert picture[34 : 34 + 512, :1024].std() > 20
@@ -140,7 +143,7 @@ def test_foreign_folders_are_compared_in_their_units(pano_mvs: Command, truth: P
         cv2.imwrite(
             str(tmp_path / "png" / f"{Path(name).stem}.png"), np.nan_to_num(1000 * half).round().astype(np.uint16)
         )
-    np.savez(tmp_path / "true.npz", **arrays)
+    write_npz(tmp_path / "true.npz", arrays)
     arguments = ("evaluate", "depth", tmp_path / "png", "--truth", tmp_path / "true.npz")
     report = told(pano_mvs(*arguments, "--unit", "0.001", "--json"))
     assert report["scale"] == 1
@@ -155,8 +158,8 @@ def test_foreign_folders_are_compared_in_their_units(pano_mvs: Command, truth: P
 def test_of_many_views_the_worst_are_listed(pano_mvs: Command, tmp_path: Path) -> None:
     true = {f"v{idx:02d}": np.full((4, 8), 2, np.float32) for idx in range(43)}
     wrong = {name: np.where(np.arange(8) < idx % 5, 9, ranges) for idx, (name, ranges) in enumerate(true.items())}
-    np.savez(tmp_path / "true.npz", **true)
-    np.savez(tmp_path / "found.npz", **wrong)
+    write_npz(tmp_path / "true.npz", true)
+    write_npz(tmp_path / "found.npz", wrong)
     text = pano_mvs("evaluate", "depth", tmp_path / "found.npz", "--truth", tmp_path / "true.npz").text
     assert "the 40 of 43 views with the worst δ<1.05" in text
     assert "v42" in text
@@ -236,7 +239,7 @@ def test_strangers_are_named_with_what_either_has(pano_mvs: Command, output: Pat
     result = pano_mvs("evaluate", "depth", output, "--truth", tmp_path / "other.npz")
     assert result.code == 2
     assert "no picture in common: the one has 000, 001, 002, the other zebra" in result.flat
-    np.savez(tmp_path / "shape.npz", **{"001": np.ones((30, 50), np.float32)})
+    write_npz(tmp_path / "shape.npz", {"001": np.ones((30, 50), np.float32)})
     result = pano_mvs("evaluate", "depth", output, "--truth", tmp_path / "shape.npz")
     assert result.code == 2
     assert "001.tiff against" in result.flat
@@ -258,7 +261,7 @@ class TestRun:
         views = [(view.cam_from_world, known.range_map(view)) for view in known.views.values()]
         points = np.concatenate([view_points(TrueView(pose, ranges)) for pose, ranges in views if ranges is not None])
         points /= SCALE  # the frame and the unit of the model
-        up = np.tile(np.float32([0, -1, 0]), (len(points), 1))
+        up = np.tile(np.array([0, -1, 0], np.float32), (len(points), 1))
         grey = np.full((len(points), 3), 99, np.uint8)
         write_ply(output / "cloud.ply", PointCloud(points, up, grey, np.ones(len(points), np.uint8)))
         result = pano_mvs("evaluate", output, "--truth", truth)

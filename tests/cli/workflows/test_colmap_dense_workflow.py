@@ -10,6 +10,7 @@ import pytest
 
 from tests.benchmarks.colmap_dense import fused_points
 from tests.cli.conftest import SIZE_HW, SMALL, Command, run_json
+from tests.stored import read_picture
 
 NAMES = ["000", "001", "002", "003"]
 
@@ -33,7 +34,7 @@ def test_colmap_dense_writes_models_masks_and_a_workspace_that_fuses(pano_mvs: C
     assert (faces.num_reg_images(), faces.num_rigs(), faces.num_frames()) == (24, 1, 4)
     assert faces.num_points3D() == seeds.num_points3D()
     for name in NAMES:
-        assert cv2.imread(str(out / f"colmap/masks/{name}.png.png"), cv2.IMREAD_UNCHANGED).shape == SIZE_HW
+        assert read_picture(out / f"colmap/masks/{name}.png.png", cv2.IMREAD_UNCHANGED).shape == SIZE_HW
     assert len(fused_points(out / "colmap_dense")) > 3000
     metrics = {stage["name"]: stage["metrics"] for stage in run_json(out)["stages"]}
     assert metrics["dense"]["faces_without_points"] == 0

@@ -14,13 +14,14 @@ from pano_mvs.io.clouds.ply import read_ply
 from pano_mvs.io.ranges.files import read_range_tiff
 from tests.cli.conftest import SIZE_HW, SMALL, Command
 from tests.io.images.pictures import png_chunk, xmp
+from tests.stored import read_picture
 
 LEFT, TOP, WIDTH, HEIGHT = 20, 18, 290, 121
 
 
 def cut(path: Path, *, half: bool = False) -> None:
     """Leave a part of a panorama in its file, with the metadata that say so."""
-    part = cv2.imread(str(path))[TOP : TOP + HEIGHT, LEFT : LEFT + WIDTH]
+    part = read_picture(path)[TOP : TOP + HEIGHT, LEFT : LEFT + WIDTH]
     if half:
         part = cv2.resize(part, (WIDTH // 2, round(HEIGHT / 2)), interpolation=cv2.INTER_AREA)
     packet = xmp({

@@ -11,6 +11,7 @@ import numpy as np
 from pano_mvs.geometry import roll_panorama
 from pano_mvs.io.ranges.files import read_range_tiff
 from tests.cli.conftest import SMALL, Command
+from tests.stored import read_picture
 
 KNOWN_RANGES = """\
 pano_mvs: 1
@@ -31,7 +32,7 @@ def rolled_capture(capture: Path, folder: Path, columns: int) -> Path:
     truth = json.loads((capture / "truth" / "poses.json").read_text())
     for view in truth["views"]:
         name = Path(view["image"]).name
-        image, new_from_old = roll_panorama(cv2.imread(str(capture / "images" / name)), columns)
+        image, new_from_old = roll_panorama(read_picture(capture / "images" / name), columns)
         cv2.imwrite(str(folder / "images" / name), image)
         view.pop("sha256", None)  # the rolled picture is another one
         view["R"] = (new_from_old @ np.array(view["R"])).tolist()

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from pano_mvs.io.clouds.ply import read_ply
 from pano_mvs.io.ranges.files import read_range_tiff
-from tests.cli.conftest import run_json
+from tests.cli.conftest import Command, run_json
 
 
 @pytest.mark.slow
-def test_fast_runs_from_pictures_to_cloud(pano_mvs, rendered, tmp_path):
+def test_fast_runs_from_pictures_to_cloud(pano_mvs: Command, rendered: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     result = pano_mvs(
         "run", "fast", "--images", rendered / "images", "--out", out,

@@ -19,6 +19,7 @@ from pano_mvs.io.ranges.files import read_range_tiff
 from tests.algorithms.poses.synthetic_capture import random_rotation
 from tests.cli.conftest import SMALL, Command, run_json
 from tests.io.images.pictures import app1, exif, full_sphere, xmp
+from tests.stored import read_picture
 from tests.test_docs_frames import block
 
 UP = np.array([0.0, -1.0, 0.0])
@@ -178,7 +179,7 @@ def test_cropped_photographs_alone_give_a_level_world_in_metres_and_north(pano_m
     truth = true_poses(capture)
     for name, pose in truth.items():
         path = capture / "images" / name
-        picture = cv2.imread(str(path))
+        picture = read_picture(path)
         height, width = picture.shape[:2]
         edge = height // 10
         up = pose.rotation @ UP

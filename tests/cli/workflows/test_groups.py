@@ -4,22 +4,27 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
 import pytest
-from rich.console import Console
+from numpy.typing import NDArray
 
-from pano_mvs.cli.run_command import print_summary
+from pano_mvs.cli.console import Console
+from pano_mvs.cli.run.printing import print_summary
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec
 from pano_mvs.io.clouds.ply import read_ply
 from pano_mvs.io.poses.files import read_groups, read_poses
 from pano_mvs.io.ranges.files import read_range_tiff
-from pano_mvs.report.verdict import verdict
+from pano_mvs.results.run_output import RunOutput
+from pano_mvs.results.stored_values import StoredValues
+from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene.image_files.image_file import write_png
 from pano_mvs.testing.room import capture_poses, default_room, render
 from pano_mvs.viewer.shown_scene import open_scene
 from tests.cli.conftest import Command, run_json
+from tests.stored import write_npz
 
 SIZE_HW = (96, 192)
 LARGE, SMALL = ("a0.png", "a1.png", "a2.png"), ("b0.png", "b1.png")
@@ -74,7 +79,9 @@ def write_rooms(folder: Path) -> float:
     (folder / "capture" / "images").mkdir(parents=True)
     (folder / "capture" / "truth").mkdir()
     (folder / "rooms").mkdir()
-    views, depths, ours = [], {}, {"a": [], "b": []}
+    views: list[dict[str, Any]] = []
+    depths: dict[str, NDArray[np.float32]] = {}
+    ours: dict[str, list[dict[str, Any]]] = {"a": [], "b": []}
     poses = dict(
         zip(LARGE + SMALL, [*capture_poses(3, spread=0.4), *capture_poses(2, seed=3, spread=0.4)], strict=True)
     )
@@ -86,7 +93,7 @@ def write_rooms(folder: Path) -> float:
         ours[name[0]].append({"image": name, "R": moved.rotation.tolist(), "t": moved.translation.tolist()})
     size = {"width": SIZE_HW[1], "height": SIZE_HW[0]}
     (folder / "capture" / "truth" / "poses.json").write_text(json.dumps({**size, "metric": True, "views": views}))
-    np.savez(folder / "capture" / "truth" / "depth.npz", **depths)
+    write_npz(folder / "capture" / "truth" / "depth.npz", depths)
     for room, listed in ours.items():
         (folder / "rooms" / f"{room}.json").write_text(json.dumps({**size, "metric": False, "views": listed}))
     return float(np.linalg.norm(poses["b0.png"].center - poses["b1.png"].center))
@@ -178,14 +185,14 @@ def _check_evaluation(pano_mvs: Command, out: Path, rooms: Path) -> None:
 
 def test_the_terminal_says_what_the_report_finds_of_groups(capsys: pytest.CaptureFixture[str]) -> None:
     groups = [{"images": ["a", "b", "c"]}, {"images": ["x", "y"], "nearest_pair": ["b", "x", 0, 31]}]
-    poses = {"registered": [*"abcxy"], "rejected": {}, "points": 7, "scale": "its own", "groups": groups}
-    summary = {"units": {"run": 0, "cached": 3, "failed": 0}, "seconds": 1.0, "failures": [], "blocked": [],
-               "rejected": {}, "poses": poses, "scores": {}, "all_scores": {}, "notes": [], "stopped": "",
-               "left_over": {}, "files": {}}  # fmt: skip
-    print_summary(summary, Path("out"), Console(width=200), written=0, verdict=verdict(summary))
-    told = capsys.readouterr().out
-    assert "Usable, with doubts: see below.\ndoubtful: 2 groups of panoramas share no reliable connection" in told
-    assert "To join them take pictures between b and x (31 candidates)." in told
-    poses["groups"] = groups[:1]
-    print_summary(summary, Path("out"), Console(width=200), written=0, verdict=verdict(summary))
+    poses = {"registered": [*"abcxy"], "points": 7, "scale": "its own", "groups": groups}
+    print_summary(_output({"poses": poses}), Console(width=200))
+    printed = capsys.readouterr().out
+    assert "Usable, with doubts: see below.\ndoubtful: 2 groups of panoramas share no reliable connection" in printed
+    assert "To join them take pictures between b and x (31 candidates)." in printed
+    print_summary(_output({"poses": poses | {"groups": groups[:1]}}), Console(width=200))
     assert "reliable connection" not in capsys.readouterr().out
+
+
+def _output(summary: dict[str, object]) -> RunOutput:
+    return RunOutput(Path("out"), RunSummary.from_json(summary), StoredValues())

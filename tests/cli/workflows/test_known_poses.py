@@ -9,6 +9,7 @@ import cv2
 import pytest
 
 from tests.cli.conftest import Command, run_json
+from tests.stored import read_picture
 
 WORKFLOW = """\
 pano_mvs: 1
@@ -79,7 +80,7 @@ def test_poses_of_other_pictures_of_the_same_names_are_refused(pano_mvs: Command
     )
     assert pano_mvs("run", known, "--out", "out").code == 0
     for path in sorted((capture / "images").iterdir()):
-        picture = cv2.imread(str(path))
+        picture = read_picture(path)
         if path.name == "001.png":
             picture[0, 0] ^= 1
             cv2.imwrite(str(path), picture)
@@ -87,12 +88,12 @@ def test_poses_of_other_pictures_of_the_same_names_are_refused(pano_mvs: Command
     assert touched.code == 0
     assert "001.png is not the picture, byte for byte, whose pose poses.json records" in touched.flat
     for path in sorted((capture / "images").iterdir()):
-        cv2.imwrite(str(path), 255 - cv2.imread(str(path)))
+        cv2.imwrite(str(path), 255 - read_picture(path))
     others = pano_mvs("run", known, "--out", "out")
     assert others.code == 2
     assert "records other pictures under these names: not one of 4" in others.flat
     for path in sorted((capture / "images").iterdir()):
-        cv2.imwrite(str(path.with_suffix(".jpg")), cv2.imread(str(path)))
+        cv2.imwrite(str(path.with_suffix(".jpg")), read_picture(path))
         path.unlink()
     assert pano_mvs("run", known, "--out", "out").code == 0, "saved in another format, they must be others"
 

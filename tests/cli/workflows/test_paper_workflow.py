@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,8 +19,8 @@ SMALL = ("--set", "features.max_keypoints=3000", "--set", "depth.planes=64")
 
 
 @pytest.fixture
-def run(rendered: Path, pano_mvs: Command):  # type: ignore[no-untyped-def]
-    def call(*overrides: str, out: str = "out"):  # type: ignore[no-untyped-def]
+def run(rendered: Path, pano_mvs: Command) -> Callable[..., dict[str, Any]]:
+    def call(*overrides: str, out: str = "out") -> dict[str, Any]:
         options = [part for override in overrides for part in ("--set", override)]
         result = pano_mvs(
             "run", "paper", "--images", rendered / "images", "--out", out,
@@ -32,7 +34,7 @@ def run(rendered: Path, pano_mvs: Command):  # type: ignore[no-untyped-def]
 
 
 @pytest.mark.slow
-def test_the_papers_way_from_pictures_to_ranges(run) -> None:  # type: ignore[no-untyped-def]
+def test_the_papers_way_from_pictures_to_ranges(run: Callable[..., dict[str, Any]]) -> None:
     summary = run()
     params = {stage["name"]: stage["params"] for stage in summary["stages"]}
     assert params["depth"]["spacing"] == "uniform"
@@ -52,7 +54,7 @@ def test_the_papers_way_from_pictures_to_ranges(run) -> None:  # type: ignore[no
 
 
 @pytest.mark.slow
-def test_each_ablation_is_one_switch(run) -> None:  # type: ignore[no-untyped-def]
+def test_each_ablation_is_one_switch(run: Callable[..., dict[str, Any]]) -> None:
     full = run()
     unscaled = run("unscaled.enabled=true", out="unscaled")
     lengths = [np.linalg.norm(center) for center in unscaled["poses"]["centers"]]

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from pano_mvs.io.clouds.ply import read_ply
 from pano_mvs.io.ranges.files import read_range_tiff
-from tests.cli.conftest import SMALL, run_json
+from tests.cli.conftest import SMALL, Command, run_json
 
 
 @pytest.mark.slow
-def test_quality_is_more_precise_than_the_quickstart_on_the_same_pictures(pano_mvs, rendered, tmp_path):
+def test_quality_is_more_precise_than_the_quickstart_on_the_same_pictures(
+    pano_mvs: Command, rendered: Path, tmp_path: Path
+) -> None:
     errors = {}
     for preset in ("quickstart", "quality"):
         out = tmp_path / preset

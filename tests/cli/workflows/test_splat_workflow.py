@@ -14,6 +14,7 @@ from pano_mvs.io.clouds.ply import read_ply
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.io.ranges.files import read_confidence_png, read_range_tiff
 from tests.cli.conftest import SMALL, Command
+from tests.stored import read_picture
 
 # What makes quality slow is tested with it.
 PLAIN_RANGES = (
@@ -41,10 +42,10 @@ def test_splat_writes_panoramas_faces_and_seeds_that_agree(pano_mvs: Command, re
             read_range_tiff(out / f"range/{stem}.tiff"),
             read_confidence_png(out / f"confidence/{stem}.png"),
         )
-        depth = cv2.imread(str(out / "nerfstudio/equirectangular" / frame["depth_file_path"]), cv2.IMREAD_UNCHANGED)
+        depth = read_picture(out / "nerfstudio/equirectangular" / frame["depth_file_path"], cv2.IMREAD_UNCHANGED)
         np.testing.assert_allclose(depth[confidence >= 64] / 1000, ranges[confidence >= 64], atol=0.000501)
         assert not depth[confidence < 64].any()
-        mask = cv2.imread(str(out / "nerfstudio/equirectangular" / frame["mask_path"]), cv2.IMREAD_UNCHANGED)
+        mask = read_picture(out / "nerfstudio/equirectangular" / frame["mask_path"], cv2.IMREAD_UNCHANGED)
         assert not mask[-15:].any()
         assert not depth[mask == 0].any()
     faces = json.loads((out / "nerfstudio/faces/transforms.json").read_text())

@@ -14,6 +14,7 @@ from pano_mvs.io.clouds.ply import read_ply
 from pano_mvs.io.ranges.files import read_range_tiff
 from pano_mvs.testing.room import capture_poses, default_room, range_along
 from tests.cli.conftest import SIZE_HW, SMALL, Command, deliverables, run_json
+from tests.stored import read_picture
 
 
 def known(capture: Path) -> tuple[str, ...]:
@@ -73,7 +74,7 @@ def test_ranges_and_confidences_fit_together(quickstart: tuple[Path, str]) -> No
     out, _ = quickstart
     for name in NAMES:
         ranges = read_range_tiff(out / f"range/{name}.tiff")
-        confidence = cv2.imread(str(out / f"confidence/{name}.png"), cv2.IMREAD_UNCHANGED)
+        confidence = read_picture(out / f"confidence/{name}.png", cv2.IMREAD_UNCHANGED)
         assert ranges.shape == confidence.shape == SIZE_HW
         np.testing.assert_array_equal(np.isfinite(ranges), confidence > 0)
         assert (confidence >= 128).mean() > 0.3
@@ -135,7 +136,7 @@ def test_touching_one_image_under_known_poses_runs_exactly_its_units(pano_mvs: C
     arguments = ("known_poses", *known(capture), *limits)
     assert pano_mvs("run", *arguments).code == 0
     path = capture / "images" / "003.png"
-    image = cv2.imread(str(path))
+    image = read_picture(path)
     image[0, 0] ^= 1
     cv2.imwrite(str(path), image)
     plan = pano_mvs("plan", *arguments)

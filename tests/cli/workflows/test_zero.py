@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pano_mvs.cli import evaluate_depth_print, inspect_text, run_command
-from pano_mvs.report.figures import figure
+from pano_mvs.cli import evaluate_depth_print
+from pano_mvs.cli.inspect import text as inspect_text
+from pano_mvs.cli.run import printing
+from pano_mvs.results.figures import figure
 
 
 @pytest.mark.parametrize(
@@ -14,7 +16,7 @@ from pano_mvs.report.figures import figure
     [
         figure(-0.0),
         figure([-0.0, 1.0]),
-        run_command._shown(-0.0),
+        printing._shown(-0.0),
         evaluate_depth_print._shown("psnr_db", {"psnr_db": -0.0}),
         inspect_text._vector(np.array([-1e-9, 0.0, 1.0])),
     ],

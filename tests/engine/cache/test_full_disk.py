@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -19,12 +20,12 @@ import pytest
 from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
-from pano_mvs.cli.run_command import MIN_FREE_VARIABLE
 from pano_mvs.core import files
 from pano_mvs.core.errors import StoreError
+from pano_mvs.engine.cache import disk_guard
 from pano_mvs.engine.cache.maintenance import verify
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.running import disk_guard as room
+from pano_mvs.session.running import MIN_FREE_VARIABLE
 from tests.engine.conftest import Toy
 from tests.stress.captures import deliverables, write_toy
 
@@ -37,7 +38,7 @@ class Disk:
         self.calls = 0
         self._number = number
         for place, name in ((tempfile, "mkstemp"), (tempfile, "mkdtemp"), (Path, "write_bytes"), (Path, "write_text"),
-                            (Path, "mkdir"), (Path, "touch"), (files.shutil, "copyfile"), (os, "open")):  # fmt: skip
+                            (Path, "mkdir"), (Path, "touch"), (shutil, "copyfile"), (os, "open")):  # fmt: skip
             monkeypatch.setattr(place, name, self._metered(getattr(place, name), creates=name == "open"))
 
     def _metered(self, function: Callable[..., Any], *, creates: bool) -> Callable[..., Any]:
@@ -101,7 +102,7 @@ def test_library_that_tells_of_a_full_disk_in_its_own_words_is_understood(
     toy.edit("plug.py", lambda text: text.replace('    """Multiply."""', f'    """Multiply."""\n    raise {how}'))
     code, said = run(toy)
     assert (code, "cannot write" in said or "requested" in said) == (3, True)
-    monkeypatch.setattr(room, "_NOTHING_LEFT_BYTES", 1 << 60)
+    monkeypatch.setattr(disk_guard, "_FULL_BELOW_BYTES", 1 << 60)
     code, said = run(toy)
     assert code == 4
     assert "Make room" in said
@@ -109,7 +110,7 @@ def test_library_that_tells_of_a_full_disk_in_its_own_words_is_understood(
 
 def test_what_was_made_on_a_full_disk_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A library that does not look at what became of its writes leaves a short file and says nothing."""
-    monkeypatch.setattr(room, "_NOTHING_LEFT_BYTES", 1 << 60)
+    monkeypatch.setattr(disk_guard, "_FULL_BELOW_BYTES", 1 << 60)
     with pytest.raises(StoreError, match="is full"), Store(tmp_path).scratch():
         pass
 
@@ -120,7 +121,7 @@ def test_guard_stops_before_the_disk_is_full(toy: Toy, monkeypatch: pytest.Monke
         monkeypatch.setenv(MIN_FREE_VARIABLE, "900TB")
     code, said = run(toy, *([] if by_variable else ["--min-free", "900 TB"]))
     assert code == 4
-    assert f"where the cache {toy.folder / 'cache'} is, 900000000 MB are kept (--min-free). Make room" in said
+    assert f"of the cache {toy.folder / 'cache'}, but 900000000 MB must stay free (--min-free). Make room" in said
     monkeypatch.delenv(MIN_FREE_VARIABLE, raising=False)
     assert run(toy, "--min-free", "1MB", "--durable")[0] == 0
 
@@ -135,7 +136,7 @@ def test_size_that_is_none_is_refused(toy: Toy) -> None:
 def test_workers_keep_the_guard_of_the_run(toy: Toy) -> None:
     """The workers' own guard, of 200 MB, would stop them on a small disk where the run was told to go on."""
     text = 'import pano_mvs.engine.cache.store as s\n    for o in __import__("gc").get_objects():\n'
-    text += "        if isinstance(o, s.Store): assert (o.durable, o.least_free_bytes) == (True, 12345), o.durable"
+    text += "        if isinstance(o, s.Store): assert (o.durable, o.min_free_bytes) == (True, 12345), o.durable"
     toy.edit("plug.py", lambda plugin: plugin.replace('    """Multiply."""', f'    """Multiply."""\n    {text}'))
     code, said = run(toy, "--executor", "processes", "--workers", "2", "--durable", "--min-free", "12345")
     assert code == 0, said

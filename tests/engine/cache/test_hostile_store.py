@@ -60,7 +60,7 @@ def with_header(text: str) -> bytes:
     return npy.magic(1, 0) + len(header).to_bytes(2, "little") + header + bytes(64)
 
 
-PLANTED = {
+PLANTED: dict[str, Callable[[Path], bytes]] = {
     "pickle": lambda trace: pickle.dumps(Bomb(trace)),
     "array of objects": pickled_array,
     "zip of arrays": zipped_arrays,
@@ -119,7 +119,7 @@ def test_planted_arrays_are_not_executed_and_are_computed_again(patient: Patient
     assert result.exit_code == 0
     assert deliverables(patient.out) == patient.expected
     assert not trace.exists()
-    assert any("holds nothing that pano_mvs writes" in text for text in result.warnings)
+    assert any("has content that pano_mvs does not write" in text for text in result.warnings)
 
 
 def plant_number(patient: Patient, data: bytes) -> RunResult:
@@ -239,7 +239,7 @@ def test_links_in_place_of_inner_folders_are_refused(toy: Toy, kind: str) -> Non
         path.write_bytes(path.read_bytes()[:-1] + b"x")
     before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in outside.rglob("*") if path.is_file()}
     shutil.rmtree(toy.folder / "out")
-    with pytest.raises(StoreError, match="is a link, which no cache has"):
+    with pytest.raises(StoreError, match="is a link, but caches have no links"):
         toy.run("scaled.by=7")
     verify(Store(root))
     collect(Store(root), unused_s=0.0, forget_after_s=0.0, delete=True)
@@ -302,7 +302,7 @@ def blob_refs(wrong: bool) -> st.SearchStrategy[Any]:
 
 def nearly_records(wrong: bool) -> st.SearchStrategy[Any]:
     names = st.text(max_size=4)
-    parts = st.dictionaries(names, blob_refs(False), min_size=1, max_size=2)
+    parts: st.SearchStrategy[Any] = st.dictionaries(names, blob_refs(False), min_size=1, max_size=2)
     if wrong:
         parts = parts.flatmap(lambda some: blob_refs(True).map(lambda one: {**some, "wrong": one})) | anything
     refs = st.fixed_dictionaries({"kind": names, "digest": digests, "parts": parts})

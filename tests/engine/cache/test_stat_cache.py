@@ -72,7 +72,7 @@ def test_what_is_learnt_later_holds(tmp_path: Path) -> None:
 
 
 def test_it_does_not_grow_for_ever(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stat_cache, "_MOST_ENTRIES", 10)
+    monkeypatch.setattr(stat_cache, "_MAX_ENTRIES", 10)
     for number in range(25):
         cache = StatCache(tmp_path / "stat.json")
         cache.digest(write(tmp_path, f"{number:02d}", b"x"))
@@ -154,7 +154,7 @@ def list_items''').replace("import os\n", "import os\nfrom pano_mvs.scene import
     store = Store(session.store_root)
     executor = ProcessExecutor(store, workers=1, threads=1)  # what a worker notices, we have to forget
     try:
-        result = Run(session.workflow, session.graph, store, session.out, executor=executor).execute()
+        result = Run(session.workflow, session.graph, store, out=session.out, executor=executor).execute()
     finally:
         executor.close()
     assert result.exit_code == 0, (result.failures, result.warnings)

@@ -4,6 +4,7 @@ import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from pano_mvs.core.errors import ContractError, UsageError
 from pano_mvs.core.files import CACHE_MARK
 from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.running.events import Silent
+from pano_mvs.engine.running.events import SilentObserver
 from pano_mvs.scene import RangeMap, Record
 from tests.engine.conftest import Toy, ran, settle
 from tests.permissions import permissions_hold
@@ -45,10 +46,12 @@ def test_values_come_back_as_they_were(tmp_path: Path) -> None:
 @pytest.mark.parametrize("shape", [(0, 3), (), (3, 5), (3, 100_000)])
 @pytest.mark.parametrize("order", ["C", "F"])
 @pytest.mark.parametrize("dtype", ["uint8", "int32", "float64"])
-def test_arrays_of_any_form_come_back_read_only(tmp_path: Path, shape: tuple[int, ...], order: str, dtype: str) -> None:
+def test_arrays_of_any_form_come_back_read_only(
+    tmp_path: Path, shape: tuple[int, ...], order: Literal["C", "F"], dtype: str
+) -> None:
     blobs = Store(tmp_path).blobs
     count = int(np.prod(shape))
-    array = np.asarray(np.arange(count).astype(dtype).reshape(shape, order=order))  # type: ignore[call-overload]
+    array: NDArray[Any] = np.asarray(np.arange(count).astype(np.dtype(dtype)).reshape(shape, order=order))
     ref = blobs.put(array)
     assert ref.is_mapped == (array.nbytes > 200_000)
     back = blobs.get(ref)
@@ -204,7 +207,7 @@ def test_what_has_no_canonical_form_is_refused(value: object) -> None:
         digest_from_value([value])
 
 
-def test_much_damage_takes_few_passes(toy: Toy) -> None:
+def test_much_damage_takes_few_passes(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each damaged blob made the run start over: hundreds of them in a large capture took hours."""
     for number in range(6, 20):
         toy.number(f"{number}.txt", str(10 * number))
@@ -216,13 +219,10 @@ def test_much_damage_takes_few_passes(toy: Toy) -> None:
     for record in (root / "records").rglob("*.json"):
         if b'"stage": "toy.mean"' in record.read_bytes() or b'"stage": "toy.write' in record.read_bytes():
             record.unlink()
-    passes = []
-    listed = Silent.stage_started
-    try:
-        Silent.stage_started = lambda self, name, units: passes.append(name)  # type: ignore[method-assign]
+    passes: list[str] = []
+    with monkeypatch.context() as listening:
+        listening.setattr(SilentObserver, "stage_started", lambda self, name, units: passes.append(name))
         result = toy.run()
-    finally:
-        Silent.stage_started = listed  # type: ignore[method-assign]
     assert result.exit_code == 0
     assert toy.deliverables() == clean
     assert len(result.warnings) > 19
@@ -240,5 +240,5 @@ def test_input_that_is_gone_while_a_stage_reads_it_is_no_fault_of_the_stage(toy:
         raise FileNotFoundError("no such file")'''))  # fmt: skip
     result = toy.run()
     assert (result.exit_code, result.failures) == (0, [])
-    assert any("is gone; the same command computes it again" in text for text in result.warnings)
+    assert any("is missing; the same command computes it again" in text for text in result.warnings)
     assert mark.exists()

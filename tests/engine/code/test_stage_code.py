@@ -15,10 +15,10 @@ from pano_mvs.core.kernel_cache import user_cache_folder
 from pano_mvs.engine.code.libraries import library_versions
 from pano_mvs.engine.code.reach import Reach
 from pano_mvs.engine.code.sources import Sources
-from pano_mvs.engine.code.stage_code import code_graph, reach_of_function, stage_code
 from pano_mvs.engine.code.summary import summarize_module
-from pano_mvs.engine.executors.unit_text import require_same_code
+from pano_mvs.engine.executors.unit_json import require_same_code
 from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.engine.stages.stage_code import code_graph, reach_of_function, stage_code
 from tests.engine.code.package_copy import copied_package
 
 PACKAGE = Path(pano_mvs.__file__).parent

@@ -18,7 +18,7 @@ from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.processes import ProcessExecutor
 from pano_mvs.engine.executors.protocol import Executor
 from pano_mvs.engine.executors.serial import SerialExecutor
-from pano_mvs.engine.running.events import RunResult, Silent
+from pano_mvs.engine.running.events import RunResult, SilentObserver
 from pano_mvs.engine.running.run import Run
 from tests.engine.conftest import Toy, settle
 
@@ -118,7 +118,7 @@ def texts(toy: Toy) -> Toy:
     return toy
 
 
-class Meddler(Silent):
+class Meddler(SilentObserver):
     """Does something once, when a unit has been computed."""
 
     def __init__(self, stage: str, item: str, meddle: Callable[[], object]) -> None:
@@ -126,8 +126,8 @@ class Meddler(Silent):
         self._meddle: Callable[[], object] | None = meddle
         self.warnings: list[str] = []
 
-    def unit_finished(self, stage: str, item: str, outcome: str, seconds: float) -> None:
-        if (stage, item) == self._when and self._meddle is not None:
+    def unit_finished(self, name: str, item: str, *, status: str, seconds: float) -> None:
+        if (name, item) == self._when and self._meddle is not None:
             self._meddle()
             self._meddle = None
 
@@ -135,13 +135,15 @@ class Meddler(Silent):
         self.warnings.append(text)
 
 
-def run(toy: Toy, observer: Silent | None = None, *, executor: str = "serial", cache: str = "cache") -> RunResult:
+def run(
+    toy: Toy, observer: SilentObserver | None = None, *, executor: str = "serial", cache: str = "cache"
+) -> RunResult:
     session = toy.session(cache=toy.folder / cache)
     store = Store(session.store_root)
     made: Executor
     made = SerialExecutor(store, threads=1) if executor == "serial" else ProcessExecutor(store, workers=1, threads=1)
     try:
-        return Run(session.workflow, session.graph, store, session.out, observer=observer, executor=made).execute()
+        return Run(session.workflow, session.graph, store, out=session.out, observer=observer, executor=made).execute()
     finally:
         made.close()
 
@@ -153,7 +155,7 @@ def without(toy: Toy, name: str) -> dict[str, bytes]:
     path.unlink(missing_ok=True)
     session = toy.session(cache=toy.folder / "elsewhere")
     out = toy.folder / "clean"
-    assert Run(session.workflow, session.graph, Store(session.store_root), out).execute().exit_code == 0
+    assert Run(session.workflow, session.graph, Store(session.store_root), out=out).execute().exit_code == 0
     if aside is not None:
         path.write_bytes(aside)
     return {path.name: path.read_bytes() for path in out.glob("*.out")}
@@ -316,7 +318,7 @@ def test_what_is_not_proven_can_be_dropped(texts: Toy, monkeypatch: pytest.Monke
     shutil.rmtree(texts.folder / "cache")
     path = texts.folder / "capture" / "2.txt"
     with monkeypatch.context() as earlier_version:
-        earlier_version.setattr("pano_mvs.engine.running.execute.changed_items", lambda unit, store: {})
+        earlier_version.setattr("pano_mvs.engine.executors.execute.changed_items", lambda unit, store: {})
         run(texts, Meddler("total", "", lambda: path.write_text("77")))  # `late` reads the path, and so other bytes
     path.write_text("20")
     assert run(texts).computed == 0

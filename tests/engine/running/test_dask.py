@@ -10,15 +10,17 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.code import stage_code
+from pano_mvs.engine.code.plugin_digest import code_texts
 from pano_mvs.engine.executors import dask_cluster, dask_task
 from pano_mvs.engine.executors.dask_cluster import DaskExecutor
 from pano_mvs.engine.executors.serial import SerialExecutor
+from pano_mvs.engine.stages import stage_code
 from tests.engine.conftest import Toy, ran
 from tests.engine.running.test_executors import files_below, keys_and_outputs, run_with, told
 from tests.engine.running.test_run import ALL_UNITS
@@ -38,10 +40,15 @@ def existing_cluster(folder: Path, *, workers: int = 2) -> Iterator[tuple[str, l
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     root = str(Path(__file__).parents[3])
     environment["PYTHONPATH"] = root
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": folder, "env": environment}
+    quiet: dict[str, Any] = {
+        "stdout": subprocess.DEVNULL,
+        "stderr": subprocess.DEVNULL,
+        "cwd": folder,
+        "env": environment,
+    }
     command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard",
                "--scheduler-file", str(address_file)]  # fmt: skip
-    processes = [subprocess.Popen(command, **quiet)]  # type: ignore[call-overload]
+    processes = [subprocess.Popen(command, **quiet)]
     try:
         deadline = time.monotonic() + 60
         while not address_file.exists() and time.monotonic() < deadline:
@@ -49,7 +56,7 @@ def existing_cluster(folder: Path, *, workers: int = 2) -> Iterator[tuple[str, l
         for _ in range(workers):
             command = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(address_file),
                        "--nthreads", "1", "--no-dashboard"]  # fmt: skip
-            processes.append(subprocess.Popen(command, **quiet))  # type: ignore[call-overload]
+            processes.append(subprocess.Popen(command, **quiet))
         address = json.loads(address_file.read_text())["address"]
         _wait_for_workers(address, workers)
         yield address, processes[1:]
@@ -66,7 +73,8 @@ def existing_cluster(folder: Path, *, workers: int = 2) -> Iterator[tuple[str, l
 def _wait_for_workers(address: str, workers: int) -> None:
     from distributed import Client
 
-    with Client(address, timeout=30, set_as_default=False) as client:
+    connect: Any = Client  # which has no types
+    with connect(address, timeout=30, set_as_default=False) as client:
         client.wait_for_workers(workers, timeout=60)
 
 
@@ -93,7 +101,7 @@ def test_existing_cluster_gives_the_bytes_of_serial_and_lives_on(toy: Toy) -> No
 def test_plugin_comes_along_as_text(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the plugin's file lies, the worker sees something else."""
     session = toy.session()
-    texts = {path: dask_cluster.code_texts(path) for path in session.workflow.plugins}
+    texts = {path: code_texts(path) for path in session.workflow.plugins}
     monkeypatch.setattr(DaskExecutor, "_texts", lambda self, path: texts[path])
     monkeypatch.setattr(stage_code, "code_texts", lambda path: texts[path])
     hidden = (toy.folder / "plug.py").rename(toy.folder / "hidden.py")
@@ -102,7 +110,7 @@ def test_plugin_comes_along_as_text(toy: Toy, monkeypatch: pytest.MonkeyPatch) -
     try:
         from pano_mvs.engine.running.run import Run
 
-        result = Run(session.workflow, session.graph, store, toy.folder / "out", executor=executor).execute()
+        result = Run(session.workflow, session.graph, store, out=toy.folder / "out", executor=executor).execute()
     finally:
         executor.close()
     assert hidden.exists()

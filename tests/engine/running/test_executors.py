@@ -13,15 +13,15 @@ from pathlib import Path
 
 import pytest
 
-from pano_mvs.core.errors import GateError, InputError, PanoMvsError, UsageError
+from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError, UsageError
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors import choose, worker_process
 from pano_mvs.engine.executors.choose import make_executor
 from pano_mvs.engine.executors.processes import ProcessExecutor
-from pano_mvs.engine.executors.protocol import Executor, Outcome
+from pano_mvs.engine.executors.protocol import Executor, JobOutcome
 from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.executors.threads import bound_environment, share_cores
-from pano_mvs.engine.running.events import RunResult, Silent
+from pano_mvs.engine.running.events import RunResult, SilentObserver
 from pano_mvs.engine.running.run import Run
 from tests.engine.conftest import Toy, ran
 from tests.engine.running.test_run import ALL_UNITS
@@ -33,14 +33,16 @@ def two_processes(store: Store) -> Executor:
     return ProcessExecutor(store, workers=2, threads=1)
 
 
-def run_with(toy: Toy, make: Make, *overrides: str, name: str = "x", observer: Silent | None = None) -> RunResult:
+def run_with(
+    toy: Toy, make: Make, *overrides: str, name: str = "x", observer: SilentObserver | None = None
+) -> RunResult:
     """Run into a folder and a store of the name's own."""
     session = toy.session(*overrides, cache=toy.folder / f"cache-{name}")
     store = Store(session.store_root)
     executor = make(store)
     try:
         out = toy.folder / f"out-{name}"
-        return Run(session.workflow, session.graph, store, out, observer=observer, executor=executor).execute()
+        return Run(session.workflow, session.graph, store, out=out, observer=observer, executor=executor).execute()
     finally:
         executor.close()
 
@@ -181,14 +183,14 @@ def test_the_log_of_a_process_that_died_is_named_if_it_holds_anything(
     """An empty log file was kept and named: a process that dies cannot remove its own."""
     wait = SerialExecutor.wait
 
-    def wait_for_death(self: SerialExecutor, timeout_s: float | None = None) -> tuple[int, Outcome] | None:
+    def wait_for_death(self: SerialExecutor, timeout_s: float | None = None) -> tuple[int, JobOutcome] | None:
         job = self._jobs[0] if self._jobs else None
         if timeout_s == 0 or job is None or (job.unit.entry.name, job.unit.item) != ("scaled", "3.txt"):
             return wait(self, timeout_s)
         self._jobs.clear()
         job.log.parent.mkdir(parents=True, exist_ok=True)
         job.log.write_text(said)
-        return job.number, Outcome("failed", cause="its worker process died (exit code 7)", died=True)
+        return job.number, JobOutcome("failed", cause="its worker process died (exit code 7)", died=True)
 
     monkeypatch.setattr(SerialExecutor, "wait", wait_for_death)
     result = run_with(toy, SerialExecutor)
@@ -245,7 +247,7 @@ def test_timeout_ends_the_unit_and_not_the_run(toy: Toy) -> None:
 
 def test_serial_says_that_it_keeps_no_timeouts(toy: Toy) -> None:
     result = run_with(toy, SerialExecutor, "scaled.timeout_s=1")
-    assert any("timeout_s of scaled is not kept" in warning for warning in result.warnings)
+    assert any("timeout_s of scaled has no effect" in warning for warning in result.warnings)
 
 
 @pytest.mark.slow
@@ -290,7 +292,7 @@ def test_damaged_blob_is_reported_and_its_producer_computed_again(toy: Toy) -> N
 def test_policies_mean_the_same_in_processes(toy: Toy) -> None:
     toy.number("3.txt", "13")
     stopped = run_with(toy, two_processes, "scaled.on_error=stop")
-    assert stopped.exit_code == GateError.exit_code
+    assert stopped.exit_code == RunStoppedError.exit_code
     assert "unlucky" in stopped.stopped
     gated = run_with(toy, two_processes, "scaled.min_success=0.9")
     assert "min_success is 0.9" in gated.stopped
@@ -375,7 +377,7 @@ def test_stage_that_changed_meanwhile_is_not_mistaken_for_the_old_one(toy: Toy) 
     executor = two_processes(store)
     try:
         with pytest.raises(UsageError, match="not the same in the worker"):
-            Run(session.workflow, session.graph, store, toy.folder / "out", executor=executor).execute()
+            Run(session.workflow, session.graph, store, out=toy.folder / "out", executor=executor).execute()
     finally:
         executor.close()
 
@@ -417,7 +419,7 @@ def test_executors_are_chosen_by_name_and_contradictions_refused(
         make_executor(store, "thread")
     with pytest.raises(UsageError, match="one unit at a time"):
         make_executor(store, "serial", workers=2)
-    with pytest.raises(UsageError, match="--scheduler is dask's"):
+    with pytest.raises(UsageError, match="--scheduler requires --executor dask"):
         make_executor(store, "processes", scheduler="tcp://somewhere:8786")
 
 
@@ -428,7 +430,7 @@ def test_nothing_of_a_cancelled_run_goes_on(toy: Toy) -> None:
     time.sleep(600)'''))  # fmt: skip
     before = threading.active_count()
     started = time.monotonic()
-    assert run_with(toy, two_processes, "scaled.on_error=stop").exit_code == GateError.exit_code
+    assert run_with(toy, two_processes, "scaled.on_error=stop").exit_code == RunStoppedError.exit_code
     assert time.monotonic() - started < 60
     assert threading.active_count() == before
 

@@ -10,7 +10,7 @@ import pytest
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.planning.units import Unit
-from pano_mvs.engine.running.dispatcher import Desk
+from pano_mvs.engine.running.dispatcher import Dispatcher
 from pano_mvs.engine.stages.stage import SourceItem, spec_of
 from pano_mvs.engine.workflows.policy import Policy
 from pano_mvs.engine.workflows.workflow import StageEntry
@@ -22,14 +22,14 @@ from tests.io.images.pictures import png_chunk
 GIB = 1 << 30
 
 
-def unit_of(function: Any, params: Any, tmp_path: Path, *, memory: str = "0", **more: Any) -> tuple[Desk, Unit]:
+def unit_of(function: Any, params: Any, tmp_path: Path, *, memory: str = "0", **more: Any) -> tuple[Dispatcher, Unit]:
     spec = spec_of(function)
     assert spec is not None
     store = Store(tmp_path / "cache")
     entry = StageEntry("a", spec, params, Policy(use=spec.name, memory=memory), "w:1:1")
     inputs = {name: store.put_value(value) for name, value in more.pop("values", {}).items()}
     unit = Unit(entry, "x", ("x",), inputs, "0" * 32, {}, more.get("source"))
-    return Desk(SerialExecutor(store), store, tmp_path / "out", {}), unit
+    return Dispatcher(SerialExecutor(store), store, out=tmp_path / "out", plugins={}), unit
 
 
 def stated(path: Path, width: int, height: int) -> Path:
@@ -43,8 +43,8 @@ def stated(path: Path, width: int, height: int) -> Path:
 def test_a_source_knows_the_decoded_size_by_the_header(tmp_path: Path, width: int, least: float, most: float) -> None:
     """A PNG of 30,000×15,000 took 2.8 GB without a word; what is beyond the limit is refused by name anyway."""
     item = SourceItem("x.png", {"image": stated(tmp_path / "x.png", width, width // 2)})
-    desk, unit = unit_of(folder, FolderParams(path=tmp_path), tmp_path, source=item)
-    assert least * GIB <= desk._memory_of(unit) <= most * GIB
+    dispatcher, unit = unit_of(folder, FolderParams(path=tmp_path), tmp_path, source=item)
+    assert least * GIB <= dispatcher._memory_of(unit) <= most * GIB
 
 
 def panorama(tmp_path: Path, width: int, name: str) -> Panorama:
@@ -59,11 +59,11 @@ def panorama(tmp_path: Path, width: int, name: str) -> Panorama:
 def test_stages_count_what_decoding_their_inputs_takes(
     tmp_path: Path, width: int, name: str, least: float, most: float
 ) -> None:
-    desk, unit = unit_of(sift_tangent, SiftParams(), tmp_path, values={"image": panorama(tmp_path, width, name)})
-    assert least * GIB <= desk._memory_of(unit) <= most * GIB
+    dispatcher, unit = unit_of(sift_tangent, SiftParams(), tmp_path, values={"image": panorama(tmp_path, width, name)})
+    assert least * GIB <= dispatcher._memory_of(unit) <= most * GIB
 
 
 def test_what_the_workflow_says_goes_first(tmp_path: Path) -> None:
     values = {"image": panorama(tmp_path, 30_000, "x.jpg")}
-    desk, unit = unit_of(sift_tangent, SiftParams(), tmp_path, memory="1GB", values=values)
-    assert desk._memory_of(unit) == 10**9
+    dispatcher, unit = unit_of(sift_tangent, SiftParams(), tmp_path, memory="1GB", values=values)
+    assert dispatcher._memory_of(unit) == 10**9

@@ -74,7 +74,7 @@ def test_the_lock_of_a_process_that_is_gone_is_taken_over(
 def test_the_lock_of_another_host_is_left_to_the_user(tmp_path: Path, change: Change) -> None:
     path = left_behind(tmp_path, change)
     before = path.read_bytes()
-    with pytest.raises(StoreError, match=rf"which cannot be seen from here, delete {path}"), output_lock(tmp_path):
+    with pytest.raises(StoreError, match=rf"which cannot be checked from here, delete {path}"), output_lock(tmp_path):
         pass
     assert path.read_bytes() == before
 
@@ -85,7 +85,7 @@ def test_a_lock_that_names_nobody_is_left_to_the_user(
 ) -> None:
     monkeypatch.setattr(module, "_PAUSE_S", 0)
     (tmp_path / LOCK_NAME).write_bytes(text)
-    with pytest.raises(StoreError, match="does not say which run"), output_lock(tmp_path):
+    with pytest.raises(StoreError, match="does not name the run"), output_lock(tmp_path):
         pass
     assert (tmp_path / LOCK_NAME).read_bytes() == text
 

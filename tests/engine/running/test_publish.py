@@ -11,7 +11,8 @@ import pytest
 from pano_mvs.core.errors import ContractError
 from pano_mvs.core.files import OUTPUT_MARK
 from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.running.publish import NameClashError, Publisher
+from pano_mvs.engine.running.file_claims import NameClashError
+from pano_mvs.engine.running.publish import Publisher
 from pano_mvs.scene import Files
 
 
@@ -117,7 +118,7 @@ def test_who_delivers_of_a_chain_of_clashes_does_not_depend_on_the_order(
     assert failed == {"b", "c"}
     assert files_in(tmp_path / "out") == {"ab": "a", "a": "a", "d": "d"}
     assert publisher.published.keys() == {"ab", "a", "d"} == set(publisher.written)
-    causes = publisher.clash_causes()
+    causes = publisher.refusals()
     assert causes.keys() == {("toy", "b"), ("toy", "c")}
     assert "ab is delivered for a too" in causes["toy", "b"]
     assert "bc is delivered for b too" in causes["toy", "c"]
@@ -183,7 +184,7 @@ def test_what_is_the_runs_own_is_not_delivered(tmp_path: Path, target: str) -> N
     path = tmp_path / "text.txt"
     path.write_text("x")
     files = store.put_value(Files({"a.txt": path, target: path}))
-    with pytest.raises(ContractError, match="which is the run's own"):
+    with pytest.raises(ContractError, match="which the run itself writes"):
         publisher.publish("toy", "report.html.png", files)
     assert publisher.written == []
     if not target.rpartition("/")[2].startswith("."):  # marks and temporary files are the run's in any folder

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from pano_mvs.core.errors import GateError, InputError, StoreError, UsageError, WorkflowError
-from pano_mvs.engine.cache.latest_runs import RunBook
+from pano_mvs.core.errors import InputError, RunStoppedError, StoreError, UsageError, WorkflowError
+from pano_mvs.engine.cache.latest_runs import RunHistory
 from pano_mvs.engine.stages.registry import Registry
 from tests.engine.conftest import Toy, ran
 
@@ -148,13 +148,13 @@ def test_failed_unit_is_tried_again(toy: Toy) -> None:
 
 def test_on_error_stop_and_gates_stop_with_exit_code_4(toy: Toy) -> None:
     toy.number("3.txt", "13")
-    assert toy.run("scaled.on_error=stop").exit_code == GateError.exit_code
+    assert toy.run("scaled.on_error=stop").exit_code == RunStoppedError.exit_code
     assert "unlucky" in toy.run("scaled.on_error=stop").stopped
-    assert toy.run("scaled.min_success=0.9").exit_code == GateError.exit_code
+    assert toy.run("scaled.min_success=0.9").exit_code == RunStoppedError.exit_code
     gated = toy.run("scaled.gate={value: 1000}")
-    assert gated.exit_code == GateError.exit_code
-    assert "the gate asks for 1000" in gated.stopped
-    assert "it reports: value" in toy.run("scaled.gate={valu: 1}").stopped
+    assert gated.exit_code == RunStoppedError.exit_code
+    assert "`gate` requires 1000" in gated.stopped
+    assert "the stage reports: value" in toy.run("scaled.gate={valu: 1}").stopped
 
 
 def test_empty_source_of_failures_only_is_an_input_error(toy: Toy) -> None:
@@ -202,7 +202,7 @@ def test_a_unit_that_delivers_what_is_the_runs_own_fails_and_nothing_else(toy: T
         result = toy.run()
         assert result.exit_code == 3
         (failure,) = result.failures
-        assert "it delivers Run.json, which is the run's own" in failure.cause
+        assert "it delivers Run.json, which the run itself writes" in failure.cause
         assert not (toy.folder / "out" / "Run.json").exists()
         assert len([name for name in result.published if name.startswith("mean/")]) == 4
     assert not toy.run("each.to=sub").failures
@@ -248,15 +248,15 @@ def test_store_that_cannot_be_written_still_serves_what_it_has(toy: Toy, monkeyp
     def refuse(*_: object, **__: object) -> None:
         raise StoreError("read only")
 
-    monkeypatch.setattr(RunBook, "remember", refuse)
+    monkeypatch.setattr(RunHistory, "remember", refuse)
     result = toy.run()
     assert result.exit_code == 0
-    assert any("cannot be told why" in warning for warning in result.warnings)
+    assert any("cannot give the reasons" in warning for warning in result.warnings)
 
 
 def test_metric_that_is_not_finite_passes_no_gate(toy: Toy) -> None:
     toy.edit("plug.py", lambda text: text.replace('ctx.metric("value", x.value)', 'ctx.metric("value", float("nan"))'))
-    assert toy.run("scaled.gate={value: 1}").exit_code == GateError.exit_code
+    assert toy.run("scaled.gate={value: 1}").exit_code == RunStoppedError.exit_code
 
 
 @pytest.mark.parametrize("where", ["    if x.value == 13:", "class ScaleParams"])
@@ -295,8 +295,8 @@ def test_helpers_of_one_plugin_are_not_those_of_another(toy: Toy) -> None:
     registry = Registry()
     for name in ("first", "second"):
         registry.add_file(toy.folder / name / "plugin.py")
-    assert registry.stages["first.pairs"].function(()) == 1
-    assert registry.stages["second.pairs"].function(()) == 50
+    values: list[object] = [registry.stages[f"{name}.pairs"].function(()) for name in ("first", "second")]
+    assert values == [1, 50]
 
 
 def test_stage_that_a_plugin_only_imports_is_not_its_own(toy: Toy) -> None:

@@ -9,12 +9,12 @@ import pytest
 from pydantic import Field, ValidationError
 
 from pano_mvs.core.errors import UsageError
-from pano_mvs.core.parts import Parts
+from pano_mvs.core.named_registry import NamedRegistry
 from pano_mvs.core.settings import check_settings, setting
 from pano_mvs.engine.stages.params import Params
 from pano_mvs.engine.stages.settings import params_from, settings_from
 
-ANIMALS = Parts("animal", {"cat": 1, "dog": 2})
+ANIMALS = NamedRegistry("animal", {"cat": 1, "dog": 2})
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class ZooSettings:
     count: int = setting(3, ge=1, le=9, doc="how many")
     weight: float | None = setting(None, gt=0, doc="of each")
     window: int = setting(5, ge=1, odd=True, doc="side")
-    animal: str = setting("cat", parts=ANIMALS, doc="which")
+    animal: str = setting("cat", registry=ANIMALS, doc="which")
     mood: Literal["good", "bad"] = setting("good", doc="of all")
 
     def __post_init__(self) -> None:

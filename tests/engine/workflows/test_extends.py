@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from pano_mvs.cli.session import open_session, presets_folder
 from pano_mvs.core.errors import WorkflowError
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.workflow import Workflow, load_workflow
+from pano_mvs.session.session import open_session, presets_folder
 from tests.engine.conftest import Toy, ran
 
 CHILD = "pano_mvs: 1\nname: child\nextends: wf.yaml\n"
@@ -135,7 +135,7 @@ def test_mistakes_are_told_with_the_place_in_their_own_file(toy: Toy) -> None:
     assert any(line.startswith("child.yaml:5:11: stage 'pairs': unknown setting 'colour'") for line in found), found
     assert any("child.yaml:6:3: stage 'none' needs `use: NAME`; no file that is extended has" in line for line in found)
     assert any(
-        "child.yaml:7:3: stage 'away' needs `use: NAME`; there is none of that name to remove" in p for p in found
+        "child.yaml:7:3: stage 'away' needs `use: NAME`; there is no stage of that name to remove" in p for p in found
     )
     assert any(line.startswith("child.yaml:8:3: stage 'nine' needs `use: NAME`: write") for line in found)
 
@@ -143,10 +143,10 @@ def test_mistakes_are_told_with_the_place_in_their_own_file(toy: Toy) -> None:
 @pytest.mark.parametrize(
     ("extends", "what"),
     [
-        ("7", "child.yaml:3:10: extends: name a workflow file or a preset"),
-        ("{a: b}", "child.yaml:3:10: extends: name a workflow file or a preset"),
-        ("[wf.yaml, 7]", "child.yaml:3:20: extends: name a workflow file or a preset"),
-        ("''", "extends: name a workflow file or a preset"),
+        ("7", "child.yaml:3:10: extends: must be a workflow file or a preset"),
+        ("{a: b}", "child.yaml:3:10: extends: must be a workflow file or a preset"),
+        ("[wf.yaml, 7]", "child.yaml:3:20: extends: must be a workflow file or a preset"),
+        ("''", "extends: must be a workflow file or a preset"),
         ("wf.yml", "child.yaml:3:10: extends: there is no file wf.yml and no preset 'wf.yml'. Did you mean 'wf.yaml'"),
         ("../../../no/such", "child.yaml:3:10: extends: there is no file"),
         ("capture", "child.yaml:3:10: extends: workflow capture is a folder"),
@@ -167,4 +167,4 @@ def test_files_that_extend_two_others_each_do_not_multiply(toy: Toy) -> None:
     assert "scaled" in load(toy, CHILD.replace("wf.yaml", "a19.yaml")).stages
     for number in range(60):
         (toy.folder / f"c{number}.yaml").write_text(f"pano_mvs: 1\nextends: c{number + 1}.yaml\n")
-    assert "50 files are allowed" in problems(toy, CHILD.replace("wf.yaml", "c0.yaml"))[-1]
+    assert "at most 50 files are allowed" in problems(toy, CHILD.replace("wf.yaml", "c0.yaml"))[-1]

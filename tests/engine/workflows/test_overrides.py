@@ -122,7 +122,7 @@ def test_plugin_files_can_be_added(toy: Toy, settings: Path, monkeypatch: pytest
         assert [path.name for path in found.plugins] == ["settings.py", "extra.py"]
     gone = problems(settings, "plugins=gone.py")
     assert gone[0].startswith("--set plugins: plugin file")
-    assert "--set plugins: a plugin is the path of a Python file" in problems(settings, "plugins=7")
+    assert "--set plugins: a plugin must be the path of a Python file" in problems(settings, "plugins=7")
 
 
 def test_paths_in_files_and_on_the_command_line(
@@ -146,11 +146,11 @@ def test_paths_in_files_and_on_the_command_line(
         ("mani.limit=1", "--set mani.limit=1: no stage 'mani'. Did you mean 'many'"),
         ("many.limits=1", "--set many.limits: stage 'many': unknown setting 'limits'. Did you mean 'limit'?"),
         ("many.retires=1", "unknown setting 'retires'. Did you mean 'retries'?"),
-        ("many.numbers.7=1", "--set many.numbers.7=1: numbers is a list of 2: write a position from 0"),
-        ("many.numbers.x=1", "numbers is a list of 2: write a position from 0"),
-        ("many.numbers.-1=1", "numbers is a list of 2: write a position from 0"),
+        ("many.numbers.7=1", "--set many.numbers.7=1: numbers is a list of 2: give a position from 0"),
+        ("many.numbers.x=1", "numbers is a list of 2: give a position from 0"),
+        ("many.numbers.-1=1", "numbers is a list of 2: give a position from 0"),
         ("many.numbers.99999999999999999999=1", "numbers is a list of 2"),
-        ("many.retries.x=1", "--set many.retries.x=1: retries is 3, which has no 'x' in it"),
+        ("many.retries.x=1", "--set many.retries.x=1: retries is 3, which has no 'x'"),
         ("many.inner.y=1", "--set many.inner.y: stage 'many': unknown setting 'inner.y'."),
         ("many.limit=many", "--set many.limit: stage 'many': limit:"),
         ("many.limit=[", "--set many.limit:1:"),
@@ -160,8 +160,8 @@ def test_paths_in_files_and_on_the_command_line(
         ("many.use=[1]", "--set many.use: stage 'many': there is no stage [1]"),
         ("many.use=null", "--set many.use: stage 'many': there is no stage None"),
         ("many.gate.x={min: 2, max: 1}", "min 2 is larger than max 1: nothing would pass"),
-        ("many.gate.x={}", "say {min: …}, {max: …} or both"),
-        ("many.gate.x=high", "must be a number (the least value) or {min: …, max: …}"),
+        ("many.gate.x={}", "give {min: …}, {max: …} or both"),
+        ("many.gate.x=high", "must be a number (the minimum) or {min: …, max: …}"),
         ("many.gate.x.mim=1", "unknown setting 'gate.x.mim'."),
         ("many.to=../up", "--set many.to: stage 'many': to: must be a folder inside the output folder"),
         ("many.memory=lots", "memory: must be a size such as 500MB"),

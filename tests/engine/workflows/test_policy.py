@@ -7,22 +7,22 @@ from pathlib import Path
 
 import pytest
 
-from pano_mvs.cli.session import presets_folder
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.policy import RESERVED_KEYS
 from pano_mvs.engine.workflows.wiring import wire
 from pano_mvs.engine.workflows.workflow import WorkflowReader
+from pano_mvs.session.session import presets_folder
 from tests.engine.conftest import Toy, ran
 
 REFERENCE = Path(__file__).parents[3] / "docs" / "workflows.md"
 
 
 @pytest.mark.parametrize(
-    ("gate", "asks"),
+    ("gate", "requires"),
     [
-        ("{value: 31}", "value is 30, the gate asks for 31 or more"),
-        ("{value: {min: 30.5}}", "value is 30, the gate asks for 30.5 or more"),
-        ("{value: {max: 29}}", "value is 30, the gate asks for 29 or less"),
+        ("{value: 31}", "value is 30, but `gate` requires 31 or more"),
+        ("{value: {min: 30.5}}", "value is 30, but `gate` requires 30.5 or more"),
+        ("{value: {max: 29}}", "value is 30, but `gate` requires 29 or less"),
         ("{value: {min: 1, max: 29}}", "29 or less"),
         ("{value: 30}", ""),
         ("{value: {min: 30, max: 30}}", ""),
@@ -30,11 +30,11 @@ REFERENCE = Path(__file__).parents[3] / "docs" / "workflows.md"
         ("{}", ""),
     ],
 )
-def test_gates_have_a_least_and_a_largest_value(toy: Toy, gate: str, asks: str) -> None:
+def test_thresholds_have_a_minimum_and_a_maximum(toy: Toy, gate: str, requires: str) -> None:
     result = toy.run(f"scaled.gate={gate}")
-    assert result.exit_code == (4 if asks else 0)
-    assert asks in result.stopped
-    assert ("mean" in ran(result)) != bool(asks), "what reads from the stage waits until it has passed"
+    assert result.exit_code == (4 if requires else 0)
+    assert requires in result.stopped
+    assert ("mean" in ran(result)) != bool(requires), "what reads from the stage waits until it has passed"
 
 
 def test_a_gate_that_is_changed_computes_nothing_again(toy: Toy) -> None:

@@ -10,11 +10,11 @@ import jsonschema
 import pytest
 from ruamel.yaml import YAML
 
-from pano_mvs.cli.session import presets_folder
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.policy import RESERVED_KEYS
 from pano_mvs.engine.workflows.schema import workflow_schema
 from pano_mvs.engine.workflows.workflow import WorkflowReader
+from pano_mvs.session.session import presets_folder
 from tests.engine.toy import HELPER, PLUGIN
 
 SHIPPED = sorted(presets_folder().glob("*.yaml"))

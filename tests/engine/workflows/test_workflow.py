@@ -44,21 +44,21 @@ def test_every_mistake_is_found_in_one_go_with_its_place(toy: Toy) -> None:
 @pytest.mark.parametrize(
     ("text", "place", "what"),
     [
-        ("pano_mvs: 1\npano_mvs: 1\nstages: {}", "wf.yaml:2:1", "given twice"),
+        ("pano_mvs: 1\npano_mvs: 1\nstages: {}", "wf.yaml:2:1", "occurs twice"),
         ("pano_mvs: 1\nstagse: {}", "wf.yaml:2:1", "unknown key 'stagse'. Did you mean 'stages'?"),
         ("stages: {a: {use: x}}", "wf.yaml:1:1", "`pano_mvs: 1` is missing"),
         ("pano_mvs: 7\nstages: {a: {use: x}}", "wf.yaml:1:11", "workflow format 7"),
         ("pano_mvs: 1\nstages: [a]", "wf.yaml:2:9", "must be a mapping"),
         ("pano_mvs: 1\nstages: {a: {path: capture}}", "wf.yaml:2:10", "needs `use: NAME`"),
-        ("pano_mvs: 1\nstages: {../a: {use: x}}", "wf.yaml:2:10", "must be a word"),
+        ("pano_mvs: 1\nstages: {../a: {use: x}}", "wf.yaml:2:10", "must consist"),
         ("pano_mvs: !!python/object:os.system 1", "wf.yaml:1:11", "is not allowed"),
         ("pano_mvs: [1", "wf.yaml", "expected"),
         ("", "wf.yaml:1:1", "empty"),
-        ("pano_mvs: 1\nname: a/b\nstages: {a: {use: x}}", "wf.yaml:2:7", "name must be a word"),
+        ("pano_mvs: 1\nname: a/b\nstages: {a: {use: x}}", "wf.yaml:2:7", "name must consist"),
         ("pano_mvs: 1\nplugins: plug.py\nstages: {a: {use: x}}", "wf.yaml:2:10", "must be a list"),
         ("pano_mvs: 1\nplugins: [gone.py]\nstages: {a: {use: x}}", "wf.yaml:2:11", "does not exist"),
         ("[" * 10_000, "wf.yaml", "nested too deeply"),
-        ("pano_mvs: " + "9" * 10_000, "wf.yaml:1:11", "not a number that can be used"),
+        ("pano_mvs: " + "9" * 10_000, "wf.yaml:1:11", "not a usable number"),
     ],
 )
 def test_mistakes_of_form(toy: Toy, text: str, place: str, what: str) -> None:
@@ -77,7 +77,7 @@ def test_mistakes_of_form(toy: Toy, text: str, place: str, what: str) -> None:
         ("  a: {use: toy.scale, in: {x: b}}\n  b: {use: toy.scale, in: {x: a}}\n", "in a cycle: "),
         (
             SOURCE + "  a: {use: toy.scale}\n  b: {use: toy.scale, in: {x: i}}\n  c: {use: toy.scale}\n",
-            "could be fed by a, b; say which with `in: {x: …}`",
+            "could be fed by a, b; choose with `in: {x: …}`",
         ),
         ("  i: {use: toy.source, path: capture, to: ../up}\n", "inside the output folder"),
     ],

@@ -1,9 +1,14 @@
 """COLMAP models: pycolmap reads what we write, and we read what COLMAP writes."""
 
+from __future__ import annotations
+
 import dataclasses
 import struct
 import subprocess
 import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pycolmap
@@ -21,7 +26,7 @@ FILES = ("cameras", "frames", "images", "points3D", "rigs")
 NOISE_RAD = 1e-3
 
 
-def noisy_poses(points=200):
+def noisy_poses(points: int = 200) -> Poses:
     """Poses whose points are seen by two to four cameras, with a little noise; some beside the seam and the poles."""
     rng = np.random.default_rng(7)
     cameras = capture_poses(4, seed=2)
@@ -48,17 +53,17 @@ def noisy_poses(points=200):
 
 
 @pytest.fixture(scope="module")
-def model_folder(tmp_path_factory):
+def model_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("model") / "sparse" / "0"
     write_colmap_model(folder, noisy_poses(), SIZES)
     return folder
 
 
-def test_all_five_files_are_written(model_folder):
+def test_all_five_files_are_written(model_folder: Path) -> None:
     assert sorted(path.name for path in model_folder.iterdir()) == [f"{name}.bin" for name in FILES]
 
 
-def test_pycolmap_reads_cameras_images_and_names(model_folder):
+def test_pycolmap_reads_cameras_images_and_names(model_folder: Path) -> None:
     model = pycolmap.Reconstruction(str(model_folder))
     cameras = {camera.camera_id: camera for camera in model.cameras.values()}
     assert [(c.model_name, c.height, c.width, list(c.params)) for _, c in sorted(cameras.items())] == [
@@ -76,7 +81,7 @@ def test_pycolmap_reads_cameras_images_and_names(model_folder):
         assert image.cam_from_world().rotation.matrix() == pytest.approx(pose.rotation)
 
 
-def test_the_points_project_onto_their_observations(model_folder):
+def test_the_points_project_onto_their_observations(model_folder: Path) -> None:
     """COLMAP's own projection: keypoints, tracks and poses belong together, at either picture size."""
     model = pycolmap.Reconstruction(str(model_folder))
     angles, count = [], 0
@@ -93,7 +98,7 @@ def test_the_points_project_onto_their_observations(model_folder):
     assert model.compute_mean_reprojection_error() == pytest.approx(NOISE_RAD * 1000 / (2 * np.pi), rel=0.2)
 
 
-def test_reading_gives_back_what_was_written(model_folder):
+def test_reading_gives_back_what_was_written(model_folder: Path) -> None:
     poses, expected = read_colmap_model(model_folder), noisy_poses()
     poses.check()
     for name in ("names", "point_colors_rgb", "track_point_idx", "track_image_idx"):
@@ -104,7 +109,7 @@ def test_reading_gives_back_what_was_written(model_folder):
     assert not poses.metric
 
 
-def test_text_models_and_parent_folders_are_read_too(model_folder, tmp_path):
+def test_text_models_and_parent_folders_are_read_too(model_folder: Path, tmp_path: Path) -> None:
     pycolmap.Reconstruction(str(model_folder)).write_text(str(tmp_path))
     poses = read_poses(tmp_path)
     assert poses.names == NAMES
@@ -112,13 +117,13 @@ def test_text_models_and_parent_folders_are_read_too(model_folder, tmp_path):
     assert read_poses(model_folder.parents[1]).names == NAMES
 
 
-def test_models_of_before_rigs_are_read(model_folder, tmp_path):
+def test_models_of_before_rigs_are_read(model_folder: Path, tmp_path: Path) -> None:
     for name in ("cameras", "images", "points3D"):
         (tmp_path / f"{name}.bin").write_bytes((model_folder / f"{name}.bin").read_bytes())
     assert read_colmap_model(tmp_path).names == NAMES
 
 
-def test_poses_without_points_survive(tmp_path):
+def test_poses_without_points_survive(tmp_path: Path) -> None:
     expected = Poses.without_points(
         dict(zip("ab", capture_poses(2), strict=True)), frame="any", scale="any", metric=False
     )
@@ -129,7 +134,7 @@ def test_poses_without_points_survive(tmp_path):
     assert len(poses.points_in_world) == len(poses.track_bearings) == 0
 
 
-def test_the_same_poses_are_the_same_bytes_in_another_process(model_folder, tmp_path):
+def test_the_same_poses_are_the_same_bytes_in_another_process(model_folder: Path, tmp_path: Path) -> None:
     code = (
         "import sys; from pathlib import Path; from tests.io.colmap.test_model import *; "
         "write_colmap_model(Path(sys.argv[1]), noisy_poses(), SIZES)"
@@ -139,12 +144,12 @@ def test_the_same_poses_are_the_same_bytes_in_another_process(model_folder, tmp_
         assert (tmp_path / f"{name}.bin").read_bytes() == (model_folder / f"{name}.bin").read_bytes(), name
 
 
-def test_a_size_that_is_not_given_is_named(tmp_path):
+def test_a_size_that_is_not_given_is_named(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"the size of c\.png is not given"):
         write_colmap_model(tmp_path, noisy_poses(), dict.fromkeys(NAMES[:3], (8, 16)))
 
 
-def test_other_cameras_are_refused(tmp_path):
+def test_other_cameras_are_refused(tmp_path: Path) -> None:
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(
         pycolmap.Camera(camera_id=1, model="PINHOLE", width=4, height=4, params=[2, 2, 2, 2])
@@ -154,14 +159,14 @@ def test_other_cameras_are_refused(tmp_path):
         read_colmap_model(tmp_path)
 
 
-def test_a_model_without_images_is_refused(tmp_path):
+def test_a_model_without_images_is_refused(tmp_path: Path) -> None:
     pycolmap.Reconstruction().write_binary(str(tmp_path))
     with pytest.raises(InputError, match="registers no image"):
         read_colmap_model(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_a_truncated_model_is_named(model_folder, tmp_path, name):
+def test_a_truncated_model_is_named(model_folder: Path, tmp_path: Path, name: str) -> None:
     for file in FILES:
         (tmp_path / f"{file}.bin").write_bytes((model_folder / f"{file}.bin").read_bytes())
     whole = (tmp_path / f"{name}.bin").read_bytes()
@@ -170,12 +175,12 @@ def test_a_truncated_model_is_named(model_folder, tmp_path, name):
         read_colmap_model(tmp_path)
 
 
-def test_a_folder_without_a_model_is_named(tmp_path):
+def test_a_folder_without_a_model_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no COLMAP model here"):
         read_colmap_model(tmp_path)
 
 
-def test_points_that_no_image_sees_are_kept(tmp_path):
+def test_points_that_no_image_sees_are_kept(tmp_path: Path) -> None:
     poses = noisy_poses()
     kept = poses.track_point_idx != 3
     tracks = {name: getattr(poses, name)[kept] for name in ("track_point_idx", "track_image_idx", "track_bearings")}
@@ -186,7 +191,9 @@ def test_points_that_no_image_sees_are_kept(tmp_path):
 
 
 @pytest.mark.parametrize(("form", "suffixes"), [("bin", ["bin"]), ("txt", ["txt"]), ("both", ["bin", "txt"])])
-def test_models_are_written_as_text_binary_or_both(tmp_path, form, suffixes):
+def test_models_are_written_as_text_binary_or_both(
+    tmp_path: Path, form: Literal["bin", "txt", "both"], suffixes: Sequence[str]
+) -> None:
     write_colmap_model(tmp_path / "model", noisy_poses(), SIZES, form=form)
     files = [f"{name}.{suffix}" for name in FILES for suffix in suffixes]
     assert sorted(path.name for path in (tmp_path / "model").iterdir()) == sorted(files)
@@ -199,7 +206,7 @@ def test_models_are_written_as_text_binary_or_both(tmp_path, form, suffixes):
     assert {point.track.length() for point in model.points3D.values()} == {2, 3}
 
 
-def test_what_we_read_is_what_colmaps_own_reader_reads(model_folder, tmp_path):
+def test_what_we_read_is_what_colmaps_own_reader_reads(model_folder: Path, tmp_path: Path) -> None:
     model = pycolmap.Reconstruction(str(model_folder))
     model.write_text(str(tmp_path))
     for folder in (model_folder, tmp_path):
@@ -215,7 +222,7 @@ def test_what_we_read_is_what_colmaps_own_reader_reads(model_folder, tmp_path):
         np.testing.assert_array_equal(lengths, [point.track.length() for point in points])
 
 
-def copied(model_folder, folder, name, change):
+def copied(model_folder: Path, folder: Path, name: str, change: Callable[[bytes], bytes]) -> Path:
     """A copy of the binary model in which one file is changed."""
     for file in ("cameras", "images", "points3D"):
         data = (model_folder / f"{file}.bin").read_bytes()
@@ -225,7 +232,9 @@ def copied(model_folder, folder, name, change):
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
 @pytest.mark.parametrize("count", [10**6, 2**40, 2**64 - 1])
-def test_a_count_beyond_the_file_is_refused_before_it_takes_memory(model_folder, tmp_path, name, count):
+def test_a_count_beyond_the_file_is_refused_before_it_takes_memory(
+    model_folder: Path, tmp_path: Path, name: str, count: int
+) -> None:
     """An absurd count of points filled all memory once: the reader made room for what the file promised."""
     folder = copied(model_folder, tmp_path, name, lambda data: struct.pack("<Q", count) + data[8:])
     with pytest.raises(InputError, match=rf"{name}\.bin: the COLMAP model cannot be read: it states {count} entries"):
@@ -233,18 +242,18 @@ def test_a_count_beyond_the_file_is_refused_before_it_takes_memory(model_folder,
 
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_an_empty_file_is_named(model_folder, tmp_path, name):
+def test_an_empty_file_is_named(model_folder: Path, tmp_path: Path, name: str) -> None:
     with pytest.raises(InputError, match=rf"{name}\.bin: the COLMAP model cannot be read"):
         read_colmap_model(copied(model_folder, tmp_path, name, lambda data: b""))
 
 
-def test_points_that_images_observe_but_the_model_lacks_are_named(model_folder, tmp_path):
+def test_points_that_images_observe_but_the_model_lacks_are_named(model_folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"images\.bin \(b/1\.jpg\): observes point \d+, which points3D\.bin does not"):
         read_colmap_model(copied(model_folder, tmp_path, "points3D", lambda data: bytes(8)))
 
 
 @pytest.mark.parametrize("place", [4, 36, 52])
-def test_a_pose_that_is_no_number_is_named_when_it_is_read(model_folder, tmp_path, place):
+def test_a_pose_that_is_no_number_is_named_when_it_is_read(model_folder: Path, tmp_path: Path, place: int) -> None:
     change = lambda data: data[: 8 + place] + struct.pack("<d", np.nan) + data[16 + place :]  # noqa: E731
     with pytest.raises(InputError, match=r"images\.bin \(.*\.\w+\): the pose holds NaN or infinite numbers"):
         read_colmap_model(copied(model_folder, tmp_path, "images", change))
@@ -267,7 +276,7 @@ def test_a_pose_that_is_no_number_is_named_when_it_is_read(model_folder, tmp_pat
         ("points3D", "1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1", "point 1 is listed twice"),
     ],
 )
-def test_a_malformed_text_is_named(tmp_path, file, line, what):
+def test_a_malformed_text_is_named(tmp_path: Path, file: str, line: str, what: str) -> None:
     lines = {"cameras": "1 EQUIRECTANGULAR 1024 512 1024 512", "images": "1 1 0 0 0 0 0 0 1 a.jpg\n", "points3D": ""}
     for name, text in (lines | {file: line}).items():
         (tmp_path / f"{name}.txt").write_text(text + "\n")

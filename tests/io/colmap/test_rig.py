@@ -5,13 +5,16 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from functools import cache
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import pycolmap
 import pytest
 
-from pano_mvs.algorithms.faces.layout import panorama_faces
+from pano_mvs.algorithms.faces.layout import Face, FaceLayout, panorama_faces
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.io.colmap.images import write_picture
 from pano_mvs.io.colmap.maps import read_colmap_map, write_depth_map, write_normal_map
@@ -20,21 +23,21 @@ from pano_mvs.io.colmap.workspace import write_stereo_configs
 from pano_mvs.scene.image_files.image_file import decode_image
 from tests.io.colmap.test_model import NAMES, noisy_poses
 
-LAYOUTS = ("cube", "icosahedron")
+LAYOUTS: tuple[FaceLayout, ...] = ("cube", "icosahedron")
 
 
 @cache
-def faces_of(layout):
+def faces_of(layout: FaceLayout) -> tuple[Face, ...]:
     return panorama_faces((512, 1024), layout=layout, fov_deg=100, size_px=240)
 
 
-def cuts(layout="cube", names=NAMES):
+def cuts(layout: FaceLayout = "cube", names: Sequence[str] = NAMES) -> dict[str, CutPanorama]:
     faces = faces_of(layout)
     views = [face.view for face in faces]
     return {name: CutPanorama(views, [f"{name}_{face.name}.jpg" for face in faces]) for name in names}
 
 
-def test_opencv_is_loaded_before_pycolmap():
+def test_opencv_is_loaded_before_pycolmap() -> None:
     """The other way round OpenCV's PNG writer frees with pycolmap's zlib what it got from its own, and dies."""
     code = (
         "import sys, pano_mvs.api; assert 'cv2' in sys.modules and 'pycolmap' not in sys.modules;"
@@ -46,7 +49,7 @@ def test_opencv_is_loaded_before_pycolmap():
 
 
 @pytest.mark.parametrize("shape", [(3, 5), (3, 5, 3)])
-def test_maps_have_colmaps_layout(tmp_path, shape):
+def test_maps_have_colmaps_layout(tmp_path: Path, shape: tuple[int, ...]) -> None:
     """Text `width&height&channels&`, then planes; read here as COLMAP's own script does, column by column."""
     values = np.random.default_rng(1).normal(size=shape).astype(np.float32)
     values[1, 2] = np.nan
@@ -62,7 +65,7 @@ def test_maps_have_colmaps_layout(tmp_path, shape):
 
 
 @pytest.mark.parametrize("data", [b"", b"5&3&1&", b"5&3&1&" + bytes(59), b"5&3&x&" + bytes(60), b"-5&3&1&" + bytes(60)])
-def test_broken_maps_are_named(tmp_path, data):
+def test_broken_maps_are_named(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "map.bin"
     path.write_bytes(data)
     with pytest.raises(InputError, match="no complete depth or normal map"):
@@ -71,16 +74,17 @@ def test_broken_maps_are_named(tmp_path, data):
         read_colmap_map(tmp_path / "none.bin")
 
 
-def test_other_arrays_are_no_maps(tmp_path):
+def test_other_arrays_are_no_maps(tmp_path: Path) -> None:
+    doubles: Any = np.zeros((3, 4))
     with pytest.raises(UsageError, match="a depth map is"):
-        write_depth_map(tmp_path / "a", np.zeros((3, 4)))
+        write_depth_map(tmp_path / "a", doubles)
     with pytest.raises(UsageError, match="a normal map is"):
         write_normal_map(tmp_path / "a", np.zeros((3, 4), np.float32))
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("form", ["bin", "txt"])
-def test_pycolmap_reads_rigs_frames_and_poses(tmp_path, layout, form):
+def test_pycolmap_reads_rigs_frames_and_poses(tmp_path: Path, layout: FaceLayout, form: Literal["bin", "txt"]) -> None:
     poses, faces = noisy_poses(), faces_of(layout)
     write_rig_model(tmp_path, poses, cuts(layout), form=form)
     files = {"cameras", "images", "points3D", "rigs", "frames"}
@@ -103,7 +107,7 @@ def test_pycolmap_reads_rigs_frames_and_poses(tmp_path, layout, form):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_tracks_lie_in_the_faces_and_project_onto_their_key_points(tmp_path, layout):
+def test_tracks_lie_in_the_faces_and_project_onto_their_key_points(tmp_path: Path, layout: FaceLayout) -> None:
     poses = noisy_poses()
     seen = write_rig_model(tmp_path, poses, cuts(layout))
     model = pycolmap.Reconstruction(str(tmp_path))
@@ -127,7 +131,7 @@ def test_tracks_lie_in_the_faces_and_project_onto_their_key_points(tmp_path, lay
     )
 
 
-def test_panoramas_cut_otherwise_have_a_rig_of_their_own(tmp_path):
+def test_panoramas_cut_otherwise_have_a_rig_of_their_own(tmp_path: Path) -> None:
     mixed = cuts("cube", NAMES[:2]) | cuts("icosahedron", NAMES[2:])
     write_rig_model(tmp_path, noisy_poses(), mixed)
     model = pycolmap.Reconstruction(str(tmp_path))
@@ -135,7 +139,7 @@ def test_panoramas_cut_otherwise_have_a_rig_of_their_own(tmp_path):
     assert len({image.camera_id for image in model.images.values()}) == 26
 
 
-def test_panoramas_without_faces_and_points_that_nobody_sees_are_left_out(tmp_path):
+def test_panoramas_without_faces_and_points_that_nobody_sees_are_left_out(tmp_path: Path) -> None:
     """OpenMVS reads points3D.txt as far as the first point without a track."""
     poses = noisy_poses()
     write_rig_model(tmp_path, poses, cuts(names=NAMES[2:]))
@@ -146,7 +150,7 @@ def test_panoramas_without_faces_and_points_that_nobody_sees_are_left_out(tmp_pa
     assert min(point.track.length() for point in model.points3D.values()) >= 1
 
 
-def test_the_text_model_is_what_openmvs_reads(tmp_path):
+def test_the_text_model_is_what_openmvs_reads(tmp_path: Path) -> None:
     """InterfaceCOLMAP: PINHOLE and four numbers; two lines an image, the second may be empty; points with tracks."""
     write_rig_model(tmp_path, noisy_poses(), cuts())
     lines = {
@@ -160,14 +164,14 @@ def test_the_text_model_is_what_openmvs_reads(tmp_path):
     assert all(len(line.split()) >= 10 and len(line.split()) % 2 == 0 for line in lines["points3D"])
 
 
-def test_the_same_poses_are_the_same_bytes(tmp_path):
+def test_the_same_poses_are_the_same_bytes(tmp_path: Path) -> None:
     for folder in ("a", "b"):
         write_rig_model(tmp_path / folder, noisy_poses(), cuts())
     for path in (tmp_path / "a").iterdir():
         assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes(), path.name
 
 
-def test_configurations_name_every_picture(tmp_path):
+def test_configurations_name_every_picture(tmp_path: Path) -> None:
     names = ["front/a b/1.jpg", "up/ä.jpg"]
     files = write_stereo_configs(tmp_path, names)
     match, fusion = (files[f"colmap_dense/stereo/{name}.cfg"].read_text("utf-8") for name in ("patch-match", "fusion"))
@@ -178,7 +182,7 @@ def test_configurations_name_every_picture(tmp_path):
 @pytest.mark.parametrize(
     ("suffix", "largest"), [(".png", 0), (".jpg", 12), (".JPEG", 12), (".webp", 20), (".heic", 12)]
 )
-def test_pictures_keep_their_colors(tmp_path, suffix, largest):
+def test_pictures_keep_their_colors(tmp_path: Path, suffix: str, largest: int) -> None:
     smooth = np.indices((40, 40)).sum(axis=0).astype(np.uint8) * 3
     picture = np.stack([smooth, smooth[::-1], 255 - smooth], axis=-1)
     write_picture(tmp_path / f"a{suffix}", picture)

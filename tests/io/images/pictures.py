@@ -1,18 +1,24 @@
 """Picture files made for the tests: with and without GPano, in every container."""
 
+from __future__ import annotations
+
 import io
 import struct
 import zlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 GPANO = "http://ns.google.com/photos/1.0/panorama/"
 RDF = "http://www.w3.org/1999/02/22-rdf-syntax-ns#"
 
 
-def xmp(fields, *, form="element", wrapped=True):
+def xmp(fields: Mapping[str, object], *, form: str = "element", wrapped: bool = True) -> bytes:
     """An XMP packet with GPano fields as elements or as attributes."""
     if form == "element":
         inner = "".join(f"<GPano:{name}>{value}</GPano:{name}>" for name, value in fields.items())
@@ -24,7 +30,7 @@ def xmp(fields, *, form="element", wrapped=True):
     return (f'<x:xmpmeta xmlns:x="adobe:ns:meta/">{rdf}</x:xmpmeta>' if wrapped else rdf).encode()
 
 
-def full_sphere(height, width, **more):
+def full_sphere(height: int, width: int, **more: object) -> dict[str, object]:
     return {
         "ProjectionType": "equirectangular",
         "FullPanoWidthPixels": width,
@@ -36,16 +42,24 @@ def full_sphere(height, width, **more):
     } | more
 
 
-def picture(size_hw):
+def picture(size_hw: tuple[int, int]) -> NDArray[np.uint8]:
     return np.random.default_rng(size_hw[0]).integers(0, 256, (*size_hw, 3)).astype(np.uint8)
 
 
-def app1(payload):
+def app1(payload: bytes) -> bytes:
     """A metadata segment of a JPEG."""
     return b"\xff\xe1" + struct.pack(">H", len(payload) + 2) + payload
 
 
-def write_jpeg(path, size_hw, packet=None, *, segments=b"", behind=b"", progressive=False):
+def write_jpeg(
+    path: Path,
+    size_hw: tuple[int, int],
+    packet: bytes | None = None,
+    *,
+    segments: bytes = b"",
+    behind: bytes = b"",
+    progressive: bool = False,
+) -> Path:
     """A JPEG with an XMP packet, other segments in front of it, and bytes behind its end."""
     data = bytes(cv2.imencode(".jpg", picture(size_hw), [cv2.IMWRITE_JPEG_PROGRESSIVE, int(progressive)])[1])
     if packet is not None:
@@ -54,11 +68,19 @@ def write_jpeg(path, size_hw, packet=None, *, segments=b"", behind=b"", progress
     return path
 
 
-def png_chunk(kind, body):
+def png_chunk(kind: bytes, body: bytes) -> bytes:
     return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
 
-def write_png(path, size_hw, packet=None, *, compressed=False, exif_bytes=None, at=33):
+def write_png(
+    path: Path,
+    size_hw: tuple[int, int],
+    packet: bytes | None = None,
+    *,
+    compressed: bool = False,
+    exif_bytes: bytes | None = None,
+    at: int = 33,
+) -> Path:
     """A PNG with metadata behind its header, or elsewhere: -12 is in front of the last chunk."""
     data = bytes(cv2.imencode(".png", picture(size_hw))[1])
     chunks = b"" if exif_bytes is None else png_chunk(b"eXIf", exif_bytes)
@@ -70,7 +92,15 @@ def write_png(path, size_hw, packet=None, *, compressed=False, exif_bytes=None, 
     return path
 
 
-def exif(order="<", *, refs=(b"N", b"E", 0), latitude=None, longitude=None, altitude=(1234, 10), orientation=None):
+def exif(
+    order: str = "<",
+    *,
+    refs: tuple[bytes, bytes, int] = (b"N", b"E", 0),
+    latitude: Sequence[tuple[int, int]] | None = None,
+    longitude: Sequence[tuple[int, int]] | None = None,
+    altitude: tuple[int, int] = (1234, 10),
+    orientation: int | None = None,
+) -> bytes:
     """EXIF metadata: a TIFF directory with the GPS directory, that with six entries, and perhaps an orientation."""
     latitude = latitude or ((47, 1), (30, 1), (3600, 100))
     longitude = longitude or ((8, 1), (15, 1), (0, 1))
@@ -91,18 +121,18 @@ def exif(order="<", *, refs=(b"N", b"E", 0), latitude=None, longitude=None, alti
     return header + first + bytes(4) + struct.pack(order + "H", 6) + b"".join(entries) + bytes(4) + numbers
 
 
-def by_pillow(size_hw, kind, *, mode="RGB", **more):
+def by_pillow(size_hw: tuple[int, int], kind: str, *, mode: str = "RGB", **more: Any) -> bytes:
     """The bytes of a picture as another program writes them."""
     stream = io.BytesIO()
     Image.fromarray(picture(size_hw)).convert(mode).save(stream, kind, **more)
     return stream.getvalue()
 
 
-def sound_files(size_hw, packet):
+def sound_files(size_hw: tuple[int, int], packet: bytes) -> list[bytes]:
     """The bytes of a small file in every container, each with the same metadata: XMP and EXIF."""
     jpeg = bytes(cv2.imencode(".jpg", picture(size_hw))[1])
     segments = app1(b"Exif\0\0" + exif()) + app1(b"http://ns.adobe.com/xap/1.0/\0" + packet)
-    webp = {"xmp": packet, "exif": exif(), "lossless": True}
+    webp: dict[str, Any] = {"xmp": packet, "exif": exif(), "lossless": True}
     return [
         jpeg[:2] + segments + jpeg[2:],
         by_pillow(size_hw, "WEBP", **webp),

@@ -1,6 +1,9 @@
 """Which pictures a capture has, and which of them are panoramas."""
 
+from __future__ import annotations
+
 import struct
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,7 +19,7 @@ from tests.io.images.pictures import by_pillow, full_sphere, picture, sound_file
 from tests.permissions import permissions_hold
 
 
-def test_pictures_come_in_the_order_in_which_people_count(tmp_path):
+def test_pictures_come_in_the_order_in_which_people_count(tmp_path: Path) -> None:
     names = ["b/1.jpg", "B10.jpg", "a2.JPG", "a10.png", "A1.tif", "b2.webp", "a2b.jpeg", "a/3.tiff"]
     for name in names:
         (tmp_path / name).parent.mkdir(exist_ok=True)
@@ -29,21 +32,21 @@ def test_pictures_come_in_the_order_in_which_people_count(tmp_path):
     assert found == ["A1.tif", "a2.JPG", "a2b.jpeg", "a10.png", "a/3.tiff", "b2.webp", "B10.jpg", "b/1.jpg"]
 
 
-def test_a_folder_under_a_hidden_one_is_not_hidden(tmp_path):
+def test_a_folder_under_a_hidden_one_is_not_hidden(tmp_path: Path) -> None:
     inside = tmp_path / ".photos" / "lobby"
     inside.mkdir(parents=True)
     (inside / "1.jpg").touch()
     assert list_pictures(inside) == [inside / "1.jpg"]
 
 
-def test_names_that_differ_only_in_case_or_zeros_keep_one_order():
+def test_names_that_differ_only_in_case_or_zeros_keep_one_order() -> None:
     names = ["img_1", "IMG_1", "img_01", "img_²"]
     assert len({tuple(map(str, natural_key(name))) for name in names}) == 4
     backwards = ["img_²", "img_01", "IMG_1", "img_1"]
     assert sorted(names, key=natural_key) == sorted(backwards, key=natural_key)
 
 
-def test_caches_are_no_part_of_the_capture(tmp_path):
+def test_caches_are_no_part_of_the_capture(tmp_path: Path) -> None:
     """Their masks and previews were taken for images on the second run."""
     Store(tmp_path / "new")
     Store(tmp_path / "deep" / "old")
@@ -59,13 +62,13 @@ def test_caches_are_no_part_of_the_capture(tmp_path):
 
 
 @pytest.mark.parametrize("mode", [0o000, 0o400])
-def test_a_subfolder_that_cannot_be_read_costs_what_it_holds(tmp_path, mode):
+def test_a_subfolder_that_cannot_be_read_costs_what_it_holds(tmp_path: Path, mode: int) -> None:
     """A `lost+found` ended the run."""
     for name in ("1.jpg", "lost+found/2.jpg", "z/3.jpg"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
     (tmp_path / "lost+found").chmod(mode)
-    notes = []
+    notes: list[str] = []
     with permissions_hold():
         found = [path.relative_to(tmp_path).as_posix() for path in list_pictures(tmp_path, notes)]
     (tmp_path / "lost+found").chmod(0o700)
@@ -76,7 +79,7 @@ def test_a_subfolder_that_cannot_be_read_costs_what_it_holds(tmp_path, mode):
         assert notes == [f"{tmp_path / 'lost+found'}: cannot be listed (Permission denied); what it holds is left out"]
 
 
-def test_a_folder_that_cannot_be_read_is_an_error(tmp_path):
+def test_a_folder_that_cannot_be_read_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "photos").mkdir(mode=0o000)
     with permissions_hold(), pytest.raises(InputError, match=r"photos: cannot be listed \(Permission denied\)"):
         list_pictures(tmp_path / "photos")
@@ -84,19 +87,19 @@ def test_a_folder_that_cannot_be_read_is_an_error(tmp_path):
 
 
 @pytest.mark.parametrize(("folder", "what"), [("gone", "no such folder"), ("empty", "no pictures here")])
-def test_a_folder_without_pictures_is_named(tmp_path, folder, what):
+def test_a_folder_without_pictures_is_named(tmp_path: Path, folder: str, what: str) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match=f"{folder}: {what}"):
         list_pictures(tmp_path / folder)
 
 
-def test_a_panorama_that_says_so_needs_no_warning(tmp_path):
+def test_a_panorama_that_says_so_needs_no_warning(tmp_path: Path) -> None:
     info = describe_picture(write_jpeg(tmp_path / "a.jpg", (32, 64), xmp(full_sphere(32, 64))))
     assert (info.size_hw, info.file_size_hw, info.crop_ltwh, info.warnings) == ((32, 64), (32, 64), None, ())
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tiff", "webp"])
-def test_twice_as_wide_as_high_is_a_panorama_with_a_warning(tmp_path, suffix):
+def test_twice_as_wide_as_high_is_a_panorama_with_a_warning(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a.{suffix}"
     cv2.imwrite(str(path), picture((32, 64)))
     info = describe_picture(path)
@@ -106,7 +109,7 @@ def test_twice_as_wide_as_high_is_a_panorama_with_a_warning(tmp_path, suffix):
     assert "no GPano metadata" in info.traits[0]
 
 
-def test_headers_are_read_without_decoding(tmp_path, monkeypatch):
+def test_headers_are_read_without_decoding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(captures, "decode_image", None)
     write_jpeg(tmp_path / "a.jpg", (32, 64))
     write_jpeg(tmp_path / "b.jpg", (32, 64), progressive=True)
@@ -118,7 +121,7 @@ def test_headers_are_read_without_decoding(tmp_path, monkeypatch):
         assert describe_picture(path).size_hw == (32, 64), path
 
 
-def test_tables_before_the_frame_are_no_frame(tmp_path):
+def test_tables_before_the_frame_are_no_frame(tmp_path: Path) -> None:
     """Some encoders write their Huffman tables (marker C4, among the frames' markers) first."""
     data = write_jpeg(tmp_path / "a.jpg", (32, 64)).read_bytes()
     table = data[data.index(b"\xff\xc4") :]
@@ -127,7 +130,7 @@ def test_tables_before_the_frame_are_no_frame(tmp_path):
     assert describe_picture(tmp_path / "a.jpg").size_hw == (32, 64)
 
 
-def test_the_output_of_an_earlier_run_is_no_part_of_the_capture(tmp_path):
+def test_the_output_of_an_earlier_run_is_no_part_of_the_capture(tmp_path: Path) -> None:
     """Its previews lay among the pictures where the output folder was made below the capture."""
     for name in (
         "1.jpg",
@@ -141,7 +144,7 @@ def test_the_output_of_an_earlier_run_is_no_part_of_the_capture(tmp_path):
     assert [path.relative_to(tmp_path).as_posix() for path in list_pictures(tmp_path)] == ["1.jpg", "b/2.jpg"]
 
 
-def test_a_thumbnail_within_the_metadata_is_not_the_picture(tmp_path):
+def test_a_thumbnail_within_the_metadata_is_not_the_picture(tmp_path: Path) -> None:
     thumbnail = bytes(cv2.imencode(".jpg", picture((16, 20)))[1])
     data = write_jpeg(tmp_path / "a.jpg", (32, 64)).read_bytes()
     exif = b"\xff\xe1" + struct.pack(">H", len(thumbnail) + 8) + b"Exif\0\0" + thumbnail
@@ -149,7 +152,7 @@ def test_a_thumbnail_within_the_metadata_is_not_the_picture(tmp_path):
     assert describe_picture(tmp_path / "a.jpg").size_hw == (32, 64)
 
 
-def test_a_cropped_panorama_is_placed_on_its_sphere(tmp_path):
+def test_a_cropped_panorama_is_placed_on_its_sphere(tmp_path: Path) -> None:
     fields = full_sphere(40, 80) | {
         "CroppedAreaImageWidthPixels": 60, "CroppedAreaImageHeightPixels": 30,
         "CroppedAreaLeftPixels": 10, "CroppedAreaTopPixels": 7,
@@ -163,7 +166,7 @@ def test_a_cropped_panorama_is_placed_on_its_sphere(tmp_path):
     assert panorama.load_mask().sum() == 30 * 60
 
 
-def test_a_panorama_made_smaller_keeps_its_place(tmp_path):
+def test_a_panorama_made_smaller_keeps_its_place(tmp_path: Path) -> None:
     fields = full_sphere(400, 800) | {
         "CroppedAreaImageWidthPixels": 600, "CroppedAreaImageHeightPixels": 300,
         "CroppedAreaLeftPixels": 100, "CroppedAreaTopPixels": 70,
@@ -173,7 +176,7 @@ def test_a_panorama_made_smaller_keeps_its_place(tmp_path):
     assert "resized from 600×300 to 60×30 px" in info.warnings[0]
 
 
-def test_a_whole_panorama_made_smaller_is_whole(tmp_path):
+def test_a_whole_panorama_made_smaller_is_whole(tmp_path: Path) -> None:
     info = describe_picture(write_jpeg(tmp_path / "a.jpg", (512, 1024), xmp(full_sphere(2688, 5376))))
     assert (info.size_hw, info.crop_ltwh) == ((512, 1024), None)
 
@@ -188,7 +191,9 @@ def test_a_whole_panorama_made_smaller_is_whole(tmp_path):
         ((32, 64), full_sphere(32, 64, FullPanoHeightPixels=40), "the full sphere is 64×40 px"),
     ],
 )
-def test_what_is_no_panorama_is_named_with_the_remedy(tmp_path, size, fields, what):
+def test_what_is_no_panorama_is_named_with_the_remedy(
+    tmp_path: Path, size: tuple[int, int], fields: dict[str, object] | None, what: str
+) -> None:
     path = write_jpeg(tmp_path / "odd one.jpg", size, None if fields is None else xmp(fields))
     with pytest.raises(InputError, match=rf"odd one\.jpg: .*{what}.*[.:] "):
         describe_picture(path)
@@ -197,7 +202,7 @@ def test_what_is_no_panorama_is_named_with_the_remedy(tmp_path, size, fields, wh
 @pytest.mark.parametrize(
     "data", [b"", b"\xff\xd8\xff", b"\xff\xd8\xff\xe1\x00\x00\xff\xd9", b"\x89PNG\r\n\x1a\n", b"hello"]
 )
-def test_what_is_no_picture_is_named(tmp_path, data):
+def test_what_is_no_picture_is_named(tmp_path: Path, data: bytes) -> None:
     (tmp_path / "a.jpg").write_bytes(data)
     with pytest.raises(InputError, match=r"a\.jpg: "):
         describe_picture(tmp_path / "a.jpg")

@@ -7,6 +7,7 @@ import struct
 import tracemalloc
 import zlib
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -33,7 +34,7 @@ from tests.io.images.pictures import (
 SIZE = (32, 64)
 PACKET = xmp(full_sphere(*SIZE, PosePitchDegrees="1.5", PoseRollDegrees="-2"), form="attribute")
 EXPECTED = GPano("equirectangular", SIZE, (0, 0, 64, 32), None, 1.5, -2.0)
-POSITION = pytest.approx((47.51, 8.25, 123.4))
+POSITION: Any = pytest.approx((47.51, 8.25, 123.4))
 FILLER = app1(b"filler\0" + bytes(65_000)) * 80  # 5 MB
 
 

@@ -1,5 +1,10 @@
 """Where a picture was taken, and how a viewer would turn it."""
 
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -10,7 +15,7 @@ from tests.io.images.pictures import app1, exif, write_jpeg
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_position_and_orientation_are_read_in_both_byte_orders(order):
+def test_position_and_orientation_are_read_in_both_byte_orders(order: str) -> None:
     assert position_from_exif(exif(order)) == pytest.approx((47.51, 8.25, 123.4))
     assert position_from_exif(exif(order, orientation=6)) == pytest.approx((47.51, 8.25, 123.4))
     assert orientation_from_exif(exif(order, orientation=6)) == 6
@@ -18,7 +23,7 @@ def test_position_and_orientation_are_read_in_both_byte_orders(order):
     assert orientation_from_exif(exif(order, orientation=77)) == 1
 
 
-def test_south_west_and_below_the_sea_are_negative():
+def test_south_west_and_below_the_sea_are_negative() -> None:
     assert position_from_exif(exif(refs=(b"S", b"W", 1))) == pytest.approx((-47.51, -8.25, -123.4))
 
 
@@ -26,13 +31,13 @@ def test_south_west_and_below_the_sea_are_negative():
     "change", [{"latitude": ((0, 0), (0, 0), (0, 0))}, {"latitude": ((91, 1), (0, 1), (0, 1))},
                {"longitude": ((181, 1), (0, 1), (0, 1))}, {"altitude": (0, 0)}]
 )  # fmt: skip
-def test_what_is_no_position_is_none(change):
+def test_what_is_no_position_is_none(change: dict[str, Any]) -> None:
     assert position_from_exif(exif(**change)) is None
 
 
 @given(st.binary(max_size=12), st.integers(0, 180), st.integers(0, 180))
 @settings(max_examples=300, deadline=None)
-def test_damage_is_never_a_crash(noise, offset, cut):
+def test_damage_is_never_a_crash(noise: bytes, offset: int, cut: int) -> None:
     data = exif()
     damaged = (data[:offset] + noise + data[offset + len(noise) :])[: len(data) - cut]
     position = position_from_exif(damaged)
@@ -40,7 +45,7 @@ def test_damage_is_never_a_crash(noise, offset, cut):
     assert position is None or (abs(position[0]) <= 90 and abs(position[1]) <= 180)
 
 
-def test_a_picture_tells_where_it_was_taken(tmp_path):
+def test_a_picture_tells_where_it_was_taken(tmp_path: Path) -> None:
     assert describe_picture(write_jpeg(tmp_path / "a.jpg", (32, 64))).position_lla is None
     info = describe_picture(write_jpeg(tmp_path / "b.jpg", (32, 64), segments=app1(b"Exif\0\0" + exif())))
     assert info.position_lla == pytest.approx((47.51, 8.25, 123.4))

@@ -1,5 +1,9 @@
 """GPano metadata, in all forms in which they occur, and in those in which they should not."""
 
+from __future__ import annotations
+
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -18,25 +22,25 @@ EXPECTED = GPano("equirectangular", (32, 64), (0, 0, 64, 32), 180.0, 1.4, -2.5)
 
 @pytest.mark.parametrize("form", ["element", "attribute"])
 @pytest.mark.parametrize("wrapped", [True, False])
-def test_elements_and_attributes_are_read_from_a_jpeg(tmp_path, form, wrapped):
+def test_elements_and_attributes_are_read_from_a_jpeg(tmp_path: Path, form: str, wrapped: bool) -> None:
     path = write_jpeg(tmp_path / "a.jpg", (32, 64), xmp(FIELDS, form=form, wrapped=wrapped))
     assert read_gpano(path) == EXPECTED
 
 
 @pytest.mark.parametrize("compressed", [True, False])
-def test_they_are_read_from_a_png(tmp_path, compressed):
+def test_they_are_read_from_a_png(tmp_path: Path, compressed: bool) -> None:
     path = write_png(tmp_path / "a.png", (32, 64), xmp(FIELDS), compressed=compressed)
     assert read_gpano(path) == EXPECTED
 
 
-def test_a_picture_without_them_has_none(tmp_path):
+def test_a_picture_without_them_has_none(tmp_path: Path) -> None:
     assert read_gpano(write_jpeg(tmp_path / "a.jpg", (32, 64))) is None
     assert find_gpano((), write_png(tmp_path / "a.png", (32, 64)).read_bytes()) == (None, ())
     other = b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><a b="c"/></x:xmpmeta>'
     assert find_gpano([other]) == (None, ())
 
 
-def test_the_packet_that_has_the_fields_is_found_behind_others(tmp_path):
+def test_the_packet_that_has_the_fields_is_found_behind_others(tmp_path: Path) -> None:
     other = b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><a b="c"/></x:xmpmeta>'
     broken = b"<x:xmpmeta><unclosed></x:xmpmeta>"
     gpano, warnings = find_gpano([other, broken], broken + xmp(FIELDS))
@@ -45,7 +49,7 @@ def test_the_packet_that_has_the_fields_is_found_behind_others(tmp_path):
     assert "malformed" in warnings[0]
 
 
-def test_entities_are_refused():
+def test_entities_are_refused() -> None:
     bomb = b'<x:xmpmeta xmlns:x="a"><!DOCTYPE a [<!ENTITY b "c">]>' + xmp(FIELDS)[12:]
     gpano, warnings = find_gpano([bomb])
     assert gpano is None
@@ -61,7 +65,9 @@ def test_entities_are_refused():
         ({"FullPanoWidthPixels": "0"}, "", {"full_size_hw": None}),
     ],
 )
-def test_a_field_that_makes_no_sense_is_left_out(change, warned, expected):
+def test_a_field_that_makes_no_sense_is_left_out(
+    change: dict[str, str], warned: str, expected: dict[str, None]
+) -> None:
     gpano, warnings = find_gpano([xmp(FIELDS | change)])
     assert gpano == GPano(**{**vars(EXPECTED), **expected})
     assert warned in "".join(warnings)
@@ -69,7 +75,7 @@ def test_a_field_that_makes_no_sense_is_left_out(change, warned, expected):
 
 @given(st.sampled_from(SOUND), st.binary(max_size=300), st.integers(0, 900), st.integers(0, 40))
 @settings(max_examples=300, deadline=None)
-def test_damage_is_never_a_crash(data, noise, offset, cut):
+def test_damage_is_never_a_crash(data: bytes, noise: bytes, offset: int, cut: int) -> None:
     """Bytes overwritten at any place, and the rest cut off."""
     damaged = data[:offset] + noise + data[offset + len(noise) : len(data) - cut]
     gpano, warnings = find_gpano(read_container(damaged).xmp, damaged)
@@ -78,7 +84,7 @@ def test_damage_is_never_a_crash(data, noise, offset, cut):
 
 
 @given(st.floats(-89, 89), st.floats(-179, 179))
-def test_up_is_a_unit_vector_turned_by_roll_and_pitch(pitch_deg, roll_deg):
+def test_up_is_a_unit_vector_turned_by_roll_and_pitch(pitch_deg: float, roll_deg: float) -> None:
     up = np.array(GPano(pitch_deg=pitch_deg, roll_deg=roll_deg).up_in_cam)
     by_turns = rotation_from_rotvec((np.radians(pitch_deg), 0, 0)) @ (0, -np.cos(np.radians(roll_deg)), 0)
     expected = by_turns * (1, 1, -1) + (-np.sin(np.radians(roll_deg)), 0, 0)
@@ -86,11 +92,11 @@ def test_up_is_a_unit_vector_turned_by_roll_and_pitch(pitch_deg, roll_deg):
     assert np.linalg.norm(up) == pytest.approx(1)
 
 
-def test_a_level_camera_has_up_at_its_zenith():
+def test_a_level_camera_has_up_at_its_zenith() -> None:
     assert GPano(pitch_deg=0.0, roll_deg=0.0).up_in_cam == pytest.approx((0, -1, 0))
     assert GPano(pitch_deg=3.0).up_in_cam is None
 
 
-def test_a_missing_file_is_named(tmp_path):
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"gone\.jpg: cannot be read"):
         read_gpano(tmp_path / "gone.jpg")

@@ -1,5 +1,9 @@
 """The same picture under two names."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+
 import pytest
 
 from pano_mvs.io.images.names import match_image_names
@@ -20,5 +24,5 @@ from pano_mvs.io.images.names import match_image_names
         ("11.jpg", ["1.jpg", "111.jpg"], None),
     ],
 )
-def test_one_counterpart_is_found_and_two_are_none(wanted, available, found):
+def test_one_counterpart_is_found_and_two_are_none(wanted: str, available: Sequence[str], found: str | None) -> None:
     assert match_image_names([wanted], available) == ({wanted: found} if found else {})

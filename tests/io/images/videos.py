@@ -39,7 +39,7 @@ def number_of(frame: Picture) -> int:
 def write_video(path: Path, count: int, picture: Callable[[int], Picture] = counted, *, per_s: float = 20.0) -> Path:
     """Write a video of so many frames, .mp4 or .avi."""
     height, width = picture(0).shape[:2]
-    codec = cv2.VideoWriter_fourcc(*("MJPG" if path.suffix == ".avi" else "mp4v"))
+    codec = cv2.VideoWriter.fourcc(*("MJPG" if path.suffix == ".avi" else "mp4v"))
     writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, codec, per_s, (width, height))
     assert writer.isOpened()
     for number in range(count):

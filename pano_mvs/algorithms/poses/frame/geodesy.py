@@ -26,6 +26,9 @@ def lla_from_local(position_in_local: ArrayLike, origin_lla: ArrayLike) -> Float
     """Return the inverse of `local_from_lla`, (..., 3), to a micrometre.
 
     The latitude is found by fixed-point iteration (Heiskanen and Moritz, "Physical Geodesy", 1967, section 5-3).
+
+    >>> lla_from_local([0.0, 0.0, 1000.0], (48.0, 11.0, 500.0)).round(3).tolist()  # 1 km to the north
+    [48.009, 11.0, 500.078]
     """
     offset = np.asarray(position_in_local, dtype=np.float64) @ _earth_from_local(origin_lla).T
     x, y, z = np.moveaxis(_earth_from_lla(origin_lla) + offset, -1, 0)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.combination import source_weights
 from pano_mvs.algorithms.sweep.costs.cost import checked_cost
-from pano_mvs.algorithms.sweep.costs.registry import SWEEP_COSTS
+from pano_mvs.algorithms.sweep.costs.registry import BUILTIN
 from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, step_penalties, warm_up
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.settings import SweepSettings
@@ -87,9 +87,7 @@ def pixel_cost(reference: NDArray[np.uint8], warped: FloatArray, settings: Sweep
     size_hw, cost = (reference.shape[0], reference.shape[1]), settings.matching_cost
     radius = settings.box_radius if cost.averages_itself else settings.compare_radius
     found = cost.function(reference, warped, CostWindow.of(size_hw, radius, spherical=settings.spherical_window))
-    return (
-        np.asarray(found, np.float64) if SWEEP_COSTS.is_builtin(cost.name) else checked_cost(found, size_hw, cost.name)
-    )
+    return np.asarray(found, np.float64) if cost.name in BUILTIN else checked_cost(found, size_hw, cost.name)
 
 
 def _aggregate(volume: NDArray[np.int64], work: SweepInput) -> NDArray[np.int64]:

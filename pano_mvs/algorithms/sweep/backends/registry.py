@@ -16,7 +16,7 @@ from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.winner import Winners
 from pano_mvs.core.errors import UsageError
-from pano_mvs.core.parts import Parts
+from pano_mvs.core.named_registry import NamedRegistry
 
 # The cost of the small sweeps that find limits and match exposures, and a backend that has it.
 _HELPER_COST, _HELPER_BACKEND = "census", "numba"
@@ -76,7 +76,7 @@ def _numba(work: SweepInput) -> Winners:
     return numba_backend.find_winners(work)
 
 
-SWEEP_BACKENDS = Parts(
+SWEEP_BACKENDS = NamedRegistry(
     "sweep backend",
     {
         "numba": SweepBackend(

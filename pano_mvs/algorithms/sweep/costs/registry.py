@@ -11,12 +11,12 @@ from pano_mvs.algorithms.sweep.costs.cost import CostFunction, SweepCost
 from pano_mvs.algorithms.sweep.costs.sad import SAD
 from pano_mvs.algorithms.sweep.costs.sad_gradient import SAD_GRADIENT
 from pano_mvs.algorithms.sweep.costs.zncc import ZNCC
-from pano_mvs.core.parts import Parts
+from pano_mvs.core.named_registry import NamedRegistry
 
 BUILTIN = {cost.name: cost for cost in (CENSUS, CENSUS_GRADIENT, SAD, SAD_GRADIENT, ZNCC)}
 """The built-in costs by name."""
 
-SWEEP_COSTS: Parts[SweepCost] = Parts("sweep cost", BUILTIN)
+SWEEP_COSTS: NamedRegistry[SweepCost] = NamedRegistry("sweep cost", BUILTIN)
 """All costs."""
 
 Function = TypeVar("Function", bound=CostFunction)

@@ -1,0 +1,128 @@
+"""Everything that a plugin needs of pano_mvs; `pano_mvs.api.sweep` adds what backends of the sweep are made of.
+
+from pano_mvs.api import Context, Each, Near, Panorama, Params, Pose, RangeMap, stage
+
+class MySweepParams(Params):
+    planes: int = 128
+
+@stage("depth.my_sweep")
+def my_sweep(ref: Each[Panorama], pose: Each[Pose], sources: Near[Panorama], source_poses: Near[Pose],
+             params: MySweepParams, ctx: Context) -> RangeMap: ...
+"""
+
+from pano_mvs.algorithms.poses.frame.geodesy import lla_from_local
+from pano_mvs.algorithms.poses.frame.georeference import origin_of_frame
+from pano_mvs.algorithms.sweep.backends.registry import register_sweep_backend
+from pano_mvs.algorithms.sweep.costs.registry import register_sweep_cost
+from pano_mvs.algorithms.sweep.preparation import SweepInput
+from pano_mvs.algorithms.sweep.windows import CostWindow
+from pano_mvs.algorithms.sweep.winner import Winners
+from pano_mvs.algorithms.two_view.verification import verify_pair
+from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError, UsageError
+from pano_mvs.core.named_registry import NamedRegistry
+from pano_mvs.core.settings import setting
+from pano_mvs.engine.stages.context import Context
+from pano_mvs.engine.stages.params import NOT_IN_KEY, InputPath, Params, RegisteredIn, SourcePath
+from pano_mvs.engine.stages.ports import All, Each, Names, Near, One
+from pano_mvs.engine.stages.settings import params_from, settings_from
+from pano_mvs.engine.stages.stage import SourceItem, source, stage
+from pano_mvs.geometry import (
+    Rigid3,
+    Similarity3,
+    pad_panorama,
+    pixel_from_ray,
+    ray_from_pixel,
+    ray_grid,
+    roll_panorama,
+    sample_panorama,
+)
+from pano_mvs.io.clouds.thinning import CHUNK_POINTS, chunks, select_points
+from pano_mvs.io.clouds.thinning import Kept as KeptPoints
+from pano_mvs.io.clouds.thinning import Selection as PointSelection
+from pano_mvs.scene import (
+    Axis,
+    Features,
+    FilePart,
+    Files,
+    GlobalDescriptor,
+    Pairs,
+    Panorama,
+    PointCloud,
+    Pose,
+    Poses,
+    RangeMap,
+    Record,
+    Scores,
+    TwoView,
+    Views,
+)
+from pano_mvs.scene.files import group_file
+from pano_mvs.scene.image_files.image_file import decode_image, write_png
+from pano_mvs.scene.pose_groups import join_groups, per_group, split_groups
+
+__all__ = [
+    "CHUNK_POINTS",
+    "NOT_IN_KEY",
+    "All",
+    "Axis",
+    "Context",
+    "CostWindow",
+    "Each",
+    "Features",
+    "FilePart",
+    "Files",
+    "GlobalDescriptor",
+    "InputError",
+    "InputPath",
+    "KeptPoints",
+    "NamedRegistry",
+    "Names",
+    "Near",
+    "One",
+    "Pairs",
+    "PanoMvsError",
+    "Panorama",
+    "Params",
+    "PointCloud",
+    "PointSelection",
+    "Pose",
+    "Poses",
+    "RangeMap",
+    "Record",
+    "RegisteredIn",
+    "Rigid3",
+    "RunStoppedError",
+    "Scores",
+    "Similarity3",
+    "SourceItem",
+    "SourcePath",
+    "SweepInput",
+    "TwoView",
+    "UsageError",
+    "Views",
+    "Winners",
+    "chunks",
+    "decode_image",
+    "group_file",
+    "join_groups",
+    "lla_from_local",
+    "origin_of_frame",
+    "pad_panorama",
+    "params_from",
+    "per_group",
+    "pixel_from_ray",
+    "ray_from_pixel",
+    "ray_grid",
+    "register_sweep_backend",
+    "register_sweep_cost",
+    "roll_panorama",
+    "sample_panorama",
+    "select_points",
+    "setting",
+    "settings_from",
+    "source",
+    "split_groups",
+    "stage",
+    "verify_pair",
+    "write_png",
+]

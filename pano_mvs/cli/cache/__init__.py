@@ -1,0 +1,1 @@
+"""`pano-mvs cache`: inspect, verify and clean a cache."""

@@ -1,0 +1,154 @@
+"""The commands that look after a cache: its size, what it holds, whether it is sound, and what can go."""
+
+from __future__ import annotations
+
+import os
+import re
+from datetime import datetime
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from pano_mvs.core.errors import UsageError
+from pano_mvs.core.paths import is_denied, is_file
+from pano_mvs.core.text import plural
+from pano_mvs.engine.cache.maintenance import GarbageCollection, collect, size_on_disk, usage_of, verify
+from pano_mvs.engine.cache.store import Store
+from pano_mvs.results.summary import CACHE_VARIABLE
+
+_SHOWN = 10
+_UNITS_S = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0, "w": 604800.0}
+_FAILED_ITEMS = 3
+_UNPROVEN = (
+    "{} of an earlier version, which did not check the images that it read, {} not proven: images "
+    "were changed, moved or deleted since, perhaps while they were being read"
+)
+
+
+def open_cache(cache: Path | None) -> Store:
+    """Open the cache that is asked for: `--cache`, $PANO_MVS_CACHE, or `.pano-mvs` in the current folder.
+
+    Raises:
+        UsageError: if there is none.
+    """
+    variable = os.environ.get(CACHE_VARIABLE)
+    root = cache or (Path(variable) if variable else Path(".pano-mvs"))
+    if not is_file(root / "layout.json"):
+        if is_denied(root / "layout.json"):
+            raise UsageError(f"{root}: you may not look into this folder (permission denied). Mend its permissions")
+        raise UsageError(
+            f"{root} is no cache of pano-mvs; name one with --cache DIR (it lies beside the workflow file "
+            "as .pano-mvs, or where you ran a preset by its name)"
+        )
+    return Store(root)
+
+
+def show_usage(store: Store, console: Console) -> None:
+    """Print how much of the cache each stage takes."""
+    table = Table("stage", "units", "size", "computed in")
+    for usage in usage_of(store):
+        table.add_row(usage.stage, str(usage.units), size_text(usage.size_bytes), f"{usage.seconds:.0f} s")
+    console.print(table)
+    console.print(f"{escape(str(store.root))}: {size_text(size_on_disk(store))} on the disk", highlight=False)
+
+
+def show_runs(store: Store, console: Console) -> None:
+    """Print the runs and the pins whose results a collection keeps."""
+    table = Table("run", "workflow", "ended", "units", "results in")
+    for entry in store.runs.entries():
+        when = datetime.fromisoformat(entry.when).astimezone().strftime("%Y-%m-%d %H:%M")
+        name = f"{entry.name} (pin)" if entry.pinned else entry.name
+        table.add_row(escape(name), escape(entry.workflow), when, str(entry.units), escape(entry.out))
+    console.print(table)
+
+
+def verify_cache(store: Store, console: Console, *, drop_unproven: bool = False) -> int:
+    """Check every file of the cache; return the exit code."""
+    damage = verify(store, drop_unproven=drop_unproven)
+    for what, paths in (
+        ("removed, damaged", damage.removed),
+        ("incomplete", damage.incomplete),
+        ("not proven", damage.unproven),
+        ("not of the cache", damage.foreign),
+        ("temporary", damage.temporary),
+    ):
+        for path in paths[:_SHOWN]:
+            console.print(f"{what}: {escape(path)}", highlight=False, soft_wrap=True)
+        if len(paths) > _SHOWN:
+            console.print(f"{what}: … and {len(paths) - _SHOWN} more")
+    console.print(
+        f"{damage.records} {plural(damage.records, 'record')} and {damage.blobs} "
+        f"{plural(damage.blobs, 'blob')} are sound, {len(damage.removed)} damaged",
+        highlight=False,
+    )
+    if damage.unproven:
+        count = len(damage.unproven)
+        unproven = _UNPROVEN.format(f"{count} {plural(count, 'result')}", plural(count, "is", "are"))
+        console.print(unproven, highlight=False, soft_wrap=True)
+        removed, it = plural(count, "it was removed", "they were removed"), plural(count, "it", "them")
+        console.print(removed if drop_unproven else f"--drop-unproven removes {it}", highlight=False)
+    if not damage.removed and not damage.incomplete and not damage.unproven:
+        return 0
+    if damage.removed or damage.incomplete or drop_unproven:
+        console.print("the same run computes what is missing again")
+    return _FAILED_ITEMS
+
+
+def collect_cache(store: Store, console: Console, *, delete: bool, unused: str, older_than: str) -> None:
+    """Print what nothing needs any more; remove it if asked."""
+    forget_after_s = seconds_from_text(older_than) if older_than else None
+    found = collect(store, unused_s=seconds_from_text(unused), forget_after_s=forget_after_s, delete=delete)
+    for entry in found.runs:
+        console.print(f"run of {escape(entry.workflow)} into {escape(entry.out)}, ended {entry.when}", highlight=False)
+    console.print(_told(found, delete=delete), highlight=False)
+    if not delete and (found.records or found.blobs or found.runs):
+        console.print("nothing was deleted; --delete does it")
+
+
+def _told(found: GarbageCollection, *, delete: bool) -> str:
+    records, blobs = len(found.records), len(found.blobs)
+    what = f"{records} {plural(records, 'unit')}, {blobs} {plural(blobs, 'blob')}, {size_text(found.size_bytes)}"
+    return f"{'deleted' if delete else 'would delete'}: {what}; {size_text(found.kept_bytes)} stay"
+
+
+def pin_run(store: Store, console: Console, run: str, name: str) -> None:
+    """Keep what a run used whatever runs after it."""
+    pin = store.runs.pin(run, name)
+    console.print(
+        f"{escape(pin.name)}: {pin.units} {plural(pin.units, 'unit')} of {escape(pin.workflow)} "
+        f"{plural(pin.units, 'is', 'are')} kept until `cache unpin`",
+        highlight=False,
+    )
+
+
+def unpin_run(store: Store, console: Console, name: str) -> None:
+    """Give up a pin."""
+    pins = {entry.name: entry for entry in store.runs.entries() if entry.pinned}
+    if name not in pins:
+        raise UsageError(f"there is no pin {name!r}; there are: {', '.join(sorted(pins)) or 'none'}")
+    store.runs.forget(pins[name])
+    console.print(f"{escape(name)} is no pin any more", highlight=False)
+
+
+def size_text(size_bytes: int) -> str:
+    """Return a size as people read it, such as 1.3 GB."""
+    size = float(size_bytes)
+    for unit in ("B", "kB", "MB", "GB"):
+        if size < 1000:
+            return f"{size:.0f} {unit}" if unit == "B" else f"{size:.1f} {unit}"
+        size /= 1000
+    return f"{size:.1f} TB"
+
+
+def seconds_from_text(text: str) -> float:
+    """Return a time such as 30d, 12h or 90s in seconds.
+
+    Raises:
+        UsageError: if it is none.
+    """
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)([smhdw])", text.strip())
+    if match is None:
+        raise UsageError(f"{text!r} is no time: write a number and s, m, h, d or w, such as 30d")
+    return float(match[1]) * _UNITS_S[match[2]]

@@ -1,0 +1,1 @@
+"""`pano-mvs inspect`: one pixel of a sweep, printed."""

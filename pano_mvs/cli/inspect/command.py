@@ -1,0 +1,193 @@
+"""Print all that is known of one pixel of a run, with its cost curve."""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+
+from pano_mvs.cli.inspect.text import as_json_value, print_inspection
+from pano_mvs.core.errors import InputError, StoreError, UsageError
+from pano_mvs.core.paths import is_file, is_folder
+from pano_mvs.engine.cache.store import Store, UnitRecord
+from pano_mvs.engine.planning.plan import StagePlan, make_plan
+from pano_mvs.engine.planning.units import Unit
+from pano_mvs.io.images.names import match_image_names
+from pano_mvs.io.truth import read_truth
+from pano_mvs.results.summary import RunSummary, cache_of
+from pano_mvs.scene import RangeMap
+from pano_mvs.session.session import Session, open_session
+from pano_mvs.stages.depth import SweepParams
+from pano_mvs.viewer.inspect.inspection import Inspection
+from pano_mvs.viewer.inspect.pixel import UnitFound, inspect_pixel
+
+_SHOWN = 6
+
+
+@dataclass(frozen=True)
+class PixelWanted:
+    """What is to be inspected.
+
+    Attributes:
+        image: name of the image, or an end of it that fits one alone.
+        x: column of the pixel from the left edge, in pixels of the swept size; its fraction is dropped.
+        y: row from the upper edge, likewise.
+        stage: name of the sweep in the workflow; empty for the first.
+        truth: folder with poses.json and depth.npz; None for the workflow's own.
+    """
+
+    image: str
+    x: float
+    y: float
+    stage: str = ""
+    truth: Path | None = None
+
+
+def inspect(session: Session, wanted: PixelWanted, console: Console, *, plot: Path | None, as_json: bool) -> None:
+    """Print what is known of a pixel.
+
+    Raises:
+        UsageError: if there is no such sweep, image or pixel.
+        InputError: if what the sweep reads is not computed yet.
+        StoreError: if the plot cannot be written.
+    """
+    found = _inspection(session, wanted)
+    if plot is not None:
+        _write_plot(plot, found)
+    if as_json:
+        print(json.dumps(as_json_value(found), indent=1, allow_nan=False, ensure_ascii=False))
+        return
+    print_inspection(found, console)
+    if plot is not None:
+        console.print(f"plot in {escape(str(plot))}", highlight=False, soft_wrap=True)
+
+
+def open_run(target: str, *, overrides: Sequence[str], images: Path | None, cache: Path | None) -> Session:
+    """Open a workflow, or that of an output folder with the settings, the pictures and the cache of its run.
+
+    Raises:
+        InputError: if the output folder is none, or its workflow is gone.
+    """
+    out = Path(target)
+    if not is_folder(out):
+        return open_session(target, overrides=overrides, images=images, cache=cache)
+    summary = RunSummary.read(out)
+    workflow = Path(summary.workflow.path)
+    if not is_file(workflow):
+        raise InputError(f"{out}: its workflow {workflow} is gone. Give another: pano-mvs inspect WORKFLOW IMAGE X Y")
+    # A relative folder was meant from where the run was started; what it was is in the settings.
+    folder = next((stage.params.get("path") for stage in summary.stages if stage.name == "images"), None)
+    given = [
+        f"images.path={json.dumps(folder)}" if one.startswith("images.path=") and folder else one
+        for one in summary.workflow.overrides
+    ]
+    if cache is None and summary.cache:
+        cache = cache_of(summary)
+    return open_session(str(workflow), overrides=[*given, *overrides], images=images, cache=cache, out=out)
+
+
+@dataclass
+class _Found:
+    """What a plan shows of an image."""
+
+    images: list[str] = field(default_factory=list)
+    units: dict[str, dict[str, UnitFound]] = field(default_factory=dict)
+
+    def look(self, unit: Unit, record: UnitRecord | None, _reason: str) -> None:
+        """Take note of a unit."""
+        if unit.source is not None:
+            self.images.append(unit.item)
+        if issubclass(unit.entry.spec.output, RangeMap):
+            self.units.setdefault(unit.entry.name, {})[unit.item] = unit, record
+
+
+def _inspection(session: Session, wanted: PixelWanted) -> Inspection:
+    if not (math.isfinite(wanted.x) and math.isfinite(wanted.y)):
+        raise UsageError(f"({wanted.x}, {wanted.y}) is no pixel: give its column and its row as numbers")
+    sweep = _sweep_stage(session, wanted.stage)
+    store = Store(session.store_root, for_reading=True)
+    found = _Found()
+    plans = make_plan(session.workflow, session.graph, store, visit=found.look)
+    image = _image(wanted.image, found.images)
+    unit = found.units.get(sweep, {}).get(image)
+    if unit is None:
+        raise InputError(_why_not(plans, sweep, image, session))
+    stages = [units[image] for units in found.units.values() if image in units]
+    truth = wanted.truth or _truth_of(session, image)
+    return inspect_pixel(unit, stages, store, column=math.floor(wanted.x), row=math.floor(wanted.y), truth=truth)
+
+
+def _sweep_stage(session: Session, name: str) -> str:
+    sweeps = [stage for stage in session.graph.order if isinstance(session.workflow.stages[stage].params, SweepParams)]
+    if not sweeps:
+        raise UsageError("this workflow has no depth.sweep: only sweeps have cost curves")
+    if name and name not in sweeps:
+        raise UsageError(f"{name!r} is no depth.sweep of this workflow; its sweeps: {', '.join(sweeps)}")
+    return name or sweeps[0]
+
+
+def _image(wanted: str, names: Sequence[str]) -> str:
+    matched = match_image_names([wanted], names)
+    if wanted in matched:
+        return matched[wanted]
+    fitting = [name for name in names if wanted in name]
+    if len(fitting) == 1:
+        return fitting[0]
+    shown = fitting or list(names)
+    raise UsageError(
+        f"{len(fitting) or 'no'} images are called {wanted!r}; there are: {', '.join(shown[:_SHOWN])}"
+        f"{' …' if len(shown) > _SHOWN else ''}"
+    )
+
+
+def _why_not(plans: Sequence[StagePlan], sweep: str, image: str, session: Session) -> str:
+    plan = next(plan for plan in plans if plan.name == sweep)
+    if image in plan.blocked:
+        return f"{sweep}:{image} cannot be swept: {plan.blocked[image]}"
+    if plan.open or plan.may_run:
+        return (
+            f"{sweep}:{image} reads what the cache {session.store_root} does not hold, with these settings, "
+            f"pictures and version. Inspect the output folder of a run in place of the workflow, or run the "
+            f"workflow with these settings first, or just that: {_run_command(session, f'{sweep}:{image}')}"
+        )
+    return f"{sweep} has no view of {image}: it was not registered, or has no neighbours; see report.html"
+
+
+def _run_command(session: Session, unit: str) -> str:
+    """Return the command that computes a unit with this session's settings, images and cache."""
+    words = ["pano-mvs", "run", str(session.workflow.path), "--cache", str(session.store_root), "--only", unit]
+    for override in session.workflow.overrides:
+        setting, _, _ = override.partition("=")
+        path = getattr(session.workflow.stages["images"].params, "path", None) if setting == "images.path" else None
+        # The workflow writes --images as a setting, but as it was typed, which need not be YAML.
+        words += ["--images", str(path)] if isinstance(path, Path) and is_folder(path) else ["--set", override]
+    return shlex.join(words)
+
+
+def _truth_of(session: Session, image: str) -> Path | None:
+    """Return the truth that the workflow itself compares with, if it does and knows the image.
+
+    A preset's truth is of its sample: of other pictures it says nothing.
+    """
+    for entry in session.workflow.stages.values():
+        folder = getattr(entry.params, "truth", None)
+        if isinstance(folder, Path) and is_file(folder / "poses.json"):
+            return folder if read_truth(folder).match([image]) else None
+    return None
+
+
+def _write_plot(path: Path, found: Inspection) -> None:
+    from pano_mvs.viewer.inspect.curve_picture import write_curve_picture
+
+    if path.suffix.lower() != ".png":
+        raise UsageError(f"--plot {path}: the plot is a PNG, call it so")
+    try:
+        write_curve_picture(path, found)
+    except OSError as error:
+        raise StoreError(f"--plot {path}: cannot be written ({error.strerror}). Choose another place") from error

@@ -1,0 +1,1 @@
+"""`pano-mvs plan` and `status`: what a run would compute, and why."""

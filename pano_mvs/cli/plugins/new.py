@@ -1,0 +1,113 @@
+"""Write a new plugin: a working file of some kind, and its test."""
+
+from __future__ import annotations
+
+import keyword
+import re
+import sys
+from dataclasses import dataclass
+from importlib.metadata import packages_distributions
+from pathlib import Path
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from pano_mvs.core.errors import UsageError
+from pano_mvs.core.files import write_text
+from pano_mvs.core.paths import exists
+
+_NAME = re.compile(r"[a-z][a-z0-9_]*")
+
+
+@dataclass(frozen=True, slots=True)
+class PluginKind:
+    """A kind of plugin.
+
+    Attributes:
+        prefix: of the stage's name; empty for a part of the sweep.
+        what: what it does, in words.
+        use: how a workflow uses it, with `{name}` for its name.
+        laws: the function of `pano_mvs.testing.conformance` that gives its contract.
+    """
+
+    prefix: str
+    what: str
+    use: str
+    laws: str = "stage_laws"
+
+
+KINDS = {
+    "source": PluginKind("source", "where panoramas come from", "images: {{use: source.{name}, path: photos}}"),
+    "mask": PluginKind("mask", "which pixels every later stage ignores", "masked: {{use: mask.{name}}}"),
+    "features": PluginKind("features", "key points as bearings", "features: {{use: features.{name}}}"),
+    "pairs": PluginKind("pairs", "which pictures are matched", "pairs: {{use: pairs.{name}}}"),
+    "matches": PluginKind("matches", "which key points are the same", "matches: {{use: matches.{name}}}"),
+    "poses": PluginKind("poses", "where the pictures were taken", "poses: {{use: poses.{name}}}"),
+    "views": PluginKind("views", "which sources each reference is swept against", "views: {{use: views.{name}}}"),
+    "depth": PluginKind("depth", "the range of every pixel", "depth: {{use: depth.{name}}}"),
+    "sweep_cost": PluginKind(
+        "", "what depth.sweep compares by", "depth: {{use: depth.sweep, backend: numpy, cost: {name}}}", "cost_laws"
+    ),
+    "sweep_backend": PluginKind(
+        "", "what computes depth.sweep", "depth: {{use: depth.sweep, backend: {name}, cost: sad}}", "backend_laws"
+    ),
+    "filter": PluginKind("filters", "range map in, range map out", "filtered: {{use: filters.{name}}}"),
+    "fusion": PluginKind("fusion", "from range maps to one cloud", "cloud: {{use: fusion.{name}}}"),
+    "export": PluginKind("export", "files for other programs", "written: {{use: export.{name}}}"),
+}
+
+
+def rendered(kind: str, name: str) -> tuple[str, str]:
+    """Return the text of a new plugin and that of its test.
+
+    Raises:
+        UsageError: if there is no such kind, or the name cannot be that of a Python file.
+    """
+    if kind not in KINDS:
+        raise UsageError(f"there is no kind of plugin {kind!r}; there are {', '.join(KINDS)}")
+    if not _NAME.fullmatch(name) or keyword.iskeyword(name):
+        raise UsageError(f"a plugin cannot be called {name!r}: use small letters, digits and '_', a letter first")
+    if name in sys.stdlib_module_names or name in packages_distributions():
+        raise UsageError(f"a plugin cannot be called {name!r}: its file would hide the Python package of that name")
+    environment = Environment(
+        loader=PackageLoader("pano_mvs.cli.plugins", "templates"),
+        undefined=StrictUndefined,
+        keep_trailing_newline=True,
+        autoescape=False,  # noqa: S701  # it writes Python, and the name is checked
+    )
+    title = "".join(word.capitalize() for word in name.split("_"))
+    values = {"name": name, "title": title, "kind": kind, "laws": KINDS[kind].laws, "prefix": KINDS[kind].prefix}
+    return (
+        environment.get_template(f"{kind}.py.jinja").render(values),
+        environment.get_template("test.py.jinja").render(values),
+    )
+
+
+def write_plugin(kind: str, name: str, folder: Path, console: Console) -> None:
+    """Write a new plugin and its test into a folder, and say how it is used.
+
+    Raises:
+        UsageError: if a file of that name is there already, or as of `rendered`.
+    """
+    plugin, test = rendered(kind, name)
+    paths = folder / f"{name}.py", folder / f"test_{name}.py"
+    for path in paths:
+        if exists(path):
+            raise UsageError(f"{path} is there already; nothing was written. Take another name, or another --dir")
+    for path, text in zip(paths, (plugin, test), strict=True):
+        write_text(path, text)
+    console.print(f"wrote {escape(str(paths[0]))} and its test", highlight=False, soft_wrap=True)
+    console.print("name it in a workflow:", highlight=False)
+    console.print(f"  plugins: [{name}.py]", highlight=False, markup=False)
+    console.print(f"  stages:\n    {KINDS[kind].use.format(name=name)}", highlight=False, markup=False)
+    console.print(f"test it: pytest {escape(str(paths[1]))}", highlight=False, soft_wrap=True)
+
+
+def show_kinds(console: Console) -> None:
+    """List the kinds of plugins there are."""
+    table = Table("kind", "what it is", "in a workflow")
+    for name, kind in KINDS.items():
+        table.add_row(name, kind.what, escape(kind.use.format(name="mine")))
+    console.print(table)

@@ -1,0 +1,1 @@
+"""`pano-mvs run`: progress on a terminal or as JSON lines, and the summary that is printed."""

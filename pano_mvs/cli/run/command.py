@@ -1,0 +1,62 @@
+"""`pano-mvs run`: run a workflow with progress on the terminal, or as JSON lines for programs."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
+from types import FrameType
+
+from pano_mvs.cli.console import Console
+from pano_mvs.cli.run.json_events import JsonEvents
+from pano_mvs.cli.run.printing import print_summary
+from pano_mvs.cli.run.progress import ProgressBars
+from pano_mvs.cli.streams import apart
+from pano_mvs.session.running import Execution, run_session
+from pano_mvs.session.session import Session
+
+
+def run_workflow(session: Session, execution: Execution, *, as_json: bool = False) -> int:
+    """Run a workflow, print progress and a summary, or events if `as_json`, and return the exit code."""
+    stream = apart(sys.stdout)
+    try:
+        with interrupted_by_termination():
+            if as_json:
+                with redirect_stdout(sys.stderr):  # a plugin may print in this process
+                    return run_session(session, execution, JsonEvents(stream)).summary.exit_code
+            console = Console(file=stream)
+            with ProgressBars(console) as bars:
+                output = run_session(session, execution, bars)
+            print_summary(output, console)
+            return output.summary.exit_code
+    finally:
+        if stream is not sys.stdout:
+            stream.close()
+
+
+@contextmanager
+def interrupted_by_termination() -> Iterator[None]:
+    """Let a request to terminate (SIGTERM) and the end of the terminal (SIGHUP) end a run as an interrupt does.
+
+    A terminal that closes sends SIGHUP more than once: only the first counts. Under nohup it is ignored, as is wanted.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only a main thread is told
+        return
+
+    hangup = getattr(signal, "SIGHUP", None)
+    ends = [signal.SIGTERM, *([hangup] if hangup and signal.getsignal(hangup) is not signal.SIG_IGN else [])]
+
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        if hangup is not None:
+            signal.signal(hangup, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in ends}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,51 @@
+"""What a run does, as a stream of JSON objects, one in a line, for programs.
+
+Every object has `event` and `time` (seconds since 1970). The events, in the order in which they can come:
+
+    run_started     schema (1), workflow, stages (names, in order), executor, workers, threads, out
+    stage_started   stage, units
+    unit_started    stage, item                             only for units that are computed
+    unit_failed     stage, item, cause, consequence, log (file or ""), said (the last lines that it printed)
+    unit_finished   stage, item, outcome ("run" | "cached" | "failed" | "blocked"), seconds
+    stage_finished  stage, use, units, run, cached, failed, blocked, seconds, unit_seconds, metrics
+    warning         text
+    run_finished    exit_code, stopped, run, cached, failed, blocked, seconds, out; and of a run that was not broken off
+                    verdict (mood, outcome, judgement, sentence, tiles, findings (mood, text, remedy), as in the
+                    report) and doubts (image to reason)
+
+`item` is empty where a stage has one unit only. Stages overlap. If a damaged part of the store is found, the run starts
+over: `stage_started` comes again for every stage, and what was counted before does not count. `run_finished` is always
+the last line, also of a run that is interrupted (130) or ends in an error (then `stopped` says which), unless the
+process is killed. Fields may be added to a schema; none changes its meaning.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from typing import Any, TextIO
+
+from pano_mvs.core.text import json_without_controls
+from pano_mvs.session.progress import Event, RunFinished, RunStarted
+
+SCHEMA = 1
+
+
+class JsonEvents:
+    """A progress callback that writes the events of a run as JSON lines."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def __call__(self, event: Event) -> None:
+        """Write one event."""
+        fields: dict[str, Any] = {"event": event.kind, "time": round(time.time(), 3)}
+        if isinstance(event, RunStarted):
+            fields["schema"] = SCHEMA
+        fields |= dataclasses.asdict(event)
+        if isinstance(event, RunFinished) and event.verdict is None:
+            del fields["verdict"], fields["doubts"]
+        line = json.dumps(fields, ensure_ascii=False, allow_nan=False, default=str)
+        self._stream.write(json_without_controls(line) + "\n")
+        self._stream.flush()

@@ -1,0 +1,146 @@
+"""The summary that `pano-mvs run` prints."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping
+from statistics import median
+
+from rich.markup import escape
+from rich.table import Table
+
+from pano_mvs.cli.console import Console
+from pano_mvs.core.text import one_line, plural
+from pano_mvs.results.records import Number, ScoresSummary, Verdict
+from pano_mvs.results.run_output import RunOutput
+from pano_mvs.results.summary import RunSummary
+from pano_mvs.viewer.shown_scene import is_to_see
+
+_SHOWN_FAILURES = 20
+
+
+def print_summary(output: RunOutput, console: Console) -> None:
+    """Print where the results are and how good they are known to be."""
+    summary, out = output.summary, str(output.out)
+    units = summary.units
+    failed = f", {units.failed} failed" if units.failed else ""
+    cached = " (nothing to compute)" if not units.run and not units.failed else ""
+    counts = f"{units.run} {plural(units.run, 'unit')} computed, {units.cached} cached{failed}"
+    console.print(f"\n{counts} in {summary.seconds or 0:.1f} s{cached}", highlight=False)
+    _print_failures(summary, console)
+    _print_poses(summary, console)
+    print_scores(summary.scores, console)
+    _print_comparison(summary.all_scores, console)
+    for note in summary.notes:
+        console.print(f"note: {escape(note)}", highlight=False, soft_wrap=True)
+    if summary.left_over:
+        count = len(summary.left_over)
+        text = f"{count} {plural(count, 'file')} of an earlier run, which this one did not write,"
+        console.print(f"{text} {plural(count, 'is', 'are')} still there", highlight=False)
+    _print_verdict(output.verdict, console)
+    look = f", or look around with pano-mvs view {escape(shlex.quote(out))}" if is_to_see(summary.files) else ""
+    count = len(summary.files)
+    files = f"{count} {plural(count, 'file')}, {len(output.written)} written now"
+    console.print(
+        f"results in {escape(out)} ({files}): open report.html{look}",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def _print_failures(summary: RunSummary, console: Console) -> None:
+    causes = summary.failures
+    for failure in causes[:_SHOWN_FAILURES]:
+        text = f"{one_line(failure.label)}: {failure.cause} — {failure.consequence}"
+        console.print(f"[red]failed:[/] {escape(text)}", highlight=False, soft_wrap=True)
+        if failure.log:
+            console.print(f"  what it printed is in {escape(failure.log)}", highlight=False, soft_wrap=True)
+    if len(causes) > _SHOWN_FAILURES:
+        console.print(f"… and {len(causes) - _SHOWN_FAILURES} more, all in run.json", highlight=False)
+    for image, rejected in summary.rejected.items():
+        text = f"{one_line(image)}: {rejected.reason}"
+        console.print(f"[yellow]left out:[/] {escape(text)}", highlight=False, soft_wrap=True)
+
+
+def _print_poses(summary: RunSummary, console: Console) -> None:
+    poses = summary.poses
+    if poses:
+        total = len(poses.registered) + len(poses.rejected)
+        points = f"{poses.points} {plural(poses.points, 'point')}"
+        text = f"poses: {len(poses.registered)} of {total} registered, {points}; scale: {poses.scale}"
+        console.print(escape(text), highlight=False)
+
+
+def _print_verdict(verdict: Verdict, console: Console) -> None:
+    """Print whether the result can be relied on, as the report says it, and what is wrong or doubtful."""
+    if verdict.judgement:
+        console.print(f"[{_COLORS[verdict.mood]}]{escape(verdict.judgement)}[/]", highlight=False, soft_wrap=True)
+    for finding in verdict.findings:
+        if finding.mood in _MARKS:
+            text = (
+                f"[{_COLORS[finding.mood]}]{_MARKS[finding.mood]}:[/] {escape(finding.text)} {escape(finding.remedy)}"
+            )
+            console.print(text.rstrip(), highlight=False, soft_wrap=True)
+
+
+_COLORS = {"good": "green", "fair": "yellow", "bad": "red"}
+_MARKS = {"fair": "doubtful", "bad": "bad"}
+
+
+def print_scores(scores: ScoresSummary, console: Console) -> None:
+    """Print pose scores in a line and range scores in a table."""
+    poses = scores.poses
+    if poses:
+        together = poses.get("registered_in_one_frame")
+        in_one_frame = "" if together is None else f" ({together} in one frame)"
+        error_deg = poses.get("median_pair_error_deg")
+        measured = "no pair to measure" if error_deg is None else f"median pair error {error_deg:.3f}°"
+        text = f"{poses['registered']} of {poses['of']} registered{in_one_frame}, {measured}"
+        if "scale_ratio_error_max" in poses:
+            text += f", translation scale ratios within {100 * poses['scale_ratio_error_max']:.2f} %"
+        console.print(f"against the ground truth: {text}", highlight=False)
+    if not scores.views:
+        return
+    table = Table("view", *_SHOWN_SCORES.values(), caption=_IN_BRACKETS)
+    for view, values in scores.views.items():
+        table.add_row(escape(view), *(_beside_constant(values, name) for name in _SHOWN_SCORES))
+    console.print(table)
+
+
+def _print_comparison(all_scores: Mapping[str, ScoresSummary], console: Console) -> None:
+    """Print, where several branches are scored, the medians over their views side by side."""
+    if len(all_scores) < 2:
+        return
+    table = Table("median over views", *_SHOWN_SCORES.values(), caption=_IN_BRACKETS)
+    for stage, scores in all_scores.items():
+        views = scores.views.values()
+        names = {name for view in views for name in view}
+        found = {name: [value for view in views if (value := view.get(name)) is not None] for name in names}
+        middle = {name: median(values) for name, values in found.items() if values}
+        table.add_row(escape(stage), *(_beside_constant(middle, name) for name in _SHOWN_SCORES))
+    console.print(table)
+
+
+_IN_BRACKETS = "in brackets: the best of all constant ranges"
+_SHOWN_SCORES = {
+    "psnr_db": "PSNR dB",
+    "w_mae": "MAE",
+    "w_delta_105": "δ<1.05",
+    "completeness": "complete",
+    "ause": "AUSE",
+}
+"""Score to the heading under which it is printed; MAE and δ are weighted by solid angle.
+
+AUSE is the area between the sparsification curve of the confidence and that of the true errors.
+"""
+
+
+def _beside_constant(values: Mapping[str, Number], name: str) -> str:
+    constant = values.get(f"best_constant_{name}")
+    return _shown(values.get(name)) + ("" if constant is None else f" ({_shown(constant)})")
+
+
+def _shown(value: float | None) -> str:
+    if value is None:
+        return "–"
+    return f"{value:z.3g}" if abs(value) < 1 else f"{value:.2f}"

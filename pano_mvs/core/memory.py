@@ -1,0 +1,81 @@
+"""Free memory of this host, and sizes such as "2GB"."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+_UNITS = {
+    "": 1,
+    "B": 1,
+    "KB": 10**3,
+    "MB": 10**6,
+    "GB": 10**9,
+    "TB": 10**12,
+    "KIB": 2**10,
+    "MIB": 2**20,
+    "GIB": 2**30,
+    "TIB": 2**40,
+}
+_SIZE = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([a-zA-Z]*)\s*")
+
+
+def bytes_from_size(size: str | int) -> int:
+    """Return the bytes of a size such as `2GB`, `1.5 GiB` or a number of bytes.
+
+    Raises:
+        ValueError: if the text is not a size.
+    """
+    match = _SIZE.fullmatch(str(size))
+    if match is None or match[2].upper() not in _UNITS:
+        raise ValueError("must be a size such as 500MB, 2GB or 1.5GiB")
+    return int(float(match[1]) * _UNITS[match[2].upper()])
+
+
+def size_text(size_bytes: int) -> str:
+    """Return a size as text, in MB or GB."""
+    return f"{size_bytes / 1e9:.1f} GB" if size_bytes >= 1e9 else f"{size_bytes / 1e6:.0f} MB"
+
+
+def free_memory_bytes() -> int:
+    """Return the memory that can be used without swapping, within the limit of a container; 0 if unknown."""
+    found = [size for size in (_free_of_system(), _free_of_container()) if size]
+    return min(found, default=0)
+
+
+def _free_of_system() -> int:
+    if sys.platform == "win32":
+        return _free_of_windows()
+    if sys.platform == "darwin":
+        # macOS fills free memory with cached files, so that its figure says little: most of the memory is available.
+        found = subprocess.run(["/usr/sbin/sysctl", "-n", "hw.memsize"], capture_output=True, check=False).stdout
+        return int(found) * 3 // 4 if found.strip().isdigit() else 0
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), 0)
+    except (OSError, ValueError):
+        return 0
+
+
+def _free_of_container() -> int:
+    folder = Path("/sys/fs/cgroup")
+    try:
+        limit, used = ((folder / name).read_text(encoding="ascii").strip() for name in ("memory.max", "memory.current"))
+        if limit == "max":
+            return 0
+        lines = (folder / "memory.stat").read_text(encoding="ascii").splitlines()
+        files = sum(int(line.split()[1]) for line in lines if line.startswith("inactive_file "))
+        return max(1, int(limit) - int(used) + files)  # memory of cached files is released when needed
+    except (OSError, ValueError):
+        return 0
+
+
+def _free_of_windows() -> int:
+    status = (ctypes.c_ulonglong * 8)()  # MEMORYSTATUSEX: two 32-bit fields, then seven of 64 bits
+    ctypes.memmove(status, ctypes.byref(ctypes.c_uint32(ctypes.sizeof(status))), 4)
+    kernel = getattr(ctypes, "windll").kernel32  # noqa: B009 (exists on Windows alone)
+    return int(status[2]) if os.name == "nt" and kernel.GlobalMemoryStatusEx(status) else 0

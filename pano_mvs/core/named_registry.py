@@ -1,0 +1,102 @@
+"""Registries of values that users choose by name and to which plugins add, such as the costs of a sweep."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from pano_mvs.core.errors import PluginError, UsageError
+
+Value = TypeVar("Value")
+_ATTRIBUTE = "__pano_mvs_registrations__"
+_unavailable: dict[tuple[str, str], str] = {}
+
+
+@dataclass(frozen=True, slots=True)
+class Registration:
+    """The name under which a plugin registered a function.
+
+    Attributes:
+        kind: what the registry holds, in words: "sweep cost".
+        name: by which users choose it.
+        origin: where the function is defined, `file:line`.
+    """
+
+    kind: str
+    name: str
+    origin: str
+
+
+class NamedRegistry(Generic[Value]):
+    """Values of one kind by name: the built-in ones, and those of plugins."""
+
+    def __init__(self, kind: str, builtin: Mapping[str, Value]) -> None:
+        self.kind = kind
+        self._builtin = dict(builtin)
+        self._added: dict[str, tuple[Value, Callable[..., Any]]] = {}
+
+    def names(self) -> tuple[str, ...]:
+        """Return all names, the built-in ones first."""
+        return *self._builtin, *sorted(self._added)
+
+    def register(self, name: str, value: Value, function: Callable[..., Any]) -> None:
+        """Add a plugin's value; it replaces one that a plugin registered before under the same name.
+
+        Args:
+            name: letters, digits, '-', '_' and '.'.
+            value: what `get` returns.
+            function: the plugin's function behind the value; its file counts as the code of the value.
+
+        Raises:
+            PluginError: if the name has other characters, or is that of a built-in value.
+        """
+        if not name or not all(sign.isalnum() or sign in "-_." for sign in name):
+            raise PluginError(f"a {self.kind} cannot be called {name!r}: use letters, digits, '-', '_' and '.'")
+        if name in self._builtin:
+            raise PluginError(f"the {self.kind} {name!r} is built in: register yours under another name")
+        self._added[name] = value, function
+        code = function.__code__
+        registration = Registration(self.kind, name, f"{code.co_filename}:{code.co_firstlineno}")
+        setattr(function, _ATTRIBUTE, (*registrations_of(function), registration))
+
+    def get(self, name: str) -> Value:
+        """Return the value registered under a name.
+
+        Raises:
+            UsageError: if there is none; the message lists the known names.
+        """
+        self.check(name)
+        return self._builtin[name] if name in self._builtin else self._added[name][0]
+
+    def check(self, name: str) -> str:
+        """Return the name if it is registered, else raise UsageError."""
+        why = _unavailable.get((self.kind, name))
+        if name in self._builtin or (name in self._added and why is None):
+            return name
+        if why is not None:
+            raise UsageError(f"the {self.kind} {name!r} cannot be used: {why}")
+        close = get_close_matches(name, self.names(), n=2, cutoff=0.5)
+        hint = f"did you mean {' or '.join(map(repr, close))}? " if close else ""
+        raise UsageError(
+            f"there is no {self.kind} {name!r}; {hint}known: {', '.join(self.names())}. If it is a plugin's, install "
+            "the plugin or list its file under `plugins:`"
+        )
+
+    def code_file(self, name: str) -> Path | None:
+        """Return the plugin file behind a name, or None if the value is built in."""
+        return Path(self._added[name][1].__code__.co_filename) if name in self._added else None
+
+
+def set_unavailable(reasons: Mapping[tuple[str, str], str]) -> None:
+    """Declare which names of broken plugins cannot be used: kind and name to the reason. Replaces earlier reasons."""
+    _unavailable.clear()
+    _unavailable.update(reasons)
+
+
+def registrations_of(value: object) -> tuple[Registration, ...]:
+    """Return the names under which an object is registered; most objects have none."""
+    found = getattr(value, _ATTRIBUTE, ())
+    return found if isinstance(found, tuple) and all(isinstance(one, Registration) for one in found) else ()

@@ -1,0 +1,156 @@
+"""Numbers as people read them, and the tables of scores."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pano_mvs.results.records import ScoresSummary
+
+# What a person looks at first; other scores follow as they come.
+_FIRST = ("psnr_db", "w_mae", "w_delta_105", "median_relative_error", "completeness")
+# The figures of the scores, in words; others are spelt out from their names.
+_WORDS = {
+    "psnr_db": "PSNR dB",
+    "mae": "mean error",
+    "w_mae": "mean error on the sphere",
+    "abs_rel": "mean relative error",
+    "delta_105": "within 5 %",
+    "w_delta_105": "within 5 % on the sphere",
+    "bad_5": "off by more than 5 %",
+    "sparsification_area": "sparsification area",
+    "sparsification_oracle_area": "sparsification area of an oracle",
+    "ause": "area between the two (AUSE)",
+    "of": "of panoramas with truth",
+}
+_CONSTANTS = "best_constant_", "constant_"
+_BRACKETS = (
+    "In brackets: what one constant range for all pixels scores, the constant that is best for the very score "
+    "(in runs of earlier versions the median of the true ranges)."
+)
+_MIN_SHOWN = 0.0001
+_UNITS = {"deg": "°", "rad": "rad", "px": "px", "s": "s", "db": "dB", "mb": "MB"}
+
+
+def share(value: Any) -> str:
+    """Return a fraction as a percentage, never rounded up to 100 %."""
+    if not _is_number(value):
+        return "–"
+    percent = 100 * float(value)
+    if 0 < percent < 0.05:
+        return "< 0.1 %"
+    digits = 0 if 10 <= percent < 99 or percent in (0, 100) else 1
+    return f"{min(percent, 99.9) if percent < 100 else percent:.{digits}f} %"
+
+
+def duration(seconds: Any) -> str:
+    """Return seconds as `0.4 s`, `12 s`, `3 min 05 s` or `2 h 07 min`."""
+    if not _is_number(seconds):
+        return "–"
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+def degrees(value: Any) -> str:
+    """Return an angle in degrees with two significant digits."""
+    return f"{significant(value)}°" if _is_number(value) else "–"
+
+
+def significant(value: float, digits: int = 2) -> str:
+    """Return a number with at least so many significant digits, and never with an exponent."""
+    if 0 < abs(value) < _MIN_SHOWN:
+        return f"< {_MIN_SHOWN}"
+    return f"{value:z.0f}" if abs(value) >= 10**digits - 0.5 else f"{value:z.{digits}g}"
+
+
+def figure(value: Any) -> str:
+    """Return a value with four significant digits, thousands apart."""
+    if isinstance(value, bool) or value is None:
+        return {True: "yes", False: "no", None: "–"}[value]
+    if isinstance(value, int):
+        return f"{value:,}".replace(",", "\u202f")
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            return "–"
+        return figure(round(value)) if abs(value) >= 1000 else f"{value:z.4g}"
+    if isinstance(value, list | tuple):
+        return ", ".join(figure(item) for item in value)
+    if isinstance(value, Mapping):
+        return ", ".join(f"{words(str(key))} {figure(item)}" for key, item in value.items())
+    return str(value)
+
+
+def words(name: str) -> str:
+    """Return the name of a figure in words: `median_pair_error_deg` is `median pair error, °`."""
+    if name in _WORDS:
+        return _WORDS[name]
+    *parts, last = name.split("_")
+    if parts[:1] == ["auc"] and last == "deg":
+        return f"AUC at {'.'.join(parts[1:])}°"
+    return f"{' '.join(parts)}, {_UNITS[last]}" if parts and last in _UNITS else name.replace("_", " ")
+
+
+def score_tables(scores: ScoresSummary) -> dict[str, Any]:
+    """Return the scores of the poses as rows, and those of the views as a table with one column for each metric.
+
+    What a constant range map scores (`best_constant_…`, or in older runs `constant_…`) stands in brackets beside.
+    """
+    views = scores.views
+    known = [metric for metric in _metrics(views) if not metric.startswith(_CONSTANTS)]
+    columns = [metric for metric in _FIRST if metric in known] + [metric for metric in known if metric not in _FIRST]
+    middle = {metric: median([view.get(metric) for view in views.values()]) for metric in _metrics(views)}
+    return {
+        "poses": list(scores.poses.items()),
+        "columns": columns,
+        "views": [(name, [_beside_constant(values, metric) for metric in columns]) for name, values in views.items()],
+        "median": [_beside_constant(middle, metric) for metric in columns] if len(views) > 1 else [],
+        "notes": [*([_BRACKETS] if len(_metrics(views)) > len(columns) else []), *scores.notes],
+    }
+
+
+def side_by_side(tables: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[str, Any]:
+    """Return the medians of several branches as one table with a row for each; none where there is but one.
+
+    Args:
+        tables: (name of a branch, what `score_tables` gave for it).
+    """
+    scored = [(name, table) for name, table in tables if table["views"]]
+    if len(scored) < 2:
+        return {"columns": [], "rows": []}
+    columns = list(dict.fromkeys(column for _, table in scored for column in table["columns"]))
+    rows = []
+    for name, table in scored:
+        values = dict(zip(table["columns"], table["median"] or table["views"][0][1], strict=True))
+        rows.append((name, [values.get(column) for column in columns]))
+    return {"columns": columns, "rows": rows}
+
+
+def _metrics(views: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    return list(dict.fromkeys(metric for values in views.values() for metric in values))
+
+
+def _beside_constant(values: Mapping[str, Any], metric: str) -> str:
+    """Return a score, and in brackets what a constant scores where that is known."""
+    found = figure(values.get(metric))
+    constant = next((values[prefix + metric] for prefix in _CONSTANTS if values.get(prefix + metric) is not None), None)
+    return found if constant is None else f"{found} ({figure(constant)})"
+
+
+def median(values: list[Any]) -> float | None:
+    """Return the median of those values that are finite numbers, or None."""
+    numbers = sorted(float(value) for value in values if _is_number(value))
+    if not numbers:
+        return None
+    middle = len(numbers) // 2
+    return numbers[middle] if len(numbers) % 2 else (numbers[middle - 1] + numbers[middle]) / 2
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -1,0 +1,277 @@
+"""What a person should know of a run before anything else: what is wrong or doubtful, and what to do about it."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+
+from pano_mvs.core.text import plural
+from pano_mvs.results.figures import figure, median, share, significant
+from pano_mvs.results.records import Finding, PoseGroup, PosesSummary
+from pano_mvs.results.summary import RunSummary
+
+GOOD_REGISTERED, FAIR_REGISTERED = 0.95, 0.5
+# Residuals are compared with a pixel of the panorama: what is measured to within one is measured well.
+GOOD_RESIDUAL_PX, FAIR_RESIDUAL_PX = 1.0, 2.0
+# A sky takes up to half of the sphere, so it is not for much less that a result is bad.
+GOOD_COMPLETE, FAIR_COMPLETE = 0.8, 0.35
+# Plain walls are confirmed by nobody: a third of a furnished room is as much as can be had.
+GOOD_CONSISTENT, FAIR_CONSISTENT = 0.3, 0.12
+_FEW_LINKS = 2
+_SHOWN_GROUPS = 5
+_SHOWN_DOUBTS = 5
+# A model more than half of whose cameras are doubtful is not to be relied on.
+FAIR_UNDOUBTED = 0.5
+_NAMES_AND_FIGURES = re.compile(r"\d+([.,]\d+)?|'[^']*'")
+_ENDINGS = re.compile(r"\b(is|are)\b|(?<=\w)e?s\b")  # by which one and several differ
+
+
+def mood_of(value: float, good: float, fair: float) -> str:
+    """Return "good", "fair" or "bad": limits that fall from good to fair are lower ones, else upper ones."""
+    if good > fair:
+        return "good" if value >= good else "fair" if value >= fair else "bad"
+    return "good" if value <= good else "fair" if value <= fair else "bad"
+
+
+def findings(summary: RunSummary, *, residual_px: float | None = None) -> tuple[Finding, ...]:
+    """Return what is wrong or doubtful in a run, the worst first.
+
+    Args:
+        summary: of the run.
+        residual_px: median reprojection residual in pixels of the panoramas, if known.
+    """
+    found = [
+        *_stopped(summary),
+        *_failures(summary),
+        *_registration(summary),
+        *_doubts(summary),
+        *_groups(summary),
+        *_graph(summary),
+        *_residual(residual_px),
+        *_views(summary),
+        *_cloud(summary),
+        *_baseline(summary),
+    ]
+    return tuple(sorted(found, key=lambda finding: ("bad", "fair", "").index(finding.mood)))
+
+
+def _stopped(summary: RunSummary) -> list[Finding]:
+    stopped = summary.stopped
+    if not stopped:
+        return []
+    if stopped == "interrupted":
+        return [
+            Finding(
+                "fair",
+                "The run was interrupted: what is shown is what it had finished.",
+                "Run the same command again; what is finished is not computed again.",
+            )
+        ]
+    stopped = stopped if stopped.endswith((".", "!", "?")) else f"{stopped}."
+    return [Finding("bad", f"The run stopped early: {stopped}", "Mend this and run the same command again.")]
+
+
+def _failures(summary: RunSummary) -> list[Finding]:
+    failures, blocked = summary.failures, summary.blocked
+    if not failures:
+        return []
+    stages = Counter(failure.stage for failure in failures)
+    where = ", ".join(f"{count} in {stage}" for stage, count in stages.most_common(3))
+    more = f"; {_units(len(blocked))} could not run because of {plural(len(failures), 'it', 'them')}" if blocked else ""
+    verb = plural(len(failures), "unit of work failed", "units of work failed")
+    return [Finding("fair", f"{figure(len(failures))} {verb} ({where}){more}.", "Each is listed with its cause.")]
+
+
+def _registration(summary: RunSummary) -> list[Finding]:
+    registered, rejected = len(summary.poses.registered), summary.poses.rejected
+    total = registered + len(rejected)
+    if not total or not rejected:
+        return []
+    mood = mood_of(registered / total, GOOD_REGISTERED, FAIR_REGISTERED)
+    text = (
+        f"{len(rejected)} of {total} {plural(total, 'panorama')} {plural(len(rejected), 'has', 'have')} no pose: "
+        f"{_commonest(list(rejected.values()))}."
+    )
+    if mood == "good":
+        return [Finding("", text)]
+    return [
+        Finding(
+            mood,
+            text,
+            "Take more pictures between those, 0.5–1 m apart indoors, each seeing much of what the next one sees.",
+        )
+    ]
+
+
+def doubt_mood(poses: PosesSummary) -> str:
+    """Return "fair" if some registered cameras are doubtful, "bad" if more than half are, else "good"."""
+    return mood_of(1 - len(poses.doubts) / max(1, len(poses.registered)), 1.0, FAIR_UNDOUBTED)
+
+
+def _doubts(summary: RunSummary) -> list[Finding]:
+    doubts, poses = summary.doubtful_images, summary.poses
+    if not doubts:
+        return []
+    reasons = [f"{name} ({reason})" for name, reason in doubts.items()]
+    more = f"; and {len(reasons) - _SHOWN_DOUBTS} more" if len(reasons) > _SHOWN_DOUBTS else ""
+    what = "camera" if poses.doubts else "image"
+    count = f"{len(reasons)} {plural(len(reasons), f'{what} is', f'{what}s are')} doubtful"
+    them = plural(len(reasons), "it and its", "them and their")
+    mood = doubt_mood(poses) if poses.doubts else "fair"
+    return [
+        Finding(
+            mood,
+            f"{count}: {'; '.join(reasons[:_SHOWN_DOUBTS])}{more}.",
+            f"Take panoramas between {them} neighbours, with things in view that occur only once, or leave "
+            f"{plural(len(reasons), 'it', 'these images')} out.",
+        )
+    ]
+
+
+def _groups(summary: RunSummary) -> list[Finding]:
+    groups = summary.poses.groups
+    if len(groups) < 2:
+        return []
+    sizes = [f"group {number} has {_named(group)}" for number, group in enumerate(groups[1:], start=1)]
+    more = f"; and {len(sizes) - _SHOWN_GROUPS} more" if len(sizes) > _SHOWN_GROUPS else ""
+    largest = len(groups[0].images)
+    text = (
+        f"{len(groups)} groups of panoramas share no reliable connection: each has its own frame and scale. The "
+        f"largest has {largest} {plural(largest, 'panorama')}; "
+        f"{'; '.join(sizes[:_SHOWN_GROUPS])}{more}."
+    )
+    return [Finding("fair", text, pictures_between(groups))]
+
+
+def _named(group: PoseGroup) -> str:
+    names = group.images
+    return f"{len(names)} ({', '.join(names[:3])}{' …' if len(names) > 3 else ''})"
+
+
+def pictures_between(groups: Sequence[PoseGroup]) -> str:
+    """Return which images to take so that the smaller groups join the largest one, the first of two or more."""
+    found = []
+    for pair in (group.nearest_pair for group in groups[1:]):
+        if pair:
+            matches, candidates = pair.matches, pair.candidates
+            known = (
+                f"{matches} {plural(matches, 'match', 'matches')}"
+                if matches
+                else f"{candidates} {plural(candidates, 'candidate')}"
+            )
+            found.append(f"{pair.first} and {pair.second} ({known})")
+    if not found:
+        return "Take pictures between the groups, 0.5–1 m apart, and compare them with both."
+    more = " …" if len(found) > _SHOWN_GROUPS else ""
+    return f"To join them take pictures between {'; between '.join(found[:_SHOWN_GROUPS])}{more}."
+
+
+def _commonest(reasons: Sequence[str]) -> str:
+    """Return the reason that is given most often, whatever the figures and names in it, and how often it is."""
+    kinds = [_ENDINGS.sub("", _NAMES_AND_FIGURES.sub("…", reason)) for reason in reasons]
+    ((kind, count),) = Counter(kinds).most_common(1)
+    example = reasons[kinds.index(kind)]
+    return example if len(reasons) == 1 else f"{count} {plural(count, 'time')} such as “{example}”"
+
+
+def _graph(summary: RunSummary) -> list[Finding]:
+    """Return which registered cameras are linked to one other alone, where there are cameras enough to tell."""
+    names, links = summary.poses.registered, summary.poses.links
+    if len(names) < 4 or not links:
+        return []
+    count = Counter(name for link in links if link.inliers for name in link[:2])
+    loose = [name for name in names if 0 < count[name] < _FEW_LINKS]
+    if not loose:
+        return []
+    shown = ", ".join(loose[:3]) + (" …" if len(loose) > 3 else "")
+    mood = "fair" if len(loose) > len(names) / 4 else ""
+    sharing = plural(len(loose), "camera shares", "cameras share")
+    return [
+        Finding(
+            mood,
+            f"{len(loose)} {sharing} a verified geometry with one other alone ({shown}): unless their "
+            "poses were given, nothing confirms them.",
+        )
+    ]
+
+
+def _residual(residual_px: float | None) -> list[Finding]:
+    if residual_px is None or (mood := mood_of(residual_px, GOOD_RESIDUAL_PX, FAIR_RESIDUAL_PX)) == "good":
+        return []
+    text = f"The points miss the pictures by {significant(residual_px)} pixels in the median: the poses are not sharp."
+    return [
+        Finding(
+            mood,
+            text,
+            "Check that the pictures are sharp, unstitched seams aside, and not edited one by one; "
+            "put poses.refine behind the solver if it is not there.",
+        )
+    ]
+
+
+def compares_views(summary: RunSummary) -> bool:
+    """Return whether any stage compared the views: where none did, no pixel is confirmed, and that says nothing."""
+    compared = any("consistency" in stage.use for stage in summary.stages)
+    return compared or any(view.consistent for view in summary.views)
+
+
+def _views(summary: RunSummary) -> list[Finding]:
+    found = []
+    complete = median([view.completeness for view in summary.views])
+    consistent = median([view.consistent for view in summary.views])
+    if complete is not None and (mood := mood_of(complete, GOOD_COMPLETE, FAIR_COMPLETE)) != "good":
+        found.append(
+            Finding(
+                mood,
+                f"Half of the views have a range for less than {share(complete)} of their pixels.",
+                "Sky and masks have none; elsewhere look at the views in the report.",
+            )
+        )
+    if consistent is not None and not compares_views(summary):
+        found.append(
+            Finding(
+                "",
+                "No stage compared the views with each other, so nothing is known of their agreement.",
+                "filters.consistency does it.",
+            )
+        )
+    elif consistent is not None and (mood := mood_of(consistent, GOOD_CONSISTENT, FAIR_CONSISTENT)) != "good":
+        found.append(
+            Finding(
+                mood,
+                f"Other views confirm only {share(consistent)} of the pixels in the median view.",
+                "Plain walls cannot be confirmed; if textured ones are not either, the cameras are too "
+                "far apart or the poses are wrong.",
+            )
+        )
+    return found
+
+
+def _cloud(summary: RunSummary) -> list[Finding]:
+    if summary.cloud.points == 0:
+        return [
+            Finding(
+                "bad",
+                "The cloud has no points: no two views agree on any surface.",
+                "Look at the ranges in the report; if they are right, the poses are wrong.",
+            )
+        ]
+    return []
+
+
+def _baseline(summary: RunSummary) -> list[Finding]:
+    """Return whether a constant range would have scored as well."""
+    found = []
+    for stage, scores in summary.scores_by_stage.items():
+        views = scores.views.values()
+        ours = median([view.get("psnr_db") for view in views])
+        constant = median([view.get("best_constant_psnr_db", view.get("constant_psnr_db")) for view in views])
+        if ours is not None and constant is not None and ours <= constant:
+            text = f"Against the truth ({stage}), one constant range for all pixels does as well"
+            found.append(Finding("bad", f"{text}: {ours:z.1f} dB to {constant:z.1f} dB."))
+    return found
+
+
+def _units(count: int) -> str:
+    return f"{figure(count)} further {plural(count, 'unit')}"

@@ -1,0 +1,83 @@
+"""Pictures that travel within the page: JPEG of at most so many bytes, as data URIs."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.paths import is_file, resolved
+
+_QUALITIES = (82, 70, 55, 40)
+_MIN_PX = 32
+_LINE_PX = 4
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One picture of the page.
+
+    Attributes:
+        uri: `data:image/jpeg;base64,…`.
+        size_hw: (height, width) in pixels.
+        key: under which a later page finds it again; "" if it never does.
+    """
+
+    uri: str
+    size_hw: tuple[int, int]
+    key: str = ""
+
+
+def picture(image: NDArray[np.uint8], *, width: int, most_bytes: int, key: str = "") -> Picture:
+    """Return an image as JPEG: first with a lower quality, then smaller, until it takes no more than its share.
+
+    Args:
+        image: (H, W, 3) uint8 RGB.
+        width: in pixels, at most.
+        most_bytes: of the JPEG, before it is written as text.
+        key: see `Picture`.
+    """
+    shown = resized(image, width)
+    while True:
+        bgr = cv2.cvtColor(shown, cv2.COLOR_RGB2BGR)
+        for quality in _QUALITIES:
+            data = bytes(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
+            if len(data) <= most_bytes or (min(shown.shape[:2]) <= _MIN_PX and quality == _QUALITIES[-1]):
+                size_hw = int(shown.shape[0]), int(shown.shape[1])
+                return Picture(f"data:image/jpeg;base64,{base64.b64encode(data).decode('ascii')}", size_hw, key)
+        shown = resized(shown, shown.shape[1] * 3 // 4)
+
+
+def resized(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
+    """Return an image of at most a width."""
+    if image.shape[1] <= width:
+        return image
+    size = width, max(1, round(image.shape[0] * width / image.shape[1]))
+    smaller: NDArray[np.uint8] = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return smaller
+
+
+def preview_panels(out_dir: Path, relative: str, *, small: bool = False) -> tuple[NDArray[np.uint8], ...]:
+    """Return the panorama and the range map of a preview, (H, W, 3) RGB each; none if it is none of ours.
+
+    Args:
+        out_dir: the output folder, outside of which nothing is read.
+        relative: the preview's path below it.
+        small: an eighth of the size, which is decoded sooner.
+    """
+    path = resolved(out_dir / relative)
+    if not relative or not path.is_relative_to(resolved(out_dir)) or not is_file(path):
+        return ()
+    data = np.fromfile(path, np.uint8)
+    image = cv2.imdecode(data, cv2.IMREAD_REDUCED_COLOR_8 if small else cv2.IMREAD_COLOR) if len(data) else None
+    if image is None or image.shape[0] < image.shape[1] or image.shape[1] < 2:
+        return ()
+    rgb: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    height = rgb.shape[1] // 2
+    # Between them is a white line; below is the scale.
+    start = height if small else height + _LINE_PX
+    return rgb[:height], rgb[start : start + height]

@@ -1,0 +1,161 @@
+"""The values that a run left in the cache. Nothing is computed again; what is gone is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import InputError, StoreError
+from pano_mvs.core.paths import is_file, resolved
+from pano_mvs.engine.cache.store import ItemRef, Store
+from pano_mvs.engine.running.run import Run
+from pano_mvs.results.summary import RunSummary
+from pano_mvs.scene import Panorama, PointCloud, Poses, RangeMap, Record
+
+ROLES = ("images", "pairs", "poses", "ranges", "cloud")
+"""The final values of a run by role; run.json says which stage made each."""
+
+_Kind = TypeVar("_Kind", bound=Record)
+
+
+@dataclass(frozen=True)
+class StoredValues:
+    """The values of one run.
+
+    Attributes:
+        store: the cache; None if it is not known or gone.
+        refs: role to item to the stored value; see `ROLES`. The only item of a role such as `poses` is called "".
+        notes: what could not be read, and why; grows with each value that is asked for.
+    """
+
+    store: Store | None = None
+    refs: Mapping[str, Mapping[str, ItemRef]] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    @staticmethod
+    def of_run(run: Run, stages: Mapping[str, str]) -> StoredValues:
+        """Return what a run in this process made.
+
+        Args:
+            run: the run, finished or not.
+            stages: role to the stage that made it.
+        """
+        refs = {role: run.states[stage].items for role, stage in stages.items() if stage in run.states}
+        return StoredValues(run.store, refs)
+
+    @staticmethod
+    def of_folder(out: Path, summary: RunSummary, store: Store) -> StoredValues:
+        """Return what the latest run into a folder made, by the cache's list of runs.
+
+        Args:
+            out: the output folder.
+            summary: its run.json.
+            store: the cache that the run used.
+
+        Raises:
+            StoreError: if the list of runs is damaged.
+        """
+        own = str(resolved(out))
+        entry = next((run for run in store.runs.entries() if run.out == own and not run.pinned), None)
+        if entry is None:
+            return StoredValues(notes=[f"the cache {store.root} knows no run into {out}, so pictures are missing"])
+        stages = {role: stage for role, stage in summary.results.items() if role in ROLES}
+        if not stages:
+            note = "run.json is of an earlier version and names no results: run again to see pictures"
+            return StoredValues(notes=[note])
+        refs = {role: _Recorded(store, entry.keys.get(stage, {})) for role, stage in stages.items()}
+        _find_images(store, summary, refs.get("images", {}))
+        return StoredValues(store, refs)
+
+    @property
+    def poses(self) -> Poses | None:
+        """The poses that the ranges were made with."""
+        return self._load("poses", "", Poses)
+
+    @property
+    def cloud(self) -> PointCloud | None:
+        """The fused cloud."""
+        return self._load("cloud", "", PointCloud)
+
+    def panorama(self, name: str) -> Panorama | None:
+        """Return a panorama, whose picture is decoded on demand."""
+        return self._load("images", name, Panorama)
+
+    def range_map(self, name: str) -> RangeMap | None:
+        """Return the final range map of a view."""
+        return self._load("ranges", name, RangeMap)
+
+    def confidence(self, name: str) -> NDArray[np.uint8] | None:
+        """Return the confidence (H, W) of the final range map of a view, without reading the rest of it."""
+        part = self._part("ranges", name, "confidence")
+        return part if isinstance(part, np.ndarray) else None
+
+    def pair_reason(self, name: str) -> str:
+        """Return why a pair has no general geometry, "" if that is not known."""
+        meta = self._part("pairs", name, "meta")
+        return str(meta.get("reason", "")) if isinstance(meta, dict) else ""
+
+    def digest(self, role: str, name: str = "") -> str:
+        """Return the digest of a value, "" if there is none."""
+        ref = self.refs.get(role, {}).get(name)
+        return ref.digest if ref is not None else ""
+
+    def _part(self, role: str, name: str, part: str) -> Any:
+        ref = self.refs.get(role, {}).get(name)
+        if self.store is None or ref is None or part not in ref.parts:
+            return None
+        try:
+            return self.store.blobs.get(ref.parts[part])
+        except StoreError as error:
+            self.notes.append(str(error))
+            return None
+
+    def _load(self, role: str, name: str, kind: type[_Kind]) -> _Kind | None:
+        ref = self.refs.get(role, {}).get(name)
+        if self.store is None or ref is None:
+            return None
+        try:
+            value = self.store.load(ref, kind)
+        except (StoreError, InputError) as error:
+            self.notes.append(str(error))
+            return None
+        return value if isinstance(value, kind) else None
+
+
+class _Recorded(Mapping[str, ItemRef]):
+    """Item to its stored value, whose record is read when it is asked for: the page shows few of many pairs."""
+
+    def __init__(self, store: Store, keys: Mapping[str, str]) -> None:
+        self._store = store
+        self._keys = keys
+        self._known: dict[str, ItemRef | None] = {}
+
+    def __getitem__(self, item: str) -> ItemRef:
+        if item not in self._known:
+            record = self._store.read_record(self._keys[item])
+            self._known[item] = record.output if record is not None else None
+        found = self._known[item]
+        if found is None:
+            raise KeyError(item)
+        return found
+
+    def __iter__(self) -> Iterator[str]:
+        return (item for item in self._keys if item in self)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+
+def _find_images(store: Store, summary: RunSummary, refs: Mapping[str, ItemRef]) -> None:
+    """Tell the store where the user's own images are: it knows them by their digests alone."""
+    source = next((stage for stage in summary.stages if stage.name == summary.results.get("images")), None)
+    folder = source.params.get("path") if source else None
+    for name, ref in refs.items() if folder else ():
+        path = Path(str(folder)) / name
+        if any(part.external for part in ref.parts.values()) and is_file(path):
+            store.blobs.register_external(path)

@@ -1,0 +1,183 @@
+"""The summary of a run, which is what run.json holds."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field, ValidationError
+
+from pano_mvs.core.errors import InputError
+from pano_mvs.core.files import replacing
+from pano_mvs.results.records import (
+    BlockedUnit,
+    CloudSummary,
+    Entry,
+    FailedUnit,
+    ImageReason,
+    Number,
+    PosesSummary,
+    ScoresSummary,
+    StageOutcome,
+    UnitCounts,
+    Verdict,
+    ViewSummary,
+    WorkflowSummary,
+)
+
+RUN_JSON = "run.json"
+CACHE_VARIABLE = "PANO_MVS_CACHE"
+SCHEMA = 1
+
+
+class RunSummary(Entry):
+    """What a run did and what it found; immutable. `to_json` and `from_json` convert to and from run.json.
+
+    >>> summary = RunSummary.from_json({"workflow": {"name": "fast"}, "exit_code": 3, "failures": [{"stage": "depth"}]})
+    >>> summary.workflow.name, summary.ok, summary.failures[0].stage
+    ('fast', False, 'depth')
+    >>> RunSummary.from_json(summary.to_json()) == summary
+    True
+
+    Attributes:
+        schema_version: of run.json, where it is called `schema`; fields may be added to a version, none changes.
+        workflow: what ran.
+        cache: folder of the cache; empty if it is not known.
+        version: of pano_mvs.
+        started: date and time, ISO 8601 in UTC.
+        machine: processor, number of cores and memory.
+        executor: its name, number of workers, and threads of each.
+        seconds: that the run took; None if it is not known.
+        exit_code: 0 finished; 1 internal error; 2 unusable workflow or input; 3 finished with failed or doubtful items;
+            4 stopped by a quality threshold or a guard; 130 interrupted.
+        stopped: why the run ended early; empty if it did not.
+        units: number of units, by outcome.
+        stages: those that began, in the order of the workflow.
+        failures: units that failed.
+        blocked: units that could not run because others failed.
+        rejected: image that a stage left out to the reason.
+        doubts: image that a stage finds doubtful to the reason.
+        warnings: such as damaged files in the cache that were computed again.
+        notes: of the stages.
+        results: role (`images`, `pairs`, `poses`, `ranges`, `cloud`) to the stage that made the final values.
+        poses: the cameras.
+        scores: of the first stage that compares with the ground truth.
+        all_scores: stage to scores, if several branches were compared.
+        views: the final range maps.
+        cloud: the fused cloud.
+        workflow_text: the workflow as it was read.
+        versions: library to version.
+        files: file in the output folder to its digest.
+        left_over: files of earlier runs that this one did not write and that are still there, likewise.
+        verdict: whether the result can be relied on; None if the run ended before it could be judged.
+    """
+
+    schema_version: int = Field(default=SCHEMA, alias="schema")
+    workflow: WorkflowSummary = WorkflowSummary()
+    cache: str = ""
+    version: str = ""
+    started: str = ""
+    machine: Mapping[str, Number | str] = {}
+    executor: Mapping[str, Number | str] = {}
+    seconds: float | None = None
+    exit_code: int = 0
+    stopped: str = ""
+    units: UnitCounts = UnitCounts()
+    stages: tuple[StageOutcome, ...] = ()
+    failures: tuple[FailedUnit, ...] = ()
+    blocked: tuple[BlockedUnit, ...] = ()
+    rejected: Mapping[str, ImageReason] = {}
+    doubts: Mapping[str, ImageReason] = {}
+    warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    results: Mapping[str, str] = {}
+    poses: PosesSummary = PosesSummary()
+    scores: ScoresSummary = ScoresSummary()
+    all_scores: Mapping[str, ScoresSummary] = {}
+    views: tuple[ViewSummary, ...] = ()
+    cloud: CloudSummary = CloudSummary()
+    workflow_text: str = ""
+    versions: Mapping[str, str] = {}
+    files: Mapping[str, str] = {}
+    left_over: Mapping[str, str] = {}
+    verdict: Verdict | None = None
+
+    @staticmethod
+    def from_json(value: object) -> RunSummary:
+        """Return the summary that `to_json` gave; fields that are missing or null have their defaults.
+
+        Raises:
+            InputError: if it is not the content of a run.json.
+        """
+        try:
+            return RunSummary.model_validate(value)
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            place = ".".join(map(str, first["loc"])) or "the whole file"
+            raise InputError(f"{place}: {first['msg']}") from error
+
+    @staticmethod
+    def read(out: Path) -> RunSummary:
+        """Return the summary of the latest run into an output folder.
+
+        Raises:
+            InputError: if the folder has no run.json that can be read.
+        """
+        path = out / RUN_JSON
+        try:
+            value = json.loads(path.read_bytes())
+        except OSError as error:
+            raise InputError(f"{path} cannot be read ({error.strerror}). Give the output folder of a run") from error
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"{path} is no run.json ({error}). Run again to write it anew") from error
+        if not isinstance(value, Mapping) or not isinstance(value.get("stages"), list):
+            raise InputError(f"{path} is no run.json. Run again to write it anew")
+        try:
+            return RunSummary.from_json(value)
+        except InputError as error:
+            raise InputError(f"{path} is no run.json ({error}). Run again to write it anew") from error
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the content of run.json, as values that `json.dumps` takes."""
+        return self.model_dump(by_alias=True)
+
+    def write(self, out: Path) -> None:
+        """Write run.json into an output folder.
+
+        Raises:
+            StoreError: if it cannot be written.
+        """
+        encoder = json.JSONEncoder(indent=1, allow_nan=False)
+        with replacing(out / RUN_JSON) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as stream:
+            stream.writelines(encoder.iterencode(self.to_json()))
+            stream.write("\n")
+
+    @property
+    def ok(self) -> bool:
+        """Whether the run finished without failed or doubtful items."""
+        return self.exit_code == 0
+
+    @property
+    def scores_by_stage(self) -> Mapping[str, ScoresSummary]:
+        """The scores of every branch that has some, by the stage that scored it."""
+        return self.all_scores or ({"scores": self.scores} if self.scores else {})
+
+    @property
+    def doubtful_images(self) -> Mapping[str, str]:
+        """Doubtful image to the reason: those of the final poses first, then what other stages found."""
+        others = {name: doubt.reason for name, doubt in self.doubts.items()}
+        return {**self.poses.doubts, **{name: why for name, why in others.items() if name not in self.poses.doubts}}
+
+    @property
+    def source_folder(self) -> Path | None:
+        """Folder from which the run read its images, if it read a folder."""
+        paths = [stage.params.get("path") for stage in self.stages if stage.use.startswith("source.")]
+        return next((Path(str(path)) for path in paths if path), None)
+
+
+def cache_of(summary: RunSummary, given: Path | None = None) -> Path:
+    """Return the cache that is given, else $PANO_MVS_CACHE, else the one that the run used."""
+    return given or Path(os.environ.get(CACHE_VARIABLE) or summary.cache or ".pano-mvs")

@@ -1,0 +1,225 @@
+"""Run a workflow: from a session to the results in the output folder. The module reads in the order of a run."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+from pano_mvs.core.errors import PanoMvsError, UsageError
+from pano_mvs.core.memory import bytes_from_size
+from pano_mvs.engine.cache.blobs import DamagedBlobError
+from pano_mvs.engine.cache.store import MIN_FREE_BYTES, Store
+from pano_mvs.engine.executors.choose import make_executor
+from pano_mvs.engine.executors.protocol import Executor
+from pano_mvs.engine.planning.run_options import RunOptions
+from pano_mvs.engine.running.output_lock import output_lock
+from pano_mvs.engine.running.run import Run
+from pano_mvs.results.run_output import RunOutput
+from pano_mvs.results.stored_values import StoredValues
+from pano_mvs.results.summary import RunSummary
+from pano_mvs.session.outputs import (
+    INTERRUPTED,
+    earlier_files,
+    set_aside_foreign_files,
+    write_outputs,
+    write_outputs_after_error,
+)
+from pano_mvs.session.progress import EventObserver, Progress, RunFinished, RunStarted, ignore
+from pano_mvs.session.session import Session, check_output, open_session
+from pano_mvs.session.settings import overrides_from_settings
+
+MIN_FREE_VARIABLE = "PANO_MVS_MIN_FREE"
+
+
+@dataclass(frozen=True, slots=True)
+class Execution:
+    """How the units of a run are computed.
+
+    Attributes:
+        executor: `serial`, `processes` or `dask`; empty to choose by the other settings and this machine.
+        workers: number of units at a time; 0 for one per core, if memory permits.
+        threads: of each worker; 0 for an equal share of the cores.
+        scheduler: address of a dask scheduler.
+        min_free: free space on the cache's disk below which no unit is started, such as `5GB`; empty for the value
+            of $PANO_MVS_MIN_FREE, or else 200 MB.
+        durable: whether to flush every result to the disk before going on.
+    """
+
+    executor: str = ""
+    workers: int = 0
+    threads: int = 0
+    scheduler: str = ""
+    min_free: str = ""
+    durable: bool = False
+
+
+def run(
+    workflow: str | Path,
+    images: str | Path | None = None,
+    out: str | Path | None = None,
+    *,
+    settings: Mapping[str, object] | None = None,
+    cache: str | Path | None = None,
+    executor: str = "",
+    workers: int | None = None,
+    until: Sequence[str] = (),
+    only: Sequence[str] = (),
+    refresh: Sequence[str] = (),
+    keep_going: bool = False,
+    progress: Progress | None = None,
+) -> RunOutput:
+    """Run a workflow and return its results; what is in the cache is not computed again.
+
+    Units that fail do not raise an error: they are in `summary.failures`, and `summary.ok` is False. The same holds
+    for a quality threshold that stops the run (`summary.stopped`).
+
+    Without `images`, presets run on their samples:
+
+    >>> import pano_mvs
+    >>> run = pano_mvs.run("quickstart", out="out", settings={"depth.planes": 96})
+    >>> run.ok, run.summary.poses.registered
+    (True, ('000.png', '001.png', '002.png', '003.png'))
+    >>> run.views["000.png"].range_map.shape
+    (512, 1024)
+
+    Args:
+        workflow: name of a preset, or a workflow file.
+        images: folder of panoramas; None for the one that the workflow names.
+        out: output folder; None for out/<name of the workflow> in the current folder.
+        settings: `STAGE.PARAM` to its value: a Python value, or a string as `--set` takes it.
+        cache: folder of the cache; None for $PANO_MVS_CACHE, or else `.pano-mvs` beside the workflow file (in the
+            current folder if the workflow is a preset).
+        executor: `processes` (the default), `serial` (in this process, for a debugger) or `dask`.
+        workers: number of units at a time; None for one per core, if memory permits.
+        until: stages at which to end.
+        only: units, as `STAGE:ITEM`, to which the run is confined, with all that they need.
+        refresh: stages or units to compute again though they are cached.
+        keep_going: go on after failures even if a stage has `on_error: stop`.
+        progress: called with each event of `pano_mvs.session.progress`; an exception that it raises ends the run.
+
+    Raises:
+        UsageError: if the workflow, a setting or a folder cannot be used.
+        InputError: if the images cannot be read.
+        StoreError: if the cache or the output folder cannot be written.
+    """
+    run_options = RunOptions(tuple(until), tuple(only), tuple(refresh), accept_code=False, keep_going=keep_going)
+    session = open_session(
+        str(workflow),
+        overrides=overrides_from_settings(settings or {}),
+        images=Path(images) if images is not None else None,
+        cache=Path(cache) if cache is not None else None,
+        out=Path(out) if out is not None else None,
+        run_options=run_options,
+    )
+    return run_session(session, Execution(executor, workers or 0), progress or ignore)
+
+
+def run_session(session: Session, execution: Execution = Execution(), progress: Progress = ignore) -> RunOutput:
+    """Run an open session; see `run`."""
+    check_output(session)
+    set_aside_foreign_files(session.out)
+    min_free = min_free_bytes(execution.min_free)
+    store = Store(session.store_root, durable=execution.durable, min_free_bytes=min_free)
+    executor = make_executor(
+        store,
+        execution.executor,
+        workers=execution.workers,
+        threads=execution.threads,
+        scheduler=execution.scheduler,
+    )
+    try:
+        return _run_and_report(session, store, executor, progress)
+    finally:
+        executor.close()
+
+
+def _run_and_report(session: Session, store: Store, executor: Executor, progress: Progress) -> RunOutput:
+    """Run between the first and the last event."""
+    clock = time.perf_counter()
+    progress(
+        RunStarted(
+            workflow=session.workflow.name,
+            stages=tuple(session.graph.order),
+            executor=executor.name,
+            workers=executor.capacity,
+            threads=executor.threads,
+            out=session.out,
+        )
+    )
+    end = RunFinished(exit_code=1, stopped="internal error", out=session.out)
+    try:
+        output = _run_locked(session, store, executor, progress)
+        end = _finished(output.summary, end)
+        return output
+    except PanoMvsError as error:
+        end = replace(end, exit_code=error.exit_code, stopped=str(error))
+        raise
+    except KeyboardInterrupt:
+        end = replace(end, exit_code=INTERRUPTED, stopped="interrupted")
+        raise
+    finally:
+        progress(replace(end, seconds=round(time.perf_counter() - clock, 3)))
+
+
+def _run_locked(session: Session, store: Store, executor: Executor, progress: Progress) -> RunOutput:
+    """Run while no other run writes into the output folder."""
+    started, clock = datetime.now(UTC), time.perf_counter()
+    run = Run(
+        session.workflow,
+        session.graph,
+        store,
+        out=session.out,
+        observer=EventObserver(progress),
+        executor=executor,
+        options=session.run_options,
+    )
+    with output_lock(session.out):
+        summary, values = _execute(run, started, clock)
+    return RunOutput(session.out, summary, values, written=tuple(run.result.written))
+
+
+def _execute(run: Run, started: datetime, clock: float) -> tuple[RunSummary, StoredValues]:
+    """Compute, then write the summary and the report; a damaged file that only the report meets is computed again."""
+    earlier = earlier_files(run.out)
+    while True:
+        try:
+            run.execute(earlier_files=earlier)
+        except (Exception, KeyboardInterrupt, SystemExit) as error:
+            write_outputs_after_error(run, error, started=started, clock=clock)
+            raise
+        try:
+            return write_outputs(run, started=started, clock=clock)
+        except DamagedBlobError as error:  # it has been removed, so another round computes it
+            run.observer.warn(str(error))
+
+
+def _finished(summary: RunSummary, end: RunFinished) -> RunFinished:
+    units = summary.units
+    return replace(
+        end,
+        exit_code=summary.exit_code,
+        stopped=summary.stopped,
+        run=units.run,
+        cached=units.cached,
+        failed=units.failed,
+        blocked=units.blocked,
+        verdict=summary.verdict,
+        doubts=dict(summary.doubtful_images),
+    )
+
+
+def min_free_bytes(size: str = "") -> int:
+    """Return the bytes of `--min-free`, else of $PANO_MVS_MIN_FREE, else the default.
+
+    Raises:
+        UsageError: if it is not a size.
+    """
+    size = size or os.environ.get(MIN_FREE_VARIABLE, "")
+    try:
+        return bytes_from_size(size) if size else MIN_FREE_BYTES
+    except ValueError as error:
+        raise UsageError(f"--min-free (or ${MIN_FREE_VARIABLE}) {size!r}: {error}") from error

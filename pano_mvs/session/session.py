@@ -1,0 +1,115 @@
+"""What every command that takes a workflow needs: the workflow wired, its store, its output folder."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pano_mvs
+from pano_mvs.core.errors import InputError, UsageError, WorkflowError
+from pano_mvs.core.paths import exists, is_denied, is_folder, problem_of, resolved
+from pano_mvs.engine.planning.run_options import DEFAULT_OPTIONS, RunOptions
+from pano_mvs.engine.stages.params import files_of
+from pano_mvs.engine.stages.registry import Registry
+from pano_mvs.engine.workflows.wiring import Graph, wire, wiring_problems
+from pano_mvs.engine.workflows.workflow import InvalidWorkflowError, Workflow, find_workflow, load_workflow
+from pano_mvs.results.summary import CACHE_VARIABLE
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """A workflow, ready to be planned or run."""
+
+    workflow: Workflow
+    graph: Graph
+    registry: Registry
+    store_root: Path
+    out: Path
+    run_options: RunOptions = DEFAULT_OPTIONS
+
+
+def presets_folder() -> Path:
+    """Return the folder of the shipped workflows: inside the installed package, or beside it in a checkout."""
+    package = Path(pano_mvs.__file__).parent
+    inside = package / "workflows"
+    return inside if is_folder(inside) else package.parent / "workflows"
+
+
+def open_session(
+    name: str,
+    *,
+    overrides: Sequence[str] = (),
+    images: Path | None = None,
+    cache: Path | None = None,
+    out: Path | None = None,
+    run_options: RunOptions = DEFAULT_OPTIONS,
+) -> Session:
+    """Find, validate and wire a workflow.
+
+    The store is `cache`, else $PANO_MVS_CACHE, else `.pano-mvs` beside the workflow file (in the current folder for a
+    preset given by name). The output folder is `out`, else `out/<workflow name>` in the current folder.
+
+    Raises:
+        UsageError: if there is no such workflow.
+        WorkflowError: with every mistake in it.
+        InputError: if the folder of images is not there.
+        UsageError: if a stage reads the folder of the cache.
+    """
+    path, is_preset = find_workflow(name, presets_folder())
+    if images is not None and not is_folder(images):
+        if exists(images):
+            raise InputError(f"--images {images}: this is a file; give the folder with the pictures")
+        raise InputError(
+            f"--images {images}: there is no such folder that you may look at ({problem_of(images)})"
+            if is_denied(images)
+            else f"--images {images}: there is no such folder"
+        )
+    registry = Registry.installed()
+    try:
+        workflow = load_workflow(path, registry, overrides=overrides, images=images, presets=presets_folder())
+    except InvalidWorkflowError as error:
+        raise WorkflowError([*error.problems, *wiring_problems(error.stages)]) from None
+    workflow = replace(workflow, plugins=_all_plugins(workflow, registry))
+    graph = wire(workflow)
+    variable = os.environ.get(CACHE_VARIABLE)
+    beside = resolved(Path()) if is_preset else path.parent
+    root = cache or (Path(variable) if variable else beside / ".pano-mvs")
+    session = Session(workflow, graph, registry, root, out or Path("out") / workflow.name, run_options)
+    if name := _reader_of(root, session):
+        option = "--cache" if cache or not variable else f"${CACHE_VARIABLE}"
+        raise UsageError(
+            f"{option} {root}: stage {name!r} reads this very folder, and the cache's files would lie "
+            "among its own. Choose another folder"
+        )
+    return session
+
+
+def check_output(session: Session) -> None:
+    """Refuse an output folder that is itself read from.
+
+    Raises:
+        UsageError: if a stage reads it.
+    """
+    if name := _reader_of(session.out, session):
+        raise UsageError(f"--out {session.out}: stage {name!r} reads this very folder. Choose another folder")
+
+
+def _reader_of(folder: Path, session: Session) -> str:
+    """Return the stage whose settings name a folder; "" if there is none."""
+    place = resolved(folder)
+    for name, entry in session.workflow.stages.items():
+        if any(resolved(path) == place for paths in files_of(entry.params).values() for path in paths):
+            return name
+    return ""
+
+
+def _all_plugins(workflow: Workflow, registry: Registry) -> dict[Path, str]:
+    """Return the plugin files that a workflow names, and those of the user's folder that it uses without naming them.
+
+    Both go along to the workers, which need not have the folder.
+    """
+    named = {resolved(path) for path in workflow.plugins}
+    behind = registry.files_behind({entry.spec.name for entry in workflow.stages.values()})
+    return dict(workflow.plugins) | {path: digest for path, digest in behind.items() if path not in named}

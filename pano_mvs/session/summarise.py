@@ -1,0 +1,281 @@
+"""The summary of a run from what the engine knows of it."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from datetime import datetime
+from importlib.metadata import PackageNotFoundError, version
+from math import isfinite
+from pathlib import PurePosixPath
+from typing import Any
+
+import numpy as np
+
+import pano_mvs
+from pano_mvs.core.paths import resolved
+from pano_mvs.engine.executors.threads import available_threads
+from pano_mvs.engine.running.events import Failure, RunResult, StageSummary
+from pano_mvs.engine.running.run import Run
+from pano_mvs.engine.workflows.workflow import Workflow
+from pano_mvs.results.records import (
+    BlockedUnit,
+    CloudSummary,
+    Direction,
+    FailedUnit,
+    ImageReason,
+    NearestPair,
+    PairLink,
+    PoseGroup,
+    PosesSummary,
+    ScoresSummary,
+    StageOutcome,
+    UnitCounts,
+    ViewSummary,
+    WorkflowSummary,
+)
+from pano_mvs.results.summary import RunSummary
+from pano_mvs.scene import Axis, PointCloud, Poses, Scores, TwoView
+from pano_mvs.scene.index import pair_from_name
+from pano_mvs.scene.pose_groups import split_groups
+from pano_mvs.session.final_stages import chain_of, final_stages, latest
+
+_LIBRARIES = ("numpy", "numba", "opencv-python-headless", "pycolmap", "pyvista", "scipy")
+_MIN_AGREEMENT = 0.1
+
+
+def summarise(run: Run, *, started: datetime, seconds: float) -> RunSummary:
+    """Return the summary of a run, finished or not, without a verdict.
+
+    Args:
+        run: after `execute`, also if it raised.
+        started: when it began.
+        seconds: that it took.
+    """
+    workflow, result = run.workflow, run.result
+    scores = _scores(run)
+    blocked = tuple(_blocked(failure) for failure in result.failures if failure.blocked)
+    results = final_stages(run)
+    return RunSummary(
+        workflow=WorkflowSummary(
+            name=workflow.name, path=str(workflow.path or ""), overrides=tuple(workflow.overrides)
+        ),
+        cache=str(resolved(run.store.root)),
+        version=pano_mvs.__version__,
+        started=started.isoformat(timespec="seconds"),
+        machine=_machine(),
+        executor={"name": run.executor.name, "workers": run.executor.capacity, "threads": run.executor.threads},
+        seconds=round(seconds, 3),
+        exit_code=result.exit_code,
+        stopped=result.stopped,
+        units=_counts(result),
+        stages=tuple(_stage(summary, workflow) for summary in result.stages),
+        failures=tuple(_failed(failure) for failure in result.failures if not failure.blocked),
+        blocked=blocked,
+        rejected=_reasons(result.rejected),
+        doubts=_reasons(result.doubts),
+        warnings=tuple(result.warnings),
+        notes=tuple(note for summary in result.stages for note in summary.notes),
+        results=results,
+        poses=_poses(run, blocked),
+        scores=next(iter(scores.values()), ScoresSummary()),
+        all_scores=scores if len(scores) > 1 else {},
+        views=_views(run, results.get("ranges", "")),
+        cloud=_cloud(run),
+        workflow_text=workflow.text,
+        versions=_versions(),
+        files=dict(sorted(result.published.items())),
+        left_over=dict(sorted(result.left_over.items())),
+    )
+
+
+def _counts(result: RunResult) -> UnitCounts:
+    return UnitCounts(
+        run=result.computed,
+        cached=result.cached,
+        failed=sum(stage.failed for stage in result.stages),
+        blocked=sum(stage.blocked for stage in result.stages),
+    )
+
+
+def _stage(summary: StageSummary, workflow: Workflow) -> StageOutcome:
+    entry = workflow.stages[summary.name]
+    return StageOutcome(
+        name=summary.name,
+        use=summary.use,
+        version=entry.spec.version,
+        params=entry.params.model_dump(mode="json"),
+        units=summary.units,
+        run=summary.run,
+        cached=summary.cached,
+        failed=summary.failed,
+        blocked=summary.blocked,
+        seconds=round(summary.seconds, 3),
+        unit_seconds=round(summary.unit_seconds, 3),
+        metrics=summary.metrics,
+    )
+
+
+def _failed(failure: Failure) -> FailedUnit:
+    names = ("stage", "item", "cause", "consequence", "trace", "log")
+    return FailedUnit(**{name: getattr(failure, name) for name in names})
+
+
+def _blocked(failure: Failure) -> BlockedUnit:
+    return BlockedUnit(stage=failure.stage, item=failure.item, cause=failure.cause)
+
+
+def _reasons(found: Mapping[str, tuple[str, str]]) -> dict[str, ImageReason]:
+    return {image: ImageReason(stage=stage, reason=reason) for image, (stage, reason) in found.items()}
+
+
+def _poses(run: Run, blocked: tuple[BlockedUnit, ...]) -> PosesSummary:
+    poses, result = latest(run, Poses), run.result
+    if poses is None:
+        return PosesSummary()
+    links: tuple[PairLink, ...] = ()
+    for stage in result.stages:
+        if issubclass(run.workflow.stages[stage.name].spec.output, TwoView):
+            links = tuple(_link(pair, metrics) for pair, metrics in stage.unit_metrics.items())
+    groups = split_groups(poses)
+    return PosesSummary(
+        registered=tuple(poses.names),
+        blocked=blocked,
+        rejected={image: why for image, (_, why) in result.rejected.items()},
+        doubts={image: result.doubts[image][1] for image in poses.names if image in result.doubts},
+        confirmed=_confirmed(poses),
+        centers=poses.centers.tolist(),
+        points=len(poses.points_in_world),
+        frame=poses.frame,
+        scale=poses.scale,
+        metric=poses.metric,
+        up=_up(groups[0]),
+        groups=tuple(
+            PoseGroup(
+                images=tuple(group.names),
+                frame=group.frame,
+                scale=group.scale,
+                metric=group.metric,
+                points=len(group.points_in_world),
+                up=_up(group),
+                nearest_pair=nearest_pair(groups[0].names, group.names, links) if number else None,
+            )
+            for number, group in enumerate(groups)
+        ),
+        links=links,
+    )
+
+
+def _confirmed(poses: Poses) -> dict[str, tuple[float | None, float | None]]:
+    """Return image to its confirmed and its expected share, None for one that is not known."""
+    if poses.confirmed_shares is None or poses.expected_shares is None:
+        return {}
+    columns = zip(poses.names, poses.confirmed_shares.tolist(), poses.expected_shares.tolist(), strict=True)
+    shares = {name: (_rounded_share(confirmed), _rounded_share(expected)) for name, confirmed, expected in columns}
+    return {name: pair for name, pair in shares.items() if pair[0] is not None}
+
+
+def _rounded_share(share: float) -> float | None:
+    return round(share, 4) if isfinite(share) else None
+
+
+def nearest_pair(largest: Sequence[str], other: Sequence[str], links: Sequence[PairLink]) -> NearestPair | None:
+    """Return the pair that comes closest to joining two groups: that with most matches, or else most candidates.
+
+    Args:
+        largest: images of the largest group.
+        other: images of another one.
+        links: the pairs that were matched.
+
+    Returns:
+        The pair; None if no image of one group was compared with one of the other.
+    """
+    inside, outside = set(largest), set(other)
+    found = []
+    for link in links:
+        for a, b in ((link.first, link.second), (link.second, link.first)):
+            if a in inside and b in outside:
+                found.append((-link.inliers, -(link.candidates or 0), a, b))
+    if not found:
+        return None
+    matches, candidates, a, b = min(found)
+    return NearestPair(a, b, -matches, -candidates)
+
+
+def _link(pair: str, metrics: Mapping[str, float]) -> PairLink:
+    candidates, residual_deg = metrics.get("candidates"), metrics.get("residual_deg")
+    first, second = pair_from_name(pair)
+    return PairLink(
+        first,
+        second,
+        int(metrics.get("inliers", 0)),
+        None if candidates is None else int(candidates),
+        None if residual_deg is None else round(residual_deg, 5),
+    )
+
+
+def _up(poses: Poses) -> Direction | None:
+    """Return the mean of the cameras' up directions in the world, None if they point everywhere."""
+    mean = -np.asarray(poses.rotations)[:, 1].sum(axis=0) / max(1, len(poses.names))
+    length = float(np.linalg.norm(mean))
+    if length <= _MIN_AGREEMENT:
+        return None
+    x, y, z = (round(float(part) / length, 6) for part in mean)
+    return x, y, z
+
+
+def _scores(run: Run) -> dict[str, ScoresSummary]:
+    """Return stage to its scores, for each branch that has some."""
+    found = {}
+    for name in run.graph.order:
+        if issubclass(run.workflow.stages[name].spec.output, Scores):
+            scores = run.load(name, Scores)
+            if isinstance(scores, Scores):
+                found[name] = ScoresSummary(poses=scores.poses, views=scores.views, notes=scores.notes)
+    return found
+
+
+def _views(run: Run, stage_name: str) -> tuple[ViewSummary, ...]:
+    stage = next((summary for summary in run.result.stages if summary.name == stage_name), None)
+    if stage is None or run.states[stage.name].axis is not Axis.VIEW:
+        return ()
+    previews: dict[str, str] = {}
+    for path in run.result.published:
+        _, folder, name = f"/{path}".rpartition("/preview/")
+        if folder:
+            previews.setdefault(str(PurePosixPath(name).with_suffix("")), path)
+    return tuple(
+        ViewSummary(
+            name=item,
+            preview=previews.get(str(PurePosixPath(item).with_suffix("")), previews.get(item, "")),
+            metrics={name: round(value, 6) for name, value in stage.unit_metrics.get(item, {}).items()},
+        )
+        for item in run.states[stage.name].items
+    )
+
+
+def _cloud(run: Run) -> CloudSummary:
+    chain = chain_of(run.workflow, run.graph, PointCloud)
+    stage = next((summary for summary in reversed(run.result.stages) if summary.name in chain), None)
+    points = stage.metrics.get("points") if stage else None
+    return CloudSummary(points=None if points is None else int(points))
+
+
+def _machine() -> dict[str, Any]:
+    """Return what a run's times depend on."""
+    found: dict[str, Any] = {"processor": platform.machine(), "cores": available_threads()}
+    with suppress(AttributeError, ValueError, OSError):  # not on every system
+        found["memory_gb"] = round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1)
+    return found
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version(), "pano_mvs": pano_mvs.__version__, "system": platform.platform()}
+    for name in _LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found

@@ -1,0 +1,3 @@
+from tests.report.conftest import results, tiny
+
+__all__ = ["results", "tiny"]

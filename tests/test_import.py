@@ -1,0 +1,36 @@
+"""What `import pano_mvs` offers, and that it costs next to nothing."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import pano_mvs
+
+SLOW_LIBRARIES = {"cv2", "jinja2", "numba", "numpy", "pycolmap", "pydantic", "pyvista", "scipy"}
+
+
+@pytest.mark.parametrize("module", ["pano_mvs", "pano_mvs.cli.app"])
+def test_no_library_is_imported_before_it_is_needed(module: str) -> None:
+    """`pano-mvs --help` took 0.6 s of which numpy, scipy and pydantic were all but a tenth."""
+    code = f"import sys, {module}; print(*({SLOW_LIBRARIES} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
+def test_all_names_are_there_and_type_checkers_see_the_same() -> None:
+    tree = ast.parse(Path(pano_mvs.__file__).read_text(encoding="utf-8"))
+    (block,) = [node for node in tree.body if isinstance(node, ast.If)]
+    imports = [node for node in block.body if isinstance(node, ast.ImportFrom)]
+    declared = {alias.name: node.module for node in imports for alias in node.names}
+    assert declared == {name: f"pano_mvs.{home}" for name, home in pano_mvs._HOMES.items()}
+    assert sorted([*declared, "__version__"]) == sorted(pano_mvs.__all__)
+    assert set(pano_mvs.__all__) <= set(dir(pano_mvs))
+    for name in pano_mvs.__all__:
+        assert getattr(pano_mvs, name) is not None
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        pano_mvs.nothing  # noqa: B018  # the attribute is asked for

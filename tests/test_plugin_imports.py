@@ -1,0 +1,58 @@
+"""Plugins that we ship, and those that `plugin new` writes, import nothing of ours but the API for plugins."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pano_mvs import api
+from pano_mvs.api import sweep
+from pano_mvs.cli.plugins.new import KINDS, rendered
+
+PLUGINS = Path(__file__).parents[1] / "plugins"
+FILES = sorted(path for path in PLUGINS.glob("pano_mvs_*/pano_mvs_*/**/*.py"))
+ALLOWED = {"pano_mvs.api", "pano_mvs.api.sweep"}
+
+
+def imported(text: str) -> Iterator[str]:
+    """Yield the modules of pano_mvs that a module imports."""
+    for node in ast.walk(ast.parse(text)):
+        names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+        names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else names
+        yield from (name for name in names if name.split(".")[0] == "pano_mvs")
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}/{path.name}")
+def test_shipped_plugins_import_the_api_alone(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert set(imported(text)) <= ALLOWED
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.ImportFrom) and node.module in ALLOWED:
+            module = sweep if node.module.endswith("sweep") else api
+            assert {alias.name for alias in node.names} <= set(module.__all__)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_new_plugins_import_the_api_alone(kind: str) -> None:
+    plugin, test = rendered(kind, "mine")
+    assert set(imported(plugin)) <= ALLOWED
+    assert set(imported(test)) == {"pano_mvs.testing.conformance"}
+
+
+def test_there_are_plugins_and_other_imports_are_seen() -> None:
+    assert {path.parent.name for path in FILES} >= {"pano_mvs_example", "pano_mvs_las", "pano_mvs_torch"}
+    assert list(imported("import pano_mvs.io\nfrom pano_mvs.scene import Poses\nimport pano_mvs_las")) == [
+        "pano_mvs.io",
+        "pano_mvs.scene",
+    ]
+
+
+@pytest.mark.parametrize("module", [api, sweep])
+def test_all_names_of_the_api_are_there(module: object) -> None:
+    names = module.__all__  # type: ignore[attr-defined]  # a module's own list
+    assert len(set(names)) == len(names)
+    for name in names:
+        assert getattr(module, name) is not None
