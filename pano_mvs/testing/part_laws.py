@@ -63,8 +63,9 @@ def _cost_tells_same(name: str) -> None:
     reference, warped, window = _looks(name, (32, 64))
     same = _registered(name).function(reference, reference.astype(np.float64), window)
     other = _registered(name).function(reference, warped, window)
-    assert same.mean() < 0.5 * other.mean(), f"the cost {name} is {same.mean():.3f} of a picture against itself and "\
-        f"{other.mean():.3f} against another"  # fmt: skip
+    assert same.mean() < 0.5 * other.mean(), (
+        f"the cost {name} is {same.mean():.3f} of a picture against itself and {other.mean():.3f} against another"
+    )
 
 
 def _cost_is_a_function(name: str) -> None:

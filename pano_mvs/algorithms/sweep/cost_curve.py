@@ -78,8 +78,10 @@ def cost_curve(work: SweepInput, *, column: int, row: int, masked: bool = False)
     """
     height, width = work.reference.shape[:2]
     if not (0 <= column < width and 0 <= row < height):
-        raise UsageError(f"pixel ({column}, {row}) is not in a picture of {width}×{height}: columns are 0 to "
-                         f"{width - 1}, rows 0 to {height - 1}")  # fmt: skip
+        raise UsageError(
+            f"pixel ({column}, {row}) is not in a picture of {width}×{height}: columns are 0 to "
+            f"{width - 1}, rows 0 to {height - 1}"
+        )
     here = np.array([row]), np.array([column])
     worst = work.settings.worst_cost
     raw = costs_at(work, *here)[:, 0].astype(np.float64)
@@ -88,9 +90,12 @@ def cost_curve(work: SweepInput, *, column: int, row: int, masked: bool = False)
     winners = winners_of(decisive[None, :, None])
     reason = _why_not(work, winners, row=row, column=column, masked=masked)
     found = range_map_from_winners(
-        winners, near=float(work.ranges[0]), far=float(work.ranges[-1]), settings=work.settings,
+        winners,
+        near=float(work.ranges[0]),
+        far=float(work.ranges[-1]),
+        settings=work.settings,
         seen=np.full((1, 1), not reason),
-    )  # fmt: skip
+    )
     winner = int(winners.plane[0, 0])
     return CostCurve(
         ranges=work.ranges,

@@ -76,9 +76,15 @@ def limits_by_sweeping(
         for idx in range(len(poses))
     ]
     checked = check_consistency(
-        maps[0], poses[0], maps[1:], poses[1:],
-        max_relative_error=0.1, max_reprojection_px=1.5, min_support=0, min_motion_px=0,
-    )  # fmt: skip
+        maps[0],
+        poses[0],
+        maps[1:],
+        poses[1:],
+        max_relative_error=0.1,
+        max_reprojection_px=1.5,
+        min_support=0,
+        min_motion_px=0,
+    )
     agreed = (checked.confidence >= CONSISTENT_CONFIDENCE[0]) & textured_pixels(small[0])
     solid_angle = np.broadcast_to(pixel_solid_angle(agreed.shape)[:, None], agreed.shape)
     seen_angle = solid_angle[small_masks[0]].sum()

@@ -73,9 +73,17 @@ def sweep_range(
     settings = settings or SweepSettings()
     compute = backend_for(backend, settings).find_winners
     work = sweep_input(
-        reference, sources, source_from_reference, near=near, far=far, settings=settings, backend=backend,
-        device=device, reference_mask=reference_mask, source_masks=source_masks,
-    )  # fmt: skip
+        reference,
+        sources,
+        source_from_reference,
+        near=near,
+        far=far,
+        settings=settings,
+        backend=backend,
+        device=device,
+        reference_mask=reference_mask,
+        source_masks=source_masks,
+    )
     winners = compute(work)
     seen = np.ones(reference.shape[:2], np.bool_) if reference_mask is None else reference_mask
     seen = seen & sees_winner(winners, work)
@@ -103,9 +111,15 @@ def sweep_input(
     ranges = virtual_ranges(near, far, planes=settings.planes, spacing=settings.spacing)
     if settings.exposure and settings.matching_cost.minds_exposure:
         rough = _rough_range(
-            reference, sources, source_from_reference, near=near, far=far, backend=backend, device=device,
+            reference,
+            sources,
+            source_from_reference,
+            near=near,
+            far=far,
+            backend=backend,
+            device=device,
             masks=(reference_mask, masks),
-        )  # fmt: skip
+        )
         sources = match_all(reference, sources, source_from_reference, ranges=rough, masks=masks)
     poses = tuple(source_from_reference)
     if settings.derotate:
@@ -141,11 +155,17 @@ def _rough_range(
     small_reference = shrink(reference, _ROUGH_ROWS)
     sources_valid = None if masks[1] is None else [_shrunk(m, like=s) for m, s in zip(masks[1], small, strict=True)]
     found = sweep_range(
-        small_reference, small, source_from_reference,
-        near=near, far=far, settings=settings, backend=helper_backend(backend), device=device,
+        small_reference,
+        small,
+        source_from_reference,
+        near=near,
+        far=far,
+        settings=settings,
+        backend=helper_backend(backend),
+        device=device,
         reference_mask=None if masks[0] is None else _shrunk(masks[0], like=small_reference),
         source_masks=sources_valid,
-    )  # fmt: skip
+    )
     if not found.valid.any():
         return found.range
     sure = found.confidence >= np.median(found.confidence[found.valid])
@@ -170,8 +190,10 @@ def _checked_sources(
 ) -> tuple[Mask, ...] | None:
     """Return the masks of all sources, or None if nothing is masked."""
     if len(sources) == 0 or len(poses) != len(sources) or (masks is not None and len(masks) != len(sources)):
-        raise UsageError(f"a sweep needs one pose (and one mask, if any) for each of one or more sources, got "
-                         f"{len(sources)} sources, {len(poses)} poses")  # fmt: skip
+        raise UsageError(
+            f"a sweep needs one pose (and one mask, if any) for each of one or more sources, got "
+            f"{len(sources)} sources, {len(poses)} poses"
+        )
     given = masks if masks is not None else [None] * len(sources)
     for idx, (source, mask) in enumerate(zip(sources, given, strict=True)):
         _check_picture(f"source {idx}", source, mask)

@@ -42,9 +42,12 @@ class BandCost:
         around = pad_panorama(work.reference, self.halo)[first : last + 2 * self.halo, self.halo : self.halo + width]
         self.reference = torch.from_numpy(np.ascontiguousarray(np.moveaxis(around, -1, 0))).to(device, torch.int32)
         kinds: dict[str, Callable[[Tensor], Tensor]] = {
-            "census": self._census, "census_gradient": self._census_gradient, "zncc": self._zncc, "sad": self._sad,
+            "census": self._census,
+            "census_gradient": self._census_gradient,
+            "zncc": self._zncc,
+            "sad": self._sad,
             "sad_gradient": self._sad_gradient,
-        }  # fmt: skip
+        }
         self._cost = kinds[settings.cost]
         self._places = list(self.windows.places())
         self._signs = list(self._signs_of(self.reference[0])) if settings.cost in ("census", "census_gradient") else []
@@ -161,9 +164,10 @@ class BandCost:
         for lines, reach in self.boxes.reaches():
             right, left = margin + reach, margin - reach - 1
             torch.sub(
-                running[..., lines, right : right + width], running[..., lines, left : left + width],
+                running[..., lines, right : right + width],
+                running[..., lines, left : left + width],
                 out=summed[..., lines, :],
-            )  # fmt: skip
+            )
         return summed
 
 
