@@ -155,3 +155,20 @@ def test_built_in_names_are_not_to_be_taken(ours: None) -> None:
     with pytest.raises(PluginError, match="'numba' is built in"):
         register_sweep_backend("numba")(find_winners)
     assert SWEEP_BACKENDS.code_file("numba") is None
+
+
+@pytest.mark.parametrize(
+    ("settings", "voxels"),
+    [
+        (SweepSettings(planes=100), 100_000),
+        (SweepSettings(planes=100, aggregation="box"), 0),
+        (SweepSettings(planes=100, levels=2), 25_000),
+    ],
+)
+def test_the_memory_of_a_volume_is_the_backends(ours: None, settings: SweepSettings, voxels: int) -> None:
+    register_sweep_backend("large", bytes_per_voxel=8)(find_winners)
+    assert SWEEP_BACKENDS.get("large").volume_bytes(1000, settings) == 8 * voxels
+    assert SWEEP_BACKENDS.get("numpy").volume_bytes(1000, settings) == 24 * voxels
+    limited = settings.replace(volume_limit_gb=1e-5)
+    assert SWEEP_BACKENDS.get("numba").volume_bytes(1000, limited) == min(3 * voxels, 10_000)
+    assert SWEEP_BACKENDS.get("large").volume_bytes(1000, limited) == 8 * voxels
