@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pano_mvs.evaluation.inputs.truth import read_truth
 from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_grid, rotation_from_rotvec, sample_panorama
-from pano_mvs.io.truth import read_truth
 from pano_mvs.testing.paint import STEEL
 from pano_mvs.testing.room import Room, range_along, render
 from pano_mvs.testing.scenes import SCENES, courtyard, poles, white_room, write_scene

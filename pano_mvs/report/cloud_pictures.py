@@ -13,10 +13,10 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.rendering.cloud import draw_cloud
+from pano_mvs.algorithms.rendering.viewpoints import Viewpoint, inside_camera, viewpoints
 from pano_mvs.report.cloud_renderer import read_pictures, write_scene
 from pano_mvs.report.earlier_page import EarlierPage
-from pano_mvs.report.software_cloud import draw_cloud
-from pano_mvs.report.viewpoints import Viewpoint, inside_camera, viewpoints
 from pano_mvs.results.pictures import Picture, picture
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.scene import PointCloud

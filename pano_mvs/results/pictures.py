@@ -1,4 +1,4 @@
-"""Pictures that travel within the page: JPEG of at most so many bytes, as data URIs."""
+"""Pictures that are embedded in a page: JPEG with a limited size, as data URIs."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def resized(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
 
 
 def preview_panels(out_dir: Path, relative: str, *, small: bool = False) -> tuple[NDArray[np.uint8], ...]:
-    """Return the panorama and the range map of a preview, (H, W, 3) RGB each; none if it is none of ours.
+    """Return the panorama and the range map of a preview, (H, W, 3) RGB each; () for other files.
 
     Args:
         out_dir: the output folder, outside of which nothing is read.

@@ -160,6 +160,11 @@ class Poses(Record):
         return Rigid3(np.asarray(self.rotations[image_idx]), np.asarray(self.translations[image_idx]))
 
     @property
+    def cameras(self) -> dict[str, Rigid3]:
+        """The cam_from_world of each registered image, by name."""
+        return {name: self.cam_from_world(idx) for idx, name in enumerate(self.names)}
+
+    @property
     def centers(self) -> NDArray[np.float64]:
         """The camera centres, (N, 3), in the world."""
         centers: NDArray[np.float64] = -np.einsum("nji,nj->ni", self.rotations, self.translations)

@@ -7,9 +7,7 @@ from functools import partial
 
 from pydantic import Field
 
-from pano_mvs.algorithms.metrics.score import score_capture
 from pano_mvs.api import All, InputPath, One, Panorama, Params, Poses, RangeMap, Scores, stage
-from pano_mvs.io.truth import read_truth
 
 
 class TruthParams(Params):
@@ -20,12 +18,15 @@ class TruthParams(Params):
 
 @stage("evaluate.truth")
 def truth(images: All[Panorama], poses: One[Poses], ranges: All[RangeMap], params: TruthParams) -> Scores:
-    """Compare poses and range maps with the truth.
+    """Compare poses and range maps with ground truth.
 
-    A picture counts if the truth knows its name and, where the truth states the picture's SHA-256, its bytes: another
-    picture of the same name is not scored against it. What a picture's mask ignores is left out. Each group of poses is
+    An image counts if the truth has its name and, where the truth states the image's SHA-256, its bytes: a different
+    image of the same name is not scored. Pixels that an image's mask excludes are ignored. Each group of poses is
     aligned with the truth on its own; pairs across groups count as not registered.
     """
+    from pano_mvs.evaluation.capture import score_capture  # the package takes 0.1 s to import
+    from pano_mvs.evaluation.inputs.truth import read_truth
+
     known = read_truth(params.truth)
     notes: list[str] = []
     matched = {}
@@ -33,15 +34,15 @@ def truth(images: All[Panorama], poses: One[Poses], ranges: All[RangeMap], param
         if view.sha256 is None or hashlib.sha256(images[name].image.read_bytes()).hexdigest() == view.sha256:
             matched[name] = view
         else:
-            notes.append(f"{name} is not the picture that the truth in {params.truth.name} belongs to")
-    estimated = {name: poses.cam_from_world(idx) for idx, name in enumerate(poses.names)}
+            notes.append(f"{name} is not the image that the truth in {params.truth.name} belongs to")
+    scored = [name for name in matched if name in ranges]
     scores = score_capture(
-        estimated,
+        poses.cameras,
         {name: view.cam_from_world for name, view in matched.items()},
-        {name: ranges[name].range for name in matched if name in ranges},
-        {name: partial(known.range_map, view) for name, view in matched.items()},
-        confidences={name: ranges[name].confidence for name in matched if name in ranges},
-        masks={name: images[name].load_mask() for name in matched if name in ranges},
+        estimated_ranges={name: ranges[name].range for name in scored},
+        true_ranges={name: partial(known.range_map, view) for name, view in matched.items()},
+        confidences={name: ranges[name].confidence for name in scored},
+        masks={name: images[name].load_mask() for name in scored},
         groups=dict(zip(poses.names, poses.groups.tolist(), strict=True)),
     )
     return Scores(scores.poses, scores.views, (*scores.notes, *notes))

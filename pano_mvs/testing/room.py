@@ -112,8 +112,8 @@ def range_along(room: Room, origin_in_world: FloatArray, rays_in_world: FloatArr
 def write_capture(folder: Path, room: Room, poses: Sequence[Rigid3], size_hw: tuple[int, int]) -> None:
     """Write a capture of the room: images/000.png …, truth/poses.json and truth/depth.npz.
 
-    The truth has the form that `pano_mvs.io.truth.read_truth` reads: poses are cam_from_world, ranges are float32
-    with inf where there is no surface, and each view carries the SHA-256 of its picture.
+    `pano_mvs.evaluation.inputs.truth.read_truth` reads the truth: poses are cam_from_world, ranges are float32 with inf
+    where there is no surface, and each view carries the SHA-256 of its picture.
     """
     write_views(folder, (render(room, pose, size_hw) for pose in poses), poses)
 

@@ -24,7 +24,6 @@ from typing import Any
 
 import numpy as np
 
-from pano_mvs.algorithms.metrics.placements import judge_placements
 from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.poses.verification.confirmation import Picture
@@ -36,6 +35,7 @@ from pano_mvs.testing import paint, room, surfaces
 from pano_mvs.testing.repeating import drawings, fittings, prints
 from pano_mvs.testing.repeating.places import draw_arguments, draw_capture
 from pano_mvs.testing.scenes import Scene
+from tests.benchmarks.placements import judge_placements
 from tests.benchmarks.poses import MAPPERS, SEED, Cameras, Pictures, matched, native
 
 OURS = "ours"

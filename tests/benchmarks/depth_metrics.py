@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.metrics.judged import has_range, judged_pixels
-from pano_mvs.algorithms.metrics.view_scores import Judging, pixel_scores
+from pano_mvs.evaluation.ranges.pixels import has_range
+from pano_mvs.evaluation.ranges.view_scores import ScoreSettings, score_view
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,10 +92,9 @@ def depth_metrics(
     Raises:
         UsageError: if the shapes differ, or scale or peak is not positive.
     """
-    pixels = judged_pixels(estimated, truth, scale=scale, mask=mask)
-    scores = pixel_scores(pixels, Judging(peak=peak))
-    chosen = {field.name: scores[field.name] for field in dataclasses.fields(DepthMetrics)[1:]}
-    return DepthMetrics(pixels=len(pixels.true), **chosen)
+    found = score_view(estimated, truth, scale=scale, mask=mask, settings=ScoreSettings(peak=peak))
+    chosen = {field.name: found.scores[field.name] for field in dataclasses.fields(DepthMetrics)[1:]}
+    return DepthMetrics(pixels=found.pixels, **chosen)
 
 
 def constant_baseline(

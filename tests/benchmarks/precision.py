@@ -26,10 +26,10 @@ import numpy as np
 
 from pano_mvs.algorithms.features.tangent import extract_sift
 from pano_mvs.algorithms.matching.brute_force import match_features
-from pano_mvs.algorithms.metrics.poses import relative_pose_errors
 from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.two_view import verify_pair
+from pano_mvs.evaluation.poses.errors import relative_pose_errors
 from pano_mvs.geometry import Rigid3, rotate_panorama, rotation_from_quat_wxyz
 from pano_mvs.testing.scenes import large_plain_room, poles, weak_room, white_room
 from tests.benchmarks.poses import Cameras, Pictures, cameras_of, load, native

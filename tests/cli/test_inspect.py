@@ -91,7 +91,7 @@ def test_a_picture_of_the_same_name_is_not_compared_with_the_truth_of_another(ru
     (truth / "poses.json").write_text(json.dumps(poses))
     found = inspected(run / "wf.yaml", "000", 40, 28, "--cache", run / "cache", "--truth", truth)
     assert found["true_range"] is None
-    assert found["notes"] == ["000.png is not the picture that the truth in of_others belongs to"]
+    assert found["notes"] == ["000.png is not the image that the truth in of_others belongs to"]
 
 
 def test_rays_colours_neighbours_and_the_truth_are_those_of_the_capture(run: Path) -> None:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.metrics import cloud
-from pano_mvs.algorithms.metrics.cloud import CloudDistances, PointChunks, cloud_distances, score_cloud
-from pano_mvs.algorithms.metrics.surface import TrueView, surface_of_cloud, surface_of_views, view_points
 from pano_mvs.core.errors import UsageError
+from pano_mvs.evaluation.clouds import points as point_source
+from pano_mvs.evaluation.clouds.distances import CloudDistances, cloud_distances, score_cloud
+from pano_mvs.evaluation.clouds.points import PointsInMemory
+from pano_mvs.evaluation.clouds.true_surface import TrueView, surface_of_cloud, surface_of_views, view_points
 from pano_mvs.geometry import Rigid3, ray_grid
 from tests.algorithms.range_scenes import box_range
 
@@ -83,7 +85,9 @@ class TestScores:
     def test_the_truth_itself_is_perfect(self) -> None:
         points = np.concatenate([view_points(view) for view in VIEWS])
         surface = surface_of_views(VIEWS)
-        scores = score_cloud(cloud_distances(points, map(view_points, VIEWS), surface, limit=0.5), surface, (0.2, 0.1))
+        scores = score_cloud(
+            cloud_distances(PointsInMemory(points), map(view_points, VIEWS), surface, limit=0.5), surface, (0.2, 0.1)
+        )
         assert scores[0].accuracy == scores[1].accuracy == 1
         assert scores[0].completeness > 0.99
 
@@ -95,7 +99,7 @@ class TestScores:
         inwards = walls * (1 - off / np.abs(walls).max(axis=1, keepdims=True))
         surface = surface_of_views(views)
         tolerances = (off + 0.06, 0.5 * off)
-        scores = score_cloud(cloud_distances(inwards, [walls], surface, limit=1), surface, tolerances)
+        scores = score_cloud(cloud_distances(PointsInMemory(inwards), [walls], surface, limit=1), surface, tolerances)
         assert scores[0].accuracy == 1
         assert scores[1].accuracy < 0.1
 
@@ -103,7 +107,7 @@ class TestScores:
         surface = surface_of_views(VIEWS)
         points = np.concatenate([view_points(view) for view in VIEWS])
         half = points[points[:, 0] < 0]
-        (score,) = score_cloud(cloud_distances(half, [points], surface, limit=0.2), surface, (0.1,))
+        (score,) = score_cloud(cloud_distances(PointsInMemory(half), [points], surface, limit=0.2), surface, (0.1,))
         assert score.accuracy == 1
         assert score.completeness == pytest.approx(0.5, abs=0.03)
         assert score.f_score == pytest.approx(2 * score.completeness / (1 + score.completeness))
@@ -112,8 +116,8 @@ class TestScores:
         points = np.random.default_rng(3).normal(size=(200, 3)).astype(np.float32)
         surface = surface_of_views(VIEWS)
         pieces = [view_points(view) for view in VIEWS]
-        whole = cloud_distances(points, [np.concatenate(pieces)], surface, limit=9)
-        apart = cloud_distances(points, iter(pieces), surface, limit=9)
+        whole = cloud_distances(PointsInMemory(points), [np.concatenate(pieces)], surface, limit=9)
+        apart = cloud_distances(PointsInMemory(points), iter(pieces), surface, limit=9)
         np.testing.assert_array_equal(whole.of_points, apart.of_points)
         nearest = np.array([np.linalg.norm(np.concatenate(pieces) - point, axis=1).min() for point in points])
         np.testing.assert_allclose(whole.of_points, nearest, rtol=1e-5)
@@ -121,9 +125,14 @@ class TestScores:
     def test_a_cloud_in_chunks_is_the_cloud(self, monkeypatch: pytest.MonkeyPatch) -> None:
         points = np.random.default_rng(3).normal(size=(900, 3)).astype(np.float32)
         surface, pieces = surface_of_views(VIEWS), [view_points(view) for view in VIEWS]
-        whole = cloud_distances(points, pieces, surface, limit=9)
-        monkeypatch.setattr(cloud, "CHUNK_POINTS", 100)
-        for chunks in (points, PointChunks(900, lambda: iter(np.split(points, [7, 350, 350])))):
+        whole = cloud_distances(PointsInMemory(points), pieces, surface, limit=9)
+        monkeypatch.setattr(point_source, "CHUNK_POINTS", 100)
+
+        class Uneven(PointsInMemory):
+            def chunks(self) -> Iterator[NDArray[np.float32]]:
+                return iter(np.split(self.positions, [7, 350, 350]))
+
+        for chunks in (PointsInMemory(points), Uneven(points)):
             apart = cloud_distances(chunks, pieces, surface, limit=9)
             np.testing.assert_array_equal(whole.of_points, apart.of_points)
             np.testing.assert_array_equal(whole.of_surface, apart.of_surface)
@@ -141,15 +150,16 @@ class TestScores:
     def test_an_empty_cloud_scores_nothing_and_a_bad_limit_is_named(self) -> None:
         surface = surface_of_views(VIEWS)
         none = np.zeros((0, 3), np.float32)
-        distances = cloud_distances(none, map(view_points, VIEWS), surface, limit=1)
+        distances = cloud_distances(PointsInMemory(none), map(view_points, VIEWS), surface, limit=1)
         assert [(s.accuracy, s.completeness, s.f_score) for s in score_cloud(distances, surface)] == [(0, 0, 0)] * 2
         assert np.isinf(distances.of_surface).all()
         with pytest.raises(UsageError, match="must be positive"):
-            cloud_distances(none, [], surface, limit=0)
+            cloud_distances(PointsInMemory(none), [], surface, limit=0)
 
     def test_a_distance_equal_to_the_tolerance_is_within_it(self) -> None:
         surface = surface_of_cloud(np.zeros((1, 3), np.float32), voxel_size=1)
         one = np.array([0.5], np.float32)
         assert score_cloud(CloudDistances(one, one), surface, (0.5,))[0].f_score == 1
-        found = cloud_distances(np.array([[0.5, 0, 0]], np.float32), [surface.points_in_world], surface, limit=0.5)
+        beside = PointsInMemory(np.array([[0.5, 0, 0]], np.float32))
+        found = cloud_distances(beside, [surface.points_in_world], surface, limit=0.5)
         np.testing.assert_array_equal(found.of_points, one)

@@ -5,8 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.metrics.poses import align_centers, center_errors, relative_pose_errors
 from pano_mvs.core.errors import UsageError
+from pano_mvs.evaluation.poses.alignment import align_centers
+from pano_mvs.evaluation.poses.errors import center_errors, relative_pose_errors
 from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec
 from tests.algorithms.poses.synthetic_capture import random_poses, random_rotation
 
@@ -142,3 +143,23 @@ def test_pairs_across_groups_cannot_be_measured_and_count_as_not_registered() ->
     unmoved = relative_pose_errors(true, true, groups=groups)
     assert (unmoved.pair_deg[across] == 180).all()
     assert relative_pose_errors(true, true).in_one_frame == 5
+
+
+def test_all_pairs_at_once_are_the_pairs_one_by_one() -> None:
+    rng = np.random.default_rng(8)
+    truth = random_poses(rng, 7)
+    names = list(truth)
+    noise = {name: Rigid3(rotation_from_rotvec(rng.normal(0, 0.02, 3)), rng.normal(0, 0.1, 3)) for name in names}
+    estimated = {name: noise[name] @ truth[name] for name in names if name != names[2]}
+    groups = {name: idx % 2 for idx, name in enumerate(estimated)}
+    found = relative_pose_errors(estimated, truth, groups=groups)
+    for idx, (first, second) in enumerate(found.pairs):
+        expected = np.array([180.0, 180.0])
+        if first in groups and groups[first] == groups.get(second):
+            guess, true = (poses[second] @ poses[first].inverse() for poses in (estimated, truth))
+            angle = np.arccos((np.trace(guess.rotation.T @ true.rotation) - 1) / 2)
+            cosine = guess.translation @ true.translation
+            cosine /= np.linalg.norm(guess.translation) * np.linalg.norm(true.translation)
+            expected = np.rad2deg([angle, np.arccos(cosine)])
+        np.testing.assert_allclose([found.rotation_deg[idx], found.direction_deg[idx]], expected, atol=1e-5)
+    assert (found.registered, found.in_one_frame, found.expected) == (6, 3, 7)

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from pano_mvs.algorithms.metrics.best_constant import best_constant_errors, best_constant_median
-from pano_mvs.algorithms.metrics.judged import aligning_scale, judged_pixels, weighted_median, weighted_quantile
-from pano_mvs.algorithms.metrics.range_errors import BadLimit, range_errors
-from pano_mvs.algorithms.metrics.view_scores import PROTOCOLS, Judging, ViewScores, mean_scores, score_view
 from pano_mvs.core.errors import UsageError
+from pano_mvs.evaluation.ranges.best_constant import best_constant_errors, best_constant_median
+from pano_mvs.evaluation.ranges.errors import BadLimit, range_errors
+from pano_mvs.evaluation.ranges.pixels import aligning_scale, scored_pixels, weighted_median, weighted_quantile
+from pano_mvs.evaluation.ranges.view_scores import PROTOCOLS, ScoreSettings, ViewScores, mean_scores, score_view
 from pano_mvs.geometry import pixel_solid_angle
 from tests.oracles import range_scores as oracle
 
@@ -44,7 +44,7 @@ class TestDefinitions:
     @settings(max_examples=15, deadline=None)
     def test_every_score_is_what_its_definition_says(self, seed: int, scale: float, hard: float) -> None:
         estimated, truth, _ = draw(seed, hard=hard)
-        found = score_view(estimated, truth, scale=scale, judging=Judging(peak=7.0, bad=BAD)).scores
+        found = score_view(estimated, truth, scale=scale, settings=ScoreSettings(peak=7.0, bad=BAD)).scores
         for prefix in PROTOCOLS:
             for name in NAMES:
                 expected = oracle.score(prefix + name, estimated, truth, peak=7.0, scale=scale)
@@ -68,14 +68,14 @@ class TestDefinitions:
         assert all(np.isnan(value) for constant in found.constants.values() for value in constant.values())
 
     def test_a_missing_pixel_is_bad_at_any_limit(self) -> None:
-        found = score_view(np.full(SIZE, np.nan), np.full(SIZE, 2.0), judging=Judging(bad=BAD)).scores
+        found = score_view(np.full(SIZE, np.nan), np.full(SIZE, 2.0), settings=ScoreSettings(bad=BAD)).scores
         assert {found[limit.name] for limit in BAD} == {1}
 
     def test_confidence_below_what_is_asked_is_no_estimate(self) -> None:
         truth = np.full(SIZE, 2.0)
         estimated, confidence = truth.copy(), np.full(SIZE, 200, np.uint8)
         estimated[:3], confidence[:3] = 9.0, 100
-        found = score_view(estimated, truth, confidence=confidence, judging=Judging(min_confidence=128)).scores
+        found = score_view(estimated, truth, confidence=confidence, settings=ScoreSettings(min_confidence=128)).scores
         assert (found["completeness"], found["valid_mae"], found["mae"]) == (0.5, 0, 1)
         assert found["ause"] == pytest.approx(0, abs=1e-12)
         assert score_view(estimated, truth, confidence=confidence).scores["completeness"] == 1
@@ -83,8 +83,8 @@ class TestDefinitions:
     @pytest.mark.parametrize(
         ("settings", "words"),
         [
-            ({"judging": Judging(min_confidence=1)}, "no confidence"),
-            ({"confidence": np.zeros((2, 2), np.uint8)}, "must be of one size"),
+            ({"settings": ScoreSettings(min_confidence=1)}, "there is no confidence"),
+            ({"confidence": np.zeros((2, 2), np.uint8)}, "must be .* of one size"),
             ({"scale": np.nan}, "must be positive"),
         ],
     )
@@ -210,7 +210,7 @@ class TestBestConstant:
     @settings(max_examples=15, deadline=None)
     def test_the_best_constant_is_never_worse_than_mean_or_median(self, seed: int) -> None:
         estimated, truth, _ = draw(seed)
-        constants = score_view(estimated, truth, judging=Judging(bad=BAD)).constants
+        constants = score_view(estimated, truth, settings=ScoreSettings(bad=BAD)).constants
         for other in ("median", "mean"):
             for prefix in PROTOCOLS:
                 for name in NAMES:
@@ -222,13 +222,13 @@ class TestBestConstant:
 class TestFit:
     def test_without_a_fit_and_without_pixels_the_factor_is_one(self) -> None:
         estimated, truth, _ = draw(0)
-        assert aligning_scale(judged_pixels(estimated, truth), "none") == 1
-        assert aligning_scale(judged_pixels(np.full(SIZE, np.nan), truth), "lsq") == 1
+        assert aligning_scale(scored_pixels(estimated, truth), "none") == 1
+        assert aligning_scale(scored_pixels(np.full(SIZE, np.nan), truth), "lsq") == 1
 
     @pytest.mark.parametrize("align", ["median", "lsq"])
     def test_a_factor_is_found_and_undone(self, align: Literal["median", "lsq"]) -> None:
         _, truth, _ = draw(1, hard=0.2)
-        found = score_view(truth / 3, truth, judging=Judging(align=align))
+        found = score_view(truth / 3, truth, settings=ScoreSettings(align=align))
         assert found.scale == pytest.approx(3)
         assert found.scores["valid_mae"] == pytest.approx(0, abs=1e-12)
         unfitted = score_view(truth / 3, truth)
@@ -236,10 +236,10 @@ class TestFit:
 
     def test_least_squares_are_the_least(self) -> None:
         estimated, truth, _ = draw(2)
-        both = judged_pixels(estimated, truth).only_valid()
+        both = scored_pixels(estimated, truth).only_valid()
         found = minimize_scalar(lambda s: np.sum(both.weight * (s * both.found - both.true) ** 2), bounds=(0.01, 10),
                                 method="bounded", options={"xatol": 1e-10})  # fmt: skip
-        assert aligning_scale(judged_pixels(estimated, truth), "lsq") == pytest.approx(found.x, rel=1e-5)
+        assert aligning_scale(scored_pixels(estimated, truth), "lsq") == pytest.approx(found.x, rel=1e-5)
 
     def test_the_fit_weights_by_solid_angle(self) -> None:
         weight = pixel_solid_angle((4, 8))
@@ -248,7 +248,7 @@ class TestFit:
         estimated[0] = 1.0
         share = weight[0] / weight.sum()
         expected = (share * 2 + (1 - share) * 4) / (share + (1 - share) * 4)
-        assert aligning_scale(judged_pixels(estimated, truth), "lsq") == pytest.approx(expected)
+        assert aligning_scale(scored_pixels(estimated, truth), "lsq") == pytest.approx(expected)
 
 
 def test_quantiles_by_weight_are_those_of_repeated_values() -> None:

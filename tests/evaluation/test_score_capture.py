@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.metrics.score import KEPT, KEPT_OF_CONFIDENCE, score_capture
-from pano_mvs.algorithms.metrics.view_scores import score_view
+from pano_mvs.evaluation.capture import KEPT, KEPT_OF_CONFIDENCE, score_capture
+from pano_mvs.evaluation.ranges.view_scores import score_view
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Scores
 from tests.algorithms.range_scenes import box_range
@@ -25,8 +25,10 @@ def scored(
     confidence: NDArray[np.uint8] | None = None,
     poses: dict[str, Rigid3] = POSES,
 ) -> Scores:
-    confidences = {"a": confidence} if confidence is not None else None
-    return score_capture(poses, POSES, {"a": estimated}, {"a": lambda: truth}, confidences=confidences)
+    confidences = {"a": confidence} if confidence is not None else {}
+    return score_capture(
+        poses, POSES, estimated_ranges={"a": estimated}, true_ranges={"a": lambda: truth}, confidences=confidences
+    )
 
 
 def test_each_score_stands_beside_what_constants_score() -> None:
@@ -60,19 +62,19 @@ def test_what_is_masked_is_not_judged() -> None:
     truth, _ = box_range((32, 64))
     estimated, mask = truth.copy(), np.ones((16, 32), bool)
     estimated[16:], mask[8:] = np.nan, False
-    views = {"a": estimated}, {"a": lambda: truth}
-    assert score_capture(POSES, POSES, *views, masks={"a": mask}).views["a"]["completeness"] == 1
-    assert score_capture(POSES, POSES, *views).views["a"]["completeness"] == 0.5
+    views: dict[str, Any] = {"estimated_ranges": {"a": estimated}, "true_ranges": {"a": lambda: truth}}
+    assert score_capture(POSES, POSES, **views, masks={"a": mask}).views["a"]["completeness"] == 1
+    assert score_capture(POSES, POSES, **views).views["a"]["completeness"] == 0.5
 
 
 def test_a_pair_with_an_unregistered_camera_has_no_error() -> None:
     """Where most pairs had one, the report gave 180° as the median pose error."""
     true = {name: Rigid3(np.eye(3), np.array(place)) for name, place in
             (("a", (0.0, 0, 0)), ("b", (1.0, 0, 0)), ("c", (0.0, 1, 0)), ("d", (0.0, 0, 1)))}  # fmt: skip
-    found = score_capture({name: true[name] for name in "ab"}, true, {}, {}).poses
+    found = score_capture({name: true[name] for name in "ab"}, true).poses
     assert [found[f"median_{kind}_error_deg"] for kind in ("pair", "rotation", "direction")] == [0, 0, 0]
     assert found["auc_5_deg"] == pytest.approx(1 / 6)
-    apart = score_capture({name: true[name] for name in "ab"}, true, {}, {}, groups={"a": 0, "b": 1}).poses
+    apart = score_capture({name: true[name] for name in "ab"}, true, groups={"a": 0, "b": 1}).poses
     assert (apart["registered"], apart["auc_5_deg"]) == (2, 0)
     assert not any("median" in name for name in apart)
 
@@ -83,7 +85,7 @@ def test_what_cannot_be_judged_has_no_score() -> None:
     assert found["completeness"] == 0
     assert not {"ause", "median_relative_error", "best_constant_median_relative_error"} & set(found)
     assert all(np.isfinite(value) for value in found.values())
-    missing = score_capture(POSES, POSES, {"a": nothing}, {"a": lambda: None})
+    missing = score_capture(POSES, POSES, estimated_ranges={"a": nothing}, true_ranges={"a": lambda: None})
     assert (missing.views, missing.notes) == ({}, ("a: no true range map",))
     flat = np.full((8, 16), 2.0, np.float32)
     perfect = scored(flat, flat)

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.metrics.score import score_capture
-from pano_mvs.algorithms.metrics.sparsification import sparsify
 from pano_mvs.core.errors import UsageError
+from pano_mvs.evaluation.capture import score_capture
+from pano_mvs.evaluation.ranges.pixels import scored_pixels
+from pano_mvs.evaluation.ranges.sparsification import Sparsification
+from pano_mvs.evaluation.ranges.sparsification import sparsify as sparsify_pixels
 from pano_mvs.geometry import Rigid3
 
 SIZE = (16, 32)
+
+
+def sparsify(
+    estimated: NDArray[np.float64], confidence: NDArray[np.integer], truth: NDArray[np.float64], scale: float = 1.0
+) -> Sparsification:
+    return sparsify_pixels(scored_pixels(estimated, truth, confidence=confidence, scale=scale))
 
 
 def noisy(seed: int = 0) -> tuple[NDArray[np.float64], NDArray[np.float64], np.random.Generator]:
@@ -75,9 +85,11 @@ def test_scores_of_a_capture_tell_how_confidence_ranks_if_it_is_given() -> None:
     truth, estimated, rng = noisy()
     confidence = rng.integers(1, 255, SIZE).astype(np.uint8)
     poses = {name: Rigid3(np.eye(3), np.array([x, 0.0, 0.0])) for name, x in (("a", 0.0), ("b", 1.0))}
-    known = {"a": lambda: truth.astype(np.float32)}
-    ranges = {"a": estimated.astype(np.float32)}
-    told = score_capture(poses, poses, ranges, known, confidences={"a": confidence}).views["a"]
+    maps: dict[str, Any] = {
+        "estimated_ranges": {"a": estimated.astype(np.float32)},
+        "true_ranges": {"a": lambda: truth.astype(np.float32)},
+    }
+    told = score_capture(poses, poses, **maps, confidences={"a": confidence}).views["a"]
     assert told["ause"] == pytest.approx(sparsify(estimated, confidence, truth).ause, rel=1e-3)
     assert told["ause"] == pytest.approx(told["sparsification_area"] - told["sparsification_oracle_area"])
-    assert "ause" not in score_capture(poses, poses, ranges, known).views["a"]
+    assert "ause" not in score_capture(poses, poses, **maps).views["a"]

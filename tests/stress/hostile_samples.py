@@ -15,6 +15,8 @@ import numpy as np
 
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.workflow import load_workflow
+from pano_mvs.evaluation.inputs.range_files import find_ranges
+from pano_mvs.evaluation.inputs.truth import read_truth
 from pano_mvs.io.clouds.ply import read_ply, write_ply
 from pano_mvs.io.clouds.ply_mesh import read_ply_mesh, write_ply_mesh
 from pano_mvs.io.clouds.ply_points import open_ply_points
@@ -24,8 +26,6 @@ from pano_mvs.io.images.captures import describe_picture
 from pano_mvs.io.images.exr import has_exr, write_exr
 from pano_mvs.io.poses.files import read_groups, recorded_pictures
 from pano_mvs.io.ranges.files import read_normals
-from pano_mvs.io.ranges.folders import find_ranges
-from pano_mvs.io.truth import read_truth
 from pano_mvs.scene import PointCloud
 from pano_mvs.scene.image_files.image_file import decode_image
 from pano_mvs.scene.masking import decode_mask

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.faces.icosahedron import face_centers
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import PinholeView, spiral_rays
 from pano_mvs.scene.face_files import FaceLayout
@@ -110,8 +111,6 @@ def upright_rotation(axis_in_cam: FloatArray) -> FloatArray:
 
 
 def _rotations(layout: FaceLayout) -> list[tuple[str, FloatArray]]:
-    from pano_mvs.algorithms.features.icosahedron import face_centers  # which itself is made of pinhole views
-
     if layout == "cube":
         return list(zip(CUBE_NAMES, CUBE_ROTATIONS, strict=True))
     if layout == "octagon":

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from pano_mvs.algorithms.poses.frame.gauge import normalised_poses
-from pano_mvs.algorithms.poses.placement.growth import GrownModel, grown_models
+from pano_mvs.algorithms.poses.growth import GrownModel, grown_models
 from pano_mvs.algorithms.poses.placement.placed_model import pairs_of
 from pano_mvs.algorithms.poses.placement.reasons import why_no_pair
 from pano_mvs.algorithms.poses.placement.scale import ScaleEstimator

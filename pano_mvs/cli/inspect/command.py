@@ -18,8 +18,8 @@ from pano_mvs.core.paths import is_file, is_folder
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
 from pano_mvs.engine.planning.units import Unit
+from pano_mvs.evaluation.inputs.truth import read_truth
 from pano_mvs.io.images.names import match_image_names
-from pano_mvs.io.truth import read_truth
 from pano_mvs.results.summary import RunSummary, cache_of
 from pano_mvs.scene import RangeMap
 from pano_mvs.session.session import Session, open_session
@@ -72,7 +72,7 @@ def open_run(target: str, *, overrides: Sequence[str], images: Path | None, cach
     """Open a workflow, or that of an output folder with the settings, the pictures and the cache of its run.
 
     Raises:
-        InputError: if the output folder is none, or its workflow is gone.
+        InputError: if the folder has no run.json, or its workflow is gone.
     """
     out = Path(target)
     if not is_folder(out):

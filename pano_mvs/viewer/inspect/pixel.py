@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.metrics.poses import align_centers
 from pano_mvs.algorithms.sweep.cost_curve import CostCurve, cost_curve
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
 from pano_mvs.algorithms.sweep.settings import SweepSettings
@@ -21,8 +20,9 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.engine.cache.store import Store, UnitRecord
 from pano_mvs.engine.executors.execute import arguments_of
 from pano_mvs.engine.planning.units import Unit
+from pano_mvs.evaluation.inputs.truth import read_truth
+from pano_mvs.evaluation.poses.alignment import align_centers
 from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_from_pixel
-from pano_mvs.io.truth import read_truth
 from pano_mvs.scene import Panorama, Pose, RangeMap
 from pano_mvs.stages.depth import SweepParams
 from pano_mvs.viewer.inspect.inspection import Inspection, SourceSight, StageRange
@@ -188,7 +188,7 @@ def _true_range(
     matched = truth.match(list(estimated))
     views = {name: view for name, view in matched.items() if view.sha256 in (None, _sha256(pictures[name]))}
     if image in matched and image not in views:
-        return np.nan, (f"{image} is not the picture that the truth in {folder.name} belongs to",)
+        return np.nan, (f"{image} is not the image that the truth in {folder.name} belongs to",)
     ranges = truth.range_map(views[image]) if image in views else None
     if ranges is None or ranges.shape != read.reference.size_hw:
         return np.nan, (f"the truth in {folder.name} has no range map of {image} at the size that was swept",)

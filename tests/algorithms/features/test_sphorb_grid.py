@@ -8,9 +8,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pano_mvs.algorithms.faces.icosahedron import face_centers
 from pano_mvs.algorithms.features import sphorb
 from pano_mvs.algorithms.features.geodesic import NEIGHBOURS, GeodesicGrid
-from pano_mvs.algorithms.features.icosahedron import face_centers
 from pano_mvs.algorithms.features.smoothing import smooth_panorama
 from pano_mvs.algorithms.features.sphorb import extract_sphorb, grid_pyramid
 from pano_mvs.core.errors import UsageError

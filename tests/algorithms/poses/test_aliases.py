@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.metrics.poses import relative_pose_errors
 from pano_mvs.algorithms.poses.placement.placed_model import PlacedModel, pairs_of
 from pano_mvs.algorithms.poses.verification.aliases import (
     Alias,
@@ -15,6 +14,7 @@ from pano_mvs.algorithms.poses.verification.aliases import (
     labellings,
     moved_cameras,
 )
+from pano_mvs.evaluation.poses.errors import relative_pose_errors
 from pano_mvs.geometry import Rigid3, geodesic_angle, rotation_from_rotvec
 from tests.algorithms.poses.aliased_capture import TILE, AliasedCapture, aliased_capture, shifted_pose
 

@@ -12,7 +12,6 @@ import pycolmap
 import pytest
 
 from pano_mvs.algorithms.faces.layout import CUBE_ROTATIONS
-from pano_mvs.algorithms.metrics.poses import relative_pose_errors
 from pano_mvs.algorithms.poses.adjustment.refine import refine_poses
 from pano_mvs.algorithms.poses.colmap import solver as colmap
 from pano_mvs.algorithms.poses.colmap.cube_rig import face_of_bearing, face_pixels, face_size
@@ -20,6 +19,7 @@ from pano_mvs.algorithms.poses.colmap.database import Cameras, write_database
 from pano_mvs.algorithms.poses.colmap.mapping import Mapper
 from pano_mvs.algorithms.poses.colmap.sift import colmap_sift
 from pano_mvs.algorithms.poses.colmap.solver import solve_colmap
+from pano_mvs.evaluation.poses.errors import relative_pose_errors
 from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import split_groups

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.metrics.poses import relative_pose_errors
-from pano_mvs.algorithms.poses.placement.growth import grown_models, ranked_seeds
+from pano_mvs.algorithms.poses.growth import grown_models, ranked_seeds
 from pano_mvs.algorithms.poses.placement.placed_model import (
     Pairs,
     PlacedModel,
@@ -15,6 +14,7 @@ from pano_mvs.algorithms.poses.placement.placed_model import (
     pairs_of,
 )
 from pano_mvs.algorithms.poses.placement.resection import resection_errors
+from pano_mvs.evaluation.poses.errors import relative_pose_errors
 from pano_mvs.geometry import Rigid3
 from tests.algorithms.poses.aliased_capture import AliasedCapture, aliased_capture, shifted_pose
 

@@ -10,13 +10,13 @@ import pytest
 
 from pano_mvs.algorithms.features.tangent import extract_sift
 from pano_mvs.algorithms.matching.brute_force import match_features
-from pano_mvs.algorithms.metrics.placements import judge_placements
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
 from pano_mvs.algorithms.poses.verification.confirmation import Picture
 from pano_mvs.algorithms.poses.verification.verify_poses import verify_poses
 from pano_mvs.algorithms.two_view import verify_pair
 from pano_mvs.testing.repeating.places import colonnade, tiled_hall
 from pano_mvs.testing.scenes import Scene
+from tests.benchmarks.placements import judge_placements
 
 SIZE_HW = (256, 512)
 WHOLE = np.ones(SIZE_HW, np.bool_)

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.metrics.placements import judge_placements
-from pano_mvs.algorithms.metrics.poses import relative_pose_errors
 from pano_mvs.algorithms.poses.scaled_translation import solve_scaled_translation
+from pano_mvs.evaluation.poses.errors import relative_pose_errors
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Poses, TwoView
 from tests.algorithms.poses.aliased_capture import AliasedCapture, aliased_capture
+from tests.benchmarks.placements import judge_placements
 
 # Image 3 stands a tile further along by three of its five pairs; one more pair is false.
 FALSE = {(0, 3): 1, (1, 3): 1, (2, 3): 1, (0, 2): -1}

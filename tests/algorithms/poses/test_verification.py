@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.metrics.placements import judge_placements
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.algorithms.poses.placement.placed_model import pairs_of
 from pano_mvs.algorithms.poses.verification import arbitration
@@ -21,6 +20,7 @@ from pano_mvs.testing.room import capture_poses, default_room, render
 from pano_mvs.testing.scenes import white_room
 from tests.algorithms.poses.aliased_capture import same_matches, view_of
 from tests.algorithms.room_pictures import SIZE_HW, WHOLE, Vector, moved, room_capture, room_matches
+from tests.benchmarks.placements import judge_placements
 from tests.known import known
 
 Matches = tuple[dict[str, Features], dict[tuple[str, str], TwoView]]

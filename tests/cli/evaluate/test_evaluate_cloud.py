@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from pano_mvs.algorithms.metrics.surface import TrueView, view_points
-from pano_mvs.cli.evaluate_cloud import CloudRequest, judge_cloud
+from pano_mvs.evaluation.clouds.evaluate import evaluate_cloud
+from pano_mvs.evaluation.clouds.true_surface import TrueView, view_points
+from pano_mvs.evaluation.inputs.truth import read_truth
 from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec
 from pano_mvs.io.clouds.ply import write_ply
 from pano_mvs.io.clouds.ply_points import open_ply_points
-from pano_mvs.io.truth import read_truth
 from pano_mvs.scene import PointCloud
 from tests.algorithms.poses.synthetic_capture import random_rotation
 from tests.cli.conftest import Command
@@ -154,13 +154,13 @@ def test_up_is_where_the_cameras_have_it(tmp_path: Path, folder: Path, surface: 
         (turned, turned.rotation @ (0, -1, 0)),
     ):
         known = write_json(tmp_path / "m.json", {name: place.move_camera(pose) for name, pose in poses.items()})
-        found = judge_cloud(CloudRequest(reference, reference, true_poses=known, poses=known)).compared.up
+        found = evaluate_cloud(reference, reference, true_poses=known, poses=known).compared.up
         angle_deg = np.rad2deg(np.arccos(found @ expected))
         assert angle_deg < 10  # the cameras of the room are held nearly level
     flips = (np.eye(3), np.diag([1.0, -1, -1])) * 2
     upside = {name: Rigid3(flip, pose.translation) for flip, (name, pose) in zip(flips, poses.items(), strict=True)}
     known = write_json(tmp_path / "m.json", upside)
-    found = judge_cloud(CloudRequest(reference, reference, true_poses=known, poses=known)).compared.up
+    found = evaluate_cloud(reference, reference, true_poses=known, poses=known).compared.up
     np.testing.assert_array_equal(found, [0, -1, 0])
 
 

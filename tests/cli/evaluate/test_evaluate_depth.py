@@ -12,13 +12,13 @@ import cv2
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.metrics.surface import TrueView, view_points
-from pano_mvs.algorithms.metrics.view_scores import score_view
+from pano_mvs.evaluation.clouds.true_surface import TrueView, view_points
+from pano_mvs.evaluation.inputs.truth import read_truth
+from pano_mvs.evaluation.ranges.view_scores import score_view
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.clouds.ply import write_ply
 from pano_mvs.io.colmap.model import write_colmap_model
 from pano_mvs.io.ranges.files import write_confidence_png, write_range_tiff
-from pano_mvs.io.truth import read_truth
 from pano_mvs.scene import PointCloud, Poses
 from tests.cli.conftest import SIZE_HW, Command, Outcome
 from tests.stored import read_picture, write_npz
@@ -211,10 +211,10 @@ def test_masks_and_confidence_leave_out_what_they_say(
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--min-confidence", "128"), "so --min-confidence cannot be kept"),
+        (("--min-confidence", "128"), "so --min-confidence cannot be applied"),
         (("--scale", "big"), "'big' is no scale"),
         (("--bad", "often"), "no limit for bad pixels"),
-        (("--unit", "0"), "--unit must be a positive number"),
+        (("--unit", "0"), "unit must be a positive number"),
         (("--peak", "0"), "peak must be a positive length"),
         (("--masks", "none"), "masks must be a folder"),
         (("--masks", "."), "no mask in it belongs to a view"),
@@ -238,7 +238,7 @@ def test_strangers_are_named_with_what_either_has(pano_mvs: Command, output: Pat
     np.savez(tmp_path / "other.npz", zebra=np.ones((4, 8), np.float32))
     result = pano_mvs("evaluate", "depth", output, "--truth", tmp_path / "other.npz")
     assert result.code == 2
-    assert "no picture in common: the one has 000, 001, 002, the other zebra" in result.flat
+    assert "no image in common: the one has 000, 001, 002, the other zebra" in result.flat
     write_npz(tmp_path / "shape.npz", {"001": np.ones((30, 50), np.float32)})
     result = pano_mvs("evaluate", "depth", output, "--truth", tmp_path / "shape.npz")
     assert result.code == 2
@@ -291,5 +291,5 @@ class TestRun:
         np.savez(tmp_path / "other.npz", zebra=np.ones((4, 8), np.float32))
         result = pano_mvs("evaluate", "run", output, "--truth", tmp_path / "other.npz")
         assert result.code == 2
-        for words in ("the truth has no poses", "knows none of their pictures", "there is no cloud.ply"):
+        for words in ("the truth has no poses", "knows none of their images", "there is no cloud.ply"):
             assert words in result.flat

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pano_mvs.cli import evaluate_depth_print
 from pano_mvs.cli.inspect import text as inspect_text
 from pano_mvs.cli.run import printing
+from pano_mvs.evaluation.ranges import tables as depth_tables
 from pano_mvs.results.figures import figure
 
 
@@ -17,7 +17,7 @@ from pano_mvs.results.figures import figure
         figure(-0.0),
         figure([-0.0, 1.0]),
         printing._shown(-0.0),
-        evaluate_depth_print._shown("psnr_db", {"psnr_db": -0.0}),
+        depth_tables._shown("psnr_db", {"psnr_db": -0.0}),
         inspect_text._vector(np.array([-1e-9, 0.0, 1.0])),
     ],
 )

@@ -1,1 +1,0 @@
-"""How far poses and ranges are from the truth."""

@@ -1,0 +1,201 @@
+"""The commands `pano-mvs evaluate …`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from pano_mvs.cli.console import Console
+from pano_mvs.cli.default_command import RunByDefault
+from pano_mvs.cli.guard import guarded
+from pano_mvs.core.errors import UsageError
+from pano_mvs.core.text import plural
+
+evaluate_app = typer.Typer(
+    cls=RunByDefault,
+    help="Compare results with ground truth; `evaluate OUT --truth DIR` means `evaluate run OUT --truth DIR`.",
+    no_args_is_help=True,
+)
+
+_FILES = "a folder of range maps (.tiff, .exr, .npy, .npz, 16-bit .png; paired by path), or an .npz file"
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+
+
+@evaluate_app.command("run")
+@guarded
+def run(
+    out: Annotated[Path, typer.Argument(help="The output folder of a run.")],
+    truth: Annotated[Path, typer.Option("--truth", help="Folder with poses.json and depth.npz, or one of these.")],
+) -> None:
+    """Compare a run's poses, range maps and cloud with the truth, as far as both exist."""
+    from pano_mvs.cli.evaluate.printing import print_run
+    from pano_mvs.evaluation import evaluate_run
+
+    print_run(evaluate_run(out, truth), Console())
+
+
+@evaluate_app.command("poses")
+@guarded
+def poses(
+    model: Annotated[Path, typer.Argument(help="COLMAP model, poses.json, transforms.json, CSV, or a run's output.")],
+    truth: Annotated[Path, typer.Option("--truth", help="The true poses, in any of these formats.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Compare the poses in any file with the truth, whatever their frames and units."""
+    from pano_mvs.cli.evaluate.printing import print_json, print_summary
+    from pano_mvs.evaluation import evaluate_poses
+
+    evaluation = evaluate_poses(model, truth)
+    if as_json:
+        print_json(evaluation.to_json())
+    else:
+        print_summary(evaluation.summary(), Console())
+
+
+@evaluate_app.command("cloud")
+@guarded
+def cloud(
+    cloud: Annotated[Path, typer.Argument(help="A PLY file, or the output folder of a run.")],
+    truth: Annotated[Path, typer.Option("--truth", help="Folder with poses and range maps, or a reference PLY.")],
+    poses: Annotated[
+        Path | None,
+        typer.Option("--poses", help="The poses with which it was made; without, a PLY lies in the truth's frame."),
+    ] = None,
+    true_poses: Annotated[
+        Path | None, typer.Option("--true-poses", help="The true poses in the frame of a reference PLY.")
+    ] = None,
+    thresholds: Annotated[
+        list[float], typer.Option("--threshold", help="A tolerance in the truth's unit; may be given repeatedly.")
+    ] = [0.05, 0.02],  # noqa: B006  # typer reads it and never changes it
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder for the cloud and the surface coloured by their errors, and pictures."),
+    ] = None,
+    picture: Annotated[
+        Path | None, typer.Option("--picture", help="A PNG to write that shows the errors in the views and from above.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare a cloud with the true surface: accuracy, completeness, F-score."""
+    from pano_mvs.cli.evaluate.printing import print_json, print_line, print_summary
+    from pano_mvs.evaluation import evaluate_cloud, write_error_clouds, write_overview
+
+    evaluation = evaluate_cloud(cloud, truth, poses=poses, true_poses=true_poses, thresholds=thresholds)
+    if picture is not None:
+        write_overview(picture, evaluation)
+    if out is not None:
+        write_error_clouds(out, evaluation)
+    if as_json:
+        print_json(evaluation.to_json())
+        return
+    print_summary(evaluation.summary(), Console())
+    if out is not None:
+        print_line(f"accuracy.ply, completeness.ply and pictures of the errors are in {out}", Console())
+
+
+@evaluate_app.command("depth")
+@guarded
+def depth(
+    source: Annotated[Path, typer.Argument(help=f"The output folder of a run, {_FILES}.")],
+    truth: Annotated[Path, typer.Option("--truth", help="Folder with poses.json and depth.npz, or any of these.")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder for pictures of the errors, scores.json and scores.csv."),
+    ] = None,
+    align: Annotated[
+        Literal["none", "median", "lsq"], typer.Option("--align", help="Fit each view to the truth by a factor.")
+    ] = "none",
+    scale: Annotated[
+        str, typer.Option("--scale", help="Factor to the truth's unit; auto: from the camera centres, if known.")
+    ] = "auto",
+    unit: Annotated[float, typer.Option("--unit", help="Unit of the files' numbers; 0.001 for mm.")] = 1.0,
+    truth_unit: Annotated[float, typer.Option("--truth-unit", help="Unit of the truth's numbers.")] = 1.0,
+    peak: Annotated[float, typer.Option("--peak", help="The range that MSE and PSNR count as 1.")] = 10.0,
+    bad: Annotated[
+        list[str], typer.Option("--bad", help="An error above which a pixel is bad: 5%, or 0.1; may be repeated.")
+    ] = ["5%"],  # noqa: B006  # typer reads it and never changes it
+    min_confidence: Annotated[
+        int,
+        typer.Option(
+            "--min-confidence",
+            min=0,
+            max=255,
+            help="Ranges of lower confidence count as missing; 64: seen, 128: consistent with other views.",
+        ),
+    ] = 0,
+    masks: Annotated[
+        Path | None, typer.Option("--masks", help="Folder of masks <image name>.png; pixels where it is 0 are ignored.")
+    ] = None,
+    mask: Annotated[
+        Path | None, typer.Option("--mask", help="Evaluate only pixels inside this mask (applied to every view).")
+    ] = None,
+    images: Annotated[
+        Path | None, typer.Option("--images", help="Folder of the panoramas, for the pictures of the errors.")
+    ] = None,
+    error_limit: Annotated[
+        float, typer.Option("--error-limit", help="Relative error at which the colours of the pictures end.")
+    ] = 0.1,
+    baseline: Annotated[
+        Literal["best", "median", "mean"], typer.Option("--baseline", help="Which constant is shown beside each score.")
+    ] = "best",
+    poses: Annotated[
+        Path | None, typer.Option("--poses", help="The estimated poses, for the scale; default: the output folder's.")
+    ] = None,
+    true_poses: Annotated[
+        Path | None, typer.Option("--true-poses", help="The true poses, for the scale; default: the truth folder's.")
+    ] = None,
+    csv: Annotated[Path | None, typer.Option("--csv", help="Write one row for each view.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare range maps with the truth: MSE, PSNR, MAE, RMSE, AbsRel, δ, bad pixels, completeness, AUSE."""
+    from pano_mvs.cli.evaluate.printing import print_json, print_line, print_summary
+    from pano_mvs.evaluation import (
+        BadLimit,
+        ScoreSettings,
+        depth_summary,
+        evaluate_depth,
+        write_depth_csv,
+        write_depth_pictures,
+        write_depth_scores,
+    )
+
+    settings = ScoreSettings(peak, tuple(BadLimit.from_text(text) for text in bad), align, min_confidence)
+    evaluation = evaluate_depth(
+        source,
+        truth,
+        settings=settings,
+        unit=unit,
+        truth_unit=truth_unit,
+        scale=_scale(scale),
+        poses=poses,
+        true_poses=true_poses,
+        masks=masks,
+        mask=mask,
+    )
+    if out is not None:
+        write_depth_pictures(out, evaluation, images=images, limit=error_limit)
+        write_depth_scores(out, evaluation)
+    if csv is not None:
+        write_depth_csv(csv, evaluation)
+    if as_json:
+        print_json(evaluation.to_json())
+        return
+    print_summary(depth_summary(evaluation, baseline=baseline), Console())
+    if out is not None:
+        count = len(evaluation.views)
+        print_line(
+            f"{count} {plural(count, 'picture')} of the errors, scores.json and scores.csv are in {out}", Console()
+        )
+
+
+def _scale(text: str) -> float | Literal["auto"]:
+    if text == "auto":
+        return "auto"
+    try:
+        return float(text)
+    except ValueError as error:
+        raise UsageError(
+            f"'{text}' is no scale: give a positive number, or auto to find it from the camera centres"
+        ) from error

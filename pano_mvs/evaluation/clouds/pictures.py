@@ -1,0 +1,137 @@
+"""Pictures of the errors of a cloud: in the views, from above, from outside and from inside."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from pano_mvs.algorithms.rendering.cloud import draw_cloud
+from pano_mvs.algorithms.rendering.viewpoints import viewpoints
+from pano_mvs.evaluation.clouds.error_clouds import distance_colors, write_error_cloud
+from pano_mvs.evaluation.clouds.evaluate import CloudEvaluation
+from pano_mvs.evaluation.clouds.points import Points, PointsInMemory
+from pano_mvs.evaluation.drawing import WIDTH, Picture, put_text, strip, write_stack
+
+_MAX_POINTS, _MAX_VIEWS = 2_000_000, 12
+_LINE, _SIZE_HW = 28, (640, WIDTH)
+
+
+def write_error_clouds(folder: Path, evaluation: CloudEvaluation) -> None:
+    """Write accuracy.ply and completeness.ply, a picture of each, and errors.png (see `write_overview`).
+
+    Both clouds lie in the truth's frame: the points of the cloud coloured by their distance from the true surface, and
+    the surface that should be covered coloured by its distance from the cloud.
+    """
+    surface, distances = evaluation.compared.surface, evaluation.distances
+    limits, farthest = evaluation.limits, evaluation.farthest
+    write_error_cloud(
+        folder / "accuracy.ply", evaluation.cloud.chunks(), distances.of_points, limits=limits, farthest=farthest
+    )
+    samples = PointsInMemory(surface.points_in_world).chunks()
+    write_error_cloud(folder / "completeness.ply", samples, distances.of_surface, limits=limits, farthest=farthest)
+    title = "cloud by its distance from the true surface"
+    _write_views(folder / "accuracy.png", _some_points(evaluation), title=title, evaluation=evaluation)
+    step = -(-len(surface.points_in_world) // _MAX_POINTS) or 1
+    points = surface.points_in_world[::step]
+    normals, title = _towards_cameras(evaluation, step), "true surface by its distance from the cloud"
+    some = distances.of_surface[::step]
+    _write_views(folder / "completeness.png", (points, normals, some), title=title, evaluation=evaluation)
+    write_overview(folder / "errors.png", evaluation)
+
+
+def write_overview(path: Path, evaluation: CloudEvaluation) -> None:
+    """Write a PNG of the surface's distances from the cloud in each view, and of the cloud's distances from above.
+
+    Of many views, those are shown in which most of the surface was missed.
+    """
+    surface, distances, limits = evaluation.compared.surface, evaluation.distances, evaluation.limits
+    missed = surface.area * (distances.of_surface > limits[-1])
+    lost = np.bincount(surface.view_idx, missed, max(1, len(evaluation.compared.used)))
+    shown = set(np.argsort(-lost, kind="stable")[:_MAX_VIEWS].tolist())
+    parts = [_legend(evaluation)]
+    for idx, (name, view) in enumerate(evaluation.compared.used.items()):
+        if idx not in shown:
+            continue
+        own = surface.view_idx == idx
+        panorama = np.full(view.range.shape, np.nan, np.float32)
+        panorama.reshape(-1)[surface.pixel_idx[own]] = distances.of_surface[own]
+        rows = np.unique(np.nonzero(~np.isnan(panorama))[0])
+        step = int(np.diff(rows).min()) if len(rows) > 1 else 1  # between rows with samples
+        colors = distance_colors(panorama[step // 2 :: step, step // 2 :: step], limits)
+        size = WIDTH, round(WIDTH * colors.shape[0] / colors.shape[1])
+        parts += [
+            strip(_LINE, f"{name}: true surface, by its distance from the cloud"),
+            np.asarray(cv2.resize(colors, size, interpolation=cv2.INTER_NEAREST), np.uint8),
+        ]
+    points, _, of_points = _some_points(evaluation)
+    parts += [strip(_LINE, "cloud from above, by its distance from the true surface")]
+    write_stack(path, [*parts, _top_view(points, of_points, evaluation)])
+
+
+def _write_views(path: Path, cloud: tuple[Points, Points, Points], *, title: str, evaluation: CloudEvaluation) -> None:
+    """Write a PNG of points coloured by their distances, seen from three places, with a legend.
+
+    Args:
+        path: the file to write.
+        cloud: points (N, 3) in the truth's frame, their normals (N, 3) towards the visible side, or 0, and their
+            distances (N,); points seen from behind are left out.
+        title: what is shown.
+        evaluation: whose limits and cameras are used.
+    """
+    points, normals, distances = cloud
+    parts = [_legend(evaluation)]
+    if len(points):
+        cameras, up = evaluation.compared.cameras, evaluation.compared.up
+        colors = distance_colors(distances, evaluation.limits)
+        for view in viewpoints(points, cameras, up, aspect=_SIZE_HW[1] / _SIZE_HW[0]):
+            parts.append(strip(_LINE, f"{title}, {view.title.lower()}"))
+            parts.append(draw_cloud(points, normals, colors, view, size_hw=_SIZE_HW))
+    write_stack(path, parts)
+
+
+def _some_points(evaluation: CloudEvaluation) -> tuple[Points, Points, Points]:
+    """Return positions and normals (0 if unknown) in the truth's frame, and distances, of at most `_MAX_POINTS`."""
+    step = -(-evaluation.cloud.count // _MAX_POINTS) or 1
+    return *evaluation.cloud.some(step), evaluation.distances.of_points[::step]
+
+
+def _towards_cameras(evaluation: CloudEvaluation, step: int) -> Points:
+    """Return unit vectors (N, 3) from samples of the surface to the cameras that saw them; 0 for a reference cloud."""
+    surface, used = evaluation.compared.surface, evaluation.compared.used
+    points = surface.points_in_world[::step]
+    if not used:
+        return np.zeros_like(points)
+    centers = np.array([view.cam_from_world.center for view in used.values()])
+    towards = centers[surface.view_idx[::step]] - points
+    return np.asarray(towards / np.linalg.norm(towards, axis=1, keepdims=True), np.float32)
+
+
+def _top_view(points: Points, distances: Points, evaluation: CloudEvaluation) -> Picture:
+    """Return the cloud from above without its outermost 1 %; of the points of a pixel, the worst is shown."""
+    flat = points[:, [0, 2]].astype(np.float64)
+    if not len(flat):
+        return strip(_LINE)
+    low, high = np.quantile(flat, [0.005, 0.995], axis=0)
+    scale = (WIDTH - 1) / max(float((high - low).max()), 1e-9)
+    size = np.ceil((high - low) * scale).astype(int) + 1
+    pixel = np.rint((flat - low) * scale).astype(int)
+    inside = ((pixel >= 0) & (pixel < size)).all(axis=1)
+    order = np.flatnonzero(inside)[np.argsort(distances[inside], kind="stable")]
+    view = strip(int(size[1]))
+    # z points ahead, which is upwards in the picture.
+    view[size[1] - 1 - pixel[order, 1], pixel[order, 0]] = distance_colors(distances[order], evaluation.limits)
+    return view
+
+
+def _legend(evaluation: CloudEvaluation) -> Picture:
+    """Return a strip (28, 1024, 3) RGB with the colours of `distance_colors` and the distances that they stand for."""
+    legend = strip(_LINE)
+    limits = evaluation.limits
+    entries = [(limit, f"up to {limit:g}") for limit in limits] + [(np.inf, "farther"), (np.nan, "not counted")]
+    for idx, (distance, text) in enumerate(entries):
+        left = 8 + idx * (WIDTH - 8) // len(entries)
+        legend[6 : _LINE - 6, left : left + 20] = distance_colors(np.array([distance], np.float32), limits)[0]
+        put_text(legend, text, (left + 26, _LINE - 9))
+    return legend

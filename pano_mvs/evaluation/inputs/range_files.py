@@ -1,0 +1,199 @@
+"""Range maps in files of any program: folders of TIFF, EXR, PNG, NPY and NPZ files, or one NPZ file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.core.paths import below, is_file, is_folder
+from pano_mvs.evaluation.inputs.names import RANGE_SUFFIXES
+from pano_mvs.io.images.exr import read_exr
+from pano_mvs.io.ranges.files import read_confidence_png
+from pano_mvs.io.ranges.npy import keys_of_npz, read_npy, read_npz
+from pano_mvs.scene import RangeMap
+from pano_mvs.scene.image_files.decoding import decode_picture
+
+# Channels of an EXR file that may hold the ranges, most likely first.
+_EXR_CHANNELS = ("range", "depth", "distance", "Z", "Depth.Z", "V", "Y", "R")
+
+
+@dataclass(frozen=True)
+class RangeFile:
+    """The range map of one image in a file.
+
+    Attributes:
+        path: the file.
+        key: name of the array in an NPZ file; "" for the only array, or the one named range or depth.
+        unit: factor from the file's numbers to the unit that `read` returns.
+        confidence_path: an 8-bit PNG with the confidence, or None.
+        what: the map's name in error messages; by default the key.
+    """
+
+    path: Path
+    key: str = ""
+    unit: float = 1.0
+    confidence_path: Path | None = None
+    what: str = ""
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    def read(self) -> NDArray[np.float32]:
+        """Return the range map (H, W) float32; zero, negative and infinite ranges become NaN.
+
+        Raises:
+            InputError: if the file cannot be read or holds no range map.
+        """
+        array = self._array()
+        if array.ndim == 3 and array.shape[-1] == 1:
+            array = array[..., 0]
+        if array.ndim != 2 or not array.size or array.dtype.kind not in "fiu" or array.dtype.itemsize < 2:
+            name = f"{self.path}: {self.key}" if self.key else f"{self.path}:"
+            raise InputError(
+                f"{name} holds {array.shape} {array.dtype}, not a map of ranges (height, width) in floats or 16-bit "
+                "steps. Write ranges as float TIFF, EXR or NPY, or as 16-bit PNG with --unit"
+            )
+        return _positive_or_nan(array, self.unit)
+
+    def read_confidence(self) -> NDArray[np.uint8] | None:
+        """Return the confidence (H, W) uint8, or None if there is none.
+
+        Raises:
+            InputError: if the file cannot be read.
+        """
+        return None if self.confidence_path is None else read_confidence_png(self.confidence_path)
+
+    def _array(self) -> NDArray[Any]:
+        suffix = self.path.suffix.lower()
+        if suffix == ".npy":
+            return read_npy(self.path)
+        if suffix == ".npz":
+            return read_npz(self.path, self.key or _only_key(self.path), what=self.what)
+        if suffix == ".exr":
+            channels = read_exr(self.path)
+            name = next((name for name in (*_EXR_CHANNELS, *channels) if name in channels), None)
+            if name is None:
+                raise InputError(f"{self.path}: an EXR file without channels. Write it again")
+            return channels[name]
+        return _read_image(self.path)
+
+
+@dataclass(frozen=True, eq=False)
+class RangeArray:
+    """A range map in memory, with the methods of a `RangeFile`.
+
+    Attributes:
+        name: the image's name.
+        array: (H, W) ranges.
+        unit: factor to the unit that `read` returns.
+        confidence: (H, W) uint8, or None.
+    """
+
+    name: str
+    array: NDArray[np.floating]
+    unit: float = 1.0
+    confidence: NDArray[np.uint8] | None = None
+
+    def __str__(self) -> str:
+        return f"the array {self.name}"
+
+    def read(self) -> NDArray[np.float32]:
+        """Return the range map (H, W) float32; zero, negative and infinite ranges become NaN."""
+        if self.array.ndim != 2:
+            raise UsageError(f"{self} has the shape {self.array.shape}, expected (height, width)")
+        return _positive_or_nan(self.array, self.unit)
+
+    def read_confidence(self) -> NDArray[np.uint8] | None:
+        """Return the confidence (H, W) uint8, or None if there is none."""
+        return self.confidence
+
+
+RangeMaps = Path | Mapping[str, "RangeMap | NDArray[np.floating]"]
+"""Range maps as a path (see `find_ranges`) or in memory, by image name."""
+StoredRange = RangeFile | RangeArray
+
+
+def find_ranges(source: RangeMaps, *, unit: float = 1.0) -> dict[str, StoredRange]:
+    """Return the range maps of a folder or an NPZ file in order, by image name without extension.
+
+    A folder with a subfolder `range` counts as the output of a run, with its `confidence`. In any other folder, all
+    files below it with one of the `RANGE_SUFFIXES` are taken; a single `depth.npz` stands for its arrays.
+
+    Args:
+        source: a folder, an .npz file with one array per image, or arrays or `RangeMap` records by image name.
+        unit: factor from the stored numbers to the wanted unit.
+
+    Raises:
+        InputError: if there are no range maps, or an archive is damaged.
+    """
+    if isinstance(source, Mapping):
+        return {name: _in_memory(name, given, unit) for name, given in source.items()}
+    if is_file(source) and source.suffix.lower() == ".npz":
+        return _in_archive(source, unit)
+    if not is_folder(source):
+        raise InputError(
+            f"{source}: no such folder or .npz file. Give the output folder of a run, or a folder of range maps"
+        )
+    folder = source / "range" if is_folder(source / "range") else source
+    files = [file for file in below(folder) if file.suffix.lower() in RANGE_SUFFIXES and not file.name.startswith(".")]
+    archives = [file for file in files if file.suffix == ".npz"]
+    if [file.name for file in archives] == ["depth.npz"]:
+        return _in_archive(archives[0], unit)
+    found: dict[str, StoredRange] = {}
+    for file in sorted(files, key=lambda file: (RANGE_SUFFIXES.index(file.suffix.lower()), file)):
+        name = file.relative_to(folder).with_suffix("").as_posix()
+        confidence = source / "confidence" / f"{name}.png"
+        of_run = folder != source and is_file(confidence)
+        found.setdefault(name, RangeFile(file, unit=unit, confidence_path=confidence if of_run else None))
+    if not found:
+        raise InputError(f"{folder}: no range maps here. They may be {', '.join(RANGE_SUFFIXES)}")
+    return dict(sorted(found.items()))
+
+
+def _in_memory(name: str, given: RangeMap | NDArray[np.floating], unit: float) -> RangeArray:
+    if isinstance(given, RangeMap):
+        return RangeArray(name, given.range, unit, given.confidence)
+    return RangeArray(name, given, unit)
+
+
+def _in_archive(path: Path, unit: float) -> dict[str, StoredRange]:
+    keys = keys_of_npz(path)
+    if not keys:
+        raise InputError(f"{path}: holds no arrays. Give a file with one range map per image")
+    return {key: RangeFile(path, key, unit) for key in keys}
+
+
+def _only_key(path: Path) -> str:
+    """Return the name of an archive's only array, or of the one that is named range or depth."""
+    inside = list(_in_archive(path, 1.0))
+    key = next((name for name in ("range", "depth") if name in inside), inside[0])
+    if len(inside) > 1 and key not in ("range", "depth"):
+        raise InputError(
+            f"{path}: holds {len(inside)} arrays ({', '.join(inside[:3])} …), none of them named 'range'. Rename one, "
+            "or give this file itself instead of its folder"
+        )
+    return key
+
+
+def _read_image(path: Path) -> NDArray[Any]:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
+    array = decode_picture(data, path, cv2.IMREAD_UNCHANGED)
+    if array is None:
+        raise InputError(f"{path}: not an image that can be decoded ({len(data)} bytes). Write it again")
+    return np.asarray(array)
+
+
+def _positive_or_nan(array: NDArray[Any], unit: float) -> NDArray[np.float32]:
+    with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold becomes infinite, and so NaN
+        ranges = array.astype(np.float32) * np.float32(unit)
+    return np.where(np.isfinite(ranges) & (ranges > 0), ranges, np.float32(np.nan))

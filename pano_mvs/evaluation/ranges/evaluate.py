@@ -1,0 +1,174 @@
+"""Comparison of range maps with true ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.evaluation.inputs.cameras import Cameras
+from pano_mvs.evaluation.inputs.range_files import RangeMaps
+from pano_mvs.evaluation.inputs.sources import as_path, source_name
+from pano_mvs.evaluation.ranges.pairs import RangePairs, ViewMaps, ViewMasks, pair_ranges
+from pano_mvs.evaluation.ranges.scale import FoundScale, find_scale
+from pano_mvs.evaluation.ranges.view_scores import BASELINES, ScoreSettings, ViewScores, mean_scores, score_view
+from pano_mvs.evaluation.tables import finite_values
+
+Sizes = tuple[tuple[int, int], tuple[int, int]]
+
+
+@dataclass(frozen=True)
+class DepthEvaluation:
+    """Scores of range maps.
+
+    Attributes:
+        source: name of the estimates' source.
+        truth: name of the truth's source.
+        settings: how the range maps were scored.
+        scale: factor from the estimates' unit to the truth's, before any fit.
+        views: scores by image name.
+        pairs: the range maps that were compared.
+        sizes: number of views by (height, width) of the estimate and of the truth.
+    """
+
+    source: str
+    truth: str
+    settings: ScoreSettings
+    scale: FoundScale
+    views: Mapping[str, ViewScores]
+    pairs: RangePairs
+    sizes: Mapping[Sizes, int]
+
+    @cached_property
+    def mean(self) -> Mapping[str, float]:
+        """The mean of each score over the views."""
+        return mean_scores([view.scores for view in self.views.values()])
+
+    @cached_property
+    def mean_constants(self) -> Mapping[str, Mapping[str, float]]:
+        """The mean of each score of the constants over the views, by the name of the baseline."""
+        return {name: mean_scores([view.constants[name] for view in self.views.values()]) for name in BASELINES}
+
+    @property
+    def without_mask(self) -> tuple[str, ...]:
+        """The views without a mask in the folder of masks."""
+        return self.pairs.masks.missing(list(self.views))
+
+    def read_maps(self, name: str) -> ViewMaps:
+        """Return the maps of a scored view: confident estimates alone, with the scale and the fit applied.
+
+        Raises:
+            InputError: if a file can no longer be read.
+        """
+        maps = self.pairs.read(name)
+        estimated: NDArray[np.float32] = maps.estimated
+        if self.settings.min_confidence and maps.confidence is not None:
+            estimated = np.where(maps.confidence >= self.settings.min_confidence, estimated, np.float32(np.nan))
+        return replace(maps, estimated=(estimated * self.views[name].scale).astype(np.float32))
+
+    def to_json(self) -> dict[str, object]:
+        """Return all figures as JSON values; None stands for what is no finite number (the PSNR of no error)."""
+        return {
+            "source": self.source,
+            "truth": self.truth,
+            "peak": self.settings.peak,
+            "align": self.settings.align,
+            "min_confidence": self.settings.min_confidence,
+            "scale": self.scale.value,
+            "scale_reason": self.scale.reason,
+            "mean": finite_values(self.mean),
+            "mean_constant": {name: finite_values(values) for name, values in self.mean_constants.items()},
+            "views": {
+                name: {
+                    "pixels": view.pixels,
+                    "scale": view.scale,
+                    "scores": finite_values(view.scores),
+                    "constant": {baseline: finite_values(found) for baseline, found in view.constants.items()},
+                }
+                for name, view in self.views.items()
+            },
+            "without_truth": list(self.pairs.without_truth),
+            "without_estimate": list(self.pairs.without_estimate),
+            "without_mask": list(self.without_mask),
+        }
+
+
+def evaluate_depth(
+    estimates: RangeMaps | str,
+    truth: RangeMaps | str,
+    *,
+    settings: ScoreSettings | None = None,
+    unit: float = 1.0,
+    truth_unit: float = 1.0,
+    scale: float | Literal["auto"] = "auto",
+    poses: Cameras | str | None = None,
+    true_poses: Cameras | str | None = None,
+    masks: Path | str | None = None,
+    mask: Path | str | None = None,
+) -> DepthEvaluation:
+    """Compare range maps with the truth.
+
+    Args:
+        estimates: the output folder of a run, a folder of range maps, an .npz file, or arrays by image name.
+        truth: a folder with poses.json and depth.npz, or any of the forms of `estimates`.
+        settings: how to score; by default those of `ScoreSettings`.
+        unit: factor from the estimates' numbers to their unit of length, such as 0.001 for millimetres.
+        truth_unit: factor from the truth's numbers to their unit of length.
+        scale: factor from the estimates' unit to the truth's; "auto" derives it from the camera centres if both sides
+            have poses, else it is 1.
+        poses: the estimated poses, if they are not in the folder of the estimates.
+        true_poses: the true poses, if they are not in the folder of the truth.
+        masks: a folder with one mask per image; pixels where it is 0 are ignored.
+        mask: one mask for all images.
+
+    Raises:
+        InputError: if a file is missing or damaged, or the two do not belong together.
+        UsageError: if a setting is invalid.
+
+    Example:
+        >>> import numpy as np
+        >>> truth = {"a": np.full((4, 8), 2.0), "b": np.full((4, 8), 4.0)}
+        >>> evaluation = evaluate_depth({"a.png": np.full((4, 8), 2.2)}, truth)
+        >>> round(evaluation.mean["mae"], 4), evaluation.pairs.without_estimate
+        (0.2, ('b',))
+    """
+    settings = settings or ScoreSettings()
+    source: RangeMaps = as_path(estimates)
+    target: RangeMaps = as_path(truth)
+    for what, value in (("unit", unit), ("truth unit", truth_unit)):
+        if not 0 < value < float("inf"):
+            raise UsageError(f"the {what} must be a positive number, got {value}")
+    view_masks = ViewMasks(as_path(masks), as_path(mask))
+    pairs = pair_ranges(source, target, unit=unit, truth_unit=truth_unit, masks=view_masks)
+    found_scale = find_scale(source, target, scale=scale, poses=as_path(poses), true_poses=as_path(true_poses))
+    views: dict[str, ViewScores] = {}
+    sizes: dict[Sizes, int] = {}
+    for name, factor in found_scale.of_views(pairs.truths).items():
+        maps = pairs.read(name)
+        if settings.min_confidence and maps.confidence is None:
+            raise InputError(
+                f"{pairs.estimates[name]}: no confidence/{name}.png beside it, so --min-confidence cannot be applied. "
+                "Omit it, or give the output folder of a run"
+            )
+        views[name] = score_view(
+            maps.estimated,
+            maps.truth,
+            confidence=maps.confidence,
+            scale=factor,
+            mask=maps.counted,
+            settings=settings,
+        )
+        size = maps.size_hw, (maps.truth.shape[0], maps.truth.shape[1])
+        sizes[size] = sizes.get(size, 0) + 1
+    if not any(view.pixels for view in views.values()):
+        raise InputError(
+            f"{source_name(target)}: no pixel of any view has a true range that counts. Check its files and the masks: "
+            "zero, negative, infinite and NaN are no range"
+        )
+    return DepthEvaluation(source_name(source), source_name(target), settings, found_scale, views, pairs, sizes)

@@ -1,0 +1,163 @@
+"""Estimated and true range maps of the same images, at the size and in the unit of the truth."""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.core.paths import children, is_file, is_folder
+from pano_mvs.evaluation.inputs.names import match_images, shortened_list, without_extension
+from pano_mvs.evaluation.inputs.range_files import RangeMaps, StoredRange, find_ranges
+from pano_mvs.evaluation.inputs.sources import source_name
+from pano_mvs.evaluation.inputs.truth import find_true_ranges
+from pano_mvs.evaluation.ranges.resize import resized_labels, resized_range
+from pano_mvs.scene.masking import decode_mask, placed_mask
+
+
+@dataclass(frozen=True, eq=False)
+class ViewMaps:
+    """The maps of one view, all of the truth's size.
+
+    Attributes:
+        estimated: (H, W) float32 in scene units, NaN where there is no estimate.
+        truth: (H, W) float32 true range, NaN where unknown.
+        confidence: (H, W) uint8, or None.
+        counted: (H, W), False excludes a pixel; None counts all.
+        size_hw: (height, width) of the estimate before resampling.
+    """
+
+    estimated: NDArray[np.float32]
+    truth: NDArray[np.float32]
+    confidence: NDArray[np.uint8] | None
+    counted: NDArray[np.bool_] | None
+    size_hw: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class ViewMasks:
+    """Masks that exclude pixels (where they are 0) from the scores.
+
+    Attributes:
+        folder: a folder with a mask per image, `<image name>.png` or `<name without extension>.png`, or None.
+        common: one mask for all images, or None.
+    """
+
+    folder: Path | None = None
+    common: Path | None = None
+
+    def require_some(self, names: Sequence[str]) -> None:
+        """Raise InputError unless the folder holds a mask of one of the views."""
+        if self.folder is None:
+            return
+        if not is_folder(self.folder):
+            raise InputError(f"{self.folder}: masks must be a folder. Give one mask for all images as --mask")
+        if len(self.missing(names)) == len(names):
+            raise InputError(
+                f"{self.folder}: no mask in it belongs to a view. The mask of {names[0]} must be named like the image "
+                f"with .png appended, or {without_extension(names[0])}.png"
+            )
+
+    def missing(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Return the views without a mask in the folder; none without a folder."""
+        return () if self.folder is None else tuple(name for name in names if _mask_of(self.folder, name) is None)
+
+    def read(self, name: str, size_hw: tuple[int, int]) -> NDArray[np.bool_] | None:
+        """Return the pixels (H, W) of a view that count, None for all.
+
+        Raises:
+            InputError: if a mask cannot be read.
+        """
+        own = None if self.folder is None else _mask_of(self.folder, name)
+        sphere = (0, 0, size_hw[1], size_hw[0])
+        counted = [
+            placed_mask(decode_mask(path), size_hw, of=sphere, whole_hw=size_hw)
+            for path in (self.common, own)
+            if path is not None
+        ]
+        return np.asarray(np.logical_and.reduce(counted)) if counted else None
+
+
+@dataclass(frozen=True)
+class RangePairs:
+    """Range maps and their ground truth.
+
+    Attributes:
+        estimates: the estimates with ground truth, by image name.
+        truths: their true range maps.
+        true_names: the truth's names of the images.
+        masks: which pixels count.
+        truth_path: folder or file with the truth, or None.
+        without_truth: names of the estimates without truth.
+        without_estimate: the truth's names of images without an estimate.
+    """
+
+    estimates: Mapping[str, StoredRange]
+    truths: Mapping[str, StoredRange]
+    true_names: Mapping[str, str]
+    masks: ViewMasks
+    truth_path: Path | None = None
+    without_truth: tuple[str, ...] = ()
+    without_estimate: tuple[str, ...] = ()
+
+    def read(self, name: str) -> ViewMaps:
+        """Return the maps of one view at the truth's size.
+
+        Raises:
+            InputError: if a file cannot be read, or the maps are not of one aspect ratio.
+        """
+        file, true_file = self.estimates[name], self.truths[name]
+        truth, found, confidence = true_file.read(), file.read(), file.read_confidence()
+        size_hw = truth.shape[0], truth.shape[1]
+        try:
+            estimated = resized_range(found, size_hw)
+            confidence = None if confidence is None else resized_labels(confidence, size_hw)
+            counted = self.masks.read(name, size_hw)
+        except UsageError as error:
+            raise InputError(f"{file} against {true_file}: {error}") from error
+        return ViewMaps(estimated, truth, confidence, counted, (found.shape[0], found.shape[1]))
+
+
+def pair_ranges(source: RangeMaps, truth: RangeMaps, *, unit: float, truth_unit: float, masks: ViewMasks) -> RangePairs:
+    """Return estimated and true range maps, paired by image name.
+
+    Raises:
+        InputError: if either side has no range maps, they have no image in common, or no mask is of any of them.
+    """
+    estimates, truths = find_ranges(source, unit=unit), find_true_ranges(truth, unit=truth_unit)
+    matched = match_images(estimates, truths)
+    if not matched:
+        raise InputError(
+            f"{source_name(source)} and {source_name(truth)} have no image in common: the one has "
+            f"{shortened_list(estimates)}, the other {shortened_list(truths)}. Range maps are paired by their paths "
+            "without extension"
+        )
+    names = {name: matched[name] for name in estimates if name in matched}
+    masks.require_some(list(names))
+    return RangePairs(
+        {name: estimates[name] for name in names},
+        {name: truths[other] for name, other in names.items()},
+        names,
+        masks,
+        truth if isinstance(truth, Path) else None,
+        tuple(name for name in estimates if name not in names),
+        tuple(name for name in truths if name not in set(names.values())),
+    )
+
+
+def _mask_of(folder: Path, name: str) -> Path | None:
+    """Return the mask of an image: one named like the image with .png appended before one without its extension."""
+    plain = without_extension(name)
+    own = [folder / f"{name}.png"] if name != plain else []
+    stem = PurePosixPath(plain).name
+    beside = [
+        path
+        for path in children((folder / plain).parent, f"{glob.escape(stem)}.*.png")
+        if without_extension(path.stem) == stem
+    ]
+    return next((path for path in (*own, *beside, folder / f"{plain}.png") if is_file(path)), None)

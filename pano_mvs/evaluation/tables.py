@@ -1,0 +1,43 @@
+"""Results as text for people: lines and tables, independent of how they are displayed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """A table of text cells.
+
+    Attributes:
+        headings: one per column.
+        rows: the cells of each row.
+        baselines: a second line of each row, such as the scores of a constant; empty without.
+    """
+
+    headings: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    baselines: tuple[tuple[str, ...], ...] = ()
+
+    def __str__(self) -> str:
+        lines = [self.headings]
+        for idx, row in enumerate(self.rows):
+            lines += [row, *self.baselines[idx : idx + 1]]
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        return "\n".join("  ".join(map(str.ljust, line, widths)).rstrip() for line in lines)
+
+
+Summary = tuple[str | TextTable, ...]
+"""Lines of text and tables, in the order in which they are displayed."""
+
+
+def finite_or_none(value: float) -> float | None:
+    """Return a number for JSON, which has no NaN and no infinity."""
+    return float(value) if math.isfinite(value) else None
+
+
+def finite_values(values: Mapping[str, float]) -> dict[str, float | None]:
+    """Return named numbers for JSON, None for NaN and infinity."""
+    return {name: finite_or_none(value) for name, value in values.items()}

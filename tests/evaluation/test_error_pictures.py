@@ -1,0 +1,91 @@
+"""Pictures and clouds of errors: what colour says what."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pano_mvs.core.errors import UsageError
+from pano_mvs.evaluation.clouds.error_clouds import distance_colors, write_error_cloud
+from pano_mvs.evaluation.ranges.error_picture import error_colored, signed_error, write_error_picture
+from pano_mvs.io.clouds.ply_points import open_ply_points
+from tests.stored import read_picture
+
+GREY, BLACK = (128, 128, 128), (25, 25, 25)
+
+
+def test_hue_tells_the_sign_and_lightness_the_size() -> None:
+    errors = np.array([-1.0, -0.1, -0.05, 0.0, 0.05, 0.1, 1.0])
+    colors = error_colored(errors, 0.1).astype(int)
+    np.testing.assert_array_equal(colors[0], colors[1])
+    np.testing.assert_array_equal(colors[5], colors[6])
+    assert (colors[:3, 2] > colors[:3, 0]).all()  # too near: blue
+    assert (colors[4:, 0] > colors[4:, 2]).all()  # too far: red
+    lightness = colors.sum(axis=1)
+    assert (np.diff(lightness[1:4]) > 0).all()
+    assert (np.diff(lightness[3:6]) < 0).all()
+
+
+def test_missing_is_black_and_what_does_not_count_is_grey() -> None:
+    truth = np.array([[2.0, 2.0, np.nan]])
+    error = signed_error(np.array([[2.2, np.nan, 1.0]]), truth)
+    np.testing.assert_allclose(error, [[0.1, np.nan, np.nan]])
+    colors = error_colored(error, 0.1, counted=np.isfinite(truth))
+    assert [tuple(color) for color in colors[0, 1:]] == [BLACK, GREY]
+
+
+@pytest.mark.parametrize("size", [(8, 16), (512, 1024), (600, 1200)])
+def test_the_picture_holds_four_panels_of_any_size_with_the_seam_and_the_poles(
+    tmp_path: Path, size: tuple[int, int]
+) -> None:
+    truth = np.full(size, 2.0, np.float32)
+    estimated = truth.copy()
+    estimated[:, : size[1] // 2] *= 1.5
+    estimated[-size[0] // 4 :] = np.nan
+    image = np.full((10, 20, 3), (200, 30, 30), np.uint8)
+    path = tmp_path / "new" / "a.jpg"
+    write_error_picture(path, estimated, truth, image=image)
+    picture = cv2.cvtColor(read_picture(path), cv2.COLOR_BGR2RGB).astype(int)
+    assert picture.shape == (2 * (34 + 512 + 60), 2 * 1024 + 8, 3)
+    panels = picture[34 : 34 + 512, :1024], picture[34 : 34 + 512, 1032:]
+    assert np.abs(panels[0] - (200, 30, 30)).max() < 12
+    corners = {
+        place: panels[1][row, column] for place, row, column in (("far", 3, 3), ("right", 3, -3), ("none", -3, 3))
+    }
+    assert np.abs(corners["far"] - (116, 18, 18)).max() < 20
+    assert np.abs(corners["right"] - (245, 245, 242)).max() < 20
+    assert np.abs(corners["none"] - BLACK).max() < 20
+
+
+def test_a_picture_without_panorama_or_truth_is_made_too(tmp_path: Path) -> None:
+    nothing = np.full((8, 16), np.nan, np.float32)
+    write_error_picture(tmp_path / "a.jpg", nothing, nothing, counted=np.zeros((8, 16), bool))
+    picture = read_picture(tmp_path / "a.jpg")
+    assert tuple(picture[200, 1500]) == GREY
+
+
+def test_a_cloud_carries_its_errors_as_numbers_and_as_colours(tmp_path: Path) -> None:
+    points = np.random.default_rng(0).normal(size=(9, 3)).astype(np.float32)
+    distances = np.array([0.01, 0.03, 0.2, np.inf, 0.01, 0.02, 0.05, 0.06, 0], np.float32)
+    path = tmp_path / "new" / "a.ply"
+    write_error_cloud(path, (points[i : i + 4] for i in (0, 4, 8)), distances, limits=(0.02, 0.05), farthest=1.0)
+    read = open_ply_points(path)
+    np.testing.assert_array_equal(np.concatenate(list(read.chunks(2))), points)
+    np.testing.assert_array_equal(read.vertices["distance"], np.minimum(distances, 1))
+    colors = np.stack([read.vertices[name] for name in ("red", "green", "blue")], axis=-1)
+    np.testing.assert_array_equal(colors, distance_colors(distances, (0.02, 0.05)))
+    with pytest.raises(UsageError, match="9 points, but 8 distances"):
+        write_error_cloud(path, [points], distances[:8], limits=(0.02,), farthest=1.0)
+
+
+def test_pyvista_reads_the_scalar(tmp_path: Path) -> None:
+    import pyvista
+
+    points = np.eye(3, dtype=np.float32)
+    write_error_cloud(tmp_path / "a.ply", [points], np.array([0, 0.5, 2], np.float32), limits=(1,), farthest=1.5)
+    mesh = pyvista.read(tmp_path / "a.ply")
+    np.testing.assert_array_equal(mesh.points, points)
+    assert mesh.n_points == 3
