@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.numba.aggregation import keep_band, volume_parts, winners_by_paths
+from pano_mvs.algorithms.sweep.backends.compiled_aggregation import keep_band, volume_parts, winners_by_paths
 from pano_mvs.algorithms.sweep.numba.arguments import BAND_ROWS, fresh_state, sweep_arguments
 from pano_mvs.algorithms.sweep.numba.kernels_band import sweep_band
 from pano_mvs.algorithms.sweep.numba.kernels_records import Sweep

@@ -58,7 +58,9 @@ def find_winners(work: SweepInput) -> Winners:
             winner.add(combined)
     if not with_volume:
         return winner.result()
-    from pano_mvs.algorithms.sweep.numba.aggregation import winners_by_paths  # on use: numba is slow to import
+    from pano_mvs.algorithms.sweep.backends.compiled_aggregation import (
+        winners_by_paths,  # on use: numba is slow to import
+    )
 
     return winners_by_paths(work, volume)
 

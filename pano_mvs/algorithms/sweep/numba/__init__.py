@@ -1,1 +1,1 @@
-"""The compiled sweep: kernels, their arguments, threads. All but `kernels_constants` import numba, so import on use."""
+"""The compiled sweep: kernels, their arguments, tiles, threads; `kernels_constants` alone does not import numba."""
