@@ -51,7 +51,7 @@ def write_curve_picture(path: Path, inspection: Inspection) -> None:
 
 
 class _Panel:
-    """One plot of costs over the virtual ranges, evenly apart."""
+    """One plot of costs over the depth hypotheses, at equal distances."""
 
     def __init__(self, board: DrawingBoard, inspection: Inspection, upper: float, costs: NDArray[np.float64]) -> None:
         self.board, self.inspection = board, inspection
@@ -137,7 +137,7 @@ def _write_title(board: DrawingBoard, found: Inspection) -> None:
 
 
 def _write_legend(board: DrawingBoard, found: Inspection, y: float) -> None:
-    board.write("virtual range, scene units", ((_LEFT + _RIGHT) / 2, y - 26), Letters(color=_FAINT, align=0.5))
+    board.write("depth hypothesis, scene units", ((_LEFT + _RIGHT) / 2, y - 26), Letters(color=_FAINT, align=0.5))
     by_paths = found.curve.aggregated is not None
     entries = [
         (source.name.rsplit("/", 1)[-1], _SOURCES[idx % len(_SOURCES)], 1) for idx, source in enumerate(found.sources)
