@@ -46,6 +46,7 @@ def _chosen(tree: Path, group: Group, arguments: argparse.Namespace) -> list[Mut
     """Return the faults with the smallest ids, which are digests, so that other faults do not change the sample."""
     paths = [path for one in group.sources for path in sorted(tree.glob(one)) if path.name != "__init__.py"]
     mutants = [one for path in paths for one in mutants_of(path.relative_to(tree).as_posix(), path.read_text("utf-8"))]
+    mutants = [one for one in mutants if not group.within or one.where.partition(".")[0] == group.within]
     if arguments.ids:
         return [one for one in mutants if one.id in arguments.ids]
     first, number = arguments.skip, arguments.sample or len(mutants)

@@ -12,7 +12,7 @@ EQUIVALENT = {
     # wiring
     "262a5645": "wiring_problems: the name of the workflow is not read",
     "699b16f0": "_Wirer.connect: of several names that are close only the first is shown",
-    # run
+    # run_pass
     "46a1225a": "RunPass._publish: nobody reads the status of a unit whose files cannot be delivered",
     "45236129": "RunPass._publish: the damaged blob is gone, so that its record is not found either",
     "ecfbff9e": "RunPass._dispatch: nobody reads the status of a unit that is refused",

@@ -10,10 +10,12 @@ class Group:
     Attributes:
         sources: glob patterns of the modules, from the root of the repository.
         tests: paths that pytest runs.
+        within: the class or function that is mutated; empty for whole modules.
     """
 
     sources: tuple[str, ...]
     tests: tuple[str, ...]
+    within: str = ""
 
 
 def _engine(*names: str) -> tuple[str, ...]:
@@ -50,7 +52,7 @@ GROUPS = {
     "wiring": Group(
         ("pano_mvs/engine/workflows/wiring.py",), _engine("workflows/wiring", "workflows/workflow", "running/run")
     ),
-    "run": Group(
+    "run_pass": Group(
         ("pano_mvs/engine/running/run.py",),
         _engine(
             "running/run_pass",
@@ -60,6 +62,7 @@ GROUPS = {
             "cache/hostile_store",
             "cache/stat_cache",
         ),
+        within="RunPass",
     ),
 }
 """`__init__.py` is left out: it says what is public, which a test of its own checks."""

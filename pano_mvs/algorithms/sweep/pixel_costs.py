@@ -9,8 +9,6 @@ from pano_mvs.algorithms.sweep.backends.numpy_backend import combined_cost
 from pano_mvs.algorithms.sweep.preparation import SweepInput, valid_where_seen
 from pano_mvs.geometry import pixel_from_ray, ray_from_pixel, sample_panorama
 
-_NO_VOLUME = np.empty((0, 0, 0), np.uint8)
-
 
 def costs_at(work: SweepInput, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float32]:
     """Return the mean costs of pixels before the decision, (D, N), combined from the sources, not scaled.
@@ -29,7 +27,7 @@ def costs_at(work: SweepInput, rows: NDArray[np.intp], columns: NDArray[np.intp]
 def _compiled_costs(work: SweepInput, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float32]:
     """Sweep the tiles in which the pixels lie, range by range: the winner's cost is then that of the range."""
     # On use: numba is slow to import.
-    from pano_mvs.algorithms.sweep.numba.arguments import fresh_state, sweep_arguments
+    from pano_mvs.algorithms.sweep.numba.arguments import NO_VOLUME, fresh_state, sweep_arguments
     from pano_mvs.algorithms.sweep.numba.kernels_band import sweep_band
     from pano_mvs.algorithms.sweep.numba.kernels_winner import BEST
     from pano_mvs.algorithms.sweep.numba.tiles import run_arguments, runs_of, tile_means
@@ -46,7 +44,7 @@ def _compiled_costs(work: SweepInput, rows: NDArray[np.intp], columns: NDArray[n
         arguments = run_arguments(sweep, run)
         for idx in range(len(work.ranges)):
             state, planes = fresh_state(run.rows, run.columns + 2 * run.margin)
-            sweep_band(run.first, arguments, work.ranges[idx : idx + 1], _NO_VOLUME, state, planes)
+            sweep_band(run.first, arguments, work.ranges[idx : idx + 1], NO_VOLUME, state, planes)
             costs[idx, own] = state[BEST][place]
     return costs
 

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.combination import parallax_weights
 from pano_mvs.algorithms.sweep.costs.census_gradient import census_weight
-from pano_mvs.algorithms.sweep.costs.registry import BUILTIN
-from pano_mvs.algorithms.sweep.numba.kernels_constants import (
+from pano_mvs.algorithms.sweep.costs.kernels_constants import (
     GREY_WEIGHT,
     MAX_COLOR_COST,
     MAX_GRADIENT_COST,
     ZNCC_NOISE_VARIANCE,
 )
+from pano_mvs.algorithms.sweep.costs.registry import BUILTIN
 from pano_mvs.algorithms.sweep.numba.kernels_gradient import census_gradient_row, sad_gradient_row
 from pano_mvs.algorithms.sweep.numba.kernels_zncc import zncc_rows
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range

@@ -12,15 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.backends.compiled_aggregation import keep_band, volume_parts, winners_by_paths
-from pano_mvs.algorithms.sweep.numba.arguments import BAND_ROWS, fresh_state, sweep_arguments
+from pano_mvs.algorithms.sweep.numba.arguments import BAND_ROWS, NO_VOLUME, fresh_state, sweep_arguments
 from pano_mvs.algorithms.sweep.numba.kernels_band import sweep_band
 from pano_mvs.algorithms.sweep.numba.kernels_records import Sweep
 from pano_mvs.algorithms.sweep.numba.threads import run_jobs, workers
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.winner import Winners
-
-NO_VOLUME = np.empty((0, 0, 0), np.uint8)
-"""Given to `sweep_band` where the winners are wanted at once."""
 
 
 def find_winners(work: SweepInput) -> Winners:
@@ -30,9 +27,9 @@ def find_winners(work: SweepInput) -> Winners:
     done in parts of the rows, see `volume_parts`.
     """
     if work.settings.levels > 1:
-        from pano_mvs.algorithms.sweep.coarse_to_fine import coarse_to_fine  # it calls this one at its coarsest level
+        from pano_mvs.algorithms.sweep.coarse_to_fine.coarse_to_fine import find_winners_coarse_to_fine
 
-        return coarse_to_fine.find_winners(work)
+        return find_winners_coarse_to_fine(work, find_coarsest=find_winners_plainly)
     return find_winners_plainly(work)
 
 

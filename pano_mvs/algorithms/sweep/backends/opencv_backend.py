@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.sweep.backends.numpy_backend import combine_costs, pixel_cost
 from pano_mvs.algorithms.sweep.backends.running_winner import RunningWinner
 from pano_mvs.algorithms.sweep.combination import source_weights
-from pano_mvs.algorithms.sweep.numba.kernels_constants import ZNCC_NOISE_VARIANCE
+from pano_mvs.algorithms.sweep.costs.kernels_constants import ZNCC_NOISE_VARIANCE
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.windows import CostWindow, WindowBands
 from pano_mvs.algorithms.sweep.winner import Winners

@@ -12,13 +12,13 @@ Memory: 42 bytes a pixel for costs and sums instead of 3 bytes for each pixel an
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.backends.numba_backend import find_winners_plainly
 from pano_mvs.algorithms.sweep.coarse_to_fine.guided import GuidedSweep
 from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guides import split_layers
 from pano_mvs.algorithms.sweep.exposure import shrink
@@ -35,15 +35,18 @@ _MAX_PENALTY = 4000
 _SPLIT_RADIUS, _SPLIT_GAP = 2, 6.0
 
 
-def find_winners(work: SweepInput) -> Winners:
-    """Return the winning candidate of every pixel and the costs around it, close to those of the plain sweep.
+def find_winners_coarse_to_fine(work: SweepInput, *, find_coarsest: Callable[[SweepInput], Winners]) -> Winners:
+    """Return the winning candidate of every pixel and the costs around it, close to those of the full sweep.
 
-    Pictures that cannot be halved (odd sides, fewer than 128 rows) are swept plainly.
+    Args:
+        work: what to sweep.
+        find_coarsest: sweeps all planes at the coarsest level, and images that cannot be halved (odd sides, fewer than
+            128 rows).
     """
     coarse = _coarse_input(work)
     if coarse is None:
-        return find_winners_plainly(work)
-    found = find_winners(coarse)
+        return find_coarsest(work)
+    found = find_winners_coarse_to_fine(coarse, find_coarsest=find_coarsest)
     guides = _guides(found, coarse, work)
     with workers() as pool:
         winners = GuidedSweep(work, guides, pool).find_winners()

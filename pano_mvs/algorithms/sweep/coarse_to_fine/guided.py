@@ -7,7 +7,6 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.backends.numba_backend import NO_VOLUME
 from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guided import sweep_guided_band
 from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guided_paths import (
     PER_PLANE,
@@ -18,7 +17,7 @@ from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guided_paths import (
 from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guides import adopt_candidates
 from pano_mvs.algorithms.sweep.hypotheses import range_at
 from pano_mvs.algorithms.sweep.no_match import is_bare
-from pano_mvs.algorithms.sweep.numba.arguments import BAND_ROWS, fresh_state, sweep_arguments
+from pano_mvs.algorithms.sweep.numba.arguments import BAND_ROWS, NO_VOLUME, fresh_state, sweep_arguments
 from pano_mvs.algorithms.sweep.numba.kernels_band import sweep_band
 from pano_mvs.algorithms.sweep.numba.kernels_records import Guide
 from pano_mvs.algorithms.sweep.numba.kernels_winner import BEST

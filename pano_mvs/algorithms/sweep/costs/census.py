@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.sweep.costs import kernels_constants
 from pano_mvs.algorithms.sweep.costs.cost import SweepCost
-from pano_mvs.algorithms.sweep.numba import kernels_constants
 from pano_mvs.algorithms.sweep.windows import CostWindow
 
 

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.sweep.costs import kernels_constants
 from pano_mvs.algorithms.sweep.costs.census import census_cost, max_census
 from pano_mvs.algorithms.sweep.costs.cost import SweepCost
+from pano_mvs.algorithms.sweep.costs.kernels_constants import GREY_WEIGHT, MAX_COLOR_COST, MAX_GRADIENT_COST
 from pano_mvs.algorithms.sweep.costs.sad_gradient import sad_gradient_cost
-from pano_mvs.algorithms.sweep.numba import kernels_constants
-from pano_mvs.algorithms.sweep.numba.kernels_constants import GREY_WEIGHT, MAX_COLOR_COST, MAX_GRADIENT_COST
 from pano_mvs.algorithms.sweep.windows import CostWindow
 
 _CENSUS_SHARE = 4

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.sweep.costs import kernels_constants
 from pano_mvs.algorithms.sweep.costs.cost import SweepCost
-from pano_mvs.algorithms.sweep.numba import kernels_constants
 from pano_mvs.algorithms.sweep.windows import CostWindow
 
 # In grey levels, summed over R, G and B: a pixel that differs by more is simply wrong.

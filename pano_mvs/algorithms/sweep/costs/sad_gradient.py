@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.sweep.costs import kernels_constants
 from pano_mvs.algorithms.sweep.costs.cost import SweepCost
+from pano_mvs.algorithms.sweep.costs.kernels_constants import MAX_COLOR_COST, MAX_GRADIENT_COST
 from pano_mvs.algorithms.sweep.costs.sad import absolute_differences
-from pano_mvs.algorithms.sweep.numba import kernels_constants
-from pano_mvs.algorithms.sweep.numba.kernels_constants import MAX_COLOR_COST, MAX_GRADIENT_COST
 from pano_mvs.algorithms.sweep.windows import CostWindow, neighbours
 
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.sweep.costs import kernels_constants
 from pano_mvs.algorithms.sweep.costs.cost import SweepCost
-from pano_mvs.algorithms.sweep.numba import kernels_constants
-from pano_mvs.algorithms.sweep.numba.kernels_constants import ZNCC_NOISE_VARIANCE
+from pano_mvs.algorithms.sweep.costs.kernels_constants import ZNCC_NOISE_VARIANCE
 from pano_mvs.algorithms.sweep.windows import CostWindow, box_mean
 
 

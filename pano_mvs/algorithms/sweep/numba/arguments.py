@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.combination import source_weights
 from pano_mvs.algorithms.sweep.costs.census_gradient import census_weight
-from pano_mvs.algorithms.sweep.numba.kernels_constants import CENSUS_GRADIENT
+from pano_mvs.algorithms.sweep.costs.kernels_constants import CENSUS_GRADIENT
 from pano_mvs.algorithms.sweep.numba.kernels_records import Combination, Sources, Sweep, Windows
 from pano_mvs.algorithms.sweep.numba.kernels_winner import STATES
 from pano_mvs.algorithms.sweep.numba.packing import pack_sources, pack_votes
@@ -19,6 +19,9 @@ from pano_mvs.geometry import pad_panorama
 
 BAND_ROWS = 32
 """The rows that `sweep_band` is given at a time."""
+
+NO_VOLUME = np.empty((0, 0, 0), np.uint8)
+"""Passed to `sweep_band` where the winners are wanted and the costs are not."""
 
 
 def sweep_arguments(work: SweepInput) -> Sweep:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from pano_mvs.algorithms.sweep.costs.kernels_constants import SAD
 from pano_mvs.algorithms.sweep.numba.kernels_combine import combine_row
-from pano_mvs.algorithms.sweep.numba.kernels_constants import SAD
 from pano_mvs.algorithms.sweep.numba.kernels_lookup import warp_band
 from pano_mvs.algorithms.sweep.numba.kernels_project import knot_rows
 from pano_mvs.algorithms.sweep.numba.kernels_records import F32, F64, I32, U8, Lookup, Sweep

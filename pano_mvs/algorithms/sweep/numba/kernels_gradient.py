@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from pano_mvs.algorithms.sweep.costs.kernels_constants import GREY_WEIGHT, MAX_COLOR_COST, MAX_GRADIENT_COST
 from pano_mvs.algorithms.sweep.numba.kernels_census import count_census_row
-from pano_mvs.algorithms.sweep.numba.kernels_constants import GREY_WEIGHT, MAX_COLOR_COST, MAX_GRADIENT_COST
 from pano_mvs.algorithms.sweep.numba.kernels_cost import difference_row
 from pano_mvs.algorithms.sweep.numba.kernels_records import I64, U8, U16
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from pano_mvs.algorithms.sweep.costs.kernels_constants import CENSUS, CENSUS_GRADIENT, SAD_GRADIENT, ZNCC
 from pano_mvs.algorithms.sweep.numba.kernels_census import count_census_row
-from pano_mvs.algorithms.sweep.numba.kernels_constants import CENSUS, CENSUS_GRADIENT, SAD_GRADIENT, ZNCC
 from pano_mvs.algorithms.sweep.numba.kernels_cost import box_rows, difference_row
 from pano_mvs.algorithms.sweep.numba.kernels_gradient import census_gradient_row, sad_gradient_row
 from pano_mvs.algorithms.sweep.numba.kernels_records import F32, I32, I64, U8, U16, Sweep

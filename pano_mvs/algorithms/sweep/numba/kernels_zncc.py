@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from pano_mvs.algorithms.sweep.numba.kernels_constants import ZNCC_NOISE_VARIANCE
+from pano_mvs.algorithms.sweep.costs.kernels_constants import ZNCC_NOISE_VARIANCE
 from pano_mvs.algorithms.sweep.numba.kernels_cost import box_rows
 from pano_mvs.algorithms.sweep.numba.kernels_records import F32, I32, I64, U8, U16
 
