@@ -48,7 +48,6 @@ def all_findings(cache: Path | None = None, out: Path | None = None) -> Iterator
         cache: folder of the cache; by default where a preset run from here would have it.
         out: folder of the results; likewise.
     """
-    import pano_mvs
     from pano_mvs.cli.doctor.disk import folder_findings
     from pano_mvs.cli.doctor.machine import kernel_cache_finding, machine_findings
     from pano_mvs.cli.doctor.packages import package_findings
@@ -61,7 +60,7 @@ def all_findings(cache: Path | None = None, out: Path | None = None) -> Iterator
     yield from package_findings()
     yield from library_findings()
     yield from machine_findings()
-    yield kernel_cache_finding(Path(pano_mvs.__file__).parent / "algorithms")
+    yield kernel_cache_finding()
     variable = os.environ.get(CACHE_VARIABLE)
     yield from folder_findings("cache", cache or Path(variable or ".pano-mvs"), "--cache DIR")
     yield from folder_findings("results", out or Path("out"), "--out DIR")

@@ -8,8 +8,8 @@ from difflib import get_close_matches
 from pathlib import Path
 
 from pano_mvs.cli.doctor.finding import Finding
+from pano_mvs.core.kernel_cache import PACKAGE, kernel_cache_folder
 from pano_mvs.core.kernel_cache import VARIABLE as KERNEL_VARIABLE
-from pano_mvs.core.kernel_cache import kernel_cache_folder
 from pano_mvs.core.memory import free_memory_bytes, size_text
 from pano_mvs.core.paths import below
 from pano_mvs.engine.executors.threads import available_threads
@@ -52,7 +52,7 @@ def machine_findings(
     yield from _variables(environment)
 
 
-def kernel_cache_finding(package: Path, environment: Mapping[str, str] = os.environ) -> Finding:
+def kernel_cache_finding(package: Path = PACKAGE, environment: Mapping[str, str] = os.environ) -> Finding:
     """Return whether compiled kernels can be kept; if not, every process compiles them anew."""
     chosen = environment.get(KERNEL_VARIABLE)
     try:
