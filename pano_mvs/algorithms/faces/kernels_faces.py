@@ -9,6 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.kernels_reprojection import sample_range
+from pano_mvs.geometry.kernels_sphere import pixel_from_ray
 
 FloatArray = NDArray[np.float64]
 
@@ -41,6 +42,5 @@ def z_depth_rows(
             ray_x = rotation[0, 0] * a + rotation[1, 0] * b + rotation[2, 0]
             ray_y = rotation[0, 1] * a + rotation[1, 1] * b + rotation[2, 1]
             ray_z = rotation[0, 2] * a + rotation[1, 2] * b + rotation[2, 2]
-            x = (math.atan2(ray_x, ray_z) / (2 * math.pi) + 0.5) * width
-            y = (0.5 - math.atan2(-ray_y, math.hypot(ray_x, ray_z)) / math.pi) * height
+            x, y = pixel_from_ray(ray_x, ray_y, ray_z, height, width)
             z_depth[row, column] = sample_range(ranges, x, y, max_step) / math.sqrt(1 + a * a + b * b)

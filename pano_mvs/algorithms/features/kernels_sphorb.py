@@ -8,6 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pano_mvs.geometry.kernels_sphere import bilinear
+
 FloatArray = NDArray[np.float64]
 
 ARC = 10  # of the 18 cells of the ring
@@ -231,10 +233,9 @@ def disc_is_clear(
 def sample_lattice(picture: NDArray[np.uint8], u: float, v: float) -> float:
     """Return the bilinear value of a picture (side, side) at column u and row v."""
     column, row = math.floor(u), math.floor(v)
-    right, down = u - column, v - row
-    upper = picture[row, column] * (1 - right) + picture[row, column + 1] * right
-    lower = picture[row + 1, column] * (1 - right) + picture[row + 1, column + 1] * right
-    value: float = upper * (1 - down) + lower * down
+    upper_left, upper_right = picture[row, column], picture[row, column + 1]
+    lower_left, lower_right = picture[row + 1, column], picture[row + 1, column + 1]
+    value: float = bilinear(upper_left, upper_right, lower_left, lower_right, u - column, v - row)
     return value
 
 

@@ -8,6 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pano_mvs.geometry.kernels_sphere import wrapped_column
+
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _root(parents: NDArray[np.int64], index: int) -> int:
@@ -40,16 +42,16 @@ def label_surfaces(ranges: NDArray[np.float32], max_step: float) -> NDArray[np.i
     for row in range(height):
         for column in range(width):
             here = row * width + column
-            right = row * width + (column + 1) % width
+            right = row * width + wrapped_column(row, column + 1, height, width)
             below = here + width
             if row == height - 1:
-                below = row * width + (column + width // 2) % width
+                below = row * width + wrapped_column(height, column, height, width)
             for other in (right, below):
                 a, b = flat[here], flat[other]
                 if math.isfinite(a) and math.isfinite(b) and max(a, b) <= min(a, b) * (1 + max_step):
                     _join(parents, here, other)
             if row == 0:
-                other = (column + width // 2) % width
+                other = wrapped_column(-1, column, height, width)
                 a, b = flat[here], flat[other]
                 if math.isfinite(a) and math.isfinite(b) and max(a, b) <= min(a, b) * (1 + max_step):
                     _join(parents, here, other)

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.kernels_reprojection import wrapped_column, wrapped_row
+from pano_mvs.geometry.kernels_sphere import wrapped_column, wrapped_row
 
 FloatArray = NDArray[np.float64]
 

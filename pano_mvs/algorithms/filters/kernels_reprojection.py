@@ -8,6 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pano_mvs.geometry.kernels_sphere import angle_between, corners_at, pixel_from_ray
+
 FloatArray = NDArray[np.float64]
 Triple = FloatArray | tuple[float, float, float]
 
@@ -16,35 +18,13 @@ Triple = FloatArray | tuple[float, float, float]
 UNKNOWN, AGREES, CONTRADICTS, HIDDEN = 0, 1, 2, 3
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
-def wrapped_column(row: int, column: int, height: int, width: int) -> int:
-    """Return the column, in the picture, of a pixel at most one picture height outside of it."""
-    if row < 0 or row >= height:
-        column += width // 2
-    return column % width
-
-
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
-def wrapped_row(row: int, height: int) -> int:
-    """Return the row, in the picture, of a pixel at most one picture height outside of it."""
-    if row < 0:
-        return -1 - row
-    if row >= height:
-        return 2 * height - 1 - row
-    return row
-
-
 @njit(cache=True, error_model="numpy", nogil=True)
 def sample_range(ranges: NDArray[np.float32], x: float, y: float, max_step: float) -> float:
     """Return the range between pixels: bilinear in 1/range if the four lie on one surface, else that of the nearest."""
     height, width = ranges.shape
-    left, top = math.floor(x - 0.5), math.floor(y - 0.5)
-    weight_x, weight_y = x - 0.5 - left, y - 0.5 - top
-    row_0, row_1 = wrapped_row(top, height), wrapped_row(top + 1, height)
-    r00 = ranges[row_0, wrapped_column(top, left, height, width)]
-    r01 = ranges[row_0, wrapped_column(top, left + 1, height, width)]
-    r10 = ranges[row_1, wrapped_column(top + 1, left, height, width)]
-    r11 = ranges[row_1, wrapped_column(top + 1, left + 1, height, width)]
+    row_0, row_1, column_00, column_01, column_10, column_11, weight_x, weight_y = corners_at(x, y, height, width)
+    r00, r01 = ranges[row_0, column_00], ranges[row_0, column_01]
+    r10, r11 = ranges[row_1, column_10], ranges[row_1, column_11]
     near, far = min(min(r00, r01), min(r10, r11)), max(max(r00, r01), max(r10, r11))
     # min and max may swallow a NaN; the sum does not.
     if math.isfinite(r00 + r01 + r10 + r11) and far <= near * (1 + max_step):
@@ -56,17 +36,13 @@ def sample_range(ranges: NDArray[np.float32], x: float, y: float, max_step: floa
     return float(r10) if weight_x < 0.5 else float(r11)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def project(
-    point: Triple, rotation: FloatArray, translation: FloatArray, height: int, width: int
-) -> tuple[float, float, float]:
-    """Return (x, y, distance) of a point (3 numbers) of the reference frame in a source panorama."""
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def transformed(point: Triple, rotation: FloatArray, translation: FloatArray) -> tuple[float, float, float]:
+    """Return R x + t of a point (3 numbers)."""
     a = rotation[0, 0] * point[0] + rotation[0, 1] * point[1] + rotation[0, 2] * point[2] + translation[0]
     b = rotation[1, 0] * point[0] + rotation[1, 1] * point[1] + rotation[1, 2] * point[2] + translation[1]
     c = rotation[2, 0] * point[0] + rotation[2, 1] * point[1] + rotation[2, 2] * point[2] + translation[2]
-    x = (math.atan2(a, c) / (2 * math.pi) + 0.5) * width
-    y = (0.5 - math.atan2(-b, math.hypot(a, c)) / math.pi) * height
-    return x, y, math.sqrt(a * a + b * b + c * c)
+    return a, b, c
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -79,11 +55,8 @@ def reprojection_angle(point: Triple, baseline: FloatArray, ratio: float) -> flo
     other_0 = baseline[0] + ratio * (point[0] - baseline[0])
     other_1 = baseline[1] + ratio * (point[1] - baseline[1])
     other_2 = baseline[2] + ratio * (point[2] - baseline[2])
-    cross_0 = point[1] * other_2 - point[2] * other_1
-    cross_1 = point[2] * other_0 - point[0] * other_2
-    cross_2 = point[0] * other_1 - point[1] * other_0
-    dot = point[0] * other_0 + point[1] * other_1 + point[2] * other_2
-    return math.atan2(math.sqrt(cross_0 * cross_0 + cross_1 * cross_1 + cross_2 * cross_2), dot)
+    angle: float = angle_between(point[0], point[1], point[2], other_0, other_1, other_2)
+    return angle
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -100,7 +73,9 @@ def judge_point(
     `limits` holds the maximum relative error, the maximum reprojection angle in radians, and the maximum relative
     step between neighbours on one surface.
     """
-    x, y, distance = project(point, rotation, translation, ranges.shape[0], ranges.shape[1])
+    a, b, c = transformed(point, rotation, translation)
+    x, y = pixel_from_ray(a, b, c, ranges.shape[0], ranges.shape[1])
+    distance = math.sqrt(a * a + b * b + c * c)
     if not distance > 0:
         return UNKNOWN, 0.0, x, y, 0.0
     seen = sample_range(ranges, x, y, limits[2])
@@ -169,7 +144,8 @@ def judge_rows(
             verdict, _, _, _, seen = judge_point(point, rotation, translation, baseline, source_ranges, limits)
             verdicts[row, column] = verdict
             if verdict == AGREES:
-                _, _, distance = project(point, rotation, translation, ranges.shape[0], ranges.shape[1])
+                a, b, c = transformed(point, rotation, translation)
+                distance = math.sqrt(a * a + b * b + c * c)
                 share = reprojection_angle(point, baseline, seen / distance) / limits[1]
                 supports[row, column] = (1.0 - share * share) ** 2
                 motions[row, column] = squared_motion(point, distance, baseline)

@@ -13,9 +13,8 @@ from pano_mvs.algorithms.filters.kernels_reprojection import (
     CONTRADICTS,
     Triple,
     judge_point,
-    wrapped_column,
-    wrapped_row,
 )
+from pano_mvs.geometry.kernels_sphere import bilinear, corners_at, pixel_at
 
 FloatArray = NDArray[np.float64]
 Reference = tuple[NDArray[np.float32], FloatArray, NDArray[np.float32], NDArray[np.bool_]]
@@ -27,16 +26,12 @@ Tallies = tuple[NDArray[np.bool_], NDArray[np.uint8], NDArray[np.uint8], NDArray
 def add_color(image: NDArray[np.uint8], x: float, y: float, weight: float, color: FloatArray) -> None:
     """Add the bilinear colour at a position, times a weight, to color (4,): r, g, b, weight."""
     height, width = image.shape[0], image.shape[1]
-    left, top = math.floor(x - 0.5), math.floor(y - 0.5)
-    weight_x, weight_y = x - 0.5 - left, y - 0.5 - top
-    row_0, row_1 = wrapped_row(top, height), wrapped_row(top + 1, height)
-    column_00, column_01 = wrapped_column(top, left, height, width), wrapped_column(top, left + 1, height, width)
-    column_10 = wrapped_column(top + 1, left, height, width)
-    column_11 = wrapped_column(top + 1, left + 1, height, width)
+    row_0, row_1, column_00, column_01, column_10, column_11, weight_x, weight_y = corners_at(x, y, height, width)
     for channel in range(3):
-        upper = (1 - weight_x) * image[row_0, column_00, channel] + weight_x * image[row_0, column_01, channel]
-        lower = (1 - weight_x) * image[row_1, column_10, channel] + weight_x * image[row_1, column_11, channel]
-        color[channel] += weight * ((1 - weight_y) * upper + weight_y * lower)
+        upper_left, upper_right = image[row_0, column_00, channel], image[row_0, column_01, channel]
+        lower_left, lower_right = image[row_1, column_10, channel], image[row_1, column_11, channel]
+        value = bilinear(upper_left, upper_right, lower_left, lower_right, weight_x, weight_y)
+        color[channel] += weight * value
     color[3] += weight
 
 
@@ -55,9 +50,8 @@ def pixel_footprint(view: Triple, normal: NDArray[np.float32]) -> float:
 @njit(cache=True, error_model="numpy", nogil=True)
 def confidence_at(confidence: NDArray[np.uint8], x: float, y: float) -> int:
     """Return the confidence of the pixel at a position."""
-    height, width = confidence.shape
-    row = min(max(math.floor(y), 0), height - 1)
-    value: int = confidence[row, math.floor(x) % width]
+    row, column = pixel_at(x, y, confidence.shape[0], confidence.shape[1])
+    value: int = confidence[row, column]
     return value
 
 

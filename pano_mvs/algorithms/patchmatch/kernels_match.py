@@ -11,6 +11,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pano_mvs.geometry.kernels_sphere import elevation_from_y, fast_azimuth, fast_dip
+
 FloatArray = NDArray[np.float64]
 Place = tuple[int, int, int, float, int, NDArray[np.int64], NDArray[np.int64]]
 Sources = tuple[
@@ -19,10 +21,7 @@ Sources = tuple[
 
 _F = np.float32
 _U = np.uint64
-_HALF_PI, _PI, _TINY, _ONE = _F(np.pi / 2), _F(np.pi), _F(1e-30), _F(1)
-# Abramowitz and Stegun, Handbook of Mathematical Functions, 4.4.49: |error| ≤ 2e-8 on [0, 1].
-_A2, _A4, _A6, _A8 = _F(-0.3333314528), _F(0.1999355085), _F(-0.1420889944), _F(0.1065626393)
-_A10, _A12, _A14, _A16 = _F(-0.0752896400), _F(0.0429096138), _F(-0.0161657367), _F(0.0028662257)
+_TINY, _ONE = _F(1e-30), _F(1)
 _LOW, _STEP = _U(65535), _F(1 / 256)
 
 # Rows of the sums over a window, per source: samples b (less the reference's mean), products with the reference a
@@ -30,14 +29,6 @@ _LOW, _STEP = _U(65535), _F(1 / 256)
 SUM_B, SUM_BB, SUM_AB = 0, 1, 2
 SUM_G, SUM_GG, SUM_GB, SUM_GA = 3, 6, 12, 15
 SUMS = 18
-
-
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
-def _atan_unit(a: np.float32) -> np.float32:
-    """Return atan of a number in [0, 1], float32."""
-    s = a * a
-    tail = _A8 + s * (_A10 + s * (_A12 + s * (_A14 + s * _A16)))
-    return a * (_ONE + s * (_A2 + s * (_A4 + s * (_A6 + s * tail))))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -138,22 +129,10 @@ def project_samples(
         x = m00 * s + m01 * c + o0 + t0 * q
         y = m10 * s + m11 * c + o1 + t1 * q
         z = m20 * s + m21 * c + o2 + t2 * q
-        ax, ay, az = abs(x), abs(y), abs(z)
-        small = ax if ax < az else az
-        large = az if ax < az else ax
-        turn = _atan_unit(small / (large + _TINY))
-        turn = _HALF_PI - turn if ax > az else turn
-        turn = _PI - turn if z < _F(0) else turn
-        turn = -turn if x < _F(0) else turn
         level_squared = x * x + z * z + _TINY
         level = np.sqrt(level_squared)
-        small = ay if ay < level else level
-        large = level if ay < level else ay
-        dip = _atan_unit(small / (large + _TINY))
-        dip = _HALF_PI - dip if ay > level else dip
-        dip = -dip if y < _F(0) else dip
-        px = turn * x_scale + x_middle
-        py = dip * y_scale + y_middle
+        px = fast_azimuth(x, z) * x_scale + x_middle
+        py = fast_dip(y, level) * y_scale + y_middle
         column, row = np.int32(px), np.int32(py)
         column = last_column if column > last_column else column
         row = last_row if row > last_row else row
@@ -290,7 +269,7 @@ def sum_windows(
     sums[:] = _F(0)
     for k in range(side * side):
         v, column = rows[k // side], columns[k % side]
-        elevation = np.pi * (0.5 - (row + v + 0.5) / height)
+        elevation = elevation_from_y(row + v + 0.5, height)
         start = pad + first + column
         inverse_ranges(planes, azimuth, start, _F(np.cos(elevation)), _F(-np.sin(elevation)), inverse)
         for s in range(len(starts)):

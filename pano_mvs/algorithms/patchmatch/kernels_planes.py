@@ -10,6 +10,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pano_mvs.geometry.kernels_sphere import azimuth_from_x, elevation_from_y, wrapped_column, wrapped_row
+
 FloatArray = NDArray[np.float64]
 
 _F = np.float32
@@ -20,8 +22,7 @@ _MIN_WEIGHT, _MIN_SPREAD = 5.0, 0.25
 @njit(cache=True, error_model="numpy", nogil=True)
 def tangent_basis(row: int, column: int, height: int, width: int, stretch: float, basis: FloatArray) -> None:
     """Write the ray of a pixel and its derivatives by u and v, (3, 3); the rows are orthogonal."""
-    elevation = np.pi * (0.5 - (row + 0.5) / height)
-    azimuth = 2 * np.pi * ((column + 0.5) / width - 0.5)
+    elevation, azimuth = elevation_from_y(row + 0.5, height), azimuth_from_x(column + 0.5, width)
     level, dip, s, c = np.cos(elevation), np.sin(elevation), np.sin(azimuth), np.cos(azimuth)
     across, down = 2 * np.pi / width * level * stretch, np.pi / height
     basis[0, 0], basis[0, 1], basis[0, 2] = level * s, -dip, level * c
@@ -104,12 +105,10 @@ def fit_slopes(
     side = len(offsets)
     center = np.float64(inverse[row, column])
     for j in range(side):
-        y, turn = row + j - side // 2, 0
-        if y < 0 or y >= height:  # beyond a pole: half a turn further on
-            y = -1 - y if y < 0 else 2 * height - 1 - y
-            turn = width // 2
+        y = row + j - side // 2
+        in_row = wrapped_row(y, height)
         for step in range(side):
-            values[j, step] = inverse[y, (column + offsets[step] + turn) % width] / center
+            values[j, step] = inverse[in_row, wrapped_column(y, column + offsets[step], height, width)] / center
     alpha, beta, gamma, _ = weighted_slopes(values, offsets, stretch, (1.0, 0.0, 0.0), max_step, max_step)
     alpha, beta, gamma, _ = weighted_slopes(values, offsets, stretch, (alpha, beta, gamma), max_step, 0.0)
     return alpha, beta, gamma

@@ -9,6 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.kernels_reprojection import AGREES, judge_point, reprojection_angle
+from pano_mvs.geometry.kernels_sphere import pixel_at
 
 FloatArray = NDArray[np.float64]
 
@@ -48,7 +49,7 @@ def see_points(
         baseline = -(rotation.T @ moved)
         bounds = (limits[0], max_angle, limits[1])
         verdict, _, x, y, found = judge_point(point, rotation, moved, baseline, ranges, bounds)
-        row, column = min(max(math.floor(y), 0), height - 1), math.floor(x) % width
+        row, column = pixel_at(x, y, height, width)
         seen[idx] = verdict == AGREES and confidence[row, column] >= limits[2]
         if not seen[idx]:
             continue

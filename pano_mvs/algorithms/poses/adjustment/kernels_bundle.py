@@ -11,6 +11,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pano_mvs.geometry.kernels_sphere import angle_between
+
 FloatArray = NDArray[np.float64]
 
 
@@ -243,7 +245,5 @@ def ray_errors(
         x = rotations[k, 0, 0] * dx + rotations[k, 0, 1] * dy + rotations[k, 0, 2] * dz
         y = rotations[k, 1, 0] * dx + rotations[k, 1, 1] * dy + rotations[k, 1, 2] * dz
         z = rotations[k, 2, 0] * dx + rotations[k, 2, 1] * dy + rotations[k, 2, 2] * dz
-        u, v, w = bearings[t, 0], bearings[t, 1], bearings[t, 2]
-        sine = np.sqrt((v * z - w * y) ** 2 + (w * x - u * z) ** 2 + (u * y - v * x) ** 2)
-        errors[t] = np.arctan2(sine, u * x + v * y + w * z)
+        errors[t] = angle_between(bearings[t, 0], bearings[t, 1], bearings[t, 2], x, y, z)
     return errors

@@ -6,6 +6,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pano_mvs.geometry.kernels_sphere import pixel_from_ray
+
 FloatArray = NDArray[np.float64]
 
 _PARAMETERS = 6
@@ -47,8 +49,8 @@ def sample_patches(
                 x = middles[m, 0] + a * first_axes[m, 0] + b * second_axes[m, 0]
                 y = middles[m, 1] + a * first_axes[m, 1] + b * second_axes[m, 1]
                 z = middles[m, 2] + a * first_axes[m, 2] + b * second_axes[m, 2]
-                column = (0.5 + np.arctan2(x, z) / (2 * np.pi)) * width - 0.5 + pad_px
-                row = (0.5 + np.arctan2(y, np.sqrt(x * x + z * z)) / np.pi) * height - 0.5 + pad_px
+                x_px, y_px = pixel_from_ray(x, y, z, height, width)
+                column, row = x_px - 0.5 + pad_px, y_px - 0.5 + pad_px
                 left, top = int(np.floor(column)), int(np.floor(row))
                 _cubic(column - left, across)
                 _cubic(row - top, down)

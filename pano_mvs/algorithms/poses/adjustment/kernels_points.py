@@ -6,6 +6,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pano_mvs.geometry.kernels_sphere import angle_between
+
 FloatArray = NDArray[np.float64]
 
 
@@ -110,9 +112,7 @@ def triangulate(
                 errors[t] = np.pi
                 if fits:
                     x, y, z = point[0] - centers[t, 0], point[1] - centers[t, 1], point[2] - centers[t, 2]
-                    u, v, w = rays[t, 0], rays[t, 1], rays[t, 2]
-                    sine = np.sqrt((v * z - w * y) ** 2 + (w * x - u * z) ** 2 + (u * y - v * x) ** 2)
-                    errors[t] = np.arctan2(sine, u * x + v * y + w * z)
+                    errors[t] = angle_between(rays[t, 0], rays[t, 1], rays[t, 2], x, y, z)
                     if used[t] and errors[t] > worst:
                         worst = errors[t]
             if not fits or worst <= max_error:
