@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
@@ -56,6 +57,10 @@ class FilePart:
         if self.external and self.digest and digest_from_bytes(data) != self.digest:
             raise ChangedFileError(changed_text(self.path), self.path)
         return data
+
+    def sha256(self) -> str:
+        """Return the SHA-256 of the file's bytes in hex, as other programs state it; raises as `read_bytes` does."""
+        return hashlib.sha256(self.read_bytes()).hexdigest()
 
 
 def changed_text(path: Path) -> str:
