@@ -36,10 +36,17 @@ class SweepCase:
     def swept(self, backend: str, *, device: str = "auto") -> RangeMap:
         """Return the range map that a backend makes of it."""
         return sweep_range(
-            self.pictures[0], self.pictures[1:], self.source_from_reference, near=NEAR, far=FAR,
-            settings=self.settings, backend=backend, device=device,
-            reference_mask=self.masks[0], source_masks=self.masks[1:],
-        )  # fmt: skip
+            self.pictures[0],
+            self.pictures[1:],
+            self.source_from_reference,
+            near=NEAR,
+            far=FAR,
+            settings=self.settings,
+            backend=backend,
+            device=device,
+            reference_mask=self.masks[0],
+            source_masks=self.masks[1:],
+        )
 
 
 def cost_of_case(number: int) -> str:

@@ -1,4 +1,4 @@
-"""What there is to look at in an output folder, or in a lone PLY file."""
+"""What the viewer shows of an output folder or of a single PLY file."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class ShownScene:
 
 
 def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> ShownScene:
-    """Return what there is to look at.
+    """Return the scene of an output folder or of a PLY file.
 
     Args:
         path: the output folder of a run, or a PLY file, a cloud or a mesh.
@@ -115,7 +115,7 @@ def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> Sho
     if cloud is None and mesh_file is None and not cameras:
         raise InputError(
             f"{path}: holds no {cloud_name} with points, no {mesh_name} and no {model}. Give the output "
-            "folder of a run; its report.html tells what became of it"
+            "folder of a run; its report.html shows what happened"
         )
     return ShownScene(
         name=resolved(path).name,
@@ -157,7 +157,7 @@ def _cloud(path: Path | None, name: str, notes: list[str]) -> PlyPoints | None:
     if cloud is None:
         notes.append(f"no {name}: the workflow has no export.ply, or the run did not get there")
     else:
-        notes.append(f"{name} holds no points: report.html tells why")
+        notes.append(f"{name} holds no points: report.html shows why")
     return None
 
 

@@ -14,7 +14,7 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from pano_mvs.algorithms.sweep.kernels_vector import REGISTER_BYTES, element_pointer, load_unaligned
+from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import REGISTER_BYTES, element_pointer, load_unaligned
 
 LANES: Final = REGISTER_BYTES // 4
 """How many products one register holds."""

@@ -92,7 +92,7 @@ def _set_scales(axes: Axes, ranges: NDArray[np.float64], *, with_labels: bool) -
         taken = x if is_shown else taken
     axes.set_xticks(places, labels)
     if with_labels:
-        axes.set_xlabel("range of the depth hypothesis, scene units")
+        axes.set_xlabel("depth hypothesis, scene units")
 
 
 def _add_marks(axes: Axes, inspection: Inspection, costs: NDArray[np.float64]) -> None:
