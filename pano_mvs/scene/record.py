@@ -52,8 +52,9 @@ class FilePart:
         try:
             data = self.path.read_bytes()
         except (OSError, ValueError) as error:  # ValueError: a name that no file can have
-            raise InputError(f"{self.path}: cannot be read ({reason_of(error)}). Check that it exists and may be "
-                             "read") from error  # fmt: skip
+            raise InputError(
+                f"{self.path}: cannot be read ({reason_of(error)}). Check that it exists and may be read"
+            ) from error
         if self.external and self.digest and digest_from_bytes(data) != self.digest:
             raise ChangedFileError(changed_text(self.path), self.path)
         return data

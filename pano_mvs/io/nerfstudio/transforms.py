@@ -107,6 +107,10 @@ def _listed(
 def _intrinsics(frame: NerfstudioFrame) -> dict[str, Any]:
     width, height = frame.size_wh
     return {
-        "w": width, "h": height, "fl_x": frame.focal_xy[0], "fl_y": frame.focal_xy[1], "cx": width / 2,
+        "w": width,
+        "h": height,
+        "fl_x": frame.focal_xy[0],
+        "fl_y": frame.focal_xy[1],
+        "cx": width / 2,
         "cy": height / 2,
-    }  # fmt: skip
+    }
