@@ -37,7 +37,7 @@ from pano_mvs.geometry import (
     sample_panorama,
 )
 from pano_mvs.io.clouds.thinning import CHUNK_POINTS, chunks, select_points
-from pano_mvs.io.clouds.thinning import Kept as KeptPoints
+from pano_mvs.io.clouds.thinning import SelectedPoints as KeptPoints
 from pano_mvs.io.clouds.thinning import Selection as PointSelection
 from pano_mvs.scene import (
     Axis,

@@ -19,13 +19,12 @@ from pano_mvs.io.poses.files import read_poses
 from pano_mvs.results.records import PosesSummary
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene.files import group_file
+from pano_mvs.scene.up_direction import WORLD_UP, mean_up_direction
 
 FloatArray = NDArray[np.float64]
 
 _CLOUD, _MESH, _MODELS = "cloud.ply", "mesh.ply", "colmap/sparse"
 _HEAD_BYTES = 1 << 14
-# The cameras' own directions up must agree this well to count as the scene's.
-_MIN_AGREEMENT = 0.5
 _NAMED_DOUBTS = 5
 
 
@@ -231,10 +230,8 @@ def _map_of(folder: Path, kind: str, name: str, suffix: str) -> Path | None:
 
 def _frame(cameras: tuple[ShownCamera, ...]) -> tuple[FloatArray, FloatArray]:
     """Return the directions up and ahead: those of the cameras where they agree, else −y and z."""
-    ups = np.array([-camera.cam_from_world.rotation[1] for camera in cameras]).reshape(-1, 3)
-    mean = ups.mean(axis=0) if len(ups) else np.zeros(3)
-    length = float(np.linalg.norm(mean))
-    up = mean / length if length > _MIN_AGREEMENT else np.array([0.0, -1.0, 0.0])
+    common_up = mean_up_direction([camera.cam_from_world.rotation for camera in cameras])
+    up = np.array(WORLD_UP) if common_up is None else common_up
     ahead = cameras[0].cam_from_world.rotation[2] if cameras else np.array([0.0, 0.0, 1.0])
     ahead = ahead - up * float(ahead @ up)
     if np.linalg.norm(ahead) < 1e-6:
