@@ -167,6 +167,7 @@ class Run:
         """Repeat the pass until it finds nothing damaged; what it finds has been removed and is computed again."""
         found: Counter[str] = Counter()
         while True:
+            self._pass = RunPass(self, self._warnings)
             try:
                 self._pass.execute()
                 return
@@ -179,7 +180,6 @@ class Run:
                             f"{text} again and again: check the disk, or choose another cache with --cache DIR"
                         ) from error
                 self._pass.drain()
-                self._pass = RunPass(self, self._warnings)
 
     def _remember(self) -> None:
         """Store the keys and file digests for the next run; the run does not fail if that is impossible."""
