@@ -42,7 +42,7 @@ def label_surfaces(ranges: NDArray[np.float32], max_step: float) -> NDArray[np.i
     for row in range(height):
         for column in range(width):
             here = row * width + column
-            right = row * width + wrapped_column(row, column + 1, height, width)
+            right = row * width + (column + 1) % width
             below = here + width
             if row == height - 1:
                 below = row * width + wrapped_column(height, column, height, width)

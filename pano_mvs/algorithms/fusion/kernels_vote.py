@@ -1,4 +1,4 @@
-"""Compiled: the vote of one source on the pixels of a reference view, and the merging of its points and colours."""
+"""Compiled: the support of one source for the pixels of a reference view, and the merging of its points and colours."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def confidence_at(confidence: NDArray[np.uint8], x: float, y: float) -> int:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def vote(reference: Reference, source: Source, limits: FloatArray, rows: tuple[int, int], tallies: Tallies) -> None:
-    """Add one source's vote on the pixels of the rows [first, end) of a reference view.
+    """Add one source's support for the pixels of the rows [first, end) of a reference view.
 
     `reference` is (ranges, rays, normals, bool where a point may be written); `source` is (rotation, translation of
     source_from_reference, ranges, confidence, image); `limits` holds the three of `judge_point`, the maximum ratio

@@ -254,9 +254,9 @@ def sum_windows(
         azimuth: (2, W + 2 pad) float32 sin θ and cos θ of the columns.
         window: weights and centred samples, (side², n) float32, and means (n,), of the reference.
         sources: (·,) uint64 packed pictures, (S,) where each begins, (S, 2) their sizes, (S, 3, 4) float64
-            source_from_reference, (·,) uint8 which patches may vote, empty if all may, and (S,) where each begins.
+            source_from_reference, (·,) uint8 which patches count, empty if all do, and (S,) where each begins.
         sums: (S, SUMS, n) float32, written.
-        votes: (S, n) bool, written: True where the source may vote on the pixel.
+        votes: (S, n) bool, written: True where the source counts for the pixel.
     """
     row, first, height, stretch, pad, rows, columns = place
     weights, centred, means = window

@@ -41,7 +41,7 @@ def correlate_sources(
     noise: np.float32,
     correlations: NDArray[np.float32],
 ) -> None:
-    """Write the correlation of each source with the reference, (S, n); −2 where it has no vote."""
+    """Write the correlation of each source with the reference, (S, n); −2 where it does not count."""
     for s in range(correlations.shape[0]):
         for i in range(_U(correlations.shape[1])):
             b = sums[s, SUM_B, i]
@@ -52,7 +52,7 @@ def correlate_sources(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def least_of_best(correlations: NDArray[np.float32], i: int, held: NDArray[np.float32]) -> np.float32:
-    """Return the least correlation of the better half of the voting sources (rounded up); 1 if there is none."""
+    """Return the least correlation of the better half of the sources that count (rounded up); 1 if there is none."""
     votes = 0
     for s in range(correlations.shape[0]):
         value = correlations[s, i]

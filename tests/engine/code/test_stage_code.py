@@ -67,6 +67,8 @@ def changed_by(module: str, old: str, new: str) -> set[str]:
         ("algorithms.features.kernels_sphorb", "ARC = 10", "ARC = 9", {"features.sphorb"}),
         ("algorithms.patchmatch.kernels_planes", "_MIN_WEIGHT, _MIN_SPREAD = 5.0", "_MIN_WEIGHT, _MIN_SPREAD = 6.0",
          {"depth.patchmatch"}),
+        ("geometry.kernels_sphere", "2 * math.pi * (x / width - 0.5)", "2 * math.pi * (x / width - 1.5)",
+         {"depth.patchmatch"}),
         ("algorithms.sweep.numba.kernels_sgm", "_BLOCK = ", "_BLOCK = 1 * ", SWEEPS),
         ("algorithms.filters.kernels_fill", "_DIRECTIONS = ", "_DIRECTIONS = 1 * ", {"filters.fill"}),
         ("algorithms.two_view.kernels_five_point", "_MAX_INTERVALS = ", "_MAX_INTERVALS = 1 + ",
