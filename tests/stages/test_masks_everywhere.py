@@ -15,7 +15,7 @@ from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.geometry import pixel_from_ray
 from pano_mvs.scene import PointCloud, Pose, RangeMap
 from pano_mvs.stages.fusion import VoteParams, vote
-from pano_mvs.testing.conformance import stage_laws
+from pano_mvs.testing.conformance import stage_contract_tests
 from pano_mvs.testing.tiny_capture import TinyCapture, Variant, tiny_capture
 
 FEW = {"planes": 12, "near": 0.5, "far": 6.0}
@@ -45,11 +45,13 @@ VARIANTS: list[tuple[str, dict[str, Any]]] = [
 )
 def test_no_setting_lets_a_stage_see_what_is_masked(name: str, settings: dict[str, Any]) -> None:
     size_hw = (128, 256) if settings.get("levels", 1) > 1 else (32, 64)
-    laws = [law for law in stage_laws(name, settings=settings, size_hw=size_hw) if "masked" in str(law)]
-    assert len(laws) == 1
-    laws[0].check()
+    contract_tests = [
+        test for test in stage_contract_tests(name, settings=settings, size_hw=size_hw) if "masked" in str(test)
+    ]
+    assert len(contract_tests) == 1
+    contract_tests[0].check()
     if Registry.installed().stages[name].output is not PointCloud:
-        next(law for law in stage_laws(name, settings=settings) if "respects masks" in str(law)).check()
+        next(test for test in stage_contract_tests(name, settings=settings) if "respects masks" in str(test)).check()
 
 
 def seen_in(capture: TinyCapture, rays: NDArray[np.float64], name: str) -> NDArray[np.bool_]:
