@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 _SIZE_HW = (128, 256)
 _DARK, _BRIGHT = 24, 40
-_LEAST_DARK_SHARE = 0.97
+_MIN_DARK_SHARE = 0.97
 
 
 def is_dual_fisheye(picture: NDArray[np.uint8]) -> bool:
@@ -27,5 +27,5 @@ def is_dual_fisheye(picture: NDArray[np.uint8]) -> bool:
     upper, lower = outside.copy(), outside.copy()
     upper[_SIZE_HW[0] // 2 :] = lower[: _SIZE_HW[0] // 2] = False
     dark = grey < _DARK
-    is_dark_around = min(dark[upper].mean(), dark[lower].mean()) > _LEAST_DARK_SHARE
+    is_dark_around = min(dark[upper].mean(), dark[lower].mean()) > _MIN_DARK_SHARE
     return bool(is_dark_around and np.median(grey[inside]) > _BRIGHT)

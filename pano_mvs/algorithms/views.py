@@ -14,7 +14,7 @@ from pano_mvs.scene.pose_groups import split_groups
 FloatArray = NDArray[np.float64]
 
 # Fewer shared points than this say nothing about how well two pictures see the same place.
-_FEWEST_SHARED = 8
+_MIN_SHARED = 8
 # Triangulation angles around this one weigh fully; MVS practice puts the best trade between precision and likeness
 # here (Schönberger et al., "Pixelwise view selection for unstructured multi-view stereo", 2016, use similar limits).
 _BEST_ANGLE_DEG = 12.0
@@ -101,7 +101,7 @@ def _shared_point_scores(poses: Poses, *, min_angle_deg: float, max_angle_deg: f
     np.add.at(scores, (image_a, image_b), weight)
     np.add.at(shared, (image_a, image_b), weight > 0)
     scores, shared = scores + scores.T, shared + shared.T
-    return np.where(shared >= _FEWEST_SHARED, scores, 0.0)
+    return np.where(shared >= _MIN_SHARED, scores, 0.0)
 
 
 def _angle_weight(angle_deg: FloatArray, min_angle_deg: float, max_angle_deg: float) -> FloatArray:

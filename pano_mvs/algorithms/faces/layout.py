@@ -37,7 +37,7 @@ CUBE_ROTATIONS: FloatArray = np.array(
 )
 CUBE_NAMES = ("front", "right", "back", "left", "up", "down")
 _OCTAGON_NAMES = ("front", "front-right", "right", "back-right", "back", "back-left", "left", "front-left")
-_LEAST_FOV_DEG, _LARGEST_FOV_DEG, _LEAST_SIZE_PX = 30.0, 150.0, 4
+_MIN_FOV_DEG, _MAX_FOV_DEG, _MIN_SIZE_PX = 30.0, 150.0, 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,11 +71,11 @@ def panorama_faces(
     Raises:
         UsageError: if the field of view or the size is out of bounds.
     """
-    if not _LEAST_FOV_DEG <= fov_deg <= _LARGEST_FOV_DEG:
+    if not _MIN_FOV_DEG <= fov_deg <= _MAX_FOV_DEG:
         raise UsageError(f"the field of view of a face must be from 30 to 150 degrees, got {fov_deg}")
     size = default_face_size(size_hw, fov_deg=fov_deg) if size_px is None else size_px
-    if size < _LEAST_SIZE_PX:
-        raise UsageError(f"a face must be {_LEAST_SIZE_PX} pixels wide or more, got {size}")
+    if size < _MIN_SIZE_PX:
+        raise UsageError(f"a face must be {_MIN_SIZE_PX} pixels wide or more, got {size}")
     focal_px = size / (2 * np.tan(np.radians(fov_deg) / 2))
     center = np.array([size / 2, size / 2])
     return tuple(
@@ -90,7 +90,7 @@ def default_face_size(size_hw: tuple[int, int], *, fov_deg: float = 96.0) -> int
     Rounded up to an even number of pixels; towards its edges a face is finer.
     """
     exact = size_hw[1] / np.pi * np.tan(np.radians(fov_deg) / 2)
-    return max(2 * int(np.ceil(exact / 2 - 1e-9)), _LEAST_SIZE_PX)
+    return max(2 * int(np.ceil(exact / 2 - 1e-9)), _MIN_SIZE_PX)
 
 
 def covers_sphere(faces: tuple[Face, ...]) -> bool:

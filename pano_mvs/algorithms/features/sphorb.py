@@ -25,7 +25,7 @@ from pano_mvs.scene import Features
 FloatArray = NDArray[np.float64]
 
 _SCALE = 1.2
-_FEWEST_STEPS = 24
+_MIN_STEPS = 24
 _PATCH_RADIUS = 15  # cells from the centre to the farthest test
 _TESTS = 256
 _MARGIN = 32  # no less than _CLEARANCE lattice steps, stretched 1.42 times, from 5 cells beyond a face
@@ -95,7 +95,7 @@ def extract_sphorb(
 def grid_pyramid(width: int, levels: int) -> list[GeodesicGrid]:
     """Return geodesic grids for a panorama: cells of one pixel's area at the equator, then 1.2 times wider each."""
     finest = width / np.sqrt(10 * np.pi)
-    steps = [max(_FEWEST_STEPS, round(finest / _SCALE**level)) for level in range(levels)]
+    steps = [max(_MIN_STEPS, round(finest / _SCALE**level)) for level in range(levels)]
     return [GeodesicGrid(n, _MARGIN) for n in dict.fromkeys(steps)]
 
 

@@ -24,7 +24,7 @@ _PRECISION_PX = 0.2
 # Beside a step like this, in ln range, it is doubtful which side a pixel belongs to, so far away from it.
 _DOUBTFUL_STEP, _DOUBTFUL_RADIUS = 0.1, 2
 # Of the sources that can tell, these must contradict a pixel in one direction for it to count as contradicted.
-_ONE_WAY, _LEAST_JUDGES = 0.75, 2
+_ONE_WAY, _MIN_JUDGES = 0.75, 2
 
 
 def check_consistency(
@@ -199,7 +199,7 @@ def _agreement(votes: _Votes, seen: NDArray[np.bool_]) -> Agreement:
         return float(np.sum(where.mean(axis=1) * row_weights))
 
     compared = seen & (judges > 0)
-    contradicted = compared & (votes.agreeing == 0) & (judges >= _LEAST_JUDGES)
+    contradicted = compared & (votes.agreeing == 0) & (judges >= _MIN_JUDGES)
     total = share(compared)
     parts = (
         compared & (votes.agreeing > 0),

@@ -21,7 +21,7 @@ from pano_mvs.scene.range_map import FILLED_CONFIDENCE
 FloatArray = NDArray[np.float64]
 
 # Of the weight that a window would have with every pixel at its full: less than this says nothing.
-_LEAST_SUPPORT = 1e-6
+_MIN_SUPPORT = 1e-6
 
 
 def guided_range(
@@ -93,7 +93,7 @@ def guided_values(
     colors = guide - 128.0
     area = box_sum(np.ones_like(target), radius)
     total = box_sum(weight, radius)
-    sure = total > _LEAST_SUPPORT * area
+    sure = total > _MIN_SUPPORT * area
     share = 1 / np.where(sure, total, 1)
     mean_color = share[..., None] * box_sum(weight[..., None] * colors, radius)
     mean = share * box_sum(weight * target, radius)
@@ -106,7 +106,7 @@ def guided_values(
     counted = np.where(sure, total / area, 0)
     averaged = box_spread(counted[..., None] * lines, radius)
     reach = box_spread(counted, radius)
-    known = reach > _LEAST_SUPPORT * area
+    known = reach > _MIN_SUPPORT * area
     averaged /= np.where(known, reach, 1)[..., None]
     values = np.sum(averaged[..., :3] * colors, axis=-1) + averaged[..., 3]
     return values, np.where(known, reach / np.maximum(box_spread(np.ones_like(target), radius), 1), 0)

@@ -21,13 +21,13 @@ from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_HYPOTHESES, _MOST_POINTS, _FEWEST_POINTS = 256, 3000, 30
+_HYPOTHESES, _MAX_POINTS, _MIN_POINTS = 256, 3000, 30
 # Colours change by less than this share from pixel to pixel within a surface.
 _COLOR_STEP, _DARKEST = 0.02, 20.0
 # Pixels without texture vote with this weight beside those of the outline.
 _BARE_WEIGHT = 0.1
 # The plane must be seen on most sides of the surface: carried on beyond what is seen it may lead anywhere.
-_SECTORS, _FEWEST_SECTORS = 8, 6
+_SECTORS, _MIN_SECTORS = 8, 6
 _STEPS_BEYOND = 0.8, 1.3
 # What was seen within this many tolerances of the plane was seen on it, only not well.
 _SAME_SURFACE = 3.0
@@ -85,7 +85,7 @@ def lay_planes(
     for surface in _large_surfaces(labels, area * np.degrees(1) ** 2, min_area_deg2):
         support = _dilated(surface, margin) & trusted
         points = _drawn(support, weight, rng)
-        if len(points) < _FEWEST_POINTS:
+        if len(points) < _MIN_POINTS:
             continue
         plane, on_plane = fit_plane(
             rays[support][points], inverse[support][points], max_relative_error=max_relative_error, rng=rng
@@ -165,19 +165,19 @@ def _dilated(mask: Mask, margin: int) -> Mask:
 def _drawn(support: Mask, weight: FloatArray, rng: np.random.Generator) -> NDArray[np.intp]:
     """Return positions among the supporting pixels, drawn by their weights."""
     weights = weight[support]
-    if len(weights) < _FEWEST_POINTS:
+    if len(weights) < _MIN_POINTS:
         return np.zeros(0, np.intp)
-    return rng.choice(len(weights), _MOST_POINTS, p=weights / weights.sum())
+    return rng.choice(len(weights), _MAX_POINTS, p=weights / weights.sum())
 
 
 def _is_sound(plane: FloatArray, surface: FloatArray, rays: FloatArray, inverse: FloatArray) -> bool:
     """Return whether a plane keeps within its points' ranges all over a surface, and is seen on most sides of it."""
     laid = surface @ plane
     low, high = _STEPS_BEYOND
-    if len(rays) < _FEWEST_POINTS or laid.min() < low * inverse.min() or laid.max() > high * inverse.max():
+    if len(rays) < _MIN_POINTS or laid.min() < low * inverse.min() or laid.max() > high * inverse.max():
         return False
     middle = surface.mean(axis=0)
     across = np.linalg.svd(middle[None])[2][1:]  # two directions at right angles to the middle
     angle = np.arctan2(*(rays @ across.T).T)
     sectors = np.floor((angle / (2 * np.pi) + 0.5) * _SECTORS).astype(np.int64) % _SECTORS
-    return len(np.unique(sectors)) >= _FEWEST_SECTORS
+    return len(np.unique(sectors)) >= _MIN_SECTORS

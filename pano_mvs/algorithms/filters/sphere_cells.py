@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 # Two bands of a pole's cap: fewer cells around would make the half turn over the pole land on the cell itself.
-_FEWEST_CELLS = 4
+_MIN_CELLS = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,9 +94,9 @@ def _cells_in_band(size_hw: tuple[int, int], cell_px: float) -> NDArray[np.int64
     height, width = size_hw
     bands = max(2, round(height / cell_px))
     elevation = np.pi * (0.5 - (np.arange(bands) + 0.5) / bands)
-    equator = max(_FEWEST_CELLS, 2 * round(width / cell_px / 2))
+    equator = max(_MIN_CELLS, 2 * round(width / cell_px / 2))
     halvings = np.rint(np.log2(1 / np.cos(elevation)))
-    counts: NDArray[np.int64] = np.maximum(_FEWEST_CELLS, 2 * np.rint(equator / 2 / 2**halvings)).astype(np.int64)
+    counts: NDArray[np.int64] = np.maximum(_MIN_CELLS, 2 * np.rint(equator / 2 / 2**halvings)).astype(np.int64)
     return counts
 
 

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 _NEIGHBOURS = 4
 # Of what its neighbours have. Cameras with true poses had 0.64 and more of it (rendered and synthetic rooms, plain ones
 # too; 4 to 9 views, 2 to 8 sources), those at the edge of a capture least; half a metre off they had 0.47 at most.
-_LEAST_SHARE_OF_NEIGHBOURS = 0.55
+_MIN_SHARE_OF_NEIGHBOURS = 0.55
 # Cameras with true poses had 0.62 at most, half a metre off 0.63 and more. This does not suffice alone: it keeps views
 # apart that agree little because their errors scatter.
-_LEAST_ONE_WAY = 0.55
+_MIN_ONE_WAY = 0.55
 # Where neighbours agree with nobody either, or little can be compared, nothing is known.
-_LEAST_AGREED, _LEAST_COMPARED = 0.1, 0.2
-_LEAST_VIEWS = 3
+_MIN_AGREED, _MIN_COMPARED = 0.1, 0.2
+_MIN_VIEWS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +53,8 @@ def view_doubts(agreements: Mapping[str, Agreement], centers: Mapping[str, NDArr
         agreements: by view.
         centers: (3,) camera centres of the views of one world; views without one are not judged.
     """
-    names = [name for name in agreements if name in centers and agreements[name].compared >= _LEAST_COMPARED]
-    if len(names) < _LEAST_VIEWS:
+    names = [name for name in agreements if name in centers and agreements[name].compared >= _MIN_COMPARED]
+    if len(names) < _MIN_VIEWS:
         return {}
     places = np.array([centers[name] for name in names])
     agreed = np.array([agreements[name].agreed for name in names])
@@ -62,7 +62,7 @@ def view_doubts(agreements: Mapping[str, Agreement], centers: Mapping[str, NDArr
     for idx, (name, around) in enumerate(zip(names, nearest_views(places), strict=True)):
         usual = float(np.median(agreed[around]))
         one_way = agreements[name].one_way
-        if usual >= _LEAST_AGREED and agreed[idx] < _LEAST_SHARE_OF_NEIGHBOURS * usual and one_way >= _LEAST_ONE_WAY:
+        if usual >= _MIN_AGREED and agreed[idx] < _MIN_SHARE_OF_NEIGHBOURS * usual and one_way >= _MIN_ONE_WAY:
             doubts[name] = (f"other views agree with {100 * agreed[idx]:.0f} % of its ranges (usual around it: "
                             f"{100 * usual:.0f} %) and contradict {100 * one_way:.0f} % in one direction")  # fmt: skip
     return doubts

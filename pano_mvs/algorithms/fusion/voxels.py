@@ -11,7 +11,7 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.scene import PointCloud
 
 # Points that wait for being sorted into voxels: fewer would have all voxels sorted again and again.
-_FEWEST_WAITING = 1_000_000
+_MIN_WAITING = 1_000_000
 
 
 def thin_by_voxels(cloud: PointCloud, voxel_size: float) -> PointCloud:
@@ -75,7 +75,7 @@ class VoxelGrid:
         sums = np.concatenate([weight, weight * values], axis=1)
         self._parts.append(_merged([_Voxels(places, sums, cloud.normals_in_world, largest)]))
         waiting = sum(len(part.places) for part in self._parts[1:])
-        if waiting > max(_FEWEST_WAITING, len(self._parts[0].places)):
+        if waiting > max(_MIN_WAITING, len(self._parts[0].places)):
             self._parts = [_merged(self._parts)]
 
     def cloud(self) -> PointCloud:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import is_file
 
-FEWEST_POINTS = 100
+MIN_POINTS = 100
 _SHALLOWEST, _DEEPEST = 5, 12
 _TOLD = 300
 

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 _NEIGHBOURS = 6
 # A stray point, far from all others, would else keep a large bubble around it.
-_LARGEST_SPACING = 10.0
+_MAX_SPACING = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,7 +38,7 @@ def point_spacings(points: NDArray[np.float32]) -> NDArray[np.float64]:
     count = min(_NEIGHBOURS + 1, len(points))
     distances, _ = cKDTree(points).query(points, k=count)
     spacings: NDArray[np.float64] = np.median(np.asarray(distances)[:, 1:], axis=1)
-    return np.asarray(np.minimum(spacings, _LARGEST_SPACING * np.median(spacings)))
+    return np.asarray(np.minimum(spacings, _MAX_SPACING * np.median(spacings)))
 
 
 def trimmed_mesh(mesh: Mesh, points: NDArray[np.float32], *, max_spacings: float) -> Mesh:

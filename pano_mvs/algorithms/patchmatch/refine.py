@@ -41,7 +41,7 @@ _BEYOND = 1.5
 # Samples of a window are neighbours, and not independent: of 25 so many count.
 _SAMPLES = 10.0
 # No step is larger, in pixels of the reference at the widest baseline: beyond that pictures are not linear.
-_LARGEST_STEP_PX = 0.5
+_MAX_STEP_PX = 0.5
 # Neighbours on a plane differ in range by less than this share a radian: the tangent of a slant of 58°.
 _MAX_SLOPE = 1.6
 _FIT_RADIUS = 3
@@ -99,7 +99,7 @@ def refine_range(
     # The inverse range that moves a point by one pixel at the widest baseline.
     pixel_q = 2 * np.pi / width / max(float(np.linalg.norm(pose.translation)) for pose in source_from_reference)
     numbers = (np.float32(1 / sigma_color), np.float32(noise**2), (prior_px * pixel_q) ** -2,
-               (prior_slope * pixel_q) ** -2, _SAMPLES, np.float32(_LARGEST_STEP_PX * pixel_q))  # fmt: skip
+               (prior_slope * pixel_q) ** -2, _SAMPLES, np.float32(_MAX_STEP_PX * pixel_q))  # fmt: skip
     offsets = column_offsets((height, width), 2 * (window // 2), spherical=True)[:, ::2].copy()
     stretches = column_stretch(height, spherical=True)
     near_offsets = column_offsets((height, width), _FIT_RADIUS, spherical=True)

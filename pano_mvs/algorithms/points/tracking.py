@@ -27,7 +27,7 @@ _MAX_SURFACE_STEP = 0.05
 _MAX_REPROJECTION_PX = 1.0
 # More points than are wanted go into the test of who sees them, since some fail it.
 _SURPLUS = 1.3
-_MOST_CANDIDATES = 12_000_000
+_MAX_CANDIDATES = 12_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,7 +171,7 @@ def _candidates(
     rng: np.random.Generator,
 ) -> _Candidates:
     """Return the samples of all views in the world, thinned at random if there are too many to sort."""
-    share = min(1.0, _MOST_CANDIDATES / max(sum(len(samples[name]) for name in names), 1))
+    share = min(1.0, _MAX_CANDIDATES / max(sum(len(samples[name]) for name in names), 1))
     points, homes, colors = [np.zeros((0, 3))], [np.zeros(0, np.int32)], [np.zeros((0, 3), np.uint8)]
     for idx, name in enumerate(names):
         view = samples[name]

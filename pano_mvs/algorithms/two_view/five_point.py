@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 _SAMPLE = 5
-_MOST = 10  # essential matrices of one sample
+_MAX_SOLUTIONS = 10  # essential matrices of one sample
 
 
 def essentials_from_five(first: FloatArray, second: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
@@ -29,7 +29,7 @@ def essentials_from_five(first: FloatArray, second: FloatArray) -> tuple[FloatAr
     from pano_mvs.algorithms.two_view.kernels_five_point import solve_five
 
     count = len(first)
-    essentials, sample_idx = np.empty((_MOST * count, 3, 3)), np.empty(_MOST * count, np.int64)
+    essentials, sample_idx = np.empty((_MAX_SOLUTIONS * count, 3, 3)), np.empty(_MAX_SOLUTIONS * count, np.int64)
     samples = np.arange(_SAMPLE * count).reshape(count, _SAMPLE)
     found = solve_five(
         np.ascontiguousarray(first, np.float64).reshape(-1, 3),

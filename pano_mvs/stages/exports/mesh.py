@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from pano_mvs.algorithms.mesh.poisson import FEWEST_POINTS, poisson_depth, solve_poisson
+from pano_mvs.algorithms.mesh.poisson import MIN_POINTS, poisson_depth, solve_poisson
 from pano_mvs.algorithms.mesh.triangles import Mesh, point_spacings, trimmed_mesh, without_crumbs
 from pano_mvs.api import Context, Files, InputError, One, Params, PointCloud, stage
 from pano_mvs.core.text import plural
@@ -74,9 +74,9 @@ def _solved(cloud: PointCloud, params: MeshParams, folder: Path) -> tuple[Mesh, 
     selection = Selection(params.min_confidence, params.min_views, max_points=params.max_points)
     write_ply(source, cloud, kept=select_points(cloud, selection, folder))
     points = read_ply(source).points_in_world
-    if len(points) < FEWEST_POINTS:
+    if len(points) < MIN_POINTS:
         raise InputError(f"{len(points)} of {len(cloud)} points {plural(len(points), 'is', 'are')} left for a mesh; "
-                         f"{FEWEST_POINTS} are needed. Lower `min_views` or `min_confidence`, or look at why the cloud "
+                         f"{MIN_POINTS} are needed. Lower `min_views` or `min_confidence`, or look at why the cloud "
                          "is empty")  # fmt: skip
     spacing = float(np.median(point_spacings(points)))
     depth = params.depth or poisson_depth(points, spacing)
