@@ -1,4 +1,4 @@
-"""Kinds of settings that several stages have."""
+"""Types of settings that several stages have."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pydantic import AfterValidator
 
 def _odd(value: int) -> int:
     if value % 2 == 0:
-        raise ValueError(f"must be odd, since a window has a centre: {value - 1} or {value + 1}")
+        raise ValueError(f"must be odd, because a window has a centre pixel: use {value - 1} or {value + 1}")
     return value
 
 
 Odd: TypeAlias = Annotated[int, AfterValidator(_odd)]
-"""The side of a window."""
+"""Side length of a window."""

@@ -1,4 +1,4 @@
-"""Fusion: from range maps to one cloud."""
+"""Fusion of range maps into one cloud."""
 
 from __future__ import annotations
 
@@ -15,31 +15,44 @@ from pano_mvs.api import All, Context, Panorama, Params, PointCloud, Pose, Range
 class VoteParams(Params):
     """Settings of fusion.vote."""
 
-    min_views: int = Field(default=2, ge=1, description="views that must agree on a point")
-    max_relative_error: float = Field(default=0.02, gt=0, description="ranges that agree differ by at most this share")
+    min_views: int = Field(default=2, ge=1, description="minimum number of views that agree on a point")
+    max_relative_error: float = Field(
+        default=0.02, gt=0, description="maximum relative difference of ranges that agree"
+    )
     min_support: float | None = Field(
-        default=0.1, gt=0, le=1, description="share of the surface around a pixel that vouches for one missing view"
+        default=0.1,
+        gt=0,
+        le=1,
+        description="confirmed share of the surface around a pixel that replaces one missing view",
     )
-    merge_within: float = Field(default=0.01, ge=0, description="points of views that differ by less are averaged")
+    merge_within: float = Field(
+        default=0.01, ge=0, description="average points of views with a smaller relative difference"
+    )
     max_footprint_ratio: float = Field(
-        default=4.0, ge=1, description="a view leaves to another what that sees this much better; 1: no point twice"
+        default=4.0,
+        ge=1,
+        description="leave a point to another view that sees it this much better; 1: no duplicate points",
     )
-    even_density: bool = Field(default=True, description="thin rows away from the equator to points per solid angle")
-    stride: int = Field(default=1, ge=1, description="write every stride-th pixel in both directions")
+    even_density: bool = Field(
+        default=True, description="thin rows away from the equator to even density per solid angle"
+    )
+    stride: int = Field(default=1, ge=1, description="use every stride-th pixel in both directions")
     min_confidence: int = Field(
-        default=64, ge=1, le=255, description="pixels below have no vote (64: seen, 128: consistent)"
+        default=64, ge=1, le=255, description="minimum confidence of pixels (64: seen, 128: consistent)"
     )
-    neighbours: int = Field(default=8, ge=0, description="views, the nearest ones, that vote on a view's pixels")
-    voxel_size: float | None = Field(default=None, gt=0, description="thin to one point per cube, in scene units")
+    neighbours: int = Field(default=8, ge=0, description="number of nearest views to compare each view with")
+    voxel_size: float | None = Field(
+        default=None, gt=0, description="thin to one point per voxel of this edge, scene units"
+    )
 
 
 @stage("fusion.vote")
 def vote(
     ranges: All[RangeMap], poses: All[Pose], images: All[Panorama], params: VoteParams, ctx: Context
 ) -> PointCloud:
-    """One coloured cloud with normals of all points on which several views agree.
+    """Fuse range maps into one coloured cloud with normals, keeping points on which several views agree.
 
-    Groups of poses are fused one by one, since nothing is known of where they are to each other.
+    Groups of poses are fused one by one, because their relative positions are unknown.
     """
     groups = {name: pose.group for name, pose in poses.items()}
     clouds = []
@@ -74,13 +87,13 @@ def _fused(
 
 
 def _min_views(params: VoteParams, views: int) -> int:
-    """Return how many views must agree on a point: no more than there are."""
+    """Return the number of views that must agree on a point, at most the number of views."""
     return min(params.min_views, max(1, views))
 
 
 def _why_empty(ranges: Mapping[str, RangeMap], min_views: int) -> str:
     if not any(range_map.valid.any() for range_map in ranges.values()):
-        return "the cloud is empty: no view has any range. Look at the masks, and at what the depth stage says"
+        return "the cloud is empty: no view has any range. Check the masks and the messages of the depth stage"
     return (
         f"the cloud is empty: at no pixel did {min_views} views agree. Look at the poses, or lower min_confidence or "
         "min_views"

@@ -102,7 +102,7 @@ def test_sensors_that_contradict_each_other_are_no_evidence() -> None:
     vertical = vertical_from_sensors(poses, readings)
     assert not vertical
     assert "disagree by" in vertical.reason
-    assert "no registered panorama states" in vertical_from_sensors(poses, {}).reason
+    assert "no registered panorama has pitch and roll" in vertical_from_sensors(poses, {}).reason
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -80,9 +80,7 @@ def sharpest_up(points: FloatArray, centers: FloatArray, up: FloatArray) -> Laye
         up: (3,) unit vector around which to search.
     """
     if len(points) < _MIN_POINTS:
-        return Layers(
-            up, 0.0, f"{_MIN_POINTS} sparse points are needed to find level surfaces, there are {len(points)}"
-        )
+        return Layers(up, 0.0, f"{len(points)} sparse points are too few for level surfaces; {_MIN_POINTS} are needed")
     offsets = points - np.median(centers, axis=0)
     ranges = np.linalg.norm(offsets, axis=1)
     typical = float(np.median(ranges))
