@@ -1,4 +1,4 @@
-"""What a user may choose of a fusion."""
+"""Settings of fusion."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from pano_mvs.core.errors import UsageError
 
 @dataclass(frozen=True, slots=True)
 class FusionSettings:
-    """Which pixels become points, and how points of several views become one.
+    """Which pixels become points, and how points of several views are merged.
 
     Attributes:
-        min_views: how many views, the one that writes the point included, must agree on it.
-        max_relative_error: largest relative difference of two views' ranges of one point.
-        min_support: a pixel that lacks one view enters all the same if at least this share of the window around it is
-            confirmed and of its surface, and no view contradicts it; None: none does.
-        merge_within: points of two views that differ by less, relative to the range, are averaged with Tukey's
-            biweight of that difference; 0 leaves every point where its own view sees it.
-        max_footprint_ratio: a view leaves a point to another one that agrees and in which a pixel covers less of the
-            surface by more than this factor. 1: each piece of the surface is written by one view alone.
+        min_views: number of views, including the one that contributes the point, that must agree on it.
+        max_relative_error: maximum relative difference of two views' ranges of one point.
+        min_support: a pixel that lacks one view is accepted if at least this share of the window around it is confirmed
+            and on the same surface, and no view contradicts it; None: never.
+        merge_within: points of two views with a smaller relative difference are averaged with Tukey's biweight of that
+            difference; 0 leaves every point where its own view sees it.
+        max_footprint_ratio: a view leaves a point to another agreeing view in which a pixel covers a smaller area of
+            the surface by more than this factor. 1: each part of the surface is contributed by one view only.
         even_density: whether rows away from the equator are thinned to an even number of points per solid angle.
-        stride: write every stride-th pixel in both directions.
-        min_confidence: pixels of a lower confidence neither write nor vote.
-        neighbours: how many of the views, those with the nearest centres, vote on a view's pixels.
-        voxel_size: edge, in scene units, of voxels in which points are joined into one; None joins none.
+        stride: use every stride-th pixel in both directions.
+        min_confidence: pixels with a lower confidence are ignored.
+        neighbours: number of views with the nearest centres to compare a view's pixels with.
+        voxel_size: edge, in scene units, of voxels in which points are merged; None: do not merge.
     """
 
     min_views: int = 2
@@ -47,8 +47,10 @@ class FusionSettings:
         if wrong:
             raise UsageError(f"settings of a fusion must be positive, got {wrong}")
         if not self.merge_within >= 0 or not self.max_footprint_ratio >= 1 or self.neighbours < 0:
-            raise UsageError(f"merge_within and neighbours must be 0 or more, max_footprint_ratio 1 or more, got "
-                             f"{self.merge_within}, {self.neighbours}, {self.max_footprint_ratio}")  # fmt: skip
+            raise UsageError(
+                f"merge_within and neighbours must be 0 or more, max_footprint_ratio 1 or more, got "
+                f"{self.merge_within}, {self.neighbours}, {self.max_footprint_ratio}"
+            )
         if self.min_support is not None and not 0 < self.min_support <= 1:
             raise UsageError(f"min_support is a share above 0, or None, got {self.min_support}")
         if self.voxel_size is not None and not self.voxel_size > 0:

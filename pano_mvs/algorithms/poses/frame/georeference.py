@@ -91,7 +91,7 @@ def fit_gps(
         return replace(
             unknown,
             reason=f"{len(located)} of {len(poses.names)} registered panoramas "
-            f"{plural(len(located), 'has', 'have')} a GPS position; {_MIN_POSITIONS} needed",
+            f"{plural(len(located), 'has', 'have')} a GPS position; {_MIN_POSITIONS} are needed",
         )
     lla = np.array([position for _, position in located], np.float64)
     origin_lla = np.median(lla, axis=0)
