@@ -12,8 +12,8 @@ from pano_mvs.algorithms.fusion.vote import fuse_stream
 from pano_mvs.api import All, Context, Panorama, Params, PointCloud, Pose, RangeMap, stage
 
 
-class VoteParams(Params):
-    """Settings of fusion.vote."""
+class FusionParams(Params):
+    """Settings of `fusion.vote`."""
 
     min_views: int = Field(default=2, ge=1, description="minimum number of views that agree on a point")
     max_relative_error: float = Field(
@@ -48,7 +48,7 @@ class VoteParams(Params):
 
 @stage("fusion.vote")
 def vote(
-    ranges: All[RangeMap], poses: All[Pose], images: All[Panorama], params: VoteParams, ctx: Context
+    ranges: All[RangeMap], poses: All[Pose], images: All[Panorama], params: FusionParams, ctx: Context
 ) -> PointCloud:
     """Fuse range maps into one coloured cloud with normals, keeping points on which several views agree.
 
@@ -72,7 +72,7 @@ def _fused(
     ranges: All[RangeMap],
     poses: All[Pose],
     images: All[Panorama],
-    params: VoteParams,
+    params: FusionParams,
     threads: int,
 ) -> PointCloud:
     """Return the cloud of the views of one group."""
@@ -86,7 +86,7 @@ def _fused(
     return fuse_stream(cams, load, FusionSettings(**settings), threads=threads)
 
 
-def _min_views(params: VoteParams, views: int) -> int:
+def _min_views(params: FusionParams, views: int) -> int:
     """Return the number of views that must agree on a point, at most the number of views."""
     return min(params.min_views, max(1, views))
 

@@ -56,12 +56,12 @@ def backend_contract_tests(backend: Path | str, *, device: str = "auto") -> list
 
 def _cost_is_bounded(name: str) -> None:
     for size_hw in ((8, 16), (9, 18), (25, 50)):
-        reference, warped, window = _looks(name, size_hw)
+        reference, warped, window = _cost_inputs(name, size_hw)
         checked_cost(_registered(name).function(reference, warped, window), size_hw, name)
 
 
 def _cost_separates_same(name: str) -> None:
-    reference, warped, window = _looks(name, (32, 64))
+    reference, warped, window = _cost_inputs(name, (32, 64))
     same = _registered(name).function(reference, reference.astype(np.float64), window)
     other = _registered(name).function(reference, warped, window)
     assert same.mean() < 0.5 * other.mean(), (
@@ -70,7 +70,7 @@ def _cost_separates_same(name: str) -> None:
 
 
 def _cost_is_a_function(name: str) -> None:
-    reference, warped, window = _looks(name, (25, 50))
+    reference, warped, window = _cost_inputs(name, (25, 50))
     reference.flags.writeable = warped.flags.writeable = False
     first, second = (np.asarray(_registered(name).function(reference, warped, window)).tobytes() for _ in range(2))
     assert first == second, f"the cost {name} returns something else when called again"
@@ -97,7 +97,7 @@ def _cases(name: str) -> Iterator[int]:
     yield from able[:: max(1, len(able) // _CASES_TRIED)]
 
 
-def _looks(name: str, size_hw: tuple[int, int]) -> tuple[NDArray[np.uint8], NDArray[np.float64], CostWindow]:
+def _cost_inputs(name: str, size_hw: tuple[int, int]) -> tuple[NDArray[np.uint8], NDArray[np.float64], CostWindow]:
     """Return two different images as the cost receives them, and windows of 5 × 5 pixels."""
     first, second = (picture.copy() for picture in tiny_capture(Variant(size_hw)).pictures[:2])
     if not _registered(name).colors:

@@ -40,7 +40,7 @@ class Scene:
         gains: (V, 3) factor of each view's red, green and blue.
         offsets: (V, 3) grey levels added to them.
         noise: standard deviation of the sensor's noise in grey levels.
-        outdoor: whether ranges differ so much that only relative errors are meaningful.
+        outdoor: whether only relative errors are meaningful, because ranges differ by orders of magnitude.
     """
 
     name: str

@@ -85,7 +85,7 @@ def sweep_case(number: int) -> SweepCase:
 
 
 @functools.cache
-def _readable(number: int) -> RangeMap:
+def _by_numpy(number: int) -> RangeMap:
     return sweep_case(number).swept("numpy")
 
 
@@ -97,7 +97,7 @@ def agreement(number: int, backend: str, *, device: str = "auto") -> float:
     """
     found = sweep_case(number).swept(backend, device=device)
     found.check()
-    return share_alike(found, _readable(number), sweep_case(number).settings)
+    return share_alike(found, _by_numpy(number), sweep_case(number).settings)
 
 
 def share_alike(one: RangeMap, other: RangeMap, settings: SweepSettings) -> float:

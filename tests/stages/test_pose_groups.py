@@ -39,7 +39,7 @@ from pano_mvs.stages.exports.mesh import MeshParams, mesh
 from pano_mvs.stages.exports.nerfstudio import NerfstudioParams, nerfstudio
 from pano_mvs.stages.filters import ConsistencyParams, consistency
 from pano_mvs.stages.frame import BaselineParams, LevelParams, ScaleParams, level, scale
-from pano_mvs.stages.fusion import VoteParams, vote
+from pano_mvs.stages.fusion import FusionParams, vote
 from pano_mvs.stages.patchmatch import PatchMatchParams, patchmatch
 from pano_mvs.stages.points import TrackedParams, tracked
 from pano_mvs.stages.poses import known_poses
@@ -105,7 +105,7 @@ def _fused(rooms: Rooms, names: tuple[str, ...] = _ORDER, **settings: Any) -> Po
     if set(names) == set(_SMALL):
         poses = {name: Pose(pose.cam_from_world) for name, pose in poses.items()}
     ctx = Context(np.random.default_rng(0), Path())
-    return vote(ranges=chosen, poses=poses, images=rooms.images, params=VoteParams(**settings), ctx=ctx)
+    return vote(ranges=chosen, poses=poses, images=rooms.images, params=FusionParams(**settings), ctx=ctx)
 
 
 def test_each_image_knows_its_group(rooms: Rooms) -> None:
@@ -134,7 +134,7 @@ def test_nothing_of_one_room_enters_the_cloud_of_the_other(rooms: Rooms) -> None
 
 def test_a_room_without_ranges_keeps_its_number(rooms: Rooms, ctx: Context) -> None:
     ranges = {name: rooms.ranges[name] for name in _LARGE}
-    cloud = vote(ranges=ranges, poses=rooms.pose_items, images=rooms.images, params=VoteParams(), ctx=ctx)
+    cloud = vote(ranges=ranges, poses=rooms.pose_items, images=rooms.images, params=FusionParams(), ctx=ctx)
     assert [len(group) > 0 for group in cloud.groups()] == [True, False]
     assert any(note.startswith("group 1: the cloud is empty") for note in ctx.notes)
 

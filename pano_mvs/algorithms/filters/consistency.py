@@ -121,11 +121,11 @@ def checked_with_agreement(
         raise UsageError("the limits of the consistency check must be positive")
     px_per_rad = reference.range.shape[1] / (2 * np.pi)
     limits = np.array([max_relative_error, max_reprojection_px / px_per_rad, _MAX_SURFACE_STEP])
-    votes = _count_votes(reference, reference_pose, sources, source_poses, limits)
-    motion = max_relative_error * px_per_rad * np.sqrt(votes.motion)
-    consistent = (votes.agreeing >= min_views) & (votes.support >= min_support) & (motion >= min_motion_px)
+    comparison = _compare_with_sources(reference, reference_pose, sources, source_poses, limits)
+    motion = max_relative_error * px_per_rad * np.sqrt(comparison.motion)
+    consistent = (comparison.agreeing >= min_views) & (comparison.support >= min_support) & (motion >= min_motion_px)
     step = _step_around(reference.range)
-    grade = (1 - 0.5**votes.support) * motion**2 / (motion**2 + _PRECISION_PX**2)
+    grade = (1 - 0.5**comparison.support) * motion**2 / (motion**2 + _PRECISION_PX**2)
     grade *= 0.5 + 0.5 * _DOUBTFUL_STEP**2 / (step**2 + _DOUBTFUL_STEP**2)
     low, high = CONSISTENT_CONFIDENCE
     graded = np.floor(low + (high - low) * grade).astype(np.uint8)
@@ -134,14 +134,14 @@ def checked_with_agreement(
     confidence = np.where(seen, np.where(consistent, graded, weak), reference.confidence)
     ranges = reference.range
     if remove_inconsistent and sources:
-        removed = (votes.agreeing == 0) & (votes.contradicting >= min(min_contradictions, len(sources)))
+        removed = (comparison.agreeing == 0) & (comparison.contradicting >= min(min_contradictions, len(sources)))
         ranges = np.where(removed, np.float32(np.nan), ranges)
     confidence[np.isnan(ranges)] = 0
-    return RangeMap(ranges, confidence, reference.normals_in_cam), _agreement(votes, seen)
+    return RangeMap(ranges, confidence, reference.normals_in_cam), _agreement(comparison, seen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Votes:
+class _Comparison:
     """Agreement of all sources with each pixel, (H, W) each.
 
     Attributes:
@@ -159,19 +159,19 @@ class _Votes:
     motion: NDArray[np.float64]
 
 
-def _count_votes(
+def _compare_with_sources(
     reference: RangeMap,
     reference_pose: Rigid3,
     sources: Sequence[RangeMap],
     source_poses: Sequence[Rigid3],
     limits: NDArray[np.float64],
-) -> _Votes:
+) -> _Comparison:
     import numba  # slow to import
 
     from pano_mvs.algorithms.filters import kernels_reprojection as kernels  # compiles on import
 
     shape = reference.range.shape
-    votes = _Votes(
+    comparison = _Comparison(
         np.zeros(shape, np.int64),
         np.zeros(shape, np.int64),
         np.zeros(shape, np.uint16),
@@ -186,30 +186,30 @@ def _count_votes(
         known = seen_ranges(source, min_confidence=WEAK_CONFIDENCE[0])
         arguments = ranges, rays, view, known, limits, verdicts, supports, motions
         for_bands(partial(_judge, kernels.judge_rows, arguments), shape[0], threads=numba.get_num_threads())
-        votes.agreeing[...] += verdicts == kernels.AGREES
-        votes.contradicting[...] += verdicts == kernels.CONTRADICTS
-        votes.hiding[...] += verdicts == kernels.HIDDEN
+        comparison.agreeing[...] += verdicts == kernels.AGREES
+        comparison.contradicting[...] += verdicts == kernels.CONTRADICTS
+        comparison.hiding[...] += verdicts == kernels.HIDDEN
         # Rounded, so that the sum of a few values does not depend on the order of the sources.
-        votes.support[...] += np.rint(supports * 2**40) / 2**40
-        votes.motion[...] += np.rint(supports * motions * 2**40) / 2**40
-    return votes
+        comparison.support[...] += np.rint(supports * 2**40) / 2**40
+        comparison.motion[...] += np.rint(supports * motions * 2**40) / 2**40
+    return comparison
 
 
-def _agreement(votes: _Votes, seen: NDArray[np.bool_]) -> Agreement:
+def _agreement(comparison: _Comparison, seen: NDArray[np.bool_]) -> Agreement:
     """Return the agreement of the sources with all pixels that were seen, (H, W)."""
-    judges = votes.agreeing + votes.contradicting + votes.hiding
+    judges = comparison.agreeing + comparison.contradicting + comparison.hiding
     row_weights = pixel_solid_angle(seen.shape) * seen.shape[1] / (4 * np.pi)
 
     def share(where: NDArray[np.bool_]) -> float:
         return float(np.sum(where.mean(axis=1) * row_weights))
 
     compared = seen & (judges > 0)
-    contradicted = compared & (votes.agreeing == 0) & (judges >= _MIN_JUDGES)
+    contradicted = compared & (comparison.agreeing == 0) & (judges >= _MIN_JUDGES)
     total = share(compared)
     parts = (
-        compared & (votes.agreeing > 0),
-        contradicted & (votes.contradicting >= _ONE_WAY * judges),
-        contradicted & (votes.hiding >= _ONE_WAY * judges),
+        compared & (comparison.agreeing > 0),
+        contradicted & (comparison.contradicting >= _ONE_WAY * judges),
+        contradicted & (comparison.hiding >= _ONE_WAY * judges),
     )
     return Agreement(total, *(share(part) / total if total else 0.0 for part in parts))
 

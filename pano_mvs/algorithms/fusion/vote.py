@@ -153,7 +153,7 @@ def _points_of(
     normals = _normals_or_views(reference, rays, written, threads)
     tallies = _own_tallies(reference, rays, normals)
     for window, idx, tie in sources:
-        _add_votes(window[idx], tie, (reference, rays, normals, written), settings, tallies, threads)
+        _compare_with(window[idx], tie, (reference, rays, normals, written), settings, tallies, threads)
     kept = _kept(reference, tallies, settings) & written
     position = tallies.sums[kept]
     color = tallies.colors[kept]
@@ -184,7 +184,7 @@ def _own_tallies(reference: Sight, rays: NDArray[np.float64], normals: NDArray[n
     )
 
 
-def _add_votes(
+def _compare_with(
     source: Sight,
     tie: float,
     pixels: tuple[Sight, NDArray[np.float64], NDArray[np.float32], NDArray[np.bool_]],

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs, facing_pose, least_essentials
 from pano_mvs.algorithms.two_view.five_point import essentials_from_five
 from pano_mvs.algorithms.two_view.hypotheses import draw_samples
-from pano_mvs.algorithms.two_view.redirection import voted_directions
+from pano_mvs.algorithms.two_view.redirection import direction_candidates
 from pano_mvs.algorithms.two_view.refinement import refine_relative_pose
 from pano_mvs.algorithms.two_view.significance import (
     MAX_LOG10_FALSE_ALARMS,
@@ -161,7 +161,7 @@ class _Search:
         found: list[Rigid3] = []
         wide_rad = 2 * self.threshold_rad  # the rotation is only approximate for these matches
         for rotation in _distinct_rotations(known):
-            directions, costs = voted_directions(rotation, p, q, rng=self.rng, threshold_rad=wide_rad)
+            directions, costs = direction_candidates(rotation, p, q, rng=self.rng, threshold_rad=wide_rad)
             found += [Rigid3(rotation, direction) for direction in _peaks(directions, costs)]
         finalists = least_essentials(pool, p, q, wide_rad, count=_PEAKS)
         return found + [facing_pose(essential, p, q, wide_rad) for essential in finalists]

@@ -96,7 +96,7 @@ def estimate_two_view(
             len(first),
             f"only {len(first)} {plural(len(first), 'match', 'matches')}, {_MIN_MATCHES} needed for a hypothesis",
         )
-    # Hypotheses are given up after a few matches, which must be any.
+    # Hypotheses are rejected after the first few matches, so the order of matches must be random.
     order = rng.permutation(len(first))
     search = _Search(first[order], second[order], rng, threshold_rad, SOLVERS[solver], optimise=refine)
     leaders, iterations = search.run(confidence=confidence, max_iterations=max_iterations)
@@ -107,7 +107,7 @@ def estimate_two_view(
         pose = best_redirected(leaders, first, second, rng=rng, threshold_rad=threshold_rad)
         pose = _refined(pose, first, second, threshold_rad)
     if pose is None:
-        return _none(len(first), "no relative pose is shared by eight matches")
+        return _none(len(first), "no relative pose is supported by eight matches")
     residuals, inliers = agreement(pose, first, second, threshold_rad)
     return RelativePose(pose, inliers, residuals, iterations)
 
@@ -140,9 +140,9 @@ class _Search:
     optimise: bool
 
     def run(self, *, confidence: float, max_iterations: int) -> tuple[list[Rigid3], int]:
-        """Return the leading poses, best first, and how many hypotheses were tried.
+        """Return the leading poses, best first, and the number of hypotheses.
 
-        One if a better one would have been met by now, several if the search was given up.
+        There is one pose if a better one would have been found by now, and several if the search reached its limit.
         """
         leaders: list[tuple[float, int, Rigid3]] = []
         samples, tried, needed = 0, 0, np.inf
@@ -161,7 +161,7 @@ class _Search:
         return [pose for _, _, pose in (leaders[:1] if samples >= needed else leaders)], tried
 
     def _best_of_batch(self, worst: float) -> tuple[Rigid3 | None, float, int]:
-        """Return the best pose of a batch of samples if it costs less than `worst`, its cost, how many were tried."""
+        """Return the best pose of a batch if it costs less than `worst`, its cost, and the number of trials."""
         size = len(self.first)
         drawn = draw_samples(self.rng, size, batch=self.solver.batch, sample=self.solver.sample)
         hypotheses = self.solver.solve(self.first[drawn], self.second[drawn])
@@ -173,7 +173,7 @@ class _Search:
             self.first[screened],
             self.second[screened],
             self.threshold_rad,
-            # What a hypothesis costs without a look at the sides is the least that it can cost.
+            # The cost without cheirality is a lower bound of the cost.
             limit=worst if len(self.first) <= _SCREEN else np.inf,
             sigmas=_LAG_SIGMAS if self.optimise else np.inf,
             count=_FINALISTS,
@@ -185,7 +185,7 @@ class _Search:
         return poses[int(np.argmin(costs))], float(costs.min()), len(hypotheses)
 
     def _optimised(self, pose: Rigid3, cost: float) -> tuple[Rigid3, float]:
-        """Refit on the inliers of a wide, then ever narrower band, and keep the best."""
+        """Refit on the inliers of a wide, then successively narrower band, and keep the best."""
         candidates = self._polished(pose) if self.solver.sample == 5 else self._refitted(pose)
         if not candidates:
             return pose, cost
@@ -194,7 +194,7 @@ class _Search:
         return (candidates[best], float(costs[best])) if costs[best] < cost else (pose, cost)
 
     def _polished(self, pose: Rigid3) -> list[Rigid3]:
-        """Minimise the angular error of the inliers: unlike the linear solution it is as sound on a plane."""
+        """Minimise the angular error of the inliers; unlike the linear solution, this also works for planar scenes."""
         found: list[Rigid3] = []
         for widen in (2.0, 1.0):
             inliers = np.flatnonzero(self._residuals(pose) < widen * self.threshold_rad)

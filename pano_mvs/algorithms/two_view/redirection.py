@@ -48,7 +48,7 @@ def _redirected(
 ) -> Rigid3:
     chosen = rng.choice(len(first), min(_MATCHES, len(first)), replace=False)
     p, q = first[chosen], second[chosen]
-    directions, costs = voted_directions(pose.rotation, p, q, rng=rng, threshold_rad=2 * threshold_rad)
+    directions, costs = direction_candidates(pose.rotation, p, q, rng=rng, threshold_rad=2 * threshold_rad)
     directions = np.concatenate([pose.translation[None], directions])
     costs = np.concatenate([facing_costs([pose], p, q, 2 * threshold_rad), costs])
     found = Rigid3(pose.rotation, directions[int(np.argmin(costs))])
@@ -59,7 +59,7 @@ def _redirected(
     return found if costs[0] <= costs[1] else opposite
 
 
-def voted_directions(
+def direction_candidates(
     rotation: FloatArray,
     p: FloatArray,
     q: FloatArray,

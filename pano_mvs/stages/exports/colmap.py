@@ -152,7 +152,7 @@ def colmap_dense(
     files = sparse_targets(children(folder)) | write_stereo_configs(ctx.scratch, seen)
     for number, group in enumerate(others, start=1):
         files |= _other_model(group, number, _cuts(group.names, faces, item_stems(images)), params.format, ctx)
-    _tell_blanks(seen, params.format, ctx)
+    _warn_about_spaces(seen, params.format, ctx)
     blind = sum(not count for count in seen.values())
     ctx.metric("faces_without_points", blind)
     if blind:
@@ -183,7 +183,7 @@ def colmap_dense_init(
     return _sparse_models(joined, images, params.format, ctx, "colmap_dense_init/sparse")
 
 
-def _tell_blanks(names: Iterable[str], form: ModelForm, ctx: Context) -> None:
+def _warn_about_spaces(names: Iterable[str], form: ModelForm, ctx: Context) -> None:
     found = next((name for name in names if " " in name), "") if form != "bin" else ""
     if found:
         ctx.note(
@@ -200,7 +200,7 @@ def _sparse_models(poses: Poses, images: Mapping[str, Panorama], form: ModelForm
         sizes_hw = {name: images[name].source_size_hw for name in group.names if name in images}
         write_colmap_model(folder, group, sizes_hw, form=form)
         files |= {f"{target}/{number}/{path.name}": path for path in children(folder)}
-    _tell_blanks(poses.names, form, ctx)
+    _warn_about_spaces(poses.names, form, ctx)
     return Files(files)
 
 

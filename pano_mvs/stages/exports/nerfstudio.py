@@ -85,7 +85,7 @@ def nerfstudio_frames(
     if range_map is not None:
         kept = valid & range_map.valid & (range_map.confidence >= params.min_confidence)
         ranges = np.where(kept, range_map.range, np.float32(np.nan))
-    made = _Made(params, ctx)
+    made = _FrameFiles(params, ctx)
     if "equirectangular" in params.variants:
         _add_panorama(made, image, valid, ranges)
     if "faces" in params.variants:
@@ -189,7 +189,7 @@ def _write_group(
     return files
 
 
-class _Made:
+class _FrameFiles:
     """The files of one panorama."""
 
     def __init__(self, params: NerfstudioFramesParams, ctx: Context) -> None:
@@ -224,7 +224,9 @@ class _Made:
         return f"depths/{name}.png"
 
 
-def _add_panorama(made: _Made, image: Panorama, valid: NDArray[np.bool_], ranges: NDArray[np.float32] | None) -> None:
+def _add_panorama(
+    made: _FrameFiles, image: Panorama, valid: NDArray[np.bool_], ranges: NDArray[np.float32] | None
+) -> None:
     folder, name = "nerfstudio/equirectangular", "{name}"
     height, width = image.size_hw
     whole = image.crop_ltwh is None and image.size_hw == image.source_size_hw
@@ -240,7 +242,9 @@ def _add_panorama(made: _Made, image: Panorama, valid: NDArray[np.bool_], ranges
     )
 
 
-def _add_faces(made: _Made, image: Panorama, valid: NDArray[np.bool_], ranges: NDArray[np.float32] | None) -> None:
+def _add_faces(
+    made: _FrameFiles, image: Panorama, valid: NDArray[np.bool_], ranges: NDArray[np.float32] | None
+) -> None:
     folder, params = "nerfstudio/faces", made.params
     panorama = image.load()
     for face in panorama_faces(image.size_hw, layout=params.layout, fov_deg=params.fov_deg, size_px=params.size_px):

@@ -45,15 +45,15 @@ class Alias:
     Attributes:
         move: (3,) in the world, after the rotation about the origin.
         support: weight of the pairs that suggest it.
-        votes: (i, j), i < j, to a signed weight: positive if j is to move by the motion x → turn x + move relative to
-            i, negative if by its inverse.
+        signed_weights: (i, j), i < j, to a signed weight: positive if j is to move by the motion x → turn x + move
+            relative to i, negative if by its inverse.
         turn: (3, 3) rotation of the world, usually the identity.
         own_inverse: whether the motion is its own inverse, like a half turn.
     """
 
     move: FloatArray
     support: float
-    votes: dict[Edge, float]
+    signed_weights: dict[Edge, float]
     turn: FloatArray = field(default_factory=lambda: np.eye(3))
     own_inverse: bool = False
 
@@ -103,17 +103,19 @@ def _straight_aliases(model: PlacedModel, suggestions: list[_Suggestion]) -> lis
     for _ in range(_ATTEMPTS):
         if not left.any() or len(found) == _MAX_ALIASES:
             break
-        votes = [_votes(edges, weights, apart[row] <= opposite[row], near[row] & left) for row in range(len(edges))]
-        support = np.array([sum(map(abs, vote.values())) for vote in votes]) * left
+        signed_weights = [
+            _signed_weights(edges, weights, apart[row] <= opposite[row], near[row] & left) for row in range(len(edges))
+        ]
+        support = np.array([sum(map(abs, signed.values())) for signed in signed_weights]) * left
         best = int(np.argmax(support))
         members = np.flatnonzero(near[best] & left)
         left[members] = False
         left[best] = False
-        if len(votes[best]) < max(_MIN_PAIRS, _MIN_PAIR_SHARE * len(model.chosen)):
+        if len(signed_weights[best]) < max(_MIN_PAIRS, _MIN_PAIR_SHARE * len(model.chosen)):
             continue
         signs = np.where(apart[best, members] <= opposite[best, members], 1.0, -1.0)
         move = np.average(moves[members] * signs[:, None], axis=0, weights=weights[members])
-        found.append(Alias(move, float(support[best]), votes[best]))
+        found.append(Alias(move, float(support[best]), signed_weights[best]))
     return found
 
 
@@ -145,11 +147,11 @@ def _turned_aliases(suggestions: list[_Suggestion]) -> list[Alias]:
     move = np.average([motion.apply(pivot) for motion in motions], axis=0, weights=weights) - turn @ pivot
     motion = Rigid3(turn, move)
     own_inverse = all(_same_motion(motion.inverse(), replace(found, motion=motion), spread) for found in alike)
-    votes: dict[Edge, float] = {}
+    signed_weights: dict[Edge, float] = {}
     for found, way in zip(alike, same, strict=True):
-        if found.weight > abs(votes.get(found.edge, 0.0)):
-            votes[found.edge] = found.weight if way or own_inverse else -found.weight
-    return [Alias(move, support, votes, turn, own_inverse)]
+        if found.weight > abs(signed_weights.get(found.edge, 0.0)):
+            signed_weights[found.edge] = found.weight if way or own_inverse else -found.weight
+    return [Alias(move, support, signed_weights, turn, own_inverse)]
 
 
 def _same_motion(motion: Rigid3, other: _Suggestion, spread: float) -> bool:
@@ -179,13 +181,13 @@ def labellings(model: PlacedModel, alias: Alias) -> list[dict[int, int]]:
         held = _HELD * model.pairs.geometries[i, j][rank].weight
         gain[place[i], place[j]] -= held
         gain[place[j], place[i]] -= held
-    for (i, j), vote in alias.votes.items():
-        a, b = (i, j) if vote > 0 else (j, i)
-        gain[place[a], place[b]] += abs(vote)
-        gain[place[b], place[a]] += abs(vote) if alias.own_inverse else -abs(vote)
+    for (i, j), signed in alias.signed_weights.items():
+        a, b = (i, j) if signed > 0 else (j, i)
+        gain[place[a], place[b]] += abs(signed)
+        gain[place[b], place[a]] += abs(signed) if alias.own_inverse else -abs(signed)
     found: dict[tuple[int, ...], float] = {}
-    for (i, j), vote in sorted(alias.votes.items(), key=lambda item: (-abs(item[1]), item[0]))[:_STARTS]:
-        a, b = (place[i], place[j]) if vote > 0 else (place[j], place[i])
+    for (i, j), signed in sorted(alias.signed_weights.items(), key=lambda item: (-abs(item[1]), item[0]))[:_STARTS]:
+        a, b = (place[i], place[j]) if signed > 0 else (place[j], place[i])
         labels = np.zeros(len(images), np.intp)
         labels[b] = 1
         labels, score = _improved(gain, labels, kept=(a, b))
@@ -236,16 +238,16 @@ def _suggestions(model: PlacedModel) -> list[_Suggestion]:
     return [suggestions[idx] for idx in heaviest]
 
 
-def _votes(
+def _signed_weights(
     edges: list[Edge], weights: FloatArray, same_way: NDArray[np.bool_], near: NDArray[np.bool_]
 ) -> dict[Edge, float]:
     """Return the heaviest signed weight of each pair among the motions that are near one of them."""
-    votes: dict[Edge, float] = {}
+    signed_weights: dict[Edge, float] = {}
     for idx in np.flatnonzero(near):
         signed = float(weights[idx]) if same_way[idx] else -float(weights[idx])
-        if abs(signed) > abs(votes.get(edges[idx], 0.0)):
-            votes[edges[idx]] = signed
-    return votes
+        if abs(signed) > abs(signed_weights.get(edges[idx], 0.0)):
+            signed_weights[edges[idx]] = signed
+    return signed_weights
 
 
 def _best_cut(gain: FloatArray) -> list[tuple[int, ...]]:

@@ -159,7 +159,7 @@ def _unshift_blocks(model: PlacedModel, confirmation: Confirmation) -> tuple[set
         if gain > _PROMISING_GAIN and remaining:
             labels, gain = _with_better_labels(model, alias, labels, gain, confirmation)
         if gain <= _MIN_BLOCK_GAIN or not remaining:
-            periodic = len(alias.votes) > _PERIODIC * len(model.chosen)
+            periodic = len(alias.signed_weights) > _PERIODIC * len(model.chosen)
             limit = _AMBIGUOUS_GAIN_PERIODIC if periodic else _AMBIGUOUS_GAIN
             if gain > limit:
                 return moved, _ambiguity(model, alias, labels)
@@ -199,7 +199,7 @@ def _ambiguity(model: PlacedModel, alias: Alias, labels: dict[int, int]) -> str:
 def _turned_ambiguity(alias: Alias) -> str:
     """Return a warning that part of the capture may be rotated; a few pairs hardly determine which images."""
     return (
-        f"the place repeats: {len(alias.votes)} pairs would agree if some of the images were rotated by "
+        f"the place repeats: {len(alias.signed_weights)} pairs would agree if some of the images were rotated by "
         f"{_turn_deg(alias):.0f}° and placed elsewhere, as in a second, similar room"
     )
 
