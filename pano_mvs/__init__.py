@@ -3,6 +3,7 @@
     run = pano_mvs.run("quickstart", images="photos", out="out")    # compute, or take from the cache
     run = pano_mvs.load("out")                                      # what an earlier run made
     plan = pano_mvs.plan("quickstart", images="photos")             # what a run would compute
+    scores = pano_mvs.evaluate_run("out", "truth")                  # how far it is from ground truth
 
 The command line is `pano-mvs`. Authors of plugins import `pano_mvs.api`. The conventions (frames, pixels, ranges) are
 stated once, in `pano_mvs.geometry`.
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError, StoreError, UsageError, WorkflowError
+    from pano_mvs.evaluation import evaluate_cloud, evaluate_depth, evaluate_poses, evaluate_run
     from pano_mvs.results.run_output import RunOutput, RunView, load
     from pano_mvs.results.summary import RunSummary
     from pano_mvs.session.planning import RunPlan, plan
@@ -32,6 +34,10 @@ __all__ = [
     "UsageError",
     "WorkflowError",
     "__version__",
+    "evaluate_cloud",
+    "evaluate_depth",
+    "evaluate_poses",
+    "evaluate_run",
     "load",
     "plan",
     "run",
@@ -49,6 +55,10 @@ _HOMES = {
     "StoreError": "core.errors",
     "UsageError": "core.errors",
     "WorkflowError": "core.errors",
+    "evaluate_cloud": "evaluation",
+    "evaluate_depth": "evaluation",
+    "evaluate_poses": "evaluation",
+    "evaluate_run": "evaluation",
     "load": "results.run_output",
     "plan": "session.planning",
     "run": "session.running",

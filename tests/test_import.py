@@ -11,7 +11,7 @@ import pytest
 
 import pano_mvs
 
-SLOW_LIBRARIES = {"cv2", "jinja2", "numba", "numpy", "pycolmap", "pydantic", "pyvista", "scipy"}
+SLOW_LIBRARIES = {"cv2", "jinja2", "matplotlib", "numba", "numpy", "pycolmap", "pydantic", "pyvista", "scipy"}
 
 
 @pytest.mark.parametrize("module", ["pano_mvs", "pano_mvs.cli.app"])

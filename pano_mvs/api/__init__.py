@@ -12,16 +12,19 @@ def my_sweep(ref: Each[Panorama], pose: Each[Pose], sources: Near[Panorama], sou
 
 from pano_mvs.algorithms.poses.frame.geodesy import lla_from_local
 from pano_mvs.algorithms.poses.frame.georeference import origin_of_frame
-from pano_mvs.algorithms.sweep.backends import register_sweep_backend
-from pano_mvs.algorithms.sweep.costs import CostWindow, register_sweep_cost
+from pano_mvs.algorithms.sweep.backends.registry import register_sweep_backend
+from pano_mvs.algorithms.sweep.costs.registry import register_sweep_cost
 from pano_mvs.algorithms.sweep.preparation import SweepInput
+from pano_mvs.algorithms.sweep.windows import CostWindow
 from pano_mvs.algorithms.sweep.winner import Winners
 from pano_mvs.algorithms.two_view.verification import verify_pair
 from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError, UsageError
 from pano_mvs.core.named_registry import NamedRegistry
+from pano_mvs.core.settings import setting
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.params import NOT_IN_KEY, InputPath, Params, RegisteredIn, SourcePath
 from pano_mvs.engine.stages.ports import All, Each, Names, Near, One
+from pano_mvs.engine.stages.settings import params_from, settings_from
 from pano_mvs.engine.stages.stage import SourceItem, source, stage
 from pano_mvs.geometry import (
     Rigid3,
@@ -34,7 +37,7 @@ from pano_mvs.geometry import (
     sample_panorama,
 )
 from pano_mvs.io.clouds.thinning import CHUNK_POINTS, chunks, select_points
-from pano_mvs.io.clouds.thinning import Kept as KeptPoints
+from pano_mvs.io.clouds.thinning import SelectedPoints as KeptPoints
 from pano_mvs.io.clouds.thinning import Selection as PointSelection
 from pano_mvs.scene import (
     Axis,
@@ -105,6 +108,7 @@ __all__ = [
     "lla_from_local",
     "origin_of_frame",
     "pad_panorama",
+    "params_from",
     "per_group",
     "pixel_from_ray",
     "ray_from_pixel",
@@ -114,6 +118,8 @@ __all__ = [
     "roll_panorama",
     "sample_panorama",
     "select_points",
+    "setting",
+    "settings_from",
     "source",
     "split_groups",
     "stage",

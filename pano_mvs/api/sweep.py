@@ -4,31 +4,33 @@ A backend takes a `SweepInput` and returns `Winners`. `find_winners` is the read
 are its parts: weights of the sources, penalties between depth hypotheses, windows and constants of the costs.
 """
 
-from pano_mvs.algorithms.sweep.backends import register_sweep_backend
+from pano_mvs.algorithms.sweep.backends.numpy_backend import find_winners
+from pano_mvs.algorithms.sweep.backends.registry import register_sweep_backend
 from pano_mvs.algorithms.sweep.combination import source_weights
-from pano_mvs.algorithms.sweep.costs import CostWindow, register_sweep_cost
-from pano_mvs.algorithms.sweep.numpy_backend import find_winners
-from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, step_penalties, warm_up
-from pano_mvs.algorithms.sweep.preparation import SweepInput
-from pano_mvs.algorithms.sweep.settings import (
+from pano_mvs.algorithms.sweep.costs.census_gradient import census_weight
+from pano_mvs.algorithms.sweep.costs.kernels_constants import (
     GREY_WEIGHT,
-    LARGEST_COLOR_COST,
-    LARGEST_GRADIENT_COST,
+    MAX_COLOR_COST,
+    MAX_GRADIENT_COST,
     ZNCC_NOISE_VARIANCE,
 )
-from pano_mvs.algorithms.sweep.windows import WindowBands, column_offsets
+from pano_mvs.algorithms.sweep.costs.registry import register_sweep_cost
+from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, step_penalties, warm_up
+from pano_mvs.algorithms.sweep.preparation import SweepInput
+from pano_mvs.algorithms.sweep.windows import CostWindow, WindowBands, column_offsets
 from pano_mvs.algorithms.sweep.winner import Winners
 
 __all__ = [
     "DIRECTIONS",
     "GREY_WEIGHT",
-    "LARGEST_COLOR_COST",
-    "LARGEST_GRADIENT_COST",
+    "MAX_COLOR_COST",
+    "MAX_GRADIENT_COST",
     "ZNCC_NOISE_VARIANCE",
     "CostWindow",
     "SweepInput",
     "WindowBands",
     "Winners",
+    "census_weight",
     "column_offsets",
     "find_winners",
     "register_sweep_backend",

@@ -1,6 +1,6 @@
 """The command line: options in, the engine's or a library's function called, exit codes out.
 
-0 ok · 1 internal error · 2 usage or validation · 3 finished with failed items · 4 stopped by a gate or guard ·
+0 ok · 1 internal error · 2 usage or validation · 3 finished with failed items · 4 stopped by a threshold or a guard ·
 130 interrupted.
 """
 
@@ -208,7 +208,7 @@ def status(
 @app.command()
 @guarded
 def report(out: Annotated[Path, typer.Argument(help="The output folder of a run.")], cache: CacheOption = None) -> None:
-    """Write report.html anew from run.json and the cache; nothing is computed again."""
+    """Write report.html again from run.json and the cache; nothing is computed."""
     from pano_mvs.cli.report_command import rewrite_report
 
     rewrite_report(out, cache, Console())
@@ -233,23 +233,30 @@ def view_results(
     surface: Annotated[
         str,
         typer.Option(
-            "--show", metavar="cloud|mesh|both", help="By default the cloud, if there is one.", show_default=False
+            "--show",
+            metavar="cloud|mesh|both",
+            help="What to show; default: the cloud, if there is one.",
+            show_default=False,
         ),
     ] = "",
-    points: Annotated[int, typer.Option("--points", min=0, help="Draw at most so many points; 0: all.")] = 2_000_000,
-    size: Annotated[str, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Of the window in pixels.")] = "1280x860",
+    points: Annotated[
+        int, typer.Option("--points", min=0, help="Maximum number of points to draw; 0: all.")
+    ] = 2_000_000,
+    size: Annotated[
+        str, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Size of the window in pixels.")
+    ] = "1280x860",
     images: Annotated[
-        Path | None, typer.Option("--images", help="Folder of the panoramas, if they have moved.")
+        Path | None, typer.Option("--images", help="Folder of the panoramas, if they were moved.")
     ] = None,
-    labels: Annotated[bool, typer.Option("--labels", help="Name the cameras.")] = False,
+    labels: Annotated[bool, typer.Option("--labels", help="Show the names of the cameras.")] = False,
     blended: Annotated[bool, typer.Option("--blend", help="Show the cloud within a panorama.")] = False,
-    backs: Annotated[bool, typer.Option("--backs", help="Show points that turn their back to the eye too.")] = False,
+    backs: Annotated[bool, typer.Option("--backs", help="Also show points that face away from the viewer.")] = False,
     group: Annotated[
         int,
         typer.Option(
             "--group",
             min=0,
-            help="Which group of panoramas, where no reliable pair connects all of them; 0 is the largest.",
+            help="Group of panoramas to show if no reliable pair connects all of them; 0 is the largest.",
         ),
     ] = 0,
 ) -> None:
@@ -269,20 +276,28 @@ def inspect_pixel(
             metavar="WORKFLOW|OUT", help="A workflow file, the name of a preset, or the output folder of a run."
         ),
     ],
-    image: Annotated[str, typer.Argument(help="Name of the image, or a part of it that fits one alone.")],
-    x: Annotated[float, typer.Argument(help="Column from the left edge at the swept size; fractions are dropped.")],
-    y: Annotated[float, typer.Argument(help="Row from the upper edge, likewise.")],
-    stage: Annotated[str, typer.Option("--stage", help="Which sweep; else the first.", show_default=False)] = "",
+    image: Annotated[str, typer.Argument(help="Name of the image, or a part of the name that only one image has.")],
+    x: Annotated[
+        float,
+        typer.Argument(help="Column of the pixel from the left edge, at the size of the sweep; fractions are dropped."),
+    ],
+    y: Annotated[float, typer.Argument(help="Row of the pixel from the upper edge.")],
+    stage: Annotated[
+        str, typer.Option("--stage", help="Sweep stage to inspect; default: the first.", show_default=False)
+    ] = "",
     overrides: SetOption = None,
     images: ImagesOption = None,
     cache: CacheOption = None,
     truth: Annotated[
-        Path | None, typer.Option("--truth", help="Folder with poses.json and depth.npz; else the workflow's own.")
+        Path | None,
+        typer.Option("--truth", help="Folder with poses.json and depth.npz; default: the one that the workflow names."),
     ] = None,
-    plot: Annotated[Path | None, typer.Option("--plot", metavar="FILE.png", help="Draw the curve there.")] = None,
+    plot: Annotated[
+        Path | None, typer.Option("--plot", metavar="FILE.png", help="Write a plot of the cost curve to this file.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Show one pixel: its ray, its range after each stage, what its neighbours see, its cost at every virtual range."""
+    """Show one pixel: its ray, its range after each stage, what its neighbours see, and its cost at every depth."""
     from pano_mvs.cli.inspect.command import PixelWanted, inspect, open_run
 
     session = open_run(target, overrides=overrides or [], images=images, cache=cache)

@@ -15,27 +15,41 @@ WorkflowArgument = Annotated[
         metavar="WORKFLOW", help="A workflow file, or the name of a preset.", autocompletion=complete_workflow
     ),
 ]
-ImagesOption = Annotated[Path | None, typer.Option("--images", help="Folder of panoramas to use instead.")]
+ImagesOption = Annotated[
+    Path | None, typer.Option("--images", help="Folder of panoramas; default: the one that the workflow names.")
+]
 SetOption = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="STAGE.PARAM=VALUE", help="Change a setting.", autocompletion=complete_setting),
+    typer.Option(
+        "--set", metavar="STAGE.PARAM=VALUE", help="Change a setting; may be repeated.", autocompletion=complete_setting
+    ),
 ]
-CacheOption = Annotated[Path | None, typer.Option("--cache", help="Folder of the cache.")]
-OutOption = Annotated[Path | None, typer.Option("--out", help="Folder of the results; default out/<workflow>.")]
+CacheOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--cache", help="Folder of the cache; default: $PANO_MVS_CACHE, or .pano-mvs beside the workflow file."
+    ),
+]
+OutOption = Annotated[Path | None, typer.Option("--out", help="Output folder; default: out/<workflow>.")]
 UntilOption = Annotated[
     list[str] | None,
-    typer.Option("--until", metavar="STAGE", help="Only this stage and what it needs.", autocompletion=complete_stage),
+    typer.Option(
+        "--until",
+        metavar="STAGE",
+        help="Run only this stage and the stages that it needs.",
+        autocompletion=complete_stage,
+    ),
 ]
 OnlyOption = Annotated[
     list[str] | None,
-    typer.Option("--only", metavar="STAGE:ITEM", help="Only this unit and what it needs."),
+    typer.Option("--only", metavar="STAGE:ITEM", help="Run only this unit and the units that it needs."),
 ]
 RefreshOption = Annotated[
     list[str] | None,
     typer.Option(
         "--refresh",
         metavar="STAGE[:ITEM]",
-        help="Compute it again though it is cached.",
+        help="Compute this stage or unit again even if it is cached.",
         autocompletion=complete_stage,
     ),
 ]
@@ -44,13 +58,14 @@ MinFreeOption = Annotated[
     typer.Option(
         "--min-free",
         metavar="SIZE",
-        help="Room on the cache's disk below which nothing is begun, such as 5GB; 200MB.",
+        help="Start no unit if less space than this is free on the disk of the cache, such as 5GB; default: 200MB.",
         show_default=False,
     ),
 ]
 DurableOption = Annotated[
-    bool, typer.Option("--durable", help="Flush all results to the disk at once, for machines that lose power.")
+    bool,
+    typer.Option("--durable", help="Flush each result to the disk before going on, for machines that may lose power."),
 ]
 AcceptOption = Annotated[
-    bool, typer.Option("--accept-code", help="Keep what was computed before code or libraries changed.")
+    bool, typer.Option("--accept-code", help="Reuse results that were computed before code or libraries changed.")
 ]

@@ -34,7 +34,7 @@ class ViewOptions:
         view: "overview", "top", "front" or "inside:NAME".
         color: of the cloud, see `COLORINGS`.
         surface: "cloud", "mesh" or "both"; empty for the cloud where there is one.
-        points: at most so many are drawn; 0: all.
+        points: maximum number of points to draw; 0: all.
         size: WIDTHxHEIGHT of the window in pixels.
         labels: whether cameras are named.
         blended: whether the cloud is shown within a panorama.

@@ -9,7 +9,7 @@ _BAND_ROWS = 32
 
 
 def for_bands(work: Callable[[int, int], object], height: int, *, threads: int) -> None:
-    """Call `work` with the first row and the number of rows of each band.
+    """Call `work(first_row, rows)` for bands that cover all rows.
 
     Bands are disjoint, so that results do not depend on the number of threads. Compiled work that releases the GIL runs
     in parallel; an exception in one band is raised here.

@@ -6,6 +6,9 @@ import unicodedata
 from pathlib import PurePosixPath
 
 MAX_NAME_LENGTH = 100
+PAIR_SEPARATOR = " | "
+"""Stands between the two names of a pair. Windows allows no vertical bar in a file name, and few files have one."""
+
 _RESERVED = {"con", "prn", "aux", "nul", *(f"{port}{digit}" for port in ("com", "lpt") for digit in "0123456789")}
 _INVALID_CHARACTERS = '<>:"|?*'
 _RUN_FILES = {"logs", "run.json", "report.html"}
@@ -42,6 +45,8 @@ def item_problem(name: str) -> str:
         return f"its name {name!r} is empty or has control characters; rename it"
     if leads_outside(name):
         return f"its name {name!r} would lead outside the output folder; rename it"
+    if PAIR_SEPARATOR in name:
+        return f"its name {name!r} contains {PAIR_SEPARATOR!r}, which separates the names of a pair; rename it"
     return ""
 
 

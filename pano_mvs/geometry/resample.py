@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -46,7 +46,8 @@ def sample_panorama(panorama: NDArray[np.generic], pixels_px: ArrayLike) -> NDAr
 
     Args:
         panorama: (H, W) or (H, W, C), any real type, even W. A NaN neighbour with a weight makes the sample NaN.
-        pixels_px: (..., 2) positions (x, y), (0, 0) the upper-left corner; any x (it wraps), y in [0, H].
+        pixels_px: (..., 2) positions (x, y), (0, 0) the upper-left corner; any x (it wraps), y in [0, H], beyond which
+            the poles are sampled.
 
     Returns:
         (...,) or (..., C) float64.
@@ -56,7 +57,7 @@ def sample_panorama(panorama: NDArray[np.generic], pixels_px: ArrayLike) -> NDAr
     """
     pixels = np.asarray(pixels_px, dtype=np.float64)
     height, width = panorama.shape[:2]
-    padded = pad_panorama(panorama, 1)
+    padded: NDArray[Any] = pad_panorama(panorama, 1)
     x = np.mod(pixels[..., 0], width) + 0.5
     y = np.clip(pixels[..., 1], 0, height) + 0.5
     column, row = np.floor(x).astype(np.intp), np.floor(y).astype(np.intp)
@@ -67,7 +68,7 @@ def sample_panorama(panorama: NDArray[np.generic], pixels_px: ArrayLike) -> NDAr
     for d_row, w_row in ((0, 1 - weight_y), (1, weight_y)):
         for d_column, w_column in ((0, 1 - weight_x), (1, weight_x)):
             weight = w_row * w_column
-            value = padded[np.minimum(row + d_row, height + 1), np.minimum(column + d_column, width + 1)]
+            value = padded[row + d_row, column + d_column]
             result += np.where(weight > 0, weight * value, 0.0)
     return result
 

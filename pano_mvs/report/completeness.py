@@ -63,9 +63,9 @@ def shares_of(confidence: NDArray[np.uint8], mask: NDArray[np.bool_] | None = No
 
 
 def shares_from_fact(fact: Any) -> Shares | None:
-    """Return the shares that `fact_of` gave, None if they are none."""
-    sound = isinstance(fact, list) and len(fact) == 5 and all(isinstance(value, int | float) for value in fact)
-    return Shares(*map(float, fact)) if sound else None
+    """Return the shares that `fact_of` gave; None if the value is not from it."""
+    valid = isinstance(fact, list) and len(fact) == 5 and all(isinstance(value, int | float) for value in fact)
+    return Shares(*map(float, fact)) if valid else None
 
 
 def fact_of(shares: Shares) -> list[float]:

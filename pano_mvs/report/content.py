@@ -70,7 +70,7 @@ class Content:
     facts: Mapping[str, Any]
 
 
-def gather(out_dir: Path, summary: RunSummary, values: StoredValues, earlier: EarlierPage) -> Content:
+def gather(out_dir: Path, summary: RunSummary, values: StoredValues, *, earlier: EarlierPage) -> Content:
     """Return what the page shows; what is missing or damaged is left out and named in the notes.
 
     Args:

@@ -32,7 +32,7 @@ class EarlierPage:
 
     @staticmethod
     def of_file(path: Path) -> EarlierPage:
-        """Return what a page holds; nothing if it is not there or no page of ours."""
+        """Return the pictures and figures of a page; none if there is no page, or it is from another program."""
         try:
             text = path.read_text(encoding="utf-8") if path.stat().st_size <= _MAX_BYTES else ""
         except (OSError, UnicodeDecodeError):

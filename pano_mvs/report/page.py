@@ -45,7 +45,8 @@ def write_report(out_dir: Path, summary: RunSummary, values: StoredValues | None
 
 def gather_report(out_dir: Path, summary: RunSummary, values: StoredValues | None = None) -> Content:
     """Return everything that the page shows; arguments as of `write_report`."""
-    return gather(out_dir, summary, values or StoredValues(), EarlierPage.of_file(out_dir / "report.html"))
+    earlier = EarlierPage.of_file(out_dir / "report.html")
+    return gather(out_dir, summary, values or StoredValues(), earlier=earlier)
 
 
 def write_page(out_dir: Path, summary: RunSummary, content: Content) -> None:

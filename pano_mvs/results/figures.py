@@ -64,7 +64,7 @@ def degrees(value: Any) -> str:
 
 
 def significant(value: float, digits: int = 2) -> str:
-    """Return a number with at least so many significant digits, and never with an exponent."""
+    """Return a number with at least this number of significant digits, and never with an exponent."""
     if 0 < abs(value) < _MIN_SHOWN:
         return f"< {_MIN_SHOWN}"
     return f"{value:z.0f}" if abs(value) >= 10**digits - 0.5 else f"{value:z.{digits}g}"

@@ -176,7 +176,7 @@ def _commonest(reasons: Sequence[str]) -> str:
 
 
 def _graph(summary: RunSummary) -> list[Finding]:
-    """Return which registered cameras are linked to one other alone, where there are cameras enough to tell."""
+    """Return the registered cameras that are linked to only one other, if there are at least four cameras."""
     names, links = summary.poses.registered, summary.poses.links
     if len(names) < 4 or not links:
         return []

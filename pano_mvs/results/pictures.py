@@ -1,4 +1,4 @@
-"""Pictures that travel within the page: JPEG of at most so many bytes, as data URIs."""
+"""Pictures that are embedded in a page: JPEG with a limited size, as data URIs."""
 
 from __future__ import annotations
 

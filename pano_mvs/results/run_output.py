@@ -30,7 +30,7 @@ class RunOutput:
     """What a run made: a summary, and the poses, range maps and cloud on demand.
 
     Values come from the cache of the run. Where that is gone they come from the files in the output folder, if the
-    workflow exports them. A value that the run does not have is None.
+    workflow exports them. None stands for a value that the run does not have.
 
     Attributes:
         out: the output folder.

@@ -152,7 +152,7 @@ class _Recorded(Mapping[str, ItemRef]):
 
 
 def _find_images(store: Store, summary: RunSummary, refs: Mapping[str, ItemRef]) -> None:
-    """Tell the store where the user's own images are: it knows them by their digests alone."""
+    """Register the user's images with the store, which knows only their digests."""
     source = next((stage for stage in summary.stages if stage.name == summary.results.get("images")), None)
     folder = source.params.get("path") if source else None
     for name, ref in refs.items() if folder else ():

@@ -30,7 +30,7 @@ _OUTCOMES = {
     1: ("bad", "Stopped by an internal error"),
     2: ("bad", "Stopped: the workflow or an input cannot be used"),
     _SOME_FAILED: ("fair", "Finished, with failed items"),
-    4: ("bad", "Stopped by a quality gate or a guard"),
+    4: ("bad", "Stopped by a quality threshold or a guard"),
     _INTERRUPTED: ("fair", "Interrupted"),
 }
 _JUDGEMENTS = {

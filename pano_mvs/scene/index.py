@@ -6,10 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
+from pano_mvs.core.file_names import PAIR_SEPARATOR
 from pano_mvs.scene.record import Axis, Record, require
-
-# A vertical bar cannot be part of a file's name on Windows and is rare elsewhere; sources refuse it.
-_PAIR_SEPARATOR = " | "
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +56,10 @@ class Views(Record):
 
 def pair_name(first: str, second: str) -> str:
     """Return the name of the unit that joins two images."""
-    return f"{first}{_PAIR_SEPARATOR}{second}"
+    return f"{first}{PAIR_SEPARATOR}{second}"
 
 
 def pair_from_name(name: str) -> tuple[str, str]:
     """Return the two images that a unit of the pair axis joins."""
-    first, _, second = name.partition(_PAIR_SEPARATOR)
+    first, _, second = name.partition(PAIR_SEPARATOR)
     return first, second

@@ -92,8 +92,10 @@ class Panorama(Record):
         if (not same_shape(image.shape[:2], (height, width))) or (
             self.crop_ltwh is None and image.shape[:2] != self.source_size_hw
         ):
-            raise InputError(f"{self.image.path}: {image.shape[1]}×{image.shape[0]} px, but it had {width}×{height} "
-                             "when it was listed. Run again to read it anew")  # fmt: skip
+            raise InputError(
+                f"{self.image.path}: {image.shape[1]}×{image.shape[0]} px, but it had {width}×{height} "
+                "when it was listed. Run again to read it anew"
+            )
         if self.crop_ltwh is None:
             return _resized(image, self.size_hw)
         return placed_picture(image, self.size_hw, of=self.crop_ltwh, whole_hw=self.source_size_hw)

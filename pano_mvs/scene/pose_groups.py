@@ -88,8 +88,10 @@ def require_one_group(pose: Pose, others: Iterable[Pose]) -> None:
     groups = {pose.group, *(other.group for other in others)}
     if len(groups) > 1:
         named = ", ".join(map(str, sorted(groups)))
-        raise UsageError(f"a view and its sources are in groups {named} of the poses, which have different worlds. The "
-                         "view selector must choose sources of one group")  # fmt: skip
+        raise UsageError(
+            f"a view and its sources are in groups {named} of the poses, which have different worlds. The "
+            "view selector must choose sources of one group"
+        )
 
 
 def with_cameras(poses: Poses, kept: NDArray[np.bool_]) -> Poses:

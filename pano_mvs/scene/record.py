@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
@@ -51,11 +52,16 @@ class FilePart:
         try:
             data = self.path.read_bytes()
         except (OSError, ValueError) as error:  # ValueError: a name that no file can have
-            raise InputError(f"{self.path}: cannot be read ({reason_of(error)}). Check that it exists and may be "
-                             "read") from error  # fmt: skip
+            raise InputError(
+                f"{self.path}: cannot be read ({reason_of(error)}). Check that it exists and may be read"
+            ) from error
         if self.external and self.digest and digest_from_bytes(data) != self.digest:
             raise ChangedFileError(changed_text(self.path), self.path)
         return data
+
+    def sha256(self) -> str:
+        """Return the SHA-256 of the file's bytes in hex, as other programs state it; raises as `read_bytes` does."""
+        return hashlib.sha256(self.read_bytes()).hexdigest()
 
 
 def changed_text(path: Path) -> str:

@@ -61,7 +61,8 @@ class TrackedPoints(Record):
         """Return poses with these points, behind their own or in their place.
 
         Tracks in images that the poses do not have are left out. With several groups of poses, so are points of which
-        no track is left: nothing tells in which world they are.
+        no track is left: nothing tells in which world they are. `track_sigmas_rad` is None, as the new observations
+        have none.
         """
         position = {name: idx for idx, name in enumerate(poses.names)}
         image_idx = np.array([position.get(name, -1) for name in self.names], np.int32)[self.track_image_idx]
@@ -80,4 +81,5 @@ class TrackedPoints(Record):
             track_point_idx=np.concatenate([poses.track_point_idx[own], point_idx + np.int32(first)]),
             track_image_idx=np.concatenate([poses.track_image_idx[own], image_idx[known]]),
             track_bearings=np.concatenate([poses.track_bearings[own], self.track_bearings[known]]),
+            track_sigmas_rad=None,
         )

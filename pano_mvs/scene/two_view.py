@@ -104,9 +104,13 @@ class TwoView(Record):
         """Return the same geometry with these runner-ups in place of its own."""
         if not alternatives:
             return replace(
-                self, alternative_rotations=None, alternative_directions=None, alternative_sizes=None,
-                alternative_matches_idx=None, alternative_residuals_rad=None,
-            )  # fmt: skip
+                self,
+                alternative_rotations=None,
+                alternative_directions=None,
+                alternative_sizes=None,
+                alternative_matches_idx=None,
+                alternative_residuals_rad=None,
+            )
         return replace(
             self,
             alternative_rotations=np.stack([view.rotation for view in alternatives]),

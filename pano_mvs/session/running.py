@@ -132,12 +132,12 @@ def run_session(session: Session, execution: Execution = Execution(), progress: 
         scheduler=execution.scheduler,
     )
     try:
-        return _run_and_report(session, store, executor, progress)
+        return _run_and_report(session, store, executor, progress=progress)
     finally:
         executor.close()
 
 
-def _run_and_report(session: Session, store: Store, executor: Executor, progress: Progress) -> RunOutput:
+def _run_and_report(session: Session, store: Store, executor: Executor, *, progress: Progress) -> RunOutput:
     """Run between the first and the last event."""
     clock = time.perf_counter()
     progress(
@@ -152,7 +152,7 @@ def _run_and_report(session: Session, store: Store, executor: Executor, progress
     )
     end = RunFinished(exit_code=1, stopped="internal error", out=session.out)
     try:
-        output = _run_locked(session, store, executor, progress)
+        output = _run_locked(session, store, executor, progress=progress)
         end = _finished(output.summary, end)
         return output
     except PanoMvsError as error:
@@ -165,7 +165,7 @@ def _run_and_report(session: Session, store: Store, executor: Executor, progress
         progress(replace(end, seconds=round(time.perf_counter() - clock, 3)))
 
 
-def _run_locked(session: Session, store: Store, executor: Executor, progress: Progress) -> RunOutput:
+def _run_locked(session: Session, store: Store, executor: Executor, *, progress: Progress) -> RunOutput:
     """Run while no other run writes into the output folder."""
     started, clock = datetime.now(UTC), time.perf_counter()
     run = Run(

@@ -12,8 +12,6 @@ from math import isfinite
 from pathlib import PurePosixPath
 from typing import Any
 
-import numpy as np
-
 import pano_mvs
 from pano_mvs.core.paths import resolved
 from pano_mvs.engine.executors.threads import available_threads
@@ -40,10 +38,10 @@ from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene import Axis, PointCloud, Poses, Scores, TwoView
 from pano_mvs.scene.index import pair_from_name
 from pano_mvs.scene.pose_groups import split_groups
+from pano_mvs.scene.up_direction import mean_up_direction
 from pano_mvs.session.final_stages import chain_of, final_stages, latest
 
 _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "pycolmap", "pyvista", "scipy")
-_MIN_AGREEMENT = 0.1
 
 
 def summarise(run: Run, *, started: datetime, seconds: float) -> RunSummary:
@@ -217,12 +215,11 @@ def _link(pair: str, metrics: Mapping[str, float]) -> PairLink:
 
 
 def _up(poses: Poses) -> Direction | None:
-    """Return the mean of the cameras' up directions in the world, None if they point everywhere."""
-    mean = -np.asarray(poses.rotations)[:, 1].sum(axis=0) / max(1, len(poses.names))
-    length = float(np.linalg.norm(mean))
-    if length <= _MIN_AGREEMENT:
+    """Return the mean of the cameras' up directions in the world, rounded; None if they do not agree."""
+    up = mean_up_direction(poses.rotations)
+    if up is None:
         return None
-    x, y, z = (round(float(part) / length, 6) for part in mean)
+    x, y, z = (round(float(value), 6) for value in up)
     return x, y, z
 
 

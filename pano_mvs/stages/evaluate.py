@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from functools import partial
 
 from pydantic import Field
@@ -31,7 +30,7 @@ def truth(images: All[Panorama], poses: One[Poses], ranges: All[RangeMap], param
     notes: list[str] = []
     matched = {}
     for name, view in known.match(list(images)).items():
-        if view.sha256 is None or hashlib.sha256(images[name].image.read_bytes()).hexdigest() == view.sha256:
+        if view.belongs_to(images[name].image):
             matched[name] = view
         else:
             notes.append(f"{name} is not the image that the truth in {params.truth.name} belongs to")

@@ -6,12 +6,7 @@ from typing import Annotated, TypeAlias
 
 from pydantic import AfterValidator
 
+from pano_mvs.core.settings import odd
 
-def _odd(value: int) -> int:
-    if value % 2 == 0:
-        raise ValueError(f"must be odd, because a window has a centre pixel: use {value - 1} or {value + 1}")
-    return value
-
-
-Odd: TypeAlias = Annotated[int, AfterValidator(_odd)]
+Odd: TypeAlias = Annotated[int, AfterValidator(odd)]
 """Side length of a window."""

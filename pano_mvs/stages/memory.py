@@ -1,4 +1,4 @@
-"""Memory needs of stages on range maps, as measured by `python -m tests.benchmarks.stage_memory`."""
+"""Memory needs of stages on range maps, as measured by `python -m tests.benchmarks.engine.stage_memory`."""
 
 from __future__ import annotations
 

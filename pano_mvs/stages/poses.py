@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
@@ -182,7 +181,7 @@ def _require_its_pictures(path: Path, images: Mapping[str, Panorama], ctx: Conte
         for name, there in match_image_names(images, recorded).items()
         if PurePosixPath(name).suffix == PurePosixPath(there).suffix
     }
-    others = [name for name, there in matched.items() if _sha256(images[name].image.path) != recorded[there]]
+    others = [name for name, there in matched.items() if images[name].image.sha256() != recorded[there]]
     if others and len(others) == len(matched):
         raise InputError(
             f"{path}: records other images under these names: not one of {len(others)} ({others[0]} …) has the "
@@ -191,11 +190,6 @@ def _require_its_pictures(path: Path, images: Mapping[str, Panorama], ctx: Conte
         )
     for name in others:
         ctx.note(f"{name} is not the image whose pose {path.name} records: the files differ")
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 class TriangulateParams(Params):

@@ -56,7 +56,7 @@ def list_folder(params: FolderParams) -> Iterator[SourceItem]:
             "same place, taken from different positions"
         )
     if params.masks is not None:
-        require_masks([path.relative_to(params.path).as_posix() for path in pictures], params.masks)
+        require_masks(params.masks, [path.relative_to(params.path).as_posix() for path in pictures])
     for path in pictures:
         name, problem = printable_name(path.relative_to(params.path).as_posix())
         files = {"image": path}
@@ -136,7 +136,7 @@ def working_size(source_hw: tuple[int, int], max_width: int) -> tuple[int, int]:
 
 
 def _mask_of(name: str, params: FolderParams) -> Path | None:
-    own = None if params.masks is None else find_mask(name, params.masks)
+    own = None if params.masks is None else find_mask(params.masks, name)
     return own or params.mask
 
 

@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.backends import SWEEP_BACKENDS
-from pano_mvs.algorithms.sweep.costs import CostWindow, PluginCost, checked_cost, plugin_cost
+from pano_mvs.algorithms.sweep.backends.registry import SWEEP_BACKENDS
+from pano_mvs.algorithms.sweep.costs.cost import SweepCost, checked_cost
+from pano_mvs.algorithms.sweep.costs.registry import BUILTIN, SWEEP_COSTS
+from pano_mvs.algorithms.sweep.windows import CostWindow
 from pano_mvs.core.errors import UsageError
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.testing.contract_test import ContractTest
@@ -105,11 +107,10 @@ def _cost_inputs(name: str, size_hw: tuple[int, int]) -> tuple[NDArray[np.uint8]
     return first, second.astype(np.float64), CostWindow.of(size_hw, 2, spherical=True)
 
 
-def _registered(name: str) -> PluginCost:
-    cost = plugin_cost(name)
-    if cost is None:
+def _registered(name: str) -> SweepCost:
+    if name in BUILTIN:
         raise UsageError(f"the sweep cost {name!r} is built in: each backend has its own implementation of it")
-    return cost
+    return SWEEP_COSTS.get(name)
 
 
 def _names(kind: str, part: Path | str) -> list[str]:

@@ -67,7 +67,7 @@ class Tour:
     """A scene, and how it is looked at.
 
     Attributes:
-        scene: what there is.
+        scene: cloud, mesh and cameras.
         cloud: the points that are drawn, or None.
         box: (2, 3) in which nearly all lies.
         aspect: width of the window as a multiple of its height.

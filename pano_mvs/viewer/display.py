@@ -44,7 +44,7 @@ def require_drawing(
     Args:
         environment: the process's.
         platform: of Python.
-        loads: tells whether a library can be loaded; None: try it.
+        loads: returns whether a library can be loaded; None: try to load it.
     """
     if not platform.startswith("linux") or environment.get("DISPLAY"):
         return

@@ -23,7 +23,7 @@ class Hands:
         """Make a handler.
 
         Args:
-            tour: what is to be told.
+            tour: receives the actions of the user.
             seen_from: returns where the window's camera is now.
             update: shows the tour's state in the window.
         """

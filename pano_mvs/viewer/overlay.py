@@ -40,7 +40,7 @@ class Overlay:
         self._plotter, self._font, self._ink, self._paper = plotter, font, ink, paper
 
     def text(self, lines: list[str], corner: str) -> None:
-        """Write lines, but for empty ones, into the corner "upper_left" or "lower_right"."""
+        """Write lines, except empty ones, into the corner "upper_left" or "lower_right"."""
         shown = "\n".join(f" {line} " for line in lines if line)
         self._panel(shown, corner, font="arial", size=0.8)
 

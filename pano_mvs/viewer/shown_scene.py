@@ -1,4 +1,4 @@
-"""What there is to look at in an output folder, or in a lone PLY file."""
+"""What the viewer shows of an output folder or of a single PLY file."""
 
 from __future__ import annotations
 
@@ -19,13 +19,12 @@ from pano_mvs.io.poses.files import read_poses
 from pano_mvs.results.records import PosesSummary
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene.files import group_file
+from pano_mvs.scene.up_direction import WORLD_UP, mean_up_direction
 
 FloatArray = NDArray[np.float64]
 
 _CLOUD, _MESH, _MODELS = "cloud.ply", "mesh.ply", "colmap/sparse"
 _HEAD_BYTES = 1 << 14
-# The cameras' own directions up must agree this well to count as the scene's.
-_MIN_AGREEMENT = 0.5
 _NAMED_DOUBTS = 5
 
 
@@ -88,7 +87,7 @@ class ShownScene:
 
 
 def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> ShownScene:
-    """Return what there is to look at.
+    """Return the scene of an output folder or of a PLY file.
 
     Args:
         path: the output folder of a run, or a PLY file, a cloud or a mesh.
@@ -116,7 +115,7 @@ def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> Sho
     if cloud is None and mesh_file is None and not cameras:
         raise InputError(
             f"{path}: holds no {cloud_name} with points, no {mesh_name} and no {model}. Give the output "
-            "folder of a run; its report.html tells what became of it"
+            "folder of a run; its report.html shows what happened"
         )
     return ShownScene(
         name=resolved(path).name,
@@ -158,7 +157,7 @@ def _cloud(path: Path | None, name: str, notes: list[str]) -> PlyPoints | None:
     if cloud is None:
         notes.append(f"no {name}: the workflow has no export.ply, or the run did not get there")
     else:
-        notes.append(f"{name} holds no points: report.html tells why")
+        notes.append(f"{name} holds no points: report.html shows why")
     return None
 
 
@@ -231,10 +230,8 @@ def _map_of(folder: Path, kind: str, name: str, suffix: str) -> Path | None:
 
 def _frame(cameras: tuple[ShownCamera, ...]) -> tuple[FloatArray, FloatArray]:
     """Return the directions up and ahead: those of the cameras where they agree, else −y and z."""
-    ups = np.array([-camera.cam_from_world.rotation[1] for camera in cameras]).reshape(-1, 3)
-    mean = ups.mean(axis=0) if len(ups) else np.zeros(3)
-    length = float(np.linalg.norm(mean))
-    up = mean / length if length > _MIN_AGREEMENT else np.array([0.0, -1.0, 0.0])
+    common_up = mean_up_direction([camera.cam_from_world.rotation for camera in cameras])
+    up = np.array(WORLD_UP) if common_up is None else common_up
     ahead = cameras[0].cam_from_world.rotation[2] if cameras else np.array([0.0, 0.0, 1.0])
     ahead = ahead - up * float(ahead @ up)
     if np.linalg.norm(ahead) < 1e-6:

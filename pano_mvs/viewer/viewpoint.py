@@ -67,7 +67,7 @@ class Viewpoint:
         return self.eye, direction / np.linalg.norm(direction)
 
     def turned(self, dx_px: float, dy_px: float, *, window_height: int) -> Viewpoint:
-        """Return the view from the same place after the picture was dragged by so many pixels, right and down.
+        """Return the view from the same place after the picture was dragged by this number of pixels, right and down.
 
         What was under the pointer stays under it, near the middle of the window.
         """

@@ -20,7 +20,7 @@ from pano_mvs.viewer.sphere_actors import rims_actor, sphere_actor
 from pano_mvs.viewer.viewpoint import Viewpoint
 
 TEXTURED = 64
-"""At most so many cameras, the nearest ones, are spheres with pictures; all others are dots."""
+"""Maximum number of cameras, the nearest ones, that are spheres with pictures; all others are dots."""
 
 _BACKGROUND, _BACKGROUND_TOP, _INK = "#15181d", "#2b313a", "#e8ebf0"
 _ACCENT, _DOTS, _RIM = "#ffb454", "#7fb4ff", "#4da3ff"

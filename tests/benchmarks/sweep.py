@@ -16,8 +16,8 @@ import cv2
 import numba
 import numpy as np
 
-from pano_mvs.algorithms.sweep import numba_backend
 from pano_mvs.algorithms.sweep.hypotheses import virtual_ranges
+from pano_mvs.algorithms.sweep.numba import arguments
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.geometry import Rigid3, rotation_from_rotvec
 from tests.benchmarks.sampling import FLOOR_WORK, cpu_seconds, floors, remap_pipeline
@@ -60,7 +60,7 @@ def measure(*, rows: int, planes: int, sources: int, rounds: int) -> dict[str, f
     for turn in range(rounds + 1):
         times = {name: cpu_seconds(work) / FLOOR_WORK for name, work in floors().items()}
         times |= {name: sweep(settings) / samples for name, settings in configurations.items()}
-        with patch.object(numba_backend, "HAS_VECTOR", False):
+        with patch.object(arguments, "HAS_VECTOR", False):
             times[LOOPS] = sweep(sad) / samples
         times[REMAP] = remap_pipeline(images, poses, ranges) / samples if turn else np.nan
         for name, seconds in times.items() if turn else ():  # the first turn compiles

@@ -216,7 +216,7 @@ def test_status_of_a_strange_run_json(pano_mvs: Command, short: Path) -> None:
         Path("out/run.json").write_text(text)
         result = pano_mvs("status", short, "--out", "out")
         assert result.code == 0, result.text
-        assert "Run again to write it anew" in result.flat
+        assert "Run the workflow again to replace it" in result.flat
 
 
 def test_pictures_without_a_mask_are_told_in_each_run_and_only_there(

@@ -127,7 +127,7 @@ def test_runs_are_listed_by_workflow_and_folder(toy: Toy, cache: Cache) -> None:
 def test_verification_of_a_sound_cache_ends_well(toy: Toy, cache: Cache) -> None:  # noqa: F811
     toy.run()
     blobs = len(list((toy.folder / "cache" / "blobs").rglob("*.*")))
-    assert cache("verify") == (0, f"{UNITS} records and {blobs} blobs are sound, 0 damaged")
+    assert cache("verify") == (0, f"{UNITS} records and {blobs} blobs are intact, 0 damaged")
 
 
 def test_verification_removes_what_is_damaged_and_says_what_is_missing(toy: Toy, cache: Cache) -> None:  # noqa: F811
@@ -342,7 +342,7 @@ def test_verification_while_a_run_writes_reports_nothing_wrong(
     Store(toy.folder / "cache")
     monkeypatch.setattr(upkeep, "_files", and_run_between)
     code, said = cache("verify")
-    assert (code, said) == (0, f"{UNITS} records and 0 blobs are sound, 0 damaged")
+    assert (code, said) == (0, f"{UNITS} records and 0 blobs are intact, 0 damaged")
 
 
 def test_file_that_goes_while_it_is_looked_at_is_no_error(toy: Toy, cache: Cache) -> None:  # noqa: F811

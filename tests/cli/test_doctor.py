@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,12 @@ import pytest
 
 import pano_mvs
 from pano_mvs import algorithms
-from pano_mvs.cli.doctor import command, machine, probes
-from pano_mvs.cli.doctor.disk import folder_findings
+from pano_mvs.cli.doctor import command, libraries, machine
 from pano_mvs.cli.doctor.finding import Finding
-from pano_mvs.cli.doctor.machine import kernel_cache_finding, machine_findings
+from pano_mvs.cli.doctor.libraries import Answer, library_findings, run_probe
+from pano_mvs.cli.doctor.machine import folder_findings, kernel_cache_finding, machine_findings
 from pano_mvs.cli.doctor.packages import is_older, package_findings
 from pano_mvs.cli.doctor.plugins import plugin_findings
-from pano_mvs.cli.doctor.probes import Outcome, library_findings, run_probe
 from pano_mvs.core.kernel_cache import kernel_cache_folder
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.session.session import presets_folder
@@ -82,22 +81,22 @@ def test_this_installation_has_what_it_needs() -> None:
 
 
 GOOD: dict[str, dict[str, Any]] = {
-    "numba": {"version": "1", "seconds": 1.0, "disabled": False},
-    "pycolmap": {"version": "2", "cuda": False},
+    "numba": {"version": "1", "disabled": False},
+    "pycolmap": {"version": "2"},
     "cv2": {"version": "3", "missing": [], "video": True, "avif": True},
     "pyvista": {"version": "4"},
     "torch": {"version": "5", "devices": ["Card 7, 24 GB"], "built_for": "12.4"},
 }
 
 
-def fake(**answers: Any) -> probes.Try:
-    def attempt(code: str) -> Outcome:
-        name = next(name for name in ("numba", "pycolmap", "cv2", "pyvista", "torch") if f"import {name}" in code
-                    or f", {name}" in code)  # fmt: skip
-        answer = answers.get(name, GOOD[name])
-        return Outcome(None, answer) if isinstance(answer, str) else Outcome(answer)
+def fake(**answers: Any) -> Callable[[str], Answer]:
+    def probe(code: str) -> Answer:
+        names = ("numba", "pycolmap", "cv2", "pyvista", "torch")
+        name = next(name for name in names if f"import {name}" in code or f", {name}" in code)
+        answer: Answer = answers.get(name, GOOD[name])
+        return answer
 
-    return attempt
+    return probe
 
 
 def test_libraries_that_work_are_ok() -> None:
@@ -115,7 +114,7 @@ def test_libraries_that_work_are_ok() -> None:
     ("answers", "what", "state", "text"),
     [
         ({"numba": "ImportError: llvmlite"}, "numba", "failed", "llvmlite"),
-        ({"numba": {"version": "1", "seconds": 0.0, "disabled": True}}, "numba", "warning", "unset NUMBA_DISABLE_JIT"),
+        ({"numba": {"version": "1", "disabled": True}}, "numba", "warning", "unset NUMBA_DISABLE_JIT"),
         ({"pycolmap": "the process died of signal 6"}, "pycolmap", "failed", "died of signal 6"),
         ({"cv2": {**GOOD["cv2"], "missing": ["tiff"]}}, "OpenCV", "failed", "lacks tiff"),
         ({"cv2": {**GOOD["cv2"], "video": False}}, "OpenCV video", "warning", "reads no videos"),
@@ -133,11 +132,11 @@ def test_a_library_that_does_not_work_is_told_with_the_remedy(
     assert text in f"{finding.detail} {finding.remedy}"
 
 
-def test_a_probe_that_dies_or_hangs_takes_nothing_along() -> None:
-    assert run_probe("print('noise'); print('{\"a\": 1}')").said == {"a": 1}
-    assert run_probe("import os; os.abort()").why == "the process died of signal 6"
-    assert run_probe("raise ValueError('broken')").why == "ValueError: broken"
-    assert run_probe("import time; time.sleep(60)", timeout_s=0.3).why == "gave no answer within 0 s"
+def test_a_probe_that_dies_or_hangs_ends_nothing_else() -> None:
+    assert run_probe("print('noise'); print('{\"a\": 1}')") == {"a": 1}
+    assert run_probe("import os; os.abort()") == "the process died of signal 6"
+    assert run_probe("raise ValueError('broken')") == "ValueError: broken"
+    assert run_probe("import time; time.sleep(60)", timeout_s=0.3) == "gave no answer within 0 s"
 
 
 def test_the_machine_and_slips_in_the_environment() -> None:
@@ -169,7 +168,7 @@ def test_every_variable_that_the_program_reads_is_known() -> None:
 
 
 def test_a_folder_for_kernels_that_cannot_be_written(tmp_path: Path) -> None:
-    package = Path(pano_mvs.__file__).parent / "algorithms"
+    package = Path(pano_mvs.__file__).parent
     assert kernel_cache_finding(package, {"NUMBA_CACHE_DIR": str(tmp_path / "new")}).state == "ok"
     (tmp_path / "file").write_text("x")
     finding = kernel_cache_finding(package, {"NUMBA_CACHE_DIR": str(tmp_path / "file")})
@@ -188,7 +187,7 @@ def test_folders_of_a_run(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     (found,) = folder_findings("cache", tmp_path / "file" / "below", "--cache DIR")
     assert found.state == "failed"
-    assert "is no folder" in found.detail
+    assert "is not a folder" in found.detail
     tmp_path.chmod(0o500)
     with permissions_hold():
         (found,) = folder_findings("results", tmp_path / "out", "--out DIR")
@@ -205,7 +204,7 @@ def test_plugins_that_fail_clash_or_are_not_there(tmp_path: Path, monkeypatch: p
     bad = found[str(folder / "bad.py")]
     assert "ZeroDivisionError" in bad.detail
     assert "pano-mvs stage show filters.mine" in bad.remedy
-    assert found["PANO_MVS_PLUGINS"].detail == f"{tmp_path / 'gone'} is no folder"
+    assert found["PANO_MVS_PLUGINS"].detail == f"{tmp_path / 'gone'} is not a folder"
     assert found["stages"].state == found["presets"].state == "ok"
     nothing = by_what(plugin_findings(Registry(), tmp_path, {}))
     assert nothing["stages"].state == nothing["presets"].state == "failed"
@@ -215,7 +214,7 @@ def test_the_command_shows_the_remedies_and_ends_with_2_if_a_run_cannot_work(
     pano_mvs: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     answers: dict[str, object] = {"pyvista": "no libGL.so.1"}
-    monkeypatch.setattr(probes, "run_probe", lambda code: fake(**answers)(code))
+    monkeypatch.setattr(libraries, "run_probe", lambda code: fake(**answers)(code))
     of_a_large_machine = partial(machine_findings, {}, threads=8, processors=8, memory_bytes=16 * 10**9)
     monkeypatch.setattr(machine, "machine_findings", of_a_large_machine)  # of this one it may warn, too
     result = pano_mvs("doctor", "--cache", "c", "--out", "o")

@@ -90,7 +90,7 @@ def test_a_run_that_a_gate_stops_says_why_at_once(pano_mvs: Command, toy: Toy) -
     toy.edit("wf.yaml", lambda text: text.replace("use: toy.scale", "use: toy.scale, gate: {value: 1000}"))
     assert run(pano_mvs, toy) == 4
     page = page_in(toy.folder / "out")
-    assert "Stopped by a quality gate" in page.words
+    assert "Stopped by a quality threshold" in page.words
     assert page.words.index("requires") < page.words.index("Stages")
 
 

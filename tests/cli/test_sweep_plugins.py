@@ -30,7 +30,7 @@ def rank_cost(reference, warped, window):
 
 @register_sweep_backend("mine", costs=["sad"])
 def find_winners(work: SweepInput) -> Winners:
-    from pano_mvs.algorithms.sweep.numpy_backend import find_winners
+    from pano_mvs.algorithms.sweep.backends.numpy_backend import find_winners
 
     return find_winners(work)
 '''

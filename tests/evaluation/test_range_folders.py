@@ -12,9 +12,10 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.evaluation.inputs.names import match_images, without_extension
+from pano_mvs.evaluation.inputs.names import match_images
 from pano_mvs.evaluation.inputs.range_files import RangeFile, find_ranges
 from pano_mvs.evaluation.inputs.truth import find_true_ranges
+from pano_mvs.io.images.names import without_extension
 from pano_mvs.io.ranges.files import write_confidence_png, write_range_tiff
 from tests.stored import write_npz
 

@@ -78,6 +78,18 @@ def test_the_seam_wraps(x: float, y: float) -> None:
         assert sample_panorama(NOISE, (x + 64 * turns, y)) == pytest.approx(here, abs=1e-9)
 
 
+def test_positions_beyond_the_poles_are_taken_to_the_pole() -> None:
+    above, below = sample_panorama(NOISE, [[5, -3], [5, 40]])
+    assert above == sample_panorama(NOISE, (5, 0))
+    assert below == sample_panorama(NOISE, (5, 32))
+
+
+def test_the_last_pixel_before_the_seam_has_the_first_beside_it() -> None:
+    just_left = np.nextafter(0, -1)  # which the modulo rounds to the full width
+    assert sample_panorama(NOISE, (just_left, 10.5)) == pytest.approx(NOISE[10, [-1, 0]].mean())
+    assert sample_panorama(NOISE, (64, 10.5)) == pytest.approx(NOISE[10, [-1, 0]].mean())
+
+
 @given(st.floats(0, 64), st.sampled_from([0, 32]))
 def test_a_pole_is_the_same_point_from_both_sides(x: float, y: int) -> None:
     assert sample_panorama(NOISE, (x, y)) == pytest.approx(sample_panorama(NOISE, (x + 32, y)), abs=1e-9)

@@ -122,6 +122,18 @@ def test_a_size_without_pixels_is_refused(call: Callable[..., Any]) -> None:
         call((4, 0))
 
 
+@pytest.mark.parametrize("size", [(1, 1), (1, 2), (2, 1)])
+def test_a_picture_of_one_row_or_column_is_one(size: tuple[int, int]) -> None:
+    assert ray_grid(size)[0, 0] == pytest.approx(ray_from_pixel((0.5, 0.5), size))
+
+
+@pytest.mark.parametrize("size", [(0, 4), (4, 0), (-1, 4)])
+def test_no_camera_has_a_size_without_pixels(size: tuple[int, int]) -> None:
+    for call in (ray_from_pixel, pixel_from_ray):
+        with pytest.raises(UsageError, match="has no pixels"):
+            call((1, 1, 1), size)
+
+
 def test_the_public_names_are_those_that_exist() -> None:
     public = {name for name, value in vars(geometry).items() if callable(value) and not name.startswith("_")}
     assert public == set(geometry.__all__)

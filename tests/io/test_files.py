@@ -109,8 +109,8 @@ def test_the_ply_header_is_what_other_programs_expect(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "what"),
     [
-        (lambda data: data[:-1], "promises 3 points, but it holds 2"),
-        (lambda data: data + b"\0" * 27, "promises 3 points, but it holds 4"),
+        (lambda data: data[:-1], "states 3 points, but it contains 2"),
+        (lambda data: data + b"\0" * 27, "states 3 points, but it contains 4"),
         (lambda data: data.replace(b"little", b"big"), "not a PLY file of pano-mvs"),
         (lambda data: data.replace(b"vertex 3", b"vertex three"), "not a PLY file of pano-mvs"),
         (lambda data: b"", "not a PLY file of pano-mvs"),

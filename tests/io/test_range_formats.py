@@ -100,7 +100,7 @@ def test_without_openexr_the_remedy_is_told_before_anything_runs(monkeypatch: py
 
 def test_other_arrays_and_other_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(b"no picture")
-    with pytest.raises(InputError, match=r"a\.png: a range map in steps is a 16-bit grey PNG, this is no picture"):
+    with pytest.raises(InputError, match=r"a\.png: a range map in steps is a 16-bit grey PNG, this is not an image"):
         read_range_png(tmp_path / "a.png", unit=1)
     with pytest.raises(InputError, match=r"a\.png: normals are a float32 TIFF or a 16-bit PNG"):
         read_normals(tmp_path / "a.png")

@@ -113,7 +113,7 @@ def test_the_worst_comes_first() -> None:
 
 @pytest.mark.parametrize(
     ("code", "text", "mood"),
-    [(0, "Finished", "good"), (1, "internal error", "bad"), (4, "Stopped by a quality gate", "bad"),
+    [(0, "Finished", "good"), (1, "internal error", "bad"), (4, "Stopped by a quality threshold", "bad"),
      (130, "Interrupted", "fair"), (77, "Ended with code 77", "bad")],
 )  # fmt: skip
 def test_the_outcome_is_that_of_the_exit_code(code: int, text: str, mood: str) -> None:

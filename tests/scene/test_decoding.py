@@ -12,7 +12,7 @@ import pytest
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.scene.image_files import decoding
-from pano_mvs.scene.image_files.decoding import decode_picture
+from pano_mvs.scene.image_files.decoding import check_stated_size, decode_picture
 from pano_mvs.scene.image_files.header import stated_size, stated_size_of_file
 from pano_mvs.scene.image_files.image_file import decode_image
 from pano_mvs.scene.masking import decode_mask
@@ -67,6 +67,56 @@ def test_opencvs_own_limit_is_reported_in_our_words(tmp_path: Path) -> None:
     data = png_of(40_000, 30_000, more=bytes(130_000))
     with pytest.raises(InputError, match=r"a\.png: .*40000×30000 px \(1200 megapixels\) is more than OpenCV decodes"):
         decode_picture(data, tmp_path / "a.png", cv2.IMREAD_COLOR, max_pixels=1 << 40)
+
+
+def refuse(*_: object) -> None:
+    """Fail as OpenCV does where an assertion of its own does not hold."""
+    error = cv2.error("no")
+    error.code = -215
+    raise error
+
+
+@pytest.mark.parametrize(("width", "height", "is_limit"), [
+    ((1 << 20) + 1, 1, True), (1, (1 << 20) + 1, True), (1 << 20, 1, False), (1 << 15, 1 << 15, False),
+    (1 << 15, (1 << 15) + 1, True),
+])  # fmt: skip
+def test_what_opencv_does_not_take_is_reported_with_its_limits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, width: int, height: int, is_limit: bool
+) -> None:
+    monkeypatch.setattr(cv2, "imdecode", refuse)
+    data = png_of(width, height, more=bytes(width * height // 10_000))
+    said = r"is more than OpenCV decodes, 1074 megapixels and 1048576 px" if is_limit else r"not a picture that can be"
+    with pytest.raises(InputError, match=said):
+        decode_picture(data, tmp_path / "a.png", cv2.IMREAD_COLOR, max_pixels=1 << 40)
+
+
+def test_a_small_picture_that_opencv_refuses_is_none_that_can_be_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cv2, "imdecode", refuse)
+    with pytest.raises(InputError, match=r"a\.png: not a picture that can be decoded \(its header states 256×128 px\)"):
+        decode_picture(encoded(".png"), tmp_path / "a.png", cv2.IMREAD_COLOR)
+    with pytest.raises(InputError, match=r"a: not a picture that can be decoded\. Copy it again"):
+        decode_picture(b"something else", tmp_path / "a", cv2.IMREAD_COLOR)
+
+
+@pytest.mark.parametrize(("pixels", "size", "believed"), [
+    (64_000_000, 33, True), (64_010_000, 33, False), (70_000_000, 7000, True), (70_010_000, 7000, False),
+])  # fmt: skip
+def test_a_header_is_believed_up_to_64_megapixels_or_10000_pixels_for_a_byte(
+    tmp_path: Path, pixels: int, size: int, believed: bool
+) -> None:
+    data = png_of(10_000, pixels // 10_000)[:33].ljust(size, b"\0")
+    if believed:
+        assert check_stated_size(data, tmp_path / "a.png") == (pixels // 10_000, 10_000)
+    else:
+        with pytest.raises(InputError, match="cannot hold them"):
+            check_stated_size(data, tmp_path / "a.png")
+
+
+def test_nothing_is_no_picture(tmp_path: Path) -> None:
+    assert decode_picture(b"", tmp_path / "a", cv2.IMREAD_COLOR) is None
+    assert decode_picture(b"something else", tmp_path / "a", cv2.IMREAD_COLOR) is None
 
 
 @pytest.mark.parametrize("share", [0.3, 0.9, 0.995])

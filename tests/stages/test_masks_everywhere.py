@@ -73,7 +73,9 @@ def test_no_point_of_a_cloud_comes_from_a_masked_pixel(tmp_path: Path, min_views
     capture = tiny_capture(Variant((64, 128), masked=True))
     ranges = {name: everywhere(capture, name) for name in capture.names}
     poses = {name: Pose(pose) for name, pose in zip(capture.names, capture.poses, strict=True)}
-    params = FusionParams(min_views=min_views, merge_within=0.0, min_support=None, even_density=False)
+    params = FusionParams.model_validate(
+        {"min_views": min_views, "merge_within": 0.0, "min_support": None, "even_density": False}
+    )
     cloud = vote(ranges, poses, capture.images, params, Context(np.random.default_rng(0), tmp_path, 1))
     assert len(cloud) > 1000
     points = cloud.points_in_world.astype(np.float64)
@@ -102,5 +104,7 @@ def test_an_empty_cloud_is_told(tmp_path: Path, blank: bool, why: str) -> None:
             for idx, name in enumerate(capture.names)
         }
     context = Context(np.random.default_rng(0), tmp_path, 1)
-    assert not len(vote(ranges, poses, capture.images, FusionParams(min_views=4, min_support=None), context))
+    assert not len(
+        vote(ranges, poses, capture.images, FusionParams.model_validate({"min_views": 4, "min_support": None}), context)
+    )
     assert why in context.notes[0]

@@ -294,7 +294,7 @@ def cost(reference, warped, window):
 
 @register_sweep_backend("law_{0}", costs=["sad"])
 def backend(work):
-    from pano_mvs.algorithms.sweep.numpy_backend import find_winners
+    from pano_mvs.algorithms.sweep.backends.numpy_backend import find_winners
     from dataclasses import replace
     winners = find_winners(work)
     return replace(winners, plane=np.zeros_like(winners.plane))

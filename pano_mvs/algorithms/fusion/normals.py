@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.sphere_steps import columns_per_step
-from pano_mvs.algorithms.fusion.bands import for_bands
 from pano_mvs.algorithms.fusion.view import held_rays
+from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import UsageError
 from pano_mvs.scene import RangeMap
 
@@ -58,8 +58,8 @@ def normals_from_range(
     at = np.ones((height, width), np.bool_) if wanted is None else wanted
     normals = np.full((height, width, 3), np.nan, np.float32) if given is None else given.astype(np.float32)
 
-    def fit(rows: tuple[int, int]) -> None:
-        fit_normals((inverse, rays, at), stretches, radius, max_relative_step, rows, normals)
+    def fit(first: int, rows: int) -> None:
+        fit_normals((inverse, rays, at), stretches, radius, max_relative_step, (first, first + rows), normals)
 
     for_bands(fit, height, threads=threads)
     return normals

@@ -4,54 +4,34 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pano_mvs.core.errors import UsageError
+from pano_mvs.core.settings import check_settings, setting
 
 
 @dataclass(frozen=True, slots=True)
 class FusionSettings:
     """Which pixels become points, and how points of several views are merged.
 
-    Attributes:
-        min_views: number of views, including the one that contributes the point, that must agree on it.
-        max_relative_error: maximum relative difference of two views' ranges of one point.
-        min_support: a pixel that lacks one view is accepted if at least this share of the window around it is confirmed
-            and on the same surface, and no view contradicts it; None: never.
-        merge_within: points of two views with a smaller relative difference are averaged with Tukey's biweight of that
-            difference; 0 leaves every point where its own view sees it.
-        max_footprint_ratio: a view leaves a point to another agreeing view in which a pixel covers a smaller area of
-            the surface by more than this factor. 1: each part of the surface is contributed by one view only.
-        even_density: whether rows away from the equator are thinned to an even number of points per solid angle.
-        stride: use every stride-th pixel in both directions.
-        min_confidence: pixels with a lower confidence are ignored.
-        neighbours: number of views with the nearest centres to compare a view's pixels with.
-        voxel_size: edge, in scene units, of voxels in which points are merged; None: do not merge.
+    The view that contributes a point counts towards `min_views`. A pixel that lacks one view is accepted if at least
+    `min_support` of the window around it is confirmed and on the same surface, and no view contradicts it. Points are
+    averaged with Tukey's biweight of their relative difference. Pixels below `min_confidence` contribute no points
+    either. With `max_footprint_ratio` 1, each part of the surface is contributed by one view only.
     """
 
-    min_views: int = 2
-    max_relative_error: float = 0.02
-    min_support: float | None = 0.1
-    merge_within: float = 0.01
-    max_footprint_ratio: float = 4.0
-    even_density: bool = True
-    stride: int = 1
-    min_confidence: int = 64
-    neighbours: int = 8
-    voxel_size: float | None = None
+    min_views: int = setting(2, ge=1, doc="minimum number of views that agree on a point")
+    max_relative_error: float = setting(0.02, gt=0, doc="maximum relative difference of ranges that agree")
+    min_support: float | None = setting(
+        0.1, gt=0, le=1, doc="confirmed share of the surface around a pixel that replaces one missing view"
+    )
+    merge_within: float = setting(0.01, ge=0, doc="average points of views with a smaller relative difference")
+    max_footprint_ratio: float = setting(
+        4.0, ge=1, doc="leave a point to another view that sees it this much better; 1: no duplicate points"
+    )
+    even_density: bool = setting(True, doc="thin rows away from the equator to even density per solid angle")
+    stride: int = setting(1, ge=1, doc="use every stride-th pixel in both directions")
+    min_confidence: int = setting(64, ge=1, le=255, doc="minimum confidence of pixels (64: seen, 128: consistent)")
+    neighbours: int = setting(8, ge=0, doc="number of nearest views to compare each view with")
+    voxel_size: float | None = setting(None, gt=0, doc="thin to one point per voxel of this edge, in scene units")
 
     def __post_init__(self) -> None:
         """Raise UsageError if a setting is out of bounds."""
-        positive = {
-            name: getattr(self, name) for name in ("min_views", "max_relative_error", "stride", "min_confidence")
-        }
-        wrong = {name: value for name, value in positive.items() if not value > 0}
-        if wrong:
-            raise UsageError(f"settings of a fusion must be positive, got {wrong}")
-        if not self.merge_within >= 0 or not self.max_footprint_ratio >= 1 or self.neighbours < 0:
-            raise UsageError(
-                f"merge_within and neighbours must be 0 or more, max_footprint_ratio 1 or more, got "
-                f"{self.merge_within}, {self.neighbours}, {self.max_footprint_ratio}"
-            )
-        if self.min_support is not None and not 0 < self.min_support <= 1:
-            raise UsageError(f"min_support is a share above 0, or None, got {self.min_support}")
-        if self.voxel_size is not None and not self.voxel_size > 0:
-            raise UsageError(f"voxel_size must be positive, got {self.voxel_size}")
+        check_settings(self)

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.sphere_steps import columns_per_step
-from pano_mvs.algorithms.fusion.bands import for_bands
 from pano_mvs.algorithms.fusion.normals import normals_from_range
 from pano_mvs.algorithms.fusion.settings import FusionSettings
 from pano_mvs.algorithms.fusion.view import FusionView, Sight, SightWindow, held_rays, nearest_views, sight_of
 from pano_mvs.algorithms.fusion.voxels import VoxelGrid
+from pano_mvs.core.bands import for_bands
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import PointCloud
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
@@ -214,8 +214,8 @@ def _compare_with(
     )
     arrays = (*relation, source.ranges, source.confidence, source.image)
 
-    def of_rows(rows: tuple[int, int]) -> None:
-        vote((reference.ranges, *grids), arrays, limits, rows, tallies.arrays())
+    def of_rows(first: int, rows: int) -> None:
+        vote((reference.ranges, *grids), arrays, limits, (first, first + rows), tallies.arrays())
 
     for_bands(of_rows, height, threads=threads)
 

@@ -18,7 +18,7 @@ _START = -(1 << 30)
 
 def fits_whole_numbers(descriptors: NDArray[np.generic]) -> bool:
     """Return whether descriptors (N, D) are integers small enough for an exact comparison on this machine."""
-    from pano_mvs.algorithms.sweep.kernels_vector import HAS_VECTOR
+    from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR
 
     if not HAS_VECTOR:
         return False

@@ -1,4 +1,4 @@
-"""The costs of one pixel over all virtual ranges, as a sweep has them: for people who tune one.
+"""The costs of one pixel at all depth hypotheses, exactly as in the sweep; for tuning its settings.
 
 Nothing is approximated by a crop. Before the decision a pixel's cost depends on its window alone. Semi-global matching
 adds, for eight directions, the path that ends in the pixel; each path reads the costs along one line from pole to
@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.sweep.backends.numpy_backend import path_step, winners_of
 from pano_mvs.algorithms.sweep.no_match import has_match
-from pano_mvs.algorithms.sweep.numpy_backend import path_step, winners_of
 from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, step_penalties, warm_up
 from pano_mvs.algorithms.sweep.pixel_costs import costs_at, is_seen, votes_at
 from pano_mvs.algorithms.sweep.preparation import SweepInput
@@ -27,11 +27,11 @@ _PATHS, _WORST = 8, 255
 
 @dataclass(frozen=True, eq=False)
 class CostCurve:
-    """What one pixel costs at every virtual range; costs are shares of the worst there is, a chance match has ½.
+    """The costs of one pixel at every depth hypothesis, as shares of the worst cost; a chance match has ½.
 
     Attributes:
-        ranges: (D,) virtual ranges in scene units, ascending.
-        by_source: (S, D) cost in each source; NaN where the source has no vote.
+        ranges: (D,) depth hypotheses in scene units, ascending.
+        by_source: (S, D) cost in each source; NaN where the source is not valid.
         raw: (D,) cost combined from the sources, before the decision.
         aggregated: (D,) mean cost of the eight paths of semi-global matching, what steps between the planes cost
             included, so it may exceed 1; None if it is not asked for.
@@ -39,7 +39,7 @@ class CostCurve:
         runner_up: index of the bottom of the deepest other valley; None if there is none.
         uniqueness: how much cheaper the winner is than the best range that is not next to it, as a share of that one's
             cost: 0 says that both are as good. The confidence "peak_ratio" is made of it.
-        range: of the pixel, between the virtual ones as `selection` says; NaN if the sweep leaves it without.
+        range: of the pixel, between the hypotheses, as `selection` says; NaN if the sweep leaves it without.
         confidence: 64–127, or 0 where there is no range.
         reason: why it has no range; empty if it has.
     """
@@ -62,7 +62,7 @@ class CostCurve:
 
 
 def cost_curve(work: SweepInput, *, column: int, row: int, masked: bool = False) -> CostCurve:
-    """Return the costs of one pixel of the reference over all virtual ranges.
+    """Return the costs of one pixel of the reference at all depth hypotheses.
 
     They are those of a sweep from which every range is tried everywhere (`levels` 1), by the compiled backend for
     built-in costs and by the readable one for a plugin's, which takes as long as a sweep by it.
@@ -78,23 +78,28 @@ def cost_curve(work: SweepInput, *, column: int, row: int, masked: bool = False)
     """
     height, width = work.reference.shape[:2]
     if not (0 <= column < width and 0 <= row < height):
-        raise UsageError(f"pixel ({column}, {row}) is not in a picture of {width}×{height}: columns are 0 to "
-                         f"{width - 1}, rows 0 to {height - 1}")  # fmt: skip
+        raise UsageError(
+            f"pixel ({column}, {row}) is not in a picture of {width}×{height}: columns are 0 to "
+            f"{width - 1}, rows 0 to {height - 1}"
+        )
     here = np.array([row]), np.array([column])
     worst = work.settings.worst_cost
     raw = costs_at(work, *here)[:, 0].astype(np.float64)
     sums = _path_sums(work, row, column) if work.settings.aggregation == "sgm" else None
     decisive = raw if sums is None else sums
     winners = winners_of(decisive[None, :, None])
-    reason = _why_not(work, winners, row, column, masked=masked)
+    reason = _why_not(work, winners, row=row, column=column, masked=masked)
     found = range_map_from_winners(
-        winners, near=float(work.ranges[0]), far=float(work.ranges[-1]), settings=work.settings,
+        winners,
+        near=float(work.ranges[0]),
+        far=float(work.ranges[-1]),
+        settings=work.settings,
         seen=np.full((1, 1), not reason),
-    )  # fmt: skip
+    )
     winner = int(winners.plane[0, 0])
     return CostCurve(
         ranges=work.ranges,
-        by_source=np.stack([_of_source(work, idx, row, column) for idx in range(len(work.sources))]) / worst,
+        by_source=np.stack([_of_source(work, idx, row=row, column=column) for idx in range(len(work.sources))]) / worst,
         raw=raw / worst,
         aggregated=None if sums is None else sums / (_PATHS * _WORST),
         winner=winner,
@@ -120,8 +125,8 @@ def _uniqueness(cost: float, rival: float) -> float:
     return (rival - cost) / rival if rival > 0 else 0.0
 
 
-def _of_source(work: SweepInput, idx: int, row: int, column: int) -> FloatArray:
-    """Return the costs, (D,), of a source by itself, NaN where it has no vote."""
+def _of_source(work: SweepInput, idx: int, *, row: int, column: int) -> FloatArray:
+    """Return the costs, (D,), of a source by itself, NaN where it is not valid."""
     alone = replace(
         work,
         sources=work.sources[idx : idx + 1],
@@ -130,15 +135,15 @@ def _of_source(work: SweepInput, idx: int, row: int, column: int) -> FloatArray:
         settings=work.settings.replace(combination="sum"),
     )
     costs = costs_at(alone, np.array([row]), np.array([column]))[:, 0]
-    return np.where(votes_at(work, idx, row, column), costs, np.nan)
+    return np.where(votes_at(work, idx, row=row, column=column), costs, np.nan)
 
 
-def _why_not(work: SweepInput, winners: Winners, row: int, column: int, *, masked: bool) -> str:
+def _why_not(work: SweepInput, winners: Winners, *, row: int, column: int, masked: bool) -> str:
     """Return why the pixel is left without a range; empty if it is not."""
     plane = int(winners.plane[0, 0])
     if masked:
         return "the picture is masked here"
-    if not is_seen(work, row, column, plane):
+    if not is_seen(work, row=row, column=column, plane=plane):
         return "every source is masked where the winner would be"
     if work.settings.no_match == "keep":
         return ""
@@ -146,7 +151,7 @@ def _why_not(work: SweepInput, winners: Winners, row: int, column: int, *, maske
     nowhere = np.zeros((0, 0), np.float32)
     if has_match(Winners(everywhere, nowhere, nowhere, nowhere, nowhere), work)[row, column]:
         return ""
-    return "it runs to a limit where nothing tells ranges apart (no_match: invalid)"
+    return "it runs to a limit where all ranges match alike (no_match: invalid)"
 
 
 def _path_sums(work: SweepInput, row: int, column: int) -> FloatArray:

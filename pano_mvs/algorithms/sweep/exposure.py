@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, ray_from_pixel, ray_grid, sample_panorama
 
 _ROUNDS = 10
-_FEWEST_PIXELS = 50
+_MIN_PIXELS = 50
 # No camera's exposures differ by more; a fit that says so has met moved things or bare walls.
 _GAIN_LIMITS = 0.4, 2.5
-# What changes no grey level by more than this is none: wrong ranges and noise make as much of it.
-_LEAST_CHANGE = 2.0
+# A smaller change of all grey levels is ignored: wrong ranges and noise cause as much.
+_MIN_CHANGE = 2.0
 # A source is looked up between its pixels, which takes contrast away; so far from pixel centres along both axes the
 # reference loses as much on average (w (1 − w) is 1/6, its mean), and smoothing leaves little of either.
 _BETWEEN_PIXELS, _SMOOTHING_PX = 0.2113, 0.8
 # Colours beyond these are cut off, and what of it (255 is all) smoothing may bring into a pixel.
-_ENDS, _LARGEST_CUT_OFF = (3, 252), 10.0
+_ENDS, _MAX_CUT_OFF = (3, 252), 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +45,8 @@ def match_exposure(
     reference: NDArray[np.uint8],
     source: NDArray[np.uint8],
     source_from_reference: Rigid3,
-    ranges: NDArray[np.float32],
     *,
+    ranges: NDArray[np.float32],
     source_mask: NDArray[np.bool_] | None = None,
 ) -> Exposure:
     """Return the exposure of a source against the reference, robustly, from pixels whose range is known roughly.
@@ -71,7 +71,7 @@ def match_exposure(
     cut_off = sample_panorama(_smooth(_at_an_end(source)), pixels) + sample_panorama(
         _smooth(_at_an_end(reference)), ours
     )
-    usable = cut_off[..., 0] < _LARGEST_CUT_OFF
+    usable = cut_off[..., 0] < _MAX_CUT_OFF
     if source_mask is not None:
         usable &= sample_panorama(source_mask, pixels) > 0.999
     lines = [_robust_line(seen[usable, c], wanted[usable, c]) for c in range(seen.shape[-1])]
@@ -80,7 +80,7 @@ def match_exposure(
 
 def _robust_line(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
     """Return the slope and the intercept of y over x; (1, 0) where they cannot be known."""
-    if len(x) < _FEWEST_PIXELS or np.std(x) < 1:
+    if len(x) < _MIN_PIXELS or np.std(x) < 1:
         return 1.0, 0.0
     gain, offset = float(np.std(y) / np.std(x)), 0.0
     offset = float(np.median(y - gain * x))
@@ -96,7 +96,7 @@ def _robust_line(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float,
         offset = float(mean_y - gain * mean_x)
     darkest, brightest = np.quantile(x, [0.05, 0.95])
     change = max(abs(gain * level + offset - level) for level in (darkest, brightest))
-    if not _GAIN_LIMITS[0] < gain < _GAIN_LIMITS[1] or change < _LEAST_CHANGE:
+    if not _GAIN_LIMITS[0] < gain < _GAIN_LIMITS[1] or change < _MIN_CHANGE:
         return 1.0, 0.0
     return gain, offset
 
@@ -129,6 +129,7 @@ def match_all(
     reference: NDArray[np.uint8],
     sources: Sequence[NDArray[np.uint8]],
     source_from_reference: Sequence[Rigid3],
+    *,
     ranges: NDArray[np.float32],
     masks: Sequence[NDArray[np.bool_]] | None,
 ) -> list[NDArray[np.uint8]]:
@@ -136,5 +137,5 @@ def match_all(
     matched = []
     for idx, (source, pose) in enumerate(zip(sources, source_from_reference, strict=True)):
         mask = None if masks is None else masks[idx]
-        matched.append(match_exposure(reference, source, pose, ranges, source_mask=mask).apply(source))
+        matched.append(match_exposure(reference, source, pose, ranges=ranges, source_mask=mask).apply(source))
     return matched

@@ -1,4 +1,4 @@
-"""Which virtual ranges a sweep tries."""
+"""The depth hypotheses of a sweep: the ranges that it tries, called virtual depths in the paper."""
 
 from __future__ import annotations
 
@@ -12,15 +12,14 @@ from pano_mvs.core.errors import UsageError
 
 Spacing = Literal["inverse", "log", "uniform"]
 
-_NEAR_MARGIN, _FAR_MARGIN = 0.5, 1.5
 # Nothing is nearer than this share of the longest baseline …
 _NEAREST_BASELINES = 0.3
-# … and a point this much parallax away from infinity cannot be told from it.
-_LEAST_PARALLAX_PX = 0.5
+# … and a point this much parallax away from infinity looks the same as one at infinity.
+_MIN_PARALLAX_PX = 0.5
 
 
 def virtual_ranges(near: float, far: float, *, planes: int, spacing: Spacing) -> NDArray[np.float64]:
-    """Return the virtual ranges from near to far, (D,), ascending, in the unit of near and far."""
+    """Return the depth hypotheses from near to far, (D,), ascending, in the unit of near and far."""
     return range_at(np.arange(planes), near, far, planes=planes, spacing=spacing)
 
 
@@ -34,7 +33,7 @@ def range_at(positions: ArrayLike, near: float, far: float, *, planes: int, spac
         UsageError: unless 0 < near < far, both finite.
     """
     if not (0 < near < far and np.isfinite(far)):
-        raise UsageError(f"virtual ranges need 0 < near < far, got near {near} and far {far}")
+        raise UsageError(f"depth hypotheses need 0 < near < far, got near {near} and far {far}")
     share = np.asarray(positions, dtype=np.float64) / (planes - 1)
     result: NDArray[np.float64]
     if spacing == "inverse":
@@ -55,7 +54,7 @@ def range_limits(baselines: Sequence[float], *, width: int) -> tuple[float, floa
 
     Returns:
         (near, far): 0.3 of the longest baseline b, and the range b / (½ px) at which parallax falls under half a
-        pixel; farther than that the pictures cannot tell.
+        pixel; the images do not constrain ranges beyond it.
 
     Raises:
         UsageError: if no baseline is positive.
@@ -63,4 +62,4 @@ def range_limits(baselines: Sequence[float], *, width: int) -> tuple[float, floa
     longest = max(baselines, default=0.0)
     if not (longest > 0 and np.isfinite(longest)):
         raise UsageError("a sweep needs a source at some distance from the reference: all baselines are zero")
-    return _NEAREST_BASELINES * longest, longest / (_LEAST_PARALLAX_PX * 2 * np.pi / width)
+    return _NEAREST_BASELINES * longest, longest / (_MIN_PARALLAX_PX * 2 * np.pi / width)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.consistency import check_consistency
-from pano_mvs.algorithms.sweep.backends import helper_backend
+from pano_mvs.algorithms.sweep.backends.registry import helper_backend
 from pano_mvs.algorithms.sweep.hypotheses import range_limits
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.sweep import sweep_range
@@ -24,16 +24,16 @@ from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 _STEPS_PER_OCTAVE = 4
 _WIDTH = 256
 _PLANES = 96
-_MOST_PICTURES = 5
+_MAX_PICTURES = 5
 _NEAREST_BASELINES = 0.15
 _NEAR_QUANTILE, _FAR_QUANTILE = 0.005, 0.995
 _NEAR_MARGIN, _FAR_MARGIN = 0.7, 1.3
-_LEAST_SHARE = 0.01
-# Outdoors this share of what is not masked is sky. What ends there, at a third of the farthest range that pictures can
-# tell or beyond, sets no quantile, and with planes even in 1/range it costs next to none to go all the way.
+_MIN_SHARE = 0.01
+# Outdoors this share of what is not masked is sky. What ends there, at a third of the farthest measurable range
+# or beyond, sets no quantile, and with planes even in 1/range it costs next to none to go all the way.
 _OPEN_SHARE, _OPEN_RANGE = 0.1, 1 / 3
 # Grey levels between the darkest and the brightest pixel of a 5×5 window; plain walls agree with each other anywhere.
-_LEAST_CONTRAST = 10
+_MIN_CONTRAST = 10
 
 
 def limits_by_sweeping(
@@ -67,22 +67,28 @@ def limits_by_sweeping(
     """
     if not len(pictures) == len(cams_from_world) == len(masks) or len(pictures) < 2:
         raise UsageError("limits need a reference and at least one source, each with its pose and mask")
-    poses = list(cams_from_world[:_MOST_PICTURES])
+    poses = list(cams_from_world[:_MAX_PICTURES])
     width = pictures[0].shape[1]
-    small = [reduced_panorama(picture, _WIDTH) for picture in pictures[:_MOST_PICTURES]]
-    small_masks = [reduced_mask(mask, _WIDTH) for mask in masks[:_MOST_PICTURES]]
+    small = [reduced_panorama(picture, _WIDTH) for picture in pictures[:_MAX_PICTURES]]
+    small_masks = [reduced_mask(mask, _WIDTH) for mask in masks[:_MAX_PICTURES]]
     maps = [
         _coarse(idx, small, small_masks, poses, width=width, backend=helper_backend(backend), device=device)
         for idx in range(len(poses))
     ]
     checked = check_consistency(
-        maps[0], poses[0], maps[1:], poses[1:],
-        max_relative_error=0.1, max_reprojection_px=1.5, min_support=0, min_motion_px=0,
-    )  # fmt: skip
+        maps[0],
+        poses[0],
+        maps[1:],
+        poses[1:],
+        max_relative_error=0.1,
+        max_reprojection_px=1.5,
+        min_support=0,
+        min_motion_px=0,
+    )
     agreed = (checked.confidence >= CONSISTENT_CONFIDENCE[0]) & textured_pixels(small[0])
     solid_angle = np.broadcast_to(pixel_solid_angle(agreed.shape)[:, None], agreed.shape)
     seen_angle = solid_angle[small_masks[0]].sum()
-    if solid_angle[agreed].sum() <= _LEAST_SHARE * seen_angle:
+    if solid_angle[agreed].sum() <= _MIN_SHARE * seen_angle:
         return range_limits(_baselines(0, poses), width=width)
     near, far = _quantiles(checked.range[agreed], solid_angle[agreed])
     near, far = _outward(_NEAR_MARGIN * near, _FAR_MARGIN * far)
@@ -146,7 +152,7 @@ def textured_pixels(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
     grey = pad_panorama(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), 2)
     window = np.ones((5, 5), np.uint8)
     contrast = cv2.dilate(grey, window).astype(np.int16) - cv2.erode(grey, window)
-    textured: NDArray[np.bool_] = contrast[2:-2, 2:-2] >= _LEAST_CONTRAST
+    textured: NDArray[np.bool_] = contrast[2:-2, 2:-2] >= _MIN_CONTRAST
     return textured
 
 

@@ -11,21 +11,21 @@ from pano_mvs.algorithms.sweep.winner import Winners
 from pano_mvs.geometry import pad_panorama
 
 # Grey levels between the darkest and the brightest pixel of a window below which it is bare.
-_LEAST_CONTRAST = 10
+_MIN_CONTRAST = 10
 _CONTRAST_RADIUS = 2
 # The nearest planes are this share of all.
 _NEAREST_SHARE = 0.03
 # The last plane is as good as infinitely far if parallax there is less than this.
-_LEAST_PARALLAX_PX = 1.0
+_MIN_PARALLAX_PX = 1.0
 
 
 def has_match(winners: Winners, work: SweepInput) -> NDArray[np.bool_]:
     """Return where the winner means something, (H, W).
 
-    Limits lie a little outside of what there is, so that few surfaces are at a limit. A pixel that runs to the nearest
+    Limits lie a little outside the scene, so that few surfaces are at a limit. A pixel that runs to the nearest
     planes or to the last one has no match if its surroundings are bare: a chance decided. (Near planes are blurred, and
-    so win on bare walls more often than others.) One that runs to the last plane has none either if that plane cannot
-    be told from infinity: it is the sky, or something that turns with the camera, and any range beyond the last plane
+    so win on bare walls more often than others.) One that runs to the last plane has none either if that plane looks
+    the same as infinity: it is the sky, or something that turns with the camera, and any range beyond the last plane
     but one would do as well. Everything else is kept: what is bare between the limits was filled in from its
     surroundings, mostly rightly.
     """
@@ -35,7 +35,7 @@ def has_match(winners: Winners, work: SweepInput) -> NDArray[np.bool_]:
     baseline = max(float(np.linalg.norm(pose.translation)) for pose in work.source_from_reference)
     parallax_px = baseline / work.ranges[-1] * work.reference.shape[1] / (2 * np.pi)
     unmatched = (last | first) & is_bare(work.reference)
-    if parallax_px < _LEAST_PARALLAX_PX:
+    if parallax_px < _MIN_PARALLAX_PX:
         unmatched |= last
     return np.asarray(~unmatched)
 
@@ -48,5 +48,5 @@ def is_bare(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
     for plane in np.moveaxis(picture, -1, 0):
         padded = np.ascontiguousarray(pad_panorama(plane, radius))
         contrast = cv2.dilate(padded, window).astype(np.int16) - cv2.erode(padded, window)
-        bare &= contrast[radius:-radius, radius:-radius] < _LEAST_CONTRAST
+        bare &= contrast[radius:-radius, radius:-radius] < _MIN_CONTRAST
     return bare

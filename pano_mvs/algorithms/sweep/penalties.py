@@ -14,7 +14,7 @@ _ROWS_AT_ONCE = 256
 
 
 def step_penalties(
-    reference: NDArray[np.uint8], direction: tuple[int, int], settings: SweepSettings, rows: slice = slice(None)
+    reference: NDArray[np.uint8], direction: tuple[int, int], settings: SweepSettings, *, rows: slice = slice(None)
 ) -> NDArray[np.uint16]:
     """Return P2 of the step into each pixel, (H, W) uint16: smaller where the picture has an edge.
 

@@ -1,16 +1,13 @@
-"""The costs of some pixels at all virtual ranges, without those of all the others."""
+"""The costs of some pixels at all depth hypotheses, without those of all other pixels."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.costs import plugin_cost
-from pano_mvs.algorithms.sweep.numpy_backend import _combined_cost
+from pano_mvs.algorithms.sweep.backends.numpy_backend import combined_cost
 from pano_mvs.algorithms.sweep.preparation import SweepInput, valid_where_seen
 from pano_mvs.geometry import pixel_from_ray, ray_from_pixel, sample_panorama
-
-_NO_VOLUME = np.empty((0, 0, 0), np.uint8)
 
 
 def costs_at(work: SweepInput, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float32]:
@@ -21,8 +18,8 @@ def costs_at(work: SweepInput, rows: NDArray[np.intp], columns: NDArray[np.intp]
         rows: (N,) of the pixels.
         columns: (N,) likewise.
     """
-    if plugin_cost(work.settings.cost) is not None:
-        planes = [_combined_cost(work, virtual_range)[rows, columns] for virtual_range in work.ranges]
+    if work.settings.matching_cost.kernel is None:
+        planes = [combined_cost(work, virtual_range)[rows, columns] for virtual_range in work.ranges]
         return np.asarray(planes, dtype=np.float32)
     return _compiled_costs(work, rows, columns)
 
@@ -30,31 +27,30 @@ def costs_at(work: SweepInput, rows: NDArray[np.intp], columns: NDArray[np.intp]
 def _compiled_costs(work: SweepInput, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float32]:
     """Sweep the tiles in which the pixels lie, range by range: the winner's cost is then that of the range."""
     # On use: numba is slow to import.
-    from pano_mvs.algorithms.sweep.kernels_band import sweep_band
-    from pano_mvs.algorithms.sweep.kernels_winner import BEST
-    from pano_mvs.algorithms.sweep.numba_backend import _fresh_state
-    from pano_mvs.algorithms.sweep.tiles import run_arguments, runs_of, shared_arguments, tile_means
+    from pano_mvs.algorithms.sweep.numba.arguments import NO_VOLUME, fresh_state, sweep_arguments
+    from pano_mvs.algorithms.sweep.numba.kernels_band import sweep_band
+    from pano_mvs.algorithms.sweep.numba.kernels_winner import BEST
+    from pano_mvs.algorithms.sweep.numba.tiles import run_arguments, runs_of, tile_means
 
     height, width = work.reference.shape[:2]
     wanted = np.zeros((height, width), np.bool_)
     wanted[rows, columns] = True
-    shared = shared_arguments(work)
+    sweep = sweep_arguments(work)
     costs = np.empty((len(work.ranges), len(rows)), np.float32)
-    for run in runs_of(tile_means(wanted) > 0, (height, width), shared):
+    for run in runs_of(tile_means(wanted) > 0, (height, width), sweep.windows):
         down, across = rows - run.first, columns - run.start
         own = np.flatnonzero((down >= 0) & (down < run.rows) & (across >= 0) & (across < run.columns))
         place = down[own], across[own] + run.margin
-        arguments = run_arguments(shared, run)
+        arguments = run_arguments(sweep, run)
         for idx in range(len(work.ranges)):
-            state, planes = _fresh_state(run.rows, run.columns + 2 * run.margin)
-            arguments["ranges"] = work.ranges[idx : idx + 1]
-            sweep_band(run.first, *arguments.values(), _NO_VOLUME, state, planes)
+            state, planes = fresh_state(run.rows, run.columns + 2 * run.margin)
+            sweep_band(run.first, arguments, work.ranges[idx : idx + 1], NO_VOLUME, state, planes)
             costs[idx, own] = state[BEST][place]
     return costs
 
 
-def votes_at(work: SweepInput, source_idx: int, row: int, column: int) -> NDArray[np.bool_]:
-    """Return at which virtual ranges a source may vote on a pixel, (D,): all that is sampled there is valid."""
+def votes_at(work: SweepInput, source_idx: int, *, row: int, column: int) -> NDArray[np.bool_]:
+    """Return at which depth hypotheses a source is valid for a pixel, (D,): all pixels sampled there are."""
     if work.source_valid is None:
         return np.ones(len(work.ranges), np.bool_)
     valid = work.source_valid[source_idx]
@@ -63,7 +59,7 @@ def votes_at(work: SweepInput, source_idx: int, row: int, column: int) -> NDArra
     return np.asarray(sample_panorama(valid, pixels) > 1 - 1e-9)
 
 
-def is_seen(work: SweepInput, row: int, column: int, plane: int) -> bool:
+def is_seen(work: SweepInput, *, row: int, column: int, plane: int) -> bool:
     """Return whether a sweep keeps a pixel's winner: a source sees it in a valid pixel; see `sees_winner`."""
     point = _points_at(work, row, column)[plane]
     return work.source_valid is None or any(

@@ -27,8 +27,8 @@ class SweepInput:
         reference: (H, W, C) uint8: grey (C = 1) for census and zncc, RGB for differences.
         sources: the sources likewise, each of its own size.
         source_from_reference: their poses.
-        source_valid: for each source, where a sample may vote, (Hs, Ws); None if everywhere in all of them.
-        ranges: (D,) float64 virtual ranges, ascending.
+        source_valid: for each source, where a sample is valid, (Hs, Ws); None if everywhere in all of them.
+        ranges: (D,) float64 depth hypotheses, ascending.
         settings: what was asked for.
         device: where a backend that can choose computes.
     """
@@ -46,7 +46,7 @@ def prepare_picture(picture: NDArray[np.uint8], settings: SweepSettings) -> NDAr
     """Return the picture as it is compared, (H, W, 3) RGB to (H, W, 1) grey or (H, W, 3), prefiltered if asked for."""
     if settings.prefilter_diameter:
         picture = _bilateral(picture, settings)
-    if settings.compares_colors:
+    if settings.matching_cost.colors:
         return np.ascontiguousarray(picture)
     grey = np.empty((*picture.shape[:2], 1), np.uint8)
     for first in range(0, len(picture), _ROWS_AT_ONCE):  # 16 bits of all colours at once would be a picture six times
@@ -112,7 +112,7 @@ def _spread_columns(blocked: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]
 
 
 def sees_winner(winners: Winners, work: SweepInput) -> NDArray[np.bool_]:
-    """Return where at least one source may vote on the plane that won, (H, W)."""
+    """Return where at least one source is valid at the plane that won, (H, W)."""
     if work.source_valid is None:
         return np.ones(winners.plane.shape, np.bool_)
     height, width = winners.plane.shape

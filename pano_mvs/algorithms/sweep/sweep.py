@@ -1,6 +1,6 @@
-"""The sphere sweep: the range of every pixel of a panorama by testing virtual ranges.
+"""The sphere sweep: the range of every pixel of a panorama by testing depth hypotheses, the paper's virtual depths.
 
-For a virtual range r a reference pixel u is looked up in source k at F⁻¹(r R F(u) + t), (R, t) = source_from_reference
+For a hypothesis r, a reference pixel u is looked up in source k at F⁻¹(r R F(u) + t), (R, t) = source_from_reference
 and F the ray of a pixel; the range at which reference and sources agree best wins.
 S. Yang, K. Kim, Y. Lee, "Dense Depth Estimation from Multiple 360-degree Images Using Virtual Depth", section 3.3.
 """
@@ -13,7 +13,7 @@ from math import ceil
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.backends import backend_for, check_levels, helper_backend
+from pano_mvs.algorithms.sweep.backends.registry import backend_for, helper_backend
 from pano_mvs.algorithms.sweep.exposure import match_all, shrink
 from pano_mvs.algorithms.sweep.hypotheses import virtual_ranges
 from pano_mvs.algorithms.sweep.no_match import has_match
@@ -53,14 +53,14 @@ def sweep_range(
         reference: (H, W, 3) uint8 RGB, the full sphere, W even, H and W at least 16.
         sources: one or more (Hs, Ws, 3) uint8 RGB, each of its own size.
         source_from_reference: the pose of each source: x_in_source = R x_in_reference + t, t in scene units.
-        near: the first virtual range, in scene units.
-        far: the last one.
+        near: the nearest depth hypothesis, in scene units.
+        far: the farthest one.
         settings: how to sample, compare and decide.
         backend: "numba", compiled; "numpy", the readable reference (the whole volume in memory); "opencv"; or the
             name of a plugin's.
         device: where a backend that can choose computes: "auto", "cpu", "cuda", "cuda:1".
         reference_mask: (H, W) False where the reference is to be ignored: NaN in the result.
-        source_masks: for each source (Hs, Ws), False where it has no vote, or None.
+        source_masks: for each source (Hs, Ws), False where it is not valid, or None.
 
     Returns:
         Ranges in scene units and confidence 64–127 ("seen but weak": a sweep alone cannot say that other views
@@ -71,12 +71,19 @@ def sweep_range(
         UsageError: if shapes, types or numbers do not fit together, or near and far are no limits.
     """
     settings = settings or SweepSettings()
-    compute = backend_for(backend, settings.cost).find_winners
-    check_levels(backend, settings.levels)
+    compute = backend_for(backend, settings).find_winners
     work = sweep_input(
-        reference, sources, source_from_reference, near=near, far=far, settings=settings, backend=backend,
-        device=device, reference_mask=reference_mask, source_masks=source_masks,
-    )  # fmt: skip
+        reference,
+        sources,
+        source_from_reference,
+        near=near,
+        far=far,
+        settings=settings,
+        backend=backend,
+        device=device,
+        reference_mask=reference_mask,
+        source_masks=source_masks,
+    )
     winners = compute(work)
     seen = np.ones(reference.shape[:2], np.bool_) if reference_mask is None else reference_mask
     seen = seen & sees_winner(winners, work)
@@ -102,12 +109,18 @@ def sweep_input(
     _check_picture("reference", reference, reference_mask)
     masks = _checked_sources(sources, source_from_reference, source_masks)
     ranges = virtual_ranges(near, far, planes=settings.planes, spacing=settings.spacing)
-    if settings.exposure and settings.minds_exposure:
+    if settings.exposure and settings.matching_cost.minds_exposure:
         rough = _rough_range(
-            reference, sources, source_from_reference, near=near, far=far, backend=backend, device=device,
+            reference,
+            sources,
+            source_from_reference,
+            near=near,
+            far=far,
+            backend=backend,
+            device=device,
             masks=(reference_mask, masks),
-        )  # fmt: skip
-        sources = match_all(reference, sources, source_from_reference, rough, masks)
+        )
+        sources = match_all(reference, sources, source_from_reference, ranges=rough, masks=masks)
     poses = tuple(source_from_reference)
     if settings.derotate:
         sources, poses, masks = derotated(sources, poses, masks)
@@ -142,11 +155,17 @@ def _rough_range(
     small_reference = shrink(reference, _ROUGH_ROWS)
     sources_valid = None if masks[1] is None else [_shrunk(m, like=s) for m, s in zip(masks[1], small, strict=True)]
     found = sweep_range(
-        small_reference, small, source_from_reference,
-        near=near, far=far, settings=settings, backend=helper_backend(backend), device=device,
+        small_reference,
+        small,
+        source_from_reference,
+        near=near,
+        far=far,
+        settings=settings,
+        backend=helper_backend(backend),
+        device=device,
         reference_mask=None if masks[0] is None else _shrunk(masks[0], like=small_reference),
         source_masks=sources_valid,
-    )  # fmt: skip
+    )
     if not found.valid.any():
         return found.range
     sure = found.confidence >= np.median(found.confidence[found.valid])
@@ -159,7 +178,7 @@ def _shrunk(mask: Mask, *, like: Picture) -> Mask:
 
 
 def _voting(masks: tuple[Mask, ...] | None, settings: SweepSettings, *, rows: int) -> tuple[Mask, ...] | None:
-    """Return where each source may vote: a window's radius in pixels of the reference away from what is masked."""
+    """Return where each source is valid: a window's radius in pixels of the reference away from what is masked."""
     if masks is None:
         return None
     radius = settings.compare_radius + settings.box_radius
@@ -171,8 +190,10 @@ def _checked_sources(
 ) -> tuple[Mask, ...] | None:
     """Return the masks of all sources, or None if nothing is masked."""
     if len(sources) == 0 or len(poses) != len(sources) or (masks is not None and len(masks) != len(sources)):
-        raise UsageError(f"a sweep needs one pose (and one mask, if any) for each of one or more sources, got "
-                         f"{len(sources)} sources, {len(poses)} poses")  # fmt: skip
+        raise UsageError(
+            f"a sweep needs one pose (and one mask, if any) for each of one or more sources, got "
+            f"{len(sources)} sources, {len(poses)} poses"
+        )
     given = masks if masks is not None else [None] * len(sources)
     for idx, (source, mask) in enumerate(zip(sources, given, strict=True)):
         _check_picture(f"source {idx}", source, mask)

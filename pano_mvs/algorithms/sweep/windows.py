@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.geometry import pad_panorama
 
-WIDEST = 8.0
+MAX_STRETCH = 8.0
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 
@@ -24,7 +24,7 @@ def column_stretch(height: int, *, spherical: bool) -> NDArray[np.float64]:
     if not spherical:
         return np.ones(height)
     elevation = np.pi * (0.5 - (np.arange(height) + 0.5) / height)
-    return np.minimum(1 / np.cos(elevation), WIDEST)
+    return np.minimum(1 / np.cos(elevation), MAX_STRETCH)
 
 
 def column_offsets(size_hw: tuple[int, int], radius: int, *, spherical: bool) -> NDArray[np.int64]:
@@ -44,6 +44,42 @@ def neighbours(picture: NDArray[Scalar], rows: int, columns: NDArray[np.int64]) 
     pad = abs(rows)
     shifted = pad_panorama(picture, pad)[pad + rows : pad + rows + height, pad : pad + width]
     return np.take_along_axis(shifted, (np.arange(width) + columns[:, None]) % width, axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class CostWindow:
+    """The window around every pixel of the reference, on the sphere: over the seam and over the poles.
+
+    Attributes:
+        radius: rows on either side of the centre.
+        columns: (H, 2 radius + 1) int64 columns of its pixels against its centre, for a centre in each row.
+    """
+
+    radius: int
+    columns: NDArray[np.int64]
+
+    @staticmethod
+    def of(size_hw: tuple[int, int], radius: int, *, spherical: bool) -> CostWindow:
+        """Return the windows of a picture; `spherical` ones are widened towards the poles."""
+        return CostWindow(radius, column_offsets(size_hw, radius, spherical=spherical))
+
+    def neighbours(self, picture: NDArray[Scalar]) -> Iterator[NDArray[Scalar]]:
+        """Yield, for each place in the window row by row, the picture's pixel there for every centre, (H, W) each."""
+        for row in range(-self.radius, self.radius + 1):
+            for place in range(2 * self.radius + 1):
+                yield neighbours(picture, row, self.columns[:, place])
+
+
+def box_mean(picture: NDArray[np.float64], window: CostWindow) -> NDArray[np.float64]:
+    """Return the mean over the box that each window spans, all of its columns, (H, W)."""
+    radius, reach = window.radius, window.columns[:, -1]
+    rows = np.sum([neighbours(picture, row, np.zeros_like(reach)) for row in range(-radius, radius + 1)], axis=0)
+    result = np.zeros_like(picture)
+    for columns in np.unique(reach):
+        here = reach == columns
+        shifted = [np.roll(rows[here], shift, axis=1) for shift in range(-columns, columns + 1)]
+        result[here] = np.sum(shifted, axis=0) / ((2 * radius + 1) * (2 * columns + 1))
+    return result
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,6 +39,12 @@ class Winners:
     rival: NDArray[np.float32]
     lean: NDArray[np.float32] | None = None
 
+    @staticmethod
+    def unset(size_hw: tuple[int, int]) -> Winners:
+        """Return winners of a picture that are yet to be written."""
+        costs = [np.empty(size_hw, np.float32) for _ in range(4)]
+        return Winners(np.empty(size_hw, np.int32), *costs)
+
     @property
     def position(self) -> NDArray[np.float64]:
         """Where the winner lies among the planes, (H, W)."""
@@ -63,7 +69,7 @@ def range_map_from_winners(
 
     Args:
         winners: of all pixels.
-        near: the first virtual range.
+        near: the nearest depth hypothesis.
         far: the last one.
         settings: planes, spacing, selection and confidence.
         seen: (H, W) where the reference is valid and at least one source saw the winner.
@@ -99,8 +105,8 @@ def confidence(winners: Winners, *, measure: Literal["peak_ratio", "curvature", 
     """Return how sure the winner is, (H, W) uint8 in 64–127.
 
     "peak_ratio" is the uniqueness 1 − cost/rival: how much dearer the best rival is. It vanishes on bare surfaces,
-    along the baseline (where no source can tell ranges apart) and between two equally good ranges. "curvature" is
-    1 − 2 cost/(before + after): how sharp the minimum is. "combined" is their geometric mean.
+    along the baseline (where all ranges look the same to every source) and between two equally good ranges.
+    "curvature" is 1 − 2 cost/(before + after): how sharp the minimum is. "combined" is their geometric mean.
     """
     shares = []
     if measure != "curvature":

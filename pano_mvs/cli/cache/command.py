@@ -1,4 +1,4 @@
-"""The commands that look after a cache: its size, what it holds, whether it is sound, and what can go."""
+"""The commands that look after a cache: its size, its content, its integrity, and what can be deleted."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def verify_cache(store: Store, console: Console, *, drop_unproven: bool = False)
             console.print(f"{what}: … and {len(paths) - _SHOWN} more")
     console.print(
         f"{damage.records} {plural(damage.records, 'record')} and {damage.blobs} "
-        f"{plural(damage.blobs, 'blob')} are sound, {len(damage.removed)} damaged",
+        f"{plural(damage.blobs, 'blob')} are intact, {len(damage.removed)} damaged",
         highlight=False,
     )
     if damage.unproven:
@@ -146,7 +146,7 @@ def seconds_from_text(text: str) -> float:
     """Return a time such as 30d, 12h or 90s in seconds.
 
     Raises:
-        UsageError: if it is none.
+        UsageError: if the text is not a time.
     """
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([smhdw])", text.strip())
     if match is None:

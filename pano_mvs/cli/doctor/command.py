@@ -1,4 +1,4 @@
-"""`pano-mvs doctor`: look at everything, show it, and say by the exit code whether a run can work."""
+"""`pano-mvs doctor`: run all checks, print the findings, and return by the exit code whether a run can work."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import dataclasses
 import json
 import os
 from collections.abc import Iterator, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Annotated
 
@@ -32,7 +33,7 @@ def doctor(
     """Check the installation, the machine and the folders of a run; exit code 2 if a run cannot work."""
     console = Console()
     if console.is_terminal and not as_json:
-        with console.status("trying the libraries, a few seconds …"):
+        with console.status("trying the libraries, which takes a few seconds …"):
             findings = list(all_findings(cache, out))
     else:
         findings = list(all_findings(cache, out))
@@ -42,18 +43,16 @@ def doctor(
 
 
 def all_findings(cache: Path | None = None, out: Path | None = None) -> Iterator[Finding]:
-    """Yield all that there is to say.
+    """Yield the findings of all checks.
 
     Args:
-        cache: folder of the cache; by default where a preset run from here would have it.
-        out: folder of the results; likewise.
+        cache: the cache folder; by default that of a preset that is run in the current folder.
+        out: the folder of the results, with the same default.
     """
-    import pano_mvs
-    from pano_mvs.cli.doctor.disk import folder_findings
-    from pano_mvs.cli.doctor.machine import kernel_cache_finding, machine_findings
+    from pano_mvs.cli.doctor.libraries import library_findings
+    from pano_mvs.cli.doctor.machine import folder_findings, kernel_cache_finding, machine_findings
     from pano_mvs.cli.doctor.packages import package_findings
     from pano_mvs.cli.doctor.plugins import plugin_findings
-    from pano_mvs.cli.doctor.probes import library_findings
     from pano_mvs.engine.stages.registry import Registry
     from pano_mvs.results.summary import CACHE_VARIABLE
     from pano_mvs.session.session import presets_folder
@@ -61,7 +60,7 @@ def all_findings(cache: Path | None = None, out: Path | None = None) -> Iterator
     yield from package_findings()
     yield from library_findings()
     yield from machine_findings()
-    yield kernel_cache_finding(Path(pano_mvs.__file__).parent / "algorithms")
+    yield kernel_cache_finding()
     variable = os.environ.get(CACHE_VARIABLE)
     yield from folder_findings("cache", cache or Path(variable or ".pano-mvs"), "--cache DIR")
     yield from folder_findings("results", out or Path("out"), "--out DIR")
@@ -69,21 +68,18 @@ def all_findings(cache: Path | None = None, out: Path | None = None) -> Iterator
 
 
 def show(findings: Sequence[Finding], console: Console, *, as_json: bool = False) -> None:
-    """Print what was found: as a table with the remedies below it, or as one JSON object."""
+    """Print the findings as a table with the remedies below it, or as one JSON object."""
     failed = [finding for finding in findings if finding.state == "failed"]
     if as_json:
         text = {"ok": not failed, "findings": [dataclasses.asdict(finding) for finding in findings]}
         console.print(json.dumps(text, indent=1, ensure_ascii=False), highlight=False, markup=False, soft_wrap=True)
         return
     table = Table("", "what", "", "found")
-    group = ""
-    for finding in findings:
-        if group and finding.group != group:
-            table.add_section()
-        shown = finding.group if finding.group != group else ""
-        group = finding.group
-        state = f"[{_COLOURS[finding.state]}]{finding.state}[/]"
-        table.add_row(shown, escape(finding.what), state, escape(finding.detail))
+    for group, members in groupby(findings, key=lambda finding: finding.group):
+        for idx, finding in enumerate(members):
+            state = f"[{_COLOURS[finding.state]}]{finding.state}[/]"
+            table.add_row("" if idx else group, escape(finding.what), state, escape(finding.detail))
+        table.add_section()
     console.print(table)
     for finding in findings:
         if finding.remedy:

@@ -1,24 +1,24 @@
-"""One line of what the doctor found."""
+"""The result of one check."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeAlias
 
-State = Literal["ok", "note", "warning", "failed"]
-"""`note`: nothing is wrong. `warning`: something will be slower or missing. `failed`: a run cannot work."""
+State: TypeAlias = Literal["ok", "note", "warning", "failed"]
+"""`note`: nothing is wrong. `warning`: something is slower or missing. `failed`: a run cannot work."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What was looked at, and how it is.
+    """The result of one check.
 
     Attributes:
-        group: what it belongs to: packages, libraries, machine, disk, plugins.
-        what: what was looked at.
-        state: how it is.
+        group: packages, libraries, machine, disk or plugins.
+        what: the thing that was checked.
+        state: the verdict.
         detail: what was found.
-        remedy: what to do about it; given with every warning and failure.
+        remedy: what to do; given with every warning and failure.
     """
 
     group: str

@@ -1,24 +1,27 @@
-"""Processors, memory and environment."""
+"""Check processors, memory, the environment, and the folders that a run writes to."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
 
 from pano_mvs.cli.doctor.finding import Finding
+from pano_mvs.core.kernel_cache import PACKAGE, kernel_cache_folder
 from pano_mvs.core.kernel_cache import VARIABLE as KERNEL_VARIABLE
-from pano_mvs.core.kernel_cache import kernel_cache_folder
 from pano_mvs.core.memory import free_memory_bytes, size_text
-from pano_mvs.core.paths import below
+from pano_mvs.core.paths import below, exists, is_folder
 from pano_mvs.engine.executors.threads import available_threads
 from pano_mvs.engine.stages.plugin_files import PLUGINS_VARIABLE
 from pano_mvs.results.summary import CACHE_VARIABLE
 
 KNOWN_VARIABLES = (CACHE_VARIABLE, PLUGINS_VARIABLE, "PANO_MVS_EXECUTOR", "PANO_MVS_MIN_FREE", "PANO_MVS_RENDERER")
-_THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")
-_LITTLE_MEMORY_BYTES = 3_000_000_000
+_MIN_MEMORY_BYTES, _MIN_DISK_BYTES = 3_000_000_000, 5_000_000_000
+_finding = partial(Finding, "machine")
 
 
 def machine_findings(
@@ -28,32 +31,40 @@ def machine_findings(
     processors: int | None = None,
     memory_bytes: int | None = None,
 ) -> Iterator[Finding]:
-    """Yield how many processors and how much memory there are, and what the environment says.
+    """Yield the processors, the memory, and the environment variables that limit a run or that nothing reads.
 
     Args:
-        environment: the variables.
-        threads: processors that this process may use; found by default.
-        processors: of the machine; found by default.
-        memory_bytes: free, 0 if it cannot be told; found by default.
+        environment: the environment variables.
+        threads: processors that this process may use; by default the actual number, as below.
+        processors: processors of the machine.
+        memory_bytes: free memory, 0 if it is not known.
     """
     threads = available_threads() if threads is None else threads
     processors = (os.cpu_count() or threads) if processors is None else processors
-    yield _processors(threads, processors)
-    for name in _THREADS:
+    if threads < processors:
+        detail = f"{threads} of {processors}: a container or a scheduler limits this process"
+        yield _finding("processors", "note", detail)
+    else:
+        yield _finding("processors", "ok", str(threads))
+    for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS"):
         value = environment.get(name, "")
         if value.isdigit() and 0 < int(value) < threads:
-            yield Finding("machine", name, "warning", f"holds threads to {value} of {threads}", f"unset {name}")
+            yield _finding(name, "warning", f"limits threads to {value} of {threads}", f"unset {name}")
     free = free_memory_bytes() if memory_bytes is None else memory_bytes
-    if free and free < _LITTLE_MEMORY_BYTES:
+    if free and free < _MIN_MEMORY_BYTES:
         remedy = "close other programs, or set a smaller images.max_width: a sweep of 2048 px takes up to 3 GB"
-        yield Finding("machine", "memory", "warning", f"{size_text(free)} free", remedy)
+        yield _finding("memory", "warning", f"{size_text(free)} free", remedy)
     else:
-        yield Finding("machine", "memory", "ok", f"{size_text(free)} free" if free else "cannot be told")
-    yield from _variables(environment)
+        yield _finding("memory", "ok", f"{size_text(free)} free" if free else "not known")
+    for name in sorted(environment):
+        if name.startswith(("PANO_MVS", "PANOMVS")) and name not in KNOWN_VARIABLES:
+            close = get_close_matches(name, KNOWN_VARIABLES, n=1, cutoff=0.6)
+            remedy = f"did you mean {close[0]}?" if close else f"unset it; known are {', '.join(KNOWN_VARIABLES)}"
+            yield _finding(name, "warning", "is set, but nothing reads it", remedy)
 
 
-def kernel_cache_finding(package: Path, environment: Mapping[str, str] = os.environ) -> Finding:
-    """Return whether compiled kernels can be kept; if not, every process compiles them anew."""
+def kernel_cache_finding(package: Path = PACKAGE, environment: Mapping[str, str] = os.environ) -> Finding:
+    """Return whether compiled kernels can be cached; otherwise every process compiles them again."""
     chosen = environment.get(KERNEL_VARIABLE)
     try:
         folder = Path(chosen) if chosen else kernel_cache_folder(package)
@@ -62,24 +73,46 @@ def kernel_cache_finding(package: Path, environment: Mapping[str, str] = os.envi
         probe.write_bytes(b"")
         probe.unlink()
     except (OSError, RuntimeError) as error:
-        return Finding("machine", "compiled kernels", "warning", f"cannot be kept ({error}): every process compiles "
-                       "them anew", f"set {KERNEL_VARIABLE} to a folder that you may write to")  # fmt: skip
+        detail = f"cannot be cached ({error}): every process compiles them again"
+        return _finding("compiled kernels", "warning", detail, f"set {KERNEL_VARIABLE} to a folder that is writable")
     count = len(below(folder, "*.nbc"))
-    return Finding("machine", "compiled kernels", "ok", f"{count} kept in {folder}" if count else
-                   f"none yet in {folder}: the first run compiles them, a minute or two")  # fmt: skip
+    first = f"none yet in {folder}: the first run compiles them in a minute or two"
+    return _finding("compiled kernels", "ok", f"{count} in {folder}" if count else first)
 
 
-def _processors(threads: int, processors: int) -> Finding:
-    if threads < processors:
-        return Finding("machine", "processors", "note", f"{threads} of {processors}: a container or a scheduler holds "
-                       "this process to them")  # fmt: skip
-    return Finding("machine", "processors", "ok", str(threads))
+def folder_findings(
+    what: str, folder: Path, option: str, *, free_bytes_of: Callable[[Path], int] | None = None
+) -> Iterator[Finding]:
+    """Yield whether a folder, which need not exist, can be written, and how much space its disk has.
 
-
-def _variables(environment: Mapping[str, str]) -> Iterator[Finding]:
-    """Yield the variables that nobody reads: a slip in a name would else go unnoticed."""
-    for name in sorted(environment):
-        if name.startswith(("PANO_MVS", "PANOMVS")) and name not in KNOWN_VARIABLES:
-            close = get_close_matches(name, KNOWN_VARIABLES, n=1, cutoff=0.6)
-            remedy = f"did you mean {close[0]}?" if close else f"unset it; known are {', '.join(KNOWN_VARIABLES)}"
-            yield Finding("machine", name, "warning", "is set, but nothing reads it", remedy)
+    Args:
+        what: the use of the folder: "cache" or "results".
+        folder: the folder.
+        option: the command line option that chooses another one.
+        free_bytes_of: returns the free space of a folder's disk; by default the actual one.
+    """
+    finding = partial(Finding, "disk", what)
+    path = folder.absolute()
+    existing = next((place for place in (path, *path.parents) if os.path.lexists(place)), folder)
+    if not is_folder(existing):
+        yield finding("failed", f"{folder}: {existing} is not a folder", f"choose another with {option}")
+        return
+    try:
+        with tempfile.TemporaryDirectory(dir=existing, prefix=".pano-mvs-doctor-") as name:
+            old, new = Path(name, "old"), Path(name, "new")
+            old.write_bytes(b"old")
+            new.write_bytes(b"new")
+            new.replace(old)
+            if old.read_bytes() != b"new":
+                detail = f"{existing}: a file cannot replace another in one step"
+                yield finding("failed", detail, f"choose a folder on a local disk with {option}")
+            if exists(Path(name, "OLD")):
+                yield finding("note", f"{existing}: file names that differ only in case are the same file")
+        free = free_bytes_of(existing) if free_bytes_of else shutil.disk_usage(existing).free
+    except OSError as error:
+        detail = f"{folder} cannot be written: {error.strerror or error}"
+        yield finding("failed", detail, f"correct its permissions, or choose another folder with {option}")
+        return
+    text = f"{folder}: {size_text(free)} free"
+    remedy = f"free space, or choose another folder with {option}; a panorama of 2048 px takes about 60 MB in the cache"
+    yield finding("ok", text) if free >= _MIN_DISK_BYTES else finding("warning", text, remedy)

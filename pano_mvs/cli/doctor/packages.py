@@ -1,22 +1,29 @@
-"""Which packages are installed, against what the program's own metadata ask for."""
+"""Compare the installed packages with the requirements in the program's own metadata."""
 
 from __future__ import annotations
 
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from importlib.metadata import PackageNotFoundError, requires, version
+from typing import NamedTuple, TypeAlias
 
 from pano_mvs.cli.doctor.finding import Finding
 
-DISTRIBUTION = "pano-mvs"
-_NAME, _LEAST = re.compile(r"[A-Za-z0-9._-]+"), re.compile(r">=\s*([0-9.]+)")
-_EXTRA = re.compile(r"extra\s*==\s*['\"]([\w-]+)")
-_FOR_DEVELOPERS = frozenset({"dev", "docs"})
-_USES = {"dask": "--executor dask", "heic": "HEIC pictures", "exr": "OpenEXR files"}
-_OPENCV = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python")
+VersionOf: TypeAlias = Callable[[str], str | None]
 
-VersionOf = Callable[[str], str | None]
+_DISTRIBUTION = "pano-mvs"
+_EXTRAS_FOR_DEVELOPERS = frozenset({"dev", "docs"})
+_USES = {"dask": "--executor dask", "heic": "HEIC images", "exr": "OpenEXR files"}
+_OPENCV = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python")
+_finding = partial(Finding, "packages")
+
+
+class _Requirement(NamedTuple):
+    name: str
+    minimum: str
+    extra: str
 
 
 def installed_version(name: str) -> str | None:
@@ -30,34 +37,33 @@ def installed_version(name: str) -> str | None:
 def package_findings(
     requirements: Sequence[str] | None = None, version_of: VersionOf = installed_version
 ) -> Iterator[Finding]:
-    """Yield how each package that the program needs, and each extra, is installed.
+    """Yield the state of each required package and of each extra.
 
     Args:
-        requirements: as in the metadata of a distribution; by default the program's own.
-        version_of: finds the version of a distribution.
+        requirements: requirements as in a distribution's metadata; by default the program's own.
+        version_of: returns the version of a distribution.
     """
-    yield Finding("packages", "Python", "ok", sys.version.split()[0])
-    if requirements is None:
-        requirements = requires(DISTRIBUTION) or [] if installed_version(DISTRIBUTION) else None
-    if requirements is None:
-        remedy = "pip install pano-mvs, or pip install . in the checkout: stages are found through that"
-        yield Finding("packages", DISTRIBUTION, "warning", "runs from a folder, without being installed", remedy)
+    yield _finding("Python", "ok", sys.version.split()[0])
+    if requirements is None and not installed_version(_DISTRIBUTION):
+        remedy = "pip install pano-mvs, or pip install . in the checkout: stages are found through the installation"
+        yield _finding(_DISTRIBUTION, "warning", "runs from a folder, without being installed", remedy)
         return
-    extras: dict[str, list[tuple[str, str]]] = {}
-    for name, least, extra in filter(None, map(_parsed, requirements)):
-        if extra:
-            extras.setdefault(extra, []).append((name, least))
-        else:
-            yield _required(name, least, version_of)
-    yield from _opencv_twice(version_of)
-    for extra, needed in extras.items():
-        if extra not in _FOR_DEVELOPERS:
-            yield _extra(extra, needed, version_of)
+    needed = [_parsed(text) for text in (requires(_DISTRIBUTION) or [] if requirements is None else requirements)]
+    parsed = [requirement for requirement in needed if requirement is not None]
+    yield from (_required(requirement, version_of) for requirement in parsed if not requirement.extra)
+    opencv = [name for name in _OPENCV if version_of(name)]
+    if len(opencv) > 1:
+        detail = f"installed more than once ({', '.join(opencv)}): the packages overwrite each other's files"
+        remedy = f"pip uninstall {' '.join(opencv)}; pip install opencv-python-headless"
+        yield _finding("OpenCV", "warning", detail, remedy)
+    for extra in dict.fromkeys(requirement.extra for requirement in parsed):
+        if extra and extra not in _EXTRAS_FOR_DEVELOPERS:
+            yield _extra(extra, [requirement for requirement in parsed if requirement.extra == extra], version_of)
 
 
-def is_older(found: str, least: str) -> bool:
-    """Return whether a version lies before another; what follows the numbers (rc1, .post2) is not looked at."""
-    return _numbers(found) < _numbers(least)
+def is_older(found: str, minimum: str) -> bool:
+    """Return whether a version is older than another; suffixes of the numbers (rc1, .post2) are ignored."""
+    return _numbers(found) < _numbers(minimum)
 
 
 def _numbers(text: str) -> list[int]:
@@ -66,46 +72,38 @@ def _numbers(text: str) -> list[int]:
     return [*numbers, *[0] * (4 - len(numbers))]
 
 
-def _parsed(requirement: str) -> tuple[str, str, str] | None:
-    """Return a requirement's name, its lower bound and the extra that it belongs to; None for other systems' alone."""
-    wanted, _, marker = requirement.partition(";")
-    name, least, extra = _NAME.match(wanted), _LEAST.search(wanted), _EXTRA.search(marker)
+def _parsed(text: str) -> _Requirement | None:
+    """Return a requirement, or None if it is only for other systems."""
+    wanted, _, marker = text.partition(";")
+    name, minimum = re.match(r"[A-Za-z0-9._-]+", wanted), re.search(r">=\s*([0-9.]+)", wanted)
+    extra = re.search(r"extra\s*==\s*['\"]([\w-]+)", marker)
     if name is None or (marker.strip() and extra is None):
         return None
-    return name[0], least[1] if least else "", extra[1] if extra else ""
+    return _Requirement(name[0], minimum[1] if minimum else "", extra[1] if extra else "")
 
 
-def _required(name: str, least: str, version_of: VersionOf) -> Finding:
+def _required(requirement: _Requirement, version_of: VersionOf) -> Finding:
+    name, minimum, _ = requirement
     found = version_of(name)
-    wanted = f"{name}>={least}" if least else name
-    if found is None and name in _OPENCV:
-        other = next((other for other in _OPENCV if version_of(other)), None)
-        if other is not None:
-            return Finding("packages", name, "ok", f"{other} {version_of(other)} in its place")
+    wanted = f"{name}>={minimum}" if minimum else name
+    other = next((other for other in _OPENCV if version_of(other)), None) if name in _OPENCV else None
+    if found is None and other is not None:
+        return _finding(name, "ok", f"{other} {version_of(other)} in its place")
     if found is None:
-        return Finding("packages", name, "failed", "is not installed", f"pip install '{wanted}'")
-    if least and is_older(found, least):
-        return Finding("packages", name, "failed", f"{found}; {least} or newer is needed", f"pip install -U '{wanted}'")
-    return Finding("packages", name, "ok", found)
+        return _finding(name, "failed", "is not installed", f"pip install '{wanted}'")
+    if is_older(found, minimum):
+        return _finding(name, "failed", f"{found}; {minimum} or newer is needed", f"pip install -U '{wanted}'")
+    return _finding(name, "ok", found)
 
 
-def _opencv_twice(version_of: VersionOf) -> Iterator[Finding]:
-    found = [name for name in _OPENCV if version_of(name)]
-    if len(found) > 1:
-        shown = f"installed more than once ({', '.join(found)}): their files lie over each other"
-        remedy = f"pip uninstall {' '.join(found)}; pip install opencv-python-headless"
-        yield Finding("packages", "OpenCV", "warning", shown, remedy)
-
-
-def _extra(extra: str, needed: Sequence[tuple[str, str]], version_of: VersionOf) -> Finding:
-    what = f"extra {extra}"
-    remedy = f"pip install 'pano-mvs[{extra}]'"
-    shown = []
-    for name, least in needed:
+def _extra(extra: str, needed: Sequence[_Requirement], version_of: VersionOf) -> Finding:
+    what, remedy = f"extra {extra}", f"pip install 'pano-mvs[{extra}]'"
+    versions = []
+    for name, minimum, _ in needed:
         found = version_of(name)
         if found is None:
-            return Finding("packages", what, "note", f"not installed; for {_USES.get(extra, extra)}", remedy)
-        if least and is_older(found, least):
-            return Finding("packages", what, "warning", f"{name} {found}; {least} or newer is needed", remedy)
-        shown.append(f"{name} {found}")
-    return Finding("packages", what, "ok", ", ".join(shown))
+            return _finding(what, "note", f"not installed; for {_USES.get(extra, extra)}", remedy)
+        if is_older(found, minimum):
+            return _finding(what, "warning", f"{name} {found}; {minimum} or newer is needed", remedy)
+        versions.append(f"{name} {found}")
+    return _finding(what, "ok", ", ".join(versions))

@@ -1,9 +1,10 @@
-"""Whether the built-in stages, the presets, and everybody's plugins are there."""
+"""Check the built-in stages, the presets and the installed plugins."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 
 from pano_mvs.cli.doctor.finding import Finding
@@ -13,47 +14,42 @@ from pano_mvs.engine.stages.plugin_files import PLUGINS_VARIABLE, plugin_files_i
 from pano_mvs.engine.stages.registry import Registry
 
 _BUILTIN = "source.folder"
+_REINSTALL = "pip install --force-reinstall pano-mvs"
+_finding = partial(Finding, "plugins")
 
 
 def plugin_findings(
     registry: Registry, presets: Path, environment: Mapping[str, str] = os.environ
 ) -> Iterator[Finding]:
-    """Yield how the plugins are that were found, and what the folders of plugins hold.
+    """Yield the state of the stages, the presets, the plugins and the folders of plugins.
 
     Args:
-        registry: what was found.
-        presets: folder of the shipped workflows.
-        environment: the variables.
+        registry: the stages and plugins that were found.
+        presets: the folder of the shipped workflows.
+        environment: the environment variables.
     """
     if _BUILTIN in registry.stages:
         count = len(registry.plugins)
-        yield Finding("plugins", "stages", "ok", f"{len(registry.stages)}, from {count} "
-                      f"{plural(count, 'package or file', 'packages and files')}")  # fmt: skip
+        origins = f"{count} {plural(count, 'package or file', 'packages and files')}"
+        yield _finding("stages", "ok", f"{len(registry.stages)}, from {origins}")
     else:
-        yield Finding("plugins", "stages", "failed", "the built-in stages are not registered",
-                      "pip install --force-reinstall pano-mvs, or pip install -e . in a checkout")  # fmt: skip
-    found = [path.stem for path in children(presets, "*.yaml")]
-    if "quickstart" in found:
-        yield Finding("plugins", "presets", "ok", ", ".join(found))
+        remedy = f"{_REINSTALL}, or pip install -e . in a checkout"
+        yield _finding("stages", "failed", "the built-in stages are not registered", remedy)
+    workflows = [path.stem for path in children(presets, "*.yaml")]
+    if "quickstart" in workflows:
+        yield _finding("presets", "ok", ", ".join(workflows))
     else:
-        yield Finding("plugins", "presets", "failed", f"no workflows in {presets}",
-                      "pip install --force-reinstall pano-mvs")  # fmt: skip
+        yield _finding("presets", "failed", f"no workflows in {presets}", _REINSTALL)
     for plugin in registry.broken:
         stages = [name for kind, name in plugin.names if kind == "stage"]
         command = f"pano-mvs stage show {stages[0]}" if stages else "pano-mvs plugins"
-        yield Finding("plugins", plugin.origin, "warning", f"failed to load: {plugin.error}",
-                      f"mend or remove it; `{command}` shows more")  # fmt: skip
+        remedy = f"correct or remove it; `{command}` shows more"
+        yield _finding(plugin.origin, "warning", f"failed to load: {plugin.error}", remedy)
     for (kind, name), why in registry.clashes.items():
-        yield Finding("plugins", f"{kind} {name}", "warning", why, "until then nobody can use it")
-    yield from _folders(environment)
-
-
-def _folders(environment: Mapping[str, str]) -> Iterator[Finding]:
+        yield _finding(f"{kind} {name}", "warning", why, "nobody can use it before that is resolved")
     for folder in user_plugin_folders(environment):
-        if PLUGINS_VARIABLE not in environment and not is_folder(folder):
-            continue  # few people have the folder of their settings
         files = len(plugin_files_in(folder))
-        if not is_folder(folder):
-            yield Finding("plugins", PLUGINS_VARIABLE, "warning", f"{folder} is no folder", f"mend {PLUGINS_VARIABLE}")
-        else:
-            yield Finding("plugins", str(folder), "ok" if files else "note", f"{files} plugin {plural(files, 'file')}")
+        if is_folder(folder):
+            yield _finding(str(folder), "ok" if files else "note", f"{files} plugin {plural(files, 'file')}")
+        elif PLUGINS_VARIABLE in environment:  # the default folder is optional
+            yield _finding(PLUGINS_VARIABLE, "warning", f"{folder} is not a folder", f"correct {PLUGINS_VARIABLE}")

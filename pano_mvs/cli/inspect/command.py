@@ -72,7 +72,7 @@ def open_run(target: str, *, overrides: Sequence[str], images: Path | None, cach
     """Open a workflow, or that of an output folder with the settings, the pictures and the cache of its run.
 
     Raises:
-        InputError: if the output folder is none, or its workflow is gone.
+        InputError: if the folder has no run.json, or its workflow is gone.
     """
     out = Path(target)
     if not is_folder(out):

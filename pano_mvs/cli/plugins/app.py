@@ -26,7 +26,7 @@ FileOption = Annotated[
 
 @guarded
 def plugins(workflow: WorkflowOption = None, files: FileOption = None) -> None:
-    """List all plugins, where they come from, whether they are sound, and their stages."""
+    """List all plugins with their origin, whether they can be loaded, and their stages."""
     from pano_mvs.cli.plugins.show import show_plugins
 
     show_plugins(Console(), workflow=workflow, files=files or [])

@@ -29,7 +29,7 @@ class PluginKind:
         prefix: of the stage's name; empty for a part of the sweep.
         what: what it does, in words.
         use: how a workflow uses it, with `{name}` for its name.
-        contract_tests: the function of `pano_mvs.testing.conformance` that gives its contract.
+        contract_tests: the function of `pano_mvs.testing.conformance` that returns its contract tests.
     """
 
     prefix: str

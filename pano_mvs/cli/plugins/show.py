@@ -20,7 +20,7 @@ from pano_mvs.session.session import presets_folder
 
 
 def show_plugins(console: Console, *, workflow: str | None = None, files: Sequence[Path] = ()) -> None:
-    """List all plugins, sound or broken, then all stages, then the parts that plugins add.
+    """List all plugins, broken ones included, then all stages, then the parts that plugins add.
 
     Args:
         console: where to.

@@ -43,7 +43,7 @@ def interrupted_by_termination() -> Iterator[None]:
     A terminal that closes sends SIGHUP more than once: only the first counts. Under nohup it is ignored, as is wanted.
     """
     if threading.current_thread() is not threading.main_thread():
-        yield  # only a main thread is told
+        yield  # signals reach only the main thread
         return
 
     hangup = getattr(signal, "SIGHUP", None)

@@ -49,7 +49,7 @@ class Estimate:
         return f"{duration(left_s / at_a_time)} left" if left_s else ""
 
     def of_run(self, stages: int) -> str:
-        """Return the time left in a run of so many stages; what is not known yet makes it a lower bound."""
+        """Return the time left in a run of this number of stages; a lower bound until all stages are known."""
         known = [clock.left_s for clock in self.stages.values()]
         total = sum(left_s for left_s in known if left_s) / self.workers
         if not total:

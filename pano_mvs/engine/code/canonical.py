@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 from typing import Any
 
-_HELP_ARGUMENTS = frozenset({"description", "title", "examples"})
+_HELP_ARGUMENTS = frozenset({"description", "title", "examples", "doc"})
 _IGNORED_FIELDS = frozenset({"ctx", "kind", "type_comment", "type_ignores"})
 
 
@@ -13,15 +13,15 @@ def strip(tree: ast.AST) -> None:
     """Remove from a tree, in place, what cannot affect results.
 
     This removes docstrings and other bare strings, `pass`, the annotations of functions and of variables outside
-    classes, and the help texts of settings (`Field(description=…)`). The annotations in classes are kept, because they
-    define the fields of dataclasses and settings.
+    classes, and the help texts of settings (`Field(description=…)`, `setting(doc=…)`). The annotations in classes are
+    kept, because they define the fields of dataclasses and settings.
     """
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             node.returns = None
         elif isinstance(node, ast.arg):
             node.annotation = None
-        elif isinstance(node, ast.Call) and _name_of(node.func) == "Field":
+        elif isinstance(node, ast.Call) and _name_of(node.func) in {"Field", "setting"}:
             node.keywords = [keyword for keyword in node.keywords if keyword.arg not in _HELP_ARGUMENTS]
         for block in ("body", "orelse", "finalbody"):
             statements = getattr(node, block, None)

@@ -91,6 +91,8 @@ def _imported_files(tree: ast.Module, folder: Path, roots: _Roots) -> list[Path]
             module = node.module or ""
             dotted = [module, *(f"{module}.{alias.name}" if module else alias.name for alias in node.names)]
             base = folder.joinpath(*[".."] * (node.level - 1)).resolve() if node.level else None
+            if base is not None and (base / "__init__.py").is_file():
+                files.append(base / "__init__.py")  # the names may be its own
             for name in dotted:
                 files.extend(roots.files(name) if base is None else _module_files(base, name))
     return files

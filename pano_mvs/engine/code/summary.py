@@ -32,6 +32,7 @@ _PURE_DECORATORS = frozenset(
         "runtime_checkable",
         "final",
         "unique",
+        "params_from",
     }
 )
 """These do not register anything; other decorators might."""

@@ -36,14 +36,13 @@ from pano_mvs.evaluation.tables import Summary, TextTable, finite_or_none
 from pano_mvs.geometry import Rigid3, Similarity3
 from pano_mvs.io.clouds.ply_points import open_ply_points
 from pano_mvs.scene import PointCloud
+from pano_mvs.scene.up_direction import WORLD_UP, mean_up_direction
 
 CLOUD_FILE, MODEL_FOLDER = "cloud.ply", "colmap/sparse/0"
 # Distances are measured up to this multiple of the largest tolerance, for quantiles and files.
 _FARTHEST = 20.0
 # Points of a reference cloud that must be covered; all of its points count for the cloud's own accuracy.
 _MAX_SAMPLES = 4_000_000
-# Least length of the mean of the cameras' vertical axes from which they agree on where up is.
-_MIN_AGREEMENT = 0.5
 
 CloudInput = Path | PointCloud | NDArray[np.floating]
 """A PLY file or the output folder of a run, a record, or points (N, 3)."""
@@ -247,7 +246,8 @@ def _compared(
 ) -> CloudTruth:
     """Return the true surface: of the views of a folder, or of a reference cloud."""
     cameras = np.array([known[name].center for name in used]).reshape(-1, 3)
-    up = _up([known[name] for name in used])
+    common_up = mean_up_direction([known[name].rotation for name in used])
+    up = np.array(WORLD_UP) if common_up is None else common_up  # for the images of the errors
     if not isinstance(truth, Path) or not is_folder(truth):
         reference = _open(truth)
         some, _ = reference.some(max(1, -(-reference.count // _MAX_SAMPLES)))
@@ -261,10 +261,3 @@ def _compared(
         raise InputError(f"{truth}: holds no range map of a camera that was used ({', '.join(used[:3]) or 'none'})")
     surface = surface_of_views(list(chosen.values()))
     return CloudTruth(lambda: map(view_points, views.values()), surface, chosen, len(views), unit, cameras, up)
-
-
-def _up(cameras: Sequence[Rigid3]) -> NDArray[np.float64]:
-    """Return the unit vector (3,) that is up for most cameras, for pictures; that of the world if they disagree."""
-    down = np.mean([camera.rotation[1] for camera in cameras], axis=0) if cameras else np.zeros(3)
-    length = float(np.linalg.norm(down))
-    return -down / length if length > _MIN_AGREEMENT else np.array([0.0, -1.0, 0.0])

@@ -6,11 +6,10 @@ from collections.abc import Iterable, Sequence
 from itertools import takewhile
 from pathlib import PurePosixPath
 
-from pano_mvs.io.images.captures import PICTURE_SUFFIXES
+from pano_mvs.io.images.names import without_extension
 
 RANGE_SUFFIXES = (".tiff", ".tif", ".exr", ".npy", ".npz", ".png")
 """Extensions of range map files. If an image has several, the first of these extensions wins."""
-_EXTENSIONS = frozenset({*RANGE_SUFFIXES, *PICTURE_SUFFIXES, ".heic"})
 
 
 def match_images(names: Iterable[str], available: Iterable[str]) -> dict[str, str]:
@@ -43,13 +42,6 @@ def match_images(names: Iterable[str], available: Iterable[str]) -> dict[str, st
             closest = {name: _closest(name, theirs) for name in ours}
             matched |= {name: other for name, other in closest.items() if other and _closest(other, ours) == name}
     return matched
-
-
-def without_extension(name: str) -> str:
-    """Return a name with forward slashes and without an image's or range map's extension; other endings stay."""
-    plain = name.replace("\\", "/")
-    stem, dot, ending = plain.rpartition(".")
-    return stem if dot and f".{ending.casefold()}" in _EXTENSIONS and not stem.endswith("/") and stem else plain
 
 
 def shortened_list(names: Iterable[str], count: int = 3) -> str:

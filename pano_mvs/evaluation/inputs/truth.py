@@ -16,6 +16,7 @@ from pano_mvs.geometry import Rigid3
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.io.poses.json_files import PosedView, read_posed_views
 from pano_mvs.io.ranges.npy import keys_of_npz
+from pano_mvs.scene import FilePart
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,14 @@ class TruthView:
     cam_from_world: Rigid3
     range_file: RangeFile | None
     sha256: str | None
+
+    def belongs_to(self, image: FilePart) -> bool:
+        """Return whether an image file has the bytes that the truth states, if it states any.
+
+        Raises:
+            InputError: if the file cannot be read.
+        """
+        return self.sha256 is None or image.sha256() == self.sha256
 
 
 @dataclass(frozen=True)

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import glob
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, UsageError
-from pano_mvs.core.paths import children, is_file, is_folder
-from pano_mvs.evaluation.inputs.names import match_images, shortened_list, without_extension
+from pano_mvs.core.paths import is_folder
+from pano_mvs.evaluation.inputs.names import match_images, shortened_list
 from pano_mvs.evaluation.inputs.range_files import RangeMaps, StoredRange, find_ranges
 from pano_mvs.evaluation.inputs.sources import source_name
 from pano_mvs.evaluation.inputs.truth import find_true_ranges
 from pano_mvs.evaluation.ranges.resize import resized_labels, resized_range
+from pano_mvs.io.images.mask_files import find_mask
+from pano_mvs.io.images.names import without_extension
 from pano_mvs.scene.masking import decode_mask, placed_mask
 
 
@@ -65,7 +66,7 @@ class ViewMasks:
 
     def missing(self, names: Sequence[str]) -> tuple[str, ...]:
         """Return the views without a mask in the folder; none without a folder."""
-        return () if self.folder is None else tuple(name for name in names if _mask_of(self.folder, name) is None)
+        return () if self.folder is None else tuple(name for name in names if find_mask(self.folder, name) is None)
 
     def read(self, name: str, size_hw: tuple[int, int]) -> NDArray[np.bool_] | None:
         """Return the pixels (H, W) of a view that count, None for all.
@@ -73,7 +74,7 @@ class ViewMasks:
         Raises:
             InputError: if a mask cannot be read.
         """
-        own = None if self.folder is None else _mask_of(self.folder, name)
+        own = None if self.folder is None else find_mask(self.folder, name)
         sphere = (0, 0, size_hw[1], size_hw[0])
         counted = [
             placed_mask(decode_mask(path), size_hw, of=sphere, whole_hw=size_hw)
@@ -148,16 +149,3 @@ def pair_ranges(source: RangeMaps, truth: RangeMaps, *, unit: float, truth_unit:
         tuple(name for name in estimates if name not in names),
         tuple(name for name in truths if name not in set(names.values())),
     )
-
-
-def _mask_of(folder: Path, name: str) -> Path | None:
-    """Return the mask of an image: one named like the image with .png appended before one without its extension."""
-    plain = without_extension(name)
-    own = [folder / f"{name}.png"] if name != plain else []
-    stem = PurePosixPath(plain).name
-    beside = [
-        path
-        for path in children((folder / plain).parent, f"{glob.escape(stem)}.*.png")
-        if without_extension(path.stem) == stem
-    ]
-    return next((path for path in (*own, *beside, folder / f"{plain}.png") if is_file(path)), None)

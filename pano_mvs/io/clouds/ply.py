@@ -9,27 +9,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.io.clouds.thinning import Kept, chunks
-from pano_mvs.scene import PointCloud
+from pano_mvs.io.clouds.thinning import SelectedPoints, chunks
+from pano_mvs.scene import FilePart, PointCloud
 
-_PLAIN = np.dtype([
-    ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("nx", "<f4"), ("ny", "<f4"), ("nz", "<f4"),
-    ("red", "u1"), ("green", "u1"), ("blue", "u1"),
-])  # fmt: skip
+_PLAIN = np.dtype(
+    [
+        ("x", "<f4"),
+        ("y", "<f4"),
+        ("z", "<f4"),
+        ("nx", "<f4"),
+        ("ny", "<f4"),
+        ("nz", "<f4"),
+        ("red", "u1"),
+        ("green", "u1"),
+        ("blue", "u1"),
+    ]
+)
 _WITH_QUALITY = np.dtype([*_PLAIN.descr, ("views", "u1"), ("confidence", "u1")])
 _PLY_TYPES = {"f": "float", "u": "uchar"}
 
 
-def write_ply(path: Path, cloud: PointCloud, *, quality: bool = False, kept: Kept | None = None) -> None:
+def write_ply(path: Path, cloud: PointCloud, *, quality: bool = False, kept: SelectedPoints | None = None) -> None:
     """Write a cloud as binary little-endian PLY: x y z nx ny nz (float), red green blue (uchar).
 
-    It is written in chunks: a cloud whose arrays are memory-mapped need not fit in memory.
+    The cloud is written in chunks, so that memory-mapped arrays need not fit in memory.
 
     Args:
         path: the file to write.
         cloud: the points.
-        quality: whether each point is followed by views, how many agree on it, and confidence (uchar).
-        kept: the points to write, in their order; None: all.
+        quality: also write `views`, the number of views that agree on the point, and `confidence` (uchar).
+        kept: the points to write; all by default.
     """
     layout = _WITH_QUALITY if quality else _PLAIN
     with path.open("wb") as stream:
@@ -53,24 +62,21 @@ def _vertices(cloud: PointCloud, chunk: slice, layout: np.dtype[np.void]) -> NDA
 
 
 def read_ply(path: Path) -> PointCloud:
-    """Return the cloud in a PLY file of a layout that `write_ply` writes; view counts, where it lacks them, are 0.
+    """Return the cloud in a PLY file that `write_ply` wrote; missing view counts are 0.
 
     Raises:
         InputError: if the file cannot be read, has another layout, or ends early.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
-    head, mark, body = data.partition(b"end_header\n")
+    head, mark, body = FilePart(path).read_bytes().partition(b"end_header\n")
     counted = re.search(rb"^element vertex ([0-9]{1,18})$", head, re.MULTILINE)
     count = int(counted[1]) if counted else 0
     layout = next((known for known in (_PLAIN, _WITH_QUALITY) if head + mark == _header(count, known)), None)
     if layout is None:
         raise InputError(f"{path}: not a PLY file of pano-mvs (binary little endian, x y z nx ny nz red green blue)")
     if len(body) != count * layout.itemsize:
-        raise InputError(f"{path}: its header promises {count} points, but it holds {len(body) // layout.itemsize}. "
-                         "Write it again")  # fmt: skip
+        raise InputError(
+            f"{path}: its header states {count} points, but it contains {len(body) // layout.itemsize}. Write it again"
+        )
     vertices = np.frombuffer(body, layout)
     points, normals, colors = (
         np.stack([vertices[name] for name in names], axis=-1)

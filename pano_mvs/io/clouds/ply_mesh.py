@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
+from pano_mvs.scene import FilePart
 
 _VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
-# Our own files count a face's corners in a byte, as most programs write and all read; COLMAP's in four.
+# Our files store the number of a face's corners in one byte, which all programs read; COLMAP's in four bytes.
 _FACE = np.dtype([("count", "u1"), ("corners", "<i4", (3,))])
 _COLMAP_FACE = np.dtype([("count", "<i4"), ("corners", "<i4", (3,))])
 _FACE_PROPERTIES = {
@@ -42,16 +43,12 @@ def write_ply_mesh(path: Path, mesh: MeshArrays) -> None:
 
 
 def read_ply_mesh(path: Path) -> MeshArrays:
-    """Return the mesh in a PLY file of `write_ply_mesh`, or of COLMAP's Poisson solver.
+    """Return the mesh in a PLY file that `write_ply_mesh` or COLMAP's Poisson mesher wrote.
 
     Raises:
         InputError: if the file cannot be read, has another layout, or ends early.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
-    head, mark, body = data.partition(b"end_header\n")
+    head, mark, body = FilePart(path).read_bytes().partition(b"end_header\n")
     counts = [int(count) for count in re.findall(rb"^element (?:vertex|face) ([0-9]{1,18})$", head, re.MULTILINE)]
     layouts = [
         layout
@@ -62,8 +59,10 @@ def read_ply_mesh(path: Path) -> MeshArrays:
         raise InputError(f"{path}: not a PLY mesh of pano-mvs or COLMAP (x y z red green blue, and triangles)")
     split = counts[0] * _VERTEX.itemsize
     if len(body) != split + counts[1] * layouts[0].itemsize:
-        raise InputError(f"{path}: its header promises {counts[0]} vertices and {counts[1]} faces, but it holds other "
-                         "numbers. Write it again")  # fmt: skip
+        raise InputError(
+            f"{path}: its header states {counts[0]} vertices and {counts[1]} faces, but it contains other "
+            "numbers. Write it again"
+        )
     vertices, faces = np.frombuffer(body[:split], _VERTEX), np.frombuffer(body[split:], layouts[0])
     if (faces["count"] != 3).any():
         raise InputError(f"{path}: not all of its faces are triangles")
@@ -73,8 +72,14 @@ def read_ply_mesh(path: Path) -> MeshArrays:
 
 def _header(vertices: int, faces: int, face_property: str) -> bytes:
     lines = [
-        "ply", "format binary_little_endian 1.0", f"element vertex {vertices}",
-        *(f"property float {name}" for name in "xyz"), *(f"property uchar {name}" for name in ("red", "green", "blue")),
-        f"element face {faces}", face_property, "end_header", "",
-    ]  # fmt: skip
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {vertices}",
+        *(f"property float {name}" for name in "xyz"),
+        *(f"property uchar {name}" for name in ("red", "green", "blue")),
+        f"element face {faces}",
+        face_property,
+        "end_header",
+        "",
+    ]
     return "\n".join(lines).encode()

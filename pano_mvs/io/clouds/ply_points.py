@@ -1,4 +1,4 @@
-"""The points of anybody's PLY file."""
+"""Read the points of PLY files of any program."""
 
 from __future__ import annotations
 
@@ -15,18 +15,31 @@ from pano_mvs.core.errors import InputError
 
 # PLY's names of number types, old and new.
 _NUMBERS = {
-    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
-    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
-    "float32": "f4", "float64": "f8",
-}  # fmt: skip
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+    "double": "f8",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "float32": "f4",
+    "float64": "f8",
+}
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _MARK = b"end_header"
-_LONGEST_HEAD = 1 << 20
+_MAX_HEADER_BYTES = 1 << 20
 _COUNT = re.compile("[0-9]{1,18}")
 
 
 class _Layout(NamedTuple):
-    """How the vertices of a file lie: their number, their properties, and whether they are text."""
+    """The layout of the vertices: their number, their properties, and whether they are text."""
 
     points: int
     vertex: np.dtype[np.void]
@@ -41,7 +54,7 @@ class PlyPoints:
         path: the file.
         count: number of vertices.
         has_normals: whether they have nx, ny, nz.
-        vertices: (N,) with a field for each property, mapped from the file if that is binary.
+        vertices: (N,) with a field for each property, memory-mapped if the file is binary.
     """
 
     path: Path
@@ -50,42 +63,42 @@ class PlyPoints:
     vertices: NDArray[np.void]
 
     def chunks(self, size: int = 2_000_000) -> Iterator[NDArray[np.float32]]:
-        """Return the places, (K, 3) float32, of up to `size` vertices at a time.
+        """Yield the positions, (K, 3) float32, of up to `size` vertices at a time.
 
         Raises:
-            InputError: if one is not finite.
+            InputError: if a position is not finite.
         """
         for start in range(0, self.count, size):
-            yield self._places(slice(start, start + size))
+            yield self._positions(slice(start, start + size))
 
     def some(self, step: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return the places and normals, both (K, 3) float32, of every step-th vertex; normals not known are 0.
+        """Return the positions and normals, both (K, 3) float32, of every step-th vertex; unknown normals are 0.
 
         Raises:
-            InputError: if a place is not finite.
+            InputError: if a position is not finite.
         """
-        points = self._places(slice(None, None, step))
+        points = self._positions(slice(None, None, step))
         if not self.has_normals:
             return points, np.zeros_like(points)
         return points, np.nan_to_num(self._stacked(("nx", "ny", "nz"), slice(None, None, step)))
 
-    def _places(self, part: slice) -> NDArray[np.float32]:
+    def _positions(self, part: slice) -> NDArray[np.float32]:
         points = self._stacked(("x", "y", "z"), part)
         if not np.isfinite(points).all():
-            raise InputError(f"{self.path}: a point has no finite place. Leave such points out")
+            raise InputError(f"{self.path}: a point has no finite position. Remove such points")
         return points
 
     def _stacked(self, names: tuple[str, ...], part: slice) -> NDArray[np.float32]:
         chosen = self.vertices[part]
-        with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite is refused
+        with np.errstate(over="ignore", invalid="ignore"):  # infinite values are refused
             return np.stack([chosen[name].astype(np.float32) for name in names], axis=-1)
 
 
 def read_ply_points(path: Path) -> NDArray[np.float32]:
-    """Return the places of the vertices, (N, 3) float32, in a PLY file of any program, as of `open_ply_points`.
+    """Return the positions of the vertices, (N, 3) float32, in a PLY file; see `open_ply_points`.
 
     Raises:
-        InputError: if the file cannot be read, is no such PLY file, or ends early.
+        InputError: if the file cannot be read, is not such a PLY file, or ends early.
     """
     return np.concatenate([np.zeros((0, 3), np.float32), *open_ply_points(path).chunks()])
 
@@ -93,15 +106,15 @@ def read_ply_points(path: Path) -> NDArray[np.float32]:
 def open_ply_points(path: Path) -> PlyPoints:
     """Return the vertices of a PLY file of any program.
 
-    Text or binary, of either byte order, with any other properties and elements, as long as the vertices come first
-    and have no lists. Those of a binary file stay on the disk until they are asked for.
+    The file is text or binary in either byte order. The vertices must be its first element and must not contain lists;
+    other properties and elements are ignored. Vertices of a binary file are memory-mapped.
 
     Raises:
-        InputError: if the file cannot be read, is no such PLY file, or ends early.
+        InputError: if the file cannot be read, is not such a PLY file, or ends early.
     """
     try:
         with path.open("rb") as stream:
-            head, mark, rest = stream.read(_LONGEST_HEAD).partition(_MARK)
+            head, mark, rest = stream.read(_MAX_HEADER_BYTES).partition(_MARK)
         size = path.stat().st_size
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
@@ -111,14 +124,14 @@ def open_ply_points(path: Path) -> PlyPoints:
     offset = len(head) + len(mark) + rest.find(b"\n") + 1
     vertices = _text_vertices(path, offset, layout) if layout.text else _binary_vertices(path, offset, size, layout)
     if vertices is None:
-        raise InputError(f"{path}: its header promises {layout.points} points, but it holds fewer. Write it again")
+        raise InputError(f"{path}: its header states {layout.points} points, but it contains fewer. Write it again")
     return PlyPoints(path, layout.points, {"nx", "ny", "nz"} <= set(layout.vertex.names or ()), vertices)
 
 
 def _binary_vertices(path: Path, offset: int, size: int, layout: _Layout) -> NDArray[np.void] | None:
     if size - offset < layout.points * layout.vertex.itemsize:
         return None
-    if not layout.points:  # nothing can be mapped
+    if not layout.points:  # an empty array cannot be mapped
         return np.zeros(0, layout.vertex)
     return np.memmap(path, layout.vertex, "r", offset, (layout.points,))
 
@@ -130,15 +143,15 @@ def _text_vertices(path: Path, offset: int, layout: _Layout) -> NDArray[np.void]
     try:
         rows = [tuple(float(number) for number in line.split()) for line in lines]
         return np.array(rows, [(name, "f8") for name in layout.vertex.names or ()])
-    except ValueError:  # a line that is cut off, or holds no numbers
+    except ValueError:  # a truncated line, or one without numbers
         return None
 
 
 def _layout(lines: list[str], path: Path) -> _Layout:
-    """Return how the vertices lie, by the header's lines.
+    """Return the layout of the vertices from the lines of the header.
 
     Raises:
-        InputError: if the header is no PLY header, or its vertices are not plain.
+        InputError: if the header is not a PLY header, or its vertices have lists.
     """
     words = [line.split() for line in lines if line.strip() and not line.startswith(("comment", "obj_info"))]
     form = next((word[1] for word in words if word[0] == "format" and len(word) == 3), "")
@@ -147,8 +160,10 @@ def _layout(lines: list[str], path: Path) -> _Layout:
         raise InputError(f"{path}: not a PLY file: its header names no known format or no element")
     first = words[elements[0]]
     if first[1:2] != ["vertex"] or len(first) != 3 or not _COUNT.fullmatch(first[2]):
-        raise InputError(f"{path}: the first element of a PLY file must be its vertices with their number, this has "
-                         f"'{' '.join(first)[:80]}'")  # fmt: skip
+        raise InputError(
+            f"{path}: the first element of a PLY file must be its vertices with their number, this has "
+            f"'{' '.join(first)[:80]}'"
+        )
     properties = words[elements[0] + 1 : elements[1] if len(elements) > 1 else len(words)]
     if not all(len(word) == 3 and word[0] == "property" and word[1] in _NUMBERS for word in properties):
         raise InputError(f"{path}: its vertices have lists or properties of unknown types: write plain numbers")

@@ -1,4 +1,8 @@
-"""Which points of a cloud to write, found in memory that does not grow with the cloud."""
+"""Select the points of a cloud to write, in bounded memory.
+
+`algorithms.fusion.voxels` averages the points of a voxel while the cloud is made. Here one point of each voxel is
+selected from a finished cloud, which may be larger than memory.
+"""
 
 from __future__ import annotations
 
@@ -13,29 +17,29 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.scene import PointCloud
 
 CHUNK_POINTS = 1 << 18
-"""Points that are held at a time."""
+"""Number of points that are processed at a time."""
 
 _BUCKET_POINTS = 1 << 22
-_MOST_BUCKETS = 256
-# Three coordinates in one number of 63 bits.
-_PLACE_BITS = 21
-_MOST_PLACES = 1 << _PLACE_BITS
+_MAX_BUCKETS = 256
+# The three indices of a voxel are packed into 63 bits.
+_INDEX_BITS = 21
+_MAX_INDEX = 1 << _INDEX_BITS
 _CANDIDATE = np.dtype([("place", "<u8"), ("rank", "<u2"), ("off_center", "<f4"), ("idx", "<i8")])
 _COUNTED_VOXELS = 1 << 14
-_CUBE_SURFACE = 24.0  # of a cube from −1 to 1: what rooms have more or less
-_FEWEST_ROUNDS = 8
+_CUBE_SURFACE = 24.0  # of a cube from −1 to 1, a rough model of rooms
+_MIN_ROUNDS = 8
 _FULL_ENOUGH = 0.93
 
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Which points of a cloud are wanted.
+    """Criteria for the points of a cloud.
 
     Attributes:
-        min_confidence: points below are left out; 0: none.
-        min_views: points on which fewer views agree are left out.
-        voxel: edge in scene units of the voxels of which each keeps one point; 0: all are kept.
-        max_points: the voxels grow until no more points than this are left; 0: any number.
+        min_confidence: the smallest confidence.
+        min_views: the smallest number of views that agree on a point.
+        voxel: edge of the voxels in scene units, of which each keeps one point; 0: no voxels.
+        max_points: the largest number of points, which enlarges the voxels as necessary; 0: no limit.
     """
 
     min_confidence: int = 0
@@ -44,28 +48,28 @@ class Selection:
     max_points: int = 0
 
 
-class Kept:
-    """The points of a cloud that are kept, one bit each.
+class SelectedPoints:
+    """Selected points of a cloud, one bit per point.
 
     Attributes:
-        count: how many they are.
-        voxel: edge of the voxels that were used; 0 if none were.
+        count: the number of selected points.
+        voxel: edge of the voxels that were used; 0 without voxels.
     """
 
     def __init__(self, bits: NDArray[np.uint8], *, voxel: float) -> None:
-        """Take the bits, the first point's in the lowest."""
+        """Take the bits; that of the first point is the lowest of the first byte."""
         self._bits = bits
         self.voxel = voxel
         self.count = sum(int(np.unpackbits(part).sum()) for part in np.array_split(bits, 64))
 
     def within(self, chunk: slice) -> NDArray[np.bool_]:
-        """Return of each point of a chunk, which begins at a multiple of eight, whether it is kept."""
+        """Return which points of a chunk, whose start is a multiple of 8, are selected."""
         bits = self._bits[chunk.start // 8 : -(-chunk.stop // 8)]
         return np.unpackbits(bits, bitorder="little")[: chunk.stop - chunk.start].astype(np.bool_)
 
 
 def chunks(count: int) -> Iterator[slice]:
-    """Yield the stretches in which a cloud of so many points is gone through.
+    """Yield slices of at most `CHUNK_POINTS` points that cover a cloud.
 
     >>> list(chunks(300_000))
     [slice(0, 262144, None), slice(262144, 300000, None)]
@@ -74,38 +78,38 @@ def chunks(count: int) -> Iterator[slice]:
         yield slice(start, min(start + CHUNK_POINTS, count))
 
 
-def select_points(cloud: PointCloud, selection: Selection, scratch: Path) -> Kept | None:
-    """Return the points that are wanted, None if that is all of them.
+def select_points(cloud: PointCloud, selection: Selection, scratch: Path) -> SelectedPoints | None:
+    """Return the selected points of a cloud, or None if all are selected.
 
-    Of each voxel the most confident point is kept; of equals the one that more views agree on, then the one nearest to
-    the voxel's centre, then the first: so the result does not depend on how the work is cut up. Points are never
-    moved or mixed. Beside one bit for each point this takes memory for one chunk and one bucket of candidates (about
-    400 MB at most, as long as hashing spreads voxels evenly); the candidates wait in files, 22 bytes for each point.
+    Each voxel keeps its most confident point; among equals the point that more views agree on, then the point nearest
+    to the centre of the voxel, then the first. The result does not depend on the chunks, and points are not changed.
+    Memory: one bit per point, one chunk, and one bucket of candidates (at most about 400 MB if hashing spreads voxels
+    evenly). The candidates are in files, with 22 bytes per point.
 
     Args:
         cloud: its arrays may be memory-mapped; they are read in chunks.
-        selection: what is wanted.
+        selection: the criteria.
         scratch: an empty folder for files that are removed again.
 
     Raises:
-        UsageError: if the voxels are so small that the cloud is over 2 million of them wide.
+        UsageError: if the cloud is more than 2 million voxels wide.
     """
     if selection == Selection() or not len(cloud):
         return None
     voxel = selection.voxel
     bits = _good_bits(cloud, selection)
     if selection.max_points:
-        voxel = voxel_for_count(cloud, Kept(bits, voxel=0), selection)
+        voxel = voxel_for_count(cloud, SelectedPoints(bits, voxel=0), selection)
     if voxel:
-        bits = _thinned_bits(cloud, Kept(bits, voxel=0), voxel, scratch)
-    return Kept(bits, voxel=voxel)
+        bits = _thinned_bits(cloud, SelectedPoints(bits, voxel=0), voxel, scratch)
+    return SelectedPoints(bits, voxel=voxel)
 
 
-def voxel_for_count(cloud: PointCloud, good: Kept, selection: Selection) -> float:
-    """Return the edge of voxels, not below `selection.voxel`, that leaves `max_points` points or a little fewer.
+def voxel_for_count(cloud: PointCloud, good: SelectedPoints, selection: Selection) -> float:
+    """Return the edge of voxels, at least `selection.voxel`, that leaves `max_points` points or slightly fewer.
 
-    The number of occupied voxels is estimated from a hashed sample of them (some 16,000, so ± 1 %). On surfaces it
-    falls with the square of the edge: a secant search on logarithms begins with that.
+    The number of occupied voxels is estimated from a hashed sample of about 16,000, to 1 %. On surfaces it
+    is inversely proportional to the square of the edge, with which a secant search on logarithms begins.
     """
     wanted = 0.98 * selection.max_points
     if good.count <= selection.max_points and not selection.voxel:
@@ -114,11 +118,11 @@ def voxel_for_count(cloud: PointCloud, good: Kept, selection: Selection) -> floa
     if selection.voxel and _occupied(cloud, good, selection.voxel, share=share) <= selection.max_points:
         return selection.voxel
     reach = _reach(cloud, good)
-    smallest = max(selection.voxel, 2 * reach / (_MOST_PLACES - 2))
+    smallest = max(selection.voxel, 2 * reach / (_MAX_INDEX - 2))
     edge, slope = max(smallest, reach * np.sqrt(_CUBE_SURFACE / wanted)), -2.0
     tried: list[tuple[float, float]] = []
     fitting: list[float] = []
-    while len(tried) < _FEWEST_ROUNDS or (not fitting and edge < 4 * reach):
+    while len(tried) < _MIN_ROUNDS or (not fitting and edge < 4 * reach):
         count = max(1, _occupied(cloud, good, edge, share=share))
         if count <= wanted:
             fitting.append(edge)
@@ -142,8 +146,8 @@ def _good_bits(cloud: PointCloud, selection: Selection) -> NDArray[np.uint8]:
     return bits
 
 
-def _reach(cloud: PointCloud, good: Kept) -> float:
-    """Return the largest coordinate of the good points, of whatever sign."""
+def _reach(cloud: PointCloud, good: SelectedPoints) -> float:
+    """Return the largest absolute coordinate of the good points."""
     reach = 1e-6
     for chunk in chunks(len(cloud)):
         points = cloud.points_in_world[chunk][good.within(chunk)]
@@ -151,8 +155,8 @@ def _reach(cloud: PointCloud, good: Kept) -> float:
     return reach
 
 
-def _occupied(cloud: PointCloud, good: Kept, edge: float, *, share: int) -> int:
-    """Return about how many voxels hold a good point; those whose hash is a multiple of `share` are counted."""
+def _occupied(cloud: PointCloud, good: SelectedPoints, edge: float, *, share: int) -> int:
+    """Estimate the number of voxels with a good point by counting those whose hash is a multiple of `share`."""
     found = np.zeros(0, np.uint64)
     for chunk in chunks(len(cloud)):
         place = _places(cloud.points_in_world[chunk][good.within(chunk)], edge)[0]
@@ -161,29 +165,31 @@ def _occupied(cloud: PointCloud, good: Kept, edge: float, *, share: int) -> int:
 
 
 def _places(points: NDArray[np.float32], edge: float) -> tuple[NDArray[np.uint64], NDArray[np.float32]]:
-    """Return the voxel of each point as one number, and how far from its centre the point lies, in edges squared."""
+    """Return each point's voxel as one number, and its squared distance from the voxel's centre in edges."""
     scaled = points.astype(np.float64) / edge
     floor = np.floor(scaled)
-    index = floor + _MOST_PLACES // 2
-    if index.size and not (index.min() >= 0 and index.max() < _MOST_PLACES):
-        raise UsageError(f"voxels of {edge:g} are too small for a cloud that reaches {np.abs(points).max():g} from the "
-                         f"origin: {2 * np.abs(points).max() / _MOST_PLACES:.3g} is the least")  # fmt: skip
+    index = floor + _MAX_INDEX // 2
+    if index.size and not (index.min() >= 0 and index.max() < _MAX_INDEX):
+        raise UsageError(
+            f"voxels of {edge:g} are too small for a cloud that reaches {np.abs(points).max():g} from the "
+            f"origin: {2 * np.abs(points).max() / _MAX_INDEX:.3g} is the least"
+        )
     x, y, z = index.astype(np.uint64).T
-    place = (x << np.uint64(2 * _PLACE_BITS)) | (y << np.uint64(_PLACE_BITS)) | z
+    place = (x << np.uint64(2 * _INDEX_BITS)) | (y << np.uint64(_INDEX_BITS)) | z
     return place, ((scaled - floor - 0.5) ** 2).sum(axis=1).astype(np.float32)
 
 
 def _hashed(place: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Return 64 well-mixed bits of each number (the finaliser of SplitMix64, Steele, Lea & Flood 2014)."""
+    """Return a 64-bit hash of each number (the finaliser of SplitMix64, Steele, Lea & Flood 2014)."""
     mixed = (place ^ (place >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     hashed: NDArray[np.uint64] = mixed ^ (mixed >> np.uint64(31))
     return hashed
 
 
-def _thinned_bits(cloud: PointCloud, good: Kept, edge: float, scratch: Path) -> NDArray[np.uint8]:
+def _thinned_bits(cloud: PointCloud, good: SelectedPoints, edge: float, scratch: Path) -> NDArray[np.uint8]:
     """Return the bits of the best point of each voxel."""
-    number = min(_MOST_BUCKETS, -(-len(cloud) // _BUCKET_POINTS))
+    number = min(_MAX_BUCKETS, -(-len(cloud) // _BUCKET_POINTS))
     paths = [scratch / f"bucket_{idx}" for idx in range(number)]
     for chunk in chunks(len(cloud)):
         candidates = _best(_candidates(cloud, good, chunk, edge))
@@ -193,24 +199,24 @@ def _thinned_bits(cloud: PointCloud, good: Kept, edge: float, scratch: Path) -> 
                 stream.write(candidates[bucket == idx].tobytes())
     bits = np.zeros(-(-len(cloud) // 8), np.uint8)
     for path in paths:
-        kept = _best(np.fromfile(path, _CANDIDATE))["idx"]
-        np.bitwise_or.at(bits, kept // 8, (1 << (kept % 8)).astype(np.uint8))
+        selected = _best(np.fromfile(path, _CANDIDATE))["idx"]
+        np.bitwise_or.at(bits, selected // 8, (1 << (selected % 8)).astype(np.uint8))
         path.unlink()
     return bits
 
 
-def _candidates(cloud: PointCloud, good: Kept, chunk: slice, edge: float) -> NDArray[np.void]:
-    kept = np.flatnonzero(good.within(chunk))
-    candidates = np.zeros(len(kept), _CANDIDATE)
-    candidates["place"], candidates["off_center"] = _places(cloud.points_in_world[chunk][kept], edge)
-    confidence = 0 if cloud.confidence is None else cloud.confidence[chunk][kept].astype(np.uint16)
-    candidates["rank"] = 65535 - (256 * confidence + cloud.view_counts[chunk][kept].astype(np.uint16))
-    candidates["idx"] = chunk.start + kept
+def _candidates(cloud: PointCloud, good: SelectedPoints, chunk: slice, edge: float) -> NDArray[np.void]:
+    selected = np.flatnonzero(good.within(chunk))
+    candidates = np.zeros(len(selected), _CANDIDATE)
+    candidates["place"], candidates["off_center"] = _places(cloud.points_in_world[chunk][selected], edge)
+    confidence = 0 if cloud.confidence is None else cloud.confidence[chunk][selected].astype(np.uint16)
+    candidates["rank"] = 65535 - (256 * confidence + cloud.view_counts[chunk][selected].astype(np.uint16))
+    candidates["idx"] = chunk.start + selected
     return candidates
 
 
 def _best(candidates: NDArray[np.void]) -> NDArray[np.void]:
-    """Return the best candidate of each voxel; which is best of some bests is best of all."""
+    """Return the best candidate of each voxel."""
     order = np.lexsort((candidates["idx"], candidates["off_center"], candidates["rank"], candidates["place"]))
     place = candidates["place"][order]
     first = np.ones(len(order), np.bool_)

@@ -197,10 +197,10 @@ def _damage_named(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: the COLMAP model cannot be read: {text}. Is it complete?") from error
 
 
-def _entries(data: bytes, least_bytes: int) -> int:
+def _entries(data: bytes, min_bytes: int) -> int:
     """Return the number of entries that a binary file states, after checking that it is long enough for them."""
     (count,) = _COUNT.unpack_from(data)
-    if count * least_bytes > len(data) - _COUNT.size:
+    if count * min_bytes > len(data) - _COUNT.size:
         raise ValueError(f"it states {count} entries, but has {len(data)} bytes")
     return int(count)
 

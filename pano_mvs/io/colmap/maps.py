@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.scene import FilePart
 
 _HEADER = re.compile(rb"(\d{1,9})&(\d{1,9})&(\d{1,2})&")
 
@@ -20,7 +21,7 @@ def write_depth_map(path: Path, z_depth: NDArray[np.float32]) -> None:
     """Write z-depths (H, W) float32; NaN becomes COLMAP's 0.
 
     Raises:
-        UsageError: if the array is another.
+        UsageError: if the array has another shape or type.
     """
     if z_depth.ndim != 2 or z_depth.dtype != np.float32:
         raise UsageError(f"a depth map is (H, W) float32, got {z_depth.shape} {z_depth.dtype}")
@@ -31,7 +32,7 @@ def write_normal_map(path: Path, normals_in_cam: NDArray[np.float32]) -> None:
     """Write normals (H, W, 3) float32 in the picture's camera frame; NaN becomes (0, 0, 0).
 
     Raises:
-        UsageError: if the array is another.
+        UsageError: if the array has another shape or type.
     """
     if normals_in_cam.ndim != 3 or normals_in_cam.shape[2] != 3 or normals_in_cam.dtype != np.float32:
         raise UsageError(f"a normal map is (H, W, 3) float32, got {normals_in_cam.shape} {normals_in_cam.dtype}")
@@ -39,19 +40,16 @@ def write_normal_map(path: Path, normals_in_cam: NDArray[np.float32]) -> None:
 
 
 def read_colmap_map(path: Path) -> NDArray[np.float32]:
-    """Return a depth map (H, W) or a normal map (H, W, 3) as it is in the file: 0 where there is nothing.
+    """Return a depth map (H, W) or a normal map (H, W, 3) as stored in the file: 0 where unknown.
 
     Raises:
-        InputError: if the file cannot be read or is no such map.
+        InputError: if the file cannot be read or is not such a map.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
+    data = FilePart(path).read_bytes()
     header = _HEADER.match(data)
     width, height, channels = (int(number) for number in header.groups()) if header else (0, 0, 0)
     if header is None or len(data) != header.end() + 4 * width * height * channels:
-        raise InputError(f"{path}: no complete depth or normal map of COLMAP's. Write it again")
+        raise InputError(f"{path}: not a complete depth or normal map of COLMAP. Write it again")
     planes = np.frombuffer(data, "<f4", offset=header.end()).reshape(channels, height, width)
     return np.ascontiguousarray(planes[0] if channels == 1 else np.moveaxis(planes, 0, -1), np.float32)
 

@@ -83,13 +83,17 @@ def read_colmap_model(folder: Path) -> Poses:
         return read_sphere_model(folder)
     files = model_files(folder)
     if files is None:
-        raise InputError(f"{folder}: no COLMAP model here. Give the folder that holds cameras, images and points3D as "
-                         ".bin or .txt (often sparse/0)")  # fmt: skip
+        raise InputError(
+            f"{folder}: no COLMAP model here. Give the folder that holds cameras, images and points3D as "
+            ".bin or .txt (often sparse/0)"
+        )
     cameras = read_cameras(files[0])
     for camera_id, camera in sorted(cameras.items()):
         if camera.model != "EQUIRECTANGULAR":
-            raise InputError(f"{folder}: camera {camera_id} is {camera.model}, expected EQUIRECTANGULAR. Only models "
-                             "of panoramas can be used")  # fmt: skip
+            raise InputError(
+                f"{folder}: camera {camera_id} is {camera.model}, expected EQUIRECTANGULAR. Only models "
+                "of panoramas can be used"
+            )
     by_id = read_images(files[1])
     images = sorted(by_id.values(), key=lambda image: natural_key(image.name))
     if not images:
@@ -98,8 +102,9 @@ def read_colmap_model(folder: Path) -> Poses:
     poses = [_pose(image) for image in images]
     for image in images:
         if image.camera_id not in cameras:
-            raise InputError(f"{image.where}: its camera {image.camera_id} is not in {files[0].name}. Do the files "
-                             "belong together?")  # fmt: skip
+            raise InputError(
+                f"{image.where}: its camera {image.camera_id} is not in {files[0].name}. Do the files belong together?"
+            )
     points = read_points(files[2])
     tracks = [_observations(image, cameras[image.camera_id], points, files[2]) for image in images]
     width_by_id = {image_id: cameras[image.camera_id].size_hw[1] for image_id, image in by_id.items()}
@@ -160,8 +165,10 @@ def _observations(
     idx = np.searchsorted(points.ids, ids)
     unknown = np.append(points.ids, -1)[idx] != ids
     if unknown.any():
-        raise InputError(f"{image.where}: observes point {ids[unknown][0]}, which {path.name} does not have. Do the "
-                         "files belong together?")  # fmt: skip
+        raise InputError(
+            f"{image.where}: observes point {ids[unknown][0]}, which {path.name} does not have. Do the "
+            "files belong together?"
+        )
     return idx.astype(np.int32), ray_from_pixel(image.pixels[observed], camera.size_hw).reshape(-1, 3)
 
 
@@ -174,8 +181,9 @@ def _errors_rad(points: ModelPoints3D, width_by_id: Mapping[int, int], path: Pat
     observers, which = np.unique(points.track_image_ids, return_inverse=True)
     unknown = next((image_id for image_id in observers.tolist() if image_id not in width_by_id), None)
     if unknown is not None:
-        raise InputError(f"{path}: a point is observed by image {unknown}, which is not in the model. Do the files "
-                         "belong together?")  # fmt: skip
+        raise InputError(
+            f"{path}: a point is observed by image {unknown}, which is not in the model. Do the files belong together?"
+        )
     widths = np.array([width_by_id[image_id] for image_id in observers.tolist()], np.float64)[which]
     of_point = np.repeat(np.arange(len(points.ids)), points.track_lengths)
     sums = np.bincount(of_point, widths, minlength=len(points.ids))

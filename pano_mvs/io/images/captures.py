@@ -13,15 +13,18 @@ from pano_mvs.core.files import OUTPUT_MARK, is_cache
 from pano_mvs.core.paths import exists, is_denied, is_file, is_folder, problem_of, resolved
 from pano_mvs.io.images.containers import read_container
 from pano_mvs.io.images.exif import orientation_from_exif, position_from_exif
-from pano_mvs.io.images.gpano import GPano, find_gpano, read_file
+from pano_mvs.io.images.gpano import GPano, find_gpano
+from pano_mvs.scene import FilePart
 from pano_mvs.scene.image_files.decoding import MAX_PIXELS, check_stated_size
 from pano_mvs.scene.image_files.image_file import decode_image
 
 PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif", ".heic", ".heif"})
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi"})
 _IGNORED_FOLDERS = frozenset({"masks"})
-_TURNED = ("an EXIF orientation that turns or mirrors them, which was ignored: the pixels of a panorama are taken as "
-           "they are stored")  # fmt: skip
+_TURNED = (
+    "an EXIF orientation that turns or mirrors them, which was ignored: the pixels of a panorama are taken as "
+    "they are stored"
+)
 
 
 @dataclass(frozen=True)
@@ -67,19 +70,25 @@ def list_pictures(folder: Path, notes: list[str] | None = None) -> list[Path]:
         InputError: if the folder does not exist, cannot be listed, or holds no picture.
     """
     if not is_folder(folder):
-        raise InputError(f"{folder}: no such folder ({problem_of(folder) or 'it is a file'}). Give the folder that "
-                         "holds the panoramas")  # fmt: skip
+        raise InputError(
+            f"{folder}: no such folder ({problem_of(folder) or 'it is a file'}). Give the folder that "
+            "holds the panoramas"
+        )
     notes = [] if notes is None else notes
     files = list(files_below(folder, notes))
     pictures = [path for path in files if path.suffix.lower() in PICTURE_SUFFIXES]
     if not pictures and (film := next((path for path in files if path.suffix.lower() in VIDEO_SUFFIXES), None)):
-        raise InputError(f"{folder}: no pictures here, but the video {film.name}. Use source.video: "
-                         "--set images.use=source.video --set pairs.use=pairs.sequential")  # fmt: skip
+        raise InputError(
+            f"{folder}: no pictures here, but the video {film.name}. Use source.video: "
+            "--set images.use=source.video --set pairs.use=pairs.sequential"
+        )
     if not pictures:
         kinds = ", ".join(sorted(suffix.lstrip(".") for suffix in PICTURE_SUFFIXES))
-        raise InputError("\n  ".join([
-            f"{folder}: no pictures here. Panoramas may be {kinds}; folders called masks are left out", *notes
-        ]))  # fmt: skip
+        raise InputError(
+            "\n  ".join(
+                [f"{folder}: no pictures here. Panoramas may be {kinds}; folders called masks are left out", *notes]
+            )
+        )
     return sorted(pictures, key=lambda path: natural_key(path.relative_to(folder).as_posix()))
 
 
@@ -105,7 +114,7 @@ def describe_picture(path: Path, data: bytes | None = None, *, max_pixels: int =
             panorama.
     """
     if data is None:
-        data = read_file(path)
+        data = FilePart(path).read_bytes()
     check_stated_size(data, path, max_pixels)
     container = read_container(data)
     gpano, warnings = find_gpano(container.xmp, data)
@@ -114,8 +123,10 @@ def describe_picture(path: Path, data: bytes | None = None, *, max_pixels: int =
     size = container.size_hw or decode_image(path, data, max_pixels=max_pixels).shape[:2]
     height, width = int(size[0]), int(size[1])
     if gpano is not None and gpano.projection_type != "equirectangular":
-        raise InputError(f"{path}: its metadata say that it is {gpano.projection_type}, not equirectangular. "
-                         "Export it as an equirectangular panorama, or remove it")  # fmt: skip
+        raise InputError(
+            f"{path}: its metadata say that it is {gpano.projection_type}, not equirectangular. "
+            "Export it as an equirectangular panorama, or remove it"
+        )
     sphere, crop = (height, width), None
     if gpano is not None and gpano.full_size_hw is not None and gpano.crop_ltwh is not None:
         sphere, crop, more = _placed(path, (height, width), gpano.full_size_hw, gpano.crop_ltwh)
@@ -144,8 +155,10 @@ def files_below(folder: Path, notes: list[str]) -> Iterator[Path]:
         InputError: if the folder itself cannot be listed, or is a cache.
     """
     if is_cache(folder):
-        raise InputError(f"{folder}: this is a cache of pano-mvs, in which images of its own lie. Give the folder that "
-                         "holds the panoramas; if they lie in here, move them to a folder of their own")  # fmt: skip
+        raise InputError(
+            f"{folder}: this is a cache of pano-mvs, in which images of its own lie. Give the folder that "
+            "holds the panoramas; if they lie in here, move them to a folder of their own"
+        )
 
     def fail(error: OSError) -> None:
         problem = f"{error.filename}: cannot be listed ({error.strerror})"
@@ -189,12 +202,16 @@ def _placed(
                 f"{path}: {width}×{height} px, but its GPano metadata speak of {crop_width}×{crop_height}. It was cut "
                 "after it was taken: restore the original, or remove the metadata"
             )
-        warnings = (f"resized from {crop_width}×{crop_height} to {width}×{height} px after it was taken; its GPano "
-                    "fields count the original's pixels",)  # fmt: skip
+        warnings = (
+            f"resized from {crop_width}×{crop_height} to {width}×{height} px after it was taken; its GPano "
+            "fields count the original's pixels",
+        )
     whole = (crop_height, crop_width) == full_hw
     if whole:
         full_height, full_width = size_hw
     if full_width != 2 * full_height or left < 0 or top < 0:
-        raise InputError(f"{path}: its GPano metadata say that the full sphere is {full_width}×{full_height} px, but "
-                         "the width must be twice the height. Correct the metadata, or remove them")  # fmt: skip
+        raise InputError(
+            f"{path}: its GPano metadata say that the full sphere is {full_width}×{full_height} px, but "
+            "the width must be twice the height. Correct the metadata, or remove them"
+        )
     return (full_height, full_width), None if whole else crop_ltwh, warnings

@@ -1,7 +1,14 @@
-"""Where picture files keep their metadata: the parts of JPEG, PNG, WebP, TIFF and HEIF/AVIF files that matter here.
+"""Read the size and the EXIF and XMP metadata of image files, without decoding their pixels.
 
-JPEG: ITU-T T.81 and Adobe's XMP specification, part 3 (with extended XMP). PNG: the chunks IHDR, eXIf and iTXt.
-WebP: the RIFF chunks VP8, VP8L, VP8X, EXIF and XMP. TIFF: the first directory, XMP in tag 700.
+JPEG: ITU-T T.81 and Adobe's XMP specification, part 3 (with extended XMP). PNG: the chunks eXIf and iTXt. WebP: the
+RIFF chunks EXIF and XMP. TIFF: the first directory, with XMP in tag 700. HEIC and AVIF: the EXIF item is found by its
+signature.
+
+Pillow reads such metadata too, but not as robustly, so that it is not used here. `Image.open` reads a PNG only up to
+its pixels, and refuses all of it if a compressed text is large; it refuses truncated WebP and floating-point TIFF
+files; it does not join extended XMP. Its EXIF reader stops at the first entry that points outside of the data, so that
+the position behind it is lost. It reports damage through `warnings`, whose filters belong to the process and not to a
+thread, and applies a limit on pixels of its own, which is global too.
 """
 
 from __future__ import annotations
@@ -9,30 +16,31 @@ from __future__ import annotations
 import re
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
-from pano_mvs.scene.image_files.header import PNG_START, TIFF_STARTS, riff_chunks, stated_size
-from pano_mvs.scene.image_files.jpeg import JPEG_START, jpeg_segments
+from pano_mvs.scene.image_files.header import PNG_START, ImageKind, image_kind, riff_chunks, stated_size
+from pano_mvs.scene.image_files.jpeg import jpeg_segments
 from pano_mvs.scene.image_files.tiff_directory import open_tiff
 
-_EXIF, _XMP, _MORE_XMP = b"Exif\0\0", b"http://ns.adobe.com/xap/1.0/\0", b"http://ns.adobe.com/xmp/extension/\0"
+_EXIF, _XMP, _EXTENDED_XMP = b"Exif\0\0", b"http://ns.adobe.com/xap/1.0/\0", b"http://ns.adobe.com/xmp/extension/\0"
+_PNG_XMP = b"XML:com.adobe.xmp"
 _APP1 = 0xE1
 _TIFF_XMP = 700
 _MAX_DECOMPRESSED_BYTES = 16 << 20  # of all compressed packets of a file together
-_MOST_EXIF_BYTES = 1 << 20
+_MAX_HEIF_EXIF_BYTES = 1 << 20
 _EXIF_IN_HEIF = re.compile(rb"Exif\0\0(?=II\*\0|MM\0\*)")
 
 
 @dataclass(frozen=True)
 class Container:
-    """What the container of a picture says of it.
+    """The size and the metadata of an image file.
 
     Attributes:
-        size_hw: (height, width) as stored, or None where only decoding tells.
-        exif: EXIF metadata from their byte order on; empty where there are none.
-        xmp: XMP packets, whole or with what surrounds them.
-        warning: what of the metadata was not read although it is there, and why; empty if all was.
+        size_hw: (height, width) as stored, or None if only decoding gives it.
+        exif: EXIF metadata, which begins with the byte order; empty if there is none.
+        xmp: XMP packets, possibly with bytes around them.
+        warning: which metadata was not read, and why; empty if all was read.
     """
 
     size_hw: tuple[int, int] | None = None
@@ -42,18 +50,18 @@ class Container:
 
 
 def read_container(data: bytes) -> Container:
-    """Return what the container of a picture says; nothing of what is damaged or of another kind.
+    """Return the size and the metadata of an image file; nothing of damaged or unknown files.
 
     Args:
-        data: the file's bytes, all of them: metadata may stand behind the pixels.
+        data: all bytes of the file, since metadata may be behind the pixels.
     """
-    for begins, read in _READERS:
-        if begins(data):
-            try:
-                return read(data)
-            except (struct.error, IndexError, OverflowError, MemoryError):
-                return Container()
-    return Container()
+    kind = image_kind(data)
+    if kind is None:
+        return Container()
+    try:
+        return _READERS[kind](data)
+    except (struct.error, IndexError, OverflowError, MemoryError):
+        return Container()
 
 
 def _read_jpeg(data: bytes) -> Container:
@@ -68,32 +76,26 @@ def _read_jpeg(data: bytes) -> Container:
             exif = exif or body[len(_EXIF) :]
         elif body.startswith(_XMP):
             packets.append(body[len(_XMP) :])
-        elif body.startswith(_MORE_XMP):
-            guid, offset, part = _extension(body[len(_MORE_XMP) :])
-            extended.setdefault(guid, {}).setdefault(offset, part)
-    joined = [b"".join(part for _, part in sorted(parts.items())) for parts in extended.values()]
+        elif body.startswith(_EXTENDED_XMP):
+            guid, _, offset = struct.unpack_from(">32sII", body, len(_EXTENDED_XMP))
+            extended.setdefault(guid, {}).setdefault(offset, body[len(_EXTENDED_XMP) + 40 :])
+    joined = [b"".join(piece for _, piece in sorted(pieces.items())) for pieces in extended.values()]
     return Container(stated_size(data), exif, (*packets, *joined))
-
-
-def _extension(body: bytes) -> tuple[bytes, int, bytes]:
-    """Return the digest of an extended packet, the place of a piece in it, and the piece."""
-    _, offset = struct.unpack_from(">II", body, 32)
-    return body[:32], offset, body[40:]
 
 
 def _read_png(data: bytes) -> Container:
     exif, warning = b"", ""
     packets: list[bytes] = []
-    left = _MAX_DECOMPRESSED_BYTES
+    remaining = _MAX_DECOMPRESSED_BYTES
     for kind, start, end in _png_chunks(data):
         if kind == b"eXIf":
             exif = exif or data[start:end].removeprefix(_EXIF)
         elif kind == b"iTXt" and (text := _xmp_text(data[start:end])) is not None:
             packet, is_compressed = text
             if is_compressed:
-                packet = _decompressed(packet, left + 1)
-                left -= len(packet)
-            if left < 0:
+                packet = _decompressed(packet, max_bytes=remaining + 1)
+                remaining -= len(packet)
+            if remaining < 0:
                 limit = _MAX_DECOMPRESSED_BYTES >> 20
                 warning = f"its compressed XMP metadata is larger than {limit} MiB and was not read to its end"
                 break
@@ -110,31 +112,24 @@ def _png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
 
 
 def _xmp_text(chunk: bytes) -> tuple[bytes, bool] | None:
-    """Return the XMP packet in a PNG's international text chunk, and whether it is compressed; None if it has none."""
+    """Return the XMP packet in an iTXt chunk and whether it is compressed, or None if the chunk has another text."""
     keyword, _, rest = chunk.partition(b"\0")
-    parts = rest[2:].split(b"\0", 2)
-    if keyword != b"XML:com.adobe.xmp" or len(parts) != 3:
-        return None
-    return parts[2], rest[:1] == b"\1"
+    fields = rest[2:].split(b"\0", 2)  # language, translated keyword, text
+    return (fields[2], rest[:1] == b"\1") if keyword == _PNG_XMP and len(fields) == 3 else None
 
 
-def _decompressed(packet: bytes, most: int) -> bytes:
-    """Return a packet decompressed, up to a number of bytes; nothing of one that is damaged."""
+def _decompressed(packet: bytes, *, max_bytes: int) -> bytes:
+    """Return at most `max_bytes` of a decompressed packet; nothing of a damaged one."""
     try:
-        return zlib.decompressobj().decompress(packet, most)
+        return zlib.decompressobj().decompress(packet, max_bytes)
     except zlib.error:
         return b""
 
 
 def _read_webp(data: bytes) -> Container:
-    exif = b""
-    packets: list[bytes] = []
-    for kind, start, end in riff_chunks(data):
-        if kind == b"EXIF":
-            exif = exif or data[start:end].removeprefix(_EXIF)
-        elif kind == b"XMP ":
-            packets.append(data[start:end])
-    return Container(stated_size(data), exif, tuple(packets))
+    chunks = [(kind, data[start:end]) for kind, start, end in riff_chunks(data) if kind in (b"EXIF", b"XMP ")]
+    exif = next((body.removeprefix(_EXIF) for kind, body in chunks if kind == b"EXIF"), b"")
+    return Container(stated_size(data), exif, tuple(body for kind, body in chunks if kind == b"XMP "))
 
 
 def _read_tiff(data: bytes) -> Container:
@@ -146,15 +141,15 @@ def _read_tiff(data: bytes) -> Container:
 
 
 def _read_heif(data: bytes) -> Container:
-    """Read HEIC and AVIF, which keep both kinds of metadata as they are; their packets are found by their marks."""
+    """Read a HEIC or AVIF file, which stores EXIF uncompressed; its XMP is found by whoever searches the file."""
     found = _EXIF_IN_HEIF.search(data)
-    return Container(None, b"" if found is None else data[found.end() : found.end() + _MOST_EXIF_BYTES], ())
+    return Container(None, b"" if found is None else data[found.end() : found.end() + _MAX_HEIF_EXIF_BYTES])
 
 
-_READERS: tuple[tuple[Callable[[bytes], bool], Callable[[bytes], Container]], ...] = (
-    (lambda data: data.startswith(JPEG_START), _read_jpeg),
-    (lambda data: data.startswith(PNG_START), _read_png),
-    (lambda data: data.startswith(b"RIFF") and data[8:12] == b"WEBP", _read_webp),
-    (lambda data: data.startswith(TIFF_STARTS), _read_tiff),
-    (lambda data: data[4:8] == b"ftyp", _read_heif),
-)
+_READERS: Mapping[ImageKind, Callable[[bytes], Container]] = {
+    "jpeg": _read_jpeg,
+    "png": _read_png,
+    "webp": _read_webp,
+    "tiff": _read_tiff,
+    "heif": _read_heif,
+}

@@ -1,6 +1,7 @@
-"""Where a picture was taken, and how a viewer would turn it, as its EXIF metadata have it.
+"""The position and the orientation in the EXIF metadata of an image.
 
-EXIF 2.32: section 4.6.6 (GPS attributes) and the tag Orientation of section 4.6.4. EXIF is a TIFF without a picture.
+EXIF 2.32: section 4.6.6 (GPS attributes) and the tag Orientation of section 4.6.4. EXIF is a TIFF without an image. See
+`containers` for why Pillow does not read it.
 """
 
 from __future__ import annotations
@@ -17,13 +18,12 @@ _DAMAGE = (struct.error, IndexError, ZeroDivisionError, OverflowError)
 
 
 def position_from_exif(exif: bytes) -> tuple[float, float, float] | None:
-    """Return (latitude deg, longitude deg, altitude m), or None.
+    """Return (latitude deg, longitude deg, altitude m), or None if there is no valid position.
 
-    North, east and up are positive; an altitude that is not given is 0. Metadata that are damaged, or hold no fix,
-    count as none.
+    North, east and up are positive. A missing altitude is 0.
 
     Args:
-        exif: the metadata, which begin with the byte order, "II" or "MM".
+        exif: the metadata, which begins with the byte order, "II" or "MM".
     """
     try:
         tiff = open_tiff(exif)
@@ -33,7 +33,7 @@ def position_from_exif(exif: bytes) -> tuple[float, float, float] | None:
 
 
 def orientation_from_exif(exif: bytes) -> int:
-    """Return how a viewer would turn or mirror the picture, 1 to 8; 1 for as it is, and where nothing is said."""
+    """Return the EXIF orientation, 1 to 8: how viewers rotate or mirror the image. 1, the default, is as stored."""
     try:
         tiff = open_tiff(exif)
         value = None if tiff is None else tiff.integer(tiff.directory(tiff.first).get(_ORIENTATION))
@@ -45,8 +45,8 @@ def orientation_from_exif(exif: bytes) -> int:
 def _position(tiff: Tiff) -> tuple[float, float, float] | None:
     offset = tiff.integer(tiff.directory(tiff.first).get(_GPS_DIRECTORY))
     gps = {} if offset is None else tiff.directory(offset)
-    latitude = _angle(tiff, gps, _LATITUDE, _LATITUDE_REF, b"S")
-    longitude = _angle(tiff, gps, _LONGITUDE, _LONGITUDE_REF, b"W")
+    latitude = _angle(tiff, gps, _LATITUDE, reference=_LATITUDE_REF, negative=b"S")
+    longitude = _angle(tiff, gps, _LONGITUDE, reference=_LONGITUDE_REF, negative=b"W")
     altitude = 0.0
     if _ALTITUDE in gps:
         heights = tiff.rationals(gps[_ALTITUDE], 1)
@@ -55,13 +55,13 @@ def _position(tiff: Tiff) -> tuple[float, float, float] | None:
     return (latitude, longitude, altitude) if usable else None
 
 
-def _angle(tiff: Tiff, gps: Mapping[int, Entry], tag: int, reference: int, negative: bytes) -> float:
+def _angle(tiff: Tiff, gps: Mapping[int, Entry], tag: int, *, reference: int, negative: bytes) -> float:
     if tag not in gps or reference not in gps:
         return math.nan
-    parts = tiff.rationals(gps[tag], 3)
-    if parts is None:
+    angle = tiff.rationals(gps[tag], 3)
+    if angle is None:
         return math.nan
-    degrees, minutes, seconds = parts
+    degrees, minutes, seconds = angle
     return (degrees + minutes / 60 + seconds / 3600) * _sign(tiff, gps[reference], negative)
 
 

@@ -64,5 +64,6 @@ def read_exr(path: Path) -> dict[str, NDArray[np.float32]]:
         with OpenEXR.File(str(path), separate_channels=True) as file, np.errstate(over="ignore", invalid="ignore"):
             return {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
     except _DAMAGE as error:
-        raise InputError(f"{path}: no EXR file that can be read ({str(error) or type(error).__name__}). Write it "
-                         "again")  from error  # fmt: skip
+        raise InputError(
+            f"{path}: no EXR file that can be read ({str(error) or type(error).__name__}). Write it again"
+        ) from error

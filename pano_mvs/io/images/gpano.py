@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
-from pano_mvs.core.errors import InputError
 from pano_mvs.io.images.containers import read_container
+from pano_mvs.scene import FilePart
 
 _NAMESPACE = "{http://ns.google.com/photos/1.0/panorama/}"
 _WRAPPED, _BARE = (b"<x:xmpmeta", b"</x:xmpmeta>"), (b"<rdf:RDF", b"</rdf:RDF>")
@@ -59,20 +59,8 @@ def read_gpano(path: Path) -> GPano | None:
     Raises:
         InputError: if the file cannot be read at all.
     """
-    data = read_file(path)
+    data = FilePart(path).read_bytes()
     return find_gpano(read_container(data).xmp, data)[0]
-
-
-def read_file(path: Path) -> bytes:
-    """Return the bytes of a file.
-
-    Raises:
-        InputError: if it cannot be read.
-    """
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
 
 
 def find_gpano(chunks: Iterable[bytes], data: bytes = b"") -> tuple[GPano | None, tuple[str, ...]]:

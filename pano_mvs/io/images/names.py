@@ -1,22 +1,26 @@
-"""The same picture under two names: with and without folders, with another extension."""
+"""Names of images: with and without folders and extensions, and names that cannot be used."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import PurePosixPath
 
-_SEPARATOR = "|"  # of the two names of a pair
+from pano_mvs.io.images.captures import PICTURE_SUFFIXES
+
+_SEPARATOR = "|"  # between the two names of a pair
+_EXTENSIONS = PICTURE_SUFFIXES | {".exr", ".npy", ".npz"}
 
 
 def match_image_names(wanted: Iterable[str], available: Iterable[str]) -> dict[str, str]:
     """Return, for each wanted image name that has exactly one counterpart, that counterpart.
 
-    The first rule that gives candidates decides: the same name; one name is the other with folders in front; the
-    same without folders; the same without folders and extension. Two candidates are none.
+    The first rule that finds candidates decides: equal names; names of which one is the other with further folders in
+    front; names that are equal without folders; names that are equal without folders and extensions. A name is left
+    out if that rule finds several candidates.
 
     Args:
-        wanted: names relative to a capture, say, "a/001.jpg".
-        available: names as another file has them, say, "images/a/001.jpg" or "./001.png".
+        wanted: names relative to a capture, such as "a/001.jpg".
+        available: names in another file, such as "images/a/001.jpg" or "./001.png".
 
     Returns:
         Wanted name to available name.
@@ -41,8 +45,19 @@ def match_image_names(wanted: Iterable[str], available: Iterable[str]) -> dict[s
     return matched
 
 
+def without_extension(name: str) -> str:
+    """Return a name with forward slashes and without an image's or range map's extension; other endings stay.
+
+    >>> without_extension("a/001.JPG"), without_extension("v1.5")
+    ('a/001', 'v1.5')
+    """
+    plain = name.replace("\\", "/")
+    stem, dot, ending = plain.rpartition(".")
+    return stem if dot and f".{ending.casefold()}" in _EXTENSIONS and not stem.endswith("/") and stem else plain
+
+
 def printable_name(name: str) -> tuple[str, str]:
-    """Return a file's name as an item may have it, and why the file cannot be used under it; empty if it can."""
+    """Return a file name with unprintable characters replaced, and why the file cannot be used; "" if it can."""
     shown = name.encode(errors="replace").decode()
     if _SEPARATOR not in name and shown == name:
         return name, ""

@@ -64,15 +64,20 @@ def list_videos(path: Path, notes: list[str] | None = None) -> list[Path]:
             raise InputError(f"{path}: {path.suffix} is what the camera records before stitching; {_UNSTITCHED}")
         return [path]
     if not is_folder(path):
-        raise InputError(f"{path}: no such video or folder ({problem_of(path) or 'it is neither'}). Give a video, "
-                         "several, or the folder that holds them")  # fmt: skip
+        raise InputError(
+            f"{path}: no such video or folder ({problem_of(path) or 'it is neither'}). Give a video, "
+            "several, or the folder that holds them"
+        )
     files = list(files_below(path, [] if notes is None else notes))
     videos = [file for file in files if file.suffix.lower() in VIDEO_SUFFIXES]
     if not videos:
         raw = [file.name for file in files if file.suffix.lower() in _UNSTITCHED_SUFFIXES]
         kinds = ", ".join(sorted(suffix.lstrip(".") for suffix in VIDEO_SUFFIXES))
-        raise InputError(f"{path}: {raw[0]} is not stitched; {_UNSTITCHED}" if raw else
-                         f"{path}: no videos here; they may be {kinds}. For pictures use source.folder")  # fmt: skip
+        raise InputError(
+            f"{path}: {raw[0]} is not stitched; {_UNSTITCHED}"
+            if raw
+            else f"{path}: no videos here; they may be {kinds}. For pictures use source.folder"
+        )
     return sorted(videos, key=lambda file: natural_key(file.relative_to(path).as_posix()))
 
 
@@ -87,8 +92,10 @@ def describe_video(path: Path) -> VideoInfo:
         rate, count = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
         is_turned = int(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 360 != 0
     if not (np.isfinite(rate) and rate > 0 and count >= 1):
-        raise InputError(f"{path}: does not say how long it lasts ({count:.0f} frames at {rate:g} a second): the "
-                         "recording was not finished. Copy it into an .mp4 with a video program")  # fmt: skip
+        raise InputError(
+            f"{path}: does not say how long it lasts ({count:.0f} frames at {rate:g} a second): the "
+            "recording was not finished. Copy it into an .mp4 with a video program"
+        )
     if width != 2 * height:
         raise InputError(
             f"{path}: {width}×{height} px are no equirectangular frames, which are twice as wide as high. If it is "
@@ -120,8 +127,10 @@ def frames_between(
         while has_frame:
             time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
             if time_s <= previous:
-                raise InputError(f"{path}: its time stamps do not increase ({previous:.3f} s, then {time_s:.3f} s). "
-                                 "Copy it into an .mp4 with a video program")  # fmt: skip
+                raise InputError(
+                    f"{path}: its time stamps do not increase ({previous:.3f} s, then {time_s:.3f} s). "
+                    "Copy it into an .mp4 with a video program"
+                )
             if time_s > end_s + _SLACK_S:
                 return
             if time_s >= begin_s - _SLACK_S:
@@ -155,8 +164,10 @@ def _opened(path: Path, threads: int = 1) -> Iterator[cv2.VideoCapture]:
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, threads])
     try:
         if not capture.isOpened():
-            raise InputError(f"{path}: cannot be opened as a video: it is none, is damaged, or the recording was not "
-                             "finished. Copy it again from the camera, or repair it with a video program")  # fmt: skip
+            raise InputError(
+                f"{path}: cannot be opened as a video: it is none, is damaged, or the recording was not "
+                "finished. Copy it again from the camera, or repair it with a video program"
+            )
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         yield capture
     finally:

@@ -19,12 +19,12 @@ import numpy as np
 
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, Variant
+from pano_mvs.scene.image_files.header import PNG_START
 from pano_mvs.scene.image_files.jpeg import JPEG_FRAMES, JPEG_START, jpeg_segments
 
 _MODELS = {"equirectangular": "EQUIRECTANGULAR", "faces": "PINHOLE"}
 _DEPTHS = {"equirectangular": "distance along the ray", "faces": "z, along the camera's axis"}
 _OPENGL_FROM_CAM = np.diag([1.0, -1.0, -1.0])
-_PNG_START = b"\x89PNG\r\n\x1a\n"
 _PNG_RGB_8_BIT = bytes([8, 2])
 
 
@@ -77,7 +77,7 @@ def is_common_picture(path: Path) -> bool:
         start = stream.read(26)
         if start[:2] == JPEG_START:
             return _jpeg_channels(start + stream.read()) == 3
-    return start[:8] == _PNG_START and start[24:26] == _PNG_RGB_8_BIT
+    return start[:8] == PNG_START and start[24:26] == _PNG_RGB_8_BIT
 
 
 def _jpeg_channels(data: bytes) -> int:
@@ -107,6 +107,10 @@ def _listed(
 def _intrinsics(frame: NerfstudioFrame) -> dict[str, Any]:
     width, height = frame.size_wh
     return {
-        "w": width, "h": height, "fl_x": frame.focal_xy[0], "fl_y": frame.focal_xy[1], "cx": width / 2,
+        "w": width,
+        "h": height,
+        "fl_x": frame.focal_xy[0],
+        "fl_y": frame.focal_xy[1],
+        "cx": width / 2,
         "cy": height / 2,
-    }  # fmt: skip
+    }

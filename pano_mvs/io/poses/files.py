@@ -62,8 +62,10 @@ def read_poses(path: Path) -> Poses:
     if "views" in data:
         views, metric = read_posed_views(path)
         return _from_file({view.name: view.cam_from_world for view in views}, path, metric=metric)
-    raise InputError(f"{path}: neither key 'frames' (nerfstudio) nor key 'views' (pano-mvs), nor a list with 'shots' "
-                     "(OpenSfM): no poses here")  # fmt: skip
+    raise InputError(
+        f"{path}: neither key 'frames' (nerfstudio) nor key 'views' (pano-mvs), nor a list with 'shots' "
+        "(OpenSfM): no poses here"
+    )
 
 
 def read_groups(path: Path) -> list[Poses]:
@@ -126,8 +128,10 @@ def read_csv(path: Path) -> dict[str, Rigid3]:
 def _file_or_model(path: Path) -> Path:
     """Return the file with poses, or the folder of a COLMAP model, that a file or folder is or holds."""
     if not exists(path):
-        raise InputError(f"{path}: no such file or folder. Give a COLMAP model, a transforms.json, a "
-                         "poses.json, a reconstruction.json or a CSV file")  # fmt: skip
+        raise InputError(
+            f"{path}: no such file or folder. Give a COLMAP model, a transforms.json, a "
+            "poses.json, a reconstruction.json or a CSV file"
+        )
     if not is_folder(path):
         return path
     for model in (path, path / "sparse" / "0", path / "colmap" / "sparse" / "0"):
@@ -136,8 +140,10 @@ def _file_or_model(path: Path) -> Path:
     for name in _IN_A_FOLDER:
         if is_file(path / name):
             return path / name
-    raise InputError(f"{path}: no poses here. A folder must hold a COLMAP model (cameras, images, points3D), or one "
-                     f"of {', '.join(_IN_A_FOLDER)}")  # fmt: skip
+    raise InputError(
+        f"{path}: no poses here. A folder must hold a COLMAP model (cameras, images, points3D), or one "
+        f"of {', '.join(_IN_A_FOLDER)}"
+    )
 
 
 def _from_file(poses: dict[str, Rigid3], path: Path, *, metric: bool) -> Poses:

@@ -110,8 +110,9 @@ def read_transforms(path: Path) -> dict[str, Rigid3]:
         name = _name(frame, "panorama" if isinstance(frame, dict) and "panorama" in frame else "file_path", where)
         model = frame.get("camera_model", data.get("camera_model"))
         if model != "EQUIRECTANGULAR":
-            raise InputError(f"{where} ({name}): camera_model is {model}, expected EQUIRECTANGULAR. Only panoramas "
-                             "can be used")  # fmt: skip
+            raise InputError(
+                f"{where} ({name}): camera_model is {model}, expected EQUIRECTANGULAR. Only panoramas can be used"
+            )
         matrix = number_array(frame, "transform_matrix", (4, 4), where)
         if not np.isfinite(matrix).all():
             raise InputError(f"{where} ({name}): the pose holds NaN or infinite numbers")

@@ -56,8 +56,9 @@ def _pose(name: str, shot: Any, cameras: dict[str, Any], path: Path) -> Rigid3:
     camera = cameras.get(str(shot.get("camera", "")))
     projection = camera.get("projection_type") if isinstance(camera, dict) else None
     if projection not in _SPHERICAL:
-        raise InputError(f"{where}: its camera's projection_type is {projection}, expected spherical. Only panoramas "
-                         "can be used")  # fmt: skip
+        raise InputError(
+            f"{where}: its camera's projection_type is {projection}, expected spherical. Only panoramas can be used"
+        )
     rotvec, translation = (number_array(shot, key, (3,), where) for key in ("rotation", "translation"))
     if not np.isfinite(rotvec).all():
         raise InputError(f"{where}: key 'rotation' holds NaN or infinite numbers")

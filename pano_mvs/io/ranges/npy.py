@@ -60,8 +60,9 @@ def read_npz(path: Path, key: str, *, what: str = "") -> NDArray[Any]:
             with archive.open(member) as stream:
                 return _read_array(stream, min(member.file_size, most))
     except DAMAGE as error:
-        raise InputError(f"{path}: {what or f'the array {key}'} cannot be read ({_reason(error)}). Fetch the file "
-                         "again")  from error  # fmt: skip
+        raise InputError(
+            f"{path}: {what or f'the array {key}'} cannot be read ({_reason(error)}). Fetch the file again"
+        ) from error
 
 
 def keys_of_npz(path: Path) -> list[str]:

@@ -82,8 +82,10 @@ def decode_picture(data: bytes, path: Path, flags: int, *, max_pixels: int = MAX
     except (cv2.error, MemoryError) as error:
         raise InputError(f"{path}: {_why_not(error, size)}") from error
     if warning:
-        raise InputError(f"{path}: the JPEG is damaged or its data end early: a part of the picture is missing "
-                         f"(decoder: {warning}). Copy it again from the camera")  # fmt: skip
+        raise InputError(
+            f"{path}: the JPEG is damaged or its data end early: a part of the picture is missing "
+            f"(decoder: {warning}). Copy it again from the camera"
+        )
     return image
 
 
@@ -100,11 +102,15 @@ def check_stated_size(data: bytes, path: Path, max_pixels: int = MAX_PIXELS) -> 
     pixels = height * width
     what = f"{path}: its header states {width}×{height} px ({pixels / 1e6:.0f} megapixels)"
     if pixels > max_pixels:
-        raise InputError(f"{what}, more than the limit of {max_pixels / 1e6:.0f}. Scale it down; for panoramas, the "
-                         "source's setting max_megapixels raises the limit")  # fmt: skip
+        raise InputError(
+            f"{what}, more than the limit of {max_pixels / 1e6:.0f}. Scale it down; for panoramas, the "
+            "source's setting max_megapixels raises the limit"
+        )
     if data.startswith(_COMPRESSED_STARTS) and pixels > max(_BELIEVED_PIXELS, _PIXELS_PER_BYTE * len(data)):
-        raise InputError(f"{what}, but a file of {len(data)} bytes cannot hold them: it is damaged or cut short. Copy "
-                         "it again, or write it anew")  # fmt: skip
+        raise InputError(
+            f"{what}, but a file of {len(data)} bytes cannot hold them: it is damaged or cut short. Copy "
+            "it again, or write it anew"
+        )
     return size
 
 
@@ -161,8 +167,10 @@ def _why_not(error: Exception, size: Size | None) -> str:
     of = f" of {width}×{height} px ({width * height / 1e6:.0f} megapixels)" if size else ""
     code = error.code if isinstance(error, cv2.error) else _OPENCV_NO_MEMORY
     if code == _OPENCV_ASSERTION and (height * width > _OPENCV_PIXELS or max(height, width) > _OPENCV_SIDE):
-        return (f"a picture{of} is more than OpenCV decodes, {_OPENCV_PIXELS / 1e6:.0f} megapixels and "
-                f"{_OPENCV_SIDE} px on a side. Scale it down")  # fmt: skip
+        return (
+            f"a picture{of} is more than OpenCV decodes, {_OPENCV_PIXELS / 1e6:.0f} megapixels and "
+            f"{_OPENCV_SIDE} px on a side. Scale it down"
+        )
     if code == _OPENCV_NO_MEMORY:
         return f"there is not enough memory to decode a picture{of}. Close other programs, or scale it down"
     states = f" (its header states {width}×{height} px)" if size else ""

@@ -1,20 +1,22 @@
-"""The size that the header of a picture file states, in every kind of file that is read.
+"""The kind of an image file, and the size that its header states.
 
 JPEG: ITU-T T.81, the start of frame. PNG: the chunk IHDR. WebP: the RIFF chunks VP8, VP8L and VP8X. TIFF: the first
-directory. HEIC and AVIF: the boxes `ispe` of ISO/IEC 23008-12, of which the largest is that of the whole picture.
+directory. HEIC and AVIF: the boxes `ispe` of ISO/IEC 23008-12, of which the largest is that of the whole image.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 from pano_mvs.scene.image_files.jpeg import JPEG_FRAMES, JPEG_START, jpeg_segments
 from pano_mvs.scene.image_files.tiff_directory import open_tiff
 
 Size: TypeAlias = "tuple[int, int]"
+ImageKind: TypeAlias = Literal["jpeg", "png", "webp", "tiff", "heif"]
+"""`heif` includes AVIF."""
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
 TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -24,23 +26,34 @@ _HEIF_BYTES = 1 << 20
 _DAMAGE = (struct.error, IndexError, OverflowError)
 
 
+def image_kind(data: bytes) -> ImageKind | None:
+    """Return the kind of an image file by its first bytes, or None if it is none of these kinds."""
+    if data.startswith(JPEG_START):
+        return "jpeg"
+    if data.startswith(PNG_START):
+        return "png"
+    if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
+        return "webp"
+    if data.startswith(TIFF_STARTS):
+        return "tiff"
+    return "heif" if data[4:8] == b"ftyp" else None
+
+
 def stated_size(data: bytes) -> Size | None:
-    """Return the (height, width) that a picture's header states; None where it states none that can be read.
+    """Return the (height, width) that an image file's header states, or None if it cannot be read.
 
     Args:
-        data: the file's bytes, or its beginning as long as the header is in it.
+        data: the file's bytes, or as many as contain the header.
     """
-    for begins, read in _READERS:
-        if begins(data):
-            try:
-                return read(data)
-            except _DAMAGE:
-                return None
-    return None
+    kind = image_kind(data)
+    try:
+        return None if kind is None else _READERS[kind](data)
+    except _DAMAGE:
+        return None
 
 
 def stated_size_of_file(path: Path) -> Size | None:
-    """Return what `stated_size` finds in a file, of which no more than is needed is read; None if it cannot be read."""
+    """Return the `stated_size` of a file without reading all of it if possible; None if the file cannot be read."""
     try:
         with path.open("rb") as stream:
             data = stream.read(_FIRST_BYTES)
@@ -51,7 +64,7 @@ def stated_size_of_file(path: Path) -> Size | None:
 
 
 def riff_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
-    """Yield the chunks of a RIFF file, such as a WebP: the kind of each, and where its bytes begin and end."""
+    """Yield the chunks of a RIFF file, such as a WebP: kind, start and end of each."""
     offset = 12
     while offset + 8 <= len(data):
         kind, length = struct.unpack_from("<4sI", data, offset)
@@ -104,7 +117,7 @@ def _tiff_size(data: bytes) -> Size | None:
 
 
 def _heif_size(data: bytes) -> Size | None:
-    """Return the largest of the sizes in a HEIC or AVIF file: of its tiles, its thumbnails and the whole."""
+    """Return the largest size in a HEIC or AVIF file, which states those of tiles and thumbnails too."""
     sizes: list[Size] = []
     at = data.find(b"ispe", 0, _HEIF_BYTES)
     while at >= 0:
@@ -118,10 +131,10 @@ def _positive(height: int, width: int) -> Size | None:
     return (height, width) if height and width else None
 
 
-_READERS: tuple[tuple[Callable[[bytes], bool], Callable[[bytes], Size | None]], ...] = (
-    (lambda data: data.startswith(JPEG_START), _jpeg_size),
-    (lambda data: data.startswith(PNG_START), _png_size),
-    (lambda data: data.startswith(b"RIFF") and data[8:12] == b"WEBP", _webp_size),
-    (lambda data: data.startswith(TIFF_STARTS), _tiff_size),
-    (lambda data: data[4:8] == b"ftyp", _heif_size),
-)
+_READERS: Mapping[ImageKind, Callable[[bytes], Size | None]] = {
+    "jpeg": _jpeg_size,
+    "png": _png_size,
+    "webp": _webp_size,
+    "tiff": _tiff_size,
+    "heif": _heif_size,
+}

@@ -41,11 +41,15 @@ def decode_image(path: Path, data: bytes | None = None, *, max_pixels: int = MAX
         flags |= cv2.IMREAD_ANYDEPTH
     image = decode_picture(data, path, flags, max_pixels=max_pixels)
     if image is None and data[4:12] in (b"ftypavif", b"ftypavis"):
-        raise InputError(f"{path}: this OpenCV ({cv2.__version__}) reads no AVIF pictures, or it is damaged. Install a "
-                         "newer opencv-python-headless, or convert it to JPEG")  # fmt: skip
+        raise InputError(
+            f"{path}: this OpenCV ({cv2.__version__}) reads no AVIF pictures, or it is damaged. Install a "
+            "newer opencv-python-headless, or convert it to JPEG"
+        )
     if image is None:
-        raise InputError(f"{path}: not a picture that can be decoded ({len(data)} bytes). Remove it or convert it to "
-                         f"JPEG, or to PNG or TIFF of 8 or 16 bits")  # fmt: skip
+        raise InputError(
+            f"{path}: not a picture that can be decoded ({len(data)} bytes). Remove it or convert it to "
+            f"JPEG, or to PNG or TIFF of 8 or 16 bits"
+        )
     del data  # of large pictures each copy counts
     if image.dtype == np.uint16:
         np.right_shift(image, 8, out=image)  # both 257 v and 256 v, as which programs write 8 bits in 16, give v
@@ -61,14 +65,16 @@ def _decode_heic(data: bytes, path: Path) -> NDArray[np.uint8]:
     try:
         pillow_heif = import_module("pillow_heif")
     except ImportError as error:
-        raise InputError(f"{path}: HEIC pictures need an extra: pip install 'pano-mvs[heic]', or convert it to JPEG") \
-            from error  # fmt: skip
+        raise InputError(
+            f"{path}: HEIC pictures need an extra: pip install 'pano-mvs[heic]', or convert it to JPEG"
+        ) from error
     try:
         picture = pillow_heif.open_heif(data, convert_hdr_to_8bit=True)
         image = np.array(picture, copy=True)  # what is merely looked at may go with the picture
     except (ValueError, EOFError, OSError, RuntimeError, SyntaxError) as error:
-        raise InputError(f"{path}: not a HEIC picture that can be decoded ({error}). Copy it again, or convert it to "
-                         "JPEG")  from error  # fmt: skip
+        raise InputError(
+            f"{path}: not a HEIC picture that can be decoded ({error}). Copy it again, or convert it to JPEG"
+        ) from error
     rgb = image[..., :3] if image.ndim == 3 and image.shape[-1] >= 3 else np.atleast_3d(image)[..., :1].repeat(3, -1)
     return np.ascontiguousarray(rgb, dtype=np.uint8)
 

@@ -1,4 +1,4 @@
-"""The segments of a JPEG file: where its metadata and its pixels stand (ITU-T T.81, annex B)."""
+"""The segments of a JPEG file, which contain its metadata and its pixels (ITU-T T.81, annex B)."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ JPEG_START = b"\xff\xd8"
 JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 """Start-of-frame markers: C0–CF without the tables DHT (C4), JPG (C8) and DAC (CC)."""
 _SCAN, _END = 0xDA, b"\xff\xd9"
-_ALONE = frozenset({0x01, *range(0xD0, 0xD9)})  # markers that have no length: TEM, RST0 to RST7, SOI
+_ALONE = frozenset({0x01, *range(0xD0, 0xD9)})  # markers without a length: TEM, RST0 to RST7, SOI
 
 
 class Segment(NamedTuple):
-    """One segment: its marker's second byte, and where what follows its length begins and ends."""
+    """One segment: the second byte of its marker, and the start and end of its contents."""
 
     marker: int
     start: int
@@ -21,9 +21,9 @@ class Segment(NamedTuple):
 
 
 def jpeg_segments(data: bytes) -> Iterator[Segment]:
-    """Yield the segments of a JPEG up to the header of its first scan, that one included.
+    """Yield the segments of a JPEG up to and including the header of its first scan.
 
-    A file that is no JPEG, or is damaged, yields what can be read up to there.
+    A damaged file yields the segments before the damage; other files yield nothing.
     """
     if not data.startswith(JPEG_START):
         return
@@ -47,9 +47,9 @@ def jpeg_segments(data: bytes) -> Iterator[Segment]:
 
 
 def is_cut_short(data: bytes) -> bool:
-    """Return whether a JPEG ends before its end marker: decoders fill what is missing with grey and say nothing.
+    """Return whether a JPEG ends before its end marker. Decoders fill the missing part with grey without an error.
 
-    The marker cannot occur within a scan, and what cameras append behind it (videos, previews) does not matter.
+    The marker cannot occur within a scan. Cameras may append data behind it (videos, previews), which is ignored.
     """
     scan = next((segment for segment in jpeg_segments(data) if segment.marker == _SCAN), None)
     return scan is None or data.find(_END, scan.end) < 0

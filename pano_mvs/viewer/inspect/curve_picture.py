@@ -1,149 +1,163 @@
-"""A cost curve as a picture: what the neighbours say, and below it what semi-global matching made of that."""
+"""Draw the cost curve of a pixel: the costs of its neighbours, and below them the result of semi-global matching."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib import rc_context, rcParamsDefault
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from pano_mvs.io.images.preview import scale_ticks
-from pano_mvs.scene.image_files.image_file import write_png
-from pano_mvs.viewer.inspect.drawing_board import Color, DrawingBoard, Letters
 from pano_mvs.viewer.inspect.inspection import Inspection
 
+# In pixels: the image's width and margins, and the panels and the gap between them, from which its height follows.
 _WIDTH, _LEFT, _RIGHT = 1040, 78, 1016
-_TOP, _PANEL, _GAP, _BOTTOM = 106, 300, 46, 88
-_INK, _FAINT, _GRID = (45, 45, 50), (120, 120, 128), (232, 232, 236)
-_DECISIVE, _RAW = (22, 96, 167), (90, 100, 115)
-_SOURCES: tuple[Color, ...] = ((226, 160, 90), (120, 180, 120), (190, 140, 190), (120, 190, 200), (214, 140, 140))
-_WINNER, _RIVAL, _TRUTH = (200, 50, 50), (210, 130, 30), (20, 130, 80)
-# How wide the text at a mark may be.
-_TAG = 170
-_STEPS = (0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10)
+_TOP, _PANEL, _GAP, _AXIS, _LEGEND_ROW = 106, 300, 46, 64, 22
+_DPI = 100
+_INK, _FAINT = "#2d2d32", "#787880"
+_DECISIVE, _RAW = "#1660a7", "#5a6473"
+_SOURCES = ("#e2a05a", "#78b478", "#be8cbe", "#78bec8", "#d68c8c")
+_WINNER, _RIVAL, _TRUTH = "#c83232", "#d2821e", "#148250"
+_STYLE: Any = {  # matplotlib's type of the keys depends on its version
+    "font.size": 9,
+    "lines.linewidth": 1.6,
+    "axes.titlesize": 9,
+    "axes.titlelocation": "left",
+    "axes.titlecolor": _FAINT,
+    "axes.labelcolor": _FAINT,
+    "axes.edgecolor": _FAINT,
+    "axes.spines.left": False,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.grid.axis": "y",
+    "grid.color": "#e8e8ec",
+    "xtick.color": _FAINT,
+    "ytick.color": _FAINT,
+    "ytick.left": False,
+}
+_LEGEND_COLUMNS = 5
+_MIN_TICK_DISTANCE_PX = 44
+_TAG_WIDTH = 0.18  # largest width of the text at a mark, as a share of a panel
 
 
 def write_curve_picture(path: Path, inspection: Inspection) -> None:
-    """Write a PNG of a pixel's cost curve, with the winner, the runner-up and, if it is known, the truth.
+    """Write a PNG of a pixel's cost curve, with the winner, the runner-up and, if it is known, the true range.
 
     Raises:
         OSError: if the file cannot be written.
     """
     curve = inspection.curve
-    panels = 1 if curve.aggregated is None else 2
-    height = _TOP + panels * _PANEL + (panels - 1) * _GAP + _BOTTOM
-    board = DrawingBoard((height, _WIDTH))
-    _write_title(board, inspection)
-    drawn = np.concatenate([curve.raw, curve.by_source[np.isfinite(curve.by_source)]])
-    raw = _Panel(board, inspection, _TOP, drawn)
-    raw.axes("cost before the decision, as a share of the worst there is", ranges=panels == 1)
-    raw.sources()
-    raw.curve(curve.raw, _RAW if panels == 2 else _DECISIVE)
-    raw.marks(curve.raw)
+    panels = [("cost before the decision, as a share of the largest possible", curve.raw)]
     if curve.aggregated is not None:
-        paths = _Panel(board, inspection, _TOP + _PANEL + _GAP, curve.aggregated)
-        paths.axes("after semi-global matching: mean cost of the eight paths", ranges=True)
-        paths.curve(curve.aggregated, _DECISIVE)
-        paths.marks(curve.aggregated)
-    _write_legend(board, inspection, height - 16)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_png(path, board.picture())
+        panels.append(("after semi-global matching: mean cost of the eight paths", curve.aggregated))
+    below = _AXIS + _LEGEND_ROW * math.ceil((len(inspection.sources) + 1) / _LEGEND_COLUMNS)
+    height = _TOP + len(panels) * (_PANEL + _GAP) - _GAP + below
+    with rc_context(rcParamsDefault), rc_context(_STYLE):  # without the user's own style
+        figure = Figure((_WIDTH / _DPI, height / _DPI), dpi=_DPI)
+        _add_title(figure, inspection, height)
+        for idx, (title, costs) in enumerate(panels):
+            bottom = below + (len(panels) - 1 - idx) * (_PANEL + _GAP)
+            box = (_LEFT / _WIDTH, bottom / height, (_RIGHT - _LEFT) / _WIDTH, _PANEL / height)
+            axes = figure.add_axes(box, title=title)
+            if idx == 0:
+                for source, source_costs in enumerate(curve.by_source):
+                    axes.plot(source_costs, color=_SOURCES[source % len(_SOURCES)], linewidth=0.8)
+            is_last = idx == len(panels) - 1
+            axes.plot(costs, color=_DECISIVE if is_last else _RAW)
+            _set_scales(axes, curve.ranges, with_labels=is_last)
+            _add_marks(axes, inspection, costs)
+        _add_legend(figure, inspection)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, format="png", metadata={"Software": None})  # whose version would change the bytes
 
 
-class _Panel:
-    """One plot of costs over the virtual ranges, evenly apart."""
-
-    def __init__(self, board: DrawingBoard, inspection: Inspection, upper: float, costs: NDArray[np.float64]) -> None:
-        self.board, self.inspection = board, inspection
-        self.ranges = inspection.curve.ranges
-        self.upper, self.lower = upper, upper + _PANEL
-        self.highest = 1.1 * max(float(costs.max()), 0.02)
-
-    def at(self, plane: float, cost: float) -> tuple[float, float]:
-        """Return where a cost at a place among the planes is drawn."""
-        share = plane / (len(self.ranges) - 1)
-        height = min(cost / self.highest, 1.0)
-        return _LEFT + share * (_RIGHT - _LEFT), self.lower - height * (self.lower - self.upper)
-
-    def plane_of(self, distance: float) -> float:
-        """Return where among the planes a range lies; beyond either end, that end."""
-        return float(np.interp(distance, self.ranges, np.arange(len(self.ranges))))
-
-    def axes(self, title: str, *, ranges: bool) -> None:
-        """Draw the grid, the costs and the ranges, which are named if `ranges`."""
-        step = next((step for step in _STEPS if self.highest / step < 6), _STEPS[-1])
-        for cost in np.arange(0, self.highest, step):
-            y = self.at(0, cost)[1]
-            self.board.line([(_LEFT, y), (_RIGHT, y)], _GRID)
-            self.board.write(f"{cost:.2f}", (_LEFT - 8, y + 5), Letters(color=_FAINT, align=1))
-        self.board.write(title, (_LEFT, self.upper - 8), Letters(color=_FAINT))
-        taken = -np.inf
-        for tick in scale_ticks(float(self.ranges[0]), float(self.ranges[-1])):
-            x = self.at(self.plane_of(tick), 0)[0]
-            self.board.line([(x, self.lower), (x, self.lower + 5)], _FAINT)
-            if ranges and x - taken > 44:
-                self.board.write(f"{tick:g}", (x, self.lower + 22), Letters(color=_FAINT, align=0.5))
-                taken = x
-        self.board.line([(_LEFT, self.lower), (_RIGHT, self.lower)], _FAINT)
-
-    def sources(self) -> None:
-        """Draw the costs in each neighbour by itself."""
-        for idx, costs in enumerate(self.inspection.curve.by_source):
-            self.curve(costs, _SOURCES[idx % len(_SOURCES)], 1)
-
-    def curve(self, costs: NDArray[np.float64], color: Color, weight: int = 2) -> None:
-        """Draw a curve, with gaps where it is not known."""
-        known = np.concatenate([[False], np.isfinite(costs), [False]])
-        for start, stop in np.flatnonzero(np.diff(known.astype(np.int8))).reshape(-1, 2):
-            self.board.line([self.at(plane, float(costs[plane])) for plane in range(start, stop)], color, weight)
-
-    def marks(self, costs: NDArray[np.float64]) -> None:
-        """Draw the winner, the next valley and the true range."""
-        curve, truth = self.inspection.curve, self.inspection.true_range
-        x, y = self.at(curve.winner, float(costs[curve.winner]))
-        if np.isfinite(truth):
-            true_x = self.at(self.plane_of(truth), 0)[0]
-            self.board.dashes((true_x, self.upper), (true_x, self.lower), _TRUTH)
-            self.tag(f"truth {truth:.4g}", (true_x, self.upper - 6), _TRUTH, true_x)
-        other_x = x
-        if curve.runner_up is not None:
-            other_x, other_y = self.at(curve.runner_up, float(costs[curve.runner_up]))
-            self.board.dot((other_x, other_y), _RIVAL, filled=False)
-            self.tag(f"next valley {curve.ranges[curve.runner_up]:.4g}", (other_x, other_y), _RIVAL, x)
-        self.board.dot((x, y), _WINNER, filled=True)
-        shown = curve.range if np.isfinite(curve.range) else curve.ranges[curve.winner]
-        self.tag(f"winner {shown:.4g}", (x, y), _WINNER, other_x)
-
-    def tag(self, text: str, spot: tuple[float, float], color: Color, other_x: float) -> None:
-        """Write below a mark, where there is room, on the side away from another mark that is near."""
-        x, y = spot
-        leftwards = x > 0.75 * _WIDTH or (x < other_x < x + 2 * _TAG and x > _LEFT + _TAG)
-        below = y + 22 if y < self.lower - 24 else y - 10
-        place = x + (-12 if leftwards else 12), below
-        self.board.write(text, place, Letters(color=color, align=float(leftwards)), on_paper=True)
+def _set_scales(axes: Axes, ranges: NDArray[np.float64], *, with_labels: bool) -> None:
+    """Set the limits; ticks of the ranges stand where they lie among the hypotheses, which are evenly apart."""
+    highest = max(float(np.nanmax(line.get_ydata())) for line in axes.lines if np.isfinite(line.get_ydata()).any())
+    axes.set(xlim=(0, len(ranges) - 1), ylim=(0, 1.1 * max(highest, 0.02)))
+    axes.yaxis.set_major_formatter("{x:.2f}")
+    values = scale_ticks(float(ranges[0]), float(ranges[-1]))
+    places = [_place_of(value, ranges) for value in values]
+    labels, taken = [], -np.inf
+    for value, place in zip(values, places, strict=True):
+        x = place / (len(ranges) - 1) * (_RIGHT - _LEFT)
+        is_shown = with_labels and x - taken > _MIN_TICK_DISTANCE_PX
+        labels.append(f"{value:g}" if is_shown else "")
+        taken = x if is_shown else taken
+    axes.set_xticks(places, labels)
+    if with_labels:
+        axes.set_xlabel("depth hypothesis, scene units")
 
 
-def _write_title(board: DrawingBoard, found: Inspection) -> None:
-    settings, curve = found.settings, found.curve
-    board.write(f"{found.image}, pixel ({found.column}, {found.row})", (24, 34), Letters(0.68, _INK))
-    sure = f"confidence {curve.confidence}" if curve.confidence else "no range"
-    board.write(
-        f"{found.sweep}: {settings.cost}, window {settings.window}, {settings.combination}, "
-        f"{settings.aggregation}, {settings.planes} planes ({settings.spacing}); {sure}, "
-        f"unique by {100 * curve.uniqueness:.0f} %",
-        (24, 62),
-        Letters(0.46, _FAINT),
+def _add_marks(axes: Axes, inspection: Inspection, costs: NDArray[np.float64]) -> None:
+    """Mark the winner, the next valley and the true range."""
+    curve, truth = inspection.curve, inspection.true_range
+    if np.isfinite(truth):
+        place = _place_of(truth, curve.ranges)
+        axes.axvline(place, color=_TRUTH, linewidth=1, dashes=(6, 6))
+        _add_tag(axes, f"truth {truth:.4g}", (place, axes.get_ylim()[1]), color=_TRUTH, other=place)
+    rival = curve.winner if curve.runner_up is None else curve.runner_up
+    if curve.runner_up is not None:
+        axes.plot(rival, costs[rival], "o", ms=8, mew=1.6, color=_RIVAL, markerfacecolor="white", clip_on=False)
+        text = f"next valley {curve.ranges[rival]:.4g}"
+        _add_tag(axes, text, (rival, costs[rival]), color=_RIVAL, other=curve.winner)
+    winner = curve.winner, costs[curve.winner]
+    axes.plot(*winner, "o", ms=9, color=_WINNER, markeredgecolor="white", clip_on=False)
+    shown = curve.range if np.isfinite(curve.range) else curve.ranges[curve.winner]
+    _add_tag(axes, f"winner {shown:.4g}", winner, color=_WINNER, other=rival)
+
+
+def _add_tag(axes: Axes, text: str, place: tuple[float, float], *, color: str, other: float) -> None:
+    """Write below a mark, or above it at the bottom, on the side away from another mark that is near."""
+    count, highest = axes.get_xlim()[1], axes.get_ylim()[1]
+    x, y, other = place[0] / count, place[1] / highest, other / count
+    leftwards = x > 0.75 or (x < other < x + 2 * _TAG_WIDTH and x > _TAG_WIDTH)
+    axes.annotate(
+        text,
+        place,
+        (-12 if leftwards else 12, -14 if y > 0.08 else 14),
+        textcoords="offset pixels",
+        ha="right" if leftwards else "left",
+        va="center",
+        color=color,
+        bbox={"facecolor": "white", "edgecolor": "none", "pad": 1},
     )
 
 
-def _write_legend(board: DrawingBoard, found: Inspection, y: float) -> None:
-    board.write("virtual range, scene units", ((_LEFT + _RIGHT) / 2, y - 26), Letters(color=_FAINT, align=0.5))
-    by_paths = found.curve.aggregated is not None
-    entries = [
-        (source.name.rsplit("/", 1)[-1], _SOURCES[idx % len(_SOURCES)], 1) for idx, source in enumerate(found.sources)
-    ]
-    entries.append((f"combined ({found.settings.combination})", _RAW if by_paths else _DECISIVE, 2))
-    x = float(_LEFT)
-    for text, color, weight in entries:
-        board.line([(x, y - 4), (x + 22, y - 4)], color, weight)
-        x += 46 + board.write(text, (x + 28, y), Letters(0.42, _INK))
+def _place_of(value: float, ranges: NDArray[np.float64]) -> float:
+    """Return the position of a range among the hypotheses; beyond either end, that end."""
+    return float(np.interp(value, ranges, np.arange(len(ranges))))
+
+
+def _add_title(figure: Figure, found: Inspection, height: int) -> None:
+    settings, curve = found.settings, found.curve
+    title = _drawable(f"{found.image}, pixel ({found.column}, {found.row})")
+    figure.text(24 / _WIDTH, 1 - 34 / height, title, color=_INK, fontsize=13, parse_math=False)
+    sure = f"confidence {curve.confidence}" if curve.confidence else "no range"
+    details = (
+        f"{found.sweep}: {settings.cost}, window {settings.window}, {settings.combination}, {settings.aggregation}, "
+        f"{settings.planes} planes ({settings.spacing}); {sure}, unique by {100 * curve.uniqueness:.0f} %"
+    )
+    figure.text(24 / _WIDTH, 1 - 62 / height, _drawable(details), color=_FAINT, parse_math=False)
+
+
+def _add_legend(figure: Figure, found: Inspection) -> None:
+    names = [source.name.rsplit("/", 1)[-1] for source in found.sources]
+    lines = figure.axes[0].lines[: len(names) + 1]
+    place = (_LEFT / _WIDTH, 0)
+    legend = figure.legend(
+        lines, ["…"] * len(lines), loc="lower left", bbox_to_anchor=place, ncols=_LEGEND_COLUMNS, frameon=False
+    )  # as labels, names that begin with _ would be left out
+    for text, name in zip(legend.get_texts(), [*names, f"combined ({found.settings.combination})"], strict=True):
+        text.set(text=_drawable(name), parse_math=False, color=_INK)
+
+
+def _drawable(text: str) -> str:
+    """Return a text with ? for characters that the font may lack."""
+    return "".join(letter if letter.isprintable() and letter <= "ÿ" else "?" for letter in text)

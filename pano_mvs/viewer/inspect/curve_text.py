@@ -19,7 +19,7 @@ _PLAIN_SIGNS = {"winner": "^", "next valley": "o", "truth": "T"}
 
 
 def curve_text(curve: CostCurve, *, true_range: float = np.nan, width: int = 100, plain: bool = False) -> list[str]:
-    """Return the lines of a plot: a bar for the cost of each virtual range, low where it matches, near on the left.
+    """Return the lines of a plot: a bar for the cost of each depth hypothesis, low where it matches, near on the left.
 
     Costs after semi-global matching are drawn below those that it was given. Where there are more ranges than columns,
     a bar is the cheapest of its ranges.

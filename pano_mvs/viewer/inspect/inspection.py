@@ -39,7 +39,7 @@ class SourceSight:
         pixel_px: (x, y) in the neighbour.
         color_rgb: there.
         masked: whether the neighbour is masked there.
-        cost: of the winning range in this neighbour alone, a share of the worst; NaN if it has no vote.
+        cost: of the winning range in this neighbour alone, a share of the worst; NaN if it does not count.
     """
 
     name: str
@@ -70,7 +70,7 @@ class Inspection:
         curve: its costs.
         sources: its neighbours.
         true_range: in scene units; NaN if not known.
-        notes: what there is to say beside.
+        notes: further remarks.
     """
 
     image: str

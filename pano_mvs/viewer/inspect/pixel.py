@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -172,10 +171,6 @@ def _sights(
     return tuple(sights)
 
 
-def _sha256(picture: Panorama) -> str:
-    return hashlib.sha256(picture.image.read_bytes()).hexdigest()
-
-
 def _true_range(
     folder: Path | None, image: str, read: _SweepRead, row: int, column: int
 ) -> tuple[float, tuple[str, ...]]:
@@ -186,7 +181,7 @@ def _true_range(
     estimated = dict(zip((image, *read.names), read.poses, strict=True))
     pictures = dict(zip((image, *read.names), (read.reference, *read.sources), strict=True))
     matched = truth.match(list(estimated))
-    views = {name: view for name, view in matched.items() if view.sha256 in (None, _sha256(pictures[name]))}
+    views = {name: view for name, view in matched.items() if view.belongs_to(pictures[name].image)}
     if image in matched and image not in views:
         return np.nan, (f"{image} is not the image that the truth in {folder.name} belongs to",)
     ranges = truth.range_map(views[image]) if image in views else None

@@ -7,7 +7,7 @@ from pano_mvs.api import SweepInput, Winners, register_sweep_backend
 COSTS = ("census", "census_gradient", "zncc", "sad", "sad_gradient")
 
 
-@register_sweep_backend("torch", costs=COSTS)
+@register_sweep_backend("torch", costs=COSTS, bytes_per_voxel=8)
 def find_winners(work: SweepInput) -> Winners:
     """Return the winning plane of every pixel and the costs around it; equals the other backends' but for rounding.
 

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from pano_mvs.api import SweepInput, pad_panorama
 from pano_mvs.api.sweep import (
     GREY_WEIGHT,
-    LARGEST_COLOR_COST,
-    LARGEST_GRADIENT_COST,
+    MAX_COLOR_COST,
+    MAX_GRADIENT_COST,
     ZNCC_NOISE_VARIANCE,
     WindowBands,
+    census_weight,
     column_offsets,
 )
 from torch import Tensor
@@ -30,7 +31,7 @@ class BandCost:
         settings = work.settings
         height, width = work.reference.shape[:2]
         self.compare_radius, self.box_radius = settings.compare_radius, settings.box_radius
-        self.census_weight = settings.census_weight
+        self.census_weight = census_weight(self.compare_radius)
         self.halo = self.compare_radius + self.box_radius
         spherical = settings.spherical_window
         columns = column_offsets((height, width), self.compare_radius, spherical=spherical)
@@ -41,9 +42,12 @@ class BandCost:
         around = pad_panorama(work.reference, self.halo)[first : last + 2 * self.halo, self.halo : self.halo + width]
         self.reference = torch.from_numpy(np.ascontiguousarray(np.moveaxis(around, -1, 0))).to(device, torch.int32)
         kinds: dict[str, Callable[[Tensor], Tensor]] = {
-            "census": self._census, "census_gradient": self._census_gradient, "zncc": self._zncc, "sad": self._sad,
+            "census": self._census,
+            "census_gradient": self._census_gradient,
+            "zncc": self._zncc,
+            "sad": self._sad,
             "sad_gradient": self._sad_gradient,
-        }  # fmt: skip
+        }
         self._cost = kinds[settings.cost]
         self._places = list(self.windows.places())
         self._signs = list(self._signs_of(self.reference[0])) if settings.cost in ("census", "census_gradient") else []
@@ -64,8 +68,8 @@ class BandCost:
 
     def _census_gradient(self, warped: Tensor) -> Tensor:
         """Return the census cost, its weight times, plus differences of grey levels and of their gradients, cut off."""
-        levels = self._absolute(warped).clamp_(max=LARGEST_COLOR_COST // 3)
-        grey = levels + self._gradients(warped).clamp_(max=LARGEST_GRADIENT_COST // 3)
+        levels = self._absolute(warped).clamp_(max=MAX_COLOR_COST // 3)
+        grey = levels + self._gradients(warped).clamp_(max=MAX_GRADIENT_COST // 3)
         return self._box_mean(self.census_weight * self._disagreements(warped) + GREY_WEIGHT * grey)
 
     def _disagreements(self, warped: Tensor) -> Tensor:
@@ -101,8 +105,8 @@ class BandCost:
 
     def _sad_gradient(self, warped: Tensor) -> Tensor:
         """Return differences of colours and of their gradients, each cut off."""
-        colors = self._absolute(warped).clamp_(max=LARGEST_COLOR_COST)
-        return self._box_mean(colors + self._gradients(warped).clamp_(max=LARGEST_GRADIENT_COST))
+        colors = self._absolute(warped).clamp_(max=MAX_COLOR_COST)
+        return self._box_mean(colors + self._gradients(warped).clamp_(max=MAX_GRADIENT_COST))
 
     def _gradients(self, warped: Tensor) -> Tensor:
         """Return the sum of absolute differences of the gradients of all colours, (P, rows, W)."""
@@ -160,9 +164,10 @@ class BandCost:
         for lines, reach in self.boxes.reaches():
             right, left = margin + reach, margin - reach - 1
             torch.sub(
-                running[..., lines, right : right + width], running[..., lines, left : left + width],
+                running[..., lines, right : right + width],
+                running[..., lines, left : left + width],
                 out=summed[..., lines, :],
-            )  # fmt: skip
+            )
         return summed
 
 

@@ -51,11 +51,13 @@ class Lookup:
         height, width = self.reference_hw
         elevation = np.pi * (0.5 - (np.arange(first, last) + 0.5) / height)[:, None]
         azimuth = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
-        rays = np.stack([
-            np.cos(elevation) * np.sin(azimuth),
-            np.broadcast_to(-np.sin(elevation), (last - first, width)),
-            np.cos(elevation) * np.cos(azimuth),
-        ])  # fmt: skip
+        rays = np.stack(
+            [
+                np.cos(elevation) * np.sin(azimuth),
+                np.broadcast_to(-np.sin(elevation), (last - first, width)),
+                np.cos(elevation) * np.cos(azimuth),
+            ]
+        )
         turned = np.tensordot(self.rotation, rays, axes=1)
         return torch.from_numpy(turned.astype(np.float32)).to(self.device)
 

@@ -76,7 +76,7 @@ def _band(work: SweepInput, lookups: list[Lookup], weights: Tensor, band: tuple[
 def _combined(costs: Tensor, weights: Tensor, work: SweepInput) -> Tensor:
     """Return the mean cost of the sources that count, (S, P, rows, W) to (P, rows, W); see `combine_costs`."""
     settings = work.settings
-    most = settings.most_sources(len(costs))
+    most = settings.max_sources(len(costs))
     if work.source_valid is None and not len(weights):
         return _mean_of_least(costs, min(ceil(settings.weight_share * len(costs)), most))
     ordered, order = costs.sort(dim=0, stable=True)

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from pano_mvs.algorithms.sweep.costs import CostWindow
-from pano_mvs.algorithms.sweep.numpy_backend import path_step as plain_path_step
-from pano_mvs.algorithms.sweep.numpy_backend import winners_of as plain_winners_of
+from pano_mvs.algorithms.sweep.backends.numpy_backend import path_step as plain_path_step
+from pano_mvs.algorithms.sweep.backends.numpy_backend import winners_of as plain_winners_of
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
+from pano_mvs.algorithms.sweep.windows import CostWindow
 from pano_mvs.api import Rigid3, UsageError
 from pano_mvs.geometry import roll_panorama, sample_panorama
 from pano_mvs.testing.room import capture_poses, default_room, render
@@ -135,6 +135,6 @@ def _nothing() -> tuple[NDArray[np.uint8], list[NDArray[np.uint8]], list[Rigid3]
 def test_torch_is_not_imported_before_it_is_used() -> None:
     code = "import sys; from importlib.metadata import entry_points as e\n" \
            "[p.load() for p in e(group='pano_mvs.plugins')]\n" \
-           "from pano_mvs.algorithms.sweep.backends import SWEEP_BACKENDS as b\n" \
+           "from pano_mvs.algorithms.sweep.backends.registry import SWEEP_BACKENDS as b\n" \
            "assert 'torch' in b.names() and 'torch' not in sys.modules"  # fmt: skip
     subprocess.run([sys.executable, "-c", code], check=True)

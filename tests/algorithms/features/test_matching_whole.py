@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.matching.brute_force import match_features
 from pano_mvs.algorithms.matching.nearest_two import NearestTwo, nearest_two
 from pano_mvs.algorithms.matching.whole_numbers import fits_whole_numbers, nearest_two_whole
-from pano_mvs.algorithms.sweep.kernels_vector import HAS_VECTOR
+from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR
 from pano_mvs.core.errors import UsageError
 from tests.algorithms.features.test_matching import features
 from tests.oracles.matching import match_one_by_one

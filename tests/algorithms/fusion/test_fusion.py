@@ -206,7 +206,7 @@ class TestFusion:
         np.testing.assert_allclose(np.median(low, 0), np.median(high, 0), atol=2e-3)
 
     def test_impossible_calls_are_named(self, views: list[FusionView]) -> None:
-        with pytest.raises(UsageError, match="must be positive"):
+        with pytest.raises(UsageError, match="min_views must be at least 1, got 0"):
             fuse_views(views, FusionSettings(min_views=0))
         small = FusionView(views[0].range_map, views[0].pose, views[0].image[::2])
         with pytest.raises(UsageError, match="image must be"):

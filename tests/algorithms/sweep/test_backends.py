@@ -10,14 +10,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.backends import SWEEP_BACKENDS, backend_for, helper_backend, register_sweep_backend
-from pano_mvs.algorithms.sweep.costs import SWEEP_COSTS, CostWindow, register_sweep_cost
+from pano_mvs.algorithms.sweep.backends.numpy_backend import find_winners, winners_of
+from pano_mvs.algorithms.sweep.backends.registry import (
+    SWEEP_BACKENDS,
+    backend_for,
+    helper_backend,
+    register_sweep_backend,
+)
+from pano_mvs.algorithms.sweep.backends.running_winner import RunningWinner
+from pano_mvs.algorithms.sweep.costs.registry import SWEEP_COSTS, register_sweep_cost
 from pano_mvs.algorithms.sweep.limits import limits_by_sweeping
-from pano_mvs.algorithms.sweep.numpy_backend import find_winners, winners_of
 from pano_mvs.algorithms.sweep.preparation import SweepInput
-from pano_mvs.algorithms.sweep.running_winner import RunningWinner
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
-from pano_mvs.algorithms.sweep.windows import WindowBands, column_offsets
+from pano_mvs.algorithms.sweep.windows import CostWindow, WindowBands, column_offsets
 from pano_mvs.algorithms.sweep.winner import Winners
 from pano_mvs.core.errors import ContractError, PluginError, UsageError
 from pano_mvs.geometry import Rigid3
@@ -143,10 +148,27 @@ def test_the_small_sweeps_behind_a_sweep_need_not_be_the_backends_own(ours: None
     )  # fmt: skip
     found.check()
     with pytest.raises(UsageError, match="'differences' does not have the cost 'census'; those that do: numba, numpy"):
-        backend_for("differences", "census")
+        backend_for("differences", SweepSettings())
 
 
 def test_built_in_names_are_not_to_be_taken(ours: None) -> None:
     with pytest.raises(PluginError, match="'numba' is built in"):
         register_sweep_backend("numba")(find_winners)
     assert SWEEP_BACKENDS.code_file("numba") is None
+
+
+@pytest.mark.parametrize(
+    ("settings", "voxels"),
+    [
+        (SweepSettings(planes=100), 100_000),
+        (SweepSettings(planes=100, aggregation="box"), 0),
+        (SweepSettings(planes=100, levels=2), 25_000),
+    ],
+)
+def test_the_memory_of_a_volume_is_the_backends(ours: None, settings: SweepSettings, voxels: int) -> None:
+    register_sweep_backend("large", bytes_per_voxel=8)(find_winners)
+    assert SWEEP_BACKENDS.get("large").volume_bytes(1000, settings) == 8 * voxels
+    assert SWEEP_BACKENDS.get("numpy").volume_bytes(1000, settings) == 24 * voxels
+    limited = settings.replace(volume_limit_gb=1e-5)
+    assert SWEEP_BACKENDS.get("numba").volume_bytes(1000, limited) == min(3 * voxels, 10_000)
+    assert SWEEP_BACKENDS.get("large").volume_bytes(1000, limited) == 8 * voxels

@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.guided import STEPS, GuidedSweep
+from pano_mvs.algorithms.sweep.coarse_to_fine.guided import STEPS, GuidedSweep
+from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guided_paths import follow_guided_rows, follow_guided_strip
+from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guides import adopt_candidates, split_layers
 from pano_mvs.algorithms.sweep.hypotheses import virtual_ranges
-from pano_mvs.algorithms.sweep.kernels_band import sweep_band
-from pano_mvs.algorithms.sweep.kernels_layers import adopt_candidates, split_layers
-from pano_mvs.algorithms.sweep.kernels_tube import follow_rows, follow_tube
-from pano_mvs.algorithms.sweep.numba_backend import _fresh_state
+from pano_mvs.algorithms.sweep.numba.arguments import fresh_state, sweep_arguments
+from pano_mvs.algorithms.sweep.numba.kernels_band import sweep_band
+from pano_mvs.algorithms.sweep.numba.tiles import run_arguments, runs_of, spread_tiles, tile_means
 from pano_mvs.algorithms.sweep.preparation import SweepInput, prepare_picture
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
-from pano_mvs.algorithms.sweep.tiles import run_arguments, runs_of, shared_arguments, spread_tiles, tile_means
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, pad_panorama, roll_panorama
 from pano_mvs.scene import RangeMap
@@ -64,7 +64,7 @@ def test_around_a_flat_guide_costs_are_those_of_the_plain_sweep(changes: dict[st
     _compare_with_the_plain_sweep(64, SweepSettings(planes=20, exposure=False, **changes))
 
 
-@pytest.mark.kernel("sweep.kernels_guided", "sweep.kernels_band")
+@pytest.mark.kernel("sweep.coarse_to_fine.kernels_guided", "sweep.numba.kernels_band")
 def test_around_a_flat_guide_costs_of_a_tiny_picture_are_those_of_the_plain_sweep() -> None:
     """Small enough to run as plain Python too."""
     _compare_with_the_plain_sweep(16, SweepSettings(planes=14, window=3, exposure=False))
@@ -73,10 +73,10 @@ def test_around_a_flat_guide_costs_of_a_tiny_picture_are_those_of_the_plain_swee
 def _compare_with_the_plain_sweep(height: int, settings: SweepSettings) -> None:
     work, bands = _work(height, settings), range(0, height, 32)
     plain = np.empty((height, settings.planes, 2 * height), np.uint8)
-    shared = shared_arguments(work)
+    shared = sweep_arguments(work)
     for first in bands:
         rows = min(32, height - first)
-        sweep_band(first, *shared.values(), plain[first : first + rows], *_fresh_state(rows, 2 * height))
+        sweep_band(first, shared, work.ranges, plain[first : first + rows], *fresh_state(rows, 2 * height))
     with ThreadPoolExecutor(1) as pool:
         sweep = GuidedSweep(work, np.full((2, height, 2 * height), 9.0, np.float32), pool)
         sweep._sweep(0, np.ones((height, 2 * height), np.bool_))
@@ -108,18 +108,17 @@ def test_runs_cover_the_tiles_that_are_set_and_no_others() -> None:
     size_hw = (80, 400)
     tiles = rng.random((3, 7)) < 0.4
     tiles[1] = True
-    shared = shared_arguments(_work(64, SweepSettings(planes=20)))
+    shared = sweep_arguments(_work(64, SweepSettings(planes=20)))
     covered = np.zeros(size_hw, int)
-    for run in runs_of(tiles, size_hw, shared):
+    for run in runs_of(tiles, size_hw, shared.windows):
         covered[run.place] += 1
         assert (run.margin == 0) == (run.columns == 400)
     assert np.array_equal(covered, spread_tiles(tiles, size_hw).astype(int))
-    assert run_arguments(shared, runs_of(np.array([[True, False, False]]), (32, 128), shared)[0])[
-        "reference"
-    ].flags.c_contiguous
+    run = runs_of(np.array([[True, False, False]]), (32, 128), shared.windows)[0]
+    assert run_arguments(shared, run).reference.flags.c_contiguous
 
 
-@pytest.mark.kernel("sweep.kernels_tube")
+@pytest.mark.kernel("sweep.coarse_to_fine.kernels_guided_paths")
 @pytest.mark.parametrize("upward", [False, True])
 @pytest.mark.parametrize("drift", [0, 1, -1])
 def test_paths_among_candidates_follow_the_definition(drift: int, upward: bool) -> None:
@@ -131,7 +130,7 @@ def test_paths_among_candidates_follow_the_definition(drift: int, upward: bool) 
     total = np.zeros(volume.shape, np.uint16)
     for first in (0, 5):  # two strips, one of which crosses the seam
         lines = 5 if first == 0 else 7
-        follow_tube(volume, total, guides, penalties, np.uint16(40), first, lines, drift, upward, 0, True)
+        follow_guided_strip(volume, total, guides, penalties, np.uint16(40), first, lines, drift, upward, 0, True)
     expected = np.zeros(volume.shape)
     for column in range(width):
         rows = np.arange(height)[:: -1 if upward else 1]
@@ -142,7 +141,7 @@ def test_paths_among_candidates_follow_the_definition(drift: int, upward: bool) 
     assert np.array_equal(total, expected)
 
 
-@pytest.mark.kernel("sweep.kernels_tube")
+@pytest.mark.kernel("sweep.coarse_to_fine.kernels_guided_paths")
 def test_paths_along_rows_go_around_the_sphere() -> None:
     rng = np.random.default_rng(8)
     height, width, count = 3, 20, 3
@@ -150,7 +149,7 @@ def test_paths_along_rows_go_around_the_sphere() -> None:
     guides = rng.integers(0, 60, (height, 2, width)).astype(np.int16)
     penalties = rng.integers(60, 300, (2, height, width)).astype(np.uint16)
     total = np.zeros(volume.shape, np.uint16)
-    follow_rows(volume, total, guides, penalties, np.uint16(40), 0, height, width)
+    follow_guided_rows(volume, total, guides, penalties, np.uint16(40), 0, height, width)
     expected = np.zeros(volume.shape)
     for row in range(height):
         for way, step in enumerate((1, -1)):
@@ -161,7 +160,7 @@ def test_paths_along_rows_go_around_the_sphere() -> None:
     assert np.array_equal(total, expected)
 
 
-@pytest.mark.kernel("sweep.kernels_layers")
+@pytest.mark.kernel("sweep.coarse_to_fine.kernels_guides")
 def test_two_surfaces_are_told_apart_and_one_is_not_split() -> None:
     positions = np.full((12, 16), 10.0, np.float32)
     positions[:, 8:] = 30.0
@@ -175,7 +174,7 @@ def test_two_surfaces_are_told_apart_and_one_is_not_split() -> None:
     assert np.array_equal(layers[0], layers[1])
 
 
-@pytest.mark.kernel("sweep.kernels_layers")
+@pytest.mark.kernel("sweep.coarse_to_fine.kernels_guides")
 def test_candidates_are_adopted_with_those_that_agree() -> None:
     found, costs = np.full((9, 9), 50.0, np.float32), np.full((9, 9), np.inf, np.float32)
     found[4, 4:6], costs[4, 4:6] = (10, 12), (1, 2)
@@ -251,7 +250,7 @@ def test_the_number_of_threads_changes_no_bit() -> None:
 
 def test_only_the_compiled_backend_has_levels() -> None:
     pictures, poses, _ = _capture(64)
-    with pytest.raises(UsageError, match="needs the sweep backend 'numba'"):
+    with pytest.raises(UsageError, match="needs the sweep backend numba, got 'numpy'"):
         _sweep(pictures, poses, PLAIN.replace(levels=2), backend="numpy")
     with pytest.raises(UsageError, match="levels must be"):
         SweepSettings(levels=0)

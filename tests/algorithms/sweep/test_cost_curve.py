@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep import numba_backend
+from pano_mvs.algorithms.sweep.backends.numpy_backend import _aggregate, _source_cost, find_winners
 from pano_mvs.algorithms.sweep.cost_curve import cost_curve
-from pano_mvs.algorithms.sweep.costs import SWEEP_COSTS, CostWindow, register_sweep_cost
-from pano_mvs.algorithms.sweep.kernels_band import sweep_band
-from pano_mvs.algorithms.sweep.numpy_backend import _aggregate, _source_cost, find_winners
+from pano_mvs.algorithms.sweep.costs.registry import SWEEP_COSTS, register_sweep_cost
+from pano_mvs.algorithms.sweep.numba.arguments import fresh_state, sweep_arguments
+from pano_mvs.algorithms.sweep.numba.kernels_band import sweep_band
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_input, sweep_range
+from pano_mvs.algorithms.sweep.windows import CostWindow
 from pano_mvs.core.errors import UsageError
 from pano_mvs.testing.room import capture_poses, default_room, render
 from pano_mvs.testing.sweep_backends import CASES, FAR, NEAR, SweepCase, sweep_case
@@ -69,9 +70,7 @@ def test_paths_end_in_the_pixel_with_the_sums_of_the_volume() -> None:
             if costs is not None:
                 volume[row, :, column] = np.rint(costs.raw * 255)
     stored = np.empty((24, 9, 48), np.uint8)
-    prepared = numba_backend._band_arguments(work)
-    state, planes = numba_backend._fresh_state(24, 48)
-    sweep_band(0, *prepared, stored, state, planes)
+    sweep_band(0, sweep_arguments(work), work.ranges, stored, *fresh_state(24, 48))
     total = _aggregate(stored.astype(np.int64), work)
     for row in (0, 12, 23):
         for column in (3, 19, 35):

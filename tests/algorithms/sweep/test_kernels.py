@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 from numba import njit
 
-from pano_mvs.algorithms.sweep import kernels_sgm
-from pano_mvs.algorithms.sweep.kernels_band import store_row
-from pano_mvs.algorithms.sweep.kernels_combine import combine_row
-from pano_mvs.algorithms.sweep.kernels_cost import box_rows, census_row, difference_row
-from pano_mvs.algorithms.sweep.kernels_sad import average_differences, one_box_serves
-from pano_mvs.algorithms.sweep.kernels_sgm import sweep_row, sweep_strip
-from pano_mvs.algorithms.sweep.kernels_vector import HAS_VECTOR
-from pano_mvs.algorithms.sweep.kernels_winner import (
+from pano_mvs.algorithms.sweep.backends.numpy_backend import path_step, winners_of
+from pano_mvs.algorithms.sweep.numba import kernels_sgm
+from pano_mvs.algorithms.sweep.numba.kernels_combine import combine_row
+from pano_mvs.algorithms.sweep.numba.kernels_cost import box_rows, census_row, difference_row
+from pano_mvs.algorithms.sweep.numba.kernels_records import Combination
+from pano_mvs.algorithms.sweep.numba.kernels_sad import average_differences, one_box_serves
+from pano_mvs.algorithms.sweep.numba.kernels_sgm import sweep_row, sweep_strip
+from pano_mvs.algorithms.sweep.numba.kernels_source_cost import store_row
+from pano_mvs.algorithms.sweep.numba.kernels_winner import (
     AFTER,
     BEFORE,
     BEST,
@@ -23,7 +24,7 @@ from pano_mvs.algorithms.sweep.kernels_winner import (
     update_winners,
     winners_of_rows,
 )
-from pano_mvs.algorithms.sweep.numpy_backend import path_step, winners_of
+from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR
 from pano_mvs.algorithms.sweep.penalties import DIRECTIONS
 from pano_mvs.algorithms.sweep.windows import column_offsets
 from pano_mvs.geometry import pad_panorama
@@ -36,7 +37,7 @@ def _picture(seed: int, size_hw: tuple[int, int] = SIZE) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, size_hw, dtype=np.uint8)
 
 
-@pytest.mark.kernel("sweep.kernels_cost")
+@pytest.mark.kernel("sweep.numba.kernels_cost")
 @pytest.mark.parametrize("row", [0, 1, 8, 15])
 def test_census_counts_what_the_definition_counts(row: int) -> None:
     reference, warped = _picture(3) // 16, _picture(4) // 16  # few levels: ties
@@ -50,7 +51,7 @@ def test_census_counts_what_the_definition_counts(row: int) -> None:
     assert disagree.tolist() == expected
 
 
-@pytest.mark.kernel("sweep.kernels_cost")
+@pytest.mark.kernel("sweep.numba.kernels_cost")
 def test_differences_add_up_over_colours() -> None:
     reference, warped = _picture(5), _picture(6)
     total = np.full(SIZE[1], 7, np.uint16)
@@ -59,7 +60,7 @@ def test_differences_add_up_over_colours() -> None:
     assert total.tolist() == expected.tolist()
 
 
-@pytest.mark.kernel("sweep.kernels_cost")
+@pytest.mark.kernel("sweep.numba.kernels_cost")
 @pytest.mark.parametrize("radius", [1, 3])
 def test_running_sums_equal_the_mean_over_each_window(radius: int) -> None:
     cost = np.random.default_rng(7).integers(0, 766, SIZE).astype(np.uint16)
@@ -76,7 +77,7 @@ def test_running_sums_equal_the_mean_over_each_window(radius: int) -> None:
     np.testing.assert_allclose(means, expected, rtol=1e-5)
 
 
-@pytest.mark.kernel("sweep.kernels_sad")
+@pytest.mark.kernel("sweep.numba.kernels_sad")
 @pytest.mark.parametrize(
     ("sources", "share", "most", "pad", "serves"),
     [(3, 1.0, 3, 4, True), (3, 0.5, 3, 4, False), (3, 1.0, 2, 4, False), (3, 0.5, 1, 4, False), (1, 0.5, 1, 4, True),
@@ -85,10 +86,13 @@ def test_running_sums_equal_the_mean_over_each_window(radius: int) -> None:
 def test_one_box_serves_where_all_sources_count_and_nothing_overflows(
     sources: int, share: float, most: int, pad: int, serves: bool
 ) -> None:
-    assert one_box_serves(sources, share, most, 3, pad) == serves
+    combination = Combination(np.zeros((0, 0, 0), np.float32), share, most, np.float32(9))
+    assert one_box_serves(sources, combination, 3, pad) == serves
+    weighted = combination._replace(weights=np.ones((sources, 1, 1), np.float32))
+    assert not one_box_serves(sources, weighted, 3, pad)
 
 
-@pytest.mark.kernel("sweep.kernels_sad")
+@pytest.mark.kernel("sweep.numba.kernels_sad")
 @pytest.mark.parametrize("radius", [0, 2])
 def test_differences_are_averaged_over_seams(radius: int) -> None:
     costs = np.random.default_rng(7).integers(0, 65536, (4 + 2 * radius, 20)).astype(np.uint16)
@@ -103,7 +107,7 @@ def test_differences_are_averaged_over_seams(radius: int) -> None:
         np.testing.assert_allclose(means[row], expected, rtol=1e-6)
 
 
-@pytest.mark.kernel("sweep.kernels_combine")
+@pytest.mark.kernel("sweep.numba.kernels_combine")
 @pytest.mark.parametrize("sources", [1, 2, 3, 5])
 @pytest.mark.parametrize(("share", "most"), [(0.5, 9), (1.0, 9), (1.0, 2)])
 @pytest.mark.parametrize("all_vote", [True, False])
@@ -122,11 +126,12 @@ def test_sources_combine_to_the_mean_of_those_that_count(
         voting = sorted((float(c), float(w)) for c, w in zip(costs[:, 1, column], weight, strict=True) if c < np.inf)
         expected.append(oracle.combined_cost(voting, share=share, most=most, neutral=9.0))
     result = np.zeros(40, np.float32)
-    combine_row(costs, 1, weights, 2, share, min(most, sources), all_vote, np.float32(9), result)
+    combination = Combination(weights, share, min(most, sources), np.float32(9))
+    combine_row(costs, 1, combination, 2, all_vote, result)
     np.testing.assert_allclose(result, expected, rtol=1e-5)
 
 
-@pytest.mark.kernel("sweep.kernels_winner", "sweep.kernels_vector_winner")
+@pytest.mark.kernel("sweep.numba.kernels_winner", "sweep.numba.x86.kernels_vector_winner")
 @pytest.mark.parametrize("kinds", [(np.float32, np.int32), (np.uint16, np.uint16)])
 @pytest.mark.parametrize("at_once", [1, 4, 9])
 def test_winners_of_a_stream_equal_those_of_the_volume(
@@ -150,7 +155,7 @@ def test_winners_of_a_stream_equal_those_of_the_volume(
     np.testing.assert_array_equal(np.where(state[RIVAL] == largest, np.inf, state[RIVAL]), expected.rival)
 
 
-@pytest.mark.kernel("sweep.kernels_winner", "sweep.kernels_vector_winner")
+@pytest.mark.kernel("sweep.numba.kernels_winner", "sweep.numba.x86.kernels_vector_winner")
 def test_winners_of_rows_are_those_of_the_volume() -> None:
     volume = np.random.default_rng(9).integers(0, 60000, (5, 21, 45)).astype(np.uint16)
     expected = winners_of(volume.astype(np.float64))
@@ -160,14 +165,14 @@ def test_winners_of_rows_are_those_of_the_volume() -> None:
     np.testing.assert_array_equal(state[RIVAL], expected.rival[3:])
 
 
-@pytest.mark.kernel("sweep.kernels_band")
+@pytest.mark.kernel("sweep.numba.kernels_source_cost")
 def test_costs_are_stored_rounded_and_saturated() -> None:
     voxels = np.zeros(5, np.uint8)
     store_row(np.array([0.0, 1.24, 1.26, 100.0, 1e6], np.float32), np.float32(2.0), voxels)
     assert voxels.tolist() == [0, 2, 3, 200, 255]
 
 
-@pytest.mark.kernel("sweep.kernels_sgm")
+@pytest.mark.kernel("sweep.numba.kernels_sgm")
 @pytest.mark.parametrize("direction", DIRECTIONS)
 def test_paths_over_the_poles_equal_a_walk_pixel_by_pixel(direction: tuple[int, int]) -> None:
     rng = np.random.default_rng(9)
@@ -184,7 +189,7 @@ def test_paths_over_the_poles_equal_a_walk_pixel_by_pixel(direction: tuple[int, 
             assert total[row, :, column].tolist() == cost.tolist()
 
 
-@pytest.mark.kernel("sweep.kernels_sgm")
+@pytest.mark.kernel("sweep.numba.kernels_sgm")
 def test_paths_along_a_row_equal_a_walk_pixel_by_pixel() -> None:
     rng = np.random.default_rng(10)
     (height, width), depth, p1, warm = (3, 20), 5, 9, 10
@@ -213,7 +218,7 @@ def test_one_step_of_many_paths_equals_each_alone() -> None:
             assert together[d, k] == costs[d, k] + min([before[d, k], floor + p2, *around]) - floor
 
 
-@pytest.mark.kernel("sweep.kernels_sgm", "sweep.kernels_vector_path")
+@pytest.mark.kernel("sweep.numba.kernels_sgm", "sweep.numba.x86.kernels_vector_path")
 @pytest.mark.skipif(not HAS_VECTOR, reason="there is nothing but loops")
 @pytest.mark.parametrize(("drift", "upward"), [(0, False), (1, False), (-1, True)])
 @pytest.mark.parametrize(("lines", "first"), [(100, 0), (40, 70), (5, 99), (33, 1)])

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.kernels_census import count_census_row
-from pano_mvs.algorithms.sweep.kernels_cost import census_row
-from pano_mvs.algorithms.sweep.kernels_lookup import warp_band
-from pano_mvs.algorithms.sweep.kernels_project import knot_rows
-from pano_mvs.algorithms.sweep.kernels_sad import add_differences, interleave_rows
-from pano_mvs.algorithms.sweep.kernels_vector import HAS_VECTOR, _lanes_of_this_machine
-from pano_mvs.algorithms.sweep.packing import pack_colors, pack_plane, pack_sources
+from pano_mvs.algorithms.sweep.numba.kernels_census import count_census_row
+from pano_mvs.algorithms.sweep.numba.kernels_cost import census_row
+from pano_mvs.algorithms.sweep.numba.kernels_lookup import warp_band
+from pano_mvs.algorithms.sweep.numba.kernels_project import knot_rows
+from pano_mvs.algorithms.sweep.numba.kernels_records import Lookup, Sources
+from pano_mvs.algorithms.sweep.numba.kernels_sad import add_differences, interleave_rows
+from pano_mvs.algorithms.sweep.numba.packing import pack_colors, pack_plane, pack_sources
+from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR, _lanes_of_this_machine
 from pano_mvs.geometry import pad_panorama, pixel_from_ray, ray_grid, rotation_from_rotvec, sample_panorama
 from tests.oracles import sweep as oracle
 
@@ -52,16 +53,15 @@ def _warped(
     valid = np.ones((source.shape[0] + 1) * (source.shape[1] + 2), np.uint8)
     against = np.zeros((0, width), np.uint32) if against is None else against
     pixel_costs = np.zeros((rows + 2 * halo, width + 2 * pad), np.uint16)
-    warp_band(
-        first - halo, height, sin_cos, np.column_stack([ROTATION, translation]), 1.3, packed, colors, starts[0],
-        np.array(source.shape[:2]), valid, 0, vector, pad, knots, warped, votes, against,
-        pixel_costs,
-    )  # fmt: skip
+    shapes, poses = np.array([source.shape[:2]]), np.column_stack([ROTATION, translation])[None]
+    sources = Sources(poses, packed, colors, starts, shapes, valid, np.zeros(1, np.int64), vector)
+    found = Lookup(knots, warped, votes, against, pixel_costs)
+    warp_band(first - halo, height, sin_cos, sources, 0, 1.3, pad, found)
     assert votes.all()
     return pixel_costs if len(against) else warped
 
 
-@pytest.mark.kernel("sweep.kernels_lookup", "sweep.kernels_warp", "sweep.kernels_project")
+@pytest.mark.kernel("sweep.numba.kernels_lookup", "sweep.numba.kernels_warp", "sweep.numba.kernels_project")
 @pytest.mark.parametrize("source_hw", [(16, 32), (24, 48), (16, 64)])
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("translation", TRANSLATIONS)
@@ -101,7 +101,7 @@ def test_instructions_that_numba_must_not_use_are_left_unused(
 
 
 @needs_vector
-@pytest.mark.kernel("sweep.kernels_lookup", "sweep.kernels_vector")
+@pytest.mark.kernel("sweep.numba.kernels_lookup", "sweep.numba.x86.kernels_vector")
 @pytest.mark.parametrize("channels", [1, 3])
 def test_vector_instructions_give_what_loops_give(channels: int) -> None:
     source = _picture(2, (64, 128, channels))
@@ -112,7 +112,7 @@ def test_vector_instructions_give_what_loops_give(channels: int) -> None:
 
 
 @needs_vector
-@pytest.mark.kernel("sweep.kernels_lookup", "sweep.kernels_vector")
+@pytest.mark.kernel("sweep.numba.kernels_lookup", "sweep.numba.x86.kernels_vector")
 def test_differences_added_while_sampling_are_those_of_what_is_sampled() -> None:
     reference, source = _picture(4, (3, 56, 72)), _picture(5, (64, 128, 3))
     warped = _warped(source, TRANSLATIONS[1], (48, 64), vector=True, first=5, rows=8)
@@ -136,7 +136,7 @@ def test_packed_patches_hold_the_four_neighbours_over_seam_and_poles() -> None:
         assert both[:, 1].ravel().tolist() == corners
 
 
-@pytest.mark.kernel("sweep.kernels_census")
+@pytest.mark.kernel("sweep.numba.kernels_census")
 @pytest.mark.parametrize("side", [3, 7, 15])
 @pytest.mark.parametrize("width", [20, 64, 100])
 def test_census_by_vector_instructions_counts_what_loops_count(side: int, width: int) -> None:

@@ -11,15 +11,16 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.combination import parallax_weights
-from pano_mvs.algorithms.sweep.costs import BUILTIN_COSTS
-from pano_mvs.algorithms.sweep.kernels_gradient import census_gradient_row, sad_gradient_row
-from pano_mvs.algorithms.sweep.kernels_zncc import zncc_rows
-from pano_mvs.algorithms.sweep.settings import (
+from pano_mvs.algorithms.sweep.costs.census_gradient import census_weight
+from pano_mvs.algorithms.sweep.costs.kernels_constants import (
     GREY_WEIGHT,
-    LARGEST_COLOR_COST,
-    LARGEST_GRADIENT_COST,
+    MAX_COLOR_COST,
+    MAX_GRADIENT_COST,
     ZNCC_NOISE_VARIANCE,
 )
+from pano_mvs.algorithms.sweep.costs.registry import BUILTIN
+from pano_mvs.algorithms.sweep.numba.kernels_gradient import census_gradient_row, sad_gradient_row
+from pano_mvs.algorithms.sweep.numba.kernels_zncc import zncc_rows
 from pano_mvs.algorithms.sweep.sweep import SweepSettings, sweep_range
 from pano_mvs.algorithms.sweep.windows import column_offsets
 from pano_mvs.algorithms.sweep.winner import Winners, confidence, subplane_offset
@@ -31,7 +32,7 @@ from tests.oracles import sweep as oracle
 Capture = tuple[list[NDArray[np.uint8]], list[Rigid3], NDArray[np.float32]]
 
 SIZE = 16, 32
-NAMES = {"cost": tuple(sorted(BUILTIN_COSTS))} | {
+NAMES = {"cost": tuple(BUILTIN)} | {
     name: get_args(hint) for name, hint in get_type_hints(SweepSettings).items() if get_args(hint)
 }
 
@@ -62,7 +63,7 @@ def good_share(result: RangeMap, truth: NDArray[np.float32], ratio: float = 1.07
     return float((np.maximum(result.range / truth, truth / result.range) < ratio).mean())
 
 
-@pytest.mark.kernel("sweep.kernels_zncc")
+@pytest.mark.kernel("sweep.numba.kernels_zncc")
 @pytest.mark.parametrize("first", [0, 6, 13])
 def test_correlation_by_running_sums_equals_the_definition(first: int) -> None:
     rng = np.random.default_rng(first)
@@ -88,7 +89,7 @@ def test_correlation_by_running_sums_equals_the_definition(first: int) -> None:
     np.testing.assert_allclose(means, expected, atol=2e-4)
 
 
-@pytest.mark.kernel("sweep.kernels_gradient")
+@pytest.mark.kernel("sweep.numba.kernels_gradient")
 @pytest.mark.parametrize("row", [0, 7, 15])
 def test_differences_of_colours_and_gradients_equal_the_definition(row: int) -> None:
     rng = np.random.default_rng(row)
@@ -97,7 +98,7 @@ def test_differences_of_colours_and_gradients_equal_the_definition(row: int) -> 
     pad, total = 4, np.zeros(SIZE[1], np.uint16)
     padded = [np.stack([pad_panorama(plane, pad) for plane in np.moveaxis(p, -1, 0)]) for p in (reference, warped)]
     sad_gradient_row(padded[0], row + pad, padded[1], row + pad, 2, pad, total)
-    limits = LARGEST_COLOR_COST, LARGEST_GRADIENT_COST
+    limits = MAX_COLOR_COST, MAX_GRADIENT_COST
     expected = [
         oracle.sad_gradient_cost(reference, warped, row, column, reach=2, limits=limits) for column in range(SIZE[1])
     ]
@@ -105,7 +106,7 @@ def test_differences_of_colours_and_gradients_equal_the_definition(row: int) -> 
     assert len(set(expected)) > 5
 
 
-@pytest.mark.kernel("sweep.kernels_gradient")
+@pytest.mark.kernel("sweep.numba.kernels_gradient")
 def test_census_beside_grey_levels_equals_the_definition() -> None:
     rng = np.random.default_rng(5)
     reference = rng.integers(0, 256, SIZE, dtype=np.uint8)
@@ -114,7 +115,7 @@ def test_census_beside_grey_levels_equals_the_definition() -> None:
     disagree, total = np.zeros(SIZE[1], np.uint8), np.zeros(SIZE[1], np.uint16)
     padded = [pad_panorama(picture, pad) for picture in (reference, warped)]
     census_gradient_row(padded[0], row + pad, padded[1], row + pad, offsets[row], 10, pad, disagree, total)
-    limits = LARGEST_COLOR_COST // 3, LARGEST_GRADIENT_COST // 3
+    limits = MAX_COLOR_COST // 3, MAX_GRADIENT_COST // 3
     expected = []
     for column in range(SIZE[1]):
         census = oracle.census_cost(reference, warped, row, column, offsets[row])
@@ -128,7 +129,7 @@ def test_census_beside_grey_levels_equals_the_definition() -> None:
 @pytest.mark.parametrize("window", [3, 5, 7, 9, 15])
 def test_census_counts_four_times_as_much_as_grey_levels_at_their_worst(window: int) -> None:
     settings = SweepSettings(cost="census_gradient", window=window)
-    census = settings.census_weight * (window**2 - 1)
+    census = census_weight(window // 2) * (window**2 - 1)
     assert census == pytest.approx(0.8 * settings.worst_cost, rel=0.1)
 
 

@@ -88,7 +88,11 @@ def test_the_compiled_sweep_equals_the_readable_one(settings: SweepSettings, mas
 
 
 @pytest.mark.kernel(
-    "sweep.kernels_band", "sweep.kernels_sgm", "sweep.kernels_lookup", "sweep.kernels_warp", "sweep.kernels_winner"
+    "sweep.numba.kernels_band",
+    "sweep.numba.kernels_sgm",
+    "sweep.numba.kernels_lookup",
+    "sweep.numba.kernels_warp",
+    "sweep.numba.kernels_winner",
 )
 @pytest.mark.parametrize("changes", [{}, {"cost": "sad", "aggregation": "box"}])
 def test_a_tiny_sweep_equals_the_readable_one(changes: dict[str, str]) -> None:
@@ -253,7 +257,7 @@ def test_calls_that_cannot_work_say_why() -> None:
     [
         ({"planes": 2}, "planes"),
         ({"window": 6}, "window must be odd"),
-        ({"support": 17}, "support must be odd"),
+        ({"support": 17}, "support must be at most 15"),
         ({"window": 1}, "census needs"),
         ({"window": 1, "cost": "zncc"}, "zncc needs"),
         ({"best": 0}, "best must"),

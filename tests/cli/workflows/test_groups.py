@@ -180,7 +180,7 @@ def _check_evaluation(pano_mvs: Command, out: Path, rooms: Path) -> None:
     assert views["a0"]["scale"] == pytest.approx(2.0, rel=0.02)
     assert views["b0"]["scale"] == pytest.approx(1.0, rel=0.02)
     poses = pano_mvs("evaluate", "poses", out, "--truth", rooms / "capture" / "truth" / "poses.json")
-    assert "1 further groups of 2 images" in poses.flat
+    assert "1 further group of 2 images" in poses.flat
 
 
 def test_the_terminal_says_what_the_report_finds_of_groups(capsys: pytest.CaptureFixture[str]) -> None:

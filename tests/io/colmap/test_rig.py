@@ -68,7 +68,7 @@ def test_maps_have_colmaps_layout(tmp_path: Path, shape: tuple[int, ...]) -> Non
 def test_broken_maps_are_named(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "map.bin"
     path.write_bytes(data)
-    with pytest.raises(InputError, match="no complete depth or normal map"):
+    with pytest.raises(InputError, match="not a complete depth or normal map"):
         read_colmap_map(path)
     with pytest.raises(InputError, match="cannot be read"):
         read_colmap_map(tmp_path / "none.bin")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -49,3 +50,11 @@ def test_a_picture_tells_where_it_was_taken(tmp_path: Path) -> None:
     assert describe_picture(write_jpeg(tmp_path / "a.jpg", (32, 64))).position_lla is None
     info = describe_picture(write_jpeg(tmp_path / "b.jpg", (32, 64), segments=app1(b"Exif\0\0" + exif())))
     assert info.position_lla == pytest.approx((47.51, 8.25, 123.4))
+
+
+def test_an_entry_that_points_outside_of_the_data_hides_no_others() -> None:
+    """Pillow stops at such an entry, and the position behind it is lost."""
+    data = exif(orientation=6)
+    description = struct.pack("<HHII", 0x010E, 2, 40, 1_000_000)
+    damaged = data[:10] + description + data[22:]
+    assert position_from_exif(damaged) == pytest.approx((47.51, 8.25, 123.4))

@@ -1,0 +1,1 @@
+"""The faster sweep: half the resolution guides the full one. Needs numba."""

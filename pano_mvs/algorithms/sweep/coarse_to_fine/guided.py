@@ -1,0 +1,185 @@
+"""The sweep at full resolution among candidates around two guides."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guided import sweep_guided_band
+from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guided_paths import (
+    PER_PLANE,
+    cheapest_candidates,
+    follow_guided_rows,
+    follow_guided_strip,
+)
+from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guides import adopt_candidates
+from pano_mvs.algorithms.sweep.hypotheses import range_at
+from pano_mvs.algorithms.sweep.no_match import is_bare
+from pano_mvs.algorithms.sweep.numba.arguments import BAND_ROWS, NO_VOLUME, fresh_state, sweep_arguments
+from pano_mvs.algorithms.sweep.numba.kernels_band import sweep_band
+from pano_mvs.algorithms.sweep.numba.kernels_records import Guide
+from pano_mvs.algorithms.sweep.numba.kernels_winner import BEST
+from pano_mvs.algorithms.sweep.numba.threads import Pool, run_jobs
+from pano_mvs.algorithms.sweep.numba.tiles import TileRun, run_arguments, runs_of, spread_tiles, tile_means
+from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, step_penalties, warm_up
+from pano_mvs.algorithms.sweep.preparation import SweepInput
+from pano_mvs.algorithms.sweep.winner import Winners
+from pano_mvs.geometry import pad_panorama
+
+STEPS = 3
+"""Planes on either side of a guide that are tried."""
+
+_COUNT = 2 * STEPS + 1
+_STRIP_LINES = 64
+_ROW_LINES = 32
+_TABLE_PER_PLANE = 8
+# Guides closer than this are one surface.
+_MIN_GAP = 0.5
+# Shares of the worst cost: a match this dear is a poor one; it is odd if it is dearer than its tile by this; and
+# another is better if it is cheaper by this.
+_NO_MATCH, _UNUSUAL, _BETTER = 0.2, 0.15, 0.03
+_UNUSUAL_SHARE = 0.03
+_SEARCH_STEP = 2
+# Along the guides paths need less to hold them together.
+_P1_SHARE = 0.7
+_ADOPT_RADIUS, _ADOPT_GAP = 2, 3.0
+
+
+class GuidedSweep:
+    """One sweep around guides; see `coarse_to_fine`.
+
+    Attributes:
+        work: what is swept.
+        guides: (2, H, W) float32 positions among its planes.
+        volume: (H, 2 · 7, W) costs of the candidates: uint8 for semi-global matching, else float32 means.
+    """
+
+    def __init__(self, work: SweepInput, guides: NDArray[np.float32], pool: Pool) -> None:
+        height, width = work.reference.shape[:2]
+        self.work, self.guides, self._pool = work, guides, pool
+        self._by_paths = work.settings.aggregation == "sgm"
+        self.volume = np.empty((height, 2 * _COUNT, width), np.uint8 if self._by_paths else np.float32)
+        self._shared = sweep_arguments(work)
+        self._table = _inverse_ranges(work)
+
+    def find_winners(self) -> Winners:
+        """Return the winning candidates and the costs around them."""
+        everywhere = np.ones(self.guides.shape[1:], np.bool_)
+        self._sweep(0, everywhere)
+        self.volume[:, _COUNT:] = self.volume[:, :_COUNT]
+        self._sweep(1, np.abs(self.guides[1] - self.guides[0]) > _MIN_GAP)
+        self._search()
+        return self._decide(self._aggregated() if self._by_paths else self.volume)
+
+    def _sweep(self, layer: int, active: NDArray[np.bool_]) -> None:
+        """Compute the costs around one guide in all tiles in which any pixel is active."""
+        halo = self.work.settings.compare_radius + self.work.settings.box_radius
+        guide = pad_panorama(self.guides[layer], halo)[:, halo:-halo] if halo else self.guides[layer]
+        run_jobs(
+            self._pool,
+            partial(self._sweep_run, layer=layer, guide=guide, halo=halo),
+            runs_of(tile_means(active) > 0, active.shape, self._shared.windows),
+        )
+
+    def _sweep_run(self, run: TileRun, *, layer: int, guide: NDArray[np.float32], halo: int) -> None:
+        columns = run.with_margin % guide.shape[1]
+        around = np.ascontiguousarray(guide[run.first : run.first + run.rows + 2 * halo][:, columns])
+        sweep = run_arguments(self._shared, run)
+        if not self._by_paths:
+            sweep = sweep._replace(scale=np.float32(0))
+        costs = np.empty((run.rows, _COUNT, len(columns)), self.volume.dtype)
+        sweep_guided_band(run.first, sweep, Guide(around, self._table, _TABLE_PER_PLANE), costs)
+        rows, own = run.place
+        self.volume[rows, layer * _COUNT : (layer + 1) * _COUNT, own] = costs[:, :, run.inner]
+
+    def _search(self) -> None:
+        """Sweep tiles over all ranges where the guides do not match, and let better matches replace a guide."""
+        settings, unit = self.work.settings, 255.0 if self._by_paths else self.work.settings.worst_cost
+        least = self.volume.min(axis=1).astype(np.float32)
+        tiles = self._tiles_to_search(least, unit)
+        runs = runs_of(tiles, least.shape, self._shared.windows)
+        if not runs:
+            return
+        plane = np.zeros(least.shape, np.float32)
+        costs = np.full(least.shape, np.inf, np.float32)
+        run_jobs(self._pool, partial(self._search_run, plane, costs), runs)
+        costs *= unit / settings.worst_cost
+        costs[~(costs + _BETTER * unit < least)] = np.inf
+        adopted = np.full(least.shape, np.nan, np.float32)
+        padded = [pad_panorama(picture, _ADOPT_RADIUS) for picture in (plane, costs)]
+        adopt_candidates(*padded, _ADOPT_RADIUS, np.float32(_ADOPT_GAP), adopted)
+        self._adopt(np.where(spread_tiles(tiles, least.shape), adopted, np.nan))
+
+    def _tiles_to_search(self, least: NDArray[np.float32], unit: float) -> NDArray[np.bool_]:
+        """Return the tiles, (bands, tiles), in which pixels match much worse than most of their tile do."""
+        usual = spread_tiles(tile_means(least), least.shape)
+        odd = (least > _NO_MATCH * unit) & (least > usual + _UNUSUAL * unit) & ~is_bare(self.work.reference)
+        return tile_means(odd) > _UNUSUAL_SHARE
+
+    def _search_run(self, plane: NDArray[np.float32], costs: NDArray[np.float32], run: TileRun) -> None:
+        state, planes = fresh_state(run.rows, len(run.with_margin))
+        farthest = int(self.guides[(slice(None), *run.place)].max()) + STEPS
+        ranges = np.ascontiguousarray(self.work.ranges[: farthest + 1 : _SEARCH_STEP])
+        sweep_band(run.first, run_arguments(self._shared, run), ranges, NO_VOLUME, state, planes)
+        plane[run.place] = _SEARCH_STEP * planes[:, run.inner]
+        costs[run.place] = state[BEST][:, run.inner]
+
+    def _adopt(self, adopted: NDArray[np.float32]) -> None:
+        """Put a third surface in the place of the dearer guide, or beside the only one, and sweep there again."""
+        taken = np.isfinite(adopted)
+        first, second = self.volume[:, :_COUNT].min(axis=1), self.volume[:, _COUNT:].min(axis=1)
+        single = np.abs(self.guides[1] - self.guides[0]) <= _MIN_GAP
+        replaces_first = np.where(single, adopted < self.guides[0], first > second)
+        for layer, replaced in enumerate((taken & replaces_first, taken & ~replaces_first)):
+            self.guides[layer][replaced] = adopted[replaced]
+            self._sweep(layer, replaced)
+
+    def _aggregated(self) -> NDArray[np.uint16]:
+        """Return the sums of eight paths, (H, 2 · 7, W)."""
+        height, _, width = self.volume.shape
+        settings, total = self.work.settings, np.zeros(self.volume.shape, np.uint16)
+        guides = np.ascontiguousarray(np.moveaxis(np.rint(self.guides * PER_PLANE).astype(np.int16), 0, 1))
+        p1 = np.uint16(_P1_SHARE * settings.penalties(height)[0])
+        beyond_pole, before_seam = warm_up((height, width))
+        for rows, columns in DIRECTIONS:
+            penalties = step_penalties(self.work.reference, (rows, columns), settings)
+
+            def strip(
+                first: int, penalties: NDArray[np.uint16] = penalties, rows: int = rows, columns: int = columns
+            ) -> None:
+                lines = min(_STRIP_LINES, width - first)
+                follow_guided_strip(
+                    self.volume, total, guides, penalties, p1, first, lines, columns, rows < 0, beyond_pole, True
+                )
+
+            run_jobs(self._pool, strip, range(0, width, _STRIP_LINES))
+        sideways = np.stack([step_penalties(self.work.reference, (0, step), settings) for step in (1, -1)])
+
+        def both_ways(first: int) -> None:
+            lines = min(_ROW_LINES, height - first)
+            follow_guided_rows(self.volume, total, guides, sideways, p1, first, lines, before_seam // 4)
+
+        run_jobs(self._pool, both_ways, range(0, height, _ROW_LINES))
+        return total
+
+    def _decide(self, total: NDArray[np.uint16] | NDArray[np.uint8] | NDArray[np.float32]) -> Winners:
+        height, _, width = total.shape
+        position = np.empty((height, width), np.float32)
+        costs = np.empty((4, height, width), np.float32)
+
+        def decide(first: int) -> None:
+            rows = slice(first, first + BAND_ROWS)
+            cheapest_candidates(total, self.guides, first, self.work.settings.planes, position[rows], costs[:, rows])
+
+        run_jobs(self._pool, decide, range(0, height, BAND_ROWS))
+        plane = np.rint(position).astype(np.int32)
+        return Winners(plane, costs[0], costs[1], costs[2], costs[3], position - plane)
+
+
+def _inverse_ranges(work: SweepInput) -> NDArray[np.float32]:
+    settings = work.settings
+    positions = np.arange((settings.planes - 1) * _TABLE_PER_PLANE + 1) / _TABLE_PER_PLANE
+    ranges = range_at(positions, work.ranges[0], work.ranges[-1], planes=settings.planes, spacing=settings.spacing)
+    return (1 / ranges).astype(np.float32)

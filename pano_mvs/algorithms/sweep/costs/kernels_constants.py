@@ -1,0 +1,19 @@
+"""Numbers that are compiled into the kernels and that others need too. This module does not import numba.
+
+The folder of compiled kernels is named by the text of all files `kernels_*.py`; a constant anywhere else could change
+without the kernels being compiled again.
+"""
+
+from __future__ import annotations
+
+# The cost that `kernels_source_cost` computes.
+CENSUS, ZNCC, SAD, SAD_GRADIENT, CENSUS_GRADIENT = range(5)
+
+# Truncated costs: differences of colours, summed over R, G and B, in grey levels …
+MAX_COLOR_COST = 30
+# … and differences of gradients (over two pixels), summed over R, G and B and over both directions.
+MAX_GRADIENT_COST = 60
+# "census_gradient": a grey level of difference counts this many times.
+GREY_WEIGHT = 8
+# The variance of noise, in grey levels squared, that is added to the variance of every window.
+ZNCC_NOISE_VARIANCE = 4.0

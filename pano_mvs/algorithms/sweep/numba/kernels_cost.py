@@ -1,0 +1,89 @@
+"""Compiled: census and differences of one row, and means over boxes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from pano_mvs.algorithms.sweep.numba.kernels_records import F32, I32, I64, U8, U16
+
+_F = np.float32
+_U = np.uint64
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def census_row(
+    reference: U8, reference_row: int, warped: U8, warped_row: int, offsets: I64, pad: int, disagree: U8
+) -> None:
+    """Count the neighbours whose order against the centre differs between reference and warped source.
+
+    Args:
+        reference: (rows, W + 2 pad) uint8 grey, wrapped.
+        reference_row: row of the window's centre in `reference`.
+        warped: likewise, the source.
+        warped_row: row of the window's centre in `warped`.
+        offsets: (window,) int64 columns of the window against its centre.
+        pad: width of the wrapped margin.
+        disagree: (W,) uint8, written.
+    """
+    side = offsets.shape[0]
+    width = _U(disagree.shape[0])
+    middle = _U(pad)
+    r0, w0 = _U(reference_row), _U(warped_row)
+    disagree[:] = 0
+    for j in range(side):
+        r, w = _U(reference_row + j - side // 2), _U(warped_row + j - side // 2)
+        for k in range(side):
+            if j == side // 2 and k == side // 2:
+                continue
+            first = _U(pad + offsets[k])
+            for i in range(width):
+                differs = (reference[r, first + i] > reference[r0, middle + i]) != (
+                    warped[w, first + i] > warped[w0, middle + i]
+                )
+                disagree[i] = np.uint8(disagree[i] + np.uint8(differs))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def difference_row(reference: U8, reference_row: int, warped: U8, warped_row: int, pad: int, total: U16) -> None:
+    """Add |reference − warped| of one row of one colour to `total`, (W,) uint16."""
+    r, w, first = _U(reference_row), _U(warped_row), _U(pad)
+    for i in range(_U(total.shape[0])):
+        difference = np.int16(np.int16(reference[r, first + i]) - np.int16(warped[w, first + i]))
+        total[i] = np.uint16(total[i] + np.uint16(abs(difference)))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def box_rows(pixel_costs: U16, reach: I64, radius: int, pad: int, column_sums: I32, prefix: I32, means: F32) -> None:
+    """Average costs over windows of 2 radius + 1 rows by 2 reach + 1 columns, in O(1) each.
+
+    Args:
+        pixel_costs: (rows + 2 radius, W + 2 pad) uint16, wrapped.
+        reach: (rows,) int64 columns on either side, at most pad − 1, for each row.
+        radius: rows on either side.
+        pad: width of the wrapped margin.
+        column_sums: (W + 2 pad,) int32, scratch.
+        prefix: (W + 2 pad,) int32, scratch.
+        means: (rows, W) float32, written.
+    """
+    rows, width = means.shape
+    padded = _U(pixel_costs.shape[1])
+    column_sums[:] = 0
+    for j in range(2 * radius):
+        for i in range(padded):
+            column_sums[i] = np.int32(column_sums[i] + np.int32(pixel_costs[_U(j), i]))
+    for y in range(rows):
+        entering, leaving = _U(y + 2 * radius), _U(y)
+        for i in range(padded):
+            column_sums[i] = np.int32(column_sums[i] + np.int32(pixel_costs[entering, i]))
+        running = np.int32(0)
+        for i in range(padded):
+            running = np.int32(running + column_sums[i])
+            prefix[i] = running
+        left, right = _U(pad - reach[y] - 1), _U(pad + reach[y])
+        share = _F(1.0 / ((2 * radius + 1) * (2 * reach[y] + 1)))
+        row = _U(y)
+        for i in range(_U(width)):
+            means[row, i] = _F(np.int32(prefix[right + i] - prefix[left + i])) * share
+        for i in range(padded):
+            column_sums[i] = np.int32(column_sums[i] - np.int32(pixel_costs[leaving, i]))

@@ -1,0 +1,95 @@
+"""Compiled: truncated differences of colour and of gradient, alone and beside census."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from pano_mvs.algorithms.sweep.costs.kernels_constants import GREY_WEIGHT, MAX_COLOR_COST, MAX_GRADIENT_COST
+from pano_mvs.algorithms.sweep.numba.kernels_census import count_census_row
+from pano_mvs.algorithms.sweep.numba.kernels_cost import difference_row
+from pano_mvs.algorithms.sweep.numba.kernels_records import I64, U8, U16
+
+_U = np.uint64
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def gradient_row(
+    reference: U8, reference_row: int, warped: U8, warped_row: int, reach: int, pad: int, total: U16
+) -> None:
+    """Add |∂x r − ∂x w| + |∂y r − ∂y w| of one row of one colour to `total`, (W,) uint16.
+
+    Central differences, not halved: over two rows, and over `reach` columns on either side.
+    """
+    r, w = _U(reference_row), _U(warped_row)
+    r_up, r_down = _U(reference_row - 1), _U(reference_row + 1)
+    w_up, w_down = _U(warped_row - 1), _U(warped_row + 1)
+    left, middle, right = _U(pad - reach), _U(pad), _U(pad + reach)
+    for i in range(_U(total.shape[0])):
+        across = np.int32(reference[r, right + i]) - np.int32(reference[r, left + i])
+        across -= np.int32(warped[w, right + i]) - np.int32(warped[w, left + i])
+        down = np.int32(reference[r_down, middle + i]) - np.int32(reference[r_up, middle + i])
+        down -= np.int32(warped[w_down, middle + i]) - np.int32(warped[w_up, middle + i])
+        total[i] = np.uint16(np.int32(total[i]) + abs(across) + abs(down))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def sad_gradient_row(
+    reference: U8, reference_row: int, warped: U8, warped_row: int, reach: int, pad: int, total: U16
+) -> None:
+    """Write the truncated differences of one row to `total`, (W,) uint16: of all colours, and of their gradients.
+
+    Args:
+        reference: (C, rows, W + 2 pad) uint8, wrapped.
+        reference_row: its row.
+        warped: likewise, the source.
+        warped_row: its row.
+        reach: columns from a pixel to those of its horizontal gradient.
+        pad: width of the wrapped margin.
+        total: written.
+    """
+    gradient = np.zeros(total.shape[0], np.uint16)
+    total[:] = 0
+    for c in range(reference.shape[0]):
+        difference_row(reference[c], reference_row, warped[c], warped_row, pad, total)
+        gradient_row(reference[c], reference_row, warped[c], warped_row, reach, pad, gradient)
+    for i in range(_U(total.shape[0])):
+        color = min(np.int32(total[i]), np.int32(MAX_COLOR_COST))
+        total[i] = np.uint16(color + min(np.int32(gradient[i]), np.int32(MAX_GRADIENT_COST)))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def census_gradient_row(
+    reference: U8,
+    reference_row: int,
+    warped: U8,
+    warped_row: int,
+    offsets: I64,
+    census_weight: int,
+    pad: int,
+    disagree: U8,
+    total: U16,
+) -> None:
+    """Write the census cost of one row, its weight times, plus that of grey levels and of their gradients.
+
+    Args:
+        reference: (rows, W + 2 pad) uint8 grey, wrapped.
+        reference_row: its row.
+        warped: likewise, the source.
+        warped_row: its row.
+        offsets: (window,) int64 columns of the census window against its centre.
+        census_weight: see `SweepSettings.census_weight`.
+        pad: width of the wrapped margin.
+        disagree: (W,) uint8, scratch.
+        total: (W,) uint16, written.
+    """
+    count_census_row(reference, reference_row, warped, warped_row, offsets, pad, disagree)
+    gradient = np.zeros(total.shape[0], np.uint16)
+    total[:] = 0
+    difference_row(reference, reference_row, warped, warped_row, pad, total)
+    reach = offsets[offsets.shape[0] // 2 + 1]
+    gradient_row(reference, reference_row, warped, warped_row, reach, pad, gradient)
+    largest_level, largest_gradient = np.int32(MAX_COLOR_COST // 3), np.int32(MAX_GRADIENT_COST // 3)
+    for i in range(_U(total.shape[0])):
+        grey = min(np.int32(total[i]), largest_level) + min(np.int32(gradient[i]), largest_gradient)
+        total[i] = np.uint16(np.int32(census_weight) * np.int32(disagree[i]) + np.int32(GREY_WEIGHT) * grey)

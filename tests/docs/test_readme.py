@@ -1,0 +1,60 @@
+"""What the README says is true: its commands exist, its plugin and its workflow run."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import cv2
+import pytest
+from typer.testing import CliRunner
+
+from pano_mvs.cli.app import app
+from pano_mvs.testing.room import capture_poses, default_room, write_capture
+from tests.stored import read_picture
+
+README = Path(__file__).parents[2] / "README.md"
+
+
+def block(mark: str) -> str:
+    """Return the fenced block that follows a mark."""
+    found = re.search(rf"<!-- {mark} -->\n```\w+\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+    assert found, mark
+    return found.group(1)
+
+
+def test_plugin_and_workflow_run_as_they_stand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_capture(tmp_path / "room", default_room(), capture_poses(3, spread=0.4), (128, 256))
+    (tmp_path / "room" / "images").rename(tmp_path / "photos")
+    (tmp_path / "far_cut.py").write_text(block("plugin"))
+    (tmp_path / "mine.yaml").write_text(block("workflow"))
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(app, ["run", "mine.yaml", "--set", "depth.planes=16", "--set", "near.far=8"])
+    assert result.exit_code == 0, result.output
+    for path in sorted((tmp_path / "out" / "mine" / "range").iterdir()):
+        ranges = read_picture(path, cv2.IMREAD_UNCHANGED)
+        assert ranges[ranges == ranges].max() <= 8
+
+
+def test_quickstart_command_names_a_workflow_that_is_there() -> None:
+    workflow = re.search(r"pano-mvs run (\S+)", block("command: run"))
+    assert workflow
+    assert (README.parent / workflow.group(1)).is_file()
+
+
+def test_every_command_and_setting_that_is_named_exists() -> None:
+    text = README.read_text(encoding="utf-8")
+    runner = CliRunner()
+    for command in sorted(set(re.findall(r"pano-mvs (?:stage )?([a-z]+)", text))):
+        name = ["stage", "show"] if command == "show" else [command]
+        assert runner.invoke(app, [*name, "--help"]).exit_code == 0, command
+    for stage_name in sorted(set(re.findall(r"stage show (\S+?)`", text.replace("\n", " ")))):
+        assert runner.invoke(app, ["stage", "show", stage_name]).exit_code == 0
+    settings = [f"{name}=8" for name in re.findall(r"--set ([a-z]+\.[a-z_]+)=", text) if name != "poses.path"]
+    overrides = [argument for setting in settings for argument in ("--set", setting)]
+    assert runner.invoke(app, ["check", "quickstart", *overrides]).exit_code == 0
+
+
+@pytest.mark.parametrize("link", re.findall(r"\]\((?!http)([^)]+)\)", README.read_text(encoding="utf-8")))
+def test_links_lead_somewhere(link: str) -> None:
+    assert (README.parent / link).exists()

@@ -1,0 +1,303 @@
+"""Units of a stage from what its producers made: which run, wait, or cannot, and what their keys are made of."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from pano_mvs.core.digest import digest_from_value
+from pano_mvs.core.errors import InputError, UsageError
+from pano_mvs.engine.cache.store import ItemRef, Store
+from pano_mvs.engine.planning.resolve import KEY_SCHEMA, resolve, resolve_source
+from pano_mvs.engine.planning.units import PENDING, WHOLE, Resolution, StageState, Unit
+from pano_mvs.engine.stages.stage import SourceItem
+from pano_mvs.engine.stages.stage_code import reach_of_function, stage_code
+from pano_mvs.scene import Axis, Pairs, Views
+from tests.engine.conftest import Toy
+from tests.engine.workflows.test_wiring import MORE
+
+
+def ref(name: str) -> ItemRef:
+    return ItemRef("Number", f"digest of {name}", {})
+
+
+def images(*names: str, pending: str = "", failed: str = "") -> StageState:
+    """Return the state of a stage of images; those that are pending or failed have no value."""
+    there = {name: ref(name) for name in names if name not in pending and name not in failed}
+    members: dict[str, tuple[str, ...]] = {name: (name,) for name in names}
+    return StageState(Axis.IMAGE, there, {}, members, dict.fromkeys(failed, "dark"), set(pending))
+
+
+OPEN = StageState(Axis.IMAGE, open=True)
+
+
+class Resolved:
+    """A toy workflow with another stage at its end, of which states are put in by hand."""
+
+    def __init__(self, toy: Toy) -> None:
+        toy.edit("plug.py", lambda text: text + MORE)
+        more = ("plus: {use: toy.plus, in: {x: scaled}}", "again: {use: toy.scale, in: {x: shifted}}",
+                "seen: {use: toy.view, in: {mean: mean, x: shifted}}")  # fmt: skip
+        toy.edit("wf.yaml", lambda text: text + "".join(f"  {line}\n" for line in more))
+        self.toy = toy
+        self.session = toy.session()
+        self.store = Store(toy.folder / "cache")
+
+    def __call__(
+        self, stage: str, only: Mapping[str, frozenset[str]] | None = None, **states: StageState
+    ) -> tuple[dict[str, Unit], Resolution]:
+        graph = replace(self.session.graph, only=only or {})
+        units, resolution = resolve(self.session.workflow.stages[stage], graph, states=states, store=self.store)
+        return {unit.item: unit for unit in units}, resolution
+
+
+@pytest.fixture
+def resolved(toy: Toy) -> Resolved:
+    return Resolved(toy)
+
+
+def test_a_unit_reads_its_own_item_or_waits_or_says_what_it_lacks(resolved: Resolved) -> None:
+    units, rest = resolved("scaled", images=images("a", "b", "c", "d", pending="b", failed="c"))
+    assert list(units) == ["a", "d"]
+    assert (units["a"].inputs, units["a"].members, units["a"].label) == ({"x": ref("a")}, ("a",), "scaled:a")
+    assert (rest.waiting, rest.blocked, rest.open) == (["b"], {"c": "needs images:c, which failed"}, False)
+    assert rest.members == {name: (name,) for name in "abcd"}
+    state = images("a", "b")
+    del state.items["b"]
+    assert resolved("scaled", images=state)[1].blocked == {"b": "needs images:b, which has no result"}
+    units, rest = resolved("scaled", images=OPEN)
+    assert (units, rest.open, rest.blocked) == ({}, True, {})
+
+
+def test_a_stage_that_is_confined_has_the_units_that_are_asked_for(resolved: Resolved) -> None:
+    units, rest = resolved("scaled", {"scaled": frozenset({"c", "a"})}, images=images("a", "b", "c"))
+    assert list(units) == list(rest.members) == ["a", "c"]
+    with pytest.raises(UsageError, match=r"^scaled has no unit 'x'; it has: a, b$"):
+        resolved("scaled", {"scaled": frozenset({"x", "z"})}, images=images("a", "b"))
+    many = images(*(f"{number:02d}" for number in range(21)))
+    with pytest.raises(UsageError, match=r"18, 19 …$"):
+        resolved("scaled", {"scaled": frozenset({"x"})}, images=many)
+
+
+def test_names_of_what_will_come_count_and_of_what_failed_do_not(resolved: Resolved) -> None:
+    units, rest = resolved("pairs", scaled=images("a", "b", "c", pending="b", failed="c"))
+    assert units[WHOLE].inputs == {"names": {"a": ref("a"), "b": PENDING}}
+    assert units[WHOLE].identity["inputs"] == {"names": ["a", "b"]}
+    assert (units[WHOLE].label, rest.waiting) == ("pairs", [])
+    assert resolved("pairs", scaled=images("a", failed="a"))[1].blocked == {WHOLE: "needs scaled, which failed"}
+    assert resolved("pairs", scaled=images())[1].blocked == {WHOLE: "needs scaled, which has no result"}
+    assert resolved("pairs", scaled=OPEN)[1].waiting == [WHOLE]
+
+
+def test_a_gather_waits_for_all_and_does_without_what_failed(resolved: Resolved) -> None:
+    units, _ = resolved("shifted", scaled=images("a", "b", "c", failed="b"))
+    assert units[WHOLE].inputs == {"xs": {"a": ref("a"), "c": ref("c")}}
+    assert units[WHOLE].identity["inputs"] == {"xs": [[["a"], "digest of a"], [["c"], "digest of c"]]}
+    assert resolved("shifted", scaled=images("a", "b", pending="b"))[1].waiting == [WHOLE]
+    assert resolved("shifted", scaled=OPEN)[1].waiting == [WHOLE]
+    assert resolved("shifted", scaled=images("a", failed="a"))[1].blocked == {WHOLE: "needs scaled, which failed"}
+
+
+def whole(reference: ItemRef | None, *, pending: bool = False, failed: bool = False) -> StageState:
+    items = {} if reference is None else {WHOLE: reference}
+    return StageState(Axis.ONE, items, {}, {WHOLE: ()}, {WHOLE: "x"} if failed else {}, {WHOLE} if pending else set())
+
+
+def test_a_pair_needs_both_ends(resolved: Resolved) -> None:
+    index = whole(resolved.store.put_value(Pairs((("b", "a"), ("b", "c"), ("a", "d")))))
+    units, rest = resolved("difference", pairs=index, scaled=images("a", "b", "c", "d", pending="c", failed="d"))
+    assert list(units) == ["b | a"]
+    unit = units["b | a"]
+    assert unit.members == ("b", "a")
+    ends = unit.inputs["ends"]
+    assert isinstance(ends, dict)
+    assert list(ends) == ["b", "a"]
+    assert unit.identity["inputs"] == {"ends": ["digest of b", "digest of a"]}
+    assert rest.waiting == ["b | c"]
+    assert rest.blocked == {"a | d": "needs scaled:d, which failed"}
+    assert list(rest.members) == ["b | a", "b | c", "a | d"]
+
+
+def test_a_view_does_with_the_neighbours_that_there_are(resolved: Resolved) -> None:
+    index = whole(resolved.store.put_value(Views({"a": ("b", "c"), "b": ("c",), "d": ("a", "e"), "c": ()})))
+    units, rest = resolved("mean", views=index, scaled=images("a", "b", "c", "d", "e", failed="c", pending="e"))
+    assert list(units) == ["a"]
+    assert units["a"].inputs == {"own": ref("a"), "around": {"b": ref("b")}}
+    assert units["a"].members == ("a",)
+    assert units["a"].identity["inputs"] == {"own": "digest of a", "around": ["digest of b"]}
+    assert rest.waiting == ["d"]
+    assert rest.blocked == {
+        "b": "needs scaled:c, which failed",
+        "c": "needs scaled:c, which failed",
+    }
+    lonely, rest = resolved("mean", views=index, scaled=images("a", "b", "c", "d", "e"))
+    assert list(lonely) == ["a", "b", "d"]
+    assert rest.blocked == {"c": "needs scaled, which has no result"}
+
+
+@pytest.mark.parametrize("stage", ["difference", "mean"])
+def test_without_an_index_no_unit_is_known(resolved: Resolved, stage: str) -> None:
+    producer = {"difference": "pairs", "mean": "views"}[stage]
+    some = images("a", "b")
+    for state in (whole(None, pending=True), OPEN):
+        units, rest = resolved(stage, None, scaled=some, **{producer: state})
+        assert (units, rest.open, rest.blocked) == ({}, True, {})
+    units, rest = resolved(stage, None, scaled=some, **{producer: whole(None, failed=True)})
+    assert (units, rest.open) == ({}, False)
+    assert rest.blocked == {WHOLE: f"needs {producer}, which failed"}
+
+
+def test_a_port_that_is_not_connected_is_given_nothing(resolved: Resolved) -> None:
+    units, _ = resolved("plus", scaled=images("a"))
+    assert units["a"].inputs == {"x": ref("a"), "total": None}
+    assert units["a"].identity["inputs"] == {"x": "digest of a", "total": None}
+
+
+def test_items_of_a_collection_are_known_once_it_is_there(resolved: Resolved) -> None:
+    collection = whole(ref("all"))
+    collection.exploded = {"a": ref("a"), "b": ref("b")}
+    units, _ = resolved("again", shifted=collection)
+    assert {name: unit.inputs["x"] for name, unit in units.items()} == {"a": ref("a"), "b": ref("b")}
+    assert units["a"].members == ("a",)
+    assert resolved("again", shifted=OPEN)[1].open
+
+
+def test_units_that_read_an_item_of_a_collection_wait_for_it(resolved: Resolved) -> None:
+    collection = whole(ref("all"))
+    collection.exploded = {"a": ref("a in all")}
+    mean = images("a", "b")
+    mean.axis = Axis.VIEW
+    units, rest = resolved("seen", mean=mean, shifted=collection)
+    assert units["a"].inputs == {"mean": ref("a"), "x": ref("a in all")}
+    assert rest.blocked == {"b": "needs shifted:b, which has no result"}
+    for state in (whole(None, pending=True), OPEN):
+        mean.open = state.open
+        units, rest = resolved("seen", mean=mean, shifted=state)
+        if state.open:
+            assert rest.open
+            continue
+        assert (units, rest.blocked, rest.waiting) == ({}, {}, ["a", "b"])
+
+
+def test_a_stage_reads_several_producers(resolved: Resolved) -> None:
+    pairs = StageState(Axis.PAIR, {"a | b": ref("ab")}, {}, {"a | b": ("a", "b")})
+    units, _ = resolved("all", difference=pairs, shifted=whole(ref("s")))
+    assert units[WHOLE].identity["inputs"] == {
+        "differences": [[["a", "b"], "digest of ab"]], "shifted": "digest of s",
+    }  # fmt: skip
+    for state, blocked, waiting in (
+        (whole(None, failed=True), {WHOLE: "needs shifted, which failed"}, []),
+        (whole(None, pending=True), {}, [WHOLE]),
+    ):
+        units, rest = resolved("all", difference=pairs, shifted=state)
+        assert (units, rest.blocked, rest.waiting) == ({}, blocked, waiting)
+
+
+def test_a_key_is_made_of_the_identity_and_nothing_else(resolved: Resolved) -> None:
+    units, _ = resolved("scaled", images=images("a", "b"))
+    for unit in units.values():
+        static = {name: part for name, part in unit.identity.items() if name != "inputs"}
+        assert unit.key == digest_from_value([digest_from_value(static), unit.identity["inputs"]])
+    entry = resolved.session.workflow.stages["scaled"]
+    code = stage_code(entry.spec, entry.params)
+    assert units["a"].identity == {
+        "schema": KEY_SCHEMA, "stage": "toy.scale", "version": 1, "code": code.digest,
+        "libraries": dict(code.libraries), "params": {"by": 3.0}, "kinds": {"Number": 1},
+        "inputs": {"x": "digest of a"},
+    }  # fmt: skip
+    same = images("c", "a")
+    same.items["c"] = ref("a")
+    again, _ = resolved("scaled", images=same)
+    assert again["c"].key == again["a"].key == units["a"].key != units["b"].key
+
+
+def sources(toy: Toy, *items: SourceItem, only: frozenset[str] | None = None) -> tuple[dict[str, Unit], Resolution]:
+    entry = toy.session().workflow.stages["images"]
+    spec = replace(entry.spec, list_items=lambda _: items)
+    found = resolve_source(replace(entry, spec=spec), Store(toy.folder / "cache"), only=only)
+    return {unit.item: unit for unit in found.units}, found
+
+
+def test_a_source_s_units_are_known_by_name_and_content(toy: Toy) -> None:
+    paths = [toy.folder / "capture" / f"{number}.txt" for number in (1, 2)]
+    first, second = (SourceItem(name, {"text": path}) for name, path in zip("ab", paths, strict=True))
+    units, found = sources(toy, first, second)
+    digests = {name: unit.identity["inputs"]["files"]["text"] for name, unit in units.items()}
+    assert units["a"].identity["inputs"] == {"files": {"text": digests["a"]}, "name": "a"}
+    assert digests["a"] != digests["b"]
+    assert units["a"].source == replace(first, digests={"text": digests["a"]})
+    assert (units["a"].inputs, units["a"].members, found.members) == ({}, ("a",), {"a": ("a",), "b": ("b",)})
+    renamed, _ = sources(toy, replace(first, name="c"))
+    assert renamed["c"].key != units["a"].key
+    only, rest = sources(toy, first, second, only=frozenset({"b"}))
+    assert list(only) == list(rest.members) == ["b"]
+    assert only["b"].key == units["b"].key
+
+
+def test_items_of_a_source_that_cannot_be_used_are_blocked(toy: Toy) -> None:
+    path = toy.folder / "capture" / "1.txt"
+    units, found = sources(
+        toy, SourceItem("a", {"text": path}, problem="too dark"), SourceItem("b", {"text": path.with_name("gone")}),
+        SourceItem("c", {"text": path}), SourceItem("d | e", {"text": path}),
+    )  # fmt: skip
+    assert list(units) == ["c"]
+    assert list(found.members) == ["a", "b", "c", "d | e"]
+    assert found.blocked.keys() == {"a", "b", "d | e"}
+    assert found.blocked["a"] == "too dark"
+    assert "gone: cannot be read" in found.blocked["b"]
+    assert "contains ' | ', which separates the names of a pair" in found.blocked["d | e"]
+    with pytest.raises(InputError, match="images: the item 'a' is listed twice"):
+        sources(toy, *[SourceItem("a", {"text": path})] * 2)
+
+
+def test_a_stage_of_a_module_without_source_counts_by_its_version(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    entry = toy.session().workflow.stages["scaled"]
+    monkeypatch.setitem(sys.modules, "compiled_stages", ModuleType("compiled_stages"))
+
+    def function() -> None: ...
+
+    function.__module__ = "compiled_stages"
+    function.__qualname__ = "function"
+    code = stage_code(replace(entry.spec, function=function, code_digest=""), entry.params)  # type: ignore[arg-type]
+    assert (code.digest, code.libraries) == ("", {"compiled_stages": "not installed"})
+
+
+def test_a_stage_that_a_function_made_counts_with_all_of_its_module(tmp_path: Path) -> None:
+    from pano_mvs.engine.code.reach import CodeGraph
+    from pano_mvs.engine.code.sources import Sources
+
+    (tmp_path / "pack").mkdir()
+    (tmp_path / "pack" / "__init__.py").write_text("top = 1\n")
+    (tmp_path / "pack" / "m.py").write_text("def made(x: K):\n    def stage(): ...\nother = 2\nclass K: ...\n")
+    graph = CodeGraph(Sources({"pack": tmp_path / "pack"}))
+    whole_module = reach_of_function("pack.m", "made.<locals>.stage", graph)
+    assert whole_module.definitions.keys() == {"pack:top", "pack.m:made", "pack.m:other", "pack.m:K"}
+    assert reach_of_function("pack.m", "made", graph).definitions.keys() == {"pack.m:made", "pack.m:K"}
+
+
+def test_a_plugin_that_is_a_package_uses_no_library_of_its_own_name(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    texts = {
+        "__init__": "from mine.inner import f\nlimit = 1\n",
+        "inner": "import numpy\nfrom mine import limit\ndef f(): return numpy.pi * limit\n",
+    }
+    for name, text in texts.items():
+        path = toy.folder / "mine" / f"{name}.py"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text)
+    module = ModuleType("mine")
+    module.__file__ = str(toy.folder / "mine" / "__init__.py")
+    monkeypatch.setitem(sys.modules, "mine", module)
+
+    def function() -> None: ...
+
+    function.__module__ = "mine"
+    entry = toy.session().workflow.stages["scaled"]
+    spec = replace(entry.spec, function=function, code_digest="one")  # type: ignore[arg-type]
+    code = stage_code(spec, entry.params)
+    assert code.libraries.keys() == {"numpy"}
+    assert stage_code(spec.with_code("other"), entry.params).digest != code.digest

@@ -1,0 +1,343 @@
+"""A pass of a run submits units and acts on their outcomes, whatever the executor does."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+
+import pytest
+
+from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError, StoreError, UsageError
+from pano_mvs.engine.cache.store import ItemRef, Store, UnitRecord
+from pano_mvs.engine.executors.protocol import Job, JobOutcome
+from pano_mvs.engine.executors.serial import SerialExecutor
+from pano_mvs.engine.planning.units import Unit
+from pano_mvs.engine.running.dispatcher import FinishedJob
+from pano_mvs.engine.running.events import RunResult, SilentObserver, UnitStatus
+from pano_mvs.engine.running.run import Run, RunPass, UnusableInputError
+from tests.engine.conftest import Toy, ran
+
+
+class Shelf(SerialExecutor):
+    """Takes several jobs, and computes them one by one, or answers as it is told to.
+
+    Attributes:
+        latest_first: whether the job that was taken last is computed first.
+        memory_bytes: what is said to be free; 0 for not known.
+        answers: unit to what comes back in place of its result.
+        submitted: the units that it was given, in order.
+        most: how many it had at a time.
+    """
+
+    def __init__(self, store: Store) -> None:
+        super().__init__(store, threads=1)
+        self.capacity = 4
+        self.latest_first = True
+        self.memory_bytes = 0
+        self.answers: dict[str, JobOutcome] = {}
+        self.submitted: list[str] = []
+        self.most = 0
+
+    def submit(self, job: Job) -> None:
+        super().submit(job)
+        self.submitted.append(job.unit.label)
+        self.most = max(self.most, len(self._jobs))
+
+    def wait(self, timeout_s: float | None = None) -> tuple[int, JobOutcome] | None:
+        if self.latest_first:
+            self._jobs[:] = self._jobs[-1:] + self._jobs[:-1]
+        if timeout_s != 0 and self._jobs and self._jobs[0].unit.label in self.answers:
+            job = self._jobs.pop(0)
+            return job.number, self.answers[job.unit.label]
+        return super().wait(timeout_s)
+
+    def free_memory_bytes(self) -> int:
+        return self.memory_bytes
+
+
+def run_with(toy: Toy, shelf: Shelf, *overrides: str) -> RunResult:
+    session = toy.session(*overrides)
+    return Run(session.workflow, session.graph, Store(session.store_root), out=session.out, executor=shelf).execute()
+
+
+@pytest.fixture
+def shelf(toy: Toy) -> Shelf:
+    return Shelf(Store(toy.folder / "cache"))
+
+
+def summary(result: RunResult) -> Mapping[str, tuple[int, int, int, int]]:
+    return {one.name: (one.run, one.cached, one.failed, one.blocked) for one in result.stages}
+
+
+def test_as_many_units_are_out_as_the_executor_takes_and_the_result_is_that_of_one(toy: Toy, shelf: Shelf) -> None:
+    shelf.capacity = 3
+    result = run_with(toy, shelf)
+    assert shelf.most == 3
+    assert result.exit_code == 0
+    files = toy.deliverables()
+    shutil.rmtree(toy.folder / "cache")
+    again = toy.run()
+    assert toy.deliverables() == files
+    assert (again.published, summary(again)) == (result.published, summary(result))
+    assert len(shelf.submitted) == len(set(shelf.submitted)) == sum(ran(result).values())
+
+
+def test_what_is_in_the_store_is_not_handed_out(toy: Toy, shelf: Shelf) -> None:
+    toy.run()
+    result = run_with(toy, shelf)
+    assert shelf.submitted == []
+    assert all(counts[0] == 0 and counts[1] > 0 for counts in summary(result).values())
+
+
+def test_units_of_one_key_are_computed_once(toy: Toy, shelf: Shelf) -> None:
+    for name in ("0.txt", "6.txt"):
+        toy.number(name, "10")  # as 1.txt has
+    result = run_with(toy, shelf)
+    assert result.exit_code == 0
+    scaled = [label for label in shelf.submitted if label.startswith("scaled:")]
+    assert len([label for label in scaled if label in {"scaled:0.txt", "scaled:1.txt", "scaled:6.txt"}]) == 1
+    assert summary(result)["scaled"] == (7, 0, 0, 0)
+
+
+def test_where_a_unit_fails_those_of_its_key_fail_with_it(toy: Toy, shelf: Shelf) -> None:
+    for name in ("2.txt", "4.txt"):
+        toy.number(name, "13")
+    shelf.latest_first = False
+    result = run_with(toy, shelf)
+    failed = [one for one in result.failures if one.stage == "scaled"]
+    assert [one.item for one in failed] == ["2.txt", "4.txt"]
+    assert all("thirteen is unlucky" in one.cause for one in failed)
+    assert len([label for label in shelf.submitted if label.startswith("scaled:")]) == 4
+    assert summary(result)["scaled"] == (3, 0, 2, 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "error"),
+    [("StoreError", StoreError), ("UsageError", UsageError), ("ElseError", PanoMvsError)],
+)
+def test_what_stops_the_run_is_raised_as_what_it_is(
+    toy: Toy, shelf: Shelf, name: str, error: type[PanoMvsError]
+) -> None:
+    shelf.answers["scaled:4.txt"] = JobOutcome("stopped", cause="nothing can go on", error=name)
+    with pytest.raises(error, match="nothing can go on") as caught:
+        run_with(toy, shelf)
+    assert type(caught.value) is error
+    assert not shelf._jobs
+
+
+def test_a_gate_that_a_stage_closes_ends_the_run_with_its_code(toy: Toy, shelf: Shelf) -> None:
+    shelf.answers["scaled:4.txt"] = JobOutcome("stopped", cause="too dark", error="RunStoppedError")
+    result = run_with(toy, shelf)
+    assert (result.exit_code, result.stopped) == (RunStoppedError.exit_code, "too dark")
+
+
+def test_a_unit_that_fails_costs_what_needs_it_and_is_listed_with_its_reason(toy: Toy, shelf: Shelf) -> None:
+    shelf.answers["scaled:3.txt"] = JobOutcome("failed", cause="too dark", trace="line 1", seconds=2.0)
+    result = run_with(toy, shelf)
+    assert result.exit_code == 3
+    failure = next(one for one in result.failures if one.stage == "scaled")
+    assert (failure.item, failure.cause, failure.trace, failure.log, failure.said) == (
+        "3.txt", "too dark", "line 1", "", (),
+    )  # fmt: skip
+    assert "scaled" in failure.consequence or "3.txt" in failure.consequence
+    assert summary(result)["scaled"] == (4, 0, 1, 0)
+    assert "mean/3.txt" not in result.published
+    assert "mean/1.txt" in result.published
+
+
+def test_a_unit_that_fails_ends_the_run_where_the_workflow_says_so(toy: Toy, shelf: Shelf) -> None:
+    shelf.answers["scaled:3.txt"] = JobOutcome("failed", cause="too dark")
+    result = run_with(toy, shelf, "scaled.on_error=stop")
+    assert result.exit_code == RunStoppedError.exit_code
+    assert result.stopped == "stage 'scaled' has on_error: stop, and scaled:3.txt failed: too dark"
+
+
+def test_bad_input_to_a_stage_on_which_all_wait_ends_the_run_with_its_code(toy: Toy, shelf: Shelf) -> None:
+    shelf.answers["pairs"] = JobOutcome("failed", cause="no such file", exit_code=InputError.exit_code)
+    result = run_with(toy, shelf)
+    assert (result.exit_code, result.stopped) == (InputError.exit_code, "pairs: no such file")
+
+
+def test_bad_input_to_one_of_many_units_costs_that_unit(toy: Toy, shelf: Shelf) -> None:
+    shelf.answers["scaled:3.txt"] = JobOutcome("failed", cause="no such file", exit_code=InputError.exit_code)
+    assert run_with(toy, shelf).exit_code == 3
+
+
+def test_a_failure_of_a_stage_on_which_all_wait_is_a_failure_like_others(toy: Toy, shelf: Shelf) -> None:
+    shelf.answers["pairs"] = JobOutcome("failed", cause="a mistake in the code")
+    result = run_with(toy, shelf)
+    assert (result.exit_code, result.stopped) == (3, "")
+
+
+def test_a_stop_carries_its_code() -> None:
+    assert UnusableInputError("why", 5).exit_code == 5
+    assert str(UnusableInputError("why", 5)) == "why"
+    assert isinstance(UnusableInputError("why", 5), RunStoppedError)
+
+
+def test_a_unit_that_needs_more_memory_than_there_is_fails_and_the_others_go_on(toy: Toy, shelf: Shelf) -> None:
+    shelf.memory_bytes = 3_000_000
+    result = run_with(toy, shelf, "scaled.memory=2MB", "pairs.memory=5MB")
+    (failure,) = [one for one in result.failures if not one.blocked]
+    assert failure.stage == "pairs"
+    assert "it declares 5" in failure.cause
+    assert summary(result)["scaled"] == (5, 0, 0, 0)
+    assert summary(result)["pairs"] == (0, 0, 1, 0)
+    assert "pairs" not in shelf.submitted
+
+
+class Heard(SilentObserver):
+    """Notes what it hears of units."""
+
+    def __init__(self) -> None:
+        self.started: list[str] = []
+        self.finished: list[tuple[str, str]] = []
+
+    def unit_started(self, name: str, item: str) -> None:
+        self.started.append(f"{name}:{item}")
+
+    def unit_finished(self, name: str, item: str, *, status: UnitStatus, seconds: float) -> None:
+        self.finished.append((f"{name}:{item}", status))
+
+
+@pytest.mark.parametrize("memory", ["1MB", "5MB"])
+def test_whatever_is_computed_or_refused_is_heard_of_as_begun_and_ended(toy: Toy, shelf: Shelf, memory: str) -> None:
+    shelf.memory_bytes = 3_000_000
+    session, heard = toy.session(f"pairs.memory={memory}"), Heard()
+    Run(
+        session.workflow, session.graph, Store(session.store_root), out=session.out, executor=shelf, observer=heard
+    ).execute()
+    assert [name for name in heard.started if name.startswith("pairs")] == ["pairs:"]
+    assert [one for one in heard.finished if one[0] == "pairs:"] == [("pairs:", "run" if memory == "1MB" else "failed")]
+    blocked = {name for name, status in heard.finished if status == "blocked"}
+    assert sorted(heard.started) == sorted(name for name, _ in heard.finished if name not in blocked)
+
+
+def test_units_wait_for_memory_and_nothing_overtakes_them(toy: Toy, shelf: Shelf) -> None:
+    shelf.memory_bytes = 3_000_000
+    shelf.latest_first = False
+    together: list[int] = []
+    submit = shelf.submit
+
+    def counted(job: Job) -> None:
+        submit(job)
+        together.append(len([one for one in shelf._jobs if one.unit.entry.name == "scaled"]))
+
+    shelf.submit = counted  # type: ignore[method-assign]
+    assert run_with(toy, shelf, "scaled.memory=2MB").exit_code == 0
+    assert max(together) == 1
+    assert [one for one in shelf.submitted if one.startswith("scaled")] == [f"scaled:{n}.txt" for n in range(1, 6)]
+
+
+def test_results_of_units_that_were_out_when_a_pass_ended_count_as_computed(toy: Toy, shelf: Shelf) -> None:
+    toy.run()
+    store = toy.folder / "cache"
+    for blob in (store / "blobs").rglob("*.json"):
+        blob.write_bytes(b"x" * blob.stat().st_size)
+    toy.edit("wf.yaml", lambda text: text.replace("by: 3", "by: 4"))
+    result = run_with(toy, shelf)
+    assert result.exit_code == 0
+    assert result.warnings
+    assert summary(result)["scaled"] == (5, 0, 0, 0)
+    assert toy.run().computed == 0
+
+
+def test_a_damaged_record_is_reported_with_its_path_and_computed_again(toy: Toy, shelf: Shelf) -> None:
+    toy.run()
+    key = next(iter((toy.folder / "cache" / "records").rglob("*.json")))
+    key.write_bytes(b"nothing")
+    result = run_with(toy, shelf)
+    assert result.warnings == [f"{key} is damaged; computing it again"]
+    assert len(shelf.submitted) == 1
+
+
+def test_files_that_give_way_to_those_of_an_earlier_unit_end_the_run_if_asked(toy: Toy, shelf: Shelf) -> None:
+    toy.edit("plug.py", lambda text: text.replace("mean/{item}.txt", "mean/fixed.txt"))
+    result = run_with(toy, shelf, "each.on_error=stop")
+    assert result.exit_code == RunStoppedError.exit_code
+    assert "stage 'each' has on_error: stop" in result.stopped
+    assert "mean/fixed.txt" in result.stopped
+
+
+def test_of_units_that_deliver_one_file_the_first_of_the_capture_stays(toy: Toy, shelf: Shelf) -> None:
+    """Also where a later one was there before it: that one's result is withdrawn."""
+    toy.edit("plug.py", lambda text: text.replace("mean/{item}.txt", "mean/fixed.txt"))
+    session = toy.session()
+    run = Run(session.workflow, session.graph, Store(session.store_root), out=session.out, executor=shelf)
+    result = run.execute()
+    assert [one.item for one in result.failures] == ["2.txt", "3.txt", "4.txt", "5.txt"]
+    assert summary(result)["each"] == (1, 0, 4, 0)
+    assert toy.deliverables()["mean/fixed.txt"] == b"45.0"
+    assert list(run.states["each"].items) == ["1.txt"]
+    assert list(run.states["each"].failed) == ["2.txt", "3.txt", "4.txt", "5.txt"]
+    cached = run_with(toy, shelf)
+    assert summary(cached)["each"] == (0, 1, 4, 0)
+
+
+def test_a_damaged_input_is_left_for_the_next_pass(toy: Toy, shelf: Shelf) -> None:
+    shelf.answers["scaled:4.txt"] = JobOutcome("damaged", cause="a blob is damaged")
+    wait = shelf.wait
+
+    def once(timeout_s: float | None = None) -> tuple[int, JobOutcome] | None:
+        found = wait(timeout_s)
+        if found is not None and found[1].status == "damaged":
+            shelf.answers.clear()
+        return found
+
+    shelf.wait = once  # type: ignore[method-assign]
+    result = run_with(toy, shelf)
+    assert (result.exit_code, result.warnings) == (0, ["a blob is damaged"])
+    assert summary(result)["scaled"] == (5, 0, 0, 0)  # what the first pass computed does not count as found
+    assert shelf.submitted.count("scaled:4.txt") == 2
+    assert shelf.submitted.count("scaled:5.txt") == 1
+
+
+def test_a_file_whose_stored_bytes_are_damaged_is_computed_and_delivered_again(toy: Toy, shelf: Shelf) -> None:
+    toy.run()
+    files = toy.deliverables()
+    shutil.rmtree(toy.folder / "out")
+    damaged = sorted((toy.folder / "cache" / "blobs").rglob("*.txt"))
+    for blob in damaged:
+        blob.write_bytes(b"x" * blob.stat().st_size)
+    result = run_with(toy, shelf)
+    assert result.exit_code == 0
+    assert toy.deliverables() == files
+    assert len(result.warnings) == len(damaged)
+    assert {name: counts[0] for name, counts in summary(result).items() if counts[0]} == {"each": 5, "all": 1}
+
+
+def test_an_image_that_changed_is_left_out_and_the_run_goes_over_its_stages_again(toy: Toy, shelf: Shelf) -> None:
+    path = toy.folder / "capture" / "3.txt"
+    reason = f"{path} changed during the run"
+    shelf.answers["scaled:3.txt"] = JobOutcome("changed", cause=reason, changed={str(path): reason})
+    result = run_with(toy, shelf)
+    assert result.exit_code == 3
+    assert result.warnings == [reason]
+    failed = [(one.stage, one.item, one.cause) for one in result.failures if not one.blocked]
+    assert failed == [("images", "3.txt", reason)]
+    assert "mean/3.txt" not in result.published
+    assert "mean/2.txt" in result.published
+
+
+def test_a_change_of_a_file_that_no_source_listed_is_a_failure_of_the_unit(toy: Toy, shelf: Shelf) -> None:
+    path, reason = str(toy.folder / "settings.csv"), "settings.csv changed during the run"
+    shelf.answers["scaled:3.txt"] = JobOutcome("changed", cause=reason, changed={path: reason})
+    result = run_with(toy, shelf)
+    assert (result.exit_code, result.warnings) == (3, [])
+    assert [(one.stage, one.item, one.cause) for one in result.failures if not one.blocked] == [
+        ("scaled", "3.txt", reason)
+    ]
+
+
+def test_results_that_come_after_the_end_of_a_pass_count_as_computed(
+    toy: Toy, shelf: Shelf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = toy.session()
+    run = Run(session.workflow, session.graph, Store(session.store_root), out=session.out, executor=shelf)
+    run.computed.add("z")
+    record, entry = UnitRecord("a", {}, ItemRef("K", "d", {})), session.workflow.stages["scaled"]
+    outcomes = {"a": JobOutcome("done", record), "b": JobOutcome("failed"), "c": JobOutcome("done", record)}
+    ended = [FinishedJob(Unit(entry, key, (), {}, key, {}), outcome) for key, outcome in outcomes.items()]
+    monkeypatch.setattr(run.dispatcher, "next_finished", lambda: ended.pop(0) if ended else None)
+    RunPass(run, []).drain()
+    assert run.computed == {"a", "c", "z"}

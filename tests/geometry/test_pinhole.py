@@ -1,0 +1,96 @@
+"""A pinhole view looks where its rotation says, and its pixels and rays are inverse to each other."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from pano_mvs.geometry import PinholeView, rotation_from_rotvec
+from tests.geometry.strategies import ROTATIONS
+
+# No square, and its axis not in the middle: a mix-up of width and height, or of x and y, shows.
+AHEAD = PinholeView(np.eye(3), 50.0, np.array([30.0, 22.0]), (40, 64))
+
+
+def view_of(rotation: NDArray[np.float64]) -> PinholeView:
+    return PinholeView(rotation, 50.0, np.array([30.0, 22.0]), (40, 64))
+
+
+def test_the_axis_is_seen_at_the_principal_point_and_a_focal_length_is_45_degrees() -> None:
+    assert AHEAD.pixels_from_rays((0, 0, 3)) == pytest.approx([30, 22])
+    assert AHEAD.pixels_from_rays((1, 0, 1)) == pytest.approx([80, 22])
+    assert AHEAD.pixels_from_rays((0, 1, 1)) == pytest.approx([30, 72])
+
+
+def test_the_calibration_matrix_projects_as_the_view_does() -> None:
+    point = np.array([0.4, -0.3, 2.0])
+    x, y, one = AHEAD.calibration @ point / point[2]
+    assert (x, y) == pytest.approx(tuple(AHEAD.pixels_from_rays(point)))
+    assert one == 1
+    assert AHEAD.calibration[1, 0] == AHEAD.calibration[0, 1] == 0
+
+
+@given(ROTATIONS, st.floats(-20, 90), st.floats(-20, 60), st.floats(0.1, 10))
+def test_pixels_survive_the_round_trip_at_any_distance(
+    rotation: NDArray[np.float64], x: float, y: float, distance: float
+) -> None:
+    bearing = view_of(rotation).bearings_from_pixels((x, y))
+    assert np.linalg.norm(bearing) == pytest.approx(1)
+    assert view_of(rotation).pixels_from_rays(distance * bearing) == pytest.approx([x, y], abs=1e-8)
+
+
+def test_a_view_to_the_right_sees_what_is_right_of_the_camera() -> None:
+    to_the_right = view_of(rotation_from_rotvec((0, np.pi / 2, 0)).T)
+    assert to_the_right.pixels_from_rays((1, 0, 0)) == pytest.approx([30, 22])
+    assert to_the_right.bearings_from_pixels((30, 22)) == pytest.approx([1, 0, 0])
+
+
+@pytest.mark.parametrize("ray", [(0, 0, -1), (1, 0, 0), (0.3, 0.2, -1e-9)])
+def test_rays_not_before_the_view_have_no_pixel(ray: tuple[float, float, float]) -> None:
+    assert np.isnan(AHEAD.pixels_from_rays(ray)).all()
+    several = AHEAD.pixels_from_rays([ray, (0, 0, 1)])
+    assert np.isnan(several).tolist() == [[True, True], [False, False]]
+
+
+def test_a_pixel_outside_is_returned_as_it_is_and_not_contained() -> None:
+    outside = AHEAD.pixels_from_rays((2, 0, 1))
+    assert outside == pytest.approx([130, 22])
+    assert not AHEAD.contains(outside)
+
+
+@pytest.mark.parametrize(
+    ("pixel", "inside"),
+    [
+        ((0, 0), True),
+        ((63.999, 39.999), True),
+        ((64, 10), False),
+        ((10, 40), False),
+        ((-0.001, 10), False),
+        ((10, -0.001), False),
+        ((50, 45), False),
+        ((np.nan, 10), False),
+        ((10, np.nan), False),
+    ],
+)
+def test_a_view_contains_its_pixels_from_edge_to_edge(pixel: tuple[float, float], inside: bool) -> None:
+    assert AHEAD.contains(pixel) == inside
+    assert AHEAD.contains([[pixel, (1, 1)]]).tolist() == [[inside, True]]
+
+
+def test_rays_go_through_the_centres_of_the_pixels_or_where_they_are_wanted() -> None:
+    view = view_of(rotation_from_rotvec((0.2, -0.7, 0.4)))
+    rays = view.rays()
+    assert rays.shape == (40, 64, 3)
+    y, x = np.mgrid[0:40, 0:64]
+    assert view.pixels_from_rays(rays) == pytest.approx(np.stack([x + 0.5, y + 0.5], axis=-1))
+    corners = view.rays(slice(3, 7), offset_xy=(0.0, 0.25))
+    assert view.pixels_from_rays(corners) == pytest.approx(np.stack([x, y + 0.25], axis=-1)[3:7])
+
+
+def test_the_length_of_a_ray_is_one_over_the_cosine_to_the_axis() -> None:
+    view = view_of(rotation_from_rotvec((0.2, -0.7, 0.4)))
+    rays = view.rays(slice(0, 2))
+    assert rays @ view.view_from_cam[2] == pytest.approx(np.ones((2, 64)))
