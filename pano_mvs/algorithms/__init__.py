@@ -1,6 +1,6 @@
-"""What the product exists for: arrays and scene records in, arrays and scene records out; no settings file.
+"""The algorithms: arrays and scene records in, arrays and scene records out; no settings files and no disk.
 
-Compiled kernels are kept in a folder of the user's, see `pano_mvs.core.kernel_cache`.
+Compiled kernels are cached in a folder of the user, see `pano_mvs.core.kernel_cache`.
 """
 
 from pano_mvs.core.kernel_cache import use_kernel_cache

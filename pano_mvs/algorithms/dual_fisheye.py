@@ -1,4 +1,4 @@
-"""Tell what a two-lens camera recorded before anybody stitched it from an equirectangular panorama."""
+"""Distinguish raw recordings of two-lens cameras from stitched equirectangular panoramas."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 
 _SIZE_HW = (128, 256)
 _DARK, _BRIGHT = 24, 40
-_LEAST_DARK_SHARE = 0.97
+_MIN_DARK_SHARE = 0.97
 
 
 def is_dual_fisheye(picture: NDArray[np.uint8]) -> bool:
-    """Return whether a picture of 2:1 is two fisheye images side by side, each in a circle, rather than a panorama.
+    """Return whether an image with aspect ratio 2:1 shows two fisheye circles side by side instead of a panorama.
 
-    Outside of the two circles such a picture is black, above and below, and it is not black inside of them. In a
-    panorama the same places are bands around the seam and the middle that reach from pole to pole: sky and floor.
+    Such an image is black outside of the two circles, at the top and the bottom, but not inside of them. In a panorama,
+    the same areas are bands around the seam and the middle from pole to pole, and contain sky and floor.
 
     Args:
         picture: (H, 2 H, 3) uint8.
@@ -27,5 +27,5 @@ def is_dual_fisheye(picture: NDArray[np.uint8]) -> bool:
     upper, lower = outside.copy(), outside.copy()
     upper[_SIZE_HW[0] // 2 :] = lower[: _SIZE_HW[0] // 2] = False
     dark = grey < _DARK
-    is_dark_around = min(dark[upper].mean(), dark[lower].mean()) > _LEAST_DARK_SHARE
+    is_dark_around = min(dark[upper].mean(), dark[lower].mean()) > _MIN_DARK_SHARE
     return bool(is_dark_around and np.median(grey[inside]) > _BRIGHT)

@@ -1,4 +1,4 @@
-"""How sharp a panorama is, to tell the best of some frames of a video."""
+"""Sharpness of a panorama, to select the best of several video frames."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ _WIDEST = 2048
 
 
 def sharpness(picture: NDArray[np.uint8]) -> float:
-    """Return how sharp a panorama is: the variance of its Laplacian over that of its grey levels.
+    """Return the sharpness of a panorama: the variance of its Laplacian over that of its grey levels.
 
-    Only the band of 45° around the equator counts: rows near the poles are stretched, and show tripods and skies.
-    Dividing makes frames comparable whose exposure differs. Comparable are frames of one scene, not scenes.
+    Only a band of 45° around the equator is used: rows near the poles are stretched, and show tripods and sky. The
+    division makes frames with different exposure comparable. Only frames of the same scene are comparable.
 
     Args:
-        picture: (H, W, 3) uint8, any order of the colours; the seam wraps.
+        picture: (H, W, 3) uint8, in any order of the channels; the seam wraps.
 
     Returns:
-        A number that is 0 for a picture without any structure, and falls as motion or defocus blurs it.
+        A number that is 0 for an image without structure, and decreases with motion blur and defocus.
 
     Source: Pech-Pacheco et al., "Diatom autofocusing in brightfield microscopy: a comparative study", ICPR 2000,
     section 2 (variance of the Laplacian).

@@ -1,4 +1,4 @@
-"""Which pictures each reference is swept against."""
+"""View selection: choose the source images against which each reference is swept."""
 
 from __future__ import annotations
 
@@ -13,40 +13,42 @@ from pano_mvs.scene.pose_groups import split_groups
 
 FloatArray = NDArray[np.float64]
 
-# Fewer shared points than this say nothing about how well two pictures see the same place.
-_FEWEST_SHARED = 8
-# Triangulation angles around this one weigh fully; MVS practice puts the best trade between precision and likeness
-# here (Schönberger et al., "Pixelwise view selection for unstructured multi-view stereo", 2016, use similar limits).
+# With fewer shared points than this, the overlap of two images cannot be judged.
+_MIN_SHARED = 8
+# Triangulation angles around this one have full weight; in MVS practice the best compromise between precision and
+# similarity is here (Schönberger et al., "Pixelwise view selection for unstructured multi-view stereo", 2016, use
+# similar limits).
 _BEST_ANGLE_DEG = 12.0
-# Centres closer than this share of the extent of the capture are one place.
+# Centres closer than this share of the extent of the capture are at the same place.
 _SAME_PLACE = 1e-9
 
 
 def select_views(poses: Poses, *, count: int = 4, min_angle_deg: float = 1.0, max_angle_deg: float = 60.0) -> Views:
-    """Return for each registered image the images to sweep it against, best first.
+    """Select the source images of each registered image, best first.
 
     With tracks, a pair's score is the sum over the points that both see of a weight for the triangulation angle: 0
-    outside [min, max], rising to 1 at 12° and falling again slowly. Where a reference shares too few points with
-    anybody, and without tracks, near images come first, by the distance of the centres; those that stand much closer
-    together than is usual in the capture come after the others, since they see no parallax. Sources are of the
-    reference's own group.
+    outside [min, max], rising to 1 at 12° and then falling slowly. If a reference shares too few points with any image,
+    and without tracks, near images come first, by the distance of the centres; images that are much closer than usual
+    in the capture come after the others, since they have no parallax. Sources are in the reference's own group.
 
     Args:
         poses: of all registered images, with or without points.
-        count: the most sources of a reference.
-        min_angle_deg: points seen under a smaller angle from the two centres do not count.
-        max_angle_deg: nor those under a larger one.
+        count: maximum number of sources of a reference.
+        min_angle_deg: points seen under a smaller angle from the two centres are ignored.
+        max_angle_deg: points seen under a larger angle are ignored.
 
     Returns:
-        An entry for every registered image that has a source at another place, in the order of `poses.names`.
-        Ties are broken by that order.
+        An entry for every registered image that has a source at another place, in the order of `poses.names`. Ties are
+        broken by that order.
 
     Raises:
-        UsageError: if count is not positive or the angles are no interval.
+        UsageError: if count is not positive or the angles do not form an interval.
     """
     if count < 1 or not 0 <= min_angle_deg < max_angle_deg <= 180:
-        raise UsageError(f"views need count ≥ 1 and 0 ≤ min_angle_deg < max_angle_deg ≤ 180, got {count}, "
-                         f"{min_angle_deg} and {max_angle_deg}")  # fmt: skip
+        raise UsageError(
+            f"views need count ≥ 1 and 0 ≤ min_angle_deg < max_angle_deg ≤ 180, got {count}, "
+            f"{min_angle_deg} and {max_angle_deg}"
+        )
     found: dict[str, tuple[str, ...]] = {}
     for group in split_groups(poses):
         found |= _neighbours(group, count=count, min_angle_deg=min_angle_deg, max_angle_deg=max_angle_deg)
@@ -75,9 +77,9 @@ def _center_distances(centers: FloatArray) -> FloatArray:
 
 
 def _distance_ranks(distances: FloatArray) -> FloatArray:
-    """Return how far down the list each image comes by distance alone, (N, N): less is better.
+    """Return the rank of each image by distance alone, (N, N): smaller is better.
 
-    The distance, with everything below a quarter of the capture's usual step put after all others.
+    Images closer than a quarter of the capture's usual step are ranked after all others.
     """
     others = np.where(distances > 0, distances, np.inf).min(axis=1, initial=np.inf)
     usual = float(np.median(others[np.isfinite(others)])) if np.isfinite(others).any() else 0.0
@@ -86,7 +88,7 @@ def _distance_ranks(distances: FloatArray) -> FloatArray:
 
 
 def _shared_point_scores(poses: Poses, *, min_angle_deg: float, max_angle_deg: float) -> FloatArray:
-    """Return the weighted number of points that each two images share, (N, N), symmetric; 0 where they are too few."""
+    """Return the weighted number of shared points of all pairs, (N, N), symmetric; 0 if there are too few."""
     images = len(poses.names)
     scores, shared = np.zeros((images, images)), np.zeros((images, images), np.int64)
     first, second = _covisible(poses)
@@ -101,7 +103,7 @@ def _shared_point_scores(poses: Poses, *, min_angle_deg: float, max_angle_deg: f
     np.add.at(scores, (image_a, image_b), weight)
     np.add.at(shared, (image_a, image_b), weight > 0)
     scores, shared = scores + scores.T, shared + shared.T
-    return np.where(shared >= _FEWEST_SHARED, scores, 0.0)
+    return np.where(shared >= _MIN_SHARED, scores, 0.0)
 
 
 def _angle_weight(angle_deg: FloatArray, min_angle_deg: float, max_angle_deg: float) -> FloatArray:

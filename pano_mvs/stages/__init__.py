@@ -1,6 +1,6 @@
-"""The built-in stages, one module per kind: each binds its parameters to an algorithm, nothing more.
+"""The built-in stages, one module per kind; each connects its settings to an algorithm.
 
-They are registered through the entry point `pano_mvs.plugins`, like anybody's.
+They are registered through the entry point `pano_mvs.plugins`, like stages of plugins.
 """
 
 from pano_mvs.stages.depth import sweep

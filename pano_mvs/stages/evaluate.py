@@ -1,4 +1,4 @@
-"""Evaluation against ground truth inside a workflow."""
+"""Evaluation against ground truth within a workflow."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class TruthParams(Params):
 def truth(images: All[Panorama], poses: One[Poses], ranges: All[RangeMap], params: TruthParams) -> Scores:
     """Compare poses and range maps with ground truth.
 
-    An image counts if the truth has its name and, where the truth states the image's SHA-256, its bytes: a different
-    image of the same name is not scored. Pixels that an image's mask excludes are ignored. Each group of poses is
+    An image is scored if the ground truth contains its name and, where the truth states the image's SHA-256, if the
+    hashes match: a different image with the same name is not scored. Masked pixels are ignored. Each group of poses is
     aligned with the truth on its own; pairs across groups count as not registered.
     """
     from pano_mvs.evaluation.capture import score_capture  # the package takes 0.1 s to import

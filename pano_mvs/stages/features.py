@@ -1,4 +1,4 @@
-"""Feature extractors: key points as bearings, free of the seam and of the poles."""
+"""Feature extractors: key points as bearings, unaffected by the seam and the poles."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ from pano_mvs.api import Context, Each, Features, Panorama, Params, stage
 class SiftParams(Params):
     """Settings of features.sift_tangent."""
 
-    max_keypoints: int = Field(default=8000, ge=8, description="the best so many, spread over the sphere")
-    contrast_threshold: float = Field(default=0.004, ge=0, description="lower finds more on plain walls")
-    root: bool = Field(default=True, description="RootSIFT descriptors")
+    max_keypoints: int = Field(default=8000, ge=8, description="maximum number, spread over the sphere by strength")
+    contrast_threshold: float = Field(
+        default=0.004, ge=0, description="lower values find more key points on plain walls"
+    )
+    root: bool = Field(default=True, description="use RootSIFT descriptors")
 
 
 @stage("features.sift_tangent")
@@ -34,7 +36,7 @@ def sift_tangent(image: Each[Panorama], params: SiftParams, ctx: Context) -> Fea
 class OrbParams(Params):
     """Settings of features.orb_tangent."""
 
-    max_keypoints: int = Field(default=8000, ge=8, description="the best so many, spread over the sphere")
+    max_keypoints: int = Field(default=8000, ge=8, description="maximum number, spread over the sphere by strength")
 
 
 @stage("features.orb_tangent")
@@ -48,8 +50,8 @@ def orb_tangent(image: Each[Panorama], params: OrbParams, ctx: Context) -> Featu
 class SphorbParams(Params):
     """Settings of features.sphorb."""
 
-    max_keypoints: int = Field(default=10_000, ge=8, description="the best so many, spread over the sphere")
-    fast_threshold: int = Field(default=5, ge=1, le=254, description="lower finds more on plain walls")
+    max_keypoints: int = Field(default=10_000, ge=8, description="maximum number, spread over the sphere by strength")
+    fast_threshold: int = Field(default=5, ge=1, le=254, description="lower values find more key points on plain walls")
 
 
 @stage("features.sphorb")

@@ -1,4 +1,4 @@
-"""Kinds of settings that several stages have."""
+"""Types of settings that several stages have."""
 
 from __future__ import annotations
 
@@ -9,4 +9,4 @@ from pydantic import AfterValidator
 from pano_mvs.core.settings import odd
 
 Odd: TypeAlias = Annotated[int, AfterValidator(odd)]
-"""The side of a window."""
+"""Side length of a window."""

@@ -1,4 +1,4 @@
-"""Filters: range map in, range map out, in any order."""
+"""Filters: they take and return range maps, and can be combined in any order."""
 
 from __future__ import annotations
 
@@ -29,40 +29,40 @@ from pano_mvs.stages.memory import bytes_per_pixel
 class MedianParams(Params):
     """Settings of filters.median."""
 
-    window: Odd = Field(default=5, ge=3, le=15, description="side in pixels, odd")
+    window: Odd = Field(default=5, ge=3, le=15, description="side length in pixels, odd")
 
 
 @stage("filters.median")
 def median(range_map: Each[RangeMap], params: MedianParams, ctx: Context) -> RangeMap:
-    """Median of the valid ranges in a window; invalid pixels stay invalid."""
+    """Replace each valid range by the median of the valid ranges in a window; invalid pixels stay invalid."""
     return _measured(median_range(range_map, window=params.window), ctx)
 
 
 class GaussianParams(Params):
     """Settings of filters.gaussian."""
 
-    window: Odd = Field(default=5, ge=3, le=15, description="side in pixels, odd")
-    sigma_px: float = Field(default=1.1, gt=0, description="width in pixels (the paper: 1.1)")
+    window: Odd = Field(default=5, ge=3, le=15, description="side length in pixels, odd")
+    sigma_px: float = Field(default=1.1, gt=0, description="standard deviation in pixels (the paper: 1.1)")
 
 
 @stage("filters.gaussian")
 def gaussian(range_map: Each[RangeMap], params: GaussianParams, ctx: Context) -> RangeMap:
-    """Gaussian mean of the valid ranges in a window; invalid pixels stay invalid."""
+    """Smooth valid ranges by a Gaussian window; invalid pixels stay invalid."""
     return _measured(gaussian_range(range_map, window=params.window, sigma_px=params.sigma_px), ctx)
 
 
 class GuidedParams(Params):
     """Settings of filters.guided."""
 
-    radius: int = Field(default=4, ge=1, description="of the windows, in pixels at the equator")
-    epsilon: float = Field(default=4.0, gt=0, description="grey levels: larger contrasts are edges")
-    domain: Literal["range", "inverse"] = Field(default="inverse", description="what is smoothed: range or 1/range")
-    fill: bool = Field(default=False, description="give a range to pixels near valid ones (confidence 1–63)")
+    radius: int = Field(default=4, ge=1, description="radius of the windows, in pixels at the equator")
+    epsilon: float = Field(default=4.0, gt=0, description="contrast in grey levels above which edges are preserved")
+    domain: Literal["range", "inverse"] = Field(default="inverse", description="quantity to smooth: range or 1/range")
+    fill: bool = Field(default=False, description="fill pixels near valid ones (confidence 1–63)")
 
 
 @stage("filters.guided")
 def guided(range_map: Each[RangeMap], image: Each[Panorama], params: GuidedParams, ctx: Context) -> RangeMap:
-    """The guided filter: in every window ranges follow the colours of the picture. Masked pixels get no range."""
+    """Smooth ranges by the guided filter, preserving edges of the panorama. Masked pixels get no range."""
     smoothed = guided_range(range_map, image.load(), **params.model_dump())
     return _measured(_unmasked(smoothed, image), ctx)
 
@@ -70,25 +70,27 @@ def guided(range_map: Each[RangeMap], image: Each[Panorama], params: GuidedParam
 class ConfidenceParams(Params):
     """Settings of filters.confidence."""
 
-    min_confidence: int = Field(default=128, ge=1, le=255, description="pixels below are removed; 128: confirmed ones")
+    min_confidence: int = Field(default=128, ge=1, le=255, description="minimum confidence; 128: confirmed pixels")
 
 
 @stage("filters.confidence")
 def confidence(range_map: Each[RangeMap], params: ConfidenceParams, ctx: Context) -> RangeMap:
-    """Remove what is not sure enough: by default all that no other view confirms."""
+    """Remove pixels of low confidence: by default all pixels that no other view confirms."""
     return _measured(require_confidence(range_map, min_confidence=params.min_confidence), ctx)
 
 
 class SpeckleParams(Params):
     """Settings of filters.speckle."""
 
-    max_size_px: float = Field(default=60.0, gt=0, description="smaller islands are removed; in pixels at the equator")
-    max_relative_step: float = Field(default=0.03, gt=0, description="neighbours of one surface differ by at most this")
+    max_size_px: float = Field(default=60.0, gt=0, description="remove smaller surfaces; area in pixels at the equator")
+    max_relative_step: float = Field(
+        default=0.03, gt=0, description="maximum relative step between pixels of one surface"
+    )
 
 
 @stage("filters.speckle")
 def speckle(range_map: Each[RangeMap], params: SpeckleParams, ctx: Context) -> RangeMap:
-    """Remove small islands that hang in the air."""
+    """Remove small isolated surfaces."""
     cleaned = remove_speckles(range_map, max_size_px=params.max_size_px, max_relative_step=params.max_relative_step)
     return _measured(cleaned, ctx)
 
@@ -96,19 +98,23 @@ def speckle(range_map: Each[RangeMap], params: SpeckleParams, ctx: Context) -> R
 class ConsistencyParams(Params):
     """Settings of filters.consistency."""
 
-    max_relative_error: float = Field(default=0.02, gt=0, description="ranges that agree differ by at most this share")
-    max_reprojection_px: float = Field(default=1.0, gt=0, description="forward and back may miss the pixel by this")
+    max_relative_error: float = Field(
+        default=0.02, gt=0, description="maximum relative difference of ranges that agree"
+    )
+    max_reprojection_px: float = Field(default=1.0, gt=0, description="maximum forward-backward reprojection error")
     min_support: float = Field(
-        default=0.85, ge=0, description="sum over sources of (1 - (miss / max_reprojection_px)²)² that a pixel needs"
+        default=0.85, ge=0, description="minimum sum over sources of (1 - (error / max_reprojection_px)²)² for a pixel"
     )
     min_motion_px: float = Field(
-        default=0.05, ge=0, description="a change by max_relative_error must move a pixel by this in the sources"
+        default=0.05,
+        ge=0,
+        description="minimum motion of a pixel in the sources if its range changes by max_relative_error",
     )
-    min_views: int = Field(default=1, ge=1, description="sources that must confirm a pixel")
+    min_views: int = Field(default=1, ge=1, description="minimum number of sources that confirm a pixel")
     remove_inconsistent: bool = Field(
-        default=False, description="remove what no source confirms and several contradict"
+        default=False, description="remove pixels that no source confirms and several contradict"
     )
-    min_contradictions: int = Field(default=2, ge=1, description="sources that must contradict for that")
+    min_contradictions: int = Field(default=2, ge=1, description="number of contradicting sources for removal")
 
 
 @stage("filters.consistency", memory=bytes_per_pixel(112, each_source=8))
@@ -120,7 +126,7 @@ def consistency(
     params: ConsistencyParams,
     ctx: Context,
 ) -> RangeMap:
-    """Compare each range with those of the neighbours, forward and back: confidence 128–255 where they confirm it."""
+    """Compare ranges with those of neighbouring views, forward and backward; confirmed ones get confidence 128–255."""
     require_one_group(pose, source_poses)
     checked, agreement = checked_with_agreement(
         range_map,
@@ -137,19 +143,19 @@ def consistency(
 class BilateralSolverParams(Params):
     """Settings of filters.fast_bilateral_solver."""
 
-    sigma_spatial: float = Field(default=8.0, ge=1, description="spatial cells, in pixels at the equator")
-    sigma_luma: float = Field(default=8.0, ge=2.1, description="luma bins, in grey levels")
-    sigma_chroma: float = Field(default=8.0, ge=2.1, description="chroma bins, in grey levels")
+    sigma_spatial: float = Field(default=8.0, ge=1, description="size of spatial cells, in pixels at the equator")
+    sigma_luma: float = Field(default=8.0, ge=2.1, description="size of luma bins, in grey levels")
+    sigma_chroma: float = Field(default=8.0, ge=2.1, description="size of chroma bins, in grey levels")
     smoothness: float = Field(
-        default=1.0, ge=0, description="λ: weight of smoothness against a pixel of full confidence"
+        default=1.0, ge=0, description="λ: weight of smoothness relative to a pixel of full confidence"
     )
-    domain: Literal["range", "inverse"] = Field(default="inverse", description="what is smoothed: range or 1/range")
-    fill: bool = Field(default=True, description="give a range to pixels that had none (confidence 1–63)")
+    domain: Literal["range", "inverse"] = Field(default="inverse", description="quantity to smooth: range or 1/range")
+    fill: bool = Field(default=True, description="fill pixels without a range (confidence 1–63)")
     max_hole_deg: float = Field(
-        default=20.0, ge=0, description="larger holes, such as a sky, stay holes (diameter of a disc); 0 fills all"
+        default=20.0, ge=0, description="larger holes, such as a sky, are not filled (diameter of a disc); 0: fill all"
     )
     keep_confidence: int = Field(
-        default=128, ge=1, le=256, description="pixels of at least this confidence keep their range; 256 smooths all"
+        default=128, ge=1, le=256, description="pixels with at least this confidence keep their range; 256: smooth all"
     )
 
 
@@ -157,9 +163,9 @@ class BilateralSolverParams(Params):
 def bilateral_solver(
     range_map: Each[RangeMap], image: Each[Panorama], params: BilateralSolverParams, ctx: Context
 ) -> RangeMap:
-    """The Fast Bilateral Solver: smooth where the picture is smooth, edges where it has edges.
+    """Smooth ranges by the Fast Bilateral Solver, preserving edges of the panorama.
 
-    Masked pixels get no range, whatever `fill` says.
+    Masked pixels get no range, even with `fill`.
     """
     solved = fast_bilateral_solver(range_map, image.load(), **params.model_dump())
     return _measured(_unmasked(solved, image), ctx)
@@ -168,16 +174,16 @@ def bilateral_solver(
 class FillParams(Params):
     """Settings of filters.fill."""
 
-    max_distance_px: int = Field(default=48, ge=1, description="how far to look, in pixels at the equator")
-    min_confidence: int = Field(default=128, ge=1, le=255, description="pixels below are not trusted")
+    max_distance_px: int = Field(default=48, ge=1, description="search distance, in pixels at the equator")
+    min_confidence: int = Field(default=128, ge=1, le=255, description="minimum confidence of pixels to fill from")
     max_hole_deg: float = Field(
-        default=20.0, ge=0, description="larger holes, such as a sky, stay holes (diameter of a disc); 0 fills all"
+        default=20.0, ge=0, description="larger holes, such as a sky, are not filled (diameter of a disc); 0: fill all"
     )
 
 
 @stage("filters.fill", memory=bytes_per_pixel(96))
 def fill(range_map: Each[RangeMap], image: Each[Panorama], params: FillParams, ctx: Context) -> RangeMap:
-    """Give holes the range of the surface behind them, from trusted pixels only (confidence 1–63).
+    """Fill holes with the range of the background surface, from reliable pixels only (confidence 1–63).
 
     Masked pixels get no range.
     """
@@ -188,19 +194,21 @@ def fill(range_map: Each[RangeMap], image: Each[Panorama], params: FillParams, c
 class PlanesParams(Params):
     """Settings of filters.planes."""
 
-    contrast: float = Field(default=8.0, gt=0, description="grey levels around a pixel of a plain surface, at most")
-    min_area_deg2: float = Field(default=75.0, gt=0, description="smaller surfaces are left, in square degrees")
-    max_relative_error: float = Field(default=0.02, gt=0, description="pixels on a plane differ by at most this share")
-    min_share: float = Field(default=0.25, gt=0, le=1, description="of the trusted pixels that must lie on the plane")
-    min_confidence: int = Field(default=128, ge=1, le=255, description="pixels below are not trusted")
+    contrast: float = Field(
+        default=8.0, gt=0, description="maximum contrast around a pixel of a plain surface, grey levels"
+    )
+    min_area_deg2: float = Field(default=75.0, gt=0, description="minimum area of a surface, in square degrees")
+    max_relative_error: float = Field(default=0.02, gt=0, description="maximum relative error of a pixel on the plane")
+    min_share: float = Field(default=0.25, gt=0, le=1, description="minimum share of reliable pixels on the plane")
+    min_confidence: int = Field(default=128, ge=1, le=255, description="minimum confidence of reliable pixels")
     max_hole_deg: float = Field(
-        default=20.0, ge=0, description="larger holes, such as a sky, stay holes (diameter of a disc); 0 fills all"
+        default=20.0, ge=0, description="larger holes, such as a sky, are not filled (diameter of a disc); 0: fill all"
     )
 
 
 @stage("filters.planes", memory=bytes_per_pixel(170))
 def planes(range_map: Each[RangeMap], image: Each[Panorama], params: PlanesParams, ctx: Context) -> RangeMap:
-    """Lay planes through plain walls and ceilings, on which nothing can be matched; best after the bilateral solver.
+    """Fit planes to plain walls and ceilings, where nothing can be matched; use it after the bilateral solver.
 
     Masked pixels get no range.
     """

@@ -1,4 +1,4 @@
-"""The world frame and the unit of length of poses: levelled by gravity, scaled to metres."""
+"""World frame and unit of length of poses: levelled by gravity, scaled to metres."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ class LevelParams(Params):
 
     evidence: Literal["auto", "sensors", "structure", "cameras"] = Field(
         default="auto",
-        description="what tells the vertical: the pitch and roll that the pictures state, the level surfaces among the "
-        "sparse points, the cameras' own up directions; auto takes the first of them that can be used",
+        description="source of the vertical: sensors (pitch and roll in the metadata), structure (level surfaces among "
+        "the sparse points), or cameras (their up directions); auto uses the first available one",
     )
 
 
 @stage("poses.level")
 def level(poses: One[Poses], images: All[Panorama], params: LevelParams, ctx: Context) -> Poses:
-    """Turn the world so that y points down along gravity, and z north where compass headings agree.
+    """Rotate the world so that y points down along gravity, and z north if compass headings agree.
 
-    The origin goes to the first registered camera; the unit of length stays. Where nothing tells the vertical, the
-    poses stay as they are and the report says why. Each group of poses is levelled on its own.
+    The origin is the first registered camera; the unit of length does not change. If the vertical cannot be determined,
+    the poses do not change and the report states why. Each group of poses is levelled on its own.
     """
     headings = {name: image.heading_deg for name, image in images.items() if image.heading_deg is not None}
     groups, levelled = split_groups(poses), []
@@ -59,7 +59,7 @@ class BaselineParams(Params):
     model_config = ConfigDict(populate_by_name=True)
 
     from_image: str = Field(alias="from", description="name of an image")
-    to_image: str = Field(alias="to", description="name of another one")
+    to_image: str = Field(alias="to", description="name of another image")
     metres: float = Field(gt=0, description="distance between their centres")
 
 
@@ -72,15 +72,17 @@ class ScaleParams(Params):
     camera_height_m: float | None = Field(
         default=None, gt=0, description="median height of the cameras above the floor, in metres"
     )
-    gps: bool = Field(default=False, description="scale by the GPS positions that the pictures state")
+    gps: bool = Field(default=False, description="scale by the GPS positions in the images' metadata")
     factor: float | None = Field(default=None, gt=0, description="metres per unit of the poses")
     align: Literal["keep", "gps"] = Field(
-        default="keep", description="gps also turns the world: x east, y down, z north"
+        default="keep", description="gps also rotates the world: x east, y down, z north"
     )
-    gps_noise_m: float = Field(default=3.0, gt=0, description="standard deviation of a GPS position along an axis")
+    gps_noise_m: float = Field(
+        default=3.0, gt=0, description="standard deviation of GPS positions along an axis, in metres"
+    )
     vertical: Literal["auto", "sensors", "structure", "cameras", "world"] = Field(
         default="auto",
-        description="the vertical for gps and camera_height_m: as in poses.level, or the world's own y",
+        description="vertical for gps and camera_height_m, as in poses.level; world: the world's y axis",
     )
 
     @model_validator(mode="after")
@@ -89,22 +91,23 @@ class ScaleParams(Params):
         if sum(given) != 1:
             raise ValueError("give exactly one of baseline, camera_height_m, gps: true, factor")
         if self.align == "gps" and not self.gps:
-            raise ValueError("align: gps needs gps: true")
+            raise ValueError("align: gps requires gps: true")
         return self
 
 
 @stage("poses.scale")
 def scale(poses: One[Poses], images: All[Panorama], params: ScaleParams, ctx: Context) -> Poses:
-    """Make the metre the unit of length, by one length that is known.
+    """Scale poses to metres by a known length.
 
-    Known may be the distance between two images, the cameras' height above the floor, GPS positions, or the factor
-    itself. Everything behind it comes out in metres: ranges, cloud, COLMAP model. With several groups of poses, the
-    distance between two images tells of the group that holds both, the factor of the largest group; height and GPS
-    tell of every group in which they can be used. Other groups keep their unit, and the report says so.
+    The length is the distance between two images, the height of the cameras above the floor, GPS positions, or a
+    factor. Everything computed from the poses is then in metres: ranges, cloud, COLMAP model. If there are several
+    groups of poses, a distance between two images scales the group that contains both, a factor the largest group;
+    height and GPS scale every group for which they can be determined. Other groups keep their unit, and the report says
+    so.
 
     Raises:
-        InputError: if the length cannot be had from the poses of any group: an image that is not registered, no floor,
-            GPS positions too close together for their noise.
+        InputError: if no group can be scaled: an image is not registered, there is no floor, or the GPS positions are
+            too close together for their noise.
     """
     groups = split_groups(poses)
     if params.baseline is not None:
@@ -124,22 +127,22 @@ def scale(poses: One[Poses], images: All[Panorama], params: ScaleParams, ctx: Co
 class UnitTranslationsParams(Params):
     """Settings of poses.unit_translations."""
 
-    enabled: bool = Field(default=True, description="false passes the poses on as they are")
+    enabled: bool = Field(default=True, description="false returns the poses unchanged")
 
 
 @stage("poses.unit_translations")
 def unit_translations(poses: One[Poses], params: UnitTranslationsParams) -> Poses:
-    """Forget the translation scale factors: every camera at distance 1 from the first. The paper's ablation."""
+    """Remove the translation scale factors: every camera is at distance 1 from the first. The paper's ablation."""
     return without_scale_factors(poses) if params.enabled else poses
 
 
 def _scaled(
     poses: Poses, groups: list[Poses], chosen: list[int], scaled: Callable[[Poses], Poses], ctx: Context
 ) -> Poses:
-    """Return all groups, those of the chosen numbers scaled as far as that can be.
+    """Return all groups, with the chosen ones scaled if possible.
 
     Raises:
-        InputError: of the first chosen group, if none can be scaled.
+        InputError: the error of the first chosen group, if none can be scaled.
     """
     found, refused = list(groups), {}
     for number in chosen:
@@ -160,7 +163,7 @@ def _scaled(
 
 
 def _holding(ends: tuple[str, str], groups: list[Poses]) -> int | None:
-    """Return the number of the group that holds both images; None where one of them is in no group.
+    """Return the number of the group that contains both images; None if one of them is in no group.
 
     Raises:
         InputError: if they are in different groups.
@@ -171,7 +174,7 @@ def _holding(ends: tuple[str, str], groups: list[Poses]) -> int | None:
     if homes[0] != homes[1]:
         raise InputError(
             f"baseline: {ends[0]} and {ends[1]} are in groups {homes[0]} and {homes[1]} of the poses, which no "
-            "reliable pair connects, so the distance between them gives no scale. Name two images of one group"
+            "reliable pair connects, so the distance between them gives no scale. Use two images of one group"
         )
     return homes[0]
 
@@ -202,8 +205,10 @@ def _by_gps(poses: Poses, images: All[Panorama], params: ScaleParams, ctx: Conte
     up = _up(poses, images, params.vertical)
     fit = fit_gps(poses, positions, up, gps_noise_m=params.gps_noise_m, rng=ctx.rng)
     if not fit:
-        raise InputError(f"GPS gives no scale: {fit.reason}. Give a baseline or camera_height_m instead, or "
-                         "gps_noise_m if the receiver was better")  # fmt: skip
+        raise InputError(
+            f"GPS gives no scale: {fit.reason}. Give a baseline or camera_height_m instead, or set gps_noise_m for a "
+            "more accurate receiver"
+        )
     if "gps_residual_m" not in ctx.metrics:  # the largest group's
         ctx.metric("gps_residual_m", fit.residual_m)
         ctx.metric("gps_scale_error", fit.scale_error)
@@ -217,7 +222,7 @@ def _up(
         return _UP_OF_WORLD
     vertical = find_vertical(poses, _up_in_cam(images), evidence=evidence)
     if not vertical:
-        raise InputError(f"the vertical is not known: {vertical.reason}. Level the poses and give vertical: world")
+        raise InputError(f"the vertical is not known: {vertical.reason}. Level the poses and set vertical: world")
     return vertical.up_in_world
 
 

@@ -1,4 +1,4 @@
-"""Fusion: from range maps to one cloud."""
+"""Fusion of range maps into one cloud."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from pano_mvs.api import All, Context, Panorama, Params, PointCloud, Pose, Range
 
 
 @params_from(FusionSettings)
-class VoteParams(Params):
-    """Settings of fusion.vote."""
+class FusionParams(Params):
+    """Settings of `fusion.vote`."""
 
 
 @stage("fusion.vote")
 def vote(
-    ranges: All[RangeMap], poses: All[Pose], images: All[Panorama], params: VoteParams, ctx: Context
+    ranges: All[RangeMap], poses: All[Pose], images: All[Panorama], params: FusionParams, ctx: Context
 ) -> PointCloud:
-    """One coloured cloud with normals of all points on which several views agree.
+    """Fuse range maps into one coloured cloud with normals, keeping points on which several views agree.
 
-    Groups of poses are fused one by one, since nothing is known of where they are to each other.
+    Groups of poses are fused one by one, because their relative positions are unknown.
     """
     settings = settings_from(FusionSettings, params)
     groups = {name: pose.group for name, pose in poses.items()}
@@ -64,13 +64,13 @@ def _fused(
 
 
 def _min_views(settings: FusionSettings, views: int) -> int:
-    """Return how many views must agree on a point: no more than there are."""
+    """Return the number of views that must agree on a point, at most the number of views."""
     return min(settings.min_views, max(1, views))
 
 
 def _why_empty(ranges: Mapping[str, RangeMap], min_views: int) -> str:
     if not any(range_map.valid.any() for range_map in ranges.values()):
-        return "the cloud is empty: no view has any range. Look at the masks, and at what the depth stage says"
+        return "the cloud is empty: no view has any range. Check the masks and the messages of the depth stage"
     return (
         f"the cloud is empty: at no pixel did {min_views} views agree. Look at the poses, or lower min_confidence or "
         "min_views"

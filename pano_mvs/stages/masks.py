@@ -1,4 +1,4 @@
-"""Masks: panorama in, panorama out, with more of it to be ignored by every later stage."""
+"""Masks: stages that mask further areas of panoramas, which later stages then ignore."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from pano_mvs.api import Context, Each, Panorama, Params, stage
 class ColorParams(Params):
     """Settings of mask.color."""
 
-    color: str = Field(default="#000000", pattern="^#[0-9a-fA-F]{6}$", description="what is ignored, as #rrggbb")
-    tolerance: int = Field(default=8, ge=0, le=255, description="grey levels by which a channel may differ from it")
-    min_area_deg2: float = Field(default=4.0, ge=0, description="smaller areas are left, in square degrees")
-    margin_px: int = Field(default=2, ge=0, le=64, description="areas are widened by so much")
+    color: str = Field(default="#000000", pattern="^#[0-9a-fA-F]{6}$", description="colour to ignore, as #rrggbb")
+    tolerance: int = Field(default=8, ge=0, le=255, description="maximum difference of a channel, in grey levels")
+    min_area_deg2: float = Field(default=4.0, ge=0, description="minimum size of an area, in square degrees")
+    margin_px: int = Field(default=2, ge=0, le=64, description="width in pixels by which areas are dilated")
 
 
 @stage("mask.color")
 def color(image: Each[Panorama], params: ColorParams, ctx: Context) -> Panorama:
-    """Ignore large areas of one colour: black where a stitcher had nothing, a white disc over the tripod."""
+    """Mask large areas of one colour, such as black areas left by a stitcher or a white disc over the tripod."""
     red, green, blue = bytes.fromhex(params.color[1:])
     found = areas_of_color(
         image.load(),

@@ -1,4 +1,4 @@
-"""Matchers: which key points of two pictures are the same, and what the pictures' geometry says of it."""
+"""Matchers: find matching key points of two images, and verify them by the images' two-view geometry."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from pano_mvs.api import Context, Features, Near, Params, TwoView, stage
 class BruteForceParams(Params):
     """Settings of matches.brute_force."""
 
-    ratio: float = Field(default=0.8, gt=0, le=1, description="best distance over second best, at most")
-    mutual: bool = Field(default=True, description="only pairs that are each other's best")
+    ratio: float = Field(default=0.8, gt=0, le=1, description="maximum ratio of best to second-best distance")
+    mutual: bool = Field(default=True, description="keep only matches that are each other's best")
     preemptive: int = Field(
         default=0,
         ge=0,
-        description="leave a pair out if so many strongest key points hardly match (400, say); 0: never",
+        description="skip a pair if hardly any of this many strongest key points match (for example 400); 0: never",
     )
-    threshold_deg: float = Field(default=0.2, gt=0, le=10, description="angular Sampson error of a match that agrees")
-    min_inliers: int = Field(default=20, ge=8, description="agreeing matches that a pair needs")
+    threshold_deg: float = Field(default=0.2, gt=0, le=10, description="maximum angular Sampson error of an inlier")
+    min_inliers: int = Field(default=20, ge=8, description="minimum number of inliers of a pair")
     solver: Literal["five_point", "eight_point"] = Field(
-        default="five_point", description="how hypotheses are made; eight_point is the paper's, and weak on one plane"
+        default="five_point", description="minimal solver; eight_point is the paper's, and unreliable on planar scenes"
     )
-    refine: bool = Field(default=True, description="false keeps the best hypothesis as it comes, as the paper does")
+    refine: bool = Field(default=True, description="false keeps the best minimal hypothesis unrefined, as in the paper")
     max_alternatives: int = Field(
         default=4,
         ge=0,
-        description="runner-up geometries that a pair keeps, for places with repeated structure; none without refine",
+        description="maximum number of runner-up geometries of a pair, for repeated structure; requires refine",
     )
 
 
 @stage("matches.brute_force")
 def brute_force(features: Near[Features], params: BruteForceParams, ctx: Context) -> TwoView:
-    """Match all descriptors (ratio and mutual test), then verify by spherical RANSAC."""
+    """Match all descriptors (ratio and mutual test), then verify the matches by spherical RANSAC."""
     first, second = features
     if reason := hopeless_reason(first, second, preemptive=params.preemptive):
         return TwoView.failed(reason)

@@ -1,4 +1,4 @@
-"""What stages on range maps take in memory, as measured: `python -m tests.benchmarks.engine.stage_memory`."""
+"""Memory needs of stages on range maps, as measured by `python -m tests.benchmarks.engine.stage_memory`."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from pano_mvs.api import Params
 
 
 def bytes_per_pixel(own: int, *, each_source: int = 0) -> Callable[[Params, Mapping[str, Any]], int]:
-    """Return what finds the memory of a unit that works on a port `range_map` and, perhaps, on `sources`.
+    """Return a function that computes the memory of a unit with a port `range_map` and, optionally, `sources`.
 
     Args:
-        own: bytes for each pixel of the range map.
-        each_source: as many more for each source.
+        own: bytes per pixel of the range map.
+        each_source: additional bytes per pixel for each source.
     """
 
     def needed(_: Params, inputs: Mapping[str, Any]) -> int:

@@ -1,4 +1,4 @@
-"""Pair selectors: which pictures to match."""
+"""Pair selectors: choose which images to match."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ from pano_mvs.io.poses.files import read_poses
 
 @stage("pairs.exhaustive")
 def exhaustive(images: Names[Features]) -> Pairs:
-    """Every picture with every other; for up to some hundred pictures."""
+    """Match every image with every other one; for up to a few hundred images."""
     return exhaustive_pairs(images)
 
 
 class SequentialParams(Params):
     """Settings of pairs.sequential."""
 
-    window: int = Field(default=5, ge=1, description="each picture with so many that follow")
-    loop: bool = Field(default=False, description="the first picture follows the last")
+    window: int = Field(default=5, ge=1, description="number of following images to match each image with")
+    loop: bool = Field(default=False, description="the first image follows the last one")
     loop_closure: int = Field(
-        default=0, ge=0, description="each picture also with so many that look like it; needs global.vlad before"
+        default=0, ge=0, description="number of similar images beyond the window to match as well; requires global.vlad"
     )
 
 
@@ -51,13 +51,13 @@ class SequentialParams(Params):
 def sequential(
     images: Names[Features], descriptors: All[GlobalDescriptor] | None, params: SequentialParams, ctx: Context
 ) -> Pairs:
-    """Each picture with those that follow it, in the order of the file names; for walks and video.
+    """Match each image with the next ones in the order of the file names; for walks and video.
 
-    With `loop_closure`, also with those beyond the window that look most like it, where the walk comes back.
+    With `loop_closure`, also match it with the most similar images beyond the window, where the path returns.
     """
     if params.loop_closure and descriptors is None:
         raise UsageError(
-            "loop_closure needs global descriptors: put a stage {use: global.vlad} before pairs.sequential"
+            "loop_closure needs global descriptors: add a stage {use: global.vlad} before pairs.sequential"
         )
     pairs = loop_closing_pairs(
         images, descriptors or {}, window=params.window, loop=params.loop, loop_closure=params.loop_closure
@@ -69,7 +69,7 @@ def sequential(
 class VladParams(Params):
     """Settings of global.vlad."""
 
-    strongest: int = Field(default=4000, ge=8, description="number of the strongest key points in the vector")
+    strongest: int = Field(default=4000, ge=8, description="number of the strongest key points in the descriptor")
     sample: int = Field(
         default=200,
         ge=0,
@@ -80,7 +80,7 @@ class VladParams(Params):
 
 @stage("global.vlad")
 def vlad(features: Each[Features], params: VladParams) -> GlobalDescriptor:
-    """A global descriptor of each panorama, for pairs.retrieval and loop closure."""
+    """Compute a global descriptor of each panorama, for pairs.retrieval and loop closure."""
     return vlad_descriptor(features, strongest=params.strongest, sample=params.sample)
 
 
@@ -94,7 +94,7 @@ class RetrievalParams(Params):
 def retrieval(
     images: Names[Features], descriptors: All[GlobalDescriptor], params: RetrievalParams, ctx: Context
 ) -> Pairs:
-    """Each picture with those that look most like it; for hundreds of pictures in no order."""
+    """Match each image with the most similar ones; for hundreds of images without order."""
     pairs = retrieval_pairs(images, descriptors, neighbours=params.neighbours)
     ctx.metric("pairs", len(pairs.pairs))
     return pairs
@@ -103,8 +103,8 @@ def retrieval(
 class PositionParams(Params):
     """Settings of pairs.position."""
 
-    neighbours: int = Field(default=10, ge=1, description="each picture with so many nearest ones")
-    window: int = Field(default=3, ge=1, description="a picture without position with so many before and after it")
+    neighbours: int = Field(default=10, ge=1, description="number of nearest images to match each image with")
+    window: int = Field(default=3, ge=1, description="for images without position: number of images before and after")
     path: InputPath | None = Field(
         default=None, description="positions from a COLMAP model, poses.json, transforms.json or CSV instead of GPS"
     )
@@ -112,7 +112,7 @@ class PositionParams(Params):
 
 @stage("pairs.position")
 def position(images: All[Panorama], params: PositionParams, ctx: Context) -> Pairs:
-    """Each picture with those taken nearest to it, by GPS or by poses that are known roughly."""
+    """Match each image with the nearest ones, by GPS or by approximately known poses."""
     if params.path is not None:
         model = read_poses(params.path)
         place = dict(zip(model.names, model.centers, strict=True))
@@ -122,7 +122,7 @@ def position(images: All[Panorama], params: PositionParams, ctx: Context) -> Pai
         positions = dict(zip(located, east_north_m(list(located.values())), strict=True))
     if not positions:
         raise InputError(
-            "no picture has a position: their files hold no GPS fix. Use pairs.sequential, pairs.retrieval or "
+            "no image has a position: the files contain no GPS fix. Use pairs.sequential, pairs.retrieval or "
             "pairs.exhaustive, or give positions by `path`"
             if params.path is None
             else f"{params.path}: none of its images is one of this capture"

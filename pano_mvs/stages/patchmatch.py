@@ -14,19 +14,21 @@ from pano_mvs.stages.memory import bytes_per_pixel
 class PatchMatchParams(Params):
     """Settings of depth.patchmatch."""
 
-    rounds: int = Field(default=4, ge=0, le=32, description="how often planes are laid and matched")
+    rounds: int = Field(default=4, ge=0, le=32, description="number of rounds of fitting and matching planes")
     window: Odd = Field(
-        default=5, ge=3, le=15, description="samples along either side of the window, two pixels apart, odd"
+        default=5, ge=3, le=15, description="samples along each side of the window, two pixels apart, odd"
     )
     prior_px: float = Field(
-        default=0.6, gt=0, description="how far pictures may move a plane, in pixels of parallax (standard deviation)"
+        default=0.6, gt=0, description="standard deviation of the prior of a plane's range, in pixels of parallax"
     )
     prior_slope: float = Field(
-        default=0.1, gt=0, description="how far they may tilt it, in pixels of parallax for each pixel"
+        default=0.1, gt=0, description="standard deviation of the prior of its slope, in pixels of parallax per pixel"
     )
-    noise: float = Field(default=0.4, gt=0, description="standard deviation of a grey level, at best")
+    noise: float = Field(default=0.4, gt=0, description="minimum standard deviation of image noise, in grey levels")
     sigma_color: float = Field(
-        default=25.0, gt=0, description="samples that differ from the centre by so many grey levels count half"
+        default=25.0,
+        gt=0,
+        description="contrast to the window's centre, in grey levels, at which a sample has half weight",
     )
 
 
@@ -40,7 +42,7 @@ def patchmatch(
     params: PatchMatchParams,
     ctx: Context,
 ) -> RangeMap:
-    """Lay slanted planes through the ranges and move them to where the pictures match; gives normals."""
+    """Fit slanted planes to the ranges and move them to where the images match best; also gives normals."""
     require_one_group(pose, source_poses)
     refined = refine_range(
         range_map,

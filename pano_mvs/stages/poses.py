@@ -1,4 +1,4 @@
-"""Pose solvers: where the pictures were taken."""
+"""Pose solvers: estimate where the images were taken."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ class ScaledTranslationParams(Params):
     """Settings of poses.scaled_translation."""
 
     scale_estimator: Literal["cauchy", "log_median", "kappa"] = Field(
-        default="cauchy", description="how translation scale factors are estimated; kappa is the paper's"
+        default="cauchy", description="estimator of translation scale factors; kappa is the paper's"
     )
     kappa: float = Field(default=0.01, gt=0, description="width of the paper's clusters of scale factors")
-    adjust: bool = Field(default=True, description="adjust all cameras and points together as the model grows")
+    adjust: bool = Field(default=True, description="adjust all cameras and points as the model grows")
     ask_images: bool = Field(
-        default=True, description="let the images decide between places that the matches support about equally"
+        default=True, description="use the images to decide between poses that the matches support about equally"
     )
 
 
@@ -56,11 +56,11 @@ def scaled_translation(
     params: ScaledTranslationParams,
     ctx: Context,
 ) -> Poses:
-    """The paper's solver for any capture: relative poses joined by translation scale factors, placed by all pairs.
+    """Solve poses by the paper's method for any capture: join relative poses by translation scale factors.
 
-    Every image is placed by all of its pairs together; where several places agree with the pairs about as well, the
-    images decide. Images that cannot be placed reliably are left out, each with its reason. Groups of images that no
-    reliable pair connects are solved separately.
+    Each image is placed by all of its pairs together; if several poses agree with the pairs about equally well, the
+    images decide. Images that cannot be placed reliably are left out, each with a reason. Groups of images without a
+    reliable pair between them are solved separately.
     """
     poses = solve_scaled_translation(
         features,
@@ -78,7 +78,7 @@ class VerifyParams(Params):
     """Settings of poses.verify."""
 
     correct: bool = Field(
-        default=True, description="move or leave out cameras that the images contradict; false only reports"
+        default=True, description="move or remove cameras that the images contradict; false only reports them"
     )
 
 
@@ -91,12 +91,12 @@ def verify(
     params: VerifyParams,
     ctx: Context,
 ) -> Poses:
-    """Check poses of any origin against the images, and correct what repeated structure has put in the wrong place.
+    """Check poses of any origin against the images, and correct errors caused by repeated structure.
 
-    Every camera is swept with its neighbours at 256 columns, and gets the share of its textured pixels that they
-    confirm beside the share that is to be expected. A camera far below it is tried in the other places that its
-    matches suggest, moved to one that the images confirm clearly better, left out if nothing supports it, or reported
-    as doubtful. Without features and matches it only reports.
+    Each camera is swept with its neighbours at 256 columns. The result is the share of its textured pixels that they
+    confirm, and the share to be expected. A camera far below the expected share is tried at the other poses that its
+    matches suggest. It is moved if the images confirm another pose clearly better, left out if nothing supports it, or
+    reported as doubtful. Without features and matches the stage only reports.
     """
     verified = verify_poses(
         poses, panorama_loader(images), features=features, two_views=matches, correct=params.correct
@@ -123,20 +123,20 @@ class RefineParams(Params):
     """Settings of poses.refine."""
 
     loss: Literal["cauchy", "huber"] = Field(default="cauchy", description="robust loss of the angular residuals")
-    loss_scale_deg: float = Field(default=0.1, gt=0, description="residual at which the loss starts to bend")
-    max_error_deg: float = Field(default=0.4, gt=0, description="observations further off are dropped")
-    max_iterations: int = Field(default=50, ge=1, description="of the optimiser, in each round")
-    align: bool = Field(
-        default=True, description="place observations anew by aligning patches of the images, and adjust once more"
+    loss_scale_deg: float = Field(
+        default=0.1, gt=0, description="residual at which an observation starts to lose influence"
     )
+    max_error_deg: float = Field(default=0.4, gt=0, description="observations with a larger error are dropped")
+    max_iterations: int = Field(default=50, ge=1, description="maximum number of iterations in each round")
+    align: bool = Field(default=True, description="refine observations by aligning image patches, and adjust once more")
 
 
 @stage("poses.refine")
 def refine(poses: One[Poses], images: All[Panorama], params: RefineParams, ctx: Context) -> Poses:
-    """Angular bundle adjustment: all poses and points together, in degrees on the sphere rather than in pixels.
+    """Refine all poses and points by angular bundle adjustment, with errors in degrees on the sphere instead of pixels.
 
-    Between two adjustments patches of the images are aligned, which places the observations more precisely than the
-    detector does and says how precise each is. Groups of poses are adjusted one by one.
+    Between two adjustments, patches of the images are aligned, which locates the observations more precisely than the
+    detector and estimates their precision. Groups of poses are adjusted one by one.
     """
     refined = refine_poses(
         poses,
@@ -163,58 +163,61 @@ class FromModelParams(Params):
 
 @stage("poses.from_model")
 def from_model(images: All[Panorama], params: FromModelParams, ctx: Context) -> Poses:
-    """Poses that are known already: a COLMAP model, poses.json, nerfstudio's transforms.json, or CSV.
+    """Read known poses from a COLMAP model, poses.json, nerfstudio's transforms.json, or CSV.
 
-    Image names are compared with and without their folders and extensions. Where the file records the SHA-256 of its
-    pictures, they are compared too: poses of other pictures that happen to have the same names are refused.
+    Image names are compared with and without their folders and extensions. If the file contains the SHA-256 of its
+    images, the hashes are compared too: poses of other images with the same names are rejected.
     """
     _require_its_pictures(params.path, images, ctx)
     known = known_poses(params.path, tuple(images))
-    return checked_poses(known, ctx, remedy=f"{params.path} must know two pictures of the capture at least")
+    return checked_poses(known, ctx, remedy=f"{params.path} must contain poses of at least two images of the capture")
 
 
 def _require_its_pictures(path: Path, images: Mapping[str, Panorama], ctx: Context) -> None:
-    """Raise InputError if a file of poses records other pictures under the names of the capture; note single ones."""
+    """Raise InputError if a file of poses belongs to other images with the same names; report single mismatches."""
     recorded = recorded_pictures(path)
-    matched = {name: there for name, there in match_image_names(images, recorded).items()
-               if PurePosixPath(name).suffix == PurePosixPath(there).suffix}  # fmt: skip
+    matched = {
+        name: there
+        for name, there in match_image_names(images, recorded).items()
+        if PurePosixPath(name).suffix == PurePosixPath(there).suffix
+    }
     others = [name for name, there in matched.items() if images[name].image.sha256() != recorded[there]]
     if others and len(others) == len(matched):
         raise InputError(
-            f"{path}: records other pictures under these names: not one of {len(others)} ({others[0]} …) has the "
-            "SHA-256 that it states. Give the poses of these pictures: --set poses.path=FILE. If they are the same "
-            "pictures, saved anew, take the sha256 out of the file"
+            f"{path}: records other images under these names: not one of {len(others)} ({others[0]} …) has the "
+            "SHA-256 in the file. Give the poses of these images: --set poses.path=FILE. If they are the same images, "
+            "saved again, remove the sha256 from the file"
         )
     for name in others:
-        ctx.note(f"{name} is not the picture, byte for byte, whose pose {path.name} records")
+        ctx.note(f"{name} is not the image whose pose {path.name} records: the files differ")
 
 
 class TriangulateParams(Params):
     """Settings of poses.triangulate."""
 
-    max_error_deg: float = Field(default=0.4, gt=0, description="observations further off are dropped")
-    min_angle_deg: float = Field(default=1.0, gt=0, description="rays of a point must meet at this angle or more")
+    max_error_deg: float = Field(default=0.4, gt=0, description="observations with a larger error are dropped")
+    min_angle_deg: float = Field(default=1.0, gt=0, description="minimum angle between the rays of a point")
 
 
 @stage("poses.triangulate")
 def triangulate(
     poses: One[Poses], features: All[Features], matches: All[TwoView], params: TriangulateParams, ctx: Context
 ) -> Poses:
-    """Sparse points for poses that are kept exactly as they are."""
+    """Triangulate sparse points from known poses, which stay exactly as they are."""
     points = triangulate_tracks(
         poses, features, matches, max_error_deg=params.max_error_deg, min_angle_deg=params.min_angle_deg
     )
     return checked_poses(points, ctx)
 
 
-_CLOSER = "Take pictures closer together (0.5–1 m indoors) with more in common"
+_CLOSER = "Take panoramas closer together (0.5–1 m indoors) with more overlap"
 
 
 def checked_poses(poses: Poses, ctx: Context, *, remedy: str = _CLOSER) -> Poses:
-    """Report what was left out; stop where less than two pictures are left.
+    """Report images that were left out; stop the run if fewer than two are registered.
 
     Raises:
-        RunStoppedError: if fewer than two pictures are registered: there is nothing to sweep.
+        RunStoppedError: if fewer than two images are registered, because then there is nothing to sweep.
     """
     for name, reason in poses.rejected.items():
         ctx.reject(name, reason)
@@ -233,18 +236,20 @@ def checked_poses(poses: Poses, ctx: Context, *, remedy: str = _CLOSER) -> Poses
 def known_poses(path: Path, images: tuple[str, ...]) -> Poses:
     """Return the poses that a file has for the images of a capture, in the capture's order, without points.
 
-    Images without a pose, and images that share one name of the file, are rejected with the reason. Of an output folder
-    with several groups of poses the largest is read.
+    Images without a pose, and images that match the same name in the file, are rejected with the reason. If an output
+    folder has several groups of poses, the largest one is read.
 
     Raises:
-        InputError: if the file cannot be used, knows none of the images, or has all of them in one place.
+        InputError: if the file cannot be used, contains none of the images, or has all of them at the same place.
     """
     model, *others = read_groups(path)
     known = match_image_names(images, model.names)
     if not known:
-        raise InputError(f"{path}: none of its {len(model.names)} {plural(len(model.names), 'image')} is one of this "
-                         f"capture (it has {', '.join(model.names[:3])} …, the capture "
-                         f"{', '.join(images[:3])} …)")  # fmt: skip
+        raise InputError(
+            f"{path}: none of its {len(model.names)} {plural(len(model.names), 'image')} is one of this "
+            f"capture (it has {', '.join(model.names[:3])} …, the capture "
+            f"{', '.join(images[:3])} …)"
+        )
     position = {name: idx for idx, name in enumerate(model.names)}
     claims = Counter(known.values())
     poses = {
@@ -256,7 +261,7 @@ def known_poses(path: Path, images: tuple[str, ...]) -> Poses:
     if len(centers) > 1 and np.ptp(centers, axis=0).max() <= 1e-9 * max(1.0, float(np.abs(centers).max())):
         raise InputError(f"{path}: all {len(centers)} cameras stand in one place; depth needs different places")
     rejected = {
-        name: f"{path.name} has one pose, {known[name]!r}, that several pictures could mean"
+        name: f"{path.name} has one pose, {known[name]!r}, that matches several images"
         if name in known
         else _why_unknown(name, path, others)
         for name in images
@@ -274,6 +279,8 @@ def known_poses(path: Path, images: tuple[str, ...]) -> Poses:
 def _why_unknown(name: str, path: Path, others: Sequence[Poses]) -> str:
     for number, group in enumerate(others, start=1):
         if match_image_names((name,), group.names):
-            return (f"{path.name} has it in group {number}, whose frame is another: give the model sparse/{number} to "
-                    "have that group")  # fmt: skip
+            return (
+                f"{path.name} has it in group {number}, which has a different frame: use the model sparse/{number} "
+                "for that group"
+            )
     return f"{path.name} has no pose for it"

@@ -1,4 +1,4 @@
-"""Pose solvers that run COLMAP, and the one that extends a model whose cameras do not move."""
+"""Pose solvers that run COLMAP, and a solver that extends a model with fixed cameras."""
 
 from __future__ import annotations
 
@@ -22,31 +22,31 @@ class ColmapParams(Params):
         default="sphere", description="EQUIRECTANGULAR cameras, or a rig of six pinhole faces for each panorama"
     )
     fixed: InputPath | None = Field(
-        default=None, description="known poses (whatever poses.from_model reads) that stay; incremental mapper only"
+        default=None, description="known poses to keep fixed (any input of poses.from_model); incremental mapper only"
     )
 
     @model_validator(mode="after")
     def _fixed_needs_incremental(self) -> ColmapParams:
         if self.fixed is not None and self.mapper == "global":
-            raise ValueError("COLMAP's global mapper moves all cameras: take mapper: incremental to keep some fixed")
+            raise ValueError("COLMAP's global mapper moves all cameras: use mapper: incremental to keep some fixed")
         return self
 
 
 @stage("poses.colmap")
 def colmap_poses(features: All[Features], matches: All[TwoView], params: ColmapParams, ctx: Context) -> Poses:
-    """COLMAP's incremental or global mapper, seeded with our key points and verified matches; one pose a panorama."""
+    """Solve poses by COLMAP's incremental or global mapper, from our key points and verified matches."""
     return checked_poses(_mapped(features, matches, params, ctx), ctx)
 
 
 class ColmapSiftParams(ColmapParams):
     """Settings of poses.colmap_sift."""
 
-    max_keypoints: int = Field(default=8192, ge=8, description="of each picture, at most")
+    max_keypoints: int = Field(default=8192, ge=8, description="maximum number per image")
 
 
 @stage("poses.colmap_sift")
 def colmap_sift_poses(images: All[Panorama], params: ColmapSiftParams, ctx: Context) -> Poses:
-    """COLMAP on its own: its planar SIFT, exhaustive matching, and mapper. Masks are respected."""
+    """Solve poses by COLMAP alone: its planar SIFT, exhaustive matching, and mapper. Masks are respected."""
     pictures = ((name, image.load(), image.load_mask()) for name, image in images.items())
     features, matches = colmap_sift(pictures, max_keypoints=params.max_keypoints, rng=ctx.rng, scratch=ctx.scratch)
     return checked_poses(_mapped(features, matches, params, ctx), ctx)
@@ -55,25 +55,25 @@ def colmap_sift_poses(images: All[Panorama], params: ColmapSiftParams, ctx: Cont
 class ExtendParams(Params):
     """Settings of poses.extend."""
 
-    path: InputPath = Field(description="the known poses: whatever poses.from_model reads")
-    max_error_deg: float = Field(default=0.4, gt=0, description="observations further off are dropped")
-    min_angle_deg: float = Field(default=1.0, gt=0, description="rays of a point must meet at this angle or more")
+    path: InputPath = Field(description="known poses: any input of poses.from_model")
+    max_error_deg: float = Field(default=0.4, gt=0, description="observations with a larger error are dropped")
+    min_angle_deg: float = Field(default=1.0, gt=0, description="minimum angle between the rays of a point")
 
 
 @stage("poses.extend")
 def extend(features: All[Features], matches: All[TwoView], params: ExtendParams, ctx: Context) -> Poses:
-    """Register new pictures against known cameras, which keep their poses to the last digit, with sparse points."""
+    """Register new images with known cameras, whose poses stay exactly as they are; also gives sparse points."""
     known = known_poses(params.path, tuple(features))
     poses = extend_poses(
         known, features, matches, max_error_deg=params.max_error_deg, min_angle_deg=params.min_angle_deg
     )
-    return checked_poses(poses, ctx, remedy=f"{params.path} must know two pictures of the capture at least")
+    return checked_poses(poses, ctx, remedy=f"{params.path} must contain poses of at least two images of the capture")
 
 
 def _mapped(
     features: Mapping[str, Features], matches: Mapping[tuple[str, str], TwoView], params: ColmapParams, ctx: Context
 ) -> Poses:
-    """Run COLMAP's mapper from nothing, or from the poses that stay."""
+    """Run COLMAP's mapper from scratch, or from fixed known poses."""
     if params.fixed is None:
         return solve_colmap(
             features, matches, mapper=params.mapper, cameras=params.cameras, rng=ctx.rng, scratch=ctx.scratch

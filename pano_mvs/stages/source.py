@@ -1,4 +1,4 @@
-"""Sources: where the panoramas come from."""
+"""Sources: read the panoramas of a capture."""
 
 from __future__ import annotations
 
@@ -22,37 +22,39 @@ from pano_mvs.scene.image_files.image_file import decode_image
 class FolderParams(Params):
     """Settings of source.folder."""
 
-    path: SourcePath = Field(description="folder of the pictures, searched with its subfolders")
+    path: SourcePath = Field(description="folder of the images, searched recursively")
     masks: SourcePath | None = Field(default=None, description="folder of masks <image name>.png; 0 is ignored")
-    mask: SourcePath | None = Field(default=None, description="one mask for all pictures; 0 is ignored")
+    mask: SourcePath | None = Field(default=None, description="one mask for all images; 0 is ignored")
     nadir_deg: float = Field(
-        default=0.0, ge=0, le=90, description="ignore so much around straight down (tripod); 45 is the lowest quarter"
+        default=0.0, ge=0, le=90, description="ignore this angle around straight down (tripod); 45: the lowest quarter"
     )
-    zenith_deg: float = Field(default=0.0, ge=0, le=90, description="ignore so much around straight up")
+    zenith_deg: float = Field(default=0.0, ge=0, le=90, description="ignore this angle around straight up")
     max_width: int = Field(default=4096, ge=16, description="wider panoramas are scaled down to this width")
     max_megapixels: Annotated[float, NOT_IN_KEY] = Field(
-        default=MAX_PIXELS / 1e6, gt=0, description="larger files are refused, before they take memory"
+        default=MAX_PIXELS / 1e6, gt=0, description="larger files are rejected before they are decoded"
     )
 
     @property
     def max_pixels(self) -> int:
-        """The largest number of pixels of a file."""
+        """Maximum number of pixels of a file."""
         return int(self.max_megapixels * 1e6)
 
 
 def list_folder(params: FolderParams) -> Iterator[SourceItem]:
-    """List the pictures of a folder with their masks.
+    """List the images of a folder with their masks.
 
     Raises:
-        InputError: if the folder does not hold two pictures or more.
+        InputError: if the folder contains fewer than two images.
     """
     unread: list[str] = []
     pictures = [path for path in list_pictures(params.path, unread) if not _is_mask(path, params)]
     if not pictures:
-        raise InputError(f"{params.path}: all images in it are masks. Give the folder that holds the panoramas")
+        raise InputError(f"{params.path}: all images in it are masks. Give the folder that contains the panoramas")
     if len(pictures) < 2:
-        raise InputError(f"{params.path}: holds one picture only ({pictures[0].name}); depth needs two or more "
-                         "panoramas of the same place, taken from different positions")  # fmt: skip
+        raise InputError(
+            f"{params.path}: contains only one image ({pictures[0].name}); depth needs two or more panoramas of the "
+            "same place, taken from different positions"
+        )
     if params.masks is not None:
         require_masks(params.masks, [path.relative_to(params.path).as_posix() for path in pictures])
     for path in pictures:
@@ -65,7 +67,7 @@ def list_folder(params: FolderParams) -> Iterator[SourceItem]:
 
 
 def folder_memory_bytes(params: FolderParams, inputs: Mapping[str, Any]) -> int:
-    """Return what reading a picture and its mask takes, by the header of the file; 0 for what is refused anyway."""
+    """Return the memory for reading an image and its mask, from the header of the file; 0 for files to be rejected."""
     item: SourceItem = inputs["item"]
     height, width = stated_size_of_file(item.files["image"]) or (0, 0)
     if height * width > params.max_pixels:
@@ -78,9 +80,9 @@ def folder_memory_bytes(params: FolderParams, inputs: Mapping[str, Any]) -> int:
 def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
     """Read the panoramas of a folder and its subfolders.
 
-    A picture is a panorama if its GPano metadata say so (whole or cropped), or if it is twice as wide as high. Masks
-    are looked for as `<masks>/<image name>.png`, then `<masks>/<name without extension>.png`, then `mask`; they cover
-    what the picture covers, or the whole sphere, at any resolution.
+    An image is a panorama if its GPano metadata say so (full or cropped), or if it is twice as wide as high. Masks are
+    searched as `<masks>/<image name>.png`, then `<masks>/<name without extension>.png`, then `mask`; they cover the
+    same part of the sphere as the image, or the full sphere, at any resolution.
     """
     image = item.file("image")
     path, data = image.path, image.read_bytes()
@@ -88,7 +90,7 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
     for warning in info.warnings:
         ctx.note(f"{item.name}: {warning}")
     for trait in info.traits:
-        ctx.note(f"some pictures have {trait}")
+        ctx.note(f"some images have {trait}")
     _check_pixels(path, data, info, params.max_pixels)
     del data
     panorama = Panorama(
@@ -106,27 +108,30 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
     valid = panorama.load_mask().mean()
     ctx.metric("valid", float(valid))
     if not valid:
-        ctx.note(f"{item.name}: all of it is masked; nothing can be seen in it")
+        ctx.note(f"{item.name}: everything in it is masked")
     return panorama
 
 
 def _check_pixels(path: Path, data: bytes, info: PictureInfo, max_pixels: int) -> None:
-    """Decode the whole picture once, so that a damaged file is named here and not in the middle of a sweep."""
+    """Decode the whole image once, so that a damaged file is reported here and not in the middle of a sweep."""
     picture = decode_image(path, data, max_pixels=max_pixels)
     height, width = picture.shape[:2]
     if (height, width) != info.file_size_hw:
-        raise InputError(f"{path}: decodes to {width}×{height} px, its header says {info.file_size_hw[::-1]}. "
-                         "Save it anew")  # fmt: skip
+        raise InputError(
+            f"{path}: decodes to {width}×{height} px, its header says {info.file_size_hw[::-1]}. Save it again"
+        )
     if info.gpano is None and is_dual_fisheye(picture):
-        raise InputError(f"{path}: two fisheye images side by side, not an equirectangular panorama. Export it as one "
-                         "with the camera maker's program first (stitching)")  # fmt: skip
+        raise InputError(
+            f"{path}: two fisheye images side by side, not an equirectangular panorama. Export it as a panorama with "
+            "the camera maker's program first (stitching)"
+        )
 
 
 def working_size(source_hw: tuple[int, int], max_width: int) -> tuple[int, int]:
-    """Return the size to work at: the width a multiple of four, so that height and half a turn are whole pixels."""
+    """Return the working size: the width is a multiple of four, so that height and half a turn are whole pixels."""
     width = min(source_hw[1], max_width) // 4 * 4
     if width < 16:
-        raise InputError(f"a panorama of {source_hw[1]}×{source_hw[0]} px is too small; 16 columns are needed")
+        raise InputError(f"a panorama of {source_hw[1]}×{source_hw[0]} px is too small; it needs at least 16 columns")
     return width // 2, width
 
 
@@ -139,10 +144,10 @@ def _notes_on_masks(name: str, mask: Path | None, params: FolderParams) -> Itera
     if mask is None and params.masks is not None:
         yield f"{name} has no mask in {params.masks.name}; all of it is used"
     if params.masks is None and is_folder(unused := params.path / "masks"):
-        yield f"{unused} is there, but not used; give it as `masks` to ignore what its files mask"
+        yield f"{unused} is there, but not used; give it as `masks` to apply its masks"
 
 
 def _is_mask(path: Path, params: FolderParams) -> bool:
-    """Return whether a picture found among the panoramas is one of their masks."""
+    """Return whether an image found among the panoramas is one of their masks."""
     masks, mask = (given and given.absolute() for given in (params.masks, params.mask))
     return path.absolute() == mask or (masks is not None and path.absolute().is_relative_to(masks))

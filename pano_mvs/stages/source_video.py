@@ -1,4 +1,4 @@
-"""Panoramas from videos: frames at even steps of time, of each step the sharpest."""
+"""Panoramas from videos: the sharpest frame around each of a series of equally spaced times."""
 
 from __future__ import annotations
 
@@ -30,22 +30,24 @@ class VideoParams(Params):
     """Settings of source.video."""
 
     path: SourcePath | list[SourcePath] = Field(
-        description="an equirectangular video, a list of them, or a folder of them"
+        description="an equirectangular video, a list of videos, or a folder of videos"
     )
-    every_s: float | None = Field(default=None, gt=0, description="seconds from one frame to the next; 1 by default")
-    every_frames: int | None = Field(default=None, ge=1, description="the same in frames of the video")
+    every_s: float | None = Field(default=None, gt=0, description="time between frames in seconds; 1 by default")
+    every_frames: int | None = Field(default=None, ge=1, description="the same as a number of frames of the video")
     pick: Literal["sharpest", "nearest"] = Field(
         default="sharpest",
-        description="which of the frames within a quarter of a step: the sharpest, or the nearest",
+        description="frame to use within a quarter of a step: the sharpest, or the nearest",
     )
-    start_s: Annotated[float, NOT_IN_KEY] = Field(default=0.0, ge=0, description="leave out what comes before")
-    end_s: Annotated[float | None, NOT_IN_KEY] = Field(default=None, gt=0, description="leave out what comes after")
+    start_s: Annotated[float, NOT_IN_KEY] = Field(default=0.0, ge=0, description="start time in the video, in seconds")
+    end_s: Annotated[float | None, NOT_IN_KEY] = Field(
+        default=None, gt=0, description="end time in the video, in seconds"
+    )
     max_frames: Annotated[int | None, NOT_IN_KEY] = Field(
-        default=None, ge=2, description="of each video at most so many frames; the steps grow"
+        default=None, ge=2, description="maximum number of frames per video; a lower number increases the steps"
     )
     mask: SourcePath | None = Field(default=None, description="one mask for all frames; 0 is ignored")
-    nadir_deg: float = Field(default=0.0, ge=0, le=90, description="ignore so much around straight down (operator)")
-    zenith_deg: float = Field(default=0.0, ge=0, le=90, description="ignore so much around straight up")
+    nadir_deg: float = Field(default=0.0, ge=0, le=90, description="ignore this angle around straight down (operator)")
+    zenith_deg: float = Field(default=0.0, ge=0, le=90, description="ignore this angle around straight up")
     max_width: int = Field(default=4096, ge=16, description="wider frames are scaled down to this width")
 
     @model_validator(mode="after")
@@ -57,15 +59,15 @@ class VideoParams(Params):
         return self
 
     def step_s(self, info: VideoInfo) -> float:
-        """Return the time from one frame to the next."""
+        """Return the time between frames in seconds."""
         return self.every_frames / info.frames_per_s if self.every_frames is not None else self.every_s or 1.0
 
 
 def list_frames(params: VideoParams) -> Iterator[SourceItem]:
-    """List the frames to take, by the headers of the videos alone.
+    """List the frames to read, from the headers of the videos alone.
 
     Raises:
-        InputError: if the only video cannot be used, or all of them give fewer than two frames.
+        InputError: if the only video cannot be used, or all videos together give fewer than two frames.
     """
     items, failed, first_error = list[SourceItem](), list[SourceItem](), None
     unread: list[str] = []
@@ -78,24 +80,25 @@ def list_frames(params: VideoParams) -> Iterator[SourceItem]:
     if len(items) < 2:
         if first_error is not None:
             raise first_error
-        raise InputError(f"{items[0].files['video'] if items else params.path}: gives {len(items)} "
-                         f"{plural(len(items), 'frame')}; depth needs two or more. Set a smaller every_s, or another "
-                         "start_s and end_s")  # fmt: skip
+        raise InputError(
+            f"{items[0].files['video'] if items else params.path}: gives {len(items)} {plural(len(items), 'frame')}; "
+            "depth needs two or more. Set a smaller every_s, or another start_s and end_s"
+        )
     yield from (replace(item, notes=tuple(unread)) for item in items)
     yield from failed
 
 
 @source("source.video", list_items=list_frames)
 def video(item: SourceItem, params: VideoParams, ctx: Context) -> Panorama:
-    """Take the frames of equirectangular videos at even steps of time.
+    """Read frames of equirectangular videos at equally spaced times.
 
-    Around each step the sharpest of the frames within a quarter of a step is taken. It is kept without loss, as
-    `<video>_<milliseconds of the step>ms.png`. Match them with `pairs.sequential`.
+    Around each time, the sharpest frame within a quarter of a step is used. It is stored without loss, as
+    `<video>_<milliseconds of the time>ms.png`. Match the frames with `pairs.sequential`.
     """
     path = item.files["video"]
     info = describe_video(path)
     if info.is_turned:
-        ctx.note(f"{path.name} tells players to turn it, which was ignored: frames are taken as they are stored")
+        ctx.note(f"{path.name} has a rotation in its metadata, which was ignored: frames are used as stored")
     time_s, quality, frame = _best_frame(path, _time_from_name(item.name), params, info, threads=ctx.threads)
     if is_dual_fisheye(frame):
         raise InputError(_dual_fisheye(path))
@@ -116,10 +119,10 @@ def video(item: SourceItem, params: VideoParams, ctx: Context) -> Panorama:
 
 
 def _named_videos(params: VideoParams, notes: list[str]) -> Iterator[tuple[Path, str]]:
-    """Yield the videos, each with its name relative to the capture, without its suffix where one alone is called so.
+    """Yield the videos with their names relative to the capture, without suffix where that is unambiguous.
 
     Raises:
-        InputError: if two videos of a list have one name.
+        InputError: if two videos of a list have the same name.
     """
     named: dict[str, Path] = {}
     for path in params.path if isinstance(params.path, list) else [params.path]:
@@ -127,8 +130,10 @@ def _named_videos(params: VideoParams, notes: list[str]) -> Iterator[tuple[Path,
         for found in list_videos(path, notes):
             name = found.relative_to(base).as_posix()
             if name in named:
-                raise InputError(f"{named[name]} and {found}: frames of both would be called after {name}. Give the "
-                                 "folder that holds both as path, or rename one")  # fmt: skip
+                raise InputError(
+                    f"{named[name]} and {found}: frames of both would be called after {name}. Use the folder that "
+                    "contains both as path, or rename one of them"
+                )
             named[name] = found
     stems = item_stems(named)
     for name, path in named.items():
@@ -149,7 +154,7 @@ def _items_of(path: Path, name: str, params: VideoParams) -> Iterator[SourceItem
 
 
 def _steps(info: VideoInfo, params: VideoParams) -> list[float]:
-    """Return the times to take frames at, in seconds."""
+    """Return the times of the frames, in seconds."""
     step_s, last_s = params.step_s(info), (info.frames - 1) / info.frames_per_s
     length_s = min(last_s, params.end_s if params.end_s is not None else last_s) - params.start_s
     if length_s < 0:
@@ -164,10 +169,10 @@ def _steps(info: VideoInfo, params: VideoParams) -> list[float]:
 def _best_frame(
     path: Path, time_s: float, params: VideoParams, info: VideoInfo, *, threads: int
 ) -> tuple[float, float, NDArray[np.uint8]]:
-    """Return the time, the sharpness and the picture (BGR) of the frame to take around a time.
+    """Return the time, the sharpness and the image (BGR) of the frame to use around a time.
 
     Raises:
-        InputError: if there is none.
+        InputError: if there is no frame that can be decoded.
     """
     reach_s = max(params.step_s(info) / 4, 0.51 / info.frames_per_s)
     best: tuple[float, float, NDArray[np.uint8]] | None = None
@@ -179,8 +184,8 @@ def _best_frame(
             best, least = (found_s, quality, frame), badness
     if best is None:
         raise InputError(
-            f"{path}: has no frame between {max(0.0, time_s - reach_s):.3f} s and {time_s + reach_s:.3f} s that can be "
-            "decoded: it is damaged there, ends early, or pauses. Set end_s or start_s, or copy it again"
+            f"{path}: no frame between {max(0.0, time_s - reach_s):.3f} s and {time_s + reach_s:.3f} s can be decoded: "
+            "the video is damaged there, ends early, or pauses. Set end_s or start_s, or copy it again"
         )
     return best
 
@@ -192,5 +197,7 @@ def _time_from_name(name: str) -> float:
 
 
 def _dual_fisheye(path: Path) -> str:
-    return (f"{path}: two fisheye images side by side, not an equirectangular panorama. Export it as an "
-            "equirectangular video with the camera maker's program first (stitching)")  # fmt: skip
+    return (
+        f"{path}: two fisheye images side by side, not an equirectangular panorama. Export it as an equirectangular "
+        "video with the camera maker's program first (stitching)"
+    )

@@ -1,1 +1,1 @@
-"""Synthetic scenes with exact truth, and checks for the authors of stages."""
+"""Synthetic scenes with exact ground truth, and contract tests for authors of stages."""

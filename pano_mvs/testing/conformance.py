@@ -1,12 +1,12 @@
-"""The contract that every stage keeps, ours and a stranger's, as a list of laws to be run by any test runner.
+"""The contract of all stages, built-in or from plugins, as a list of tests for any test runner.
 
-    @pytest.mark.parametrize("law", stage_laws(Path("my_filter.py")), ids=str)
-    def test_keeps_the_contract(law: Law) -> None:
-        law.check()
+    @pytest.mark.parametrize("contract_test", stage_contract_tests(Path("my_filter.py")), ids=str)
+    def test_keeps_the_contract(contract_test: ContractTest) -> None:
+        contract_test.check()
 
-A stage is called on a tiny synthetic capture (`pano_mvs.testing.tiny_capture`) with what the stages before it might
-have made. It may refuse inputs with one of our errors, such as InputError, wherever a law speaks of tiny pictures or of
-nothing to see; any other exception breaks the law.
+Each test calls the stage on a tiny synthetic capture (`pano_mvs.testing.tiny_capture`), with inputs as earlier stages
+might produce them. Where a test is about tiny images or empty inputs, the stage may reject its inputs with one of our
+errors, such as InputError. Any other exception breaks the contract.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.stages.stage import StageSpec, spec_of
 from pano_mvs.geometry import pixel_from_ray, roll_panorama
 from pano_mvs.scene import Features, Panorama, RangeMap
-from pano_mvs.testing.law import Law
-from pano_mvs.testing.part_laws import backend_laws, cost_laws
+from pano_mvs.testing.contract_test import ContractTest
+from pano_mvs.testing.part_contracts import backend_contract_tests, cost_contract_tests
 from pano_mvs.testing.stage_calls import StageCase, digest_of
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
 
-__all__ = ["Law", "backend_laws", "check_stage", "cost_laws", "stage_laws"]
+__all__ = ["ContractTest", "backend_contract_tests", "check_stage", "cost_contract_tests", "stage_contract_tests"]
 
 Stage = StageSpec | Callable[..., Any] | ModuleType | Path | str
 
@@ -48,34 +48,34 @@ _SIZES = {
     "of two sizes": Variant(mixed=True),
 }
 _ROLL = 16
-_LARGEST_ROLL_ERROR = 0.01
-_LEAST_ROLL_AGREEMENT = {RangeMap: 0.95, Features: 0.5, Panorama: 0.99}
+_MAX_ROLL_ERROR = 0.01
+_MIN_ROLL_AGREEMENT = {RangeMap: 0.95, Features: 0.5, Panorama: 0.99}
 
 
-def stage_laws(
+def stage_contract_tests(
     stage: Stage,
     *,
     settings: Mapping[str, Any] | None = None,
     inputs: Mapping[str, Any] | None = None,
     size_hw: tuple[int, int] = (32, 64),
-) -> list[Law]:
-    """Return the laws that a stage must keep; of a file or module, those of all its stages.
+) -> list[ContractTest]:
+    """Return the contract tests of a stage, or of all stages of a file or module.
 
     Args:
-        stage: the decorated function, the file or module that holds it, its spec, or the name of an installed one.
-        settings: in place of its defaults; `{capture}` in a text stands for the folder of the tiny capture, which
-            holds images/, truth/poses.json and truth/depth.npz.
-        inputs: port to a value, for ports of kinds of your own.
-        size_hw: of the pictures, for stages that can do nothing with ordinary ones as small as these.
+        stage: the decorated function, the file or module that holds it, its spec, or the name of an installed stage.
+        settings: replace the defaults; `{capture}` in a string stands for the folder of the tiny capture, which holds
+            images/, truth/poses.json and truth/depth.npz.
+        inputs: port name to a value, for ports of your own kinds.
+        size_hw: image size, for stages that need larger images than these.
 
     Raises:
-        UsageError: if there is no stage.
+        UsageError: if there is no such stage.
         PluginError: if a file cannot be loaded.
     """
     return [
-        Law(f"{spec.name} {what}", partial(check, StageCase(spec, settings or {}, inputs or {}, size_hw)))
+        ContractTest(f"{spec.name} {what}", partial(check, StageCase(spec, settings or {}, inputs or {}, size_hw)))
         for spec in _specs(stage)
-        for what, check in _LAWS.items()
+        for what, check in _CONTRACT.items()
         if _applies(what, spec)
     ]
 
@@ -87,28 +87,28 @@ def check_stage(
     inputs: Mapping[str, Any] | None = None,
     size_hw: tuple[int, int] = (32, 64),
 ) -> None:
-    """Check all laws of a stage, see `stage_laws`.
+    """Run all contract tests of a stage; see `stage_contract_tests`.
 
     Raises:
-        AssertionError: at the first that it breaks.
-        Exception: whatever else the stage raises.
+        AssertionError: at the first test that fails.
+        Exception: any other exception that the stage raises.
     """
-    for law in stage_laws(stage, settings=settings, inputs=inputs, size_hw=size_hw):
-        law.check()
+    for contract_test in stage_contract_tests(stage, settings=settings, inputs=inputs, size_hw=size_hw):
+        contract_test.check()
 
 
 def _declares_itself(case: StageCase) -> None:
-    """It has a name of the form kind.name, a docstring, and a description of every setting."""
+    """The stage has a name of the form kind.name, a docstring, and a description of every setting."""
     spec = case.spec
     assert re.fullmatch(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)+", spec.name), f"{spec.name!r} is not kind.name"
     assert spec.doc, f"{spec.name} has no docstring"
     bare = [name for name, info in spec.params_type.model_fields.items() if not info.description]
     assert not bare, f"settings of {spec.name} without a description: {', '.join(bare)}"
-    assert inspect.isfunction(spec.function), f"{spec.name} is not a plain function, which workers find by its name"
+    assert inspect.isfunction(spec.function), f"{spec.name} is not a plain function; workers look it up by its name"
 
 
 def _settings_are_values(case: StageCase) -> None:
-    """Its settings have sound defaults, survive JSON, cannot be changed, and refuse what is not one of them."""
+    """The settings have valid defaults, survive JSON, are immutable, and reject unknown names."""
     params = case.params(case.capture)
     again = type(params).model_validate(json.loads(params.model_dump_json(by_alias=True)))
     assert again == params, f"settings of {case.spec.name} do not survive JSON: {params} became {again}"
@@ -118,48 +118,50 @@ def _settings_are_values(case: StageCase) -> None:
         type(params).model_validate(unknown)
     except ValidationError:
         return
-    raise AssertionError(f"settings of {case.spec.name} take a setting that they do not have")
+    raise AssertionError(f"settings of {case.spec.name} accept an unknown setting")
 
 
 def _result(case: StageCase) -> None:
-    """It returns what it declares, from inputs that cannot be written to, and leaves them and its settings alone."""
+    """The stage returns what it declares, accepts read-only inputs, and does not modify its inputs and settings."""
     capture = case.capture
     arguments = case.arguments(capture)
     before = {name: digest_of(value) for name, value in arguments.items()}
     params = case.params(capture).model_dump_json()
     call = case.call(capture, arguments=arguments)
-    assert call.refusal is None, f"{case.spec.name} refuses ordinary inputs: {call.refusal}"
+    assert call.refusal is None, f"{case.spec.name} rejects ordinary inputs: {call.refusal}"
     changed = [name for name, value in arguments.items() if digest_of(value) != before[name]]
-    assert not changed, f"{case.spec.name} changes its inputs {', '.join(changed)}"
-    assert case.params(capture).model_dump_json() == params, f"{case.spec.name} changes its settings"
+    assert not changed, f"{case.spec.name} modifies its inputs {', '.join(changed)}"
+    assert case.params(capture).model_dump_json() == params, f"{case.spec.name} modifies its settings"
 
 
 def _same_bytes(case: StageCase) -> None:
-    """Twice the same, with any number of threads: random numbers come from ctx.rng alone, sums have an order."""
+    """The result is the same again and with three threads: random numbers from ctx.rng, sums in a fixed order."""
     digests = [case.call(case.capture, threads=threads).digest for threads in (1, 1, 3)]
-    assert digests[0] == digests[1], f"{case.spec.name} returns something else again: is a draw not ctx.rng's?"
+    assert digests[0] == digests[1], (
+        f"{case.spec.name} returns something else when called again: draw from ctx.rng only"
+    )
     assert digests[0] == digests[2], f"{case.spec.name} returns something else with three threads"
 
 
 def _any_size(case: StageCase, variant: Variant) -> None:
-    """A sound result or a refusal."""
+    """The stage returns a valid result or raises one of our errors."""
     case.call(tiny_capture(variant))
 
 
 def _nothing_to_see(case: StageCase) -> None:
-    """A sound result or a refusal where all is masked and no stage before found anything."""
+    """The same if everything is masked and earlier stages found nothing."""
     case.call(tiny_capture(Variant(blank=True)))
 
 
 def _optional_inputs(case: StageCase) -> None:
-    """A sound result or a refusal without the inputs that may be left out."""
+    """The same without the optional inputs."""
     capture = case.capture
     left_out = {port.name: None for port in case.spec.ports if port.optional}
     case.call(capture, arguments=case.arguments(capture) | left_out)
 
 
 def _masks(case: StageCase) -> None:
-    """What is masked has no range and no key point, and stays masked."""
+    """Masked pixels have no range and no key point, and stay masked."""
     capture = tiny_capture(Variant(masked=True))
     call = case.call(capture)
     value = call.value
@@ -176,23 +178,23 @@ def _masks(case: StageCase) -> None:
         near = valid | np.roll(valid, 1, axis=1) | np.roll(valid, -1, axis=1)
         near[1:] |= valid[:-1]
         wrong = int((~near[np.minimum(rows, valid.shape[0] - 1), columns % valid.shape[1]]).sum())
-        assert not wrong, f"{case.spec.name} finds {wrong} key points where all is masked"
+        assert not wrong, f"{case.spec.name} finds {wrong} key points in masked areas"
 
 
 def _masked_content(case: StageCase) -> None:
-    """Whatever masked pixels show, the result is the same: `Panorama.load` shows none of it, the file itself does."""
+    """The result does not depend on the content of masked pixels, which `Panorama.load` hides but the file shows."""
     size_hw = (64, 128) if case.spec.output is Features else case.size_hw
     first, second = (case.call(tiny_capture(Variant(size_hw, masked=True, scribbled=noise))) for noise in (False, True))
     if first.mask is not None and second.mask is not None:
         wrong = int((first.mask != second.mask).sum())
-        assert not wrong, f"{case.spec.name} masks {wrong} pixels by what masked pixels show"
+        assert not wrong, f"{case.spec.name} masks {wrong} pixels depending on the content of masked pixels"
     else:
         same = first.digest == second.digest
-        assert same, f"{case.spec.name} returns something else when masked pixels show something else"
+        assert same, f"{case.spec.name} returns something else if the content of masked pixels changes"
 
 
 def _rolls(case: StageCase) -> None:
-    """Rolled pictures, with the cameras turned, give the rolled result: no border exists at the seam."""
+    """Rolled images with rotated cameras give the rolled result: there is no border at the seam."""
     size_hw = (64, 128) if case.spec.output is Features else case.size_hw
     first, second = (case.call(tiny_capture(Variant(size_hw, rolled=columns))) for columns in (0, _ROLL))
     straight, rolled = first.value, second.value
@@ -204,34 +206,34 @@ def _rolls(case: StageCase) -> None:
         assert isinstance(straight, Features)
         assert isinstance(rolled, Features)
         share = _same_bearings(straight, rolled, size_hw)
-    least = _LEAST_ROLL_AGREEMENT[case.spec.output]
-    assert share >= least, f"{case.spec.name}: {share:.0%} of the result rolls with the pictures, not {least:.0%}"
+    least = _MIN_ROLL_AGREEMENT[case.spec.output]
+    assert share >= least, f"{case.spec.name}: {share:.0%} of the result rolls with the images; {least:.0%} is needed"
 
 
 def _same_ranges(straight: NDArray[np.float32], rolled: NDArray[np.float32]) -> float:
     with np.errstate(invalid="ignore"):
-        close = np.abs(straight / rolled - 1) < _LARGEST_ROLL_ERROR
+        close = np.abs(straight / rolled - 1) < _MAX_ROLL_ERROR
     return float((close | (np.isnan(straight) & np.isnan(rolled))).mean())
 
 
 def _same_bearings(straight: Features, rolled: Features, size_hw: tuple[int, int]) -> float:
-    """Return the share of key points that are found within a pixel of where they should be."""
+    """Return the share of key points that are found within a pixel of the expected position."""
     _, turn = roll_panorama(np.zeros(size_hw, np.uint8), _ROLL)
     cosines = straight.bearings @ turn.T @ rolled.bearings.T
     return float((cosines.max(axis=1) > np.cos(np.pi / size_hw[0])).mean()) if cosines.size else 1.0
 
 
-_LAWS: dict[str, Callable[[StageCase], None]] = {
+_CONTRACT: dict[str, Callable[[StageCase], None]] = {
     "declares itself": _declares_itself,
     "has settings that are values": _settings_are_values,
-    "returns what it declares and leaves its inputs alone": _result,
+    "returns what it declares and does not modify its inputs": _result,
     "returns the same bytes again and with more threads": _same_bytes,
-    **{f"takes or refuses pictures {name}": partial(_any_size, variant=size) for name, size in _SIZES.items()},
-    "takes or refuses nothing to see": _nothing_to_see,
-    "takes or refuses inputs left out": _optional_inputs,
+    **{f"accepts or rejects images {name}": partial(_any_size, variant=size) for name, size in _SIZES.items()},
+    "accepts or rejects empty inputs": _nothing_to_see,
+    "accepts or rejects missing inputs": _optional_inputs,
     "respects masks": _masks,
-    "does not see what is masked": _masked_content,
-    "rolls with its pictures": _rolls,
+    "does not depend on masked content": _masked_content,
+    "rolls with its images": _rolls,
 }
 
 
@@ -239,12 +241,12 @@ def _applies(what: str, spec: StageSpec) -> bool:
     own = {port.kind for port in spec.ports if port.cardinality is Cardinality.EACH}
     sees = {port.kind for port in spec.ports} & {Panorama, RangeMap} or spec.list_items is not None
     match what.split()[0]:
-        case "takes" if "pictures" in what:
+        case "accepts" if "images" in what:
             return bool(sees)
-        case "takes" if "left out" in what:
+        case "accepts" if "missing" in what:
             return any(port.optional for port in spec.ports)
         case "respects" | "rolls":
-            return spec.output in _LEAST_ROLL_AGREEMENT and bool(own & {Panorama, RangeMap})
+            return spec.output in _MIN_ROLL_AGREEMENT and bool(own & {Panorama, RangeMap})
         case "does":
             return any(port.kind is Panorama for port in spec.ports)
     return True

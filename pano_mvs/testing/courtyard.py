@@ -1,4 +1,4 @@
-"""What stands in the synthetic courtyard; y is down, the pavement is 1.6 below the first camera."""
+"""Surfaces of the synthetic courtyard; y is down, the pavement is 1.6 below the first camera."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def courtyard_surfaces() -> tuple[Surface, ...]:
 
 
 def _buildings() -> list[Surface]:
-    """Return the pavement, and buildings with bays and gaps between them through which the sky is seen."""
+    """Return the pavement, and buildings with bays and with gaps through which the sky is seen."""
     bays = [Cuboid((-12, -5, z), (-11.2, -2, z + 2.5), STONE) for z in range(-12, 20, 6)]
     oriels = [Cuboid((11.3, -7, z), (12, -3, z + 2.5), BRICK) for z in range(-9, 23, 6)]
     return [
@@ -29,7 +29,7 @@ def _buildings() -> list[Surface]:
 
 
 def _arcade() -> list[Surface]:
-    """Return columns 0.5 thick with a beam on them, 5 away from the first camera."""
+    """Return columns 0.5 thick with a beam on top, 5 away from the first camera."""
     columns = [Rod((-5, 1.6, z), (-5, -2.2, z), 0.25, STONE) for z in range(-8, 17, 3)]
     return [*columns, Cuboid((-5.4, -2.9, -8.5), (-4.6, -2.2, 16.5), STONE)]
 

@@ -1,4 +1,4 @@
-"""What colour the surfaces of the synthetic scenes have, and the sky above them."""
+"""Colours of the surfaces of the synthetic scenes, and of the sky."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ Colors = tuple[Vector, Vector]
 
 
 class Pattern(Protocol):
-    """A texture that brings its own colours."""
+    """A texture with its own colours."""
 
     def albedo(self, points: FloatArray, normals: FloatArray, *, footprint: FloatArray) -> FloatArray:
-        """Return the unlit colours (N, 3) of points (N, 3) with normals (N, 3), where pixels are `footprint` wide."""
+        """Return the unlit colours (N, 3) of points (N, 3) with normals (N, 3), for pixels of width `footprint`."""
 
 
 WHITE: Colors = ((0.86, 0.86, 0.84), (0.86, 0.86, 0.84))
@@ -30,7 +30,7 @@ STEEL: Colors = ((0.36, 0.40, 0.46), (0.60, 0.60, 0.62))
 BLUE: Colors = ((0.25, 0.38, 0.62), (0.45, 0.60, 0.75))
 RED: Colors = ((0.70, 0.26, 0.22), (0.80, 0.52, 0.40))
 
-# Cell sizes in scene units with the strength of the noise on each.
+# Cell sizes in scene units, with the amplitude of the noise on each.
 _LIGHTNESS: dict[Texture, tuple[tuple[float, float], ...]] = {
     "strong": ((0.018, 0.4), (0.055, 0.5), (0.19, 0.5)),
     "weak": ((0.047, 0.03), (0.16, 0.05)),
@@ -46,7 +46,7 @@ _HUE: dict[Texture, tuple[tuple[float, float], ...]] = {
     "none": (),
 }
 _CLOUDS = ((0.06, 0.8),)
-# Wavelength of the noise in its cells, on average.
+# Mean wavelength of the noise in cells.
 _WAVELENGTH = 7.0
 
 
@@ -56,12 +56,12 @@ def albedo_at(
     """Return the unlit colours (N, 3) of points (N, 3) of a surface.
 
     Args:
-        points: in world coordinates; a point has one colour from wherever it is seen.
+        points: in world coordinates; a point has the same colour from every viewpoint.
         colors_rgb: the two colours between which the hue varies.
-        texture: what the surface is like.
-        seed: of the texture.
-        footprint: (N,) how wide a pixel is at each point. The texture "outdoor" fades where a pixel averages over its
-            waves, since a far wall would otherwise flicker between views; the others are as they are everywhere.
+        texture: kind of texture.
+        seed: seed of the texture.
+        footprint: (N,) width of a pixel at each point. The texture "outdoor" fades where a pixel averages over its
+            waves, since a far wall would otherwise flicker between views; the others do not depend on it.
     """
     share = 0.5 + 0.5 * np.tanh(_octaves(points, _HUE[texture], texture, seed=seed, footprint=footprint))
     lightness = _octaves(points, _LIGHTNESS[texture], texture, seed=seed + 1, footprint=footprint)
@@ -73,7 +73,7 @@ def albedo_at(
 def _octaves(
     points: FloatArray, cells: tuple[tuple[float, float], ...], texture: Texture, *, seed: int, footprint: FloatArray
 ) -> FloatArray:
-    """Return the noise (N,) of all cell sizes together, fading for the texture "outdoor"."""
+    """Return the sum of the noise (N,) of all cell sizes, fading for the texture "outdoor"."""
     if texture != "outdoor":
         return noise(points, cells=cells, seed=seed)
     total = np.zeros(len(points))
@@ -84,7 +84,7 @@ def _octaves(
 
 
 def sky_color(rays_in_world: FloatArray, sky: tuple[Vector, Vector], *, seed: int) -> FloatArray:
-    """Return the colours (N, 3) of the sky along unit rays (N, 3); clouds belong to directions, not to places."""
+    """Return the colours (N, 3) of the sky along unit rays (N, 3); clouds are infinitely far away."""
     zenith, horizon = np.array(sky)
     height = np.clip(-rays_in_world[:, 1], 0, 1)[:, None] ** 0.5
     clear = height * zenith + (1 - height) * horizon

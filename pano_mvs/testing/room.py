@@ -1,4 +1,4 @@
-"""A synthetic room whose range is known in closed form: the truth that the tests are fed from."""
+"""A synthetic room whose range is known in closed form, as ground truth for tests."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ _RAYS_AT_ONCE = 1 << 17
 
 @dataclass(frozen=True)
 class Room:
-    """Surfaces with a texture and one lamp; what a ray meets first is what a camera sees.
+    """Surfaces with a texture, and one lamp.
 
     Attributes:
         surfaces: in any order.
-        texture: of all surfaces: "strong" (features everywhere), "weak" (nearly plain walls), "isotropic", "outdoor"
-            (coarse and fine, the fine fading with the distance) or "none" (paint).
-        seed: of the texture.
-        lamp: where the light comes from; the shading is diffuse, without shadows.
-        textures: of each surface, where they differ; empty: all have `texture`.
-        sky: its colours at the zenith and at the horizon where a ray meets nothing, with clouds that are infinitely
-            far away; None: black.
+        texture: texture of all surfaces: "strong" (features everywhere), "weak" (nearly plain walls), "isotropic",
+            "outdoor" (coarse and fine, the fine part fading with distance) or "none" (paint).
+        seed: seed of the texture.
+        lamp: position of the light; the shading is diffuse, without shadows.
+        textures: texture of each surface, if they differ; empty: all have `texture`.
+        sky: colours at the zenith and at the horizon where a ray meets no surface, with clouds that are infinitely far
+            away; None: black.
     """
 
     surfaces: tuple[Surface, ...]
@@ -43,9 +43,9 @@ class Room:
 
 
 def default_room(seed: int = 0, texture: Texture = "strong") -> Room:
-    """Return a furnished room of 6 × 2.8 × 5 units, free of furniture within 0.8 of its origin (y is down).
+    """Return a furnished room of 6 × 2.8 × 5 units, without furniture within 0.8 of its origin (y is down).
 
-    With the texture "isotropic" it is a plain sphere of radius 2 around the origin, which looks alike in all
+    With the texture "isotropic" it is an empty sphere of radius 2 around the origin, which looks alike in all
     directions.
     """
     if texture == "isotropic":
@@ -54,12 +54,12 @@ def default_room(seed: int = 0, texture: Texture = "strong") -> Room:
 
 
 def capture_poses(count: int, *, seed: int = 0, spread: float = 0.6, tilt_deg: float = 10.0) -> list[Rigid3]:
-    """Return cameras in the free middle of the default room: any heading, a small tilt.
+    """Return cameras in the free centre of the default room, with arbitrary heading and small tilt.
 
     Args:
         count: number of cameras.
-        seed: of the draw.
-        spread: half the side of the cube in which the centres lie; heights vary by half of it.
+        seed: seed of the draw.
+        spread: half the side of the cube that contains the centres; heights vary by half of it.
         tilt_deg: standard deviation of the tilt about a horizontal axis.
 
     Returns:
@@ -80,17 +80,17 @@ def capture_poses(count: int, *, seed: int = 0, spread: float = 0.6, tilt_deg: f
 def render(
     room: Room, cam_from_world: Rigid3, size_hw: tuple[int, int], *, supersample: int = 2
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Return what a camera in the room sees, and how far away it is.
+    """Render a panorama of the room and its ranges.
 
     Args:
-        room: what there is.
+        room: the room to render.
         cam_from_world: any pose.
         size_hw: (height, width) of the panorama.
-        supersample: rays per pixel along either side that are averaged for the colour.
+        supersample: number of rays per pixel along each side, averaged for the colour.
 
     Returns:
-        Two arrays: (H, W, 3) uint8 RGB, and (H, W) float32 range along the ray through each pixel's exact centre,
-        NaN where the ray meets nothing.
+        Two arrays: (H, W, 3) uint8 RGB, and (H, W) float32 range along the ray through each pixel's exact centre, NaN
+        where the ray meets no surface.
     """
     height, width = size_hw
     steps = (np.arange(supersample) + 0.5) / supersample
@@ -105,15 +105,15 @@ def render(
 
 
 def range_along(room: Room, origin_in_world: FloatArray, rays_in_world: FloatArray) -> FloatArray:
-    """Return the exact distance from a point (3,) to the first surface along unit rays (N, 3); (N,), inf if none."""
+    """Return the exact distance from a point (3,) to the first surface along unit rays (N, 3); (N,), else inf."""
     return _first_hit(room, origin_in_world, rays_in_world)[0]
 
 
 def write_capture(folder: Path, room: Room, poses: Sequence[Rigid3], size_hw: tuple[int, int]) -> None:
     """Write a capture of the room: images/000.png …, truth/poses.json and truth/depth.npz.
 
-    `pano_mvs.evaluation.inputs.truth.read_truth` reads the truth: poses are cam_from_world, ranges are float32 with inf
-    where there is no surface, and each view carries the SHA-256 of its picture.
+    `pano_mvs.evaluation.inputs.truth.read_truth` reads the ground truth: poses are cam_from_world, ranges are float32
+    with inf where there is no surface, and each view has the SHA-256 of its image.
     """
     write_views(folder, (render(room, pose, size_hw) for pose in poses), poses)
 
@@ -121,7 +121,7 @@ def write_capture(folder: Path, room: Room, poses: Sequence[Rigid3], size_hw: tu
 def write_views(
     folder: Path, pictures: Iterable[tuple[NDArray[np.uint8], NDArray[np.float32]]], poses: Sequence[Rigid3]
 ) -> None:
-    """Write views, each a picture and its true ranges as `render` returns them, in the form of `write_capture`."""
+    """Write views, each an image and its true ranges as returned by `render`, in the format of `write_capture`."""
     (folder / "images").mkdir(parents=True, exist_ok=True)
     (folder / "truth").mkdir(exist_ok=True)
     views: list[dict[str, object]] = []
@@ -144,7 +144,7 @@ def write_views(
 def _traced(
     room: Room, cam_from_world: Rigid3, size_hw: tuple[int, int], offset_px: tuple[float, float], *, shaded: bool = True
 ) -> tuple[FloatArray, FloatArray]:
-    """Return distance (H W,) and colour (H W, 3) along the rays through one place within each pixel."""
+    """Return distance (H W,) and colour (H W, 3) along the rays through one position within each pixel."""
     height, width = size_hw
     origin = cam_from_world.center
     distances, colors = np.zeros(height * width), np.zeros((height * width, 3))
@@ -182,7 +182,7 @@ def _shaded(
     hits: tuple[FloatArray, NDArray[np.int64], FloatArray],
     pixel_rad: float,
 ) -> FloatArray:
-    """Return the colours (N, 3) in [0, 1] of what rays meet; the sky's, or black, where they meet nothing."""
+    """Return the colours (N, 3) in [0, 1] of what rays meet; those of the sky, or black, without a surface."""
     distances, surface_idx, normals = hits
     colors = np.zeros_like(rays)
     for idx, surface in enumerate(room.surfaces):
@@ -196,7 +196,7 @@ def _shaded(
             seed = 1000 * room.seed + 2 * idx
             albedo = albedo_at(points, surface.colors_rgb, texture, seed=seed, footprint=footprint)
         else:
-            # A pixel on a slanted surface is longer than wide; between the two it neither flickers nor blurs much.
+            # A pixel on a slanted surface is longer than wide; a value in between neither flickers nor blurs much.
             slant = np.abs(np.sum(rays[on] * normals[on], axis=1))
             albedo = texture.albedo(points, normals[on], footprint=footprint / np.sqrt(np.maximum(slant, 0.02)))
         to_lamp = np.array(room.lamp) - points

@@ -1,10 +1,10 @@
-"""Synthetic captures of very different places with exact truth, so that nothing is tuned to one room.
+"""Synthetic captures of very different places with exact ground truth, to avoid tuning to a single room.
 
     scene = courtyard(seed=1, exposure=0.15)
     picture, true_range = scene.view(0, (256, 512))
 
-All are in units that may be read as metres. Unless `turned=False`, every camera but none of the places is turned by an
-arbitrary rotation. The pictures carry sensor noise, drawn anew for each view.
+All lengths can be read as metres. Unless `turned=False`, every camera, but no place, is rotated arbitrarily. The images
+have sensor noise, drawn separately for each view.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ class Scene:
     """A place and the cameras in it.
 
     Attributes:
-        name: of the place.
-        room: what there is; where a ray meets nothing (the sky) the true range is NaN.
+        name: name of the place.
+        room: the place; the true range is NaN where a ray meets no surface (the sky).
         poses: cam_from_world of each view.
         gains: (V, 3) factor of each view's red, green and blue.
         offsets: (V, 3) grey levels added to them.
         noise: standard deviation of the sensor's noise in grey levels.
-        outdoor: whether ranges are so different that only relative errors say something.
+        outdoor: whether only relative errors are meaningful, because ranges differ by orders of magnitude.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Scene:
     def view(
         self, idx: int, size_hw: tuple[int, int], *, supersample: int = 2
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Return the picture (H, W, 3) uint8 RGB of a view and its true ranges (H, W) float32, NaN for the sky."""
+        """Return the image (H, W, 3) uint8 RGB of a view and its true ranges (H, W) float32, NaN for the sky."""
         image, ranges = render(self.room, self.poses[idx], size_hw, supersample=supersample)
         rng = np.random.default_rng([self.room.seed, idx])
         levels = image * np.array(self.gains[idx]) + self.offsets[idx] + rng.normal(0, self.noise, image.shape)
@@ -65,26 +65,27 @@ def courtyard(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: f
     """Return a paved court of 24 × 78 under an open sky: facades, columns, trees, a van; ranges from 1.4 to 60.
 
     Args:
-        seed: of textures, cameras and exposures.
+        seed: seed of textures, cameras and exposures.
         views: number of cameras, about 1.2 apart.
-        turned: whether every camera is turned by an arbitrary rotation.
-        exposure: standard deviation of the logarithm of each view's and colour's gain; 0.15 is a lot. Offsets of 40
-            grey levels times this go with it.
+        turned: whether every camera is rotated arbitrarily.
+        exposure: standard deviation of the logarithm of the gain of each view and colour; 0.15 is large. Offsets have a
+            standard deviation of 40 grey levels times this value.
     """
     surfaces: list[Painted] = [(surface, "outdoor") for surface in courtyard_surfaces()]
     room = _painted("outdoor", surfaces, seed=seed, lamp=(30.0, -80.0, 25.0), sky=_SKY)
-    return _scene("courtyard", room, views=views, turned=turned, spread=(1.2, 0.25, 1.2), exposure=exposure,
-                  outdoor=True)  # fmt: skip
+    return _scene(
+        "courtyard", room, views=views, turned=turned, spread=(1.2, 0.25, 1.2), exposure=exposure, outdoor=True
+    )
 
 
 def white_room(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: float = 0.0) -> Scene:
-    """Return a room of 6 × 2.8 × 5 whose walls, ceiling and doors are plain paint: texture on the floor and furniture.
+    """Return a room of 6 × 2.8 × 5 with plain walls, ceiling and doors, and texture on the floor and furniture.
 
     Args:
-        seed: of textures, cameras and exposures.
+        seed: seed of textures, cameras and exposures.
         views: number of cameras, about 0.6 apart.
-        turned: whether every camera is turned by an arbitrary rotation.
-        exposure: as of `courtyard`.
+        turned: whether every camera is rotated arbitrarily.
+        exposure: as in `courtyard`.
     """
     surfaces: list[Painted] = [
         (Cuboid((-3.0, -1.5, -2.5), (3.0, 1.3, 2.5), WHITE), "none"),
@@ -105,13 +106,13 @@ def white_room(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: 
 
 
 def poles(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: float = 0.0) -> Scene:
-    """Return the furnished room with 26 rods in it, upright, leaning and level, most of them 2–4 px thick at 1024×512.
+    """Return the furnished room with 26 rods, upright, leaning and level, most of them 2–4 px thick at 1024×512.
 
     Args:
-        seed: of textures, cameras and exposures.
+        seed: seed of textures, cameras and exposures.
         views: number of cameras, about 0.5 apart.
-        turned: whether every camera is turned by an arbitrary rotation.
-        exposure: as of `courtyard`.
+        turned: whether every camera is rotated arbitrarily.
+        exposure: as in `courtyard`.
     """
     rng = np.random.default_rng([seed, 0xB0])
     surfaces: list[Painted] = [(surface, "strong") for surface in default_room().surfaces]
@@ -130,16 +131,15 @@ def poles(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: float
 
 
 def corridor(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: float = 0.0) -> Scene:
-    """Return a corridor of 1.9 × 2.5 × 26 with doors, lamps and pipes, and the cameras in a row along it.
+    """Return a corridor of 1.9 × 2.5 × 26 with doors, lamps and pipes, and a row of cameras along it.
 
-    The cameras' baselines point where the corridor goes: its far end lies about the epipoles, where range is hard to
-    see.
+    The baselines are parallel to the corridor: its far end is near the epipoles, where range is difficult to measure.
 
     Args:
-        seed: of textures, cameras and exposures.
+        seed: seed of textures, cameras and exposures.
         views: number of cameras, 0.6–0.9 apart.
-        turned: whether every camera is turned by an arbitrary rotation.
-        exposure: as of `courtyard`.
+        turned: whether every camera is rotated arbitrarily.
+        exposure: as in `courtyard`.
     """
     surfaces: list[Painted] = [
         (Cuboid((-0.95, -1.1, -8.0), (0.95, 1.4, 18.0), STONE), "weak"),
@@ -164,26 +164,26 @@ def weak_room(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: f
     """Return the furnished room of `pano_mvs.testing.room` with its nearly plain texture.
 
     Args:
-        seed: of textures, cameras and exposures.
+        seed: seed of textures, cameras and exposures.
         views: number of cameras, about 0.6 apart.
-        turned: whether every camera is turned by an arbitrary rotation.
-        exposure: as of `courtyard`.
+        turned: whether every camera is rotated arbitrarily.
+        exposure: as in `courtyard`.
     """
     room = default_room(seed, "weak")
     return _scene("weak_room", room, views=views, turned=turned, spread=(0.6, 0.3, 0.6), exposure=exposure)
 
 
 def large_plain_room(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: float = 0.0) -> Scene:
-    """Return a nearly empty room of 12 × 4 × 9: plain walls and ceiling, a faint floor, few and small things.
+    """Return a nearly empty room of 12 × 4 × 9: plain walls and ceiling, a faint floor, a few small objects.
 
-    Most key points are coarse, faint and few, so that they fix the poses of cameras badly. It is not one of `SCENES`:
-    most of its surfaces have no texture at all, so that its ranges say little.
+    Most key points are coarse, faint and few, so that they determine poses poorly. It is not one of `SCENES`, since
+    most of its surfaces have no texture at all and no reliable ranges.
 
     Args:
-        seed: of textures, cameras and exposures.
+        seed: seed of textures, cameras and exposures.
         views: number of cameras, about 1.5 apart.
-        turned: whether every camera is turned by an arbitrary rotation.
-        exposure: as of `courtyard`.
+        turned: whether every camera is rotated arbitrarily.
+        exposure: as in `courtyard`.
     """
     frame = ((0.70, 0.72, 0.74), (0.70, 0.72, 0.74))
     surfaces: list[Painted] = [
@@ -213,14 +213,14 @@ SCENES: dict[str, Callable[..., Scene]] = {
 
 
 def write_scene(folder: Path, scene: Scene, size_hw: tuple[int, int]) -> None:
-    """Write all views of a scene as a capture with its truth, as `pano_mvs.testing.room.write_capture` does."""
+    """Write all views of a scene as a capture with ground truth, like `pano_mvs.testing.room.write_capture`."""
     write_views(folder, (scene.view(idx, size_hw) for idx in range(len(scene.poses))), scene.poses)
 
 
 def _painted(
     name: str, surfaces: list[Painted], *, seed: int, lamp: Vector, sky: tuple[Vector, Vector] | None = None
 ) -> Room:
-    """Return a room of surfaces with a texture each; rooms of other names have other textures."""
+    """Return a room of surfaces with a texture each; the textures depend on the name of the room."""
     own = seed + sum(map(ord, name))
     return Room(
         tuple(surface for surface, _ in surfaces),
@@ -242,7 +242,7 @@ def _scene(
     centers: NDArray[np.float64] | None = None,
     outdoor: bool = False,
 ) -> Scene:
-    """Return a scene with its cameras: at given centres, or drawn from a box, the first in the middle."""
+    """Return a scene with its cameras, at given centres or drawn from a box, the first in its centre."""
     rng = np.random.default_rng([room.seed, 0xCA])
     if centers is None:
         centers = _apart(rng, views, np.array(spread))

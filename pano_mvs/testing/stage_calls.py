@@ -1,4 +1,4 @@
-"""Call a stage on a tiny capture, as the engine would, and say by a digest what came out."""
+"""Call a stage on a tiny capture, like the engine does, and compute a digest of the result."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from pano_mvs.testing.tiny_capture import TinyCapture, Variant, tiny_capture
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """What came of a call.
+    """The result of a call.
 
     Attributes:
-        value: what the stage returned; None where it refused.
-        digest: of the value and of the figures reported beside it.
-        refusal: the error by which the stage refused its inputs.
-        mask: (H, W) the valid pixels of a panorama that it returned, whose files are gone with the call.
+        value: the value that the stage returned; None if it rejected its inputs.
+        digest: digest of the value and of the metrics.
+        refusal: the error by which the stage rejected its inputs.
+        mask: (H, W) valid pixels of a returned panorama, whose files no longer exist after the call.
     """
 
     value: Record | None
@@ -42,13 +42,13 @@ class Call:
 
 @dataclass(frozen=True, eq=False)
 class StageCase:
-    """A stage with what it is tested with.
+    """A stage with its test inputs.
 
     Attributes:
         spec: the stage.
-        settings: in place of its defaults; `{capture}` in a text stands for the folder of the capture.
+        settings: replace the defaults; `{capture}` in a string stands for the folder of the capture.
         inputs: port to a value, for ports of kinds that the tiny capture does not have.
-        size_hw: of the ordinary pictures.
+        size_hw: size of the ordinary images.
     """
 
     spec: StageSpec
@@ -62,7 +62,7 @@ class StageCase:
         return tiny_capture(Variant(self.size_hw))
 
     def params(self, capture: TinyCapture) -> Params:
-        """Return the settings; a required path that is not given is that of the pictures, or else of the truth."""
+        """Return the settings; a required path that is not given is that of the images, or else of the ground truth."""
         given = {key: _placed(value, capture) for key, value in self.settings.items()}
         own = capture.folder / ("images" if self.spec.list_items is not None else "truth")
         for name, info in self.spec.params_type.model_fields.items():
@@ -71,16 +71,16 @@ class StageCase:
         return self.spec.params_type.model_validate(given)
 
     def arguments(self, capture: TinyCapture) -> dict[str, Any]:
-        """Return a value for each port: those of the first picture, or of the first pair."""
+        """Return a value for each port: those of the first image, or of the first pair."""
         return {
             port.name: self.inputs[port.name] if port.name in self.inputs else self._argument(port, capture)
             for port in self.spec.ports
         }
 
     def call(self, capture: TinyCapture, *, threads: int = 1, arguments: Mapping[str, Any] | None = None) -> Call:
-        """Call the stage on the first picture, the first pair, or all, with random numbers that are always the same.
+        """Call the stage on the first image, the first pair, or all, with fixed random numbers.
 
-        An error of ours, but for one that blames the stage, is a refusal; all others come through.
+        Our own errors, except those that blame the stage, count as rejected inputs; all other exceptions are raised.
         """
         with TemporaryDirectory(prefix="pano-mvs-call-") as scratch:
             context = Context(np.random.default_rng(0), Path(scratch), threads)
@@ -96,7 +96,7 @@ class StageCase:
                 raise
             except PanoMvsError as error:
                 return Call(None, f"{type(error).__name__}: {error}", error)
-            require_sound(value, self.spec, Path(scratch))
+            require_valid(value, self.spec, Path(scratch))
             figures = {name: float(metric).hex() for name, metric in context.metrics.items()}
             told = [figures, context.notes, context.rejected]
             mask = value.load_mask() if isinstance(value, Panorama) else None
@@ -121,7 +121,7 @@ class StageCase:
         return items[names[0]]
 
 
-def require_sound(value: object, spec: StageSpec, scratch: Path) -> None:
+def require_valid(value: object, spec: StageSpec, scratch: Path) -> None:
     """Raise AssertionError, or the record's ContractError, unless a value is what the stage declares."""
     declared = spec.output.kind_name()
     assert isinstance(value, spec.output), f"{spec.name} declares {declared}, but returned {type(value).__name__}"
@@ -130,7 +130,7 @@ def require_sound(value: object, spec: StageSpec, scratch: Path) -> None:
         item.check()
     for path in value.files.values() if isinstance(value, Files) else ():
         inside = resolved(path).is_relative_to(resolved(scratch))
-        assert is_file(path), f"{spec.name} says that it wrote {path}, which is not there"
+        assert is_file(path), f"{spec.name} returns {path} as written, but the file does not exist"
         assert inside, f"{spec.name} wrote {path}, outside ctx.scratch"
 
 
@@ -155,7 +155,7 @@ def _part_digest(part: object) -> str:
 
 
 def _plain(value: object) -> object:
-    """Return what JSON has no form for in one that it has, as the store does."""
+    """Return a value in a form that JSON supports, as the store does."""
     return (
         dict(value) if isinstance(value, Mapping) else value.tolist() if isinstance(value, np.generic) else str(value)
     )

@@ -1,4 +1,4 @@
-"""Surfaces that the synthetic room is built of; each knows where a ray meets it, in closed form."""
+"""Surfaces of the synthetic scenes, with ray intersections in closed form."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Hit: TypeAlias = tuple[FloatArray, FloatArray]
 
 
 class Surface(Protocol):
-    """Something that a ray can meet.
+    """A surface that rays can intersect.
 
     Attributes:
         colors_rgb: the two colours in [0, 1] between which its texture varies.
@@ -92,8 +92,8 @@ class Quad:
 
     Attributes:
         corner: one of its corners.
-        edge_u: from that corner to the next.
-        edge_v: from that corner to the previous.
+        edge_u: vector from that corner to the next.
+        edge_v: vector from that corner to the previous one.
         colors_rgb: the two colours between which its texture varies.
     """
 
@@ -121,12 +121,12 @@ class Quad:
 
 @dataclass(frozen=True)
 class Rod:
-    """The wall of a round rod between two points, seen from outside or from inside; its ends are open.
+    """The surface of a round rod between two points, seen from outside or from inside; its ends are open.
 
     Attributes:
-        foot: the centre of one end.
-        head: the centre of the other.
-        radius: of the rod.
+        foot: centre of one end.
+        head: centre of the other end.
+        radius: radius of the rod.
         colors_rgb: the two colours between which its texture varies.
     """
 
@@ -142,7 +142,7 @@ class Rod:
         axis = axis / length
         to_origin = origin - np.array(self.foot)
         along_ray, along_origin = rays @ axis, float(to_origin @ axis)
-        # Across the axis the rod is a circle.
+        # Perpendicular to the axis, the rod is a circle.
         across, start = rays - along_ray[:, None] * axis, to_origin - along_origin * axis
         a, b = np.sum(across**2, axis=1), across @ start
         root = b**2 - a * (start @ start - self.radius**2)
@@ -159,12 +159,12 @@ class Rod:
 
 @dataclass(frozen=True)
 class Bounded:
-    """A surface that lies within a sphere, so that only the rays towards that sphere are tried on it.
+    """A surface within a bounding sphere, so that only rays towards the sphere are tested.
 
     Attributes:
-        surface: any.
-        center: of the sphere.
-        radius: of the sphere.
+        surface: any surface.
+        center: centre of the sphere.
+        radius: radius of the sphere.
     """
 
     surface: Surface
@@ -183,7 +183,7 @@ class Bounded:
         return distance, normals
 
     def towards(self, origin: FloatArray, rays: FloatArray) -> NDArray[np.int64]:
-        """Return the positions, ascending, of the unit rays (N, 3) from one origin (3,) that meet the sphere."""
+        """Return the positions, ascending, of the unit rays (N, 3) from one origin (3,) that intersect the sphere."""
         to_center = np.array(self.center) - origin
         apart = float(np.linalg.norm(to_center))
         if apart <= self.radius:

@@ -1,4 +1,4 @@
-"""The contract of a sweep backend: the winners of the readable one, on any settings; for the authors of backends."""
+"""Contract of sweep backends: with any settings, they find the winners of the numpy backend."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _COSTS = ("census", "zncc", "sad", "sad_gradient", "census_gradient")
 _COMBINATIONS = ("sum", "best_half", "best_k", "parallax_weighted")
 _COMBINED = list(itertools.product(_COSTS, _COMBINATIONS, ("box", "sgm")))
 CASES = len(_COMBINED)
-"""How many cases there are: every cost with every combination and aggregation, all else drawn at random."""
+"""Number of cases: every cost with every combination and aggregation, other settings drawn at random."""
 
 
 @dataclass(frozen=True, eq=False)
 class SweepCase:
-    """What a sweep is given: small views of a synthetic room, of different sizes, with or without masks."""
+    """Input of a sweep: small views of a synthetic room, of different sizes, with or without masks."""
 
     pictures: tuple[NDArray[np.uint8], ...]
     source_from_reference: tuple[Rigid3, ...]
@@ -34,7 +34,7 @@ class SweepCase:
     settings: SweepSettings
 
     def swept(self, backend: str, *, device: str = "auto") -> RangeMap:
-        """Return the range map that a backend makes of it."""
+        """Return the range map that a backend computes."""
         return sweep_range(
             self.pictures[0],
             self.pictures[1:],
@@ -50,13 +50,13 @@ class SweepCase:
 
 
 def cost_of_case(number: int) -> str:
-    """Return the cost of a case, without making its pictures."""
+    """Return the cost of a case, without rendering its images."""
     return _COMBINED[number][0]
 
 
 @functools.cache
 def sweep_case(number: int) -> SweepCase:
-    """Return one of the `CASES`; the same at every call."""
+    """Return one of the `CASES`; the same for every call."""
     rng = np.random.default_rng([2026, number])
     cost, combination, aggregation = _COMBINED[number]
     settings = SweepSettings(planes=int(rng.integers(3, 24))).replace(
@@ -85,19 +85,19 @@ def sweep_case(number: int) -> SweepCase:
 
 
 @functools.cache
-def _readable(number: int) -> RangeMap:
+def _by_numpy(number: int) -> RangeMap:
     return sweep_case(number).swept("numpy")
 
 
 def agreement(number: int, backend: str, *, device: str = "auto") -> float:
-    """Return the share of pixels of a case in which a backend is within half a level of the readable one.
+    """Return the share of pixels of a case for which a backend is within half a level of the numpy backend.
 
-    Pixels without a range in both agree too. The contract is a mean of 0.99 over all cases: sums in another order, and
-    positions rounded otherwise, decide some pixels on bare walls differently.
+    Pixels without a range in both agree, too. The contract requires a mean of 0.99 over all cases: a different order of
+    summation, or different rounding of positions, changes the winners of some pixels on bare walls.
     """
     found = sweep_case(number).swept(backend, device=device)
     found.check()
-    return share_alike(found, _readable(number), sweep_case(number).settings)
+    return share_alike(found, _by_numpy(number), sweep_case(number).settings)
 
 
 def share_alike(one: RangeMap, other: RangeMap, settings: SweepSettings) -> float:
@@ -108,7 +108,7 @@ def share_alike(one: RangeMap, other: RangeMap, settings: SweepSettings) -> floa
 
 
 def _level(range_map: RangeMap, settings: SweepSettings) -> NDArray[np.float64]:
-    """Return where between the planes the ranges are, (H, W)."""
+    """Return the positions of the ranges between the planes, (H, W)."""
     ranges = range_map.range.astype(np.float64)
     scaled = {"inverse": 1 / ranges, "log": np.log(ranges), "uniform": ranges}[settings.spacing]
     near, far = {"inverse": (1 / NEAR, 1 / FAR), "log": (np.log(NEAR), np.log(FAR)), "uniform": (NEAR, FAR)}[

@@ -1,4 +1,4 @@
-"""Band-limited noise in 3D: a point of a surface has one colour, from wherever it is seen."""
+"""Band-limited noise in 3D: a point of a surface has the same colour from every viewpoint."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pano_mvs.geometry import rotation_from_quat_wxyz
 FloatArray = NDArray[np.float64]
 
 _CELLS = 64
-# Wavelengths of the noise in cells: trilinear interpolation needs about four of them to stay smooth.
+# Wavelengths of the noise in cells: trilinear interpolation needs about four cells to be smooth.
 _SHORTEST, _LONGEST = 4.0, 12.0
 
 
@@ -22,9 +22,9 @@ def noise(points: FloatArray, *, cells: Sequence[tuple[float, float]], seed: int
 
     Args:
         points: (N, 3).
-        cells: pairs of a cell's size in scene units and the standard deviation of the noise on that lattice; its
-            wavelengths are 4 to 12 cells.
-        seed: another seed is another, independent texture.
+        cells: pairs of cell size in scene units and standard deviation of the noise on that lattice; its wavelengths
+            are 4 to 12 cells.
+        seed: each seed gives an independent texture.
 
     Returns:
         (N,) values with mean near 0.
@@ -39,13 +39,15 @@ def noise(points: FloatArray, *, cells: Sequence[tuple[float, float]], seed: int
 
 
 def _interpolated(positions: FloatArray) -> FloatArray:
-    """Return the periodic volume at positions (N, 3) in cells, trilinear."""
+    """Return the periodic volume at positions (N, 3) in cells, by trilinear interpolation."""
     volume = _volume().ravel()
     low = np.floor(positions)
     weight = positions - low
     index = low.astype(np.int64)
-    columns = [((index[:, k] % _CELLS) * step, ((index[:, k] + 1) % _CELLS) * step) for k, step in
-               enumerate((_CELLS * _CELLS, _CELLS, 1))]  # fmt: skip
+    columns = [
+        ((index[:, k] % _CELLS) * step, ((index[:, k] + 1) % _CELLS) * step)
+        for k, step in enumerate((_CELLS * _CELLS, _CELLS, 1))
+    ]
     result = np.zeros(len(positions))
     for corner in np.ndindex(2, 2, 2):
         share = np.ones(len(positions))

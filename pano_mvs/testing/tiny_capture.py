@@ -1,4 +1,4 @@
-"""A tiny synthetic capture, with everything that the stages before might have made of it: what stages are tested on."""
+"""A tiny synthetic capture with possible results of all stages, as input of contract tests."""
 
 from __future__ import annotations
 
@@ -46,16 +46,16 @@ _folders: list[TemporaryDirectory[str]] = []
 
 @dataclass(frozen=True)
 class Variant:
-    """How a tiny capture is.
+    """A variant of the tiny capture.
 
     Attributes:
-        size_hw: (height, width) of the pictures.
-        rolled: columns by which all pictures are rolled to the right, and the cameras turned with them.
-        masked: whether the tripod and a patch over the seam are masked in every picture.
-        scribbled: whether what is masked shows noise instead of the room.
+        size_hw: (height, width) of the images.
+        rolled: number of columns by which all images are rolled to the right, with rotated cameras.
+        masked: whether the tripod and a patch across the seam are masked in every image.
+        scribbled: whether masked pixels show noise instead of the room.
         cropped: whether the files lack the uppermost and lowest eighth of the sphere.
-        mixed: whether every second picture has half as many rows.
-        blank: whether there is nothing to see: all is masked, and no stage before found anything.
+        mixed: whether every second image has half as many rows.
+        blank: whether there is nothing to see: everything is masked, and earlier stages found nothing.
     """
 
     size_hw: tuple[int, int] = (32, 64)
@@ -72,12 +72,12 @@ class TinyCapture:
     """Some views of a synthetic room.
 
     Attributes:
-        folder: with images/ and truth/poses.json.
-        variant: how it is.
-        names: of the pictures.
-        poses: cam_from_world of each.
-        pictures: as the files hold them where they are neither cropped nor scribbled over.
-        ranges: the true ones, (H, W) float32.
+        folder: folder with images/ and truth/poses.json.
+        variant: the variant of the capture.
+        names: image names.
+        poses: cam_from_world of each image.
+        pictures: the images, equal to the files unless these are cropped or scribbled.
+        ranges: true ranges, (H, W) float32.
     """
 
     folder: Path
@@ -89,12 +89,12 @@ class TinyCapture:
 
     @functools.cached_property
     def images(self) -> dict[str, Panorama]:
-        """The panoramas, with GPS positions and sensors' directions."""
+        """The panoramas, with GPS positions and sensor directions."""
         return {name: self._panorama(idx) for idx, name in enumerate(self.names)}
 
     @functools.cached_property
     def items(self) -> Mapping[type[Record], Mapping[Any, Record]]:
-        """Kind to the item of each picture, or of each pair."""
+        """Items of each kind by image, or by pair."""
         pairs = self.whole(Pairs)
         return {
             Panorama: self.images,
@@ -109,7 +109,7 @@ class TinyCapture:
 
     @functools.cached_property
     def wholes(self) -> Mapping[type[Record], Record]:
-        """Kind to the one value of it."""
+        """The single value of each kind."""
         count = len(self.names)
         pairs = tuple((self.names[i], self.names[j]) for i in range(count) for j in range(i + 1, count))
         others = {name: tuple(other for other in self.names if other != name) for name in self.names}
@@ -127,14 +127,14 @@ class TinyCapture:
         return {key: item for key, item in self.items[kind].items() if isinstance(item, kind)}
 
     def whole(self, kind: type[Frozen]) -> Frozen:
-        """Return the one value of a kind."""
+        """Return the single value of a kind."""
         value = self.wholes[kind]
         assert isinstance(value, kind)
         return value
 
     @functools.cached_property
     def points_in_world(self) -> NDArray[np.float64]:
-        """Points on the room's surfaces, (P, 3); each is taken to be seen from everywhere."""
+        """Points on the room's surfaces, (P, 3); each is assumed to be visible from everywhere."""
         rng = np.random.default_rng(5)
         rays = rng.normal(size=(_POINTS, 3))
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -186,7 +186,7 @@ class TinyCapture:
         return frozen(GlobalDescriptor(np.zeros_like(vector) if self.variant.blank else vector))
 
     def _range_map(self, idx: int) -> RangeMap:
-        """Return the true ranges with noise, a hole and some outliers; nothing where the picture is masked."""
+        """Return the true ranges with noise, a hole and some outliers; masked pixels have none."""
         height, width = self.ranges[idx].shape
         draws = np.roll(np.random.default_rng([9, idx]).random((2, height, width)), self.variant.rolled, axis=2)
         ranges = self.ranges[idx] * (1 + 0.004 * (draws[0] - 0.5)).astype(np.float32)
@@ -241,7 +241,7 @@ class TinyCapture:
         )
 
     def _samples(self, idx: int) -> SurfaceSamples:
-        """Return the points as one view sees them, as if each had been found in its range map."""
+        """Return the points as seen by one view, as if each had been found in its range map."""
         count = 0 if self.variant.blank else _POINTS
         distances = np.linalg.norm(self.poses[idx].apply(self.points_in_world), axis=1)[:count]
         colors, sure = np.full((count, 3), 128, np.uint8), np.full(count, 200, np.uint8)
@@ -270,7 +270,7 @@ class TinyCapture:
 
 
 def frozen(record: Frozen) -> Frozen:
-    """Return a record whose arrays cannot be written to, as the store hands them out."""
+    """Return a record with read-only arrays, as the store returns them."""
     for value in vars(record).values():
         if isinstance(value, np.ndarray):
             value.flags.writeable = False
@@ -279,7 +279,7 @@ def frozen(record: Frozen) -> Frozen:
 
 @functools.cache
 def tiny_capture(variant: Variant = Variant()) -> TinyCapture:
-    """Return the capture of that variant; it is rendered once, into a folder that goes with the process."""
+    """Return the capture of a variant; it is rendered once, into a folder that is deleted when the process ends."""
     _folders.append(TemporaryDirectory(prefix="pano-mvs-tiny-"))
     folder = Path(_folders[-1].name)
     (folder / "images").mkdir()

@@ -47,10 +47,10 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_new_plugin_keeps_its_contract(written: Path, kind: str) -> None:
-    laws = getattr(conformance, KINDS[kind].laws)(written / f"new_{kind}.py")
-    assert len(laws) >= 2
-    for law in laws:
-        law.check()
+    contract_tests = getattr(conformance, KINDS[kind].contract_tests)(written / f"new_{kind}.py")
+    assert len(contract_tests) >= 2
+    for contract_test in contract_tests:
+        contract_test.check()
 
 
 def test_new_plugins_run_in_a_workflow(pano_mvs: Command, written: Path) -> None:

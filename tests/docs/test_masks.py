@@ -11,7 +11,7 @@ import pytest
 
 from pano_mvs.io.clouds.ply import read_ply
 from pano_mvs.io.ranges.files import read_range_tiff
-from pano_mvs.testing.conformance import stage_laws
+from pano_mvs.testing.conformance import stage_contract_tests
 from tests.cli.conftest import Command, capture, pano_mvs, rendered  # noqa: F401  # fixtures
 from tests.stored import read_picture
 
@@ -32,8 +32,8 @@ def plugin(tmp_path: Path) -> Path:
 
 
 def test_the_mask_on_the_page_keeps_the_contract(plugin: Path) -> None:
-    for law in stage_laws(plugin):
-        law.check()
+    for contract_test in stage_contract_tests(plugin):
+        contract_test.check()
 
 
 @pytest.mark.slow

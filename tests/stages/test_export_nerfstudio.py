@@ -264,7 +264,7 @@ def test_ranges_beyond_16_bits_are_unknown_and_told(tmp_path: Path) -> None:
     assert np.unique(steps[:48]).tolist() == np.unique(steps[96:]).tolist() == [0]
     assert np.unique(steps[48:96]).tolist() == [2000]
     assert ctx.metrics["beyond_depth"] == pytest.approx(2 / 3)
-    assert "beyond the 65.535 scene units" in ctx.notes[0]
+    assert "exceed the 65.535 scene units" in ctx.notes[0]
     assert "a larger depth_unit" in ctx.notes[0]
 
 

@@ -14,8 +14,8 @@ from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.geometry import pixel_from_ray
 from pano_mvs.scene import PointCloud, Pose, RangeMap
-from pano_mvs.stages.fusion import VoteParams, vote
-from pano_mvs.testing.conformance import stage_laws
+from pano_mvs.stages.fusion import FusionParams, vote
+from pano_mvs.testing.conformance import stage_contract_tests
 from pano_mvs.testing.tiny_capture import TinyCapture, Variant, tiny_capture
 
 FEW = {"planes": 12, "near": 0.5, "far": 6.0}
@@ -45,11 +45,13 @@ VARIANTS: list[tuple[str, dict[str, Any]]] = [
 )
 def test_no_setting_lets_a_stage_see_what_is_masked(name: str, settings: dict[str, Any]) -> None:
     size_hw = (128, 256) if settings.get("levels", 1) > 1 else (32, 64)
-    laws = [law for law in stage_laws(name, settings=settings, size_hw=size_hw) if "masked" in str(law)]
-    assert len(laws) == 1
-    laws[0].check()
+    contract_tests = [
+        test for test in stage_contract_tests(name, settings=settings, size_hw=size_hw) if "masked" in str(test)
+    ]
+    assert len(contract_tests) == 1
+    contract_tests[0].check()
     if Registry.installed().stages[name].output is not PointCloud:
-        next(law for law in stage_laws(name, settings=settings) if "respects masks" in str(law)).check()
+        next(test for test in stage_contract_tests(name, settings=settings) if "respects masks" in str(test)).check()
 
 
 def seen_in(capture: TinyCapture, rays: NDArray[np.float64], name: str) -> NDArray[np.bool_]:
@@ -71,7 +73,7 @@ def test_no_point_of_a_cloud_comes_from_a_masked_pixel(tmp_path: Path, min_views
     capture = tiny_capture(Variant((64, 128), masked=True))
     ranges = {name: everywhere(capture, name) for name in capture.names}
     poses = {name: Pose(pose) for name, pose in zip(capture.names, capture.poses, strict=True)}
-    params = VoteParams.model_validate(
+    params = FusionParams.model_validate(
         {"min_views": min_views, "merge_within": 0.0, "min_support": None, "even_density": False}
     )
     cloud = vote(ranges, poses, capture.images, params, Context(np.random.default_rng(0), tmp_path, 1))
@@ -103,6 +105,6 @@ def test_an_empty_cloud_is_told(tmp_path: Path, blank: bool, why: str) -> None:
         }
     context = Context(np.random.default_rng(0), tmp_path, 1)
     assert not len(
-        vote(ranges, poses, capture.images, VoteParams.model_validate({"min_views": 4, "min_support": None}), context)
+        vote(ranges, poses, capture.images, FusionParams.model_validate({"min_views": 4, "min_support": None}), context)
     )
     assert why in context.notes[0]

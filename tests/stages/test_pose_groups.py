@@ -39,7 +39,7 @@ from pano_mvs.stages.exports.mesh import MeshParams, mesh
 from pano_mvs.stages.exports.nerfstudio import NerfstudioParams, nerfstudio
 from pano_mvs.stages.filters import ConsistencyParams, consistency
 from pano_mvs.stages.frame import BaselineParams, LevelParams, ScaleParams, level, scale
-from pano_mvs.stages.fusion import VoteParams, vote
+from pano_mvs.stages.fusion import FusionParams, vote
 from pano_mvs.stages.patchmatch import PatchMatchParams, patchmatch
 from pano_mvs.stages.points import TrackedParams, tracked
 from pano_mvs.stages.poses import known_poses
@@ -105,7 +105,7 @@ def _fused(rooms: Rooms, names: tuple[str, ...] = _ORDER, **settings: Any) -> Po
     if set(names) == set(_SMALL):
         poses = {name: Pose(pose.cam_from_world) for name, pose in poses.items()}
     ctx = Context(np.random.default_rng(0), Path())
-    return vote(ranges=chosen, poses=poses, images=rooms.images, params=VoteParams(**settings), ctx=ctx)
+    return vote(ranges=chosen, poses=poses, images=rooms.images, params=FusionParams(**settings), ctx=ctx)
 
 
 def test_each_image_knows_its_group(rooms: Rooms) -> None:
@@ -134,7 +134,7 @@ def test_nothing_of_one_room_enters_the_cloud_of_the_other(rooms: Rooms) -> None
 
 def test_a_room_without_ranges_keeps_its_number(rooms: Rooms, ctx: Context) -> None:
     ranges = {name: rooms.ranges[name] for name in _LARGE}
-    cloud = vote(ranges=ranges, poses=rooms.pose_items, images=rooms.images, params=VoteParams(), ctx=ctx)
+    cloud = vote(ranges=ranges, poses=rooms.pose_items, images=rooms.images, params=FusionParams(), ctx=ctx)
     assert [len(group) > 0 for group in cloud.groups()] == [True, False]
     assert any(note.startswith("group 1: the cloud is empty") for note in ctx.notes)
 
@@ -190,7 +190,9 @@ def test_known_poses_are_those_of_the_largest_room_and_say_where_the_others_are(
     out = _placed(colmap(poses=rooms.poses, images=rooms.images, params=ModelParams(), ctx=ctx), tmp_path / "out")
     known = known_poses(out, (*_ORDER, "new.png"))
     assert set(known.names) == set(_LARGE)
-    assert known.rejected["b0.png"].startswith("out has it in group 1, whose frame is another: give the model sparse/1")
+    assert known.rejected["b0.png"].startswith(
+        "out has it in group 1, which has a different frame: use the model sparse/1"
+    )
     assert known.rejected["new.png"] == "out has no pose for it"
     assert known_poses(out / "colmap" / "sparse" / "1", _ORDER).names == tuple(_SMALL)
 
@@ -250,7 +252,7 @@ def test_a_dense_workspace_is_of_the_largest_room(rooms: Rooms, ctx: Context, tm
     for folder, names in (("sparse", _LARGE), ("sparse/0", _LARGE), ("sparse/1", _SMALL)):
         assert {name.rpartition("_")[0] for name in _model_images(out / folder)} == {Path(name).stem for name in names}
     assert "b0" not in (out / "stereo" / "fusion.cfg").read_text()
-    assert any("group 1 (b0.png, b1.png) has a frame of its own" in note for note in ctx.notes)
+    assert any("group 1 (b0.png, b1.png) has its own frame" in note for note in ctx.notes)
 
 
 def test_each_room_has_transforms_and_a_seed(rooms: Rooms, ctx: Context, tmp_path: Path) -> None:
@@ -329,7 +331,7 @@ def test_a_baseline_scales_the_room_that_holds_both_images(rooms: Rooms, ctx: Co
 
 def test_a_baseline_across_rooms_is_refused(rooms: Rooms, ctx: Context) -> None:
     baseline = BaselineParams.model_validate({"from": "000.png", "to": "b1.png", "metres": 7})
-    with pytest.raises(InputError, match=r"000\.png and b1\.png are in groups 0 and 1 .* Name two images of one group"):
+    with pytest.raises(InputError, match=r"000\.png and b1\.png are in groups 0 and 1 .* Use two images of one group"):
         _scaled(rooms, ctx, baseline=baseline)
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, NerfstudioFrames
-from pano_mvs.testing.conformance import Law, stage_laws
+from pano_mvs.testing.conformance import ContractTest, stage_contract_tests
 from tests.io.images.videos import tiny_video
 
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -26,19 +26,19 @@ INPUTS: dict[str, dict[str, Any]] = {
 SIZES_HW = {"poses.colmap_sift": (96, 192)}
 
 
-def laws() -> list[Law]:
+def contract_tests() -> list[ContractTest]:
     stages = Registry.installed().stages
     builtin = [name for name in sorted(stages) if stages[name].function.__module__.startswith("pano_mvs.stages.")]
     assert len(builtin) > 30
     return [
-        law
+        contract_test
         for name in builtin
-        for law in stage_laws(
+        for contract_test in stage_contract_tests(
             stages[name], settings=SETTINGS.get(name), inputs=INPUTS.get(name), size_hw=SIZES_HW.get(name, (32, 64))
         )
     ]
 
 
-@pytest.mark.parametrize("law", laws(), ids=str)
-def test_keeps_the_contract(law: Law) -> None:
-    law.check()
+@pytest.mark.parametrize("contract_test", contract_tests(), ids=str)
+def test_keeps_the_contract(contract_test: ContractTest) -> None:
+    contract_test.check()

@@ -1,4 +1,4 @@
-"""The laws catch stages that break them, each by its own law."""
+"""The contract tests catch stages that break the contract, each by its own test."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from pano_mvs.api import (
     write_png,
 )
 from pano_mvs.core.errors import ContractError
-from pano_mvs.testing.conformance import backend_laws, check_stage, cost_laws, stage_laws
+from pano_mvs.testing.conformance import backend_contract_tests, check_stage, cost_contract_tests, stage_contract_tests
 from pano_mvs.testing.tiny_capture import Variant, tiny_capture
 
 DRAWS = np.random.default_rng()
@@ -201,49 +201,49 @@ def stops_at_the_seam(x: Each[RangeMap]) -> RangeMap:
     return RangeMap(np.where(keep & x.valid, x.range, np.nan).astype(np.float32), np.where(keep, x.confidence, 0))
 
 
-LAWS = {
+BROKEN_BY = {
     undocumented: "declares itself",
     misnamed: "declares itself",
     undescribed: "declares itself|settings that are values",
     changed_by_json: "settings that are values",
-    another_kind: "returns what it declares|returns the same|takes or refuses|respects|rolls",
-    unsound: "returns what it declares|returns the same|takes or refuses|respects|rolls",
-    scribbles: "returns what it declares|returns the same|takes or refuses|respects|rolls",
+    another_kind: "returns what it declares|returns the same|accepts or rejects|respects|rolls",
+    unsound: "returns what it declares|returns the same|accepts or rejects|respects|rolls",
+    scribbles: "returns what it declares|returns the same|accepts or rejects|respects|rolls",
     forces: "returns what it declares|returns the same|rolls",
-    elsewhere: "returns what it declares|returns the same|takes or refuses",
-    never_written: "returns what it declares|returns the same|takes or refuses",
+    elsewhere: "returns what it declares|returns the same|accepts or rejects",
+    never_written: "returns what it declares|returns the same|accepts or rejects",
     draws: "returns the same bytes",
     counts_threads: "returns the same bytes",
     reports_at_random: "returns the same bytes",
-    needs_room: "takes or refuses pictures (8|9)",
-    needs_something: "takes or refuses nothing to see",
-    needs_the_optional: "takes or refuses inputs left out",
+    needs_room: "accepts or rejects images (8|9)",
+    needs_something: "accepts or rejects empty inputs",
+    needs_the_optional: "accepts or rejects missing inputs",
     fills_masked: "respects masks",
     unmasks: "respects masks",
     sees_masked: "respects masks",
-    looks_behind_the_mask: "does not see what is masked",
+    looks_behind_the_mask: "does not depend on masked content",
     stops_at_the_seam: "rolls with",
 }
 
 
-@pytest.mark.parametrize("broken", LAWS, ids=lambda function: function.__name__)
-def test_a_stage_that_breaks_a_law_is_caught_by_it(broken: Callable[..., Any]) -> None:
+@pytest.mark.parametrize("broken", BROKEN_BY, ids=lambda function: function.__name__)
+def test_a_stage_that_breaks_its_contract_is_caught(broken: Callable[..., Any]) -> None:
     caught = []
-    for law in stage_laws(broken):
+    for contract_test in stage_contract_tests(broken):
         if broken is forces:  # it changes what it is given
             tiny_capture.cache_clear()
         try:
-            law.check()
+            contract_test.check()
         except (AssertionError, ContractError, ValueError, IndexError):
-            caught.append(law.name)
+            caught.append(contract_test.name)
     if broken is forces:
         tiny_capture.cache_clear()
     assert caught
-    expected = LAWS[broken].split("|") if "(" not in LAWS[broken] else ["takes or refuses pictures"]
+    expected = BROKEN_BY[broken].split("|") if "(" not in BROKEN_BY[broken] else ["accepts or rejects images"]
     assert all(any(what in name for what in expected) for name in caught), caught
 
 
-def test_a_refusal_is_no_breach_but_for_ordinary_inputs() -> None:
+def test_rejecting_inputs_is_allowed_except_for_ordinary_ones() -> None:
     @stage("toy.refuses")
     def refuses(x: Each[RangeMap]) -> RangeMap:
         """Small pictures are refused."""
@@ -252,7 +252,7 @@ def test_a_refusal_is_no_breach_but_for_ordinary_inputs() -> None:
         return x
 
     check_stage(refuses)
-    with pytest.raises(AssertionError, match="refuses ordinary inputs: too small"):
+    with pytest.raises(AssertionError, match="rejects ordinary inputs: too small"):
         check_stage(refuses, size_hw=(16, 32))
 
 
@@ -277,9 +277,9 @@ def test_a_kind_of_ones_own_is_given() -> None:
 
 def test_what_is_no_stage_is_refused() -> None:
     with pytest.raises(UsageError, match="is not a stage"):
-        stage_laws(len)
+        stage_contract_tests(len)
     with pytest.raises(UsageError, match=r"did you mean 'filters\.median'"):
-        stage_laws("filters.medain")
+        stage_contract_tests("filters.medain")
 
 
 PARTS = """\
@@ -302,19 +302,21 @@ def backend(work):
 
 
 @pytest.mark.parametrize(
-    ("name", "body", "law", "why"),
+    ("name", "body", "contract_test", "why"),
     [
         ("large", "return np.abs(reference - warped)[..., 0]", "from 0 to 1", "must return .* from 0 to 1"),
-        ("constant", "return np.full(reference.shape[:2], 0.5)", "less where pictures are the same",
-         "is 0.500 of a picture against itself and 0.500 against another"),
+        ("constant", "return np.full(reference.shape[:2], 0.5)", "lower where images are the same",
+         "is 0.500 of an image against itself and 0.500 against another image"),
         ("random", "return np.random.default_rng().random(reference.shape[:2]) * (reference[..., 0] != warped[..., 0])",
-         "the same again", "another one the second time"),
+         "the same when called again", "something else when called again"),
     ],
 )  # fmt: skip
-def test_a_part_that_breaks_a_law_is_caught_by_it(tmp_path: Path, name: str, body: str, law: str, why: str) -> None:
+def test_a_part_that_breaks_its_contract_is_caught(
+    tmp_path: Path, name: str, body: str, contract_test: str, why: str
+) -> None:
     path = tmp_path / f"{name}.py"
     path.write_text(PARTS.format(name, body))
-    (broken,) = [each for each in cost_laws(path) if law in each.name]
+    (broken,) = [each for each in cost_contract_tests(path) if contract_test in each.name]
     with pytest.raises((AssertionError, ContractError), match=why):
         broken.check()
 
@@ -322,15 +324,15 @@ def test_a_part_that_breaks_a_law_is_caught_by_it(tmp_path: Path, name: str, bod
 def test_a_backend_that_finds_something_else_is_caught(tmp_path: Path) -> None:
     path = tmp_path / "backend.py"
     path.write_text(PARTS.format("backend", "return np.zeros(reference.shape[:2])"))
-    agreement, again = backend_laws(path)
-    with pytest.raises(AssertionError, match="agrees with the readable backend in"):
+    agreement, again = backend_contract_tests(path)
+    with pytest.raises(AssertionError, match="agrees with the numpy backend in"):
         agreement.check()
     again.check()
 
 
 def test_built_in_costs_have_no_laws_of_plugins() -> None:
     with pytest.raises(UsageError, match="'census' is built in"):
-        cost_laws("census")[0].check()
+        cost_contract_tests("census")[0].check()
     assert CostWindow.of((8, 16), 1, spherical=True).columns.shape == (8, 3)
 
 

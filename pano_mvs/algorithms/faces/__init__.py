@@ -1,1 +1,1 @@
-"""Pinhole pictures cut out of a panorama: faces of a rig that covers the sphere with overlap."""
+"""Pinhole views cut from a panorama: faces of a rig that covers the sphere with overlap."""

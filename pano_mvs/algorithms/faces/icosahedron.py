@@ -1,9 +1,9 @@
-"""Twenty overlapping tangent tiles, one on each face of an icosahedron.
+"""Twenty overlapping tangent tiles, one for each face of an icosahedron.
 
-A gnomonic (tangent plane) picture of a small part of the sphere is an ordinary perspective picture, on which
-planar detectors work as they were meant to, with neither seam nor pole. Great circles are straight in it, so the
-part of the sphere that is nearest to a tile's centre is exactly a triangle: the face of the icosahedron
-(Eder et al., "Tangent Images for Mitigating Spherical Distortion", 2020).
+A gnomonic (tangent plane) view of a small part of the sphere is an ordinary perspective image, to which planar
+detectors can be applied without seam or pole. Great circles are straight in it, so the part of the sphere that is
+nearest to a tile's centre is exactly a triangle: the face of the icosahedron (Eder et al., "Tangent Images for
+Mitigating Spherical Distortion", 2020).
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from pano_mvs.geometry import PinholeView
 
 FloatArray = NDArray[np.float64]
 
-_MARGIN = 0.17  # in units of the focal length; what a detector and its descriptor need beyond the face
+_MARGIN = 0.17  # in units of the focal length; required by detectors and descriptors beyond the face
 _MIN_MARGIN_PX = 24
 
 
 @cache
 def face_centers() -> FloatArray:
-    """Return the unit centres of the twenty faces, (20, 3); the nearest one owns a direction."""
+    """Return the unit centres of the twenty faces, (20, 3); a direction belongs to the nearest one."""
     return np.array([triangle.mean(axis=0) / np.linalg.norm(triangle.mean(axis=0)) for triangle in _faces()])
 
 
@@ -35,12 +35,12 @@ def face_corners() -> FloatArray:
 
 
 def beyond_face_rad(bearings: FloatArray, face_idx: int) -> FloatArray:
-    """Return by how many radians bearings (..., 3) lie beyond the nearest edge of a face, (...,); negative inside."""
+    """Return by how many radians bearings (..., 3) are beyond the nearest edge of a face, (...,); negative inside."""
     centers = face_centers()
     across = centers - centers[face_idx]
     lengths = np.linalg.norm(across, axis=1)
     lengths[face_idx] = 1.0
-    # The face's own centre gives 0, which would hide how far inside the others' edges a bearing lies.
+    # The face's own centre gives 0, which would hide how far a bearing is inside the edges.
     beyond: FloatArray = np.delete(bearings @ (across / lengths[:, None]).T, face_idx, axis=-1).max(axis=-1)
     return beyond
 
@@ -62,7 +62,7 @@ def _faces() -> tuple[FloatArray, ...]:
 
 
 def _tile(triangle: FloatArray, focal_px: float) -> PinholeView:
-    """Return the tile around a face, upright so that one corner of the face points along the tile's y axis."""
+    """Return the tile around a face, rotated so that one corner of the face is along the tile's y axis."""
     z = triangle.mean(axis=0) / np.linalg.norm(triangle.mean(axis=0))
     y = triangle[0] - (triangle[0] @ z) * z
     y /= np.linalg.norm(y)

@@ -1,10 +1,10 @@
-"""Which faces a panorama is cut into: overlapping pinhole views that share its centre.
+"""Layouts of faces: overlapping pinhole views that share the panorama's centre.
 
-    for face in panorama_faces((512, 1024)):
-        picture = face_image(panorama, face.view)
+        for face in panorama_faces((512, 1024)):
+            picture = face_image(panorama, face.view)
 
-A layout is a list of directions. All faces of one panorama are squares of one size and one focal length, so that one
-camera model serves a whole rig.
+A layout is a list of directions. All faces of one panorama are squares with the same size and focal length, so that one
+camera model is enough for a rig.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ CUBE_ROTATIONS: FloatArray = np.array(
 )
 CUBE_NAMES = ("front", "right", "back", "left", "up", "down")
 _OCTAGON_NAMES = ("front", "front-right", "right", "back-right", "back", "back-left", "left", "front-left")
-_LEAST_FOV_DEG, _LARGEST_FOV_DEG, _LEAST_SIZE_PX = 30.0, 150.0, 4
+_MIN_FOV_DEG, _MAX_FOV_DEG, _MIN_SIZE_PX = 30.0, 150.0, 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +45,7 @@ class Face:
     """One face of a layout.
 
     Attributes:
-        name: a plain word without `_`, unique in its layout; part of the names of files.
+        name: a plain word without `_`, unique in its layout; part of file names.
         view: the face as a pinhole view; `view.view_from_cam` is face_from_cam, `view.calibration` is K.
     """
 
@@ -59,23 +59,23 @@ def panorama_faces(
     """Return the faces of a panorama.
 
     The cube has six faces: front, right, back, left, up, down; "up" has the front below it, "down" above it. The
-    octagon has eight around the horizon and the cube's up and down. The icosahedron has twenty, each upright. Below 90°
-    (71° of the icosahedron) faces leave gaps; see `covers_sphere`.
+    octagon has eight around the horizon and the cube's up and down. The icosahedron has twenty, all upright. Below 90°
+    (71° for the icosahedron), there are gaps between faces; see `covers_sphere`.
 
     Args:
         size_hw: (height, width) of the full sphere.
-        layout: which directions.
-        fov_deg: field of view from edge to edge, from 30 to 150, both ways.
+        layout: name of the layout.
+        fov_deg: horizontal and vertical field of view, from 30 to 150.
         size_px: width and height of a face; None: `default_face_size`.
 
     Raises:
         UsageError: if the field of view or the size is out of bounds.
     """
-    if not _LEAST_FOV_DEG <= fov_deg <= _LARGEST_FOV_DEG:
+    if not _MIN_FOV_DEG <= fov_deg <= _MAX_FOV_DEG:
         raise UsageError(f"the field of view of a face must be from 30 to 150 degrees, got {fov_deg}")
     size = default_face_size(size_hw, fov_deg=fov_deg) if size_px is None else size_px
-    if size < _LEAST_SIZE_PX:
-        raise UsageError(f"a face must be {_LEAST_SIZE_PX} pixels wide or more, got {size}")
+    if size < _MIN_SIZE_PX:
+        raise UsageError(f"a face must be {_MIN_SIZE_PX} pixels wide or more, got {size}")
     focal_px = size / (2 * np.tan(np.radians(fov_deg) / 2))
     center = np.array([size / 2, size / 2])
     return tuple(
@@ -85,16 +85,16 @@ def panorama_faces(
 
 
 def default_face_size(size_hw: tuple[int, int], *, fov_deg: float = 96.0) -> int:
-    """Return the width at which the middle of a face is as fine as the panorama's equator: (w / π) tan(fov / 2).
+    """Return the width at which the centre of a face has the resolution of the equator: (w / π) tan(fov / 2).
 
-    Rounded up to an even number of pixels; towards its edges a face is finer.
+    Rounded up to an even number of pixels; the resolution increases towards the edges of a face.
     """
     exact = size_hw[1] / np.pi * np.tan(np.radians(fov_deg) / 2)
-    return max(2 * int(np.ceil(exact / 2 - 1e-9)), _LEAST_SIZE_PX)
+    return max(2 * int(np.ceil(exact / 2 - 1e-9)), _MIN_SIZE_PX)
 
 
 def covers_sphere(faces: tuple[Face, ...]) -> bool:
-    """Return whether every direction lies in a face, tried on 20,000 evenly spread ones."""
+    """Return whether every direction is in a face, tested for 20,000 evenly spread ones."""
     rays = spiral_rays(20_000)
     seen = np.zeros(len(rays), np.bool_)
     for face in faces:
@@ -103,7 +103,7 @@ def covers_sphere(faces: tuple[Face, ...]) -> bool:
 
 
 def upright_rotation(axis_in_cam: FloatArray) -> FloatArray:
-    """Return the face_from_cam (3, 3) of a face that looks along a direction (3,) not up or down, with no roll."""
+    """Return the face_from_cam (3, 3) of a face in a direction (3,) other than up and down, without roll."""
     z = axis_in_cam / np.linalg.norm(axis_in_cam)
     x = np.cross([0.0, 1.0, 0.0], z)
     x /= np.linalg.norm(x)

@@ -10,22 +10,22 @@ from pano_mvs.algorithms.faces.sampling import nearest_pixels, sample_view
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import PinholeView, pad_panorama
 
-# Bicubic interpolation reaches no pixel farther away than this from the one that holds the place.
+# Bicubic interpolation uses no pixel farther away than this from the one that contains the position.
 _REACH_PX = 2
 
 
 def face_image(panorama: NDArray[np.uint8], view: PinholeView) -> NDArray[np.uint8]:
-    """Return the picture of a face, (h, w, 3) uint8 RGB.
+    """Render the image of a face, (h, w, 3) uint8 RGB.
 
-    Bicubic. A face that is coarser than the panorama is averaged over so many places in each of its pixels that none
-    is farther from the next than a pixel of the panorama's equator, so that fine texture does not alias.
+    The interpolation is bicubic. If a face is coarser than the panorama, each of its pixels is the average of several
+    samples, spaced by at most a pixel of the panorama's equator, so that fine texture does not alias.
 
     Args:
         panorama: (H, W, 3) uint8 RGB, the full sphere.
         view: the face.
 
     Raises:
-        UsageError: if the panorama is no such array.
+        UsageError: if the panorama is not such an array.
     """
     if panorama.ndim != 3 or panorama.dtype != np.uint8 or panorama.shape[1] % 2:
         raise UsageError(f"a panorama is (H, W, 3) uint8 with even W, got {panorama.shape} {panorama.dtype}")
@@ -33,12 +33,12 @@ def face_image(panorama: NDArray[np.uint8], view: PinholeView) -> NDArray[np.uin
 
 
 def face_mask(valid: NDArray[np.bool_], view: PinholeView) -> NDArray[np.bool_]:
-    """Return the valid pixels of a face, (h, w) bool: those whose colour in `face_image` owes nothing to the mask.
+    """Return the valid pixels of a face, (h, w) bool: pixels of `face_image` without any contribution of masked pixels.
 
-    So the mask grows by the two pixels that the interpolation reaches, and by the width of a face's pixel.
+    The mask grows by the two pixels of the interpolation's support, and by the width of a face's pixel.
 
     Args:
-        valid: (H, W) bool of the panorama, False is to be ignored.
+        valid: (H, W) bool of the panorama; False is ignored.
         view: the face.
     """
     if valid.all():
@@ -57,5 +57,5 @@ def face_mask(valid: NDArray[np.bool_], view: PinholeView) -> NDArray[np.bool_]:
 
 
 def _samples(width: int, view: PinholeView) -> int:
-    """Return along how many places of a face's pixel colours are averaged, in each direction."""
+    """Return the number of samples in each pixel of a face, along each direction."""
     return max(1, int(np.ceil(width / (2 * np.pi) / view.focal_px - 1e-6)))

@@ -10,25 +10,26 @@ from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import PinholeView
 
-# Four neighbouring pixels further apart than this are two surfaces: no value lies between them.
+# Four neighbouring pixels with a larger relative difference are two surfaces: do not interpolate between them.
 _MAX_SURFACE_STEP = 0.05
 
 
 def face_z_depth(ranges: NDArray[np.float32], view: PinholeView, *, threads: int = 1) -> NDArray[np.float32]:
-    """Return the z-depth of a face, (h, w) float32 in the ranges' unit, NaN where it is not known.
+    """Return the z-depth of a face, (h, w) float32 in the ranges' unit, NaN if unknown.
 
-    z = range · cos α, α the angle between the ray through the face pixel's centre and the face's axis. The range
-    between the panorama's four nearest pixels is bilinear in 1 / range, in which planes are all but linear, where all
-    four are valid and the farthest is at most 5 % farther than the nearest. Elsewhere, at a step or a hole, it is that
-    of the pixel in which the ray lies, which may be none: nothing is mixed across a discontinuity, no hole is closed.
+    z = range · cos α, where α is the angle between the ray through the face pixel's centre and the face's axis. The
+    range is interpolated between the panorama's four nearest pixels, bilinearly in 1 / range, in which planes are
+    almost linear, if all four are valid and the farthest is at most 5 % farther than the nearest. Otherwise, at a step
+    or a hole, it is the range of the pixel that contains the ray, which may be invalid: surfaces are not mixed across a
+    discontinuity, and holes are not closed.
 
     Args:
         ranges: (H, W) float32 along the rays of the full sphere, NaN invalid.
         view: the face.
-        threads: how many to use; they change no bit.
+        threads: number of threads; the result does not depend on it.
 
     Raises:
-        UsageError: if the ranges are another array.
+        UsageError: if the ranges are not such an array.
     """
     from pano_mvs.algorithms.faces.kernels_faces import z_depth_rows  # compiles on import
 
@@ -47,7 +48,7 @@ def face_z_depth(ranges: NDArray[np.float32], view: PinholeView, *, threads: int
 
 
 def face_normals(normals_in_cam: NDArray[np.floating], view: PinholeView) -> NDArray[np.float32]:
-    """Return the normals of a face in ITS camera frame, (h, w, 3) float32: of the pixel in which each ray lies.
+    """Return the normals of a face in ITS camera frame, (h, w, 3) float32, from the pixel that contains each ray.
 
     Args:
         normals_in_cam: (H, W, 3) in the panorama's camera frame, NaN where unknown (and so in the result).
@@ -59,7 +60,7 @@ def face_normals(normals_in_cam: NDArray[np.floating], view: PinholeView) -> NDA
 
 
 def face_confidence(confidence: NDArray[np.uint8], view: PinholeView) -> NDArray[np.uint8]:
-    """Return the confidences of a face, (h, w) uint8: of the pixel in which each ray lies.
+    """Return the confidences of a face, (h, w) uint8, from the pixel that contains each ray.
 
     Args:
         confidence: (H, W) uint8 of the panorama.

@@ -1,4 +1,4 @@
-"""All that a dense workspace holds of one face."""
+"""Render all data of a dense workspace for one face."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from pano_mvs.scene import RangeMap
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceRender:
-    """What is seen in a face; where its mask is True nothing of it comes from a masked pixel of the panorama.
+    """Data of one face; where its mask is True, nothing comes from a masked pixel of the panorama.
 
     Attributes:
-        image: (h, w, 3) uint8 RGB; where masked, what the picture that was given shows there.
+        image: (h, w, 3) uint8 RGB; masked pixels show the content of the given image.
         mask: (h, w) bool, False where masked.
         z_depth: (h, w) float32 in scene units, NaN where unknown or masked.
         normals_in_face: (h, w, 3) float32 unit normals in the face's camera frame, towards the camera; NaN exactly
-            where the z-depth is.
+            where the z-depth is NaN.
         confidence: (h, w) uint8, 0 exactly where the z-depth is NaN.
     """
 
@@ -37,12 +37,12 @@ class FaceRender:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceSource:
-    """A panorama with its range map, made ready for the rendering of faces.
+    """A panorama with its range map, prepared for the rendering of faces.
 
     Attributes:
-        image: (H, W, 3) uint8 RGB, such as `Panorama.load`, which shows nothing masked.
+        image: (H, W, 3) uint8 RGB, for example from `Panorama.load`, which hides masked content.
         valid: (H, W) bool, False is masked.
-        ranges: (H, W) float32, NaN where unknown, masked or of too little confidence.
+        ranges: (H, W) float32, NaN if unknown, masked or of low confidence.
         normals_in_cam: (H, W, 3) float32, NaN where unknown.
         confidence: (H, W) uint8, 0 where the ranges are NaN.
     """
@@ -62,24 +62,24 @@ def face_source(
     min_confidence: int = 64,
     threads: int = 1,
 ) -> FaceSource:
-    """Return a panorama ready for `render_face`: what is masked or doubtful has no range.
+    """Prepare a panorama for `render_face`: masked and unreliable pixels have no range.
 
-    Normals are the range map's own; where it has none they are fitted to the ranges (`normals_from_range`); where that
-    is impossible a surface is taken to face the camera.
+    Normals are those of the range map; otherwise they are fitted to the ranges (`normals_from_range`); where that is
+    impossible, the surface is assumed to face the camera.
 
     Args:
         image: (H, W, 3) uint8 RGB.
-        valid: (H, W) bool, False is to be ignored.
+        valid: (H, W) bool; False is ignored.
         range_map: of the same size.
-        min_confidence: ranges below are left out.
-        threads: how many to use; they change no bit.
+        min_confidence: minimum confidence of ranges.
+        threads: number of threads; the result does not depend on it.
 
     Raises:
         UsageError: if the sizes differ.
     """
     ranges = range_map.range
     if image.shape[:2] != ranges.shape or valid.shape != ranges.shape:
-        raise UsageError(f"picture {image.shape[:2]}, mask {valid.shape} and range map {ranges.shape} differ in size")
+        raise UsageError(f"image {image.shape[:2]}, mask {valid.shape} and range map {ranges.shape} differ in size")
     kept = valid & (range_map.confidence >= min_confidence) & range_map.valid
     given = None if range_map.normals_in_cam is None else range_map.normals_in_cam.astype(np.float32)
     seen = np.where(kept, ranges, np.float32(np.nan))
@@ -93,14 +93,14 @@ def face_source(
 def render_face(
     source: FaceSource, view: PinholeView, *, depth_view: PinholeView | None = None, threads: int = 1
 ) -> FaceRender:
-    """Return what is seen of a panorama in one face.
+    """Render one face of a panorama.
 
     Args:
         source: the panorama.
         view: the face.
-        depth_view: of which view the z-depths, normals and confidences are, such as `colmap_depth_view(view)`; None:
-            the face itself.
-        threads: how many to use; they change no bit.
+        depth_view: the view of the z-depths, normals and confidences, for example `colmap_depth_view(view)`; None: the
+            face itself.
+        threads: number of threads; the result does not depend on it.
     """
     depth_view = view if depth_view is None else depth_view
     mask = face_mask(source.valid, view)
@@ -115,10 +115,10 @@ def render_face(
 
 
 def colmap_depth_view(view: PinholeView) -> PinholeView:
-    """Return the view whose pixel centres are the places that COLMAP's dense code takes a face's pixels for.
+    """Return the view whose pixel centres are where COLMAP's dense code assumes a face's pixels.
 
-    To its fusion and its patch matching the pixel in column c and row r is the ray K⁻¹ (c, r, 1): the pixel's upper
-    left corner, since (0, 0) is a corner everywhere else in COLMAP. Depth maps of the pixels' centres would be fused
-    half a pixel off.
+    For its fusion and patch matching, the pixel in column c and row r is the ray K⁻¹ (c, r, 1): the pixel's upper left
+    corner, since (0, 0) is a corner everywhere else in COLMAP. Depth maps for the pixel centres would be fused with an
+    offset of half a pixel.
     """
     return replace(view, principal_xy=view.principal_xy + 0.5)

@@ -1,4 +1,4 @@
-"""A pinhole view's picture, sampled from a panorama over its seam and poles."""
+"""Sample a pinhole view from a panorama, across its seam and poles."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ def sample_view(
     interpolation: int = cv2.INTER_CUBIC,
     samples: int = 1,
 ) -> NDArray[np.uint8]:
-    """Return a view's picture, (h, w) or (h, w, C) uint8, of a panorama (H, W) or (H, W, C): over seam and poles.
+    """Return a view's image, (h, w) or (h, w, C) uint8, from a panorama (H, W) or (H, W, C), across seam and poles.
 
     Args:
         panorama: the full sphere, even W.
-        view: where to look.
-        interpolation: OpenCV's, nearest, linear or cubic.
-        samples: places in each pixel along either side, evenly spread, that are averaged.
+        view: the pinhole view.
+        interpolation: OpenCV's constant for nearest, linear or cubic interpolation.
+        samples: number of evenly spread samples in each pixel along each side, which are averaged.
     """
     padded = pad_panorama(panorama, min(_PAD_PX, *panorama.shape[:2]))
     # OpenCV puts (0, 0) at the first pixel's centre.
@@ -45,12 +45,12 @@ def sample_view(
 def nearest_pixels(
     view: PinholeView, size_hw: tuple[int, int], *, offset_xy: tuple[float, float] = (0.5, 0.5)
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return row and column, (h, w) each, of the panorama's pixel in which one place of each of a view's pixels lies.
+    """Return row and column, (h, w) each, of the panorama's pixel that contains a position in each of a view's pixels.
 
     Args:
-        view: where to look.
+        view: the pinhole view.
         size_hw: (height, width) of the panorama.
-        offset_xy: the place, (0.5, 0.5) the pixel's centre.
+        offset_xy: the position within a pixel; (0.5, 0.5) is its centre.
     """
     row, column = np.empty(view.size_hw, np.intp), np.empty(view.size_hw, np.intp)
     for rows in _bands(view.size_hw[0]):
@@ -61,14 +61,14 @@ def nearest_pixels(
 
 
 def _offsets(samples: int) -> Iterator[tuple[float, float]]:
-    """Yield evenly spread places in a pixel."""
+    """Yield evenly spread positions in a pixel."""
     for y in range(samples):
         for x in range(samples):
             yield (x + 0.5) / samples, (y + 0.5) / samples
 
 
 def _bands(height: int) -> Iterator[slice]:
-    """Yield bands of rows, so that the rays of a large view are never all there at once."""
+    """Yield bands of rows, so that the rays of a large view are never all in memory."""
     for first in range(0, height, _BAND_ROWS):
         yield slice(first, min(first + _BAND_ROWS, height))
 

@@ -1,9 +1,9 @@
 """A geodesic grid: the sphere in nearly equal hexagonal cells, in twenty overlapping charts.
 
 Every face of an icosahedron is divided into a triangular lattice, n steps along an edge, so that each cell has six
-neighbours at fixed steps (Zhao et al., "SPHORB", 2015, section 3). The usual grid is irregular at the twelve corners
-of the icosahedron and bends at its edges. Here every face's lattice goes on smoothly beyond the face instead, as far
-as a neighbourhood reaches, so that no cell of a face has an irregular neighbourhood; a face owns what lies inside it.
+neighbours at fixed steps (Zhao et al., "SPHORB", 2015, section 3). The usual grid is irregular at the twelve corners of
+the icosahedron and bends at its edges. Here every face's lattice continues smoothly beyond the face instead, by the
+size of a neighbourhood, so that no cell of a face has an irregular neighbourhood; a face owns the cells inside it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pano_mvs.geometry import pad_panorama, pixel_from_ray
 FloatArray = NDArray[np.float64]
 
 _PAD_PX = 4
-_EDGE_RAD = float(np.arctan(2.0))  # between two corners of an icosahedron
+_EDGE_RAD = float(np.arctan(2.0))  # angle between two neighbouring corners of an icosahedron
 # Lattice steps (u, v) to the six neighbours, counter-clockwise; the axes include 60°.
 NEIGHBOURS = np.array([[1, 0], [0, 1], [-1, 1], [-1, 0], [0, -1], [1, -1]])
 
@@ -30,12 +30,12 @@ NEIGHBOURS = np.array([[1, 0], [0, 1], [-1, 1], [-1, 0], [0, -1], [1, -1]])
 class GeodesicGrid:
     """Twenty triangular lattices that cover the sphere.
 
-    A place is a face and lattice coordinates (u, v), with u, v >= 0 and u + v <= steps inside the face; cell (u, v) of
-    face f is element [f, v + margin, u + margin] of an array (20, side, side).
+    A position is a face and lattice coordinates (u, v), with u, v >= 0 and u + v <= steps inside the face; cell (u, v)
+    of face f is element [f, v + margin, u + margin] of an array (20, side, side).
 
     Attributes:
-        steps: lattice steps along an edge.
-        margin: cells that each lattice goes on beyond its face.
+        steps: number of lattice steps along an edge.
+        margin: number of cells by which each lattice extends beyond its face.
     """
 
     steps: int
@@ -43,12 +43,12 @@ class GeodesicGrid:
 
     @property
     def side(self) -> int:
-        """Cells along either axis of a face's array."""
+        """Number of cells along either axis of a face's array."""
         return self.steps + 1 + 2 * self.margin
 
     @property
     def spacing_rad(self) -> float:
-        """Mean angle between neighbouring cells: that of 10 n² hexagons that fill the sphere."""
+        """Mean angle between neighbouring cells, that of 10 n² hexagons covering the sphere."""
         return float(np.sqrt(4 * np.pi / (10 * self.steps**2) * 2 / np.sqrt(3)))
 
     @cached_property
@@ -62,17 +62,17 @@ class GeodesicGrid:
         return offsets
 
     def bearings(self, face_idx: NDArray[np.integer], places_uv: FloatArray) -> FloatArray:
-        """Return the unit bearings (N, 3) of places (N, 2) on faces (N,), in the camera frame.
+        """Return the unit bearings (N, 3) of positions (N, 2) on faces (N,), in the camera frame.
 
-        With barycentric coordinates b of the lattice, the direction is Σ sin(b_k θ) V_k over the face's corners, θ
-        the angle of an edge. Along an edge this is the great circle at constant speed.
+        With barycentric coordinates b of the lattice, the direction is Σ sin(b_k θ) V_k over the face's corners, where
+        θ is the angle of an edge. Along an edge this is the great circle at constant speed.
         """
         rays = np.einsum("nk,nkj->nj", self._weights(places_uv), face_corners()[face_idx])
         unit: FloatArray = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
         return unit
 
     def lattice_from_tangent(self, face_idx: NDArray[np.integer], places_uv: FloatArray) -> FloatArray:
-        """Return (N, 2, 2): a small step in the tangent plane, in units of `spacing_rad`, to lattice steps.
+        """Return (N, 2, 2), from a small tangent-plane step in units of `spacing_rad` to lattice steps.
 
         The tangent plane's axes are the lattice's u axis e and bearing × e, right-handed on every face.
         """
@@ -88,7 +88,7 @@ class GeodesicGrid:
         return np.asarray(np.linalg.inv(tangent_from_lattice), np.float64)
 
     def sample(self, panorama: NDArray[np.uint8], *, interpolation: int = cv2.INTER_CUBIC) -> NDArray[np.uint8]:
-        """Return a panorama (H, W) uint8 at all cells, (20, side, side); over seam and poles."""
+        """Return a panorama (H, W) uint8 sampled at all cells, (20, side, side), across seam and poles."""
         height, width = panorama.shape
         first_map, second_map = _sampling_maps(self, (height, width))
         padded = pad_panorama(panorama, _PAD_PX)
@@ -101,7 +101,7 @@ class GeodesicGrid:
 
 
 def hexagon_ring(radius: int) -> NDArray[np.int64]:
-    """Return the lattice steps (6 radius, 2) to the cells at so many steps, in order around the centre."""
+    """Return the lattice steps (6 radius, 2) to the cells at distance `radius`, in order around the centre."""
     sides = [radius * NEIGHBOURS[k] + step * NEIGHBOURS[(k + 2) % 6] for k in range(6) for step in range(radius)]
     return np.array(sides, np.int64)
 
@@ -114,7 +114,7 @@ def plane_from_lattice(cells_uv: NDArray[np.generic]) -> FloatArray:
 
 @lru_cache(maxsize=16)
 def _sampling_maps(grid: GeodesicGrid, size_hw: tuple[int, int]) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
-    """Return where in a padded panorama every cell lies, in OpenCV's fixed-point form (1/32 pixel)."""
+    """Return the position of every cell in a padded panorama, in OpenCV's fixed-point form (1/32 pixel)."""
     steps = np.arange(-grid.margin, grid.steps + grid.margin + 1, dtype=np.float64)
     v, u = np.meshgrid(steps, steps, indexing="ij")
     weights = grid._weights(np.stack([u, v], axis=-1))

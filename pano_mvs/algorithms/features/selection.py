@@ -1,4 +1,4 @@
-"""Which key points to keep: distinct ones, spread evenly over the sphere."""
+"""Select key points: distinct ones, spread evenly over the sphere."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _KEYPOINTS_PER_CELL = 8
 
 
 def distinct_keypoints(bearings: FloatArray, scores: NDArray[np.float32], *, radius_rad: float) -> NDArray[np.intp]:
-    """Return the positions of key points that have no stronger one within a radius; of equals the first stays.
+    """Return the positions of key points without a stronger one within a radius; of equals, the first is kept.
 
     Args:
         bearings: (N, 3) unit vectors.
@@ -27,7 +27,7 @@ def distinct_keypoints(bearings: FloatArray, scores: NDArray[np.float32], *, rad
     pairs = cKDTree(bearings).query_pairs(2 * np.sin(radius_rad / 2), output_type="ndarray")
     weaker, stronger = np.sort(rank[pairs], axis=1)[:, ::-1].T
     kept = np.ones(len(order), np.bool_)
-    # In order of strength of the weaker one: by then it is settled whether the stronger one stays.
+    # In order of strength of the weaker one, so that the decision on the stronger one has already been made.
     for pair in np.lexsort((stronger, weaker)):
         if kept[stronger[pair]]:
             kept[weaker[pair]] = False
@@ -35,14 +35,14 @@ def distinct_keypoints(bearings: FloatArray, scores: NDArray[np.float32], *, rad
 
 
 def spread_keypoints(bearings: FloatArray, scores: NDArray[np.float32], *, max_keypoints: int) -> NDArray[np.intp]:
-    """Return the positions of at most so many key points, strongest first, taken evenly from cells of equal area.
+    """Return the positions of at most `max_keypoints` key points, strongest first, spread over cells of equal area.
 
-    Every cell gives its best key point, then every cell its second best, and so on, until there are enough.
+    Every cell gives its best key point, then its second best, and so on, until there are enough.
 
     Args:
         bearings: (N, 3) unit vectors.
         scores: (N,) strength.
-        max_keypoints: how many to keep at most.
+        max_keypoints: maximum number of key points.
     """
     order = np.argsort(-scores, kind="stable")
     if len(order) <= max_keypoints:
@@ -58,7 +58,7 @@ def spread_keypoints(bearings: FloatArray, scores: NDArray[np.float32], *, max_k
 
 
 def _fibonacci_sphere(count: int) -> FloatArray:
-    """Return so many nearly evenly spread unit vectors, (count, 3)."""
+    """Return `count` nearly evenly spread unit vectors, (count, 3)."""
     idx = np.arange(count) + 0.5
     y = 1 - 2 * idx / count
     azimuth = np.pi * (1 + np.sqrt(5)) * idx

@@ -1,4 +1,4 @@
-"""Smoothing a panorama by the same angle in all directions and everywhere."""
+"""Gaussian smoothing of a panorama, isotropic on the sphere."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from pano_mvs.geometry import pad_panorama
 
 FloatArray = NDArray[np.float64]
 
-_PIXEL_STD = np.sqrt(1 / 12)  # of a box one pixel wide
+_PIXEL_STD = np.sqrt(1 / 12)  # standard deviation of a box one pixel wide
 
 
 def smooth_panorama(panorama: NDArray[np.uint8], sigmas_px: FloatArray) -> list[NDArray[np.uint8]]:
-    """Return a panorama smoothed by Gaussians, one picture for each width.
+    """Smooth a panorama by Gaussians, with one result for each width.
 
-    Rows are smoothed by 1 / cos φ as many pixels as columns. Towards the poles a row's pixels are narrower than those
-    of the equator; what that adds in sharpness along the row is taken away as well, so that noise and detail are alike
-    in all directions. Only within about two standard deviations of a pole is the smoothing weaker than elsewhere, for
-    there the rows are circles so small that they are smoothed towards no other place.
+    Rows are smoothed by 1 / cos φ times as many pixels as columns. Towards the poles, the pixels of a row are narrower
+    than at the equator; the additional sharpness along the row is removed as well, so that noise and detail are
+    isotropic. Only within about two standard deviations of a pole is the smoothing weaker, because the rows are such
+    small circles there.
 
     Args:
         panorama: (H, W) uint8, the full sphere.
-        sigmas_px: (S,) standard deviations in pixels at the equator, 0 or more.
+        sigmas_px: (S,) standard deviations in pixels at the equator, not negative.
 
     Returns:
         S arrays (H, W) uint8.

@@ -1,9 +1,9 @@
-"""SPHORB: corners and binary descriptors on a geodesic grid, with neither seam nor pole.
+"""SPHORB: corners and binary descriptors on a geodesic grid, unaffected by the seam and the poles.
 
 Zhao, Feng, Wan, Zhang: "SPHORB: A Fast and Robust Binary Feature on the Sphere", IJCV 113, 2015: a pyramid of geodesic
-grids, a FAST segment test on the grid's rings, an orientation by the intensity centroid, and rotated binary tests
-(Rublee et al., "ORB", 2011). Beyond the paper, corners are placed between the cells, at the peak of the Harris
-response, and patches are laid out in the tangent plane, so that they are alike on all parts of a face.
+    grids, a FAST segment test on the grid's rings, an orientation by the intensity centroid, and rotated binary tests
+    (Rublee et al., "ORB", 2011). Beyond the paper, corners are located between the cells, at the peak of the Harris
+    response, and patches are defined in the tangent plane, so that they are alike on all parts of a face.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from pano_mvs.scene import Features
 FloatArray = NDArray[np.float64]
 
 _SCALE = 1.2
-_FEWEST_STEPS = 24
-_PATCH_RADIUS = 15  # cells from the centre to the farthest test
+_MIN_STEPS = 24
+_PATCH_RADIUS = 15  # number of cells from the centre to the farthest test
 _TESTS = 256
-_MARGIN = 32  # no less than _CLEARANCE lattice steps, stretched 1.42 times, from 5 cells beyond a face
-_CLEARANCE = 18  # cells around a corner that must not be masked: its patch, and what smoothing brings into it
-# Standard deviations in cells: of the smoothing that a wider cell asks for, and of that for steadier corners.
+_MARGIN = 32  # at least _CLEARANCE lattice steps, stretched by 1.42, starting 5 cells beyond a face
+_CLEARANCE = 18  # number of cells around a corner that must not be masked: its patch, and the support of the smoothing
+# Standard deviations in cells: of the smoothing required by larger cells, and of the smoothing for stable corners.
 _ANTIALIAS, _CORNER_SIGMA = 0.5, 0.65
 _WINDOW_RADIUS, _WINDOW_SIGMA = 2, 1.0
 _PATCH_SIGMA = 2.0
@@ -38,7 +38,7 @@ _PATCH_SIGMA = 2.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Corners:
-    """Corners of one level: faces (N,), lattice places (N, 2), unit bearings (N, 3), and responses (N,)."""
+    """Corners of one level: faces (N,), lattice positions (N, 2), unit bearings (N, 3), and responses (N,)."""
 
     faces: NDArray[np.int64]
     places_uv: FloatArray
@@ -57,24 +57,26 @@ def extract_sphorb(
     fast_threshold: int = 5,
     levels: int = 7,
 ) -> Features:
-    """Return the SPHORB key points of a panorama.
+    """Extract the SPHORB key points of a panorama.
 
     Args:
         image: (H, W, 3) uint8 RGB, the full sphere.
         mask: (H, W) bool; no key point's patch reaches a False pixel.
-        max_keypoints: at most so many are kept, spread evenly over the sphere.
-        fast_threshold: least brightness difference of a corner in the segment test.
-        levels: of the pyramid; cells grow by 1.2 from each to the next.
+        max_keypoints: maximum number of key points, spread evenly over the sphere.
+        fast_threshold: minimum brightness difference of a corner in the segment test.
+        levels: number of pyramid levels; cells grow by a factor of 1.2 from each to the next.
 
     Returns:
         Features with descriptors (N, 32) uint8, compared by Hamming distance.
 
     Raises:
-        UsageError: if the shapes of image and mask do not fit.
+        UsageError: if the shapes of image and mask do not match.
     """
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or mask.shape != image.shape[:2]:
-        raise UsageError(f"features need an (H, W, 3) uint8 picture and an (H, W) mask, got {image.shape} "
-                         f"{image.dtype} and {mask.shape}")  # fmt: skip
+        raise UsageError(
+            f"features need an (H, W, 3) uint8 image and an (H, W) mask, got {image.shape} {image.dtype} and "
+            f"{mask.shape}"
+        )
     gray: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     grids = grid_pyramid(image.shape[1], levels)
     scales = np.array([grids[0].steps / grid.steps for grid in grids])
@@ -86,16 +88,19 @@ def extract_sphorb(
     pixel_rad = 2 * np.pi / image.shape[1]
     chosen = _chosen(found, max_keypoints=max_keypoints, radius_rad=0.5 * pixel_rad)
     described = [_describe(p, g, c) for p, g, c in zip(pictures, grids, chosen, strict=True)]
-    sizes = np.concatenate([
-        np.full(len(c.faces), 2 * _PATCH_RADIUS * g.spacing_rad, np.float32) for g, c in zip(grids, chosen, strict=True)
-    ])  # fmt: skip
+    sizes = np.concatenate(
+        [
+            np.full(len(c.faces), 2 * _PATCH_RADIUS * g.spacing_rad, np.float32)
+            for g, c in zip(grids, chosen, strict=True)
+        ]
+    )
     return _record(image, chosen, np.concatenate(described), sizes)
 
 
 def grid_pyramid(width: int, levels: int) -> list[GeodesicGrid]:
     """Return geodesic grids for a panorama: cells of one pixel's area at the equator, then 1.2 times wider each."""
     finest = width / np.sqrt(10 * np.pi)
-    steps = [max(_FEWEST_STEPS, round(finest / _SCALE**level)) for level in range(levels)]
+    steps = [max(_MIN_STEPS, round(finest / _SCALE**level)) for level in range(levels)]
     return [GeodesicGrid(n, _MARGIN) for n in dict.fromkeys(steps)]
 
 
@@ -104,7 +109,7 @@ def _detect(pictures: NDArray[np.uint8], grid: GeodesicGrid, *, threshold: int) 
 
     scores = np.zeros_like(pictures)
     neighbours = grid.flat_offsets(NEIGHBOURS)
-    # A corner on the common edge of two faces is found by both, so that neither leaves it to the other.
+    # A corner on the common edge of two faces is found by both, so that it is not missed by both.
     kernels.score_corners(pictures, grid.ring_offsets, grid.margin, 2, threshold, scores)
     cells = np.empty((np.count_nonzero(scores), 3), np.int64)
     cells = cells[: kernels.local_maxima(scores, neighbours, grid.margin, 1, cells)]
@@ -120,7 +125,7 @@ def _detect(pictures: NDArray[np.uint8], grid: GeodesicGrid, *, threshold: int) 
 
 
 def _unmasked(corners: _Corners, grid: GeodesicGrid, mask: NDArray[np.bool_]) -> _Corners:
-    """Keep the corners whose surroundings have no masked cell."""
+    """Keep corners without masked cells around them."""
     from pano_mvs.algorithms.features import kernels_sphorb as kernels
 
     valid = grid.sample(mask.astype(np.uint8), interpolation=cv2.INTER_NEAREST)
@@ -145,7 +150,7 @@ def _chosen(found: list[_Corners], *, max_keypoints: int, radius_rad: float) -> 
 
 
 def _distinct(found: list[_Corners], *, radius_rad: float) -> list[_Corners]:
-    """Keep the strongest of the corners that several levels found at one place."""
+    """Keep the strongest of the corners that several levels found at the same position."""
     bearings, responses = (np.concatenate([getattr(c, name) for c in found]) for name in ("bearings", "responses"))
     kept = np.zeros(len(bearings), np.bool_)
     kept[distinct_keypoints(bearings, responses, radius_rad=radius_rad)] = True
@@ -188,9 +193,9 @@ def _record(
 
 @cache
 def binary_tests() -> FloatArray:
-    """Return the places (256, 4) of the binary tests in the tangent plane, in cells, within the patch's radius.
+    """Return the positions (256, 4) of the binary tests in the tangent plane, in cells, within the patch's radius.
 
-    Both places of a test are drawn from one Gaussian around the corner (Calonder et al., "BRIEF", 2010, layout II).
+    Both positions of a test are drawn from one Gaussian around the corner (Calonder et al., "BRIEF", 2010, layout II).
     """
     rng = np.random.default_rng(0x5B)
     kept: list[FloatArray] = []

@@ -1,4 +1,4 @@
-"""SIFT and ORB on tangent tiles: key points as bearings, with neither seam nor pole."""
+"""SIFT and ORB on tangent tiles: key points as bearings, unaffected by the seam and the poles."""
 
 from __future__ import annotations
 
@@ -21,16 +21,18 @@ from pano_mvs.scene import Features
 _ORB_SCALE, _ORB_LEVELS = 1.2, 8
 _ORB_SMOOTHING_PX = 1.2
 _EDGE_PX = 0.5
-# Twice the usual: on plain walls many a key point lies on an edge, and the geometry sorts out those that slide.
+# Twice the usual value: on plain walls many key points are on edges, and geometric verification rejects those that
+# slide.
 _SIFT_EDGE_RATIO = 20
-# How far from what is masked, in sizes: SIFT's patch reaches three sizes from its middle, with falling weights, and has
-# less than a quarter of itself beyond; ORB's reaches half a size, and what is smoothed into it a tenth more.
+# Distance from masked pixels, in key point sizes: SIFT's patch extends three sizes from its centre, with decreasing
+# weights, with less than a quarter of the weight beyond this distance; ORB's extends half a size plus a tenth for
+# smoothing.
 _SIFT_CLEARANCE, _ORB_CLEARANCE = 1.5, 0.6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Found:
-    """Key points on one tile: pixels (N, 2), (0, 0) its corner; sizes and strengths (N,); descriptors (N, D)."""
+    """Key points on a tile: pixels (N, 2), (0, 0) at its corner; sizes and strengths (N,); descriptors (N, D)."""
 
     pixels_px: NDArray[np.float64]
     sizes_px: NDArray[np.float64]
@@ -52,28 +54,28 @@ def extract_sift(
     contrast_threshold: float = 0.004,
     root: bool = True,
 ) -> Features:
-    """Return the SIFT key points of a panorama (Lowe 2004, on the tangent tiles of an icosahedron).
+    """Extract the SIFT key points of a panorama (Lowe 2004, on the tangent tiles of an icosahedron).
 
-    Descriptors are whole numbers in float32, so that their products are exact and matching does not depend on the
-    order in which a BLAS adds.
+    Descriptors are integers in float32, so that their products are exact and matching does not depend on the order in
+    which a BLAS adds.
 
     Args:
         image: (H, W, 3) uint8 RGB, the full sphere.
-        mask: (H, W) bool; False pixels have no key points, and neither has their border.
-        max_keypoints: at most so many are kept, spread evenly over the sphere.
-        contrast_threshold: least contrast of a blob, in OpenCV's scale (lower finds more on plain walls).
+        mask: (H, W) bool; masked (False) pixels and their border have no key points.
+        max_keypoints: maximum number of key points, spread evenly over the sphere.
+        contrast_threshold: minimum contrast of a blob, in OpenCV's scale (lower values find more on plain walls).
         root: whether to take the square root of the L1-normalised descriptors (Arandjelović & Zisserman 2012).
 
     Raises:
-        UsageError: if the shapes of image and mask do not fit.
+        UsageError: if the shapes of image and mask do not match.
     """
-    # Without the precise upscale all key points of the first octave are shifted by a quarter of a pixel.
+    # Without the precise upscale, all key points of the first octave are shifted by a quarter of a pixel.
     detector = cv2.SIFT.create(
         contrastThreshold=contrast_threshold, edgeThreshold=_SIFT_EDGE_RATIO, enable_precise_upscale=True
     )
 
     def detect(tile_image: NDArray[np.uint8], owned: NDArray[np.uint8]) -> _Found:
-        # Descriptors are half of the work, and three of four key points belong to another tile.
+        # Descriptors take half of the time, and three of four key points belong to another tile.
         keypoints, descriptors = detector.detectAndCompute(tile_image, owned)
         pixels = np.array([k.pt for k in keypoints]).reshape(-1, 2) + 0.5
         described = np.zeros((0, 128), np.float32) if descriptors is None else descriptors
@@ -89,16 +91,16 @@ def extract_orb(
     max_keypoints: int = 8000,
     fast_threshold: int = 7,
 ) -> Features:
-    """Return the ORB key points of a panorama (Rublee et al. 2011, on the tangent tiles of an icosahedron).
+    """Extract the ORB key points of a panorama (Rublee et al. 2011, on the tangent tiles of an icosahedron).
 
     Args:
         image: (H, W, 3) uint8 RGB, the full sphere.
-        mask: (H, W) bool; False pixels have no key points, and neither has their border.
-        max_keypoints: at most so many are kept, spread evenly over the sphere.
-        fast_threshold: least brightness difference of a FAST corner.
+        mask: (H, W) bool; masked (False) pixels and their border have no key points.
+        max_keypoints: maximum number of key points, spread evenly over the sphere.
+        fast_threshold: minimum brightness difference of a FAST corner.
 
     Raises:
-        UsageError: if the shapes of image and mask do not fit.
+        UsageError: if the shapes of image and mask do not match.
     """
     detector = cv2.ORB.create(
         nfeatures=max(500, max_keypoints // 5),
@@ -109,7 +111,7 @@ def extract_orb(
     )
 
     def detect(tile_image: NDArray[np.uint8], _owned: NDArray[np.uint8]) -> _Found:
-        # A mask would change which key points ORB retains as the best of each level.
+        # A mask would change which key points ORB keeps as the best of each level.
         keypoints, descriptors = detector.detectAndCompute(tile_image, None)
         described = np.zeros((0, 32), np.uint8) if descriptors is None else descriptors
         return _Found(_orb_pixels(keypoints, tile_image), *_sizes_and_scores(keypoints), described)
@@ -127,8 +129,10 @@ def _extract(
     clearance: float,
 ) -> Features:
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or mask.shape != image.shape[:2]:
-        raise UsageError(f"features need an (H, W, 3) uint8 picture and an (H, W) mask, got {image.shape} "
-                         f"{image.dtype} and {mask.shape}")  # fmt: skip
+        raise UsageError(
+            f"features need an (H, W, 3) uint8 image and an (H, W) mask, got {image.shape} {image.dtype} and "
+            f"{mask.shape}"
+        )
     size_hw = (image.shape[0], image.shape[1])
     gray: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     valid = np.where(mask, np.uint8(255), np.uint8(0))
@@ -159,11 +163,11 @@ def _extract(
 
 
 def _unmasked(found: _Found, valid: NDArray[np.uint8], tile: PinholeView, clearance: float) -> _Found:
-    """Drop key points in the mask, or closer to it than `clearance` times their size; `valid` is 255 or 0."""
+    """Drop key points that are masked, or closer to the mask than `clearance` sizes; `valid` is 255 or 0."""
     if valid.all() or not len(found.scores):
         return found
     valid_in_tile = (sample_view(valid, tile, interpolation=cv2.INTER_LINEAR) == 255).astype(np.uint8)
-    # The frame of the tile is no border, so the distance is to masked pixels only.
+    # The border of the tile does not count, only the distance to masked pixels.
     distance_px = cv2.distanceTransform(valid_in_tile, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     x, y = np.floor(found.pixels_px).astype(np.intp).T
     distance_px = distance_px[np.clip(y, 0, tile.size_hw[0] - 1), np.clip(x, 0, tile.size_hw[1] - 1)]
@@ -171,16 +175,16 @@ def _unmasked(found: _Found, valid: NDArray[np.uint8], tile: PinholeView, cleara
 
 
 def _owned(found: _Found, tile: PinholeView, tile_idx: int) -> _Found:
-    """Keep the key points whose nearest tile centre is this tile's.
+    """Keep the key points whose nearest tile centre is that of this tile.
 
-    Two tiles place a key point on their common edge a little differently, and each might leave it to the other; so
-    either takes what lies just beyond the edge too, and the weaker of two is dropped later on.
+    Two tiles locate a key point on their common edge slightly differently, and each might assign it to the other. So
+    each tile also keeps key points just beyond the edge, and the weaker duplicates are dropped later.
     """
     return found[beyond_face_rad(tile.bearings_from_pixels(found.pixels_px), tile_idx) < _EDGE_PX / tile.focal_px]
 
 
 def _angular_sizes(tile: PinholeView, found: _Found) -> NDArray[np.float64]:
-    """Return patch diameters in radians; off the centre a gnomonic pixel shrinks by cos² along, cos across."""
+    """Return patch diameters in radians; off the centre, a gnomonic pixel shrinks by cos² along, cos across."""
     cosine = tile.bearings_from_pixels(found.pixels_px) @ tile.view_from_cam[2]
     sizes: NDArray[np.float64] = found.sizes_px / tile.focal_px * cosine**1.5
     return sizes
@@ -191,17 +195,17 @@ def _sizes_and_scores(keypoints: Sequence[cv2.KeyPoint]) -> tuple[NDArray[np.flo
 
 
 def _rooted(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return RootSIFT as whole numbers: 512 √(d / Σd), whose squared length is 512²."""
+    """Return RootSIFT descriptors as integers: 512 √(d / Σd), whose squared length is 512²."""
     total = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9)
     rooted: NDArray[np.float32] = np.rint(512 * np.sqrt(descriptors / total)).astype(np.float32)
     return rooted
 
 
 def _orb_pixels(keypoints: Sequence[cv2.KeyPoint], tile_image: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Return ORB's key points in pixels with (0, 0) at the corner, placed between the pixels of their level.
+    """Return ORB's key points in pixels with (0, 0) at the corner, with subpixel positions.
 
-    OpenCV multiplies the level's whole coordinates, counted from its first pixel's CENTRE, by the level's scale; so
-    all but the lowest level are off by (s − 1) / 2 pixels. The scale that the level really has is that of its size.
+    OpenCV multiplies the level's integer coordinates, counted from the CENTRE of its first pixel, by the level's scale;
+    so all but the lowest level are off by (s − 1) / 2 pixels. The actual scale of a level is that of its size.
     """
     points = np.array([k.pt for k in keypoints]).reshape(-1, 2)
     levels = np.array([k.octave for k in keypoints], np.intp)
@@ -218,9 +222,9 @@ def _orb_pixels(keypoints: Sequence[cv2.KeyPoint], tile_image: NDArray[np.uint8]
 
 
 def _blob_tops(picture: NDArray[np.uint8], whole_px: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Return where near whole pixels (N, 2) the Laplacian is strongest, (0, 0) the first pixel's centre.
+    """Return the subpixel peaks of the Laplacian near pixels (N, 2), (0, 0) being the first pixel's centre.
 
-    The tops of the parabolas through its absolute value along x and along y, half a pixel away at most.
+    These are the maxima of parabolas through its absolute value along x and along y, at most half a pixel away.
     """
     smooth = cv2.GaussianBlur(picture, (0, 0), _ORB_SMOOTHING_PX)
     strength = np.abs(cv2.Laplacian(smooth, cv2.CV_64F))
@@ -234,7 +238,7 @@ def _blob_tops(picture: NDArray[np.uint8], whole_px: NDArray[np.intp]) -> NDArra
 def _parabola_top(
     before: NDArray[np.float64], center: NDArray[np.float64], after: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the place of the greatest value of a parabola through three values, in −0.5 … 0.5; 0 if it has none."""
+    """Return the position of the maximum of a parabola through three values, in −0.5 … 0.5; 0 if there is none."""
     curvature = before + after - 2 * center
     peaked = curvature < 0
     top = 0.5 * (before - after) / np.where(peaked, curvature, -1.0)

@@ -1,4 +1,4 @@
-"""Pictures of the tangent tiles, sampled by maps that are kept from one panorama to the next of its size."""
+"""Images of the tangent tiles, sampled by maps that are cached for panoramas of the same size."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from pano_mvs.geometry import PinholeView, pad_panorama, pixel_from_ray
 
 _TILES = 20
 _PAD_PX = 4
-_MAX_WIDTH = 2048  # of a panorama whose maps are kept: 50 MB, of a tile 8 bytes per pixel and one for its mask
-_OWNED_SLACK_PX = 2.0  # a key point just beyond the edge may be taken, and lie in a pixel whose centre is farther off
+_MAX_WIDTH = 2048  # maximum width of panoramas whose maps are cached: 50 MB, 8 bytes a pixel plus one for the mask
+_OWNED_SLACK_PX = 2.0  # key points just beyond the edge are kept, and may be in a pixel with a more distant centre
 
 
 def sample_tile(panorama: NDArray[np.uint8], tile_idx: int) -> NDArray[np.uint8]:
-    """Return what `sample_view` returns for a tangent tile of a panorama (H, W)."""
+    """Return the result of `sample_view` for a tangent tile of a panorama (H, W)."""
     size_hw = (panorama.shape[0], panorama.shape[1])
     if size_hw[1] > _MAX_WIDTH:
         return sample_view(panorama, tangent_tiles(size_hw)[tile_idx])
@@ -28,7 +28,7 @@ def sample_tile(panorama: NDArray[np.uint8], tile_idx: int) -> NDArray[np.uint8]
 
 
 def owned_pixels(size_hw: tuple[int, int], tile_idx: int) -> NDArray[np.uint8]:
-    """Return 255 where a key point of a tile's own face may lie and 0 elsewhere, (h, w) of the tile."""
+    """Return 255 for pixels that may contain key points of the tile's own face, and 0 elsewhere, (h, w) of the tile."""
     if size_hw[1] > _MAX_WIDTH:
         return _owned_pixels(tangent_tiles(size_hw)[tile_idx], tile_idx)
     return _kept_mask(size_hw, tile_idx)

@@ -1,1 +1,1 @@
-"""Filters on range maps."""
+"""Filters on range maps: they take and return a `RangeMap`."""

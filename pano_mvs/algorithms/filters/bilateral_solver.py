@@ -1,4 +1,4 @@
-"""The Fast Bilateral Solver on the sphere: ranges that are smooth where the picture is, and sharp where it is not.
+"""The Fast Bilateral Solver on the sphere: ranges that are smooth where the panorama is, with edges where it has edges.
 
 Barron and Poole, "The Fast Bilateral Solver", ECCV 2016: minimise over the vertices y of a bilateral grid
 
@@ -7,11 +7,11 @@ Barron and Poole, "The Fast Bilateral Solver", ECCV 2016: minimise over the vert
 where t are the measured values, c their confidences, S splats pixels to vertices, B̄ is a [1 2 1] blur along each
 dimension of the grid and D_n, D_m make it bistochastic; the result is Sᵀ y.
 
-Two things differ from the paper's grid. Its spatial cells lie on the sphere (`sphere_cells`), so that neither seam nor
-poles exist. And a pixel lies between the centres of four spatial cells with bilinear weights, where the paper takes
-the nearest vertex: without this a slanted floor becomes a staircase of cells, and the result depends on where the first
-cell begins. The colour bins are hard, as in the paper, since edges are there to be kept. The data term then has the
-matrix S C Sᵀ, which is not diagonal but stays sparse: four vertices by four, added up over the pixels of each element.
+There are two differences from the paper's grid. Its spatial cells lie on the sphere (`sphere_cells`), so that there is
+neither a seam nor a pole. And a pixel is interpolated bilinearly between the centres of four spatial cells, where the
+paper uses the nearest vertex: otherwise a slanted floor becomes a staircase of cells, and the result depends on where
+the first cell begins. Colour bins are hard, as in the paper, to preserve edges. The data term then has the matrix S C
+Sᵀ, which is not diagonal but sparse: four vertices by four, summed over the pixels of each element.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE
 
 FloatArray = NDArray[np.float64]
 
-# [1 2 1] along two dimensions of space and three of colour: the centre counts twice for each.
+# [1 2 1] along two spatial and three colour dimensions: the centre counts twice for each.
 _BLUR_CENTER = 10.0
 _BISTOCHASTIC_ITERATIONS = 10
-# A pixel without range is drawn towards a colour-blind guess this much, so that a colour that appears only inside a
-# hole has a value at all.
+# Weight of a colour-blind initial guess for a pixel without range, so that a colour that only occurs inside a hole has
+# a value.
 _PRIOR_WEIGHT = 1e-4
 _TOLERANCE = 1e-4
 _SMALLEST_BIN = 2.1
@@ -47,7 +47,7 @@ _SMALLEST_BIN = 2.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BilateralSystem:
-    """The linear system A y = b of the solver, and how pixels read its solution.
+    """The linear system A y = b of the solver, and the mapping between its solution and pixels.
 
     Attributes:
         cells: spatial cells.
@@ -86,39 +86,40 @@ def fast_bilateral_solver(
     max_hole_deg: float = 20.0,
     keep_confidence: int = CONSISTENT_CONFIDENCE[0],
 ) -> RangeMap:
-    """Return a range map smoothed within the surfaces that the picture shows, and filled where it is invalid.
+    """Smooth a range map within the surfaces of the panorama, and fill invalid pixels.
 
-    The weight of a pixel in the data term is that of `confidence_weight`, relative to the largest one in the map: where
-    other views have confirmed some pixels the rest has next to no say beside them, and a map that nobody has checked is
-    solved as it is. Pixels keep their confidence; newly filled ones get 1–63 by the share of weight among the pixels
-    of like place and colour.
+    The weight of a pixel in the data term is `confidence_weight` relative to the largest weight of the map: if other
+    views have confirmed some pixels, the others have little influence, and an unchecked map is solved as it is. Pixels
+    keep their confidence; filled ones get 1–63 by the share of weight among pixels with similar position and colour.
 
     Args:
         range_map: (H, W) with even W, the full sphere.
-        guide: (H, W, 3) RGB picture.
+        guide: (H, W, 3) RGB panorama.
         sigma_spatial: size of a grid cell in pixels at the equator.
         sigma_luma: size of a grid cell in luma (0–255), at least 2.1.
         sigma_chroma: size of a grid cell in chroma (0–255), at least 2.1.
-        smoothness: λ, the multiplier of the smoothness term against weights of at most 1.
-        iterations: largest number of conjugate-gradient steps; fewer if it has converged.
-        domain: what is smooth: "inverse" (1/range, linear in the ray on every plane, and in which the errors of stereo
-            are even) or "range".
+        smoothness: λ, the weight of the smoothness term relative to data weights of at most 1.
+        iterations: maximum number of conjugate-gradient steps.
+        domain: quantity to smooth: "inverse" (1/range, which is linear in the ray on every plane, and in which stereo
+            errors are uniform) or "range".
         fill: whether invalid pixels get a range; else they stay invalid.
-        max_hole_deg: holes that hold a disc of a larger diameter stay invalid (`large_holes`): a sky has no range. 0
-            fills all.
-        keep_confidence: pixels of at least this confidence keep the range that they have, and lend it to the others;
-            256 smooths all.
+        max_hole_deg: holes that contain a larger disc stay invalid (`large_holes`), since a sky has no range; 0 fills
+            all.
+        keep_confidence: pixels with at least this confidence keep their range; 256 smooths all.
 
     Raises:
         UsageError: if guide and range map differ in size, or a parameter is out of bounds.
     """
     height, width = range_map.range.shape
     if guide.shape != (height, width, 3) or guide.dtype != np.uint8:
-        raise UsageError(f"the guide must be ({height}, {width}, 3) uint8 like the range map, got {guide.shape} "
-                         f"{guide.dtype}")  # fmt: skip
+        raise UsageError(
+            f"the guide must be ({height}, {width}, 3) uint8 like the range map, got {guide.shape} {guide.dtype}"
+        )
     if min(sigma_luma, sigma_chroma) < _SMALLEST_BIN or sigma_spatial < 1 or smoothness < 0 or iterations < 0:
-        raise UsageError(f"sigma_luma and sigma_chroma must be at least {_SMALLEST_BIN}, sigma_spatial at least 1, "
-                         f"smoothness and iterations not negative")  # fmt: skip
+        raise UsageError(
+            f"sigma_luma and sigma_chroma must be at least {_SMALLEST_BIN}, sigma_spatial at least 1, "
+            f"smoothness and iterations not negative"
+        )
     valid = range_map.valid
     if not valid.any():
         return range_map
@@ -131,7 +132,7 @@ def fast_bilateral_solver(
     cells = sphere_cells((height, width), sigma_spatial)
     colors = _color_bins(guide, sigma_luma, sigma_chroma)
     smooth, support = solve_bilateral(target, weight, colors, cells=cells, smoothness=smoothness, iterations=iterations)
-    # The solution is a weighted mean of the targets up to the tolerance of the solver: hold it within their limits.
+    # The solution is a weighted mean of the targets up to the tolerance of the solver: clip it to their range.
     smooth = np.clip(smooth, target[valid].min(), target[valid].max())
     ranges = (1 / smooth if domain == "inverse" else smooth).astype(np.float32)
     kept = range_map.confidence >= keep_confidence
@@ -154,15 +155,15 @@ def solve_bilateral(
     smoothness: float,
     iterations: int,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the solution at each pixel and the mean weight of its vertices, (H, W) each.
+    """Solve for the value and the mean weight of the vertices at each pixel, (H, W) each.
 
     Args:
-        target: (H, W) measured values, anything finite where the weight is 0.
+        target: (H, W) measured values, any finite value where the weight is 0.
         weight: (H, W) confidences in [0, 1], not all 0.
-        colors: (H, W) number of the colour bin.
+        colors: (H, W) index of the colour bin.
         cells: spatial cells of the panorama.
         smoothness: λ.
-        iterations: largest number of conjugate-gradient steps.
+        iterations: maximum number of conjugate-gradient steps.
     """
     from pano_mvs.algorithms.filters import kernels_bilateral as kernels  # compiles on import
 
@@ -174,10 +175,10 @@ def solve_bilateral(
     diagonal_gram = np.ascontiguousarray(np.einsum("eaa->ea", system.gram))
     data = kernels.sum_at_vertices(diagonal_gram, system.vertices, count)
     diagonal = smoothness * (system.m - _BLUR_CENTER * system.n**2) + data
-    # S C Sᵀ 1, the weight that a vertex draws from its pixels.
+    # S C Sᵀ 1, the weight of a vertex from its pixels.
     pulled = kernels.sum_at_vertices(system.gram.sum(axis=2), system.vertices, count)
     arguments = (smoothness, system.n, system.m, *system.graph, _BLUR_CENTER, system.vertices, system.gram)
-    # A corner of a cell in which no pixel has a share is not part of the system: it starts at 0 and stays there.
+    # Vertices without pixels are not part of the system: they start at 0 and stay there.
     held = system.mass > 0
     start = np.divide(system.right, pulled, out=np.zeros(count), where=held)
     diagonal[~held] = 1
@@ -198,9 +199,15 @@ def build_system(
     vertices, vertex_keys = kernels.number_vertices(element_keys, cells.corners)
     graph = kernels.blur_graph(vertex_keys, cells.starts, cells.neighbours, cells.strengths)
     mass, gram, right = kernels.assemble(
-        elements, target, weight, len(vertices), cells.gap_of_row, cells.weight_row, cells.weight_upper,
+        elements,
+        target,
+        weight,
+        len(vertices),
+        cells.gap_of_row,
+        cells.weight_row,
+        cells.weight_upper,
         cells.weight_lower,
-    )  # fmt: skip
+    )
     count = len(vertex_keys)
     mass = kernels.sum_at_vertices(mass, vertices, count)
     n, m = kernels.bistochastise(mass, *graph, _BLUR_CENTER, _BISTOCHASTIC_ITERATIONS)
@@ -209,20 +216,20 @@ def build_system(
 
 
 def _color_bins(guide: NDArray[np.uint8], sigma_luma: float, sigma_chroma: float) -> NDArray[np.int64]:
-    """Return the number of each pixel's bin of luma and chroma, (H, W)."""
+    """Return the index of each pixel's bin of luma and chroma, (H, W)."""
     from pano_mvs.algorithms.filters.kernels_bilateral import COLOR_BINS  # compiles on import
 
     luma, red, blue = np.moveaxis(cv2.cvtColor(guide, cv2.COLOR_RGB2YCrCb), -1, 0)
-    # Bins begin at 1: the outermost ones stay empty, so that a step in one channel never reaches the next.
+    # Bins start at 1: the outermost ones stay empty, so that a step in one channel never reaches the next.
     y, u, v = ((np.arange(256) / sigma).astype(np.int64) + 1 for sigma in (sigma_luma, sigma_chroma, sigma_chroma))
     bins: NDArray[np.int64] = (y[luma] * COLOR_BINS + u[blue]) * COLOR_BINS + v[red]
     return bins
 
 
 def _blind_guess(target: FloatArray, weight: FloatArray, cells: SphereCells) -> FloatArray:
-    """Return a smooth guess of the value everywhere, (H, W), from place alone.
+    """Return a smooth initial guess of the value everywhere, (H, W), from positions alone.
 
-    The mean of the targets in each cell, spread over cells without any by Laplace's equation on the cells' graph.
+    It is the mean of the targets in each cell, extended to empty cells by Laplace's equation on the cells' graph.
     """
     count = len(cells.starts) - 1
     element = cells.element_of_pixel[cells.gap_of_row]

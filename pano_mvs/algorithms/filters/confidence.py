@@ -1,4 +1,4 @@
-"""What the confidence of a pixel is worth."""
+"""Weights and thresholds of pixel confidences."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, WEAK_CONFIDENCE
 
-# Chosen on range maps of our own sweep after the consistency check, of two scenes; anything from 0.03 to 0.003 does.
+# Tuned on range maps of our sweep after the consistency check, of two scenes; any value from 0.03 to 0.003 works.
 _WEAK_WEIGHT, _FILLED_WEIGHT = 0.01, 0.0005
 
 
 def confidence_weight(confidence: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Return the weight of the data term, in [0, 1], for each confidence c.
 
-    c / 255 for consistent pixels (128–255), a hundredth of c / 127 for weak ones (64–127), and a twentieth of that,
-    with c / 63, for filled ones (1–63). Weak pixels that no view confirms are wrong so often that a larger weight
-    costs more than it fills.
+    c / 255 for consistent pixels (128–255), 0.01 c / 127 for weak ones (64–127), and a twentieth of that, with c / 63,
+    for filled ones (1–63). Weak pixels that no view confirms are wrong so often that a larger weight does more harm
+    than good.
     """
     filled, weak = FILLED_CONFIDENCE[1], WEAK_CONFIDENCE[1]
     c = confidence.astype(np.float64)
@@ -29,11 +29,11 @@ def confidence_weight(confidence: NDArray[np.uint8]) -> NDArray[np.float64]:
 
 
 def require_confidence(range_map: RangeMap, *, min_confidence: int = CONSISTENT_CONFIDENCE[0]) -> RangeMap:
-    """Return a range map in which only pixels of at least this confidence are left.
+    """Return a range map with only the pixels of at least this confidence.
 
     Args:
         range_map: (H, W).
-        min_confidence: 128 leaves what other views confirm, 64 what was seen at all.
+        min_confidence: 128 keeps pixels that other views confirm, 64 all pixels that were seen.
 
     Raises:
         UsageError: if min_confidence is not 1 to 255.

@@ -1,4 +1,4 @@
-"""Keep of a range map what the neighbouring views confirm, and doubt the rest."""
+"""Check a range map against those of neighbouring views, and set its confidence."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from pano_mvs.geometry import Rigid3, pad_panorama, pixel_solid_angle, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
 
-# Four neighbouring source pixels further apart than this are two surfaces: no value lies between them.
+# Four neighbouring source pixels with a larger relative difference are two surfaces: do not interpolate between them.
 _MAX_SURFACE_STEP = 0.05
-# Range maps are matched to about this part of a pixel.
+# Accuracy of range maps, as a fraction of a pixel.
 _PRECISION_PX = 0.2
-# Beside a step like this, in ln range, it is doubtful which side a pixel belongs to, so far away from it.
+# Near a step like this, in ln range, it is uncertain to which side a pixel belongs.
 _DOUBTFUL_STEP, _DOUBTFUL_RADIUS = 0.1, 2
-# Of the sources that can tell, these must contradict a pixel in one direction for it to count as contradicted.
-_ONE_WAY, _LEAST_JUDGES = 0.75, 2
+# Of the sources that can compare a pixel, these must contradict it in one direction for it to count as contradicted.
+_ONE_WAY, _MIN_JUDGES = 0.75, 2
 
 
 def check_consistency(
@@ -41,9 +41,9 @@ def check_consistency(
     remove_inconsistent: bool = False,
     min_contradictions: int = 2,
 ) -> RangeMap:
-    """Return the reference's range map with its confidence set by what the sources confirm.
+    """Set the confidence of a range map by the sources that confirm it.
 
-    See `checked_with_agreement`, which also returns what the sources say of the view as a whole.
+    See `checked_with_agreement`, which also returns the agreement of the sources with the view as a whole.
     """
     return checked_with_agreement(
         reference,
@@ -74,56 +74,58 @@ def checked_with_agreement(
     remove_inconsistent: bool,
     min_contradictions: int,
 ) -> tuple[RangeMap, Agreement]:
-    """Return the reference's range map with its confidence set by what the sources confirm.
+    """Set the confidence of a range map by the sources that confirm it, and summarise their agreement.
 
     Forward and backward: the point at range r along a pixel's ray is projected into a source, X' = R r F(u) + t. The
     source's own range s there must equal |X'| within `max_relative_error`, and the source's point at s, seen from the
     reference, must lie within `max_reprojection_px` of the pixel (Schönberger et al., "Pixelwise view selection for
-    unstructured multi-view stereo", 2016, section 4.3, on the sphere): the source agrees, and supports the pixel with
-    (1 − (e / max_reprojection_px)²)², e its reprojection error. Where s is smaller something hides the point and the
-    source has no say. Where s is larger by more than twice the limit the source sees through the point: it contradicts.
-    Ranges of the sources that were filled, not seen, have no say either.
+    unstructured multi-view stereo", 2016, section 4.3, on the sphere). The source then agrees, and supports the pixel
+    with (1 − (e / max_reprojection_px)²)², where e is its reprojection error. If s is smaller, the point is occluded
+    and the source is ignored. If s is larger by more than twice the limit, the source sees through the point and
+    contradicts it. Filled ranges of sources are ignored, too.
 
-    Close to the epipoles sources agree on anything. So each also tells how far a relative change of the range would
-    move the point in it, m = sin γ r / |X'| radians, γ the angle between the two rays at the point. With the sum S of
-    the supports and M² = Σ support · m², a pixel is consistent if `min_views` sources agree, S ≥ `min_support`, and a
-    change by `max_relative_error` moves it by `min_motion_px`: μ = M max_relative_error.
+    Close to the epipoles, sources agree on any range. So each source also measures how far a relative change of the
+    range would move the point, m = sin γ r / |X'| radians, where γ is the angle between the two rays at the point. With
+    the sum S of the supports and M² = Σ support · m², a pixel is consistent if `min_views` sources agree, S ≥
+    `min_support`, and a change by `max_relative_error` moves it by at least `min_motion_px`: μ = M max_relative_error.
 
     Confidence of a pixel that was seen and is consistent: 128 + ⌊127 (1 − 2⁻ˢ) μ² / (μ² + μ₀²) (1 + D₀² / (D² + D₀²)) /
-    2⌋. μ₀ is a fifth of a pixel, which ranges are about as sure as; D is the step ln(largest / smallest range) within
-    two pixels around, beside which a surface easily gets its neighbour's range in all views alike, and D₀ a tenth.
-    Otherwise the pixel is weak and keeps its confidence clipped to 64–127; filled pixels keep theirs.
+    2⌋. μ₀ is a fifth of a pixel, about the accuracy of ranges; D is the step ln(largest / smallest range) within two
+    pixels, near which a surface easily gets its neighbour's range in all views alike, and D₀ is a tenth. Otherwise the
+    pixel is weak and its confidence is clipped to 64–127; filled pixels keep theirs.
 
     Args:
-        reference: (H, W) range map, full sphere; normals are passed on.
+        reference: (H, W) range map, full sphere; its normals are kept.
         reference_pose: its cam_from_world.
         sources: range maps, (H', W') each, in any order: the result does not depend on it.
         source_poses: cam_from_world of each.
         max_relative_error: largest |s − |X'|| / |X'|.
         max_reprojection_px: largest angle between pixel and reprojection, in pixels of the reference at the equator.
-        min_support: smallest S; one source supports a pixel with 1 at most, and with 0.85 at 0.28 max_reprojection_px.
+        min_support: smallest S; one source supports a pixel with at most 1, and with 0.85 at an error of 0.28
+            max_reprojection_px.
         min_motion_px: smallest μ, in pixels of the reference at the equator.
         min_views: number of sources that must agree.
-        remove_inconsistent: whether to invalidate pixels that no source confirms and `min_contradictions` contradict.
-        min_contradictions: how many sources must contradict; no more than there are sources.
+        remove_inconsistent: whether to invalidate pixels that no source confirms and `min_contradictions` sources
+            contradict.
+        min_contradictions: number of sources that must contradict; at most the number of sources.
 
     Returns:
-        The checked range map, and what the sources say of the view as a whole.
+        The checked range map, and the agreement of the sources with the view as a whole.
 
     Raises:
         UsageError: if sources and poses differ in number, or a limit is not positive.
     """
     if len(sources) != len(source_poses):
-        raise UsageError(f"{len(sources)} source range maps but {len(source_poses)} poses: give one pose for each")
+        raise UsageError(f"{len(sources)} source range maps but {len(source_poses)} poses: give one pose per source")
     if not (max_relative_error > 0 and max_reprojection_px > 0 and min_views >= 1 and min_contradictions >= 1):
         raise UsageError("the limits of the consistency check must be positive")
     px_per_rad = reference.range.shape[1] / (2 * np.pi)
     limits = np.array([max_relative_error, max_reprojection_px / px_per_rad, _MAX_SURFACE_STEP])
-    votes = _count_votes(reference, reference_pose, sources, source_poses, limits)
-    motion = max_relative_error * px_per_rad * np.sqrt(votes.motion)
-    consistent = (votes.agreeing >= min_views) & (votes.support >= min_support) & (motion >= min_motion_px)
+    comparison = _compare_with_sources(reference, reference_pose, sources, source_poses, limits)
+    motion = max_relative_error * px_per_rad * np.sqrt(comparison.motion)
+    consistent = (comparison.agreeing >= min_views) & (comparison.support >= min_support) & (motion >= min_motion_px)
     step = _step_around(reference.range)
-    grade = (1 - 0.5**votes.support) * motion**2 / (motion**2 + _PRECISION_PX**2)
+    grade = (1 - 0.5**comparison.support) * motion**2 / (motion**2 + _PRECISION_PX**2)
     grade *= 0.5 + 0.5 * _DOUBTFUL_STEP**2 / (step**2 + _DOUBTFUL_STEP**2)
     low, high = CONSISTENT_CONFIDENCE
     graded = np.floor(low + (high - low) * grade).astype(np.uint8)
@@ -132,21 +134,21 @@ def checked_with_agreement(
     confidence = np.where(seen, np.where(consistent, graded, weak), reference.confidence)
     ranges = reference.range
     if remove_inconsistent and sources:
-        removed = (votes.agreeing == 0) & (votes.contradicting >= min(min_contradictions, len(sources)))
+        removed = (comparison.agreeing == 0) & (comparison.contradicting >= min(min_contradictions, len(sources)))
         ranges = np.where(removed, np.float32(np.nan), ranges)
     confidence[np.isnan(ranges)] = 0
-    return RangeMap(ranges, confidence, reference.normals_in_cam), _agreement(votes, seen)
+    return RangeMap(ranges, confidence, reference.normals_in_cam), _agreement(comparison, seen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Votes:
-    """What all sources together say of each pixel, (H, W) each.
+class _Comparison:
+    """Agreement of all sources with each pixel, (H, W) each.
 
     Attributes:
-        agreeing: how many agree.
-        contradicting: how many see through it.
-        hiding: how many see something nearer.
-        support: sum of the supports of those that agree.
+        agreeing: number of sources that agree.
+        contradicting: number of sources that see through it.
+        hiding: number of sources that see something nearer.
+        support: sum of the supports of the agreeing sources.
         motion: sum of their supports times their squared motions, in rad².
     """
 
@@ -157,22 +159,25 @@ class _Votes:
     motion: NDArray[np.float64]
 
 
-def _count_votes(
+def _compare_with_sources(
     reference: RangeMap,
     reference_pose: Rigid3,
     sources: Sequence[RangeMap],
     source_poses: Sequence[Rigid3],
     limits: NDArray[np.float64],
-) -> _Votes:
+) -> _Comparison:
     import numba  # slow to import
 
     from pano_mvs.algorithms.filters import kernels_reprojection as kernels  # compiles on import
 
     shape = reference.range.shape
-    votes = _Votes(
-        np.zeros(shape, np.int64), np.zeros(shape, np.int64), np.zeros(shape, np.uint16), np.zeros(shape),
+    comparison = _Comparison(
+        np.zeros(shape, np.int64),
+        np.zeros(shape, np.int64),
+        np.zeros(shape, np.uint16),
         np.zeros(shape),
-    )  # fmt: skip
+        np.zeros(shape),
+    )
     ranges, rays = np.ascontiguousarray(reference.range), ray_grid((shape[0], shape[1]))
     verdicts, supports, motions = np.empty(shape, np.uint8), np.empty(shape), np.empty(shape)
     for source, pose in zip(sources, source_poses, strict=True):
@@ -181,30 +186,30 @@ def _count_votes(
         known = seen_ranges(source, min_confidence=WEAK_CONFIDENCE[0])
         arguments = ranges, rays, view, known, limits, verdicts, supports, motions
         for_bands(partial(_judge, kernels.judge_rows, arguments), shape[0], threads=numba.get_num_threads())
-        votes.agreeing[...] += verdicts == kernels.AGREES
-        votes.contradicting[...] += verdicts == kernels.CONTRADICTS
-        votes.hiding[...] += verdicts == kernels.HIDDEN
-        # Rounded, so that the sum of a few does not depend on the order of the sources.
-        votes.support[...] += np.rint(supports * 2**40) / 2**40
-        votes.motion[...] += np.rint(supports * motions * 2**40) / 2**40
-    return votes
+        comparison.agreeing[...] += verdicts == kernels.AGREES
+        comparison.contradicting[...] += verdicts == kernels.CONTRADICTS
+        comparison.hiding[...] += verdicts == kernels.HIDDEN
+        # Rounded, so that the sum of a few values does not depend on the order of the sources.
+        comparison.support[...] += np.rint(supports * 2**40) / 2**40
+        comparison.motion[...] += np.rint(supports * motions * 2**40) / 2**40
+    return comparison
 
 
-def _agreement(votes: _Votes, seen: NDArray[np.bool_]) -> Agreement:
-    """Return what the sources say of all pixels that were seen, (H, W)."""
-    judges = votes.agreeing + votes.contradicting + votes.hiding
+def _agreement(comparison: _Comparison, seen: NDArray[np.bool_]) -> Agreement:
+    """Return the agreement of the sources with all pixels that were seen, (H, W)."""
+    judges = comparison.agreeing + comparison.contradicting + comparison.hiding
     row_weights = pixel_solid_angle(seen.shape) * seen.shape[1] / (4 * np.pi)
 
     def share(where: NDArray[np.bool_]) -> float:
         return float(np.sum(where.mean(axis=1) * row_weights))
 
     compared = seen & (judges > 0)
-    contradicted = compared & (votes.agreeing == 0) & (judges >= _LEAST_JUDGES)
+    contradicted = compared & (comparison.agreeing == 0) & (judges >= _MIN_JUDGES)
     total = share(compared)
     parts = (
-        compared & (votes.agreeing > 0),
-        contradicted & (votes.contradicting >= _ONE_WAY * judges),
-        contradicted & (votes.hiding >= _ONE_WAY * judges),
+        compared & (comparison.agreeing > 0),
+        contradicted & (comparison.contradicting >= _ONE_WAY * judges),
+        contradicted & (comparison.hiding >= _ONE_WAY * judges),
     )
     return Agreement(total, *(share(part) / total if total else 0.0 for part in parts))
 
@@ -214,7 +219,7 @@ def _judge(kernel: Callable[..., object], arguments: tuple[object, ...], first: 
 
 
 def _step_around(ranges: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return ln(largest / smallest valid range) within two pixels, (H, W); 0 where there is none."""
+    """Return ln(largest / smallest valid range) within two pixels, (H, W); 0 without valid pixels."""
     radius = _DOUBTFUL_RADIUS
     logs = pad_panorama(np.log(ranges), radius)
     window = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)

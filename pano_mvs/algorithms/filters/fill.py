@@ -1,4 +1,4 @@
-"""Fill holes of a range map from trusted pixels around them."""
+"""Fill holes of a range map from reliable pixels around them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE
 
-# Neighbours whose inverse range is larger than this times the background's belong to an occluder.
+# Neighbours with an inverse range larger than this times the background's belong to an occluder.
 _MAX_RATIO = 1.25
 
 
@@ -22,24 +22,24 @@ def fill_from_neighbours(
     min_confidence: int = CONSISTENT_CONFIDENCE[0],
     max_hole_deg: float = 20.0,
 ) -> RangeMap:
-    """Return a range map whose invalid pixels have the range of the surface behind them.
+    """Fill invalid pixels with the range of the background surface.
 
-    From each invalid pixel eight paths run over the sphere (over the seam, over the poles, as wide as high) to the
-    first pixel that is trusted. A hole beside an edge is mostly what the nearer surface hides from the other views, so
-    it belongs to the farther one: the second largest of the ranges found counts as background (Hirschmüller, "Stereo
-    processing by semiglobal matching and mutual information", 2008, section 2.5.4), and nearer ones than that by over
-    a quarter are left out. The others' inverse ranges are averaged with weights 1 / distance, which is linear
-    interpolation, exact on a plane, between two opposite ones. Filled pixels serve no other pixel.
+    From each invalid pixel, eight paths run over the sphere (across the seam and the poles, as wide as high) to the
+    first reliable pixel. A hole beside an edge is mostly an area that the nearer surface occludes in other views, so it
+    belongs to the farther surface: the second largest of the ranges found is the background (Hirschmüller, "Stereo
+    processing by semiglobal matching and mutual information", 2008, section 2.5.4), and ranges nearer than that by more
+    than a quarter are ignored. The inverse ranges of the others are averaged with weights 1 / distance, which between
+    two opposite pixels is linear interpolation, exact on a plane. Filled pixels are not used for other pixels.
 
     Args:
         range_map: (H, W) with even W, the full sphere.
-        max_distance_px: how far a path runs, in pixels at the equator; no path runs further than from pole to pole.
-        min_confidence: trusted pixels have at least this confidence; 128 is consistent.
-        max_hole_deg: holes that hold a disc of a larger diameter stay invalid (`large_holes`): a sky has no range. 0
-            fills all.
+        max_distance_px: maximum length of a path, in pixels at the equator; no path is longer than from pole to pole.
+        min_confidence: minimum confidence of reliable pixels; 128 is consistent.
+        max_hole_deg: holes that contain a larger disc stay invalid (`large_holes`), since a sky has no range; 0 fills
+            all.
 
     Returns:
-        The range map; filled pixels have confidence 63, when next to a trusted pixel, down to 1.
+        The range map; filled pixels have a confidence from 63, next to a reliable pixel, down to 1.
 
     Raises:
         UsageError: if max_distance_px is not positive.

@@ -1,4 +1,4 @@
-"""The Gaussian filter on range maps, over the seam and over the poles."""
+"""The Gaussian filter on range maps, across the seam and the poles."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from pano_mvs.scene import RangeMap
 
 
 def gaussian_range(range_map: RangeMap, *, window: int = 5, sigma_px: float = 1.1) -> RangeMap:
-    """Return a range map smoothed by a Gaussian over its valid pixels (normalised convolution).
+    """Smooth a range map by a Gaussian over its valid pixels (normalised convolution).
 
-    r'(u) = Σ g(u − v) r(v) / Σ g(u − v), both sums over the valid v in the window (Knutsson and Westin, "Normalized
-    and differential convolution", 1993). Invalid pixels stay invalid; the confidence is unchanged. The filter knows
-    no edges: it rounds off every step between two surfaces.
+    r'(u) = Σ g(u − v) r(v) / Σ g(u − v), both sums over the valid v in the window (Knutsson and Westin, "Normalized and
+    differential convolution", 1993). Invalid pixels stay invalid; the confidence does not change. The filter does not
+    preserve edges between surfaces.
 
     Args:
         range_map: (H, W) with even W, the full sphere.

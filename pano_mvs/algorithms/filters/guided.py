@@ -1,7 +1,8 @@
-"""The guided filter on the sphere: ranges that are, window by window, a linear function of the picture's colours.
+"""The guided filter on the sphere: ranges are, window by window, a linear function of the panorama's colours.
 
 He, Sun and Tang, "Guided Image Filtering", TPAMI 2013, with a colour guide (section 3.5). Each pixel of the data term
-is weighted by its confidence, windows keep their solid angle up to the poles, and neither seam nor poles are borders.
+is weighted by its confidence, windows keep their solid angle up to the poles, and the seam and the poles are not
+borders.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from pano_mvs.scene.range_map import FILLED_CONFIDENCE
 
 FloatArray = NDArray[np.float64]
 
-# Of the weight that a window would have with every pixel at its full: less than this says nothing.
-_LEAST_SUPPORT = 1e-6
+# Relative to a window with full weight of all pixels: windows with less weight than this are ignored.
+_MIN_SUPPORT = 1e-6
 
 
 def guided_range(
@@ -33,28 +34,29 @@ def guided_range(
     domain: Literal["range", "inverse"] = "inverse",
     fill: bool = False,
 ) -> RangeMap:
-    """Return a range map smoothed within what the picture shows as one surface.
+    """Smooth a range map within the surfaces of the panorama by the guided filter.
 
-    In every window ω the values p are fitted by p ≈ a · I + b, minimising Σ w (a · I + b − p)² + ε² |a|² Σ w, I the
-    colours and w the weight of `confidence_weight`; a pixel then gets the mean of a and b over the windows that hold
-    it, each by the weight it has. Neither value leaves the limits of all values given.
+    In every window ω the values p are fitted by p ≈ a · I + b, minimising Σ w (a · I + b − p)² + ε² |a|² Σ w, where I
+    are the colours and w is `confidence_weight`; a pixel then gets the mean of a and b over the windows that contain
+    it, each with its weight. The result is within the range of the given values.
 
     Args:
         range_map: (H, W) with even W, the full sphere.
-        guide: (H, W, 3) RGB picture.
-        radius: of the windows, in pixels at the equator.
-        epsilon: ε in grey levels: contrasts below are smoothed over, contrasts above are edges.
-        domain: what is linear in the colours: "inverse" (1/range) or "range".
+        guide: (H, W, 3) RGB panorama.
+        radius: radius of the windows, in pixels at the equator.
+        epsilon: ε in grey levels: smaller contrasts are smoothed, larger ones are preserved as edges.
+        domain: quantity that is linear in the colours: "inverse" (1/range) or "range".
         fill: whether invalid pixels within reach of a window with data get a range (confidence 1–63); else they stay
             invalid.
 
     Raises:
-        UsageError: if guide and range map differ in size, the radius does not fit, or epsilon is not positive.
+        UsageError: if guide and range map differ in size, the radius is out of range, or epsilon is not positive.
     """
     height, width = range_map.range.shape
     if guide.shape != (height, width, 3) or guide.dtype != np.uint8:
-        raise UsageError(f"the guide must be ({height}, {width}, 3) uint8 like the range map, got {guide.shape} "
-                         f"{guide.dtype}")  # fmt: skip
+        raise UsageError(
+            f"the guide must be ({height}, {width}, 3) uint8 like the range map, got {guide.shape} {guide.dtype}"
+        )
     if not 1 <= radius < height // 2 or not epsilon > 0:
         raise UsageError(f"a guided filter needs 1 ≤ radius < H / 2 and a positive epsilon, got {radius}, {epsilon}")
     valid = range_map.valid
@@ -80,20 +82,20 @@ def guided_range(
 def guided_values(
     target: FloatArray, weight: FloatArray, guide: FloatArray, *, radius: int, epsilon: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the filtered values and the mean weight within reach, (H, W) each; no value where the latter is 0.
+    """Return the filtered values and the mean weight within reach, (H, W) each; there is no value if the weight is 0.
 
     Args:
-        target: (H, W) values, anything finite where the weight is 0.
+        target: (H, W) values, any finite value where the weight is 0.
         weight: (H, W) in [0, 1].
         guide: (H, W, 3) colours.
-        radius: of the windows.
+        radius: radius of the windows.
         epsilon: ε.
     """
-    # Colours about the middle of their scale lose no digits in the differences of sums below.
+    # Colours centred on the middle of their scale lose no digits in the differences of sums below.
     colors = guide - 128.0
     area = box_sum(np.ones_like(target), radius)
     total = box_sum(weight, radius)
-    sure = total > _LEAST_SUPPORT * area
+    sure = total > _MIN_SUPPORT * area
     share = 1 / np.where(sure, total, 1)
     mean_color = share[..., None] * box_sum(weight[..., None] * colors, radius)
     mean = share * box_sum(weight * target, radius)
@@ -106,7 +108,7 @@ def guided_values(
     counted = np.where(sure, total / area, 0)
     averaged = box_spread(counted[..., None] * lines, radius)
     reach = box_spread(counted, radius)
-    known = reach > _LEAST_SUPPORT * area
+    known = reach > _MIN_SUPPORT * area
     averaged /= np.where(known, reach, 1)[..., None]
     values = np.sum(averaged[..., :3] * colors, axis=-1) + averaged[..., 3]
     return values, np.where(known, reach / np.maximum(box_spread(np.ones_like(target), radius), 1), 0)
@@ -126,8 +128,14 @@ def _solve_symmetric(matrix: FloatArray, ridge: float, right: FloatArray) -> Flo
     """Return (matrix + ridge) x = right by cofactors, for (…, 6) upper triangles and (…, 3) right sides."""
     rr, rg, rb, gg, gb, bb = np.moveaxis(matrix, -1, 0)
     rr, gg, bb = rr + ridge, gg + ridge, bb + ridge
-    cofactors = (gg * bb - gb * gb, gb * rb - rg * bb, rg * gb - gg * rb,
-                 rr * bb - rb * rb, rb * rg - rr * gb, rr * gg - rg * rg)  # fmt: skip
+    cofactors = (
+        gg * bb - gb * gb,
+        gb * rb - rg * bb,
+        rg * gb - gg * rb,
+        rr * bb - rb * rb,
+        rb * rg - rr * gb,
+        rr * gg - rg * rg,
+    )
     determinant = rr * cofactors[0] + rg * cofactors[1] + rb * cofactors[2]
     x, y, z = np.moveaxis(right, -1, 0)
     a, b, c, d, e, f = cofactors

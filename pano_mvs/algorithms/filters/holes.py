@@ -1,4 +1,4 @@
-"""Which holes of a range map are too large for anything to be said of them from their rims."""
+"""Find holes of a range map that are too large to be filled from their borders."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ Mask = NDArray[np.bool_]
 
 
 def large_holes(valid: Mask, max_hole_deg: float) -> Mask:
-    """Return the invalid pixels, (H, W), that lie within a disc of more than `max_hole_deg` without any valid pixel.
+    """Return the invalid pixels, (H, W), within a disc of more than `max_hole_deg` without any valid pixel.
 
-    On the sphere, this is the morphological opening of the hole by a disc: a sky stays a hole right to its edge, but
-    for corners narrower than the disc, whatever cracks and small holes are joined to it. (Neither the size of a
-    connected hole nor the distance to its rim tells them apart.)
+    On the sphere, this is the morphological opening of the hole by a disc: a sky stays a hole right to its edge, except
+    for corners narrower than the disc, whatever cracks and small holes are connected to it. (Neither the size of a
+    connected hole nor the distance to its border could separate these.)
 
     Args:
         valid: (H, W), the full sphere, even W.
-        max_hole_deg: diameter of the largest disc; 0 keeps no hole: nothing is too large.
+        max_hole_deg: diameter of the largest disc; 0 returns no pixel.
 
     Raises:
         UsageError: if max_hole_deg is negative.
@@ -45,10 +45,10 @@ def large_holes(valid: Mask, max_hole_deg: float) -> Mask:
 
 
 def rim(inside: Mask) -> Mask:
-    """Return the pixels of a set among which is the one nearest to any pixel outside.
+    """Return border pixels of a set, including the pixel that is nearest to any pixel outside.
 
-    Those with a neighbour outside, over the seam and over the poles; and near the poles all, since there pixels far
-    from each other in the grid are close on the sphere.
+    These are the pixels with a neighbour outside, across the seam and the poles, and all pixels near the poles, where
+    pixels far from each other in the grid are close on the sphere.
     """
     padded = pad_panorama(inside, 1)
     height, width = inside.shape
@@ -63,6 +63,6 @@ def rim(inside: Mask) -> Mask:
 
 
 def _distances(rays: NDArray[np.float64], goals: Mask, starts: Mask, reach: float) -> NDArray[np.float64]:
-    """Return the chord from each start to the nearest goal, (N,); inf where it is longer than `reach`."""
+    """Return the chord from each start to the nearest goal, (N,); inf if it is longer than `reach`."""
     tree = KDTree(rays[goals], balanced_tree=False, compact_nodes=False)
     return np.asarray(tree.query(rays[starts], distance_upper_bound=reach * (1 + 1e-12))[0], np.float64)

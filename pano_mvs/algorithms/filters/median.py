@@ -1,4 +1,4 @@
-"""The median filter on range maps, over the seam and over the poles."""
+"""The median filter on range maps, across the seam and the poles."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import pad_panorama
 from pano_mvs.scene import RangeMap
 
-# OpenCV filters float pictures with these windows only, ten times faster than a sort.
+# OpenCV supports float images with these window sizes only, ten times faster than a sort.
 _OPENCV_WINDOWS = (3, 5)
 
 
 def median_range(range_map: RangeMap, *, window: int = 5) -> RangeMap:
-    """Return a range map with each valid range replaced by the median of the valid ranges around it.
+    """Replace each valid range by the median of the valid ranges around it.
 
-    Invalid pixels are ignored by their neighbours and stay invalid; the confidence is unchanged. Of an even number of
-    ranges the nearer of the two middle ones is taken, since their mean would lie on neither of two surfaces.
+    Invalid pixels are ignored and stay invalid; the confidence does not change. Of an even number of ranges, the nearer
+    of the two middle ones is used, since their mean might be on neither of two surfaces.
 
     Args:
         range_map: (H, W) with even W, the full sphere.
@@ -49,7 +49,7 @@ def _check_window(window: int) -> None:
 
 
 def _median_of_dense(padded: NDArray[np.float32], window: int) -> NDArray[np.float32]:
-    """Return the median where all of the window is valid; what it says elsewhere means nothing."""
+    """Return the median for windows without invalid pixels; the result elsewhere is undefined."""
     pad = window // 2
     filtered: NDArray[np.float32] = cv2.medianBlur(np.nan_to_num(padded), window)[pad:-pad, pad:-pad].copy()
     return filtered
@@ -63,7 +63,7 @@ def _window_has_hole(padded: NDArray[np.float32], window: int) -> NDArray[np.boo
 
 
 def _median_of_windows(windows: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the lower median of the valid values of each window, (..., k, k) to (...,); NaN where there is none."""
+    """Return the lower median of the valid values of each window, (..., k, k) to (...,); NaN if there is none."""
     values = np.sort(windows.reshape(*windows.shape[:-2], windows.shape[-1] ** 2), axis=-1)  # NaN sorts last
     count = np.isfinite(values).sum(axis=-1, keepdims=True)
     median: NDArray[np.float32] = np.take_along_axis(values, np.maximum(count - 1, 0) // 2, axis=-1)[..., 0]

@@ -1,8 +1,8 @@
-"""Lay planes through surfaces that show nothing to match: plain walls and ceilings.
+"""Fit planes to surfaces without texture: plain walls and ceilings.
 
-On paint no window matches better than another, and what a sweep finds there is chance, now and then confirmed by other
-views' chance. But such a surface is mostly flat, and its outline is seen well. So a plane is laid through the trusted
-ranges of each connected, evenly coloured part of the picture and around it, if enough of them lie on one.
+On uniform paint no window matches better than another, and the result of a sweep is random, sometimes confirmed by
+chance in other views. But such a surface is mostly flat, and its outline is seen well. So a plane is fitted to the
+reliable ranges in and around each connected, uniformly coloured part of the panorama, if enough of them lie on one.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_HYPOTHESES, _MOST_POINTS, _FEWEST_POINTS = 256, 3000, 30
-# Colours change by less than this share from pixel to pixel within a surface.
+_HYPOTHESES, _MAX_POINTS, _MIN_POINTS = 256, 3000, 30
+# Within a surface, colours change by less than this share from pixel to pixel.
 _COLOR_STEP, _DARKEST = 0.02, 20.0
-# Pixels without texture vote with this weight beside those of the outline.
+# Weight of pixels without texture relative to those of the outline.
 _BARE_WEIGHT = 0.1
-# The plane must be seen on most sides of the surface: carried on beyond what is seen it may lead anywhere.
-_SECTORS, _FEWEST_SECTORS = 8, 6
+# The plane must be seen on most sides of the surface: extrapolation is unreliable.
+_SECTORS, _MIN_SECTORS = 8, 6
 _STEPS_BEYOND = 0.8, 1.3
-# What was seen within this many tolerances of the plane was seen on it, only not well.
+# Ranges within this many tolerances of the plane belong to it, but are imprecise.
 _SAME_SURFACE = 3.0
 
 
@@ -45,32 +45,35 @@ def lay_planes(
     min_confidence: int = CONSISTENT_CONFIDENCE[0],
     max_hole_deg: float = 20.0,
 ) -> RangeMap:
-    """Return a range map with planes where the picture is plain.
+    """Fit planes to the ranges of uniformly coloured surfaces.
 
-    A plane is linear in the ray: 1 / r = a · F(u). For each connected part of the picture without contrast, a is found
-    by RANSAC and least squares on the trusted pixels in it and within 2° around it, those with contrast counting ten
-    times. It is believed if a share of `min_share` of them lies on it, on most sides of the part's middle, and all of
-    the part comes to lie within their ranges, give or take a little. Then pixels of the part that are not on the plane
-    are put there, with the confidence of filled pixels if they were far off; those that are on it keep what they have.
+    A plane is linear in the ray: 1 / r = a · F(u). For each connected part of the panorama without contrast, a is found
+    by RANSAC and least squares on the reliable pixels in it and within 2° around it; pixels with contrast have ten
+    times the weight. The plane is accepted if at least a share of `min_share` of these pixels lies on it, on most sides
+    of the part's centre, and if the whole part is about within the range of their values. Pixels of the part that are
+    not on the plane are then moved to it, with the confidence of filled pixels if they were far off; pixels on it are
+    unchanged.
 
     Args:
         range_map: (H, W) with even W, the full sphere.
-        guide: (H, W, 3) RGB picture.
+        guide: (H, W, 3) RGB panorama.
         rng: draws the hypotheses.
-        contrast: grey levels between the darkest and the brightest pixel around a pixel of a plain surface, at most.
-        min_area_deg2: smaller parts are left as they are, in square degrees.
-        max_relative_error: pixels on the plane differ from it by no more than this share.
-        min_share: of the trusted pixels, by solid angle.
-        min_confidence: of trusted pixels; 128 is consistent.
-        max_hole_deg: holes that hold a disc of a larger diameter stay invalid (`large_holes`): a sky is no wall.
+        contrast: maximum difference in grey levels between the darkest and the brightest pixel around a pixel of a
+            plain surface.
+        min_area_deg2: minimum area of a part, in square degrees; smaller ones are unchanged.
+        max_relative_error: maximum relative difference of pixels on the plane.
+        min_share: minimum share of reliable pixels on the plane, by solid angle.
+        min_confidence: minimum confidence of reliable pixels; 128 is consistent.
+        max_hole_deg: holes that contain a larger disc stay invalid (`large_holes`): a sky is not a wall.
 
     Raises:
         UsageError: if guide and range map differ in size, or a limit is not positive.
     """
     height, width = range_map.range.shape
     if guide.shape != (height, width, 3) or guide.dtype != np.uint8:
-        raise UsageError(f"the guide must be ({height}, {width}, 3) uint8 like the range map, got {guide.shape} "
-                         f"{guide.dtype}")  # fmt: skip
+        raise UsageError(
+            f"the guide must be ({height}, {width}, 3) uint8 like the range map, got {guide.shape} {guide.dtype}"
+        )
     if not (contrast > 0 and min_area_deg2 > 0 and max_relative_error > 0 and 0 < min_share <= 1):
         raise UsageError("contrast, min_area_deg2 and max_relative_error must be positive, min_share in (0, 1]")
     labels, bare = plain_surfaces(guide, contrast)
@@ -85,12 +88,12 @@ def lay_planes(
     for surface in _large_surfaces(labels, area * np.degrees(1) ** 2, min_area_deg2):
         support = _dilated(surface, margin) & trusted
         points = _drawn(support, weight, rng)
-        if len(points) < _FEWEST_POINTS:
+        if len(points) < _MIN_POINTS:
             continue
         plane, on_plane = fit_plane(
             rays[support][points], inverse[support][points], max_relative_error=max_relative_error, rng=rng
         )
-        if on_plane.mean() < min_share or not _is_sound(
+        if on_plane.mean() < min_share or not _is_valid(
             plane, rays[surface], rays[support][points][on_plane], inverse[support][points][on_plane]
         ):
             continue
@@ -105,7 +108,7 @@ def lay_planes(
 
 
 def plain_surfaces(guide: NDArray[np.uint8], contrast: float) -> tuple[NDArray[np.int64], Mask]:
-    """Return the number of each pixel's plain part, (H, W), −1 for none, and which pixels have no contrast."""
+    """Return the index of each pixel's plain part, (H, W), −1 for none, and which pixels have no contrast."""
     from pano_mvs.algorithms.filters.kernels_components import label_surfaces  # compiles on import
 
     radius = max(1, round(guide.shape[0] / 128))
@@ -123,7 +126,7 @@ def plain_surfaces(guide: NDArray[np.uint8], contrast: float) -> tuple[NDArray[n
 def fit_plane(
     rays: FloatArray, inverse: FloatArray, *, max_relative_error: float, rng: np.random.Generator
 ) -> tuple[FloatArray, Mask]:
-    """Return the plane a (3,), 1 / r = a · ray, on which most points lie, and which do.
+    """Return the plane a (3,), 1 / r = a · ray, with most inliers, and the inliers.
 
     Args:
         rays: (N, 3) unit rays, N ≥ 3.
@@ -149,7 +152,7 @@ def fit_plane(
 
 
 def _large_surfaces(labels: NDArray[np.int64], area: FloatArray, least: float) -> list[Mask]:
-    """Return the parts that are large enough, largest first."""
+    """Return the parts with at least the minimum area, largest first."""
     inside = labels >= 0
     sizes = np.bincount(labels[inside], area[inside], labels.size)
     large = np.flatnonzero(sizes >= least)
@@ -163,21 +166,21 @@ def _dilated(mask: Mask, margin: int) -> Mask:
 
 
 def _drawn(support: Mask, weight: FloatArray, rng: np.random.Generator) -> NDArray[np.intp]:
-    """Return positions among the supporting pixels, drawn by their weights."""
+    """Return positions among the supporting pixels, drawn by weight."""
     weights = weight[support]
-    if len(weights) < _FEWEST_POINTS:
+    if len(weights) < _MIN_POINTS:
         return np.zeros(0, np.intp)
-    return rng.choice(len(weights), _MOST_POINTS, p=weights / weights.sum())
+    return rng.choice(len(weights), _MAX_POINTS, p=weights / weights.sum())
 
 
-def _is_sound(plane: FloatArray, surface: FloatArray, rays: FloatArray, inverse: FloatArray) -> bool:
-    """Return whether a plane keeps within its points' ranges all over a surface, and is seen on most sides of it."""
+def _is_valid(plane: FloatArray, surface: FloatArray, rays: FloatArray, inverse: FloatArray) -> bool:
+    """Return whether a plane stays within its points' ranges on the whole surface, and is seen on most sides of it."""
     laid = surface @ plane
     low, high = _STEPS_BEYOND
-    if len(rays) < _FEWEST_POINTS or laid.min() < low * inverse.min() or laid.max() > high * inverse.max():
+    if len(rays) < _MIN_POINTS or laid.min() < low * inverse.min() or laid.max() > high * inverse.max():
         return False
     middle = surface.mean(axis=0)
-    across = np.linalg.svd(middle[None])[2][1:]  # two directions at right angles to the middle
+    across = np.linalg.svd(middle[None])[2][1:]  # two directions perpendicular to the middle
     angle = np.arctan2(*(rays @ across.T).T)
     sectors = np.floor((angle / (2 * np.pi) + 0.5) * _SECTORS).astype(np.int64) % _SECTORS
-    return len(np.unique(sectors)) >= _FEWEST_SECTORS
+    return len(np.unique(sectors)) >= _MIN_SECTORS

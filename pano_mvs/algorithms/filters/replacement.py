@@ -1,4 +1,4 @@
-"""Put new ranges into a range map."""
+"""Replace the ranges of a range map."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def with_ranges(
 ) -> RangeMap:
     """Return a range map with other ranges (H, W), and other confidences if given.
 
-    Normals stay where the range stayed.
+    Normals are kept where the range did not change.
     """
     normals = range_map.normals_in_cam
     if normals is not None:

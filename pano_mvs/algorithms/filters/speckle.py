@@ -12,15 +12,15 @@ from pano_mvs.scene import RangeMap
 
 
 def remove_speckles(range_map: RangeMap, *, max_size_px: float = 60.0, max_relative_step: float = 0.03) -> RangeMap:
-    """Return a range map without connected surfaces that are no larger than a given solid angle.
+    """Remove connected surfaces up to a given solid angle.
 
-    Pixels next to each other (over the seam, over the poles) belong to one surface if their ranges differ by no more
-    than `max_relative_step`. The size of a surface is the sum of its pixels' solid angles.
+    Adjacent pixels (across the seam and the poles) belong to one surface if their ranges differ by at most
+    `max_relative_step`. The size of a surface is the sum of its pixels' solid angles.
 
     Args:
         range_map: (H, W) with even W, the full sphere.
-        max_size_px: the largest surface to remove, in pixels at the equator.
-        max_relative_step: the largest step within a surface, relative to the nearer range.
+        max_size_px: size of the largest surface to remove, in pixels at the equator.
+        max_relative_step: largest step within a surface, relative to the nearer range.
 
     Raises:
         UsageError: if a limit is negative.

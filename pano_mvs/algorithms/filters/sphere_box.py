@@ -1,4 +1,4 @@
-"""Sums over windows that are as wide on the sphere as they are high."""
+"""Sums over windows that are isotropic on the sphere."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ FloatArray = NDArray[np.float64]
 def box_sum(values: FloatArray, radius: int) -> FloatArray:
     """Return the sum over the window around each pixel, (H, W) or (H, W, C) as given; no NaN.
 
-    The window has 2 radius + 1 rows, over the poles where it must. Its columns are as many times more as a column of
-    the row at the window's own centre is narrower than one at the equator (whole numbers), and at most the full circle.
+    The window has 2 radius + 1 rows, across the poles if necessary. The number of columns grows as columns become
+    narrower than at the equator in the row of the window's centre (integers), up to the full circle.
 
     Args:
         values: (H, W) or (H, W, C), the full sphere, even W.
@@ -26,7 +26,7 @@ def box_sum(values: FloatArray, radius: int) -> FloatArray:
 
 
 def box_spread(values: FloatArray, radius: int) -> FloatArray:
-    """Return the sum over all pixels whose window holds each pixel: the transpose of `box_sum`."""
+    """Return the sum over all pixels whose window contains each pixel: the transpose of `box_sum`."""
     flat = _channels(values)
     return _column_sums(_row_sums(flat, _half_columns(values, radius)), radius).reshape(values.shape)
 
@@ -42,14 +42,14 @@ def _half_columns(values: FloatArray, radius: int) -> NDArray[np.int64]:
 
 
 def _column_sums(values: FloatArray, radius: int) -> FloatArray:
-    """Return the sums over 2 radius + 1 rows around each pixel, over the poles where it must."""
+    """Return the sums over 2 radius + 1 rows around each pixel, across the poles if necessary."""
     padded = pad_panorama(values, radius)[:, radius:-radius]
     above = np.concatenate([np.zeros_like(padded[:1]), np.cumsum(padded, axis=0)])
     return np.asarray(above[2 * radius + 1 :] - above[: -2 * radius - 1])
 
 
 def _row_sums(values: FloatArray, half_columns: NDArray[np.int64]) -> FloatArray:
-    """Return the sums over 2 h + 1 columns around each pixel, h of each row its own; rows wrap."""
+    """Return the sums over 2 h + 1 columns around each pixel, with a separate h for each row; rows wrap."""
     result = np.empty_like(values)
     for half in np.unique(half_columns):
         rows = half_columns == half

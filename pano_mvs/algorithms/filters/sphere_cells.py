@@ -7,18 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-# Two bands of a pole's cap: fewer cells around would make the half turn over the pole land on the cell itself.
-_FEWEST_CELLS = 4
+# Number of cells around a pole: with fewer, half a turn across the pole would end in the same cell.
+_MIN_CELLS = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SphereCells:
-    """Cells of about equal width and height all over the sphere, and how pixels lie between their centres.
+    """Cells of about equal width and height on the sphere, and the interpolation weights of pixels.
 
-    Bands of equal height run around the sphere. A band is divided into equal cells, in the bands towards the poles
-    half, a quarter … as many as at the equator, so that a cell is never much narrower than high. Cells are neighbours
-    within a band, across the seam, between bands by the length of their common side, and over the poles. A pixel lies
-    between four centres: an element. All elements of a gap between two bands have the same bands above and below.
+    Bands of equal height run around the sphere. A band is divided into equal cells, with half, a quarter … of the
+    number of cells at the equator towards the poles, so that a cell is never much narrower than high. Cells are
+    neighbours within a band, across the seam, between bands by the length of their common side, and across the poles. A
+    pixel lies between four centres, which form an element. All elements of a gap between two bands have the same bands
+    above and below.
 
     Attributes:
         element_of_pixel: (G, W) int32: element of a pixel by gap and column.
@@ -44,7 +45,7 @@ class SphereCells:
 
 
 def sphere_cells(size_hw: tuple[int, int], cell_px: float) -> SphereCells:
-    """Return the cells of a panorama, `cell_px` pixels wide and high at the equator.
+    """Divide a panorama into cells, `cell_px` pixels wide and high at the equator.
 
     Args:
         size_hw: (height, width) of the panorama in pixels, even width.
@@ -57,7 +58,7 @@ def sphere_cells(size_hw: tuple[int, int], cell_px: float) -> SphereCells:
     y = (np.arange(height) + 0.5) * bands / height + 0.5
     gap_of_row = np.floor(y).astype(np.int32)
     left, weight = _place_columns(counts, width)
-    # Above the first band lies the first band again, half a turn further on; below the last one likewise.
+    # Above the first band is the first band again, rotated by half a turn; below the last one likewise.
     upper = np.concatenate([[0], np.arange(bands)])
     lower = np.concatenate([np.arange(bands), [bands - 1]])
     half = width // 2
@@ -94,9 +95,9 @@ def _cells_in_band(size_hw: tuple[int, int], cell_px: float) -> NDArray[np.int64
     height, width = size_hw
     bands = max(2, round(height / cell_px))
     elevation = np.pi * (0.5 - (np.arange(bands) + 0.5) / bands)
-    equator = max(_FEWEST_CELLS, 2 * round(width / cell_px / 2))
+    equator = max(_MIN_CELLS, 2 * round(width / cell_px / 2))
     halvings = np.rint(np.log2(1 / np.cos(elevation)))
-    counts: NDArray[np.int64] = np.maximum(_FEWEST_CELLS, 2 * np.rint(equator / 2 / 2**halvings)).astype(np.int64)
+    counts: NDArray[np.int64] = np.maximum(_MIN_CELLS, 2 * np.rint(equator / 2 / 2**halvings)).astype(np.int64)
     return counts
 
 
@@ -110,9 +111,9 @@ def _place_columns(counts: NDArray[np.int64], width: int) -> tuple[NDArray[np.in
 def _number_elements(
     left_upper: NDArray[np.int64], left_lower: NDArray[np.int64]
 ) -> tuple[NDArray[np.int32], tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Return the number of the element of each (gap, column), and a (gap, column) that lies in each element."""
+    """Return the index of the element of each (gap, column), and a (gap, column) in each element."""
     starts = (left_upper != np.roll(left_upper, 1, axis=1)) | (left_lower != np.roll(left_lower, 1, axis=1))
-    # The element that the seam cuts begins at the end of the row, so a row's numbers start before its first column.
+    # The element at the seam starts at the end of the row, so a row's indices start before its first column.
     per_gap = starts.sum(axis=1)
     before = np.concatenate([[0], np.cumsum(per_gap)[:-1]])
     inside = (np.cumsum(starts, axis=1) - 1) % per_gap[:, None]

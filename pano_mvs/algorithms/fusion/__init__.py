@@ -1,1 +1,1 @@
-"""From range maps to one cloud."""
+"""Fusion of range maps into one cloud."""

@@ -1,4 +1,4 @@
-"""Surface normals from a range map's own grid."""
+"""Estimate surface normals on a range map's grid."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ def normals_from_range(
 ) -> NDArray[np.float32]:
     """Return the unit normal of the surface at each pixel, towards the camera.
 
-    A plane that misses the camera's centre is p · X = 1, so on a ray F the inverse range is 1/r = p · F: linear in p.
-    p is the weighted least-squares fit over a window, and −p/|p| the normal. The window is measured on the sphere: it
-    goes over the seam and the poles, and takes every ⌈1/cos φ⌋-th column, so that it stays as wide as it is high.
-    A neighbour k steps away whose inverse range differs by more than k · `max_relative_step` lies on another surface
-    and has no weight; nearer ones have Tukey's biweight of that ratio.
+    A plane that does not contain the camera's centre is p · X = 1, so on a ray F the inverse range is 1/r = p · F:
+    linear in p. p is the weighted least-squares fit over a window, and −p/|p| the normal. The window is measured on the
+    sphere: it crosses the seam and the poles, and uses every ⌈1/cos φ⌋-th column, so that it is isotropic. A neighbour
+    k steps away whose inverse range differs by more than k · `max_relative_step` is on another surface and has no
+    weight; nearer ones have Tukey's biweight of that ratio.
 
     Args:
         range_map: a range map, or its ranges (H, W) with even W; NaN is invalid.
         radius: half the width of the window in pixels at the equator.
         max_relative_step: largest relative step of the range from one pixel to the next on one surface.
-        given: (H, W, 3) normals that are known already, NaN where not; None: none are.
-        wanted: (H, W) the pixels to fit a plane at; None: all.
-        threads: how many to use; they change no bit.
+        given: (H, W, 3) known normals, NaN where unknown; None: all unknown.
+        wanted: (H, W) pixels at which to fit a plane; None: all.
+        threads: number of threads; the result does not depend on it.
 
     Returns:
-        (H, W, 3) float32 in the camera frame; NaN where the range is invalid or fewer than 5 pixels of the window are
-        of one surface.
+        (H, W, 3) float32 in the camera frame; NaN if the range is invalid or fewer than 5 pixels of the window are on
+        the same surface.
 
     Raises:
-        UsageError: if the ranges are not (H, W) with even W, or the radius does not fit.
+        UsageError: if the ranges are not (H, W) with even W, or the radius is out of range.
     """
     from pano_mvs.algorithms.fusion.kernels_normals import fit_normals  # compiles on import
 

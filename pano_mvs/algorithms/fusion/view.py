@@ -1,4 +1,4 @@
-"""A view as fusion reads it, and the few that it holds at a time."""
+"""Views for fusion, and a cache of the views in use."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class FusionView:
         range_map: (H, W) range map.
         pose: cam_from_world.
         image: (H, W, 3) uint8 RGB.
-        mask: (H, W) bool, False where the view is to be ignored; None: nowhere.
+        mask: (H, W) bool, False where the view is ignored; None: no mask.
     """
 
     range_map: RangeMap
@@ -35,14 +35,14 @@ class FusionView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sight:
-    """What a view has seen well enough to write and to vote, laid out for compiled loops.
+    """Data of a view with sufficient confidence, in the memory layout of compiled loops.
 
     Attributes:
         pose: cam_from_world.
-        ranges: (H, W) float32, NaN where there is nothing to go by.
+        ranges: (H, W) float32, NaN if unknown.
         confidence: (H, W) uint8.
         image: (H, W, 3) uint8.
-        normals: (H, W, 3) float32 normals that came with the ranges, or None.
+        normals: (H, W, 3) float32 normals of the range map, or None.
     """
 
     pose: Rigid3
@@ -54,22 +54,24 @@ class Sight:
 
 @lru_cache(maxsize=1)
 def held_rays(size_hw: tuple[int, int]) -> NDArray[np.float64]:
-    """Return the ray of each pixel, (H, W, 3), read-only: the views of a capture are of one size."""
+    """Return the ray of each pixel, (H, W, 3), read-only; cached, since views of a capture usually have one size."""
     rays = ray_grid(size_hw)
     rays.setflags(write=False)
     return rays
 
 
 def sight_of(view: FusionView, *, min_confidence: int) -> Sight:
-    """Return what a view has seen with at least that confidence and outside of its mask.
+    """Return the data of a view with at least the given confidence and outside of its mask.
 
     Raises:
         UsageError: if its arrays disagree in size.
     """
     ranges, confidence = view.range_map.range, view.range_map.confidence
     if view.image.shape != (*ranges.shape, 3) or view.image.dtype != np.uint8:
-        raise UsageError(f"a view's image must be (H, W, 3) uint8 in the size of its range map {ranges.shape}, got "
-                         f"{view.image.shape} {view.image.dtype}")  # fmt: skip
+        raise UsageError(
+            f"a view's image must be (H, W, 3) uint8 in the size of its range map {ranges.shape}, got "
+            f"{view.image.shape} {view.image.dtype}"
+        )
     good = confidence >= min_confidence
     if view.mask is not None:
         if view.mask.shape != ranges.shape:
@@ -86,7 +88,7 @@ def sight_of(view: FusionView, *, min_confidence: int) -> Sight:
 
 
 class SightWindow:
-    """Loads views when they are needed and keeps the latest few."""
+    """Loads views when they are needed and caches the most recent ones."""
 
     def __init__(self, load: Callable[[int], FusionView], *, min_confidence: int, size: int) -> None:
         """Keep at most `size` views."""
@@ -107,14 +109,14 @@ class SightWindow:
 
 
 def nearest_views(poses: Sequence[Rigid3], count: int) -> list[list[int]]:
-    """Return for each view the positions of the `count` others with the nearest centres, in rising order.
+    """Return for each view the positions of the `count` others with the nearest centres, ascending.
 
-    Where distances are equal the earlier view comes first.
+    For equal distances, the earlier view comes first.
     """
     if len(poses) <= count + 1:
         return [[other for other in range(len(poses)) if other != idx] for idx in range(len(poses))]
     centers = np.array([pose.center for pose in poses])
-    # A list of ranks, since for k=1 alone the query leaves out an axis.
+    # A list of ranks, because for k=1 the query drops an axis.
     distances, found = (np.asarray(values) for values in cKDTree(centers).query(centers, k=list(range(1, count + 2))))
     nearest = []
     for idx in range(len(poses)):

@@ -1,4 +1,4 @@
-"""From range maps to one cloud: points on which views agree."""
+"""Fuse range maps into one cloud of points on which views agree."""
 
 from __future__ import annotations
 
@@ -20,20 +20,21 @@ from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
 _MAX_SURFACE_STEP = 0.05
 _MAX_REPROJECTION_PX = 1.0
-# Where two views see a surface about equally well the earlier one keeps it: it may be 5 % worse, and the later one must
-# be 3 % better. The zone between the two is written twice, so that small errors of the footprints leave no gap.
+# If two views see a surface about equally well, the earlier one contributes it: it may be 5 % worse, and the later one
+# must be 3 % better. Points between these limits are written twice, so that small errors of the footprints leave no
+# gap.
 _EARLIER_MAY_BE_WORSE, _LATER_MUST_BE_BETTER = 1.05, 0.97
 _SUPPORT_RADIUS = 2
 _MAX_SUPPORT_STEP = 0.03
 
 
 def fuse_views(views: Sequence[FusionView], settings: FusionSettings | None = None, *, threads: int = 1) -> PointCloud:
-    """Return the cloud of all points on which views agree.
+    """Fuse views into a cloud of the points on which they agree.
 
     Args:
-        views: the views; see `fuse_stream` for many.
-        settings: which points and how; None: the defaults.
-        threads: how many to use; they change no bit.
+        views: the views; see `fuse_stream` for many views.
+        settings: settings of the fusion; None: the defaults.
+        threads: number of threads; the result does not depend on it.
 
     Raises:
         UsageError: if a view's arrays disagree.
@@ -48,14 +49,14 @@ def fuse_stream(
     *,
     threads: int = 1,
 ) -> PointCloud:
-    """Return the cloud of views that are loaded one after the other; no more than a view and its neighbours are held.
+    """Fuse views that are loaded one at a time; at most a view and its neighbours are in memory.
 
-    Each view in turn is the reference of `fuse_reference`, with its neighbours as sources; the clouds are joined in
-    the order of the views, voxel by voxel if the settings say so. The result does not depend on what is held.
+    Each view in turn is the reference of `fuse_reference`, with its neighbours as sources. The clouds are joined in the
+    order of the views, merged by voxels if `voxel_size` is set. The result does not depend on what is cached.
 
     Args:
         poses: cam_from_world of all views.
-        load: position of a view to the view; called again if it was dropped since.
+        load: position of a view to the view; called again if it was dropped from the cache.
         settings: as in `fuse_views`.
         threads: as in `fuse_views`.
 
@@ -87,17 +88,17 @@ def fuse_reference(
     """Return the points that one view contributes to the cloud.
 
     A pixel becomes a point if `min_views` views agree on it, by the test of `check_consistency`, unless more views
-    whose own pixel is consistent see through it than agree: it then hangs in free space. One that lacks a single view
-    enters on the support of its surface (`min_support`), unless a consistent pixel contradicts. What another agreeing
-    view sees clearly better is left to that one. A point is the mean, weighted by 1 / r², of where the views put it
-    (`merge_within`); its colour that of all views that agree, weighted by cos / r², the inverse of what a pixel covers
-    there; its confidence the largest of theirs.
+    whose own pixel is consistent see through it than agree, which means that it is in free space. A pixel that lacks a
+    single view is accepted by the support of its surface (`min_support`), unless a consistent pixel contradicts it.
+    Points that another agreeing view sees clearly better are left to that view. A point is the mean of the positions in
+    all agreeing views, weighted by 1 / r² (`merge_within`); its colour is their mean weighted by cos / r², the inverse
+    of the area that a pixel covers; its confidence is the largest of theirs.
 
     Args:
-        reference: the view that writes.
+        reference: the view that contributes the points.
         earlier: neighbouring views that come before it.
         later: neighbouring views that come after it.
-        settings: as in `fuse_views`; `neighbours` and `voxel_size` have no meaning here.
+        settings: as in `fuse_views`; `neighbours` and `voxel_size` are ignored.
         threads: as in `fuse_views`.
 
     Returns:
@@ -114,7 +115,7 @@ def fuse_reference(
 
 
 def join_clouds(clouds: Sequence[PointCloud]) -> PointCloud:
-    """Return one cloud of the points of several, in order; their confidence is kept if all have it."""
+    """Return one cloud of the points of several, in order; confidences are kept if all clouds have them."""
     empty = np.zeros((0, 3), np.float32)
     confidences = [cloud.confidence for cloud in clouds if cloud.confidence is not None]
     return PointCloud(
@@ -128,7 +129,7 @@ def join_clouds(clouds: Sequence[PointCloud]) -> PointCloud:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Tallies:
-    """What the sources say of each pixel, as `kernels_vote.vote` fills it in."""
+    """Agreement of the sources with each pixel, as computed by `kernels_vote.vote`."""
 
     yields: NDArray[np.bool_]
     counts: NDArray[np.uint8]
@@ -145,14 +146,14 @@ class _Tallies:
 def _points_of(
     reference: Sight, sources: Sequence[tuple[SightWindow, int, float]], settings: FusionSettings, threads: int
 ) -> PointCloud:
-    """Return the points of one view; sources are (where to get it, its position there, its `_tie`)."""
+    """Return the points of one view; sources are (window of views, position in it, `_tie`)."""
     height, width = reference.ranges.shape
     rays = held_rays((height, width))
     written = _chosen_pixels((height, width), settings)
     normals = _normals_or_views(reference, rays, written, threads)
     tallies = _own_tallies(reference, rays, normals)
     for window, idx, tie in sources:
-        _add_votes(window[idx], tie, (reference, rays, normals, written), settings, tallies, threads)
+        _compare_with(window[idx], tie, (reference, rays, normals, written), settings, tallies, threads)
     kept = _kept(reference, tallies, settings) & written
     position = tallies.sums[kept]
     color = tallies.colors[kept]
@@ -167,7 +168,7 @@ def _points_of(
 
 
 def _own_tallies(reference: Sight, rays: NDArray[np.float64], normals: NDArray[np.float32]) -> _Tallies:
-    """Return the tallies with nothing but the reference's own pixels in them."""
+    """Return tallies with only the reference's own pixels."""
     shape = reference.ranges.shape
     ranges = reference.ranges.astype(np.float64)
     weight = 1 / ranges**2
@@ -183,7 +184,7 @@ def _own_tallies(reference: Sight, rays: NDArray[np.float64], normals: NDArray[n
     )
 
 
-def _add_votes(
+def _compare_with(
     source: Sight,
     tie: float,
     pixels: tuple[Sight, NDArray[np.float64], NDArray[np.float32], NDArray[np.bool_]],
@@ -196,10 +197,16 @@ def _add_votes(
     reference, *grids = pixels
     height, width = reference.ranges.shape
     max_angle = _MAX_REPROJECTION_PX * 2 * np.pi / width
-    limits = np.array([
-        settings.max_relative_error, max_angle, _MAX_SURFACE_STEP, settings.max_footprint_ratio * tie,
-        settings.merge_within, CONSISTENT_CONFIDENCE[0],
-    ])  # fmt: skip
+    limits = np.array(
+        [
+            settings.max_relative_error,
+            max_angle,
+            _MAX_SURFACE_STEP,
+            settings.max_footprint_ratio * tie,
+            settings.merge_within,
+            CONSISTENT_CONFIDENCE[0],
+        ]
+    )
     source_from_reference = source.pose @ reference.pose.inverse()
     relation = (
         np.ascontiguousarray(source_from_reference.rotation),
@@ -232,7 +239,7 @@ def _kept(reference: Sight, tallies: _Tallies, settings: FusionSettings) -> NDAr
 
 
 def _tie(*, is_earlier: bool) -> float:
-    """Return the factor on the largest footprint ratio that settles ties with an earlier or a later source."""
+    """Return the factor on the largest footprint ratio that breaks ties with an earlier or a later source."""
     return _LATER_MUST_BE_BETTER if is_earlier else _EARLIER_MAY_BE_WORSE
 
 
@@ -247,7 +254,7 @@ def _normals_or_views(
 
 
 def _chosen_pixels(size_hw: tuple[int, int], settings: FusionSettings) -> NDArray[np.bool_]:
-    """Return every stride-th pixel, (H, W); of even density, a row at elevation φ has the share cos φ of them."""
+    """Return every stride-th pixel, (H, W); for even density, a row at elevation φ has the share cos φ of them."""
     height, width = size_hw
     rows = np.arange(height)
     share = np.cos(np.pi * (0.5 - (rows + 0.5) / height)) if settings.even_density else np.ones(height)

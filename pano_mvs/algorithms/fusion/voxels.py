@@ -1,4 +1,4 @@
-"""Thin a cloud so that no voxel holds more than one point."""
+"""Thin a cloud to one point per voxel."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.scene import PointCloud
 
-# Points that wait for being sorted into voxels: fewer would have all voxels sorted again and again.
-_FEWEST_WAITING = 1_000_000
+# Number of points that are collected before they are sorted into voxels; with fewer, voxels are sorted too often.
+_MIN_WAITING = 1_000_000
 
 
 def thin_by_voxels(cloud: PointCloud, voxel_size: float) -> PointCloud:
-    """Return a cloud with one point for each occupied voxel, in the order in which voxels first appear.
+    """Thin a cloud to one point per occupied voxel, in the order in which voxels first appear.
 
     Positions and colours are averages over the voxel, weighted by the number of views; normals are averaged and
-    normalised, or the first one where they cancel; the numbers of views and confidences are the largest.
+    normalised, or the first one if they cancel; the numbers of views and the confidences are maxima.
 
     Args:
         cloud: N points.
@@ -50,10 +50,10 @@ class _Voxels:
 
 
 class VoxelGrid:
-    """Clouds, added one after the other, as one point for each occupied voxel; memory goes with the voxels."""
+    """Adds clouds one at a time, and keeps one point per occupied voxel; memory grows with the number of voxels."""
 
     def __init__(self, voxel_size: float) -> None:
-        """Begin with nothing.
+        """Create an empty grid.
 
         Raises:
             UsageError: if the voxel size is not positive.
@@ -75,7 +75,7 @@ class VoxelGrid:
         sums = np.concatenate([weight, weight * values], axis=1)
         self._parts.append(_merged([_Voxels(places, sums, cloud.normals_in_world, largest)]))
         waiting = sum(len(part.places) for part in self._parts[1:])
-        if waiting > max(_FEWEST_WAITING, len(self._parts[0].places)):
+        if waiting > max(_MIN_WAITING, len(self._parts[0].places)):
             self._parts = [_merged(self._parts)]
 
     def cloud(self) -> PointCloud:
@@ -96,9 +96,9 @@ class VoxelGrid:
 
 
 def _merged(parts: list[_Voxels]) -> _Voxels:
-    """Return the voxels of all parts, each once."""
+    """Return the voxels of all parts without duplicates."""
     places = np.concatenate([part.places for part in parts])
-    order = np.lexsort(places.T[::-1])  # stable: the first of a voxel stays in front
+    order = np.lexsort(places.T[::-1])  # stable: the first point of a voxel stays in front
     begins = np.ones(len(order), np.bool_)
     begins[1:] = (np.diff(places[order], axis=0) != 0).any(axis=1)
     starts = np.flatnonzero(begins)

@@ -1,1 +1,1 @@
-"""What of a picture is to be ignored, found in the picture itself."""
+"""Detect image areas to be ignored."""

@@ -1,4 +1,4 @@
-"""Areas of one colour: what a stitcher, a crop or a logo put where there was no picture."""
+"""Detect areas of one colour, as left by stitchers, crops or logos."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ def areas_of_color(
     min_area_deg2: float = 4.0,
     margin_px: int = 2,
 ) -> Mask:
-    """Return the pixels, (H, W), of large connected areas of a colour, over the seam and over the poles.
+    """Return the pixels, (H, W), of large connected areas of one colour, across the seam and the poles.
 
     Args:
         picture: (H, W, 3) uint8 RGB, the full sphere.
         color_rgb: the colour.
-        tolerance: grey levels by which each channel may differ from it: what compression does to an even area.
-        min_area_deg2: smaller areas are none, in square degrees: dark corners and lamps.
-        margin_px: areas are widened by so much, to take their blurred edges along.
+        tolerance: maximum difference of each channel, in grey levels, to allow for compression artefacts.
+        min_area_deg2: minimum area in square degrees, to exclude dark corners and lamps.
+        margin_px: width in pixels by which areas are dilated, to include their blurred edges.
 
     Raises:
-        UsageError: if the picture is no (H, W, 3) uint8 array, or a number is negative.
+        UsageError: if the image is not an (H, W, 3) uint8 array, or a number is negative.
     """
     if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
-        raise UsageError(f"a picture must be (H, W, 3) uint8, got {picture.shape} {picture.dtype}")
+        raise UsageError(f"an image must be (H, W, 3) uint8, got {picture.shape} {picture.dtype}")
     if min(tolerance, min_area_deg2, margin_px) < 0:
         raise UsageError(f"numbers must not be negative, got {tolerance}, {min_area_deg2}, {margin_px}")
     from pano_mvs.algorithms.filters.kernels_components import label_surfaces  # compiles on import

@@ -13,26 +13,27 @@ from pano_mvs.scene import Features
 
 
 def match_features(first: Features, second: Features, *, ratio: float = 0.8, mutual: bool = True) -> NDArray[np.int32]:
-    """Return the key points of two pictures whose descriptors are alike.
+    """Match the key points of two images by their descriptors.
 
     A match is kept if its distance is below `ratio` times that of the second nearest (Lowe 2004, section 7.1).
 
     Args:
-        first: key points of the first picture.
-        second: of the second picture, with descriptors of the same kind.
+        first: key points of the first image.
+        second: key points of the second image, with descriptors of the same kind.
         ratio: in (0, 1]; 1 keeps every nearest neighbour.
         mutual: whether both must be each other's nearest; matches are then one to one.
 
     Returns:
-        (M, 2) int32 positions in the first and second picture, by ascending position in the first.
+        (M, 2) int32 positions in the first and second image, by ascending position in the first.
 
     Raises:
         UsageError: if the descriptors are of different kinds, or the ratio is out of range.
     """
     if first.metric != second.metric or first.descriptors.shape[1] != second.descriptors.shape[1]:
-        raise UsageError(f"descriptors of different kinds cannot be compared: {first.metric} with "
-                         f"{first.descriptors.shape[1]} and {second.metric} with {second.descriptors.shape[1]} "
-                         "components. Use one feature stage for all pictures")  # fmt: skip
+        raise UsageError(
+            f"descriptors of different kinds cannot be compared: {first.metric} with {first.descriptors.shape[1]} and "
+            f"{second.metric} with {second.descriptors.shape[1]} components. Use the same feature stage for all images"
+        )
     if not 0 < ratio <= 1:
         raise UsageError(f"the ratio of the ratio test must be in (0, 1], got {ratio}")
     if len(first) == 0 or len(second) < 2:
@@ -70,7 +71,7 @@ def _match_hamming(
 def _one_to_one(
     kept: NDArray[np.intp], nearest: NDArray[np.intp], distance: NDArray[np.float32], *, mutual: bool
 ) -> NDArray[np.int32]:
-    """Return the matches; if mutual, of several equally near ones of a second key point the first alone."""
+    """Return the matches; if mutual, only the first of several equally near ones of a second key point."""
     if mutual:
         by_distance = kept[np.argsort(distance[kept], kind="stable")]
         _, first_use = np.unique(nearest[by_distance], return_index=True)

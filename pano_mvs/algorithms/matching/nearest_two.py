@@ -1,4 +1,4 @@
-"""The nearest two of each descriptor by Euclidean distance, and how near the nearest of the other side is."""
+"""Find the two nearest neighbours of each descriptor by Euclidean distance, and the nearest distances back."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ _BLOCK_ROWS = 256
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NearestTwo:
-    """What N descriptors of one picture find among M of another, in squared distances.
+    """The nearest neighbours of N descriptors of one image among M of another, with squared distances.
 
     Attributes:
-        nearest: (N,) position of the nearest; of equally near ones the first.
-        squared: (N,) float32, to the nearest.
-        next_squared: (N,) float32, to the second nearest.
-        squared_back: (M,) float32, from each of the other picture to its nearest.
+        nearest: (N,) position of the nearest one; the first of equally near ones.
+        squared: (N,) float32, to the nearest one.
+        next_squared: (N,) float32, to the second nearest one.
+        squared_back: (M,) float32, from each descriptor of the other image to its nearest one.
     """
 
     nearest: NDArray[np.intp]
@@ -28,7 +28,7 @@ class NearestTwo:
 
 
 def nearest_two(first: NDArray[np.generic], second: NDArray[np.generic]) -> NearestTwo:
-    """Return the nearest two of each descriptor: |a − b|² = |a|² + |b|² − 2 a·b, blocks of rows at a time.
+    """Return the two nearest neighbours of each descriptor: |a − b|² = |a|² + |b|² − 2 a·b, in blocks of rows.
 
     Args:
         first: (N, D).

@@ -1,4 +1,4 @@
-"""Which pairs of images to match, from where they were taken or from what they look like."""
+"""Choose pairs of images to match by position or by visual similarity."""
 
 from __future__ import annotations
 
@@ -21,16 +21,17 @@ FloatArray = NDArray[np.float64]
 def position_pairs(
     names: Sequence[str], positions: Mapping[str, FloatArray], *, neighbours: int = 10, window: int = 3
 ) -> Pairs:
-    """Return every image with its nearest ones, so that all hang together.
+    """Pair every image with its nearest ones, so that all images are connected.
 
-    A pair is listed if either image is among the nearest of the other. Where that leaves groups apart, the shortest
+    A pair is included if either image is among the nearest of the other. If this leaves separate groups, the shortest
     links that join them are added.
 
     Args:
         names: image names in the capture's order.
         positions: image name to position, (2,) or (3,), all in one frame and unit; some may be missing.
-        neighbours: so many nearest images each.
-        window: an image without position is paired with so many before and after it in the capture's order.
+        neighbours: number of nearest images for each image.
+        window: an image without position is paired with this number of images before and after it in the capture's
+            order.
 
     Raises:
         UsageError: if a number of neighbours is less than 1.
@@ -54,16 +55,16 @@ def position_pairs(
 def retrieval_pairs(
     names: Sequence[str], descriptors: Mapping[str, GlobalDescriptor], *, neighbours: int = 20
 ) -> Pairs:
-    """Return every image with those that look most like it, so that all hang together.
+    """Pair every image with the most similar ones, so that all images are connected.
 
     The vectors of the global descriptors give a shortlist for each image (all images in captures of up to a few
-    hundred); the number of key points of their samples that match puts it in order (see `shortlist`). A pair is listed
-    if either image is among the most similar of the other. Where that leaves groups apart, the most similar links that
-    join them are added.
+    hundred), which is sorted by the number of matching key points of their samples (see `shortlist`). A pair is
+    included if either image is among the most similar of the other. If this leaves separate groups, the most similar
+    links that join them are added.
 
     Args:
         names: image names in the capture's order.
-        descriptors: image name to its global descriptor; those without one are paired with none.
+        descriptors: image name to its global descriptor; images without one are not paired.
         neighbours: number of most similar images for each image.
 
     Raises:
@@ -85,13 +86,13 @@ def loop_closing_pairs(
     loop: bool = False,
     loop_closure: int = 0,
 ) -> Pairs:
-    """Return the sequential pairs and, for every image, those with the most similar images outside its window.
+    """Return the sequential pairs and, for every image, pairs with the most similar images outside its window.
 
     Args:
         names: image names in the order in which they were taken.
         descriptors: image name to its global descriptor.
-        window: each image is paired with so many that follow it.
-        loop: whether the last images are followed by the first.
+        window: each image is paired with this number of following images.
+        loop: whether the first image follows the last one.
         loop_closure: number of similar images beyond the window to pair each image with.
 
     Raises:
@@ -113,7 +114,7 @@ def loop_closing_pairs(
 
 
 def nearest_links(distances: FloatArray, neighbours: int) -> NDArray[np.intp]:
-    """Return the links of each item to its nearest ones, and the shortest that join what would be apart.
+    """Return the links of each item to its nearest ones, and the shortest ones that join separate groups.
 
     Args:
         distances: (N, N) symmetric, not negative.
@@ -123,7 +124,7 @@ def nearest_links(distances: FloatArray, neighbours: int) -> NDArray[np.intp]:
         (M, 2) positions, first before second, sorted, no link twice.
     """
     links = _nearest(distances, neighbours)
-    # A zero is no edge to scipy; what is linked already costs less than anything else.
+    # scipy does not treat a zero as an edge; existing links already cost less than anything else.
     cost = distances - distances.min() + distances.max() + 1.0
     np.fill_diagonal(cost, 0)
     cost[links[:, 0], links[:, 1]] = cost[links[:, 1], links[:, 0]] = 1e-3
@@ -135,7 +136,7 @@ def nearest_links(distances: FloatArray, neighbours: int) -> NDArray[np.intp]:
 def east_north_m(positions_lla: Sequence[tuple[float, float, float]]) -> FloatArray:
     """Return GPS positions as metres east and north of their mean, (N, 2), on its tangent plane.
 
-    Heights are left out: those of GPS are off by tens of metres, or missing and stored as zero.
+    Altitudes are ignored: those of GPS are off by tens of metres, or missing and stored as zero.
 
     Args:
         positions_lla: latitude and longitude in degrees, altitude in metres.
@@ -147,7 +148,7 @@ def east_north_m(positions_lla: Sequence[tuple[float, float, float]]) -> FloatAr
 
 
 def _nearest(distances: FloatArray, neighbours: int) -> NDArray[np.intp]:
-    """Return links (first < second) of each item to its nearest; infinite distances are no links."""
+    """Return links (first < second) of each item to its nearest ones; infinite distances are not links."""
     apart = distances.copy()
     np.fill_diagonal(apart, np.inf)
     order = np.argsort(apart, axis=1, kind="stable")[:, :neighbours]
@@ -163,9 +164,9 @@ def _squared_distances(places: FloatArray) -> FloatArray:
 
 
 def _dissimilarities(names: Sequence[str], descriptors: Mapping[str, GlobalDescriptor], neighbours: int) -> FloatArray:
-    """Return how little alike images are, (N, N), not negative; whole numbers, so that no order of adding shows.
+    """Return the dissimilarity of images, (N, N), not negative; integers, so that the order of summation has no effect.
 
-    More matches of the samples make two images more alike; the vectors decide between equal numbers of matches.
+    More matches of the samples make two images more similar; the vectors decide between equal numbers of matches.
     """
     vectors = np.array([descriptors[name].vector for name in names], np.float32)
     alike = (vectors @ vectors.T).astype(np.float64)

@@ -1,4 +1,4 @@
-"""Which pairs of images to match, from their order alone."""
+"""Choose pairs of images to match by their order alone."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ def exhaustive_pairs(names: Sequence[str]) -> Pairs:
 
 
 def sequential_pairs(names: Sequence[str], *, window: int = 5, loop: bool = False) -> Pairs:
-    """Return the pairs of images that are at most so many places apart.
+    """Return the pairs of images that are at most `window` positions apart.
 
     Args:
         names: image names in the order in which they were taken.
-        window: each image is paired with so many that follow it.
-        loop: whether the last images are followed by the first.
+        window: each image is paired with this number of following images.
+        loop: whether the first image follows the last one.
 
     Raises:
         UsageError: if the window is less than 1.

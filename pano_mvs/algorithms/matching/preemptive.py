@@ -1,4 +1,4 @@
-"""A quick look at a pair before all its descriptors are matched."""
+"""Preemptive matching: reject pairs by a few key points before all descriptors are matched."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ _MIN_SHARE, _MIN_MATCHES = 0.02, 4
 def hopeless_reason(first: Features, second: Features, *, preemptive: int = 0) -> str:
     """Return why a pair is not worth matching, by its strongest key points alone; "" if it may be.
 
-    Wu, "Towards Linear-time Incremental Structure from Motion", 2013, section 3: most pairs of a large set show
-    nothing in common, which some hundred key points tell.
+    Wu, "Towards Linear-time Incremental Structure from Motion", 2013, section 3: most pairs of a large set have no
+    overlap, which a few hundred key points are enough to detect.
 
     Args:
-        first: key points of the first picture, strongest first.
-        second: of the second picture.
-        preemptive: how many to look at; 0 looks at none, and gives every pair a chance.
+        first: key points of the first image, strongest first.
+        second: key points of the second image.
+        preemptive: number of key points to match; 0 accepts every pair.
     """
     if not preemptive or min(len(first), len(second)) <= preemptive:
         return ""

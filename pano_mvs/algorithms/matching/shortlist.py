@@ -1,4 +1,4 @@
-"""Count matches between small samples of key points, for the pairs that look alike at first sight."""
+"""Count matches between small samples of key points, for pairs that look similar at first."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from pano_mvs.algorithms.matching.nearest_two import NearestTwo, nearest_two
 from pano_mvs.algorithms.matching.whole_numbers import PackedDescriptors, fits_whole_numbers, nearest_two_packed
 
 _MIN_SHORTLIST, _SHORTLIST_PER_NEIGHBOUR = 300, 10
-_RATIO = 0.8  # of the ratio test of Lowe 2004, section 7.1
+_RATIO = 0.8  # threshold of the ratio test of Lowe 2004, section 7.1
 
 
 def sample_matches(
     samples: Sequence[NDArray[np.int16]], dissimilarities: NDArray[np.float64], *, neighbours: int
 ) -> NDArray[np.float64]:
-    """Return how many key points of two samples match, for the pairs on the shortlist of either image.
+    """Return the number of matching key points of two samples, for pairs on the shortlist of either image.
 
     Matching a few key points of coarse scales separates overlapping images from others before the rest is matched (Wu,
     "Towards linear-time incremental structure from motion", 2013, section 3.1). A match is mutual and passes the ratio
-    test. Time is linear in the number of images once that exceeds the length of a shortlist.
+    test. Time is linear in the number of images once it exceeds the length of a shortlist.
 
     Args:
-        samples: descriptors in whole numbers, (S, B) each; an empty one matches nothing.
-        dissimilarities: (N, N), how unlike the images are at first sight; the shortlist is made by it.
+        samples: descriptors as integers, (S, B) each; an empty one matches nothing.
+        dissimilarities: (N, N), approximate dissimilarity of the images, by which shortlists are made.
         neighbours: number of neighbours that will be chosen; a shortlist has 10 times as many images, at least 300.
 
     Returns:
@@ -45,7 +45,7 @@ def sample_matches(
 
 
 def _comparison(samples: Sequence[NDArray[np.int16]]) -> Callable[[int, int], NearestTwo]:
-    """Return the function that compares two samples given by their positions: compiled where the machine can."""
+    """Return a function that compares two samples given by their positions, compiled if the machine supports it."""
     if all(map(fits_whole_numbers, samples)):
         packed = {idx: PackedDescriptors.of(sample) for idx, sample in enumerate(samples) if sample.size}
         return lambda first, second: nearest_two_packed(packed[first], packed[second])
@@ -53,11 +53,11 @@ def _comparison(samples: Sequence[NDArray[np.int16]]) -> Callable[[int, int], Ne
 
 
 def _comparable(first: NDArray[np.int16], second: NDArray[np.int16]) -> bool:
-    """Whether two samples are of one kind of descriptor, with enough of them for a ratio test."""
+    """Return whether two samples have the same kind of descriptor and are large enough for a ratio test."""
     return len(first) > 0 and len(second) >= 2 and first.shape[1] == second.shape[1]
 
 
 def _count_matches(found: NearestTwo) -> int:
-    """Return how many mutual nearest neighbours pass the ratio test."""
+    """Return the number of mutual nearest neighbours that pass the ratio test."""
     distinct = found.squared < np.float32(_RATIO**2) * found.next_squared
     return int(np.count_nonzero(distinct & (found.squared <= found.squared_back[found.nearest])))

@@ -1,4 +1,4 @@
-"""A global descriptor of a panorama: one vector over all its key points, and a sample of their descriptors."""
+"""A global descriptor of a panorama: one vector over all key points, and a sample of their descriptors."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ FloatArray = NDArray[np.float64]
 _CELL_BITS = 4
 _RESIDUAL_SIZE = 128
 _LENGTH = 1024.0
-_CODEBOOK_SEED = 20261121  # any other would do; it never changes, so that pictures can be compared
+_CODEBOOK_SEED = 20261121  # arbitrary but fixed, so that images can be compared
 
 
 def vlad_descriptor(features: Features, *, strongest: int = 4000, sample: int = 200) -> GlobalDescriptor:
-    """Return the vector of locally aggregated descriptors of a panorama, and the descriptors of its largest key points.
+    """Compute the VLAD vector of a panorama, and the descriptors of its largest key points.
 
-    Jégou et al., "Aggregating local descriptors into a compact image representation", 2010, with the signed square
-    root and the normalisation within cells of Arandjelović & Zisserman, "All about VLAD", 2013. The cells are not
-    clusters of some training set but the 16 orthants of 4 random directions, so that the vector of a picture depends
-    on this picture alone: one more picture leaves the other vectors as they are.
+    Jégou et al., "Aggregating local descriptors into a compact image representation", 2010, with the signed square root
+    and the normalisation within cells of Arandjelović & Zisserman, "All about VLAD", 2013. The cells are not clusters
+    of a training set but the 16 orthants of 4 random directions, so that the vector of an image depends on this image
+    alone: adding an image does not change other vectors.
 
     Args:
         features: key points, strongest first, with either kind of descriptor.
-        strongest: number of key points that the vector sums up.
-        sample: number of key points, those of the coarsest scales, whose descriptors are kept as they are. Key points
-            of coarse scales are the ones found again from elsewhere (Wu, "Towards linear-time incremental structure
-            from motion", 2013, section 3.1).
+        strongest: number of key points in the vector.
+        sample: number of key points, those of the coarsest scales, whose descriptors are kept unchanged. Key points of
+            coarse scales are the ones most likely found from other positions (Wu, "Towards linear-time incremental
+            structure from motion", 2013, section 3.1).
 
     Returns:
-        A vector of length 1024 within rounding, of whole numbers: scalar products are exact in any order.
+        A vector of length 1024 up to rounding, of integers: scalar products are exact in any order.
     """
     largest = _whole(features, np.argsort(-features.sizes_rad, kind="stable")[:sample]).astype(np.int16)
     turned = _turned(_centered(features, strongest))
@@ -49,7 +49,7 @@ def vlad_descriptor(features: Features, *, strongest: int = 4000, sample: int = 
 
 
 def _centered(features: Features, strongest: int) -> FloatArray:
-    """Return the descriptors as whole numbers whose mean over the components is zero, (N, D): bits become ± 1."""
+    """Return the descriptors as integers whose mean over the components is zero, (N, D): bits become ± 1."""
     whole = _whole(features, np.arange(len(features))[:strongest])
     if features.metric == "hamming":
         return whole
@@ -58,7 +58,7 @@ def _centered(features: Features, strongest: int) -> FloatArray:
 
 
 def _whole(features: Features, chosen: NDArray[np.intp]) -> FloatArray:
-    """Return the chosen descriptors in whole numbers, (N, D): bits become ± 1."""
+    """Return the chosen descriptors as integers, (N, D): bits become ± 1."""
     if features.metric == "hamming":
         return 2.0 * np.unpackbits(features.descriptors[chosen].astype(np.uint8), axis=1).astype(np.float64) - 1.0
     whole: FloatArray = np.rint(features.descriptors[chosen]).astype(np.float64)
@@ -66,7 +66,7 @@ def _whole(features: Features, chosen: NDArray[np.intp]) -> FloatArray:
 
 
 def _turned(vectors: FloatArray) -> FloatArray:
-    """Return the vectors in randomly turned axes, exactly: signs, a Hadamard matrix, a permutation; whole numbers."""
+    """Return the vectors in randomly rotated axes, exactly: signs, a Hadamard matrix, a permutation; integers."""
     size = 1 << max(vectors.shape[1] - 1, 1).bit_length()
     rng = np.random.default_rng(_CODEBOOK_SEED)
     signs = rng.choice([-1.0, 1.0], size)[: vectors.shape[1]]

@@ -1,4 +1,4 @@
-"""The nearest two of each descriptor by exact products of 16-bit numbers, where descriptors are whole and small."""
+"""Find the two nearest neighbours of descriptors of small integers by exact 16-bit products."""
 
 from __future__ import annotations
 
@@ -10,32 +10,32 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.matching.nearest_two import NearestTwo
 from pano_mvs.core.errors import UsageError
 
-# Sums of products stay below 3 × 2^27; what fills up the last block is farther away, and the start is farther still.
+# Sums of products stay below 3 × 2^27; padding of the last block is farther away, and the initial value even farther.
 _MAX_SQUARE = 1 << 27
 _FAR = 1 << 29
 _START = -(1 << 30)
 
 
 def fits_whole_numbers(descriptors: NDArray[np.generic]) -> bool:
-    """Return whether descriptors (N, D) are whole numbers so small that this machine can compare them exactly."""
+    """Return whether descriptors (N, D) are integers small enough for an exact comparison on this machine."""
     from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR
 
     if not HAS_VECTOR:
         return False
-    # The comparison is false for what is not a number, too.
+    # The comparison is also false for NaN.
     greatest = float(np.abs(descriptors).max(initial=0))
     return greatest**2 * descriptors.shape[1] <= _MAX_SQUARE and np.array_equal(descriptors, np.rint(descriptors))
 
 
 def nearest_two_whole(first: NDArray[np.generic], second: NDArray[np.generic]) -> NearestTwo:
-    """Return the nearest two of each descriptor by Euclidean distance, as `nearest_two` does, without rounding.
+    """Return the two nearest neighbours of each descriptor by Euclidean distance, like `nearest_two`, without rounding.
 
     Args:
-        first: (N, D) whole numbers for which `fits_whole_numbers` is true.
+        first: (N, D) integers for which `fits_whole_numbers` is true.
         second: (M, D) likewise, M at least 2.
 
     Raises:
-        UsageError: if there are fewer than two to choose from, or the descriptors do not fit.
+        UsageError: if there are fewer than two to choose from, or the descriptors are unsuitable.
     """
     if len(second) < 2 or first.shape[1] != second.shape[1]:
         raise UsageError(f"cannot find the nearest two among descriptors {second.shape} for descriptors {first.shape}")
@@ -44,14 +44,14 @@ def nearest_two_whole(first: NDArray[np.generic], second: NDArray[np.generic]) -
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PackedDescriptors:
-    """Descriptors in the layout of the compiled comparison, to be compared with many others.
+    """Descriptors in the memory layout of the compiled comparison, to be compared with many others.
 
     Attributes:
         count: number of descriptors, N.
-        rows: (N filled up, D filled up) int16.
-        columns: the same in blocks of columns, pairs of components together.
-        row_squares: (N filled up,) int32 squared lengths.
-        column_squares: likewise, for the number of columns filled up.
+        rows: (padded N, padded D) int16.
+        columns: the same in blocks of columns, with pairs of components together.
+        row_squares: (padded N,) int32 squared lengths.
+        column_squares: likewise, for the padded number of columns.
     """
 
     count: int
@@ -70,7 +70,7 @@ class PackedDescriptors:
         from pano_mvs.algorithms.matching import kernels_vector_match as kernels
 
         if not fits_whole_numbers(descriptors):
-            raise UsageError("descriptors must be small whole numbers, on a machine with vector instructions")
+            raise UsageError("descriptors must be small integers, on a machine with vector instructions")
         rows, columns = _filled_up(descriptors, kernels.ROWS), _filled_up(descriptors, kernels.COLUMNS)
         packed = columns.reshape(-1, kernels.COLUMNS, columns.shape[1] // 2, 2).transpose(0, 2, 1, 3)
         count = len(descriptors)
@@ -78,7 +78,7 @@ class PackedDescriptors:
 
 
 def nearest_two_packed(first: PackedDescriptors, second: PackedDescriptors) -> NearestTwo:
-    """Return what `nearest_two_whole` returns; `second` holds two descriptors at least, of as many components."""
+    """Return the result of `nearest_two_whole`; `second` holds two or more descriptors of the same length."""
     from pano_mvs.algorithms.matching import kernels_vector_match as kernels
 
     state = np.full((len(first.rows), 3, kernels.LANES), _START, np.int32)
@@ -95,7 +95,7 @@ def nearest_two_packed(first: PackedDescriptors, second: PackedDescriptors) -> N
 
 
 def _filled_up(descriptors: NDArray[np.generic], multiple: int) -> NDArray[np.int16]:
-    """Return descriptors as 16-bit numbers, zeros added so that rows are a multiple and columns are even."""
+    """Return descriptors as 16-bit numbers, zero-padded to a multiple of rows and an even number of columns."""
     count, size = descriptors.shape
     filled = np.zeros((-(-count // multiple) * multiple, size + size % 2), np.int16)
     filled[:count, :size] = descriptors
@@ -103,14 +103,14 @@ def _filled_up(descriptors: NDArray[np.generic], multiple: int) -> NDArray[np.in
 
 
 def _squares(descriptors: NDArray[np.int16], count: int) -> NDArray[np.int32]:
-    """Return the squared lengths; those after the first `count` are farther away than any."""
+    """Return the squared lengths; those after the first `count` are larger than any distance."""
     squares = np.full(len(descriptors), _FAR, np.int32)
     squares[:count] = np.einsum("nd,nd->n", descriptors[:count], descriptors[:count], dtype=np.int32)
     return squares
 
 
 def _over_lanes(state: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.intp]]:
-    """Return the greatest and second greatest value of each row, and the first column of the greatest."""
+    """Return the largest and second largest value of each row, and the first column of the largest."""
     best, second, column = state.transpose(1, 0, 2)
     greatest = best.max(axis=1)
     nearest = np.where(best == greatest[:, None], column, np.iinfo(np.int32).max).min(axis=1).astype(np.intp)

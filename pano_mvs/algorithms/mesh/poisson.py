@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import is_file
 
-FEWEST_POINTS = 100
+MIN_POINTS = 100
 _SHALLOWEST, _DEEPEST = 5, 12
 _TOLD = 300
 
-# The solver crashes on some clouds, natively: in a process of its own it takes nobody along. Its own trimming is one of
-# the places, so it is off. With several threads its sums have no order, so the same cloud gives other bytes.
+# The solver crashes on some clouds, so it runs in a separate process. One cause is its own trimming, which is off. With
+# several threads, the order of its sums is undefined, and the same cloud would give different bytes.
 _SOLVE = """
 import sys
 import pycolmap
@@ -30,11 +30,11 @@ pycolmap.poisson_meshing(source, target, options)
 
 
 def poisson_depth(points: NDArray[np.float32], spacing: float) -> int:
-    """Return the depth of an octree whose smallest cells are about as wide as points (N, 3) are apart, 5 to 12.
+    """Return the octree depth whose smallest cells are about as wide as the spacing of points (N, 3), 5 to 12.
 
     Args:
-        points: at least two.
-        spacing: their median distance to their neighbours, scene units.
+        points: at least two points.
+        spacing: median distance to their neighbours, scene units.
     """
     extent = float((points.max(axis=0) - points.min(axis=0)).max())
     cells = max(1.1 * extent / max(spacing, 1e-12), 1.0)  # the solver's cube is a tenth wider than the cloud
@@ -42,13 +42,13 @@ def poisson_depth(points: NDArray[np.float32], spacing: float) -> int:
 
 
 def solve_poisson(cloud_file: Path, folder: Path, *, depth: int, point_weight: float = 1.0) -> Path:
-    """Return the file of a closed surface through oriented points, coloured by them: a PLY file of triangles.
+    """Compute a closed surface through oriented points, with their colours, as a PLY file of triangles.
 
     Args:
         cloud_file: binary PLY with x y z nx ny nz red green blue, normals towards the side that was seen.
-        folder: where the surface is written.
-        depth: of the octree: its smallest cells are the extent / 2^depth wide.
-        point_weight: how much the surface is drawn to the points themselves; 0: the unscreened solver of 2006.
+        folder: folder for the result.
+        depth: depth of the octree; its smallest cells are extent / 2^depth wide.
+        point_weight: how closely the surface follows the points; 0: the unscreened solver of 2006.
 
     Raises:
         InputError: if the solver fails.
@@ -58,6 +58,8 @@ def solve_poisson(cloud_file: Path, folder: Path, *, depth: int, point_weight: f
     done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)  # noqa: S603  # our own
     if done.returncode or not is_file(target):
         said = (done.stderr or done.stdout).strip()[-_TOLD:]
-        raise InputError(f"the Poisson solver ended with code {done.returncode} at depth {depth}: try another `depth`, "
-                         f"or fewer points by `max_points`. It said: {said or 'nothing'}")  # fmt: skip
+        raise InputError(
+            f"the Poisson solver ended with code {done.returncode} at depth {depth}: try another `depth`, or fewer "
+            f"points by `max_points`. Its message: {said or 'none'}"
+        )
     return target

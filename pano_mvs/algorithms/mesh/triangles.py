@@ -1,4 +1,4 @@
-"""A mesh of triangles, and what of it lies near points."""
+"""A triangle mesh, and the removal of parts far from points."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 _NEIGHBOURS = 6
-# A stray point, far from all others, would else keep a large bubble around it.
-_LARGEST_SPACING = 10.0
+# Otherwise a stray point, far from all others, would keep a large bubble around it.
+_MAX_SPACING = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,7 +22,7 @@ class Mesh:
     Attributes:
         vertices_in_world: (V, 3) float32, scene units.
         colors_rgb: (V, 3) uint8.
-        faces: (F, 3) int32 positions of corners, counter-clockwise as seen from where the surface was seen.
+        faces: (F, 3) int32 vertex positions, counter-clockwise as seen from the side that was seen.
     """
 
     vertices_in_world: NDArray[np.float32]
@@ -31,26 +31,26 @@ class Mesh:
 
 
 def point_spacings(points: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return how far the points (N, 3) lie apart around each, (N,): the median distance to its six nearest.
+    """Return the spacing of points (N, 3) around each, (N,): the median distance to its six nearest neighbours.
 
-    Ten times the cloud's median at most.
+    At most ten times the cloud's median.
     """
     count = min(_NEIGHBOURS + 1, len(points))
     distances, _ = cKDTree(points).query(points, k=count)
     spacings: NDArray[np.float64] = np.median(np.asarray(distances)[:, 1:], axis=1)
-    return np.asarray(np.minimum(spacings, _LARGEST_SPACING * np.median(spacings)))
+    return np.asarray(np.minimum(spacings, _MAX_SPACING * np.median(spacings)))
 
 
 def trimmed_mesh(mesh: Mesh, points: NDArray[np.float32], *, max_spacings: float) -> Mesh:
-    """Return the part of a mesh that lies near points: a solver closes what nobody has seen.
+    """Return the part of a mesh near points; a solver also closes surfaces that were not seen.
 
-    A corner stays if it is at most `max_spacings` times as far from the nearest point as points are apart there
-    (`point_spacings`), a triangle if its three corners do.
+    A vertex is kept if its distance to the nearest point is at most `max_spacings` times the point spacing there
+    (`point_spacings`), a triangle if its three vertices are.
 
     Args:
         mesh: the mesh.
-        points: (N, 3) in the world that it was made of, more than one.
-        max_spacings: so many spacings; holes that are less than twice as wide stay closed.
+        points: (N, 3) in the world from which the mesh was made, more than one.
+        max_spacings: maximum distance in point spacings; holes narrower than twice this distance stay closed.
     """
     distances, nearest = cKDTree(points).query(mesh.vertices_in_world)
     near = distances <= max_spacings * point_spacings(points)[nearest]
@@ -58,7 +58,7 @@ def trimmed_mesh(mesh: Mesh, points: NDArray[np.float32], *, max_spacings: float
 
 
 def without_crumbs(mesh: Mesh, *, smallest_share: float) -> Mesh:
-    """Return a mesh without those of its connected parts that have less than a share of all its triangles."""
+    """Return a mesh without connected parts that have less than a given share of all its triangles."""
     count = len(mesh.vertices_in_world)
     starts, ends = mesh.faces[:, [0, 1]].ravel(), mesh.faces[:, [1, 2]].ravel()
     edges = coo_array((np.ones(len(starts), np.int8), (starts, ends)), shape=(count, count))
@@ -69,7 +69,7 @@ def without_crumbs(mesh: Mesh, *, smallest_share: float) -> Mesh:
 
 
 def used_part(mesh: Mesh, faces: NDArray[np.int32]) -> Mesh:
-    """Return some triangles of a mesh, (F, 3) positions of its corners, with the corners that they use."""
+    """Return a subset of a mesh's triangles, (F, 3) vertex positions, with the vertices that they use."""
     used, positions = np.unique(faces, return_inverse=True)
     renumbered = positions.reshape(faces.shape).astype(np.int32)
     return Mesh(mesh.vertices_in_world[used], mesh.colors_rgb[used], renumbered)

@@ -1,18 +1,18 @@
-"""Refinement of a range map by slanted planes: ranges between the planes of a sweep, and normals.
+"""Refine a range map by slanted planes: ranges between the depth hypotheses of a sweep, and normals.
 
-A sweep compares fronto-parallel windows at fixed ranges; what it finds is right to a fraction of a plane and bent on
-slanted surfaces. Here two steps alternate, the data and the smoothness of one energy:
+A sweep compares fronto-parallel windows at fixed ranges; its result is accurate to a fraction of a plane and biased on
+slanted surfaces. Here two steps alternate, the data term and the smoothness term of one energy:
 
-* a plane is laid through the ranges around each pixel, robustly (planes of disparity: Bleyer, Rhemann and Rother,
-  "PatchMatch stereo", 2011, section 3; the sphere's counterpart of disparity is the inverse range q, linear in the ray
-  on a plane: q = p · d);
-* a window on that plane is looked up in the sources through the homography R + t pᵀ of rays, and q is moved to where
-  it is most likely: a Gauss–Newton step on the zero-mean normalised correlation (Lucas and Kanade, 1981) in q and its
-  two slopes, with the plane as a prior whose weight against the pictures is that of the texture they show.
+* a plane is fitted robustly to the ranges around each pixel (planes of disparity: Bleyer, Rhemann and Rother,
+"PatchMatch stereo", 2011, section 3; the sphere's counterpart of disparity is the inverse range q, linear in the ray on
+a plane: q = p · d);
+* a window on that plane is sampled in the sources through the homography R + t pᵀ of rays, and q is moved to its most
+likely value: a Gauss–Newton step on the zero-mean normalised correlation (Lucas and Kanade, 1981) in q and its two
+slopes, with the plane as a prior whose weight depends on the texture of the images.
 
-Of PatchMatch it takes the planes and leaves the random search: started from a sweep there is little to search for, and
-handing on the planes of neighbours by correlation alone spreads the nearer surface over edges that semi-global matching
-had found (measured on four scenes). Nothing is drawn at random, so that a rolled panorama gives the rolled result.
+Unlike PatchMatch, there is no random search: starting from a sweep there is little to search for, and propagating
+planes of neighbours by correlation alone extends the nearer surface across edges that semi-global matching had found
+(measured on four scenes). The method is deterministic, so that a rolled panorama gives the rolled result.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ Mask = NDArray[np.bool_]
 FloatImage = NDArray[np.float32]
 
 _LUMA = np.array([0.2126, 0.7152, 0.0722])
-# A refined range is at most so many times the farthest swept one.
+# Maximum of a refined range, relative to the farthest swept one.
 _BEYOND = 1.5
-# Samples of a window are neighbours, and not independent: of 25 so many count.
+# Samples of a window are neighbours, and not independent: 25 samples count as this many.
 _SAMPLES = 10.0
-# No step is larger, in pixels of the reference at the widest baseline: beyond that pictures are not linear.
-_LARGEST_STEP_PX = 0.5
-# Neighbours on a plane differ in range by less than this share a radian: the tangent of a slant of 58°.
+# Maximum step, in pixels of the reference at the widest baseline: beyond it, images are not linear.
+_MAX_STEP_PX = 0.5
+# Maximum relative difference in range of neighbours on a plane per radian: the tangent of a slant of 58°.
 _MAX_SLOPE = 1.6
 _FIT_RADIUS = 3
 _SMALLEST_SIDE = 16
-# A window reaches two pixels a sample from its centre, and half as far again in a source that is nearer.
+# A window extends two pixels per sample from its centre, and one and a half times as far in a source that is nearer.
 _SOURCE_REACH = 3.0
 
 
@@ -64,42 +64,49 @@ def refine_range(
     sigma_color: float = 25.0,
     source_masks: Sequence[Mask | None] | None = None,
 ) -> RangeMap:
-    """Return a range map with the ranges between those that were tried, and with normals.
+    """Refine ranges between the depth hypotheses, and estimate normals.
 
     Args:
-        range_map: (H, W) of the reference, full sphere, right to about a pixel of parallax; pixels that were filled
-            (confidence 1–63) stay as they are, and invalid ones stay invalid.
+        range_map: (H, W) of the reference, full sphere, accurate to about a pixel of parallax; filled pixels
+            (confidence 1–63) do not change, and invalid ones stay invalid.
         reference: (H, W, 3) uint8 RGB.
         sources: one or more (Hs, Ws, 3) uint8 RGB, each of its own size.
-        source_from_reference: the pose of each source.
-        rounds: how often planes are laid and matched.
-        window: samples along either side of the window that is matched, odd; they are two pixels apart.
-        prior_px: standard deviation of a plane's range before the pictures are looked at, in pixels of parallax at the
-            widest baseline.
-        prior_slope: the same of its slopes, in pixels of parallax for each pixel.
-        noise: standard deviation of a grey level where pictures agree as well as they can.
-        sigma_color: samples that differ from the window's centre by so many grey levels count half.
-        source_masks: for each source (Hs, Ws), False where it has no vote, or None.
+        source_from_reference: pose of each source relative to the reference.
+        rounds: number of rounds of fitting and matching planes.
+        window: number of samples along each side of the window, odd; they are two pixels apart.
+        prior_px: standard deviation of the prior of a plane's range, in pixels of parallax at the widest baseline.
+        prior_slope: standard deviation of the prior of its slopes, in pixels of parallax per pixel.
+        noise: standard deviation of image noise in grey levels, at best agreement.
+        sigma_color: difference from the window's centre in grey levels at which a sample has half weight.
+        source_masks: for each source (Hs, Ws), False where it is ignored, or None.
 
     Returns:
-        Ranges and normals; confidences are those given.
+        Ranges and normals; confidences are unchanged.
 
     Raises:
-        UsageError: if shapes do not fit together or a parameter is out of bounds.
+        UsageError: if shapes do not match or a parameter is out of bounds.
     """
     _check(range_map, reference, sources, source_from_reference, source_masks)
     if rounds < 0 or window < 3 or window % 2 == 0 or min(prior_px, prior_slope, noise, sigma_color) <= 0:
-        raise UsageError(f"rounds must not be negative, window odd and at least 3, the others positive, got {rounds}, "
-                         f"{window}, {prior_px}, {prior_slope}, {noise}, {sigma_color}")  # fmt: skip
+        raise UsageError(
+            f"rounds must not be negative, window odd and at least 3, the others positive, got {rounds}, "
+            f"{window}, {prior_px}, {prior_slope}, {noise}, {sigma_color}"
+        )
     import numba  # slow to import
 
     from pano_mvs.algorithms.patchmatch import kernels_planes, kernels_refine  # compile on import
 
     height, width = range_map.range.shape
-    # The inverse range that moves a point by one pixel at the widest baseline.
+    # The change of inverse range that moves a point by one pixel at the widest baseline.
     pixel_q = 2 * np.pi / width / max(float(np.linalg.norm(pose.translation)) for pose in source_from_reference)
-    numbers = (np.float32(1 / sigma_color), np.float32(noise**2), (prior_px * pixel_q) ** -2,
-               (prior_slope * pixel_q) ** -2, _SAMPLES, np.float32(_LARGEST_STEP_PX * pixel_q))  # fmt: skip
+    numbers = (
+        np.float32(1 / sigma_color),
+        np.float32(noise**2),
+        (prior_px * pixel_q) ** -2,
+        (prior_slope * pixel_q) ** -2,
+        _SAMPLES,
+        np.float32(_MAX_STEP_PX * pixel_q),
+    )
     offsets = column_offsets((height, width), 2 * (window // 2), spherical=True)[:, ::2].copy()
     stretches = column_stretch(height, spherical=True)
     near_offsets = column_offsets((height, width), _FIT_RADIUS, spherical=True)
@@ -128,9 +135,9 @@ def refine_range(
 
 
 def _range_map_from_planes(planes: FloatImage, before: RangeMap, seen: Mask) -> RangeMap:
-    """Return the ranges along the rays and the normals of planes (3, H, W) where they mean something.
+    """Return the ranges along the rays and the normals of planes (3, H, W) where they are meaningful.
 
-    A plane that meets its ray far outside of all that was swept was led there by chance: the swept range stays.
+    A plane that intersects its ray far outside of the swept ranges is an accident: the swept range is kept.
     """
     height, width = before.range.shape
     inverse = np.einsum("ahw,hwa->hw", planes.astype(np.float64), ray_grid((height, width)))
@@ -140,7 +147,7 @@ def _range_map_from_planes(planes: FloatImage, before: RangeMap, seen: Mask) -> 
     ranges = np.divide(1.0, inverse, out=before.range.astype(np.float64), where=met)
     length = np.linalg.norm(planes, axis=0)
     normals = np.full((height, width, 3), np.nan, np.float16)
-    # p · ray > 0 at the surface, so −p looks back at the camera.
+    # p · ray > 0 at the surface, so −p points back to the camera.
     normals[met] = -(planes[:, met] / length[met]).T
     return RangeMap(ranges.astype(np.float32), before.confidence, normals)
 
@@ -148,7 +155,7 @@ def _range_map_from_planes(planes: FloatImage, before: RangeMap, seen: Mask) -> 
 def _reference_arrays(
     reference: Picture, offsets: NDArray[np.int64], stretches: NDArray[np.float64]
 ) -> tuple[object, ...]:
-    """Return what the kernels read of the reference picture, see `refine_rows`."""
+    """Return the kernels' arguments for the reference image, see `refine_rows`."""
     width = reference.shape[1]
     rows = offsets[len(offsets) // 2]
     pad = max(int(offsets.max()), int(rows[-1]))
@@ -160,7 +167,7 @@ def _reference_arrays(
 def _source_arrays(
     sources: Sequence[Picture], poses: Sequence[Rigid3], masks: Sequence[Mask | None] | None, *, reach: float
 ) -> tuple[object, ...]:
-    """Return what the kernels read of the sources, see `sum_windows`; windows reach so many picture heights far."""
+    """Return the kernels' arguments for the sources, see `sum_windows`; `reach`: window size in image heights."""
     pictures = [_packed(np.rint(256 * (source @ _LUMA)).astype(np.uint64)).ravel() for source in sources]
     starts = np.cumsum([0, *(len(picture) for picture in pictures)])[:-1]
     valid = np.zeros(0, np.uint8)
@@ -175,7 +182,7 @@ def _source_arrays(
 
 
 def _packed(plane: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Return all 2×2 patches of a plane of 16-bit numbers, (H, W) to (H + 1, W + 1), over the seam and the poles.
+    """Return all 2×2 patches of a plane of 16-bit numbers, (H, W) to (H + 1, W + 1), across the seam and the poles.
 
     Patch (j, i) is upper left | lower left << 16 | upper right << 32 | lower right << 48 of rows j − 1, j and columns
     i − 1, i.
@@ -193,17 +200,21 @@ def _check(
     poses: Sequence[Rigid3],
     masks: Sequence[Mask | None] | None,
 ) -> None:
-    """Raise UsageError unless shapes and numbers fit together."""
+    """Raise UsageError unless shapes and numbers match."""
     if len(sources) == 0 or len(poses) != len(sources) or (masks is not None and len(masks) != len(sources)):
-        raise UsageError(f"refinement needs one pose (and one mask, if any) for each of one or more sources, got "
-                         f"{len(sources)} sources, {len(poses)} poses")  # fmt: skip
+        raise UsageError(
+            f"refinement needs one pose (and one mask, if any) for each of one or more sources, got "
+            f"{len(sources)} sources, {len(poses)} poses"
+        )
     if reference.shape != (*range_map.range.shape, 3):
-        raise UsageError(f"the reference must have the size of its range map, (*{range_map.range.shape}, 3), got "
-                         f"{reference.shape}")  # fmt: skip
+        raise UsageError(
+            f"the reference must have the size of its range map, (*{range_map.range.shape}, 3), got {reference.shape}"
+        )
     for name, picture in [("reference", reference), *((f"source {idx}", s) for idx, s in enumerate(sources))]:
         if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or picture.shape[1] % 2:
-            raise UsageError(f"{name}: refinement needs (H, W, 3) uint8 RGB of even width, got {picture.shape} "
-                             f"{picture.dtype}")  # fmt: skip
+            raise UsageError(
+                f"{name}: refinement needs (H, W, 3) uint8 RGB of even width, got {picture.shape} {picture.dtype}"
+            )
         if min(picture.shape[:2]) < _SMALLEST_SIDE:
             raise UsageError(
                 f"{name}: refinement needs at least {_SMALLEST_SIDE} pixels on a side, got {picture.shape}"
@@ -212,4 +223,4 @@ def _check(
         if mask is not None and mask.shape != sources[idx].shape[:2]:
             raise UsageError(f"source {idx}: its mask must be {sources[idx].shape[:2]}, got {mask.shape}")
     if not any(np.linalg.norm(pose.translation) > 0 for pose in poses):
-        raise UsageError("no source was taken from another place than the reference: ranges cannot be seen")
+        raise UsageError("all sources were taken from the same place as the reference, so ranges cannot be measured")

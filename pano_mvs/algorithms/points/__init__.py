@@ -1,1 +1,1 @@
-"""Few points out of many range maps: evenly spread, each with the views that see it."""
+"""Select evenly distributed points from many range maps, with the views that see them."""

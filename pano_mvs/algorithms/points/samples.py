@@ -1,4 +1,4 @@
-"""Points of the surfaces that one view sees, evenly spread over its sphere."""
+"""Sample the surfaces that one view sees, evenly over its sphere."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ def sample_surface(
 ) -> SurfaceSamples:
     """Return points of the surfaces that a view sees, one for each of `count` evenly spread directions.
 
-    No place of the sphere is sampled more densely than another; a point lies on the ray through its pixel's centre.
-    Directions that are masked or have no range of enough confidence give no point, and no pixel gives two.
+    The density of samples is uniform on the sphere; a point is on the ray through its pixel's centre. Directions that
+    are masked or have no range of sufficient confidence give no point, and no pixel gives two.
 
     Args:
         image: (H, W, 3) uint8 RGB.
-        valid: (H, W) bool, False is to be ignored.
+        valid: (H, W) bool; False is ignored.
         range_map: of the same size.
-        count: how many directions.
-        min_confidence: ranges below are not used; from 128 on other views confirm them.
+        count: number of directions.
+        min_confidence: minimum confidence of ranges; from 128 on, other views confirm them.
 
     Raises:
         UsageError: if the sizes differ.
     """
     size_hw = (range_map.range.shape[0], range_map.range.shape[1])
     if image.shape[:2] != size_hw or valid.shape != size_hw:
-        raise UsageError(f"picture {image.shape[:2]}, mask {valid.shape} and range map {size_hw} differ in size")
+        raise UsageError(f"image {image.shape[:2]}, mask {valid.shape} and range map {size_hw} differ in size")
     whole = np.floor(pixel_from_ray(spiral_rays(count), size_hw)).astype(np.intp)
     row, column = np.minimum(whole[:, 1], size_hw[0] - 1), whole[:, 0] % size_hw[1]
     pixels = np.unique(row * size_hw[1] + column)

@@ -1,4 +1,4 @@
-"""Few points out of many, evenly spread."""
+"""Select evenly distributed points."""
 
 from __future__ import annotations
 
@@ -12,33 +12,33 @@ from pano_mvs.core.errors import UsageError
 
 _STEPS = 24
 _EXCESS = 0.02
-# What the voxels leave for the discs to choose from, and how many of a point's neighbours those look at: points lie on
+# Ratio of points after voxel selection, and number of a point's neighbours to examine for discs: points are on
 # surfaces, where no more fit around one.
 _CHOICE, _NEIGHBOURS = 2.5, 16
 _LEVELS_PER_OCTAVE = 3
-# Odd numbers without structure, which spread the places of voxels over all 64-bit numbers.
+# Odd numbers without structure, to hash the positions of voxels to 64-bit numbers.
 _MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9, 0xD6E8FEB86659FD93], np.uint64)
 
 
 def spread_points(
     points: NDArray[np.float64], spacing: NDArray[np.float64], count: int, rng: np.random.Generator
 ) -> NDArray[np.intp]:
-    """Return which points to keep so that `count` are left whose distances to their neighbours go with `spacing`.
+    """Select `count` points whose distances to their neighbours are proportional to `spacing`.
 
-    Two steps, each with the largest width, to about 2 %, that leaves enough. First space is divided into voxels with
-    edges that go with the spacing, rounded to one of a few sizes; of those in one voxel the point nearest to its centre
-    stays: about 2.5 times as many as are wanted. Then, in a random order, a point stays unless one that does is closer
-    than a disc's radius, which goes with the spacing (Poisson discs: Cook, "Stochastic sampling in computer graphics",
-    1986). The rest of the excess is drawn.
+    There are two steps, each with the largest width, to about 2 %, that leaves enough points. First, space is divided
+    into voxels with edges proportional to the spacing, rounded to one of a few sizes, and the point nearest to each
+    voxel's centre is kept, about 2.5 times the wanted number. Then, in random order, a point is kept unless a kept one
+    is closer than a disc's radius, which is proportional to the spacing (Poisson discs: Cook, "Stochastic sampling in
+    computer graphics", 1986). The remaining excess is removed at random.
 
     Args:
         points: (M, 3).
-        spacing: (M,) wanted distance to the neighbours at each point, of any unit: only ratios count.
-        count: how many to keep; all if there are no more.
-        rng: what the order and the excess are drawn from.
+        spacing: (M,) wanted distance to the neighbours at each point, in any unit: only ratios matter.
+        count: number of points to keep; all, if there are fewer.
+        rng: draws the order and the excess.
 
     Returns:
-        (min(count, M),) positions in `points`, rising.
+        (min(count, M),) positions in `points`, ascending.
 
     Raises:
         UsageError: if shapes disagree or a spacing is not positive.
@@ -53,7 +53,7 @@ def spread_points(
 
 
 def _widest(low: float, high: float, wanted: int, left: Callable[[float], int]) -> float:
-    """Return the largest width between two, to about 2 % of what is wanted, that leaves that much; `left` falls."""
+    """Return the largest width between two limits, to about 2 %, that leaves enough points; `left` is decreasing."""
     for _ in range(_STEPS):
         middle = float(np.sqrt(low * high))
         found = left(middle)
@@ -79,14 +79,14 @@ def _one_per_voxel(points: NDArray[np.float64], spacing: NDArray[np.float64], wa
 def _discs(
     points: NDArray[np.float64], spacing: NDArray[np.float64], wanted: int, rng: np.random.Generator
 ) -> NDArray[np.intp]:
-    """Return points no two of which are closer than the lesser of their discs' radii."""
+    """Return points of which no two are closer than the smaller of their discs' radii."""
     order = rng.permutation(len(points))
     ranks = list(range(2, min(_NEIGHBOURS, len(points)) + 1))
     distance, neighbour = (np.asarray(found) for found in cKDTree(points).query(points, k=ranks))
     first = np.repeat(np.arange(len(points)), distance.shape[1])
     second = neighbour.ravel()
     width = distance.ravel() / np.minimum(spacing[first], spacing[second])
-    later = order[first] > order[second]  # each pair but once or twice, the later one first
+    later = order[first] > order[second]  # each pair occurs once or twice, once with the later one first
     first, second = np.where(later, first, second), np.where(later, second, first)
 
     def left(radius: float) -> NDArray[np.intp]:
@@ -98,7 +98,7 @@ def _discs(
 
 
 def _undisturbed(later: NDArray[np.intp], earlier: NDArray[np.intp], total: int) -> NDArray[np.intp]:
-    """Return who stays if, of pairs of which both cannot, the earlier one stays unless it went before."""
+    """Return the points to keep, given conflicting pairs: the earlier one is kept unless it was removed before."""
     stays, open_ = np.zeros(total, np.bool_), np.ones(total, np.bool_)
     while open_.any():
         waits = np.zeros(total, np.bool_)
@@ -113,7 +113,7 @@ def _undisturbed(later: NDArray[np.intp], earlier: NDArray[np.intp], total: int)
 
 
 def _voxels(points: NDArray[np.float64], edges: NDArray[np.float64], levels: NDArray[np.float64]) -> NDArray[np.uint64]:
-    """Return a number for the voxel of each point; that two voxels share one is as good as impossible."""
+    """Return a hash of the voxel of each point; collisions are practically impossible."""
     places = np.concatenate([np.floor(points / edges[:, None]), levels[:, None]], axis=1)
     keys = np.zeros(len(points), np.uint64)
     for axis in range(4):
@@ -130,7 +130,7 @@ def _occupied(points: NDArray[np.float64], edges: NDArray[np.float64], levels: N
 def _nearest_to_centers(
     points: NDArray[np.float64], edges: NDArray[np.float64], levels: NDArray[np.float64]
 ) -> NDArray[np.intp]:
-    """Return of each occupied voxel the point nearest to its centre, the first of several."""
+    """Return the point nearest to the centre of each occupied voxel, the first one for ties."""
     place = points / edges[:, None]
     distance = np.square(place - np.floor(place) - 0.5).sum(axis=1)
     keys = _voxels(points, edges, levels)

@@ -1,4 +1,4 @@
-"""Points of many range maps with the views that see them: what splat trainers begin with."""
+"""Points of many range maps with the views that see them, to initialise Gaussian splatting."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from pano_mvs.scene.tracked_points import TrackedPoints
 
 FloatArray = NDArray[np.float64]
 
-# Even in space would leave what is near to a camera coarse, even in every view what is far away; so half of each: the
-# distance of neighbouring points goes with the square root of the distance from the nearest camera.
+# Uniform density in space would be too coarse near cameras, uniform density in every view too coarse far away. So the
+# distance of neighbouring points is proportional to the square root of the distance to the nearest camera.
 _SPACING_POWER = 0.5
 _MAX_SURFACE_STEP = 0.05
 _MAX_REPROJECTION_PX = 1.0
-# More points than are wanted go into the test of who sees them, since some fail it.
+# Factor on the number of points that are tested for visibility, since some fail.
 _SURPLUS = 1.3
-_MOST_CANDIDATES = 12_000_000
+_MAX_CANDIDATES = 12_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Candidates:
-    """Points of all views: in the world (M, 3), position of the view that each is of (M,), colour (M, 3)."""
+    """Points of all views: in the world (M, 3), index of the source view (M,), colour (M, 3)."""
 
     points: FloatArray
     home_idx: NDArray[np.int32]
@@ -44,7 +44,7 @@ class _Candidates:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sightings:
-    """Who sees what: position of the point and of the view (T,), unit ray in the view (T, 3), error in radians (T,)."""
+    """Visibility: index of the point and of the view (T,), unit ray in the view (T, 3), error in radians (T,)."""
 
     point_idx: NDArray[np.intp]
     view_idx: NDArray[np.intp]
@@ -64,23 +64,24 @@ def track_points(
     max_relative_error: float = 0.02,
     min_confidence: int = 64,
 ) -> TrackedPoints:
-    """Return evenly spread points of range maps, each with the views that see it.
+    """Select evenly distributed points of range maps, each with the views that see it.
 
-    Points are spread (`spread_points`) so that the distance between neighbours goes with the square root of that from
-    the nearest camera. A view sees a point if its own range there agrees, forward and backward, by the test of
-    `check_consistency`, with a range of at least `min_confidence`; what is hidden or masked does not agree. Groups of
-    poses get points by the number of their views, each in its own world; no point is seen from two of them.
+    Points are selected (`spread_points`) so that the distance between neighbours is proportional to the square root of
+    the distance to the nearest camera. A view sees a point if its own range there agrees, forward and backward, by the
+    test of `check_consistency`, with a confidence of at least `min_confidence`; occluded or masked points do not agree.
+    Groups of poses get points in proportion to their number of views, each in its own world frame; no point is seen
+    from two groups.
 
     Args:
         samples: image name to points of its surfaces.
-        poses: of the images; names that it lacks are left out.
+        poses: poses of the images; images without a pose are ignored.
         load_range: image name to its range map; called once for each.
-        rng: what excess points are drawn with.
-        count: how many points are wanted; there may be fewer.
-        min_views: points that fewer views see are left out; in a group of fewer views, those that not all of them see.
-        neighbours: so many views, the nearest to a point, are asked.
+        rng: draws excess points.
+        count: wanted number of points; there may be fewer.
+        min_views: minimum number of views that see a point; in a smaller group, all of its views.
+        neighbours: number of nearest views to test for each point.
         max_relative_error: largest relative difference between a view's range and the point's distance.
-        min_confidence: a view's range of a lower confidence does not see.
+        min_confidence: minimum confidence of a view's range.
 
     Raises:
         UsageError: if a number is not positive.
@@ -170,8 +171,8 @@ def _candidates(
     pose_idx: NDArray[np.intp],
     rng: np.random.Generator,
 ) -> _Candidates:
-    """Return the samples of all views in the world, thinned at random if there are too many to sort."""
-    share = min(1.0, _MOST_CANDIDATES / max(sum(len(samples[name]) for name in names), 1))
+    """Return the samples of all views in the world, thinned at random if there are too many."""
+    share = min(1.0, _MAX_CANDIDATES / max(sum(len(samples[name]) for name in names), 1))
     points, homes, colors = [np.zeros((0, 3))], [np.zeros(0, np.int32)], [np.zeros((0, 3), np.uint8)]
     for idx, name in enumerate(names):
         view = samples[name]
@@ -184,8 +185,8 @@ def _candidates(
 
 
 def _asked(tree: cKDTree, chosen: _Candidates, neighbours: int) -> list[NDArray[np.intp]]:
-    """Return for each view the points that it is asked about: those among whose nearest views it is, and its own."""
-    # A list of ranks, since for k=1 alone the query leaves out an axis.
+    """Return for each view the points to test: those for which it is among the nearest views, and its own."""
+    # A list of ranks, because for k=1 the query drops an axis.
     nearest = np.asarray(tree.query(chosen.points, k=list(range(1, neighbours + 1)))[1])
     point_idx = np.repeat(np.arange(len(nearest)), neighbours)
     view_idx = nearest.ravel()
@@ -206,7 +207,7 @@ def _sightings(
     range_map: RangeMap,
     limits: FloatArray,
 ) -> _Sightings:
-    """Return which of the points that one view is asked about it sees."""
+    """Return which of the tested points a view sees."""
     from pano_mvs.algorithms.points.kernels_seen import see_points  # compiles on import
 
     points, homes = chosen.points[asked], centers[chosen.home_idx[asked]]
@@ -230,11 +231,11 @@ def _joined(found: list[_Sightings]) -> _Sightings:
 
 
 def _tracked(names: list[str], chosen: _Candidates, sightings: _Sightings, kept: NDArray[np.intp]) -> TrackedPoints:
-    """Return the points that are kept with their tracks, in the order of the views."""
+    """Return the selected points with their tracks, in the order of the views."""
     total = len(chosen.points)
     number = np.full(total, -1, np.int32)
     number[kept] = np.arange(len(kept), dtype=np.int32)
-    # The view that a point is from puts it where it is: its error of nothing is no evidence.
+    # The view that a point comes from determines its position: its zero error is no evidence.
     others = sightings.view_idx != chosen.home_idx[sightings.point_idx]
     errors = np.bincount(sightings.point_idx[others], sightings.errors_rad[others], minlength=total)
     confirming = np.bincount(sightings.point_idx[others], minlength=total)

@@ -1,4 +1,4 @@
-"""Register new panoramas against cameras that are known already and do not move."""
+"""Register new panoramas with cameras whose poses are known and stay fixed."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ def extend_poses(
     max_error_deg: float = 0.4,
     min_angle_deg: float = 1.0,
 ) -> Poses:
-    """Return known poses, not moved by a digit, with those of new images that see their points.
+    """Register new images with known cameras; the known poses stay exactly as they are.
 
-    The tracks of the known cameras are triangulated; every new image is attached by its pairs with registered ones,
-    and its pose refined by resection against the points (angular, robust). When all are attached the points are
-    triangulated again from old and new cameras, and the new ones refined against them, a few times.
+    Tracks are triangulated from the known cameras. Each new image is placed by its pairs with registered images, and
+    its pose is refined by resection against the points (angular, robust). When all images are placed, points are
+    triangulated again from old and new cameras, and the new cameras are refined against them, a few times.
 
     Args:
-        known: poses by the names of `features`; others are left out. Its points are replaced.
+        known: poses by the names in `features`; others are ignored. The points of these poses are replaced.
         features: key points by image name, in the capture's order.
         two_views: verified pairs.
-        max_error_deg: observations further off than this give no point.
-        min_angle_deg: smallest angle between the rays of a point seen twice.
+        max_error_deg: observations with a larger error are dropped.
+        min_angle_deg: smallest angle between the rays of a point that is seen twice.
 
     Returns:
-        The images in the capture's order, in the frame and unit of the known ones; what cannot be attached is in
-        `rejected`, with the reason.
+        Poses of all registered images in the capture's order, in the frame and unit of the known poses. Images that
+        cannot be registered are in `rejected`, with the reason.
     """
     names = tuple(features)
     edges = consistent_edges(names, two_views)
@@ -69,7 +69,7 @@ def extend_poses(
 
 
 def _settled(model: GrowingModel, new: list[int]) -> None:
-    """Refine new cameras and points in turn; the other cameras stay."""
+    """Refine new cameras and points in turn; the other cameras stay fixed."""
     for _ in range(_ROUNDS if new else 0):
         model.triangulate()
         for image in new:

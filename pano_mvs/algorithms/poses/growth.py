@@ -1,4 +1,4 @@
-"""Grow a model from a seed pair: the image that its pairs place most clearly comes first."""
+"""Grow a model from a seed pair, adding first the image whose pose its pairs determine most clearly."""
 
 from __future__ import annotations
 
@@ -25,27 +25,27 @@ from pano_mvs.core.text import plural
 from pano_mvs.geometry import Rigid3
 
 _FULL_PARALLAX_DEG = 10.0
-_SEEDS = 12  # seeds of which the support by third images is computed
+_SEEDS = 12  # number of seeds whose support by third images is computed
 _THIRDS = 8
-_MAX_GROWN = 3  # seeds from which models are grown
-_ADJUST_GROWTH = 1.25  # all cameras are adjusted whenever there are a quarter more than at the last time
-_LOOKED_AT = 6  # images that are placed before the clearest of them is added, where none is clear
-_MIN_SHARE = 0.5  # of an image's pairs, by weight, that agree with a clear placement
-_CLEAR = 0.8  # a runner-up with more than this share of the best score leaves a placement in doubt …
-_CLEAR_WITH_IMAGES = 0.4  # … and with more than this where there is somebody to ask
-_SATISFYING = 0.85  # share of the pairs explained with which the first model is good enough
-_CERTAIN = 0.97  # share of the pairs explained from which the images are not asked
+_MAX_GROWN = 3  # number of seeds from which models are grown
+_ADJUST_GROWTH = 1.25  # all cameras are adjusted each time their number has grown by this factor
+_LOOKED_AT = 6  # images that are placed before the clearest of them is added, if none is clear by itself
+_MIN_SHARE = 0.5  # share of an image's pairs, by weight, that must agree with a clear placement
+_CLEAR = 0.8  # a placement is in doubt if the runner-up has more than this share of the best score …
+_CLEAR_WITH_IMAGES = 0.4  # … or more than this if the images can decide
+_SATISFYING = 0.85  # the first model is accepted if it explains this share of the pairs
+_CERTAIN = 0.97  # the images are not consulted if the model explains this share of the pairs
 _RIVALS = 2
 
 
 @dataclass(frozen=True, eq=False)
 class GrownModel:
-    """A model with what could not be added to it.
+    """A model, and the images that could not be added to it.
 
     Attributes:
         model: the cameras.
-        refused: images that could not be added, with the reason.
-        arbitration: what the images say about the cameras; None if they were not asked.
+        refused: position of each image that could not be added, to the reason.
+        arbitration: result of the check against the images; None if the images were not consulted.
         aliased: whether runner-up geometries of several pairs suggest the same move of a block of cameras.
     """
 
@@ -55,7 +55,7 @@ class GrownModel:
     aliased: bool = False
 
     def satisfies(self) -> bool:
-        """Return whether no other model need be tried."""
+        """Return whether no other model needs to be tried."""
         if self.refused or self.aliased:
             return False
         if self.arbitration is None:
@@ -63,10 +63,10 @@ class GrownModel:
         return not self.arbitration.doubts and not self.arbitration.removed
 
     def rank(self) -> tuple[float, float]:
-        """Return what models are sorted by: how much of the images and of the pairs they explain in all.
+        """Return the sort key of models: the share of images and pairs that they explain, best first.
 
-        Cameras that are doubtful confirm nothing: a model in which all cameras are confirmed about as expected is
-        better than one in which most are confirmed a little more and one hardly is.
+        Doubtful cameras do not count as confirmed. A model in which all cameras are confirmed about as expected is
+        better than one in which most are confirmed slightly more and one is hardly confirmed.
         """
         confirmed = 0.0
         if self.arbitration is not None:
@@ -78,22 +78,22 @@ class GrownModel:
 def grown_models(
     pairs: Pairs, images: Collection[int], *, adjust: bool, confirmation: Confirmation | None
 ) -> list[GrownModel]:
-    """Return models of a connected group of images, the one that explains the pairs best first.
+    """Return models of a connected group of images, the model that explains the pairs best first.
 
     Args:
-        pairs: of the capture.
-        images: of the group.
+        pairs: all pairs of the capture.
+        images: positions of the images of the group.
         adjust: whether all cameras are adjusted as the model grows.
-        confirmation: decides between placements, and between models, that the pairs do not decide; asked only then.
+        confirmation: consulted only where the pairs cannot decide between placements or between models.
     """
     models: list[GrownModel] = []
     tried: set[tuple[Edge, int]] = set()
     while seeds := ranked_seeds(pairs, images, without=tried):
         edge, rank = seeds[0]
         models.append(_grown(pairs, images, edge, rank, adjust=adjust, confirmation=confirmation))
-        # A seed that a model agrees with would lead to the same model again.
+        # A seed that agrees with this model would lead to the same model again.
         tried |= {seeds[0], *models[-1].model.chosen.items()}
-        # Seeds that nothing attaches to are not worth a try.
+        # Do not try seeds that no image can be attached to.
         grown = sum(len(found.model.cameras) > 2 for found in models)
         if models[-1].satisfies() or grown == _MAX_GROWN or len(models) == 2 * _MAX_GROWN:
             break
@@ -104,7 +104,7 @@ def grown_models(
 
 
 def _arbitrated(grown: GrownModel, *, adjust: bool, confirmation: Confirmation) -> GrownModel:
-    """Return a model in which cameras and blocks of cameras stand where the images confirm most."""
+    """Return a model in which cameras and blocks of cameras are where the images confirm them best."""
     arbitration = arbitrate(grown.model, confirmation)
     if arbitration.moved:
         settle(grown.model, adjust=adjust, confirmation=confirmation)
@@ -114,15 +114,15 @@ def _arbitrated(grown: GrownModel, *, adjust: bool, confirmation: Confirmation) 
 def ranked_seeds(
     pairs: Pairs, images: Collection[int], *, without: Collection[tuple[Edge, int]] = ()
 ) -> list[tuple[Edge, int]]:
-    """Return pairs with the geometry to begin with, the best first.
+    """Return candidate seeds, best first: pairs, each with the rank of the geometry to start from.
 
-    Much weight and enough parallax make a good seed, and third images that both of its cameras place alike. A seed
-    with a false geometry has few of those.
+    A good seed has a large weight and sufficient parallax, and its two cameras agree on the poses of third images. A
+    seed with a false geometry is rarely supported by third images.
 
     Args:
-        pairs: of the capture.
-        images: of the group.
-        without: seeds that are not wanted.
+        pairs: all pairs of the capture.
+        images: positions of the images of the group.
+        without: seeds to leave out.
     """
     members = set(images)
 
@@ -145,7 +145,7 @@ def ranked_seeds(
 
 
 def _support(pairs: Pairs, edge: Edge, rank: int) -> float:
-    """Return how much third images speak for a seed: the weight of what both of its cameras agree on."""
+    """Return the support of a seed by third images: the weight of the placements on which both cameras agree."""
     model = PlacedModel(pairs)
     model.seed(edge, rank)
     thirds = [idx for idx in pairs.partners[edge[0]] if idx in pairs.partners[edge[1]]][:_THIRDS]
@@ -161,7 +161,7 @@ def _support(pairs: Pairs, edge: Edge, rank: int) -> float:
 def _grown(
     pairs: Pairs, images: Collection[int], edge: Edge, rank: int, *, adjust: bool, confirmation: Confirmation | None
 ) -> GrownModel:
-    """Return the model that grows from a seed, and why images were refused."""
+    """Return the model that grows from a seed, and the reasons for images that could not be added."""
     model = PlacedModel(pairs)
     model.seed(edge, rank)
     left = set(images) - set(edge)
@@ -196,7 +196,7 @@ def _grown(
 
 
 def _count_pairs(pairs: Pairs, image: int, left: Collection[int], weights: dict[int, float]) -> None:
-    """Add the pairs of an image that was registered to the weights of its partners that are not."""
+    """Add the pairs of a newly registered image to the weights of its unregistered partners."""
     for partner in pairs.partners[image]:
         if partner in left:
             edge = min(image, partner), max(image, partner)
@@ -204,7 +204,7 @@ def _count_pairs(pairs: Pairs, image: int, left: Collection[int], weights: dict[
 
 
 def _unsupported(model: PlacedModel, image: int) -> str:
-    """Return why a camera of the seed, which nothing has checked yet, does not fit the others; "" if it does."""
+    """Return why an unchecked camera of the seed does not fit the other cameras; "" if it does."""
     if len(model.cameras) < 4:
         return ""
     without = model.copy()
@@ -226,9 +226,9 @@ def _next(
     """Return the image to add next and its pose; None if none can be added.
 
     Args:
-        model: to be added to.
-        weights: images that share pairs with registered ones, with the weight of these pairs.
-        confirmation: of the images.
+        model: the model to extend.
+        weights: unregistered images that share pairs with registered ones, to the total weight of these pairs.
+        confirmation: decides between rival placements by the images; None if the pairs alone decide.
         reasons: receives why an image cannot be added yet.
     """
     order = sorted(weights, key=lambda idx: (-weights[idx], idx))
@@ -255,7 +255,7 @@ def _next(
 def _by_images(
     model: PlacedModel, image: int, found: list[Placement], confirmation: Confirmation | None
 ) -> list[Placement]:
-    """Return the placements in the order in which they are to be tried: where they are rivals the images decide."""
+    """Return placements in the order in which to try them; the images decide between rivals."""
     rivals = [placement for placement in found[:_RIVALS] if placement.score > _CLEAR_WITH_IMAGES * found[0].score]
     if confirmation is None or len(rivals) < 2:
         return found[:_RIVALS]
@@ -266,7 +266,7 @@ def _by_images(
 def _accepted(
     model: PlacedModel, image: int, witnesses: Witnesses, placement: Placement, reasons: dict[int, str]
 ) -> Rigid3 | None:
-    """Return the pose of a placement polished on known points, or None if it sees too few of them; notes the reason."""
+    """Return the refined pose of a placement; None, noting the reason, if too few known points support it."""
     pose, support, known = model.polished(image, witnesses, placement)
     agreeing = len(set(witnesses.partner[placement.explained].tolist()))
     if enough_points(support, known, agreeing=agreeing):
@@ -276,7 +276,7 @@ def _accepted(
 
 
 def settle(model: PlacedModel, *, adjust: bool, confirmation: Confirmation | None) -> None:
-    """Adjust a grown model, choose geometries again, and move cameras that their pairs place elsewhere by now."""
+    """Adjust a grown model, choose geometries again, and move cameras whose pairs now agree better elsewhere."""
     for _ in range(3):
         if adjust:
             model.adjust()
@@ -289,7 +289,7 @@ def settle(model: PlacedModel, *, adjust: bool, confirmation: Confirmation | Non
 
 
 def _moved_cameras(model: PlacedModel, confirmation: Confirmation | None) -> bool:
-    """Move every camera of which another place explains clearly more; return whether any was moved."""
+    """Move every camera for which another placement explains clearly more; return whether any camera was moved."""
     moved = False
     if len(model.cameras) < 3:
         return False
@@ -309,7 +309,7 @@ def _moved_cameras(model: PlacedModel, confirmation: Confirmation | None) -> boo
 
 
 def _better_by_images(model: PlacedModel, image: int, pose: Rigid3, confirmation: Confirmation | None) -> bool:
-    """Return whether the images do not speak against moving a camera."""
+    """Return whether the images do not contradict moving a camera."""
     if confirmation is None:
         return True
     here = confirmation.share(image, model.cameras[image], model.cameras)
@@ -318,8 +318,8 @@ def _better_by_images(model: PlacedModel, image: int, pose: Rigid3, confirmation
 
 def _why_nothing(model: PlacedModel, image: int) -> str:
     if any(idx in model.cameras for idx in model.pairs.partners[image]):
-        return "no pair with a registered image shares enough points with a third to tell how far apart they are"
-    return "its pairs are with images that could not be registered either"
+        return "no pair with a registered image shares enough points with a third image to determine the distance"
+    return "its pairs are all with images that could not be registered"
 
 
 def _why_refused(pairs: Pairs, image: int, support: int, known: int, *, agreeing: int) -> str:
@@ -327,12 +327,14 @@ def _why_refused(pairs: Pairs, image: int, support: int, known: int, *, agreeing
         share = MIN_SHARE if agreeing < 2 else MIN_SHARE_OF_AGREEING
         needed = max(MIN_POINTS, int(np.ceil(share * known)))
         return (
-            f"only {support} of {known} points known from other images {plural(support, 'is', 'are')} seen where they "
-            f"should be, {needed} needed: repeated structure, something that moved, stitching errors, or an image that "
-            "is no panorama"
+            f"only {support} of {known} points known from other images {plural(support, 'is', 'are')} seen where "
+            f"they should be; {needed} are needed. Possible causes: repeated structure, moving objects, stitching "
+            "errors, or an image that is not a panorama"
         )
     partner = pairs.partners[image][0]
     count = max(len(found.view) for found in pairs.geometries[min(image, partner), max(image, partner)])
-    return (f"{known} of its points {plural(known, 'is', 'are')} known from two other images, {MIN_POINTS} needed; its "
-            f"best partner is {pairs.names[partner]!r} with {count} {plural(count, 'match', 'matches')}: take "
-            "panoramas in between")  # fmt: skip
+    return (
+        f"only {known} of its points {plural(known, 'is', 'are')} known from two other images; {MIN_POINTS} are "
+        f"needed. Its best partner is {pairs.names[partner]!r} with {count} {plural(count, 'match', 'matches')}. "
+        "Take panoramas in between"
+    )

@@ -1,4 +1,4 @@
-"""Register a capture by chaining relative poses with translation scale factors, several geometries to a pair."""
+"""Register a capture by chaining relative poses with translation scale factors, with several geometries per pair."""
 
 from __future__ import annotations
 
@@ -29,28 +29,28 @@ def solve_scaled_translation(
     load: Callable[[str], Picture] | None = None,
     rng: np.random.Generator,
 ) -> Poses:
-    """Return the poses of a capture from its verified pairs, by translation scale factors.
+    """Estimate the poses of a capture from its verified pairs by translation scale factors.
 
     Yang, Kim & Lee, "Dense Depth Estimation from Multiple 360-degree Images Using Virtual Depth", generalised from
-    views that all see the first to an unordered set: from a seed pair on, each image is placed by the rotations and
-    directions of its pairs with registered images; the length of a translation is the one at which points whose ranges
-    are known come to lie where they are. All geometries of a pair are considered, not only the one with most matches,
-    and a place is chosen by all pairs of an image together (see `placements`). Where several places, or several
-    models, agree with the pairs about as well, the images decide (see `Confirmation`).
+    views that all see the first image to an unordered set. Starting from a seed pair, each image is placed by the
+    rotations and directions of its pairs with registered images. The length of a translation is the one that puts
+    points with known ranges at these ranges. All geometries of a pair are considered, not only the one with most
+    matches, and a pose is chosen by all pairs of an image together (see `placements`). Where several poses, or several
+    models, agree with the pairs about equally well, the images decide (see `Confirmation`).
 
     Args:
         features: key points by image name, in the capture's order.
         two_views: verified pairs.
         scale_estimator: see `estimate_scale`; "kappa" is the paper's.
         kappa: the paper's κ.
-        adjust: whether to adjust all cameras and points together now and then, which keeps errors from accumulating;
-            without it the poses are those of the chain, as in the paper.
+        adjust: whether to adjust all cameras and points together at intervals, which keeps errors from accumulating. If
+            False, the poses are those of the chain, as in the paper.
         load: returns the panorama and the mask of an image by its name; None leaves every decision to the pairs.
-        rng: not drawn from today; part of the contract of pose solvers.
+        rng: not used; part of the interface of pose solvers.
 
     Returns:
-        Poses of all connected groups of two images and more, each group in the frame of its first camera, its first
-        baseline being 1. Images that cannot be placed with enough support are in `rejected`, with the reason.
+        Poses of all connected groups of two or more images. Each group is in the frame of its first camera, and its
+        first baseline has length 1. Images that cannot be placed reliably are in `rejected`, with the reason.
     """
     del rng
     names = tuple(features)
@@ -68,19 +68,22 @@ def solve_scaled_translation(
         left = {edge for edge in pairs.geometries if edge[0] in grown.refused and edge[1] in grown.refused}
         waiting += [group for group in connected_groups(left, len(names)) if len(group) > 1]
     rejected = {
-        name: reasons.get(image) or why_no_pair(name, two_views) or "its pairs contradict the pairs around them"
+        name: reasons.get(image) or why_no_pair(name, two_views) or "its pairs contradict neighbouring pairs"
         for image, name in enumerate(names)
     }
     if not groups:
         return Poses.without_points(
-            {}, rejected=rejected, frame="the first registered camera", scale="none: no image is registered",
+            {},
+            rejected=rejected,
+            frame="the first registered camera",
+            scale="none: no image is registered",
             metric=False,
-        )  # fmt: skip
+        )
     return join_groups(groups, order=names, rejected=rejected)
 
 
 def _finished(grown: GrownModel, *, adjust: bool) -> Poses:
-    """Return a grown model as poses of one group, with points."""
+    """Return a finished model as poses of one group, with points."""
     model = grown.model
     if adjust:
         model.adjust()

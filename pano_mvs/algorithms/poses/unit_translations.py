@@ -1,4 +1,4 @@
-"""Poses without translation scale factors: what the paper's ablation supposes."""
+"""Poses without translation scale factors, for the paper's ablation."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from pano_mvs.scene.pose_groups import per_group
 
 
 def unit_translations(poses: Poses) -> Poses:
-    """Return poses in which every camera stands at distance 1 from the first, in the direction where it was.
+    """Return poses in which every camera is at distance 1 from the first camera, in its original direction.
 
-    That is all that the essential matrices of the pairs with the first picture say (Yang, Kim & Lee, "Dense Depth
-    Estimation from Multiple 360-degree Images Using Virtual Depth", section 3.2: the scale factors of all views are
-    taken as 1). Sparse points do not fit such cameras and are left out; a camera at the first one's place stays there.
-    Each group has a first camera of its own.
+    This is all that the essential matrices of the pairs with the first image determine (Yang, Kim & Lee, "Dense Depth
+    Estimation from Multiple 360-degree Images Using Virtual Depth", section 3.2: the scale factors of all views are set
+    to 1). Sparse points do not fit such cameras and are removed. A camera that coincides with the first camera stays
+    there. Each group has its own first camera.
     """
     return per_group(poses, _unit_translations)
 

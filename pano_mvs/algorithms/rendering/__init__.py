@@ -1,1 +1,1 @@
-"""Pictures of clouds, drawn with numpy alone."""
+"""Images of clouds, rendered with numpy alone."""

@@ -1,4 +1,4 @@
-"""Drawing of a cloud without a graphics library: as points, the nearest in front."""
+"""Render a cloud as points with a depth buffer, without a graphics library."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ def draw_cloud(
     *,
     size_hw: tuple[int, int],
 ) -> NDArray[np.uint8]:
-    """Return a picture (H, W, 3) RGB of a cloud; points are squares, the larger the fewer they are.
+    """Return an image (H, W, 3) RGB of a cloud; points are squares, larger if there are fewer points.
 
     Args:
         points: (N, 3) in the world.
         normals: (N, 3) in the world; points seen from behind are not drawn.
         colors_rgb: (N, 3) uint8.
-        viewpoint: the camera of the picture.
-        size_hw: (height, width) of the picture.
+        viewpoint: the camera of the image.
+        size_hw: (height, width) of the image.
     """
     shown = facing(points, normals, viewpoint)
     x, y, depth = _projected(points[shown].astype(np.float64), viewpoint, size_hw)

@@ -1,8 +1,8 @@
-"""Runner-up geometries: other relative poses that matches of the same pair agree on.
+"""Runner-up geometries: other relative poses that are supported by matches of the same pair.
 
-Where structure repeats (tiles, columns), matches that are shifted by one period agree with one another as well as true
-ones do. The relative pose with most inliers then often has the right rotation and a wrong direction, and the true
-direction is supported by other matches of the same list. One pair alone cannot tell them apart; all pairs together can.
+If structure repeats (tiles, columns), matches that are shifted by one period are as consistent with one another as true
+ones. The relative pose with most inliers then often has the right rotation and a wrong direction, while other matches
+of the same list support the true direction. A single pair cannot decide between them; all pairs together can.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs, facing_pose, least_essentials
 from pano_mvs.algorithms.two_view.five_point import essentials_from_five
 from pano_mvs.algorithms.two_view.hypotheses import draw_samples
-from pano_mvs.algorithms.two_view.redirection import voted_directions
+from pano_mvs.algorithms.two_view.redirection import direction_candidates
 from pano_mvs.algorithms.two_view.refinement import refine_relative_pose
 from pano_mvs.algorithms.two_view.significance import (
     MAX_LOG10_FALSE_ALARMS,
@@ -29,13 +29,13 @@ from pano_mvs.geometry import Rigid3, angle_between, geodesic_angle
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-_TWINS = 16  # samples among the matches of a known geometry
-_FRESH = 96  # samples among the matches that the best geometry does not explain
-_PEAKS = 6  # candidates of each kind that are settled
-_FINALISTS = 4  # candidates that are judged
-_MIN_REFINED = 8  # fewer matches are not refined on
-_MIN_OWN_RATIO = 0.6  # own independent matches, of the number that a best geometry needs
-_MIN_OWN_SHARE = 0.08  # own matches, of the number that the best geometry has
+_TWINS = 16  # number of samples among the matches of a known geometry
+_FRESH = 96  # number of samples among the matches that the best geometry does not explain
+_PEAKS = 6  # number of candidates of each kind that are refined
+_FINALISTS = 4  # number of candidates that are verified
+_MIN_REFINED = 8  # minimum number of matches for refinement
+_MIN_OWN_RATIO = 0.6  # own independent matches, relative to the number that a best geometry needs
+_MIN_OWN_SHARE = 0.08  # own matches, relative to the matches of the best geometry
 _MIN_TURN_RAD = float(np.deg2rad(1.5))
 _MIN_DIRECTION_RAD = float(np.deg2rad(2.5))
 _SAME_ROTATION_RAD = float(np.deg2rad(2.0))
@@ -61,22 +61,22 @@ def distinct_geometries(
     min_inliers: int,
     most: int,
 ) -> list[Rigid3]:
-    """Return the best relative pose, and others that enough other matches agree on.
+    """Return the best relative pose, and others with enough matches of their own.
 
-    The others are looked for one after the other, each among the matches that none before explains. A pose counts only
-    if the matches of its own are more than chance among those, by the test that the best one passes; it must differ
-    from all before by 1.5° of rotation or 2.5° of direction. The best is replaced if most of its matches lie on one
-    plane, and fit the plane's other pose together with more of the rest.
+    The others are searched one at a time, each among the matches that none of the previous ones explains. A pose is
+    accepted only if its own matches are more than chance among those, by the same test as for the best one; it must
+    differ from all previous ones by 1.5° of rotation or 2.5° of direction. The best pose is replaced if most of its
+    matches lie on one plane, and fit the plane's other pose together with more of the remaining matches.
 
     Args:
         best: second_from_first of the best geometry, |t| = 1.
         first: (M, 3) unit bearings of all matches.
         second: (M, 3) unit bearings.
         rng: draws the samples.
-        threshold_rad: Sampson error below which a match agrees.
-        min_inliers: independent matches that the best geometry needed; another needs 0.6 times as many of its own, and
-            a twelfth of what the best one has.
-        most: maximum number of others.
+        threshold_rad: maximum Sampson error of an inlier.
+        min_inliers: minimum number of independent matches of the best geometry; others need 0.6 times this number of
+            their own, and a twelfth of the number of the best one.
+        most: maximum number of other poses.
     """
     search = _Search(first, second, rng, threshold_rad, min_inliers)
     best, twins = search.better_twin(best)
@@ -93,7 +93,7 @@ def distinct_geometries(
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """The search for further geometries of one pair."""
+    """The search for further geometries of a pair."""
 
     first: FloatArray
     second: FloatArray
@@ -106,14 +106,14 @@ class _Search:
         return _Geometry(pose, agreement(pose, self.first, self.second, self.threshold_rad)[1])
 
     def solutions(self, among: NDArray[np.intp], count: int) -> FloatArray:
-        """Return the essential matrices of samples of five of these matches, (N, 3, 3)."""
+        """Return the essential matrices of samples of five matches, (N, 3, 3)."""
         if len(among) < 5:
             return np.zeros((0, 3, 3))
         drawn = among[draw_samples(self.rng, len(among), batch=count, sample=5)]
         return essentials_from_five(self.first[drawn], self.second[drawn])[0]
 
     def better_twin(self, best: Rigid3) -> tuple[Rigid3, FloatArray]:
-        """Return the best pose or, if it costs less, another that its matches allow, and all that they allow."""
+        """Return the best pose or, if it costs less, another pose that fits its matches, and all essential matrices."""
         twins = self.solutions(np.flatnonzero(self.geometry(best).agreeing), _TWINS)
         order = self.rng.permutation(len(self.first))
         p, q = self.first[order], self.second[order]
@@ -126,7 +126,7 @@ class _Search:
         return poses[int(np.argmin(costs))], twins
 
     def next_geometry(self, known: Sequence[_Geometry], pool: FloatArray) -> _Geometry | None:
-        """Return the geometry with most matches of its own, if there is one for which they are more than chance."""
+        """Return the geometry with most matches of its own; None unless these are more than chance."""
         searched = ~np.any([geometry.agreeing for geometry in known], axis=0)
         needed = max(_MIN_OWN_RATIO * self.min_inliers, _MIN_OWN_SHARE * float(known[0].agreeing.sum()))
         rest = self.rng.permutation(np.flatnonzero(searched))
@@ -153,21 +153,21 @@ class _Search:
         return None
 
     def _candidates(self, known: Sequence[_Geometry], pool: FloatArray, p: FloatArray, q: FloatArray) -> list[Rigid3]:
-        """Return poses that some of the unexplained matches, p and q, agree on.
+        """Return poses that some of the unexplained matches, p and q, support.
 
-        Of two kinds: the known rotations, with the directions that pairs of these matches vote for; and the essential
-        matrices of the pool.
+        There are two kinds: the known rotations with directions from pairs of these matches, and the essential matrices
+        of the pool.
         """
         found: list[Rigid3] = []
-        wide_rad = 2 * self.threshold_rad  # the rotation is not quite right for these matches yet
+        wide_rad = 2 * self.threshold_rad  # the rotation is only approximate for these matches
         for rotation in _distinct_rotations(known):
-            directions, costs = voted_directions(rotation, p, q, rng=self.rng, threshold_rad=wide_rad)
+            directions, costs = direction_candidates(rotation, p, q, rng=self.rng, threshold_rad=wide_rad)
             found += [Rigid3(rotation, direction) for direction in _peaks(directions, costs)]
         finalists = least_essentials(pool, p, q, wide_rad, count=_PEAKS)
         return found + [facing_pose(essential, p, q, wide_rad) for essential in finalists]
 
     def _settled(self, pose: Rigid3, p: FloatArray, q: FloatArray, widths: Sequence[float]) -> Rigid3:
-        """Refine on the matches of ever narrower bands, in units of the threshold."""
+        """Refine on the matches within successively narrower bands, in units of the threshold."""
         for widen in widths:
             near = agreement(pose, p, q, widen * self.threshold_rad)[1]
             if near.sum() < _MIN_REFINED:
@@ -184,7 +184,7 @@ class _Search:
             return False
         p, q = self.first[searched], self.second[searched]
         turn = min(float(geodesic_angle(geometry.pose.rotation, other.pose.rotation)) for other in known)
-        # Two matches determine the direction where the rotation is known already.
+        # Two matches determine the direction if the rotation is known.
         sample, models = (2, 1) if turn < _SAME_ROTATION_RAD else (5, 10)
         false_alarms = log10_false_alarms(
             witnesses,
@@ -200,7 +200,7 @@ class _Search:
 
 
 def _is_other(geometry: _Geometry, known: Sequence[_Geometry], searched: BoolArray) -> bool:
-    """Return whether a geometry is none of the known ones, nor one of them bent towards some more matches."""
+    """Return whether a geometry differs from all known ones, and is not one of them adapted to a few more matches."""
     mostly_own = 2 * (geometry.agreeing & searched).sum() > geometry.agreeing.sum()
     for other in known:
         if not _differ(geometry.pose, other.pose):
@@ -226,7 +226,7 @@ def _distinct_rotations(known: Sequence[_Geometry]) -> list[FloatArray]:
 
 
 def _peaks(directions: FloatArray, costs: FloatArray) -> list[FloatArray]:
-    """Return the directions of least cost of which none is near another."""
+    """Return the directions of lowest cost that are not close to one another."""
     left = directions[np.argsort(costs, kind="stable")]
     kept: list[FloatArray] = []
     while len(left) and len(kept) < _PEAKS:

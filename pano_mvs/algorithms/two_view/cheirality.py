@@ -1,4 +1,4 @@
-"""Which matches agree with a relative pose: small errors, and in front of both cameras."""
+"""Inliers of a relative pose: small residuals, and in front of both cameras."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def facing_pose(essential: FloatArray, first: FloatArray, second: FloatArray, th
         essential: (3, 3), of any scale.
         first: (M, 3) unit bearings.
         second: (M, 3) unit bearings.
-        threshold_rad: Sampson error below which a match is an inlier.
+        threshold_rad: maximum Sampson error of an inlier.
     """
     from pano_mvs.algorithms.two_view.kernels_agreement import decompose_facing
 
@@ -35,8 +35,8 @@ def agreement(
 ) -> tuple[FloatArray, BoolArray]:
     """Return the Sampson errors, (M,), and which matches agree with a pose, |t| = 1.
 
-    A match agrees if its error is small and it lies in front of both cameras, or so far away (the angle between its
-    rays is below twice the threshold) that noise decides on which side.
+    A match agrees if its error is small and it lies in front of both cameras, or is so far away (the angle between its
+    rays is below twice the threshold) that noise determines the side.
     """
     from pano_mvs.algorithms.two_view.kernels_agreement import pose_residuals
 
@@ -48,7 +48,7 @@ def agreement(
 def facing_costs(poses: Sequence[Rigid3], first: FloatArray, second: FloatArray, threshold_rad: float) -> FloatArray:
     """Return Σ min(r² / threshold², 1) for each pose, where a match behind a camera costs 1.
 
-    The matches of one plane fit two essential matrices exactly; what lies behind the cameras tells them apart.
+    Matches on one plane fit two essential matrices exactly; only cheirality distinguishes these.
     """
     from pano_mvs.algorithms.two_view.kernels_agreement import pose_cost
 
@@ -66,19 +66,20 @@ def least_essentials(
     sigmas: float = 3.0,
     count: int,
 ) -> FloatArray:
-    """Return the essential matrices of least Σ min(r² / threshold², 1), wherever the matches lie.
+    """Return the essential matrices with the lowest Σ min(r² / threshold², 1), ignoring cheirality.
 
-    A matrix that lags behind the best after a few matches is given up (after Capel 2005, "An effective bail-out test
-    for RANSAC consensus scoring"), and with them about one in a thousand that would have led.
+    A matrix that is far worse than the best after a few matches is rejected early (after Capel 2005, "An effective
+    bail-out test for RANSAC consensus scoring"); about one in a thousand of the best ones is lost.
 
     Args:
         essentials: (N, 3, 3).
         first: (M, 3) unit bearings in random order.
         second: (M, 3) unit bearings.
         threshold_rad: Sampson error from which a match costs 1.
-        limit: only those that cost less.
-        sigmas: how far it may lag behind, in standard deviations; infinity gives up none that would have led.
-        count: maximum number to return.
+        limit: return only matrices with a lower cost.
+        sigmas: how much worse a matrix may be, in standard deviations; infinity rejects none that would have been the
+            best.
+        count: maximum number of matrices.
 
     Returns:
         (K, 3, 3), K ≤ count, best first.
@@ -95,5 +96,5 @@ def _parts(pose: Rigid3) -> tuple[FloatArray, FloatArray]:
 
 
 def _rows(array: FloatArray) -> FloatArray:
-    """Return an array as the kernels take it: float64 in C order."""
+    """Return an array in the form that the kernels expect: float64 in C order."""
     return np.ascontiguousarray(array, np.float64)

@@ -1,4 +1,4 @@
-"""The essential matrix on the sphere: residual and linear solution."""
+"""Essential matrices on the sphere: residual and linear solution."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _DIAGONAL = np.array([1.0, 1.0, 0.0])
 def sampson_angles(essentials: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
     """Return the spherical Sampson error |e| / √(|E p|² + |Eᵀ q|² − 2 e²), e = qᵀ E p, in radians.
 
-    To first order this is the angle by which the two rays together must move to meet.
+    To first order this is the total angle by which the two rays must move to intersect.
 
     Args:
         essentials: (..., 3, 3) essential matrices E = [t]× R of second_from_first, of any scale.
@@ -21,10 +21,10 @@ def sampson_angles(essentials: FloatArray, first: FloatArray, second: FloatArray
         second: (M, 3) unit bearings q in the second.
 
     Returns:
-        (..., M); zero where both rays lie on the baseline and say nothing.
+        (..., M); zero if both rays lie on the baseline.
     """
     flat = essentials.reshape(-1, 3, 3)
-    # Three matrix products in place of one loop: e is linear in E, the squared lengths in EᵀE and EEᵀ.
+    # Three matrix products replace a loop: e is linear in E, the squared lengths in EᵀE and EEᵀ.
     algebraic = flat.reshape(-1, 9) @ _products(second, first).T
     squares = _symmetric(np.swapaxes(flat, 1, 2) @ flat) @ _quadratics(first).T
     squares += _symmetric(flat @ np.swapaxes(flat, 1, 2)) @ _quadratics(second).T
@@ -37,7 +37,7 @@ def sampson_angles(essentials: FloatArray, first: FloatArray, second: FloatArray
 def essential_from_bearings(first: FloatArray, second: FloatArray) -> FloatArray:
     """Return the essential matrices that solve qᵀ E p = 0 in the least-squares sense (8-point method).
 
-    On the sphere the coordinates are of unit size already, so no normalisation of Hartley's is needed.
+    Unit bearings need no normalisation as in Hartley's method.
 
     Args:
         first: (..., M, 3) unit bearings p, M ≥ 8.

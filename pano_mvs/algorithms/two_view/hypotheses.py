@@ -1,4 +1,4 @@
-"""Hypotheses of a robust estimation: minimal solvers, samples, and how many of them are needed."""
+"""Hypotheses of a robust estimation: minimal solvers, samples, and the required number of samples."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ Solver: TypeAlias = Literal["five_point", "eight_point"]
 
 @dataclass(frozen=True)
 class MinimalSolver:
-    """How hypotheses are made.
+    """A minimal solver.
 
     Attributes:
         sample: number of matches in a sample.
         batch: number of samples that are drawn together.
         solve: (N, sample, 3) bearings of the first and of the second image to (K, 3, 3) essential matrices.
-        models: most essential matrices that a sample may give.
+        models: maximum number of essential matrices from one sample.
     """
 
     sample: int
@@ -44,7 +44,7 @@ SOLVERS: dict[Solver, MinimalSolver] = {
 
 
 def draw_samples(rng: np.random.Generator, count: int, *, batch: int, sample: int) -> NDArray[np.int64]:
-    """Return positions of distinct matches among `count` of them, (batch, sample)."""
+    """Return positions of distinct matches among `count` matches, (batch, sample)."""
     samples = rng.integers(count, size=(batch, sample))
     repeated = np.flatnonzero((np.diff(np.sort(samples, axis=1), axis=1) == 0).any(axis=1))
     for row in repeated:
@@ -53,7 +53,7 @@ def draw_samples(rng: np.random.Generator, count: int, *, batch: int, sample: in
 
 
 def samples_needed(inlier_ratio: float, confidence: float, *, sample: int) -> float:
-    """Return after how many samples one without outliers has been drawn with the wanted probability."""
+    """Return the number of samples after which one without outliers has been drawn with the given probability."""
     clean = inlier_ratio**sample
     if clean >= 1:
         return 0.0

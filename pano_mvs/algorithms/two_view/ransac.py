@@ -20,23 +20,23 @@ FloatArray = NDArray[np.float64]
 
 _MIN_MATCHES = 16
 _MIN_INLIERS = 8
-_SCREEN = 500  # matches on which all hypotheses of a batch are compared
-_FINALISTS = 4  # hypotheses of a batch that are compared on all matches
-_LAG_SIGMAS = 3.0  # hypotheses that lag so far behind are given up
-_LEADERS = 6  # hypotheses that are given new directions
-_POLISH = 1000  # inliers on which a leader is polished
+_SCREEN = 500  # number of matches on which all hypotheses of a batch are compared
+_FINALISTS = 4  # number of hypotheses of a batch that are compared on all matches
+_LAG_SIGMAS = 3.0  # hypotheses that are worse than the best by more than this are rejected early
+_LEADERS = 6  # number of hypotheses whose direction is estimated again
+_POLISH = 1000  # number of inliers on which a leading hypothesis is refined
 
 
 @dataclass(frozen=True, eq=False)
 class RelativePose:
-    """The relative pose that most matches agree on; falsy where no hypothesis could be formed.
+    """The relative pose with most support; falsy if no hypothesis could be formed.
 
     Attributes:
         second_from_first: rotation, and translation of length 1.
-        inliers: (M,) bool, which matches agree: small residual, and in front of both cameras.
+        inliers: (M,) bool, True for matches with a small residual in front of both cameras.
         residuals_rad: (M,) spherical Sampson error of all matches.
         iterations: number of hypotheses.
-        reason: why there is none.
+        reason: why there is no pose.
     """
 
     second_from_first: Rigid3
@@ -61,22 +61,23 @@ def estimate_two_view(
     confidence: float = 0.9999,
     max_iterations: int = 15_000,
 ) -> RelativePose:
-    """Return the relative pose that most matches agree on.
+    """Estimate the relative pose of two panoramas by robust estimation on the sphere.
 
-    Minimal hypotheses, ranked by the truncated squared error (Torr & Zisserman 2000, "MLESAC"), where a match behind
-    a camera counts as wrong, and optimised on their inliers whenever one leads (Chum et al. 2003, "Locally optimized
-    RANSAC"); the leaders are given new directions (see `best_redirected`); last, the angular error is minimised over
-    the five degrees of freedom. Whether the result is more than chance is for `verify_pair` to judge.
+    Minimal hypotheses are ranked by the truncated squared error (Torr & Zisserman 2000, "MLESAC"), in which a match
+    behind a camera is an outlier, and every new best hypothesis is optimised on its inliers (Chum et al. 2003, "Locally
+    optimized RANSAC"). The directions of the leading hypotheses are then estimated again (see `best_redirected`), and
+    finally the angular error is minimised over the five degrees of freedom. `verify_pair` decides whether the result is
+    more than chance.
 
     Args:
         bearings_first: (M, 3) unit rays in the first camera.
         bearings_second: (M, 3) the matching unit rays in the second.
         rng: draws the samples.
-        threshold_rad: Sampson error below which a match agrees.
-        solver: "five_point" needs fewer samples and does not mind a scene that is one plane; "eight_point" is linear
-            (the paper's), and many essential matrices fit a plane in it.
-        refine: False gives the best minimal hypothesis as it comes, as the paper does.
-        confidence: stop once a better model would have been met with this probability.
+        threshold_rad: maximum Sampson error of an inlier.
+        solver: "five_point" needs fewer samples and handles planar scenes; "eight_point" is linear (the paper's) and
+            ambiguous on planar scenes.
+        refine: False returns the best minimal hypothesis unrefined, as in the paper.
+        confidence: stop when a better model would have been found with this probability.
         max_iterations: maximum number of hypotheses.
 
     Raises:
@@ -84,8 +85,10 @@ def estimate_two_view(
     """
     first, second = np.asarray(bearings_first, np.float64), np.asarray(bearings_second, np.float64)
     if first.shape != second.shape or first.ndim != 2 or first.shape[1] != 3 or threshold_rad <= 0:
-        raise UsageError(f"two-view estimation needs two (M, 3) arrays of paired bearings and a positive threshold, "
-                         f"got {first.shape}, {second.shape} and {threshold_rad}")  # fmt: skip
+        raise UsageError(
+            f"two-view estimation needs two (M, 3) arrays of paired bearings and a positive threshold, "
+            f"got {first.shape}, {second.shape} and {threshold_rad}"
+        )
     if solver not in SOLVERS:
         raise UsageError(f"there is no solver {solver!r}; choose one of {', '.join(SOLVERS)}")
     if len(first) < _MIN_MATCHES:
@@ -93,7 +96,7 @@ def estimate_two_view(
             len(first),
             f"only {len(first)} {plural(len(first), 'match', 'matches')}, {_MIN_MATCHES} needed for a hypothesis",
         )
-    # Hypotheses are given up after a few matches, which must be any.
+    # Hypotheses are rejected after the first few matches, so the order of matches must be random.
     order = rng.permutation(len(first))
     search = _Search(first[order], second[order], rng, threshold_rad, SOLVERS[solver], optimise=refine)
     leaders, iterations = search.run(confidence=confidence, max_iterations=max_iterations)
@@ -104,7 +107,7 @@ def estimate_two_view(
         pose = best_redirected(leaders, first, second, rng=rng, threshold_rad=threshold_rad)
         pose = _refined(pose, first, second, threshold_rad)
     if pose is None:
-        return _none(len(first), "no relative pose is shared by eight matches")
+        return _none(len(first), "no relative pose is supported by eight matches")
     residuals, inliers = agreement(pose, first, second, threshold_rad)
     return RelativePose(pose, inliers, residuals, iterations)
 
@@ -137,9 +140,9 @@ class _Search:
     optimise: bool
 
     def run(self, *, confidence: float, max_iterations: int) -> tuple[list[Rigid3], int]:
-        """Return the leading poses, best first, and how many hypotheses were tried.
+        """Return the leading poses, best first, and the number of hypotheses.
 
-        One if a better one would have been met by now, several if the search was given up.
+        There is one pose if a better one would have been found by now, and several if the search reached its limit.
         """
         leaders: list[tuple[float, int, Rigid3]] = []
         samples, tried, needed = 0, 0, np.inf
@@ -158,7 +161,7 @@ class _Search:
         return [pose for _, _, pose in (leaders[:1] if samples >= needed else leaders)], tried
 
     def _best_of_batch(self, worst: float) -> tuple[Rigid3 | None, float, int]:
-        """Return the best pose of a batch of samples if it costs less than `worst`, its cost, how many were tried."""
+        """Return the best pose of a batch if it costs less than `worst`, its cost, and the number of trials."""
         size = len(self.first)
         drawn = draw_samples(self.rng, size, batch=self.solver.batch, sample=self.solver.sample)
         hypotheses = self.solver.solve(self.first[drawn], self.second[drawn])
@@ -166,12 +169,15 @@ class _Search:
             return None, np.inf, 0
         screened = slice(None, _SCREEN)
         finalists = least_essentials(
-            hypotheses, self.first[screened], self.second[screened], self.threshold_rad,
-            # What a hypothesis costs without a look at the sides is the least that it can cost.
+            hypotheses,
+            self.first[screened],
+            self.second[screened],
+            self.threshold_rad,
+            # The cost without cheirality is a lower bound of the cost.
             limit=worst if len(self.first) <= _SCREEN else np.inf,
             sigmas=_LAG_SIGMAS if self.optimise else np.inf,
             count=_FINALISTS,
-        )  # fmt: skip
+        )
         if not len(finalists):
             return None, np.inf, len(hypotheses)
         poses = [facing_pose(essential, self.first, self.second, self.threshold_rad) for essential in finalists]
@@ -179,7 +185,7 @@ class _Search:
         return poses[int(np.argmin(costs))], float(costs.min()), len(hypotheses)
 
     def _optimised(self, pose: Rigid3, cost: float) -> tuple[Rigid3, float]:
-        """Refit on the inliers of a wide, then ever narrower band, and keep the best."""
+        """Refit on the inliers of a wide, then successively narrower band, and keep the best."""
         candidates = self._polished(pose) if self.solver.sample == 5 else self._refitted(pose)
         if not candidates:
             return pose, cost
@@ -188,7 +194,7 @@ class _Search:
         return (candidates[best], float(costs[best])) if costs[best] < cost else (pose, cost)
 
     def _polished(self, pose: Rigid3) -> list[Rigid3]:
-        """Minimise the angular error of the inliers: unlike the linear solution it is as sound on a plane."""
+        """Minimise the angular error of the inliers; unlike the linear solution, this also works for planar scenes."""
         found: list[Rigid3] = []
         for widen in (2.0, 1.0):
             inliers = np.flatnonzero(self._residuals(pose) < widen * self.threshold_rad)

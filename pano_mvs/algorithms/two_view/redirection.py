@@ -1,4 +1,4 @@
-"""Help poses out of local optima: keep the rotation, draw the direction again, and let both settle."""
+"""Escape local optima of relative poses: keep the rotation, estimate the direction again, and refine both."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pano_mvs.geometry import Rigid3
 
 FloatArray = NDArray[np.float64]
 
-_MATCHES = 1000  # on which directions are compared
+_MATCHES = 1000  # number of matches on which directions are compared
 _ROUNDS = 2
 _STEPS = 8
 
@@ -19,23 +19,23 @@ _STEPS = 8
 def best_redirected(
     poses: list[Rigid3], first: FloatArray, second: FloatArray, *, rng: np.random.Generator, threshold_rad: float
 ) -> Rigid3:
-    """Return the pose with the least truncated squared error that the given ones lead to.
+    """Return the pose with the lowest truncated squared error that is reached from the given ones.
 
-    Eight matches are seldom all true where two thirds are false; but an 8-point solution on some false ones often has
-    nearly the right rotation and a wrong direction. With the rotation known two matches give the direction,
-    t ∝ (R p₁ × q₁) × (R p₂ × q₂), and from there the robust refinement finds the rest.
+    If two thirds of the matches are false, eight random matches are rarely all true; but an 8-point solution with some
+    false ones often has nearly the right rotation and a wrong direction. Given the rotation, two matches determine the
+    direction, t ∝ (R p₁ × q₁) × (R p₂ × q₂), and robust refinement finds the rest.
 
     Args:
-        poses: second_from_first of the leading hypotheses, one at least, |t| = 1.
+        poses: second_from_first of the leading hypotheses, at least one, |t| = 1.
         first: (M, 3) unit bearings of all matches, M ≥ 2.
         second: (M, 3) unit bearings.
         rng: draws the matches.
-        threshold_rad: Sampson error below which a match agrees.
+        threshold_rad: maximum Sampson error of an inlier.
     """
     candidates = list(poses)
     for pose in poses:
         moved = pose
-        # A single pose is that of a search which was sure of it.
+        # There is a single pose if the search has converged with certainty.
         for _ in range(_ROUNDS if len(poses) > 1 else 1):
             moved = _redirected(moved, first, second, rng=rng, threshold_rad=threshold_rad)
             candidates.append(moved)
@@ -48,7 +48,7 @@ def _redirected(
 ) -> Rigid3:
     chosen = rng.choice(len(first), min(_MATCHES, len(first)), replace=False)
     p, q = first[chosen], second[chosen]
-    directions, costs = voted_directions(pose.rotation, p, q, rng=rng, threshold_rad=2 * threshold_rad)
+    directions, costs = direction_candidates(pose.rotation, p, q, rng=rng, threshold_rad=2 * threshold_rad)
     directions = np.concatenate([pose.translation[None], directions])
     costs = np.concatenate([facing_costs([pose], p, q, 2 * threshold_rad), costs])
     found = Rigid3(pose.rotation, directions[int(np.argmin(costs))])
@@ -59,7 +59,7 @@ def _redirected(
     return found if costs[0] <= costs[1] else opposite
 
 
-def voted_directions(
+def direction_candidates(
     rotation: FloatArray,
     p: FloatArray,
     q: FloatArray,
@@ -68,17 +68,17 @@ def voted_directions(
     threshold_rad: float,
     count: int = 200,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return directions of translation that pairs of matches vote for, (N, 3), and what each costs, (N,).
+    """Return translation directions from pairs of matches, (N, 3), and the cost of each, (N,).
 
-    With the rotation known a match allows the directions of a great circle, t · (R p × q) = 0, and two matches meet
-    in t ∝ n₁ × n₂; of t and −t the one is taken for which more matches lie in front of the cameras.
+    Given the rotation, a match constrains the direction to a great circle, t · (R p × q) = 0, and two matches intersect
+    in t ∝ n₁ × n₂. Of t and −t, the direction with more matches in front of the cameras is used.
 
     Args:
         rotation: (3, 3) of second_from_first.
         p: (M, 3) unit bearings in the first image.
         q: (M, 3) unit bearings in the second.
         rng: draws the pairs.
-        threshold_rad: Sampson error from which a match costs 1; wide enough for what the rotation is wrong by.
+        threshold_rad: Sampson error from which a match costs 1; must allow for the error of the rotation.
         count: number of pairs.
     """
     from pano_mvs.algorithms.two_view.kernels_agreement import direction_costs

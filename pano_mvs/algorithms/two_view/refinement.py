@@ -1,4 +1,4 @@
-"""Non-linear refinement of a two-view geometry: the angular error over the five degrees of freedom."""
+"""Non-linear refinement of two-view geometries: minimise the angular error over the five degrees of freedom."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ FloatArray = NDArray[np.float64]
 def refine_relative_pose(
     pose: Rigid3, first: FloatArray, second: FloatArray, *, scale_rad: float, max_iterations: int = 20
 ) -> Rigid3:
-    """Return the second_from_first pose, |t| = 1, with the least Cauchy loss of the spherical Sampson error.
+    """Minimise the Cauchy loss of the spherical Sampson error over second_from_first, |t| = 1.
 
     Gauss–Newton with reweighting and step halving; R ← exp(ω) R, t moves on the unit sphere.
 
     Args:
-        pose: where to begin, |t| = 1.
+        pose: initial pose, |t| = 1.
         first: (M, 3) unit bearings in the first image.
         second: (M, 3) unit bearings in the second.
-        scale_rad: residual at which the weight has fallen to a half.
+        scale_rad: residual at which the weight is one half.
         max_iterations: maximum number of steps.
     """
     from pano_mvs.algorithms.two_view.kernels_refinement import refine_pose
@@ -39,7 +39,7 @@ def pose_uncertainty(pose: Rigid3, first: FloatArray, second: FloatArray, *, noi
 
     Args:
         pose: second_from_first, |t| = 1, at the optimum.
-        first: (M, 3) unit bearings that agree with it.
+        first: (M, 3) unit bearings of inliers.
         second: (M, 3) unit bearings.
         noise_rad: σ, standard deviation of the residuals.
     """
@@ -51,7 +51,7 @@ def pose_uncertainty(pose: Rigid3, first: FloatArray, second: FloatArray, *, noi
 
 
 def tangent_basis(directions: FloatArray) -> FloatArray:
-    """Return two unit vectors that are normal to each direction and to one another; (..., 3) to (..., 3, 2)."""
+    """Return two unit vectors normal to each direction and to each other; (..., 3) to (..., 3, 2)."""
     axis = np.eye(3)[np.argmin(np.abs(directions), axis=-1)]
     u = cross(directions, axis)
     u /= np.linalg.norm(u, axis=-1, keepdims=True)
@@ -82,7 +82,7 @@ def _linearised(pose: Rigid3, first: FloatArray, second: FloatArray) -> tuple[Fl
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return a × b, (..., 3), without the general case of numpy's, which costs more than the product itself."""
+    """Return a × b, (..., 3), without the overhead of numpy's general case, which exceeds that of the product."""
     a0, a1, a2 = a[..., 0], a[..., 1], a[..., 2]
     b0, b1, b2 = b[..., 0], b[..., 1], b[..., 2]
     return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-1)

@@ -1,4 +1,4 @@
-"""The pure rotation that most matches agree on: both pictures taken from one place."""
+"""Robust estimation of a pure rotation, for images taken from the same place."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _SAMPLES = 200
 def estimate_rotation(
     first: FloatArray, second: FloatArray, *, rng: np.random.Generator, threshold_rad: float
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Return second_from_first's rotation, (3, 3), without translation, and which matches agree with it, (M,).
+    """Estimate second_from_first's rotation, (3, 3), without translation, and its inliers, (M,).
 
     Two-point samples, then the least-squares rotation of the inliers (Kabsch).
 
@@ -23,7 +23,7 @@ def estimate_rotation(
         first: (M, 3) unit bearings, M ≥ 2.
         second: (M, 3) unit bearings.
         rng: draws the samples.
-        threshold_rad: angle between the turned and the seen ray below which a match agrees.
+        threshold_rad: maximum angle between the rotated and the observed ray of an inlier.
     """
     from pano_mvs.algorithms.two_view.kernels_agreement import best_turn
 

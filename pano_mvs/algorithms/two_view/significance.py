@@ -1,4 +1,4 @@
-"""How surprising it would be to find so many agreeing matches by chance (a-contrario model selection)."""
+"""A-contrario model selection: the probability of finding as many inliers by chance."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ MAX_LOG10_FALSE_ALARMS = -6.0
 def log10_false_alarms(
     inliers: int, candidates: int, *, chance: float, sample: int, models_per_sample: int = 1
 ) -> float:
-    """Return log₁₀ of the expected number of equally good models among random matches.
+    """Return log₁₀ of the expected number of equally good models among random matches (NFA).
 
-    NFA = models · (n − s) · C(n, k) · C(k, s) · p^(k − s) (Moisan & Stival 2004; Moulon et al. 2012): below 0 the
-    model is more than chance, and by how much.
+    NFA = models · (n − s) · C(n, k) · C(k, s) · p^(k − s) (Moisan & Stival 2004; Moulon et al. 2012). Values below 0
+    are more than chance; the lower, the more significant.
 
     Args:
-        inliers: k, independent matches that agree.
-        candidates: n, independent matches at all.
+        inliers: k, number of independent inliers.
+        candidates: n, number of independent matches.
         chance: p, the probability that a random match agrees with a given model.
-        sample: s, matches that determine the model.
-        models_per_sample: how many models one sample may give.
+        sample: s, number of matches that determine the model.
+        models_per_sample: maximum number of models from one sample.
     """
     if inliers <= sample or candidates <= sample:
         return float(np.log10(max(candidates, 1)))
@@ -44,18 +44,18 @@ def chance_of_pose(
     threshold_rad: float,
     draws: int = 20_000,
 ) -> float:
-    """Return the probability that a wrong match agrees with a relative pose, measured on shuffled matches.
+    """Return the probability that a false match agrees with a relative pose, measured on shuffled matches.
 
-    Key points crowd (near the horizon, say), and so do epipolar circles; the share of shuffled matches that agree
-    takes both into account where a formula for even spread would not.
+    Key points are clustered (for example near the horizon), and so are epipolar circles; the share of shuffled matches
+    that agree accounts for both, unlike a formula for uniform distributions.
 
     Args:
         pose: second_from_first, |t| = 1.
         first: (M, 3) bearings of the matches in the first image.
         second: (M, 3) in the second.
         rng: draws the pairs.
-        threshold_rad: Sampson error below which a match agrees, if it lies in front of both cameras.
-        draws: how many pairs.
+        threshold_rad: maximum Sampson error of an inlier, which must also be in front of both cameras.
+        draws: number of pairs.
     """
     from pano_mvs.algorithms.two_view.kernels_agreement import count_chance
 
@@ -67,9 +67,9 @@ def chance_of_pose(
 
 
 def independent_count(first: FloatArray, second: FloatArray, *, cell_rad: float = 0.025) -> int:
-    """Return how many matches count as independent: at most one from each small cell of either image.
+    """Return the number of independent matches: at most one from each small cell of either image.
 
-    A crowd of key points on one detail stands or falls together and must not be counted as many witnesses.
+    The matches of a cluster of key points on one detail are right or wrong together, so they count as one.
 
     Args:
         first: (M, 3) unit bearings.
@@ -80,7 +80,7 @@ def independent_count(first: FloatArray, second: FloatArray, *, cell_rad: float 
 
 
 def _cells(bearings: FloatArray, cell_rad: float) -> int:
-    """Return in how many cells bearings lie; one number names a cell, since rows of three are slow to sort."""
+    """Return the number of cells that contain bearings; one number per cell, since rows of three are slow to sort."""
     cells = np.floor(bearings / cell_rad).astype(np.int64)
     side = 2 * int(np.ceil(1 / cell_rad)) + 3
     return len(np.unique(cells @ np.array([side * side, side, 1])))

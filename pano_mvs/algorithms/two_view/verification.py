@@ -1,4 +1,4 @@
-"""Judge a pair of pictures: their relative pose, or why there is none that can be trusted."""
+"""Verify a pair of images: estimate the relative pose, or report why there is no reliable one."""
 
 from __future__ import annotations
 
@@ -44,27 +44,26 @@ def verify_pair(
     max_iterations: int = 15_000,
     max_alternatives: int = 4,
 ) -> TwoView:
-    """Return what two pictures agree on: their relative pose and the matches that bear it out.
+    """Estimate the two-view geometry of two images: their relative pose and its inliers.
 
-    A relative pose is believed only if so many independent matches would not agree by chance (see `significance`),
-    enough of them show parallax, and together they fix its direction.
+    A relative pose is reliable only if its number of independent inliers is more than chance (see `significance`), if
+    enough of them have parallax, and if together they determine its direction.
 
     Args:
-        first: key points of the first picture.
-        second: of the second.
+        first: key points of the first image.
+        second: key points of the second image.
         matches_idx: (M, 2) positions of matching key points.
         rng: draws the samples.
-        threshold_deg: spherical Sampson error below which a match agrees.
-        min_inliers: fewer independent agreeing matches are never enough.
+        threshold_deg: maximum spherical Sampson error of an inlier.
+        min_inliers: minimum number of independent inliers.
         solver: see `estimate_two_view`.
-        refine: False gives the best minimal hypothesis as it comes, as the paper does.
+        refine: False returns the best minimal hypothesis unrefined, as in the paper.
         max_iterations: maximum number of hypotheses.
-        max_alternatives: maximum number of runner-up geometries to keep (see `distinct_geometries`); without `refine`
-            there are none.
+        max_alternatives: maximum number of runner-up geometries (see `distinct_geometries`); none without `refine`.
 
     Returns:
-        geometry "general"; or "rotation", where the pictures were taken from one place; or "none". The last two are
-        falsy and carry their reason.
+        The geometry: "general"; "rotation" if both images were taken from the same place; or "none". The last two are
+        falsy and state their reason.
     """
     p, q = first.bearings[matches_idx[:, 0]], second.bearings[matches_idx[:, 1]]
     threshold_rad = float(np.deg2rad(threshold_deg))
@@ -92,9 +91,14 @@ def verify_pair(
     if not (best and refine and max_alternatives):
         return best
     poses = distinct_geometries(
-        pose.second_from_first, p, q,
-        rng=rng, threshold_rad=threshold_rad, min_inliers=min_inliers, most=max_alternatives,
-    )  # fmt: skip
+        pose.second_from_first,
+        p,
+        q,
+        rng=rng,
+        threshold_rad=threshold_rad,
+        min_inliers=min_inliers,
+        most=max_alternatives,
+    )
     costs = facing_costs(poses, p, q, threshold_rad)
     views = [view for idx in np.argsort(costs, kind="stable") if (view := pair.judged(poses[idx]))]
     return views[0].with_alternatives(sorted(views[1:], key=len, reverse=True)) if views else best
@@ -114,7 +118,7 @@ class _Pair:
         residuals, kept = agreement(pose, self.p, self.q, self.threshold_rad)
         p, q, residuals = self.p[kept], self.q[kept], residuals[kept]
         noise_rad = max(float(np.sqrt(np.mean(residuals**2))), 0.1 * self.threshold_rad)
-        # A crowd of matches counts as one witness.
+        # Clustered matches count as one.
         noise_rad *= float(np.sqrt(len(p) / independent_count(p, q)))
         rotation_std_deg, direction_std_deg = np.rad2deg(pose_uncertainty(pose, p, q, noise_rad=noise_rad))
         parallax = angle_between(p @ pose.rotation.T, q)
@@ -143,8 +147,8 @@ def _from_one_place(
         direction=np.zeros(3),
         residuals_rad=angles[turned].astype(np.float32),
         geometry="rotation",
-        reason=f"taken from the same place: a turn alone explains {turned.sum()} of {len(turned)} matches, so the pair "
-        "shows no depth",
+        reason=f"taken from the same place: a rotation alone explains {turned.sum()} of {len(turned)} matches, so the "
+        "pair has no parallax",
         candidates=len(turned),
     )
 
@@ -159,8 +163,8 @@ def _why_chance(
     threshold_rad: float,
     solver: Solver,
 ) -> str:
-    """Say so if as many matches might agree on some relative pose by chance."""
-    # Among the agreeing matches alone as well: where they crowd along one epipolar circle any match would agree.
+    """Return a reason if as many matches might agree on some relative pose by chance; "" otherwise."""
+    # Also check among the inliers alone: if they are clustered along one epipolar circle, any match would agree.
     chance = max(
         chance_of_pose(pose.second_from_first, first, second, rng=rng, threshold_rad=threshold_rad)
         for first, second in ((p, q), (p[pose.inliers], q[pose.inliers]))
@@ -174,8 +178,7 @@ def _why_chance(
     )
     if false_alarms <= MAX_LOG10_FALSE_ALARMS:
         return ""
-    return (f"{_agreeing(witnesses, len(p))} on a relative pose, which may be chance: the "
-            "pictures may not overlap")  # fmt: skip
+    return f"{_agreeing(witnesses, len(p))} on a relative pose, which may be chance: the images may not overlap"
 
 
 def _agreeing(witnesses: int, count: int) -> str:
@@ -183,17 +186,21 @@ def _agreeing(witnesses: int, count: int) -> str:
 
 
 def _why_no_parallax(parallax: FloatArray, threshold_rad: float) -> str:
-    """Say so if hardly any of the agreeing matches moved by more than the noise."""
+    """Return a reason if hardly any inlier moved by more than the noise; "" otherwise."""
     moved = int((parallax > _MIN_PARALLAX * threshold_rad).sum())
     if moved >= _MIN_WITH_PARALLAX:
         return ""
-    return (f"only {moved} of {len(parallax)} agreeing matches {plural(moved, 'shows', 'show')} parallax, "
-            f"{_MIN_WITH_PARALLAX} needed: the pictures were taken too close together for what they see")  # fmt: skip
+    return (
+        f"only {moved} of {len(parallax)} inliers {plural(moved, 'has', 'have')} parallax, {_MIN_WITH_PARALLAX} "
+        "needed: the images were taken too close together relative to the distance of the scene"
+    )
 
 
 def _why_open(direction_std_deg: float) -> str:
-    """Say so if the agreeing matches leave the direction open."""
+    """Return a reason if the inliers do not determine the direction; "" otherwise."""
     if direction_std_deg <= _MAX_DIRECTION_STD_DEG:
         return ""
-    return (f"the matches leave the direction between the pictures open by {direction_std_deg:.0f}°: they lie too "
-            "close together, or show too little parallax")  # fmt: skip
+    return (
+        f"the matches determine the direction between the images only to {direction_std_deg:.0f}°: they lie too close "
+        "together, or have too little parallax"
+    )

@@ -29,13 +29,13 @@ class PluginKind:
         prefix: of the stage's name; empty for a part of the sweep.
         what: what it does, in words.
         use: how a workflow uses it, with `{name}` for its name.
-        laws: the function of `pano_mvs.testing.conformance` that returns its contract tests.
+        contract_tests: the function of `pano_mvs.testing.conformance` that returns its contract tests.
     """
 
     prefix: str
     what: str
     use: str
-    laws: str = "stage_laws"
+    contract_tests: str = "stage_contract_tests"
 
 
 KINDS = {
@@ -48,10 +48,16 @@ KINDS = {
     "views": PluginKind("views", "which sources each reference is swept against", "views: {{use: views.{name}}}"),
     "depth": PluginKind("depth", "the range of every pixel", "depth: {{use: depth.{name}}}"),
     "sweep_cost": PluginKind(
-        "", "what depth.sweep compares by", "depth: {{use: depth.sweep, backend: numpy, cost: {name}}}", "cost_laws"
+        "",
+        "what depth.sweep compares by",
+        "depth: {{use: depth.sweep, backend: numpy, cost: {name}}}",
+        "cost_contract_tests",
     ),
     "sweep_backend": PluginKind(
-        "", "what computes depth.sweep", "depth: {{use: depth.sweep, backend: {name}, cost: sad}}", "backend_laws"
+        "",
+        "what computes depth.sweep",
+        "depth: {{use: depth.sweep, backend: {name}, cost: sad}}",
+        "backend_contract_tests",
     ),
     "filter": PluginKind("filters", "range map in, range map out", "filtered: {{use: filters.{name}}}"),
     "fusion": PluginKind("fusion", "from range maps to one cloud", "cloud: {{use: fusion.{name}}}"),
@@ -78,7 +84,13 @@ def rendered(kind: str, name: str) -> tuple[str, str]:
         autoescape=False,  # noqa: S701  # it writes Python, and the name is checked
     )
     title = "".join(word.capitalize() for word in name.split("_"))
-    values = {"name": name, "title": title, "kind": kind, "laws": KINDS[kind].laws, "prefix": KINDS[kind].prefix}
+    values = {
+        "name": name,
+        "title": title,
+        "kind": kind,
+        "contract_tests": KINDS[kind].contract_tests,
+        "prefix": KINDS[kind].prefix,
+    }
     return (
         environment.get_template(f"{kind}.py.jinja").render(values),
         environment.get_template("test.py.jinja").render(values),

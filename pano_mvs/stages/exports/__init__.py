@@ -1,1 +1,1 @@
-"""Export stages: files that other programs open."""
+"""Export stages: files for other programs."""

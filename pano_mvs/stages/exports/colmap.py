@@ -1,4 +1,4 @@
-"""Exports for COLMAP and what reads its files: sparse models, dense workspaces, seeds for splats."""
+"""Exports in COLMAP's format: sparse models, dense workspaces, initial points for Gaussian splatting."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class ModelParams(Params):
 
 @stage("export.colmap")
 def colmap(poses: One[Poses], images: All[Panorama], params: ModelParams, ctx: Context) -> Files:
-    """COLMAP model of EQUIRECTANGULAR cameras, with points and tracks, in colmap/sparse/0.
+    """COLMAP model with EQUIRECTANGULAR cameras, points and tracks, in colmap/sparse/0.
 
-    Further groups of poses, each in a frame of its own, are the models sparse/1, sparse/2 …
+    Further groups of poses, each in its own frame, are the models sparse/1, sparse/2 …
     """
     return _sparse_models(poses, images, params.format, ctx, "colmap/sparse")
 
@@ -45,16 +45,16 @@ def colmap(poses: One[Poses], images: All[Panorama], params: ModelParams, ctx: C
 class MasksParams(Params):
     """Settings of export.colmap_masks."""
 
-    pictures: bool = Field(default=False, description="also the pictures, as whole spheres, for files that are cropped")
+    pictures: bool = Field(default=False, description="also export images, uncropped, for cropped input files")
 
 
 @stage("export.colmap_masks")
 def colmap_masks(image: Each[Panorama], params: MasksParams, ctx: Context) -> Files:
-    """A mask for each picture where COLMAP looks for it, colmap/masks/<image>.png: 0 is ignored, 255 is used.
+    """Write a mask for each panorama where COLMAP looks for it, colmap/masks/<image>.png: 0 is ignored, 255 is used.
 
-    In the size of the model's cameras, and also of pictures of which nothing is masked: COLMAP leaves out a picture
-    whose mask it does not find. With `pictures` the pictures themselves are colmap/images/<image>, in that size, whole
-    spheres, and where masked they show what is around.
+    Masks have the size of the model's cameras. They are also written for panoramas without masked pixels, because
+    COLMAP skips an image whose mask it does not find. With `pictures`, the panoramas themselves are
+    colmap/images/<image>, in that size, uncropped, with masked pixels filled from their surroundings.
     """
     mask = image.load_mask()
     files = {"colmap/masks/{name}.png": ctx.scratch / "mask.png"}
@@ -70,14 +70,18 @@ class FacesParams(Params):
     """Settings of export.colmap_faces."""
 
     layout: FaceLayout = Field(default="cube", description="cube: 6 faces, octagon: 10, icosahedron: 20")
-    fov_deg: float = Field(default=96.0, ge=30, le=150, description="field of view of a face; 90 and more overlap")
-    size_px: int | None = Field(default=None, ge=4, le=16384, description="width of a face; null: as fine as the image")
-    min_confidence: int = Field(default=64, ge=1, le=255, description="ranges below have no depth (64: seen)")
-    image_format: Literal["jpg", "png"] = Field(default="jpg", description="of the faces' pictures (JPEG: quality 95)")
+    fov_deg: float = Field(default=96.0, ge=30, le=150, description="field of view of a face; faces overlap above 90")
+    size_px: int | None = Field(
+        default=None, ge=4, le=16384, description="width of a face; null: the resolution of the panorama"
+    )
+    min_confidence: int = Field(default=64, ge=1, le=255, description="minimum confidence of depths (64: seen)")
+    image_format: Literal["jpg", "png"] = Field(
+        default="jpg", description="format of the faces' images (JPEG: quality 95)"
+    )
 
 
 def faces_memory_bytes(params: FacesParams, inputs: Mapping[str, Any]) -> int:
-    """Return what one panorama's faces take: normals are fitted to the whole panorama, one face is held at a time."""
+    """Return the memory for the faces of one panorama: normals of the whole panorama, and one face at a time."""
     height, width = inputs["image"].size_hw
     size = params.size_px or default_face_size((height, width), fov_deg=params.fov_deg)
     return int(200_000_000 + 70 * height * width + 60 * size**2)
@@ -85,9 +89,9 @@ def faces_memory_bytes(params: FacesParams, inputs: Mapping[str, Any]) -> int:
 
 @stage("export.colmap_faces", memory=faces_memory_bytes)
 def colmap_faces(image: Each[Panorama], range_map: Each[RangeMap], params: FacesParams, ctx: Context) -> FaceFiles:
-    """The pinhole faces of each panorama for COLMAP's dense tools: pictures, masks, z-depth and normal maps.
+    """Write pinhole faces of each panorama for COLMAP's dense tools: images, masks, z-depth and normal maps.
 
-    In colmap_dense/; export.colmap_dense writes the model that goes with them.
+    The files are in colmap_dense/; export.colmap_dense writes the model for them.
     """
     picture = image.load()
     source = face_source(
@@ -95,15 +99,22 @@ def colmap_faces(image: Each[Panorama], range_map: Each[RangeMap], params: Faces
     )
     faces = panorama_faces(image.size_hw, layout=params.layout, fov_deg=params.fov_deg, size_px=params.size_px)
     if not covers_sphere(faces):
-        ctx.note(f"{params.layout} faces of {params.fov_deg:g}° do not cover the sphere: some directions are in none")
+        ctx.note(
+            f"{params.layout} faces of {params.fov_deg:g}° do not cover the sphere: some directions are in no face"
+        )
     suffix, depths = f".{params.image_format}", []
     files: dict[str, Path] = {}
     for face in faces:
         seen = render_face(source, face.view, depth_view=colmap_depth_view(face.view), threads=ctx.threads)
         files |= write_face(
-            ctx.scratch, face.name, suffix, image=seen.image, mask=seen.mask, z_depth=seen.z_depth,
+            ctx.scratch,
+            face.name,
+            suffix,
+            image=seen.image,
+            mask=seen.mask,
+            z_depth=seen.z_depth,
             normals_in_face=seen.normals_in_face,
-        )  # fmt: skip
+        )
         depths.append(np.isfinite(seen.z_depth).mean())
     ctx.metric("share_with_depth", float(np.mean(depths)))
     return FaceFiles(files, params.layout, params.fov_deg, faces[0].view.size_hw[0], suffix)
@@ -112,7 +123,7 @@ def colmap_faces(image: Each[Panorama], range_map: Each[RangeMap], params: Faces
 class DenseParams(Params):
     """Settings of export.colmap_dense."""
 
-    format: ModelForm = Field(default="both", description="of the model; some versions of OpenMVS read text alone")
+    format: ModelForm = Field(default="both", description="format of the model; some versions of OpenMVS need text")
 
 
 @stage("export.colmap_dense")
@@ -124,56 +135,61 @@ def colmap_dense(
     params: DenseParams,
     ctx: Context,
 ) -> Files:
-    """The model of export.colmap_faces' pictures: a dense workspace for COLMAP's fusion, OpenMVS and splat trainers.
+    """Write the model of export.colmap_faces: a dense workspace for COLMAP's fusion, OpenMVS and splat trainers.
 
-    A rig of PINHOLE cameras, a frame for each panorama, points with tracks: in colmap_dense/sparse and, for trainers,
-    in sparse/0; stereo/*.cfg. With points.tracked its points join the sparse ones, so that no face is without.
-    A workspace has one frame, that of the largest group of poses; models of the others are in sparse/1, sparse/2 …
+    It contains a rig of PINHOLE cameras, a frame for each panorama and points with tracks, in colmap_dense/sparse and,
+    for trainers, in sparse/0, and stereo/*.cfg. The points of points.tracked, if available, are added to the sparse
+    ones, so that every face sees some. A workspace has one frame, that of the largest group of poses; models of other
+    groups are in sparse/1, sparse/2 …
     """
     joined = poses if points is None else points.joined_to(poses, keep_points=True)
     largest, *others = split_groups(joined)
     cuts = _cuts(largest.names, faces, item_stems(images))
     if not cuts:
-        raise UsageError("no panorama has both a pose and faces, so there is no workspace to describe")
+        raise UsageError("no panorama has both a pose and faces, so there is no workspace to write")
     folder = ctx.scratch / "sparse"
     seen = write_rig_model(folder, largest, cuts, form=params.format)
     files = sparse_targets(children(folder)) | write_stereo_configs(ctx.scratch, seen)
     for number, group in enumerate(others, start=1):
         files |= _other_model(group, number, _cuts(group.names, faces, item_stems(images)), params.format, ctx)
-    _tell_blanks(seen, params.format, ctx)
+    _warn_about_spaces(seen, params.format, ctx)
     blind = sum(not count for count in seen.values())
     ctx.metric("faces_without_points", blind)
     if blind:
-        ctx.note(f"{blind} of {len(seen)} faces {plural(blind, 'sees', 'see')} no point of the model: COLMAP fuses "
-                 f"none of {plural(blind, 'its', 'their')} depths. Add a stage points.tracked, or raise its "
-                 "count")  # fmt: skip
+        ctx.note(
+            f"{blind} of {len(seen)} faces {plural(blind, 'sees', 'see')} no point of the model: COLMAP fuses "
+            f"none of {plural(blind, 'its', 'their')} depths. Add a stage points.tracked, or raise its "
+            "count"
+        )
     return Files(files)
 
 
 class DenseInitParams(ModelParams):
     """Settings of export.colmap_dense_init."""
 
-    keep_sfm: bool = Field(default=True, description="also the sparse points that the poses were solved with")
+    keep_sfm: bool = Field(default=True, description="also include the sparse points of the pose solver")
 
 
 @stage("export.colmap_dense_init")
 def colmap_dense_init(
     poses: One[Poses], points: One[TrackedPoints], images: All[Panorama], params: DenseInitParams, ctx: Context
 ) -> Files:
-    """COLMAP model with the many points of points.tracked, in colmap_dense_init/sparse/0: what splats begin with.
+    """COLMAP model with the dense points of points.tracked, in colmap_dense_init/sparse/0, to initialise splats.
 
-    The cameras are those of export.colmap, EQUIRECTANGULAR. Further groups of poses are in sparse/1, sparse/2 …
+    The cameras are the EQUIRECTANGULAR ones of export.colmap. Further groups of poses are in sparse/1, sparse/2 …
     """
     joined = points.joined_to(poses, keep_points=params.keep_sfm)
     ctx.metric("points", len(joined.points_in_world))
     return _sparse_models(joined, images, params.format, ctx, "colmap_dense_init/sparse")
 
 
-def _tell_blanks(names: Iterable[str], form: ModelForm, ctx: Context) -> None:
+def _warn_about_spaces(names: Iterable[str], form: ModelForm, ctx: Context) -> None:
     found = next((name for name in names if " " in name), "") if form != "bin" else ""
     if found:
-        ctx.note(f"{found!r} holds a blank: in the text model COLMAP and OpenMVS read such a name as far as that. Use "
-                 "the binary one, or rename the picture")  # fmt: skip
+        ctx.note(
+            f"{found!r} contains a space: in the text model, COLMAP and OpenMVS read the name only up to the space. "
+            "Use the binary model, or rename the image"
+        )
 
 
 def _sparse_models(poses: Poses, images: Mapping[str, Panorama], form: ModelForm, ctx: Context, target: str) -> Files:
@@ -184,28 +200,30 @@ def _sparse_models(poses: Poses, images: Mapping[str, Panorama], form: ModelForm
         sizes_hw = {name: images[name].source_size_hw for name in group.names if name in images}
         write_colmap_model(folder, group, sizes_hw, form=form)
         files |= {f"{target}/{number}/{path.name}": path for path in children(folder)}
-    _tell_blanks(poses.names, form, ctx)
+    _warn_about_spaces(poses.names, form, ctx)
     return Files(files)
 
 
 def _other_model(
     group: Poses, number: int, cuts: Mapping[str, CutPanorama], form: ModelForm, ctx: Context
 ) -> dict[str, Path]:
-    """Write the model of a group that is not the workspace's, and return where its files belong."""
+    """Write the model of a group other than the workspace's, and return the targets of its files."""
     shown = ", ".join(group.names[:3]) + (f" … ({len(group.names)} images)" if len(group.names) > 3 else "")
     if not cuts:
-        ctx.note(f"group {number} of the poses ({shown}) has no faces and so no model in {WORKSPACE}")
+        ctx.note(f"group {number} of the poses ({shown}) has no faces, so {WORKSPACE} contains no model of it")
         return {}
     folder = ctx.scratch / f"sparse_{number}"
     write_rig_model(folder, group, cuts, form=form)
     target = f"{WORKSPACE}/sparse/{number}"
-    ctx.note(f"{WORKSPACE}/sparse is the model of the largest group of poses; group {number} ({shown}) has a frame of "
-             f"its own and is in {target}. To fuse it, put that model in the place of sparse")  # fmt: skip
+    ctx.note(
+        f"{WORKSPACE}/sparse is the model of the largest group of poses; group {number} ({shown}) has its own frame "
+        f"and is in {target}. To fuse it, replace sparse by that model"
+    )
     return {f"{target}/{path.name}": path for path in children(folder)}
 
 
 def _cuts(names: Iterable[str], faces: Mapping[str, FaceFiles], stems: Mapping[str, str]) -> dict[str, CutPanorama]:
-    """Return how each panorama that has faces was cut; those that were cut alike share their views."""
+    """Return how each panorama with faces was cut; panoramas that were cut alike share their views."""
     shared: dict[tuple[str, float, int], tuple[Face, ...]] = {}
     views: dict[tuple[str, float, int], list[PinholeView]] = {}
     cuts: dict[str, CutPanorama] = {}

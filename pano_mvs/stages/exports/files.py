@@ -1,4 +1,4 @@
-"""Exports: files that other programs open."""
+"""Exports as point clouds, range maps and previews."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ from pano_mvs.scene.files import group_file
 class PlyParams(Params):
     """Settings of export.ply."""
 
-    quality: bool = Field(default=False, description="add to each point how many views agree, and its confidence")
-    min_confidence: int = Field(default=0, ge=0, le=255, description="points below are left out")
-    min_views: int = Field(default=0, ge=0, le=255, description="points on which fewer views agree are left out")
+    quality: bool = Field(
+        default=False, description="add the number of agreeing views and the confidence to each point"
+    )
+    min_confidence: int = Field(default=0, ge=0, le=255, description="minimum confidence of a point")
+    min_views: int = Field(default=0, ge=0, le=255, description="minimum number of views that agree on a point")
     voxel: float = Field(
-        default=0.0, ge=0, description="keep the best point of each voxel of this edge, scene units; 0: keep all"
+        default=0.0, ge=0, description="keep the best point of each voxel with this edge, in scene units; 0: keep all"
     )
-    max_points: int = Field(
-        default=0, ge=0, description="thin evenly to this number of points or a little fewer; 0: no limit"
-    )
+    max_points: int = Field(default=0, ge=0, description="thin evenly to at most this number of points; 0: no limit")
 
 
 @stage("export.ply")
 def ply(cloud: One[PointCloud], params: PlyParams, ctx: Context) -> Files:
-    """The fused cloud as cloud.ply: binary little endian, x y z nx ny nz red green blue.
+    """Write the fused cloud as cloud.ply: binary little endian, x y z nx ny nz red green blue.
 
-    Written, and thinned, in chunks: memory does not grow with the cloud. Further groups of poses, each in a frame of
-    its own, are cloud_1.ply, cloud_2.ply …; each file is thinned on its own.
+    The cloud is thinned and written in chunks: memory does not grow with its size. Further groups of poses, each in its
+    own frame, are cloud_1.ply, cloud_2.ply …; each file is thinned on its own.
     """
     selection = Selection(params.min_confidence, params.min_views, params.voxel, params.max_points)
     files, points = {}, 0
@@ -65,12 +65,12 @@ class RangesParams(Params):
     """Settings of export.ranges."""
 
     formats: tuple[Literal["tiff", "png", "exr", "npy"], ...] = Field(
-        default=("tiff",), description="of the ranges: tiff, exr, npy are float32 and NaN is invalid; png is 16 bit"
+        default=("tiff",), description="file formats: tiff, exr and npy are float32 with NaN as invalid; png is 16 bit"
     )
-    png_unit: float = Field(default=0.001, gt=0, description="scene units of one step of a 16-bit PNG; 0 is invalid")
-    confidence: bool = Field(default=True, description="write confidence/<image>.png")
+    png_unit: float = Field(default=0.001, gt=0, description="scene units per step of a 16-bit PNG; 0 is invalid")
+    confidence: bool = Field(default=True, description="also write confidence/<image>.png")
     normals: tuple[Literal["tiff", "png", "exr", "npy"], ...] = Field(
-        default=(), description="of the surface normals in the camera frame (x right, y down, z forward), if any"
+        default=(), description="file formats of surface normals in the camera frame (x right, y down, z forward)"
     )
 
     @field_validator("formats", "normals")
@@ -83,9 +83,9 @@ class RangesParams(Params):
 
 @stage("export.ranges")
 def ranges(range_map: Each[RangeMap], image: Each[Panorama] | None, params: RangesParams, ctx: Context) -> Files:
-    """Each range map as range/<image>.tiff (float32, NaN invalid) and confidence/<image>.png (8 bit, 0 invalid).
+    """Write each range map as range/<image>.tiff (float32, NaN invalid) and confidence/<image>.png (8 bit, 0 invalid).
 
-    Other formats, and normals/<image> of them, on request. A 16-bit PNG has its unit beside it in range/<image>.json.
+    Other formats, and normals/<image>, are optional. The unit of a 16-bit PNG is in range/<image>.json.
     """
     valid = range_map.valid if image is None else range_map.valid & image.load_mask()
     values = np.where(valid, range_map.range, np.float32(np.nan))
@@ -103,9 +103,9 @@ def ranges(range_map: Each[RangeMap], image: Each[Panorama] | None, params: Rang
 
 @stage("export.previews")
 def previews(range_map: Each[RangeMap], image: Each[Panorama], ctx: Context) -> Files:
-    """A picture for each view, preview/<image>.jpg: the panorama beside its colour-mapped range with a scale bar.
+    """Write a preview of each view, preview/<image>.jpg: the panorama beside its colour-mapped range with a scale bar.
 
-    What is masked is grey, like pixels without a range.
+    Masked pixels and pixels without a range are grey.
     """
     path = ctx.scratch / "preview.jpg"
     write_preview(path, image.load(), range_map.range, mask=image.load_mask())
@@ -129,7 +129,7 @@ def _write_range(values: NDArray[np.float32], suffix: str, params: RangesParams,
 
 
 def _normals(range_map: RangeMap, valid: NDArray[np.bool_], *, threads: int) -> NDArray[np.float32]:
-    """Return the normals of the valid pixels: those that came with the ranges, else planes fitted to the ranges."""
+    """Return the normals of the valid pixels: those of the range map, else normals of planes fitted to the ranges."""
     given = range_map.normals_in_cam
     known = normals_from_range(range_map, threads=threads) if given is None else np.asarray(given).astype(np.float32)
     return np.where(valid[..., None], known, np.float32(np.nan))

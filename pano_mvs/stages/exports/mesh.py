@@ -1,4 +1,4 @@
-"""Exports: the scene's surface as a mesh."""
+"""Export of the scene's surface as a mesh."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from pano_mvs.algorithms.mesh.poisson import FEWEST_POINTS, poisson_depth, solve_poisson
+from pano_mvs.algorithms.mesh.poisson import MIN_POINTS, poisson_depth, solve_poisson
 from pano_mvs.algorithms.mesh.triangles import Mesh, point_spacings, trimmed_mesh, without_crumbs
 from pano_mvs.api import Context, Files, InputError, One, Params, PointCloud, stage
 from pano_mvs.core.text import plural
@@ -21,27 +21,31 @@ class MeshParams(Params):
     """Settings of export.mesh."""
 
     depth: int = Field(
-        default=0, ge=0, le=14, description="of the octree: cells are the extent / 2^depth wide; 0: as points lie apart"
+        default=0, ge=0, le=14, description="depth of the octree: cells are extent / 2^depth wide; 0: by point spacing"
     )
-    point_weight: float = Field(default=1.0, ge=0, description="how much the surface is drawn to the points")
+    point_weight: float = Field(default=1.0, ge=0, description="how closely the surface follows the points")
     trim: float = Field(
-        default=4.0, ge=0, description="cut off what is farther from the points than so many of their spacings; 0: keep"
+        default=4.0,
+        ge=0,
+        description="cut off parts farther from the points than this times their spacing; 0: keep all",
     )
     smallest_part: float = Field(
-        default=0.001, ge=0, le=1, description="loose parts with less than this share of the triangles are left out"
+        default=0.001, ge=0, le=1, description="remove loose parts with less than this share of the triangles"
     )
-    max_points: int = Field(default=500_000, ge=0, description="the cloud is thinned evenly to so many; 0: never")
-    min_views: int = Field(default=2, ge=0, le=255, description="points on which fewer views agree are left out")
-    min_confidence: int = Field(default=64, ge=0, le=255, description="points below are left out")
+    max_points: int = Field(
+        default=500_000, ge=0, description="thin the cloud evenly to this number of points; 0: never"
+    )
+    min_views: int = Field(default=2, ge=0, le=255, description="minimum number of views that agree on a point")
+    min_confidence: int = Field(default=64, ge=0, le=255, description="minimum confidence of a point")
 
 
 @stage("export.mesh", memory="2GB")
 def mesh(cloud: One[PointCloud], params: MeshParams, ctx: Context) -> Files:
-    """The surface through the fused cloud as mesh.ply: coloured triangles, by screened Poisson reconstruction.
+    """Write the surface of the fused cloud as mesh.ply: coloured triangles from screened Poisson reconstruction.
 
-    The solver closes everything; what lies away from all points is cut off again. Triangles face the side that was
-    seen. One thread, whatever the run has: with more the result would differ from time to time. Further groups of
-    poses, each in a frame of its own, are mesh_1.ply, mesh_2.ply …
+    The solver returns a closed surface; parts far from all points are cut off again. Triangles face the side that was
+    seen. The solver uses one thread in any run, because the result would vary with more. Further groups of poses, each
+    in its own frame, are mesh_1.ply, mesh_2.ply …
     """
     files, faces = {}, 0
     for number, group in enumerate(cloud.groups()):
@@ -74,10 +78,11 @@ def _solved(cloud: PointCloud, params: MeshParams, folder: Path) -> tuple[Mesh, 
     selection = Selection(params.min_confidence, params.min_views, max_points=params.max_points)
     write_ply(source, cloud, kept=select_points(cloud, selection, folder))
     points = read_ply(source).points_in_world
-    if len(points) < FEWEST_POINTS:
-        raise InputError(f"{len(points)} of {len(cloud)} points {plural(len(points), 'is', 'are')} left for a mesh; "
-                         f"{FEWEST_POINTS} are needed. Lower `min_views` or `min_confidence`, or look at why the cloud "
-                         "is empty")  # fmt: skip
+    if len(points) < MIN_POINTS:
+        raise InputError(
+            f"{len(points)} of {len(cloud)} points {plural(len(points), 'is', 'are')} left for a mesh; {MIN_POINTS} "
+            "are needed. Lower `min_views` or `min_confidence`, or find out why the cloud is empty"
+        )
     spacing = float(np.median(point_spacings(points)))
     depth = params.depth or poisson_depth(points, spacing)
     solved = Mesh(*read_ply_mesh(solve_poisson(source, folder, depth=depth, point_weight=params.point_weight)))
@@ -85,5 +90,5 @@ def _solved(cloud: PointCloud, params: MeshParams, folder: Path) -> tuple[Mesh, 
         solved = trimmed_mesh(solved, points, max_spacings=params.trim)
     solved = without_crumbs(solved, smallest_share=params.smallest_part)
     if not len(solved.faces):
-        raise InputError("the mesh has no faces: the points have no common surface. Raise `trim` or `max_points`")
+        raise InputError("the mesh has no faces: the points form no common surface. Raise `trim` or `max_points`")
     return solved, depth

@@ -1,4 +1,4 @@
-"""Exports: panoramas, or pinhole faces of them, as nerfstudio reads them."""
+"""Exports for nerfstudio: panoramas, or pinhole faces of them."""
 
 from __future__ import annotations
 
@@ -51,17 +51,21 @@ class NerfstudioFramesParams(Params):
         default=("equirectangular", "faces"), min_length=1, description="whole panoramas, pinhole faces, or both"
     )
     layout: FaceLayout = Field(default="cube", description="cube: 6 faces, octagon: 10, icosahedron: 20")
-    fov_deg: float = Field(default=96.0, ge=30, le=150, description="field of view of a face; above 90 they overlap")
-    size_px: int | None = Field(default=None, ge=4, le=16384, description="width of a face; null: as fine as the image")
-    image_format: Literal["jpg", "png"] = Field(default="jpg", description="of pictures that have to be written anew")
-    depth_unit: float = Field(
-        default=0.001, gt=0, description="scene units of one step of the 16-bit depths; nerfstudio must be told another"
+    fov_deg: float = Field(default=96.0, ge=30, le=150, description="field of view of a face; faces overlap above 90")
+    size_px: int | None = Field(
+        default=None, ge=4, le=16384, description="width of a face; null: the resolution of the panorama"
     )
-    min_confidence: int = Field(default=64, ge=0, le=255, description="ranges below are no depths")
+    image_format: Literal["jpg", "png"] = Field(
+        default="jpg", description="format of images that are not copied unchanged"
+    )
+    depth_unit: float = Field(
+        default=0.001, gt=0, description="scene units per step of the 16-bit depths; pass other values to nerfstudio"
+    )
+    min_confidence: int = Field(default=64, ge=0, le=255, description="minimum confidence of depths")
 
 
 def frames_memory_bytes(params: NerfstudioFramesParams, inputs: Mapping[str, Any]) -> int:
-    """Return what one panorama takes: 40 bytes a pixel, measured at 4096 and 8192 columns, and those of a face."""
+    """Return the memory for one panorama: 40 bytes a pixel, measured at 4096 and 8192 columns, and one face."""
     height, width = inputs["image"].size_hw
     return int(40 * (height * width + (params.size_px or 0) ** 2))
 
@@ -70,18 +74,18 @@ def frames_memory_bytes(params: NerfstudioFramesParams, inputs: Mapping[str, Any
 def nerfstudio_frames(
     image: Each[Panorama], range_map: Each[RangeMap] | None, params: NerfstudioFramesParams, ctx: Context
 ) -> NerfstudioFrames:
-    """Pictures, masks and depths of each panorama under nerfstudio/; export.nerfstudio lists them in transforms.json.
+    """Write images, masks and depths of each panorama under nerfstudio/, for export.nerfstudio.
 
-    A masked pixel has no depth, and shows the colours around it, for programs that do not look at masks. A panorama
-    of which nothing is masked, and that is a colour JPEG (no CMYK) or an 8-bit PNG of the working resolution, is
-    delivered as it is.
+    Masked pixels have no depth; their colours are filled from their surroundings, for programs that ignore masks. A
+    panorama without masked pixels that is a colour JPEG (not CMYK) or an 8-bit PNG of the working resolution is copied
+    unchanged.
     """
     valid = image.load_mask()
     ranges = None
     if range_map is not None:
         kept = valid & range_map.valid & (range_map.confidence >= params.min_confidence)
         ranges = np.where(kept, range_map.range, np.float32(np.nan))
-    made = _Made(params, ctx)
+    made = _FrameFiles(params, ctx)
     if "equirectangular" in params.variants:
         _add_panorama(made, image, valid, ranges)
     if "faces" in params.variants:
@@ -89,8 +93,10 @@ def nerfstudio_frames(
     share = made.beyond / made.depths if made.depths else 0.0
     ctx.metric("beyond_depth", share)
     if share > _MUCH:
-        ctx.note(f"some depths are beyond the {65535 * params.depth_unit:g} scene units that 16 bits hold in steps of "
-                 f"{params.depth_unit:g}, and left out: a larger depth_unit holds them")  # fmt: skip
+        ctx.note(
+            f"some depths exceed the {65535 * params.depth_unit:g} scene units that 16 bits hold in steps of "
+            f"{params.depth_unit:g}, and are left out; use a larger depth_unit to include them"
+        )
     return NerfstudioFrames(made.files, made.pictures, tuple(made.frames), params.depth_unit)
 
 
@@ -98,9 +104,11 @@ class NerfstudioParams(Params):
     """Settings of export.nerfstudio."""
 
     seed_points: int = Field(
-        default=500_000, ge=0, description="points to start splats from, thinned evenly from the cloud; 0: none"
+        default=500_000, ge=0, description="initial points for splats, thinned evenly from the cloud; 0: none"
     )
-    min_views: int = Field(default=2, ge=0, le=255, description="seed points on which fewer views agree are left out")
+    min_views: int = Field(
+        default=2, ge=0, le=255, description="minimum number of views that agree on an initial point"
+    )
 
 
 @stage("export.nerfstudio")
@@ -111,18 +119,20 @@ def nerfstudio(
     params: NerfstudioParams,
     ctx: Context,
 ) -> Files:
-    """The frames of export.nerfstudio_frames as nerfstudio/<variant>/transforms.json, with points to start from.
+    """Write the frames of export.nerfstudio_frames as nerfstudio/<variant>/transforms.json, with initial points.
 
-    Where there is no cloud, the sparse points of the poses are taken. One file has one frame: further groups of poses
-    are transforms_1.json with seed_1.ply, transforms_2.json …
+    Without a cloud, the sparse points of the poses are used. A file has one frame: further groups of poses are
+    transforms_1.json with seed_1.ply, transforms_2.json …
     """
     loaded = {name: frames[name] for name in poses.names if name in frames}
     if not loaded:
         raise InputError("no panorama has both a pose and frames: nothing can be listed in transforms.json")
     if len(loaded) < len(poses.names):
         without = len(poses.names) - len(loaded)
-        ctx.note(f"{without} of {len(poses.names)} registered panoramas {plural(without, 'has', 'have')} no ranges and "
-                 f"{plural(without, 'is', 'are')} not in transforms.json")  # fmt: skip
+        ctx.note(
+            f"{without} of {len(poses.names)} registered panoramas {plural(without, 'has', 'have')} no ranges and "
+            f"{plural(without, 'is', 'are')} not in transforms.json"
+        )
     files: dict[str, Path] = {}
     groups = split_groups(poses)
     clouds = [] if cloud is None else cloud.groups()
@@ -130,8 +140,10 @@ def nerfstudio(
         own = clouds[number] if number < len(clouds) else None
         files |= _write_group(number, group, loaded, own, params, ctx)
     if len(groups) > 1:
-        ctx.note(f"the poses are in {len(groups)} groups, each with a frame of its own: transforms.json lists the "
-                 f"largest, transforms_1.json … the others")  # fmt: skip
+        ctx.note(
+            f"the poses are in {len(groups)} groups, each in its own frame: transforms.json lists the largest group, "
+            "transforms_1.json … the others"
+        )
     return Files(files)
 
 
@@ -143,7 +155,7 @@ def _write_group(
     params: NerfstudioParams,
     ctx: Context,
 ) -> dict[str, Path]:
-    """Write the transforms and the seed of one group of poses, and return where they belong."""
+    """Write the transforms and the initial points of one group of poses, and return the targets of the files."""
     registered = {name: poses.cam_from_world(idx) for idx, name in enumerate(poses.names) if name in frames}
     loaded = {name: frames[name] for name in registered}
     if not loaded:
@@ -177,8 +189,8 @@ def _write_group(
     return files
 
 
-class _Made:
-    """What was made of one panorama so far."""
+class _FrameFiles:
+    """The files of one panorama."""
 
     def __init__(self, params: NerfstudioFramesParams, ctx: Context) -> None:
         self.params = params
@@ -191,19 +203,19 @@ class _Made:
         self.depths = 0
 
     def write(self, target: str, suffix: str) -> Path:
-        """Return where the file for a target is to be written."""
+        """Return the path at which to write the file for a target."""
         path = self.files[target] = self.scratch / f"{len(self.files)}{suffix}"
         return path
 
     def add_mask(self, folder: str, name: str, valid: NDArray[np.bool_]) -> str:
-        """Write a mask unless nothing is masked; return its path beside transforms.json."""
+        """Write a mask unless nothing is masked; return its path relative to transforms.json."""
         if valid.all():
             return ""
         write_png(self.write(f"{folder}/masks/{name}.png", ".png"), np.where(valid, np.uint8(255), np.uint8(0)))
         return f"masks/{name}.png"
 
     def add_depth(self, folder: str, name: str, depths: NDArray[np.float32] | None) -> str:
-        """Write depths, if there are any; return their path beside transforms.json."""
+        """Write depths, if there are any; return their path relative to transforms.json."""
         if depths is None:
             return ""
         self.depths += int(np.isfinite(depths).sum())
@@ -212,7 +224,9 @@ class _Made:
         return f"depths/{name}.png"
 
 
-def _add_panorama(made: _Made, image: Panorama, valid: NDArray[np.bool_], ranges: NDArray[np.float32] | None) -> None:
+def _add_panorama(
+    made: _FrameFiles, image: Panorama, valid: NDArray[np.bool_], ranges: NDArray[np.float32] | None
+) -> None:
     folder, name = "nerfstudio/equirectangular", "{name}"
     height, width = image.size_hw
     whole = image.crop_ltwh is None and image.size_hw == image.source_size_hw
@@ -228,7 +242,9 @@ def _add_panorama(made: _Made, image: Panorama, valid: NDArray[np.bool_], ranges
     )
 
 
-def _add_faces(made: _Made, image: Panorama, valid: NDArray[np.bool_], ranges: NDArray[np.float32] | None) -> None:
+def _add_faces(
+    made: _FrameFiles, image: Panorama, valid: NDArray[np.bool_], ranges: NDArray[np.float32] | None
+) -> None:
     folder, params = "nerfstudio/faces", made.params
     panorama = image.load()
     for face in panorama_faces(image.size_hw, layout=params.layout, fov_deg=params.fov_deg, size_px=params.size_px):
@@ -248,13 +264,15 @@ def _add_faces(made: _Made, image: Panorama, valid: NDArray[np.bool_], ranges: N
 def _write_seed(
     poses: Poses, cloud: PointCloud | None, params: NerfstudioParams, ctx: Context, scratch: Path
 ) -> Path | None:
-    """Write the points to start from; None if there are none."""
+    """Write the initial points; return None if there are none."""
     if cloud is None or not len(cloud):
         count = len(poses.points_in_world)
         cloud = PointCloud(
-            poses.points_in_world.astype(np.float32), np.zeros((count, 3), np.float32), poses.point_colors_rgb,
+            poses.points_in_world.astype(np.float32),
+            np.zeros((count, 3), np.float32),
+            poses.point_colors_rgb,
             np.full(count, 255, np.uint8),
-        )  # fmt: skip
+        )
     if not params.seed_points or not len(cloud):
         return None
     selection = Selection(min_views=params.min_views, max_points=params.seed_points)
@@ -266,7 +284,7 @@ def _write_seed(
 
 
 def _open_masks(listed: Sequence[tuple[str, object, NerfstudioFrame]], folder: str, scratch: Path) -> dict[str, Path]:
-    """Write the masks of frames in which nothing is masked, if there are others: nerfstudio wants one for each."""
+    """Write masks of frames without masked pixels if other frames have masks: nerfstudio needs one for each frame."""
     if not any(frame.mask for _, _, frame in listed):
         return {}
     files = {}

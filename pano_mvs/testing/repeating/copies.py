@@ -1,4 +1,4 @@
-"""Congruent copies of what stands in a place."""
+"""Congruent copies of the objects of a place."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from pano_mvs.testing.surfaces import Ball, Bounded, Cuboid, FloatArray, Quad, R
 
 @dataclass(frozen=True)
 class Move:
-    """A shift, or half a turn about the vertical axis through the world's origin, which takes textures along.
+    """A shift, or half a turn about the vertical axis through the world's origin, including textures.
 
     Attributes:
-        step: of the shift.
-        half_turn: whether it is half a turn; the step is zero then.
+        step: vector of the shift.
+        half_turn: whether it is half a turn; the step is then zero.
     """
 
     step: Vector = (0.0, 0.0, 0.0)
     half_turn: bool = False
 
     def point(self, point: Vector) -> Vector:
-        """Return a point, moved."""
+        """Return a moved point."""
         return vector(self._signs * point + np.array(self.step))
 
     def direction(self, direction: Vector) -> Vector:
-        """Return a direction, moved."""
+        """Return a moved direction."""
         return vector(self._signs * direction)
 
     def thing(self, thing: Painted) -> Painted:
-        """Return a surface with its print, moved."""
+        """Return a moved surface with its print."""
         surface, pattern = thing
         if not isinstance(pattern, Print):
             raise TypeError(f"a texture {pattern!r} cannot be moved; only prints can")
@@ -42,16 +42,16 @@ class Move:
         return self.surface(surface), replace(pattern, origin=self.point(pattern.origin))
 
     def wall(self, wall: Wall) -> Wall:
-        """Return a wall, moved."""
+        """Return a moved wall."""
         return replace(wall, foot=self.point(wall.foot), along=self.direction(wall.along))
 
     def rect(self, rect: Rect) -> Rect:
-        """Return a rectangle, moved."""
+        """Return a moved rectangle."""
         low, high = corners(self.point((rect[0], 0.0, rect[1])), self.point((rect[2], 0.0, rect[3])))
         return low[0], low[2], high[0], high[2]
 
     def surface(self, surface: Surface) -> Surface:
-        """Return a surface, moved."""
+        """Return a moved surface."""
         match surface:
             case Bounded():
                 return replace(surface, surface=self.surface(surface.surface), center=self.point(surface.center))

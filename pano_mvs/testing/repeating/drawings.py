@@ -1,4 +1,4 @@
-"""Small pictures that the repeating places are printed with: tiles, house fronts, columns, posters."""
+"""Small images printed on the surfaces of the repeating places: tiles, house fronts, columns, posters."""
 
 from __future__ import annotations
 
@@ -13,20 +13,34 @@ from numpy.typing import NDArray
 from pano_mvs.testing.paint import Colors
 
 Image: TypeAlias = NDArray[np.float32]
-Kind: TypeAlias = Literal["bay", "cabinet", "ceiling", "checker", "column", "door", "gravel", "marble", "motif",
-                          "plain", "poster", "tread", "wall", "wear"]  # fmt: skip
+Kind: TypeAlias = Literal[
+    "bay",
+    "cabinet",
+    "ceiling",
+    "checker",
+    "column",
+    "door",
+    "gravel",
+    "marble",
+    "motif",
+    "plain",
+    "poster",
+    "tread",
+    "wall",
+    "wear",
+]
 
 _DARK = 0.55
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """What a picture shows; equal drawings are equal pictures.
+    """The content of an image; equal drawings give equal images.
 
     Attributes:
-        kind: of the picture.
+        kind: kind of the drawing.
         colors_rgb: its two main colours in [0, 1].
-        seed: of what is random in it.
+        seed: seed of its random parts.
         texels: its width and height, a power of two.
     """
 
@@ -38,7 +52,7 @@ class Drawing:
 
 @lru_cache(maxsize=128)
 def pyramid(drawing: Drawing) -> tuple[Image, ...]:
-    """Return the picture (n, n, 3) float32 in [0, 1] of a drawing, then halved again and again down to one texel."""
+    """Return the image (n, n, 3) float32 in [0, 1] of a drawing, then successively halved down to one texel."""
     rng = np.random.default_rng([drawing.seed, sum(map(ord, drawing.kind))])
     level = np.clip(_PAINTERS[drawing.kind](rng, drawing.texels, drawing.colors_rgb), 0, 1).astype(np.float32)
     levels = [level]
@@ -53,13 +67,13 @@ def _plain(_rng: np.random.Generator, size: int, colors: Colors) -> Image:
 
 
 def _wear(rng: np.random.Generator, size: int, _colors: Colors) -> Image:
-    """Return grey noise about ½ of standard deviation ⅙ that holds all wavelengths from 5 texels to a quarter."""
+    """Return noise with mean ½ and standard deviation ⅙, with wavelengths from 5 texels to a quarter of the size."""
     noise = _clouds(rng, size, (5, 40)) + _clouds(rng, size, (40, size / 4))
     return np.repeat((0.5 + noise / np.sqrt(2) / 6)[..., None], 3, axis=2).astype(np.float32)
 
 
 def _marble(rng: np.random.Generator, size: int, colors: Colors) -> Image:
-    """Return one tile of veined stone; the joint is its border, half on either side."""
+    """Return one tile of veined stone with half of the joint on each side."""
     return _jointed(_stone(rng, size, colors))
 
 
@@ -75,7 +89,7 @@ def _checker(rng: np.random.Generator, size: int, colors: Colors) -> Image:
 
 
 def _motif(rng: np.random.Generator, size: int, colors: Colors) -> Image:
-    """Return one cement tile with an ornament that has the tile's symmetries."""
+    """Return one cement tile with an ornament with the tile's symmetries."""
     x, y = _grid(size)
     radius, turn = np.hypot(x, y), np.arctan2(y, x)
     petals = radius < 0.30 + 0.10 * np.cos(4 * turn * rng.integers(1, 3))
@@ -104,7 +118,7 @@ def _column(rng: np.random.Generator, size: int, colors: Colors) -> Image:
 
 
 def _wall(rng: np.random.Generator, size: int, colors: Colors) -> Image:
-    """Return a panel of plaster with a faint cast, a seam at its sides, and a dark skirting board at its foot."""
+    """Return a panel of plaster with faint shading, a seam at its sides, and a dark skirting board."""
     x, y = _grid(size)
     image = _shaded(_filled(size, colors[0]), 0.012 * _clouds(rng, size, (8, 80)))
     image[np.abs(x) > 0.497] *= np.float32(0.9)
@@ -113,7 +127,7 @@ def _wall(rng: np.random.Generator, size: int, colors: Colors) -> Image:
 
 
 def _ceiling(rng: np.random.Generator, size: int, colors: Colors) -> Image:
-    """Return a panel of a hung ceiling with a lamp in it."""
+    """Return a panel of a suspended ceiling with a lamp."""
     x, y = _grid(size)
     image = _shaded(_filled(size, colors[0]), 0.01 * _clouds(rng, size, (4, 10)))
     lamp = (np.abs(x) < 0.32) & (np.abs(y) < 0.10)
@@ -140,7 +154,7 @@ def _bay(rng: np.random.Generator, size: int, colors: Colors) -> Image:
 
 
 def _door(rng: np.random.Generator, size: int, colors: Colors) -> Image:
-    """Return one bay of a corridor: a door with panels, a handle and a plate in a plain wall."""
+    """Return one bay of a corridor: a plain wall with a panelled door, a handle and a plate."""
     x, y = _grid(size)
     image = _wall(rng, size, ((0.84, 0.83, 0.79), colors[1]))
     width, head = rng.uniform(0.15, 0.19), rng.uniform(-0.28, -0.22)
@@ -167,7 +181,7 @@ def _tread(rng: np.random.Generator, size: int, colors: Colors) -> Image:
 
 
 def _cabinet(rng: np.random.Generator, size: int, colors: Colors) -> Image:
-    """Return wood with drawers and knobs, or stripes of cloth."""
+    """Return wood with drawers and knobs, or striped cloth."""
     x, y = _grid(size)
     rows = int(rng.integers(2, 6))
     image = _shaded(
@@ -180,7 +194,7 @@ def _cabinet(rng: np.random.Generator, size: int, colors: Colors) -> Image:
 
 
 def _poster(rng: np.random.Generator, size: int, _colors: Colors) -> Image:
-    """Return a framed picture like no other: coloured shapes on a wash, and lines that look like writing."""
+    """Return a unique framed image: coloured shapes on a wash, and lines that resemble writing."""
     x, y = _grid(size)
     wash = 0.5 + 0.35 * _clouds(rng, size, (20, 150))
     image = _blend((tuple(rng.uniform(0.2, 0.95, 3)), tuple(rng.uniform(0.2, 0.95, 3))), wash)
@@ -200,14 +214,25 @@ def _poster(rng: np.random.Generator, size: int, _colors: Colors) -> Image:
 
 
 _PAINTERS: dict[Kind, Callable[[np.random.Generator, int, Colors], Image]] = {
-    "bay": _bay, "cabinet": _cabinet, "ceiling": _ceiling, "checker": _checker, "column": _column, "door": _door,
-    "gravel": _gravel, "marble": _marble, "motif": _motif, "plain": _plain, "poster": _poster, "tread": _tread,
-    "wall": _wall, "wear": _wear,
-}  # fmt: skip
+    "bay": _bay,
+    "cabinet": _cabinet,
+    "ceiling": _ceiling,
+    "checker": _checker,
+    "column": _column,
+    "door": _door,
+    "gravel": _gravel,
+    "marble": _marble,
+    "motif": _motif,
+    "plain": _plain,
+    "poster": _poster,
+    "tread": _tread,
+    "wall": _wall,
+    "wear": _wear,
+}
 
 
 def _stone(rng: np.random.Generator, size: int, colors: Colors) -> Image:
-    """Return veined stone that does not go on beyond its edges as it would if the picture were laid beside itself."""
+    """Return veined stone that does not continue periodically beyond its edges."""
     bend = _clouds(rng, 2 * size, (20, 120))[:size, :size]
     field = _clouds(rng, 2 * size, (40, 260))[:size, :size] + 0.25 * bend
     veins = np.exp(-((field / 0.07) ** 2)) * np.clip(0.6 + 0.5 * bend, 0, 1)
@@ -217,7 +242,7 @@ def _stone(rng: np.random.Generator, size: int, colors: Colors) -> Image:
 
 
 def _bricks(rng: np.random.Generator, size: int, colors: Colors) -> Image:
-    """Return 16 courses of 6 bricks, every second course half a brick further."""
+    """Return 16 courses of 6 bricks, every second course shifted by half a brick."""
     x, y = _grid(size)
     course = np.floor((y + 0.5) * 16).astype(int)
     along = (x + 0.5) * 6 + 0.5 * (course % 2)
@@ -230,7 +255,7 @@ def _bricks(rng: np.random.Generator, size: int, colors: Colors) -> Image:
 
 
 def _jointed(image: Image) -> Image:
-    """Return a tile with its half of the joints around it, and the slightly darker edge that cut stone has."""
+    """Return a tile with half of the surrounding joints, and the slightly darker edge of cut stone."""
     x, y = _grid(len(image))
     edge = np.maximum(np.abs(x), np.abs(y))
     image = _shaded(image, np.where(edge > 0.485, -0.12, 0.0))
@@ -239,7 +264,7 @@ def _jointed(image: Image) -> Image:
 
 
 def _clouds(rng: np.random.Generator, size: int, wavelengths_px: tuple[float, float]) -> NDArray[np.float64]:
-    """Return periodic noise (n, n) of unit variance whose wavelengths lie between two."""
+    """Return periodic noise (n, n) of unit variance with wavelengths between two limits."""
     frequency = np.fft.fftfreq(size)
     radius = np.hypot(frequency[:, None], frequency)
     band = (radius >= 1 / wavelengths_px[1]) & (radius <= 1 / wavelengths_px[0])

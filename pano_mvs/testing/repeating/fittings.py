@@ -1,4 +1,4 @@
-"""What the repeating places are put together from: walls, blocks, columns, and the unique things in them."""
+"""Building blocks of the repeating places: walls, blocks, columns, and unique objects."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _SLOT = 1.35
 
 @dataclass(frozen=True)
 class Wall:
-    """A stretch of upright wall that pictures may hang on and furniture stand before.
+    """A section of upright wall for pictures and furniture.
 
     Attributes:
-        foot: its end at the floor, to the left of who faces it.
+        foot: its end at the floor, on the left when facing it.
         along: unit vector to its other end.
-        length: of the wall.
-        height: of the wall.
+        length: length of the wall.
+        height: height of the wall.
     """
 
     foot: Vector
@@ -37,20 +37,20 @@ class Wall:
     height: float
 
     def at(self, along: float, up: float, out: float) -> Vector:
-        """Return the point so far along the wall, above the floor, and away from it into the room."""
-        # Whoever faces the wall has its foot on the left: the room is behind.
+        """Return the point at given distances along the wall, above the floor, and from the wall into the room."""
+        # Facing the wall, its foot is on the left and the room behind.
         inward = np.array([self.along[2], 0.0, -self.along[0]])
         return vector(np.array(self.foot) + along * np.array(self.along) + out * inward - (0.0, up, 0.0))
 
 
 @dataclass
 class Site:
-    """A place while it is built.
+    """A place under construction.
 
     Attributes:
-        painted: what has been built, with its textures.
-        walls: for pictures and furniture.
-        obstacles: what stands on the floor, seen from above.
+        painted: surfaces that have been built, with textures.
+        walls: walls for pictures and furniture.
+        obstacles: outlines of objects on the floor, seen from above.
     """
 
     painted: list[Painted] = field(default_factory=list)
@@ -67,7 +67,7 @@ class Site:
         self.flat((low_x, y, low_z), ((high_x - low_x, 0.0, 0.0), (0.0, 0.0, high_z - low_z)), pattern)
 
     def wall(self, wall: Wall, pattern: Texture | Pattern, *, free: bool = True) -> None:
-        """Add a wall; if it is free, pictures may hang on it."""
+        """Add a wall; if it is free, it can have pictures."""
         edges = vector(wall.length * np.array(wall.along)), (0.0, -wall.height, 0.0)
         self.flat(wall.foot, edges, pattern)
         self.walls += [wall] * free
@@ -93,19 +93,22 @@ class Site:
         self.painted.append((Bounded(rod, middle, float(np.hypot(reach, radius))), pattern))
 
     def stand(self, rect: Rect) -> None:
-        """Note that no camera stands there."""
+        """Add an obstacle for cameras."""
         self.obstacles.append(rect)
 
     def unique_things(self, unique: float, rng: np.random.Generator, *, furniture: bool = True) -> None:
-        """Hang pictures on the walls and put furniture before them, each like no other.
+        """Hang unique pictures on the walls and put unique furniture in front of them.
 
         Args:
-            unique: share in [0, 1] of the places for them that are taken.
+            unique: share in [0, 1] of the available positions that are used.
             rng: source of randomness.
-            furniture: whether there is any.
+            furniture: whether to add furniture.
         """
-        slots = [(wall, (number + 0.5) * wall.length / int(wall.length / _SLOT))
-                 for wall in self.walls for number in range(int(wall.length / _SLOT))]  # fmt: skip
+        slots = [
+            (wall, (number + 0.5) * wall.length / int(wall.length / _SLOT))
+            for wall in self.walls
+            for number in range(int(wall.length / _SLOT))
+        ]
         order = rng.permutation(len(slots))
         for idx in order[: round(0.8 * unique * len(slots))]:
             self._picture(slots[idx][0], slots[idx][1], rng)
@@ -121,7 +124,7 @@ class Site:
         self.painted.append((_bounded_quad(corner, vector(wide * np.array(wall.along)), (0.0, high, 0.0)), pattern))
 
     def _furniture(self, wall: Wall, along: float, rng: np.random.Generator) -> None:
-        """Put a cabinet, a bench with something on it, or a plant before a wall."""
+        """Put a cabinet, a bench with objects on it, or a plant in front of a wall."""
         half, deep, high = rng.uniform(0.3, 0.6), rng.uniform(0.25, 0.5), rng.uniform(0.35, 1.1)
         kind = rng.integers(3)
         near, far = wall.at(along - half, 0.0, 0.03), wall.at(along + half, high, 0.03 + deep)
@@ -154,7 +157,7 @@ def vector(values: FloatArray) -> Vector:
 
 
 def _own_print(kind: Kind, size: tuple[float, float], origin: Vector, rng: np.random.Generator) -> Print:
-    """Return one print of a drawing like no other."""
+    """Return one print of a unique drawing."""
     colors = _paint(rng)[0], _paint(rng)[1]
     return Print(Drawing(kind, colors, int(rng.integers(1 << 30))), size, origin)
 

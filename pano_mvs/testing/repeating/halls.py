@@ -1,4 +1,4 @@
-"""Halls that repeat: a tiled floor, rows of columns."""
+"""Halls with repeated structure: a tiled floor, rows of columns."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ def tiled_hall(
 
     Args:
         size: extent along x and z.
-        tile: side of a tile; the floor repeats after one of them, "checker" after two.
-        tiles: what is on a tile.
-        wear: share in [0, 1] of texture on the floor that does not repeat.
-        walls: "plain" panels that repeat after 1.2, or "weak": with a faint texture that does not.
-        visit: as `Visit`.
+        tile: side of a tile; the floor repeats after one tile, "checker" after two.
+        tiles: pattern of the tiles.
+        wear: share in [0, 1] of non-repeating texture on the floor.
+        walls: "plain" panels that repeat after 1.2, or "weak": with a faint, non-repeating texture.
+        visit: see `Visit`.
     """
     site, (wide, deep), height = Site(), size, 3.4
     rng = np.random.default_rng([visit.get("seed", 0), 0x4A])
@@ -68,25 +68,29 @@ def colonnade(
     wear: float = 0.0,
     **visit: Unpack[Visit],
 ) -> Scene:
-    """Return rows of equal columns on a tiled floor, in a hall or under the open sky.
+    """Return rows of equal columns on a tiled floor, in a hall or in the open.
 
     Args:
         rows: number of rows.
-        columns: in each row, along z.
-        spacing: of columns and rows.
+        columns: number of columns in each row, along z.
+        spacing: distance between columns and between rows.
         tile: side of a tile.
-        tiles: what is on a tile.
-        walled: whether there are walls and a ceiling; otherwise beams lie on the columns and gravel around the floor.
-        wear: share in [0, 1] of texture on the floor that does not repeat.
-        visit: as `Visit`; without walls the pictures hang on the columns.
+        tiles: pattern of the tiles.
+        walled: whether there are walls and a ceiling; otherwise there are beams on the columns and gravel around the
+            floor.
+        wear: share in [0, 1] of non-repeating texture on the floor.
+        visit: see `Visit`; without walls, pictures hang on the columns.
     """
     site, height = Site(), 4.2
     rng = np.random.default_rng([visit.get("seed", 0), 0xC1])
     half_x, half_z = spacing * (rows + 1) / 2, spacing * (columns + 1) / 2
     rect: Rect = (-half_x, -half_z, half_x, half_z)
     site.floor(rect, 0.0, floor_print(tile, tiles, rng, wear=wear))
-    middles = [((row - (rows - 1) / 2) * spacing, (idx - (columns - 1) / 2) * spacing)
-               for row in range(rows) for idx in range(columns)]  # fmt: skip
+    middles = [
+        ((row - (rows - 1) / 2) * spacing, (idx - (columns - 1) / 2) * spacing)
+        for row in range(rows)
+        for idx in range(columns)
+    ]
     _columns(site, middles, height, rng)
     if walled:
         site.floor(rect, -height, printed("ceiling", WHITE, (spacing / 2, spacing / 2)))
@@ -106,11 +110,15 @@ def _columns(site: Site, middles: list[tuple[float, float]], height: float, rng:
     radius, half = float(rng.uniform(0.16, 0.26)), 0.32
     mantle, block = Drawing("column", stone, seed), Drawing("marble", stone, seed)
     for x, z in middles:
-        site.rod((x, -0.18, z), (x, 0.25 - height, z), radius,
-                 Print(mantle, (1.0, height - 0.43), (x, -0.18, z), wound=True))  # fmt: skip
+        site.rod(
+            (x, -0.18, z), (x, 0.25 - height, z), radius, Print(mantle, (1.0, height - 0.43), (x, -0.18, z), wound=True)
+        )
         for low, high in ((-0.18, 0.0), (-height, 0.25 - height)):
-            site.block((x - half, low, z - half), (x + half, high, z + half),
-                       Print(block, (2 * half, 2 * half), (x - half, low, z - half)))  # fmt: skip
+            site.block(
+                (x - half, low, z - half),
+                (x + half, high, z + half),
+                Print(block, (2 * half, 2 * half), (x - half, low, z - half)),
+            )
         site.stand((x - half, z - half, x + half, z + half))
 
 

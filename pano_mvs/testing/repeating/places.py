@@ -1,10 +1,10 @@
-"""Synthetic places in which structure repeats, so that pictures of different spots look alike; with exact truth.
+"""Synthetic places with repeated structure, where images of different positions look alike, with exact ground truth.
 
     scene = colonnade(seed=3, unique=0.2, layout="path", views=10)
     picture, true_range = scene.view(0, (384, 768))
 
-Lengths may be read as metres; y is down and the floor is y = 0. All places take the arguments of `Visit`; everything is
-a function of them. `draw_capture` draws a place and all of its arguments.
+Lengths can be read as metres; y is down and the floor is y = 0. All places take the arguments of `Visit` and are
+deterministic functions of them. `draw_capture` draws a place and all of its arguments.
 """
 
 from __future__ import annotations
@@ -21,8 +21,18 @@ from pano_mvs.testing.repeating.visits import TILES, Visit
 from pano_mvs.testing.repeating.walks import LAYOUTS
 from pano_mvs.testing.scenes import Scene
 
-__all__ = ["REPEATS", "Visit", "colonnade", "doors", "draw_arguments", "draw_capture", "facade_row", "stairs",
-           "tiled_hall", "twin_rooms"]  # fmt: skip
+__all__ = [
+    "REPEATS",
+    "Visit",
+    "colonnade",
+    "doors",
+    "draw_arguments",
+    "draw_capture",
+    "facade_row",
+    "stairs",
+    "tiled_hall",
+    "twin_rooms",
+]
 
 REPEATS: dict[str, Callable[..., Scene]] = {
     place.__name__: place for place in (tiled_hall, colonnade, facade_row, doors, twin_rooms, stairs)
@@ -30,18 +40,18 @@ REPEATS: dict[str, Callable[..., Scene]] = {
 
 
 def draw_capture(seed: int, *, views: int | None = None) -> Scene:
-    """Return a capture whose place, sizes, unique things, layout and number of views are drawn.
+    """Return a capture with a random place, sizes, unique objects, layout and number of views.
 
     Args:
-        seed: of the draw.
-        views: number of cameras; None: 6 to 12. The places grow with it.
+        seed: seed of the draw.
+        views: number of cameras; None: 6 to 12. The size of the place grows with it.
     """
     name, arguments = draw_arguments(seed, views=views)
     return REPEATS[name](**arguments)
 
 
 def draw_arguments(seed: int, *, views: int | None = None) -> tuple[str, dict[str, Any]]:
-    """Return the place of `draw_capture` and the arguments that it is called with; one in five has unique=0."""
+    """Return the place of `draw_capture` and its arguments; one in five has unique=0."""
     rng = np.random.default_rng([seed, 0xD4])
     name = str(rng.choice(list(REPEATS)))
     count = views or int(rng.integers(6, 13))
@@ -90,7 +100,7 @@ def _corridor(rng: np.random.Generator, views: int) -> dict[str, Any]:
 
 
 def _bays(rng: np.random.Generator, views: int, bay: float) -> int:
-    """Return how many bays make a row that a path of so many views at the most leaves some of."""
+    """Return a number of bays that a path of at most `views` cameras does not cover completely."""
     return int(np.ceil(rng.uniform(1.3, 1.9) * views / bay)) + 2
 
 

@@ -1,4 +1,4 @@
-"""Textures that repeat: a drawing printed over surfaces again and again, filtered to the width of a pixel."""
+"""Repeating textures: a drawing printed periodically on surfaces, filtered to the width of a pixel."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from pano_mvs.testing.repeating.drawings import Drawing, Image, pyramid
 from pano_mvs.testing.surfaces import FloatArray, Vector
 
 _ROW = 1024
-# Side of a print of the wear, and by how much its second layer is larger: together they do not repeat within a hall.
+# Side of a print of the wear, and scale of its second layer: together they do not repeat within a hall.
 _WEAR_SIZE, _WEAR_SCALE = 9.1, 3.37
 _WEAR = Drawing("wear", WHITE, texels=1024)
 
 
 @dataclass(frozen=True)
 class Print:
-    """A drawing printed over whatever bears it; its prints lie side by side, without gaps.
+    """A drawing printed periodically on a surface, without gaps.
 
     Attributes:
-        drawing: what is printed.
-        size: (width, height) of one print in scene units; its width in turns if it is wound.
-        origin: a point where four prints meet; the axis that it is wound about goes through it.
-        wound: whether it is wound about a vertical axis (a column). Otherwise it lies on walls with its height along y,
-            and on floors and ceilings with its width along x.
-        half_turn: whether it is printed half a turn further about the vertical axis through the world's origin.
-        wear: share in [0, 1] of texture that does not repeat.
-        seed: of the wear.
+        drawing: the drawing.
+        size: (width, height) of one print in scene units; if it is wound, the width is in turns.
+        origin: a point where four prints meet; the axis of a wound print goes through it.
+        wound: whether it is wound about a vertical axis (a column). Otherwise its height is along y on walls, and its
+            width along x on floors and ceilings.
+        half_turn: whether it is rotated by half a turn about the vertical axis through the world's origin.
+        wear: share in [0, 1] of non-repeating texture.
+        seed: seed of the wear.
     """
 
     drawing: Drawing
@@ -47,7 +47,7 @@ class Print:
         Args:
             points: in world coordinates.
             normals: (N, 3) of the surface at each.
-            footprint: (N,) how wide a pixel is at each point.
+            footprint: (N,) width of a pixel at each point.
         """
         levels = pyramid(self.drawing)
         turn = np.array([-1, 1, -1] if self.half_turn else [1, 1, 1])
@@ -59,7 +59,7 @@ class Print:
         return colors
 
     def _prints(self, home: FloatArray, normals: FloatArray) -> FloatArray:
-        """Return where in the drawing points are, (N, 2) in prints."""
+        """Return the positions of points in the drawing, (N, 2) in prints."""
         if self.wound:
             turns = np.arctan2(home[:, 0], home[:, 2]) / (2 * np.pi)
             return np.stack([turns, home[:, 1]], axis=1) / self.size
@@ -70,7 +70,7 @@ class Print:
         return np.stack([u, v], axis=1) / self.size
 
     def _worn(self, points: FloatArray, footprint: FloatArray) -> FloatArray:
-        """Return the wear (N,), of standard deviation ⅓ and less far away; it knows nothing of repetitions."""
+        """Return the non-repeating wear (N,), with standard deviation ⅓, less far away."""
         rng = np.random.default_rng([self.seed, 0x3EA7])
         total = np.zeros(len(points))
         for size in (_WEAR_SIZE, _WEAR_SIZE * _WEAR_SCALE):
@@ -82,11 +82,11 @@ class Print:
 
 
 def sampled(levels: tuple[Image, ...], prints: FloatArray, blur: FloatArray) -> FloatArray:
-    """Return the colours (N, 3) of a picture that is laid side by side with itself.
+    """Return the colours (N, 3) of a periodically repeated image.
 
     Args:
-        levels: the picture and its smaller copies, as `pyramid` returns them.
-        prints: (N, 2) x and y in pictures; the fraction is the place within one.
+        levels: the image and its smaller copies, as returned by `pyramid`.
+        prints: (N, 2) x and y in images; the fraction is the position within one.
         blur: (N,) width in texels over which the colour is averaged.
     """
     colors = np.empty((len(prints), 3))
@@ -102,7 +102,7 @@ def sampled(levels: tuple[Image, ...], prints: FloatArray, blur: FloatArray) -> 
 
 
 def _bilinear(image: Image, within: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the colours (N, 3) at places (N, 2) in [0, 1] of a periodic picture."""
+    """Return the colours (N, 3) at positions (N, 2) in [0, 1] of a periodic image."""
     if len(image) == 1:
         return np.broadcast_to(image[0], (len(within), 3))
     rows = -(-len(within) // _ROW)

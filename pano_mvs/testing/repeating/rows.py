@@ -1,4 +1,4 @@
-"""Long places that repeat: house fronts along a lane, doors along a corridor, the treads of stairs."""
+"""Long places with repeated structure: house fronts along a lane, doors along a corridor, stairs."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from pano_mvs.testing.surfaces import FloatArray
 def facade_row(
     *, bays: int = 8, bay: float = 3.0, width: float = 6.0, tile: float = 0.5, **visit: Unpack[Visit]
 ) -> Scene:
-    """Return a paved lane under the sky between two rows of equal houses; plain houses close its ends.
+    """Return a paved lane under the sky between two rows of equal houses, with plain houses at its ends.
 
     Args:
         bays: number of windows in a row.
-        bay: distance from window to window.
-        width: of the lane.
+        bay: distance between windows.
+        width: width of the lane.
         tile: side of a paving stone.
-        visit: as `Visit`; signs hang beside the windows.
+        visit: see `Visit`; signs hang beside the windows.
     """
     site, length, storey = Site(), bays * bay, 3.2
     rng = np.random.default_rng([visit.get("seed", 0), 0xFA])
@@ -65,18 +65,23 @@ def doors(*, bays: int = 8, bay: float = 2.6, width: float = 2.2, tile: float = 
 
     Args:
         bays: number of doors on a side.
-        bay: distance from door to door.
-        width: of the corridor.
+        bay: distance between doors.
+        width: width of the corridor.
         tile: side of a tile.
-        visit: as `Visit`; pictures hang between the doors.
+        visit: see `Visit`; pictures hang between the doors.
     """
     site, length, height = Site(), bays * bay, 2.6
     rng = np.random.default_rng([visit.get("seed", 0), 0xD0])
     rect = (-width / 2, -length / 2, width / 2, length / 2)
     site.floor(rect, 0.0, floor_print(tile, TILES[rng.integers(3)], rng))
     site.floor(rect, -height, printed("ceiling", WHITE, (width, bay), (-width / 2, 0.0, 0.0)))
-    front = printed("door", (OAK, BLUE, RED)[rng.integers(3)], (bay, height), (0.0, 0.0, -length / 2),
-                    seed=int(rng.integers(1 << 30)))  # fmt: skip
+    front = printed(
+        "door",
+        (OAK, BLUE, RED)[rng.integers(3)],
+        (bay, height),
+        (0.0, 0.0, -length / 2),
+        seed=int(rng.integers(1 << 30)),
+    )
     for wall in _sides(rect, height):
         site.wall(wall, front, free=False)
         site.walls += _slots(wall, bays - 1, bay, 0.0)
@@ -93,10 +98,10 @@ def stairs(
 
     Args:
         flights: number of flights.
-        treads: of each flight; the last is the landing.
-        width: of the stairs.
+        treads: number of treads of each flight; the last one is the landing.
+        width: width of the stairs.
         landing: length of a landing.
-        visit: as `Visit`; pictures hang along the walls.
+        visit: see `Visit`; pictures hang along the walls.
     """
     site, rise, run = Site(), 0.165, 0.29
     rng = np.random.default_rng([visit.get("seed", 0), 0x57])
@@ -132,7 +137,7 @@ def stairs(
 
 
 def _climb(starts: list[float], rise: float) -> Callable[[FloatArray], FloatArray]:
-    """Return how high the treads are along z."""
+    """Return the height of the treads along z."""
 
     def height_at(along: FloatArray) -> FloatArray:
         return np.asarray(-rise * np.searchsorted(starts, along, side="right"))
@@ -143,17 +148,21 @@ def _climb(starts: list[float], rise: float) -> Callable[[FloatArray], FloatArra
 def _sides(rect: Rect, height: float) -> tuple[Wall, Wall]:
     """Return the walls along z: at the low x, then at the high x."""
     length = rect[3] - rect[1]
-    return (Wall((rect[0], 0.0, rect[1]), (0.0, 0.0, 1.0), length, height),
-            Wall((rect[2], 0.0, rect[3]), (0.0, 0.0, -1.0), length, height))  # fmt: skip
+    return (
+        Wall((rect[0], 0.0, rect[1]), (0.0, 0.0, 1.0), length, height),
+        Wall((rect[2], 0.0, rect[3]), (0.0, 0.0, -1.0), length, height),
+    )
 
 
 def _ends(rect: Rect, height: float) -> tuple[Wall, Wall]:
     """Return the walls along x: at the high z, then at the low z."""
     length = rect[2] - rect[0]
-    return (Wall((rect[0], 0.0, rect[3]), (1.0, 0.0, 0.0), length, height),
-            Wall((rect[2], 0.0, rect[1]), (-1.0, 0.0, 0.0), length, height))  # fmt: skip
+    return (
+        Wall((rect[0], 0.0, rect[3]), (1.0, 0.0, 0.0), length, height),
+        Wall((rect[2], 0.0, rect[1]), (-1.0, 0.0, 0.0), length, height),
+    )
 
 
 def _slots(wall: Wall, count: int, spacing: float, out: float) -> list[Wall]:
-    """Return the places for pictures on a wall, one between each two bays."""
+    """Return the positions for pictures on a wall, one between each two bays."""
     return [Wall(wall.at((number + 1) * spacing - 0.75, 0.0, out), wall.along, 1.5, 2.6) for number in range(count)]

@@ -14,7 +14,7 @@ from pano_mvs.testing.repeating.visits import STONES, TILES, Visit, captured, pr
 from pano_mvs.testing.repeating.walks import Ground, Rect
 from pano_mvs.testing.scenes import Scene
 
-_HALF = 0.1  # of the partition's thickness
+_HALF = 0.1  # half of the partition's thickness
 _OPENING, _LINTEL, _HEIGHT = 1.4, 2.1, 2.7
 _RIM = 0.5
 
@@ -26,15 +26,15 @@ def twin_rooms(
     congruence: Literal["shift", "half_turn"] = "half_turn",
     **visit: Unpack[Visit],
 ) -> Scene:
-    """Return two equally furnished rooms on either side of x = 0 that an open doorway joins.
+    """Return two equally furnished rooms on either side of x = 0, connected by an open doorway.
 
     Each room has a closed door opposite the doorway.
 
     Args:
-        size: of each room along x and z.
+        size: size of each room along x and z.
         tile: side of a tile.
-        congruence: what brings one room to the other: a shift along x, or half a turn about the doorway's middle.
-        visit: as `Visit`; the unique things are there once, all others twice.
+        congruence: transformation between the rooms: a shift along x, or half a turn about the doorway's centre.
+        visit: see `Visit`; unique objects exist once, all others twice.
     """
     wide, deep = size
     rng = np.random.default_rng([visit.get("seed", 0), 0x2B])
@@ -55,7 +55,7 @@ def twin_rooms(
 
 
 def _room(home: Rect, tile: float, rng: np.random.Generator) -> Site:
-    """Return a room with an opening at either end and furniture; its free walls are those for unique things."""
+    """Return a room with an opening at either end and furniture; its free walls are those for unique objects."""
     site, (low_x, low_z, high_x, high_z) = Site(), home
     stone = STONES[rng.integers(3)]
     site.floor(home, 0.0, printed(TILES[rng.integers(3)], stone, (tile, tile), (low_x, 0.0, 0.0), seed=_seed(rng)))

@@ -1,4 +1,4 @@
-"""What the captures of all repeating places have in common: cameras, exposure, the look of floors and walls."""
+"""Common parts of captures of repeating places: cameras, exposure, appearance of floors and walls."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ PLASTER: Colors = ((0.84, 0.82, 0.77), (0.60, 0.52, 0.42))
 STONES = (MARBLE, SAND, SLATE)
 
 _SKY = ((0.36, 0.55, 0.86), (0.80, 0.86, 0.92))
-# So far away that equal things are shaded alike.
+# Distance of the lamp, so large that equal objects have equal shading.
 _LAMP = (3.1e5, -1e6, 4.7e5)
 _PANEL = 1.2
 
 
 class Visit(TypedDict, total=False):
-    """How a place is photographed, and how much in it is unique.
+    """How a place is photographed, and the share of unique objects.
 
     Attributes:
-        seed: of everything random; the default is 0.
-        views: number of cameras; 8.
-        unique: share in [0, 1] of the room for pictures on walls and for furniture that unique ones take; 0: but for
-            its own ends nothing in the place is unique; 0.5.
-        layout: "unordered" (the cameras are shuffled), "path" or "loop"; "unordered".
-        turned: whether every camera is turned by an arbitrary rotation, or stands upright within a degree or so and is
-            turned about the vertical only; true.
-        exposure: about by how much the logarithm of the exposure drifts during the capture; 0.
+        seed: seed of everything random; the default is 0.
+        views: number of cameras; the default is 8.
+        unique: share in [0, 1] of the positions for pictures and furniture that unique ones occupy. With 0, only the
+            ends of the place are unique; the default is 0.5.
+        layout: "unordered" (the cameras are shuffled), "path" or "loop"; the default is "unordered".
+        turned: whether every camera is rotated arbitrarily, or is upright within about a degree and rotated about the
+            vertical only; the default is true.
+        exposure: approximate drift of the logarithm of the exposure during the capture; the default is 0.
     """
 
     seed: int
@@ -54,14 +54,14 @@ class Visit(TypedDict, total=False):
 
 
 def captured(name: str, site: Site, ground: Ground, visit: Visit, *, sky: bool = False) -> Scene:
-    """Return a place with its cameras, on a tripod 1.3 to 1.7 high whose height changes by 2 cm.
+    """Return a place with its cameras, on a tripod with a height of 1.3 to 1.7 that varies by 2 cm.
 
     Args:
-        name: of the place.
-        site: what has been built.
+        name: name of the place.
+        site: the surfaces that have been built.
         ground: where cameras may stand.
         visit: how it is photographed.
-        sky: whether there is one where nothing has been built.
+        sky: whether there is a sky where nothing has been built.
     """
     seed, views = visit.get("seed", 0), visit.get("views", 8)
     rng = np.random.default_rng([seed, sum(map(ord, name)), 0xCA])
@@ -90,30 +90,30 @@ def captured(name: str, site: Site, ground: Ground, visit: Visit, *, sky: bool =
 def printed(
     kind: Kind, colors: Colors, size: tuple[float, float], origin: Vector = (0.0, 0.0, 0.0), *, seed: int = 0
 ) -> Print:
-    """Return a drawing of some size printed from an origin on; the large kinds have finer texels."""
+    """Return a drawing printed periodically from an origin; the large kinds have finer texels."""
     return Print(Drawing(kind, colors, seed, 512 if kind in ("bay", "door") else 256), size, origin)
 
 
 def floor_print(tile: float, tiles: Tiles, rng: np.random.Generator, *, wear: float = 0.0) -> Print:
-    """Return a tiled floor of a stone that is drawn; it repeats after one tile, after two if it is chequered."""
+    """Return a tiled floor of a random stone; it repeats after one tile, after two if it is chequered."""
     period = tile * (2 if tiles == "checker" else 1)
     drawing = Drawing(tiles, STONES[rng.integers(3)], int(rng.integers(1 << 30)), 512 if tiles == "checker" else 256)
     return Print(drawing, (period, period), wear=wear, seed=int(rng.integers(1 << 30)))
 
 
 def wall_print(height: float, rng: np.random.Generator, *, wear: float = 0.0) -> Print:
-    """Return plaster in panels, which are equal but for the wear."""
+    """Return plaster in panels, which are equal except for the wear."""
     drawing = Drawing("wall", PLASTER, int(rng.integers(1 << 30)))
     return Print(drawing, (_PANEL, height), wear=wear, seed=int(rng.integers(1 << 30)))
 
 
 def shrunk(rect: Rect, by: float = 0.55) -> Rect:
-    """Return a rectangle without its rim."""
+    """Return a rectangle without a margin."""
     return rect[0] + by, rect[1] + by, rect[2] - by, rect[3] - by
 
 
 def unique_rng(visit: Visit) -> np.random.Generator:
-    """Return what the unique things are drawn from; the place does not depend on how many there are."""
+    """Return the generator for unique objects; the rest of the place does not depend on their number."""
     return np.random.default_rng([visit.get("seed", 0), 0x51])
 
 

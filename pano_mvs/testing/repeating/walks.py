@@ -1,4 +1,4 @@
-"""Where somebody with a tripod would stand in a place: scattered, along a path, or once around."""
+"""Positions of a person with a tripod in a place: scattered, along a path, or in a loop."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ LAYOUTS: tuple[Layout, ...] = ("unordered", "path", "loop")
 _NEAREST, _FARTHEST = 0.6, 1.5
 _CLEARANCE = 0.4
 _TRIES = 1500
-# A walk is begun anew after so many places in a row where the next camera cannot stand.
+# Number of consecutive failures to place the next camera after which a walk is restarted.
 _STUCK = 60
 
 
 def _level(along: FloatArray) -> FloatArray:
-    """Return the ground (N,) of a place that has no stairs."""
+    """Return the ground (N,) of a place without stairs."""
     return np.zeros(len(along))
 
 
 @dataclass(frozen=True)
 class Ground:
-    """Where one can stand, seen from above.
+    """Where a camera can stand, seen from above.
 
     Attributes:
-        floors: rectangles (x_low, z_low, x_high, z_high); a camera may stand wherever one of them is.
-        obstacles: rectangles that a camera keeps 0.4 away from.
-        start: (x, z) of a place that any capture goes through.
-        heading_rad: where a path goes there, 0 along z, growing towards x; None: anywhere.
+        floors: rectangles (x_low, z_low, x_high, z_high); a camera may stand in any of them.
+        obstacles: rectangles from which a camera keeps a distance of 0.4.
+        start: (x, z) of a position that any capture includes.
+        heading_rad: direction of a path there, 0 along z, growing towards x; None: any direction.
         height_at: the y of the ground (N,) at coordinates z (N,).
     """
 
@@ -46,7 +46,7 @@ class Ground:
     height_at: Callable[[FloatArray], FloatArray] = _level
 
     def free(self, places: FloatArray) -> bool:
-        """Return whether a camera may stand at all places (N, 2) of x and z."""
+        """Return whether a camera may stand at all positions (N, 2) of x and z."""
         x, z = places[:, 0], places[:, 1]
         on_floor = np.zeros(len(places), bool)
         for low_x, low_z, high_x, high_z in self.floors:
@@ -61,20 +61,21 @@ def stands(ground: Ground, layout: Layout, views: int, rng: np.random.Generator)
     """Return x and z (N, 2) of cameras, mostly 0.6 to 1.5 from the next, in the order in which they were taken.
 
     Args:
-        ground: where one can stand.
-        layout: "unordered": each near some other; "path": one after the other; "loop": likewise, and around again.
+        ground: where cameras can stand.
+        layout: "unordered": each near another one; "path": one after the other; "loop": likewise, and back to the
+            start.
         views: number of cameras.
         rng: source of randomness.
 
     Raises:
-        ValueError: if the ground is too small for so many.
+        ValueError: if the ground is too small for this number of cameras.
     """
     walk = {"unordered": _scattered, "path": _path, "loop": _loop}[layout]
     for _ in range(_TRIES):
         found = walk(ground, views, rng)
         if found is not None:
             return found
-    raise ValueError(f"the place is too small for {views} cameras, layout {layout!r}; take fewer or a larger place")
+    raise ValueError(f"the place is too small for {views} cameras, layout {layout!r}; use fewer or a larger place")
 
 
 def _scattered(ground: Ground, views: int, rng: np.random.Generator) -> FloatArray | None:
@@ -90,7 +91,7 @@ def _scattered(ground: Ground, views: int, rng: np.random.Generator) -> FloatArr
 
 
 def _path(ground: Ground, views: int, rng: np.random.Generator) -> FloatArray | None:
-    """Return a path through the start, walked from there both ways."""
+    """Return a path through the start, extended from there in both directions."""
     start, heading = _start(ground, rng), _heading(ground, rng)
     chosen = [start]
     first_half = int(rng.integers(views // 3, views - views // 3 + 1))
@@ -110,7 +111,7 @@ def _path(ground: Ground, views: int, rng: np.random.Generator) -> FloatArray | 
 
 
 def _loop(ground: Ground, views: int, rng: np.random.Generator) -> FloatArray | None:
-    """Return an ellipse or a rounded rectangle; a long and narrow one is a way there and back."""
+    """Return an ellipse or a rounded rectangle; a long and narrow one leads there and back."""
     step, half_width = rng.uniform(_NEAREST, _FARTHEST), np.exp(rng.uniform(np.log(0.2), np.log(4.0)))
     half_length = max(half_width, views * step / 4)
     heading, center = _heading(ground, rng), _start(ground, rng)
@@ -122,8 +123,9 @@ def _loop(ground: Ground, views: int, rng: np.random.Generator) -> FloatArray | 
     roundness = rng.choice([1.0, 0.5, 0.3])
     unit = np.stack([np.cos(angle), np.sin(angle)])
     along, across = np.sign(unit) * np.abs(unit) ** roundness * [[half_length], [half_width]]
-    around = center + np.stack([along * np.sin(heading) + across * np.cos(heading),
-                                along * np.cos(heading) - across * np.sin(heading)], axis=1)  # fmt: skip
+    around = center + np.stack(
+        [along * np.sin(heading) + across * np.cos(heading), along * np.cos(heading) - across * np.sin(heading)], axis=1
+    )
     lengths = np.linalg.norm(np.roll(around, -1, axis=0) - around, axis=1)
     walked = np.cumsum(lengths) - lengths[0]
     shares = (np.arange(views) + rng.uniform(-0.1, 0.1, views)) % views / views
@@ -141,7 +143,7 @@ def _start(ground: Ground, rng: np.random.Generator) -> FloatArray:
         place = rng.uniform((low_x, low_z), (high_x, high_z))
         if ground.free(place[None]):
             return place
-    raise ValueError("no free place was found; there are too many obstacles")
+    raise ValueError("no free position was found; there are too many obstacles")
 
 
 def _heading(ground: Ground, rng: np.random.Generator) -> float:
@@ -149,7 +151,7 @@ def _heading(ground: Ground, rng: np.random.Generator) -> float:
 
 
 def _clear(ground: Ground, start: FloatArray, end: FloatArray) -> bool:
-    """Return whether one can walk straight from one place to another."""
+    """Return whether a straight walk from one position to another is free of obstacles."""
     return ground.free(start + np.linspace(0, 1, 8)[:, None] * (end - start))
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pano_mvs.api import Context, PointCloud
-from pano_mvs.testing.conformance import Law, stage_laws
+from pano_mvs.testing.conformance import ContractTest, stage_contract_tests
 from pano_mvs.testing.scenes import courtyard
 
 from pano_mvs_example import sky, xyz
@@ -17,9 +17,9 @@ from pano_mvs_example.xyz_file import XyzParams
 SIZE_HW = (128, 256)
 
 
-@pytest.mark.parametrize("law", [*stage_laws(sky), *stage_laws(xyz)], ids=str)
-def test_keeps_the_contract(law: Law) -> None:
-    law.check()
+@pytest.mark.parametrize("contract_test", [*stage_contract_tests(sky), *stage_contract_tests(xyz)], ids=str)
+def test_keeps_the_contract(contract_test: ContractTest) -> None:
+    contract_test.check()
 
 
 @pytest.mark.parametrize("seed", [1, 2])

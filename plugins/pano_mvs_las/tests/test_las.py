@@ -11,7 +11,7 @@ import pye57
 import pytest
 from pano_mvs.api import Context, InputError, Params, PointCloud, Poses, Rigid3, UsageError
 from pano_mvs.io.clouds import thinning
-from pano_mvs.testing.conformance import Law, stage_laws
+from pano_mvs.testing.conformance import ContractTest, stage_contract_tests
 from pyproj import CRS, Transformer
 
 from pano_mvs_las import e57, las
@@ -47,9 +47,9 @@ def e57_points(path: Path) -> dict[str, np.ndarray]:
         return dict(file.read_scan(0, colors=True, ignore_missing_fields=True))
 
 
-@pytest.mark.parametrize("law", [*stage_laws(las), *stage_laws(e57)], ids=str)
-def test_keeps_the_contract(law: Law) -> None:
-    law.check()
+@pytest.mark.parametrize("contract_test", [*stage_contract_tests(las), *stage_contract_tests(e57)], ids=str)
+def test_keeps_the_contract(contract_test: ContractTest) -> None:
+    contract_test.check()
 
 
 @pytest.mark.parametrize("suffix", ["las", "laz"])

@@ -94,5 +94,5 @@ def test_refuses_what_it_cannot_compare() -> None:
         nearest_two_whole(whole, whole[:1])
     with pytest.raises(UsageError, match="nearest two among"):
         nearest_two_whole(whole, np.ones((4, 6), np.float32))
-    with pytest.raises(UsageError, match="whole numbers"):
+    with pytest.raises(UsageError, match="small integers"):
         nearest_two_whole(whole, whole + np.float32(0.5))

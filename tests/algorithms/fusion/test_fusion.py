@@ -379,7 +379,7 @@ class TestVoxels:
         parts = [self.cloud(rng.uniform(-1, 1, (200, 3))) for _ in range(5)]
         whole = thin_by_voxels(join_clouds(parts), 0.3)
         for waiting in (10, 10**9):
-            monkeypatch.setattr(voxels, "_FEWEST_WAITING", waiting)
+            monkeypatch.setattr(voxels, "_MIN_WAITING", waiting)
             grid = voxels.VoxelGrid(0.3)
             for part in parts:
                 grid.add(part)

@@ -81,10 +81,10 @@ def test_every_vote_is_across_the_cut_and_points_the_same_way(block: set[int], t
     _, model = shifted_block(f"votes {sorted(block)}", block, tiles=tiles)
     alias = find_aliases(model)[0]
     back = -1.0 if alias.move @ (tiles * TILE) > 0 else 1.0
-    for (i, j), vote in alias.votes.items():
+    for (i, j), signed in alias.signed_weights.items():
         assert (i in block) != (j in block)
-        assert np.sign(vote) == (back if j in block else -back)
-    assert alias.support == pytest.approx(sum(map(abs, alias.votes.values())))
+        assert np.sign(signed) == (back if j in block else -back)
+    assert alias.support == pytest.approx(sum(map(abs, alias.signed_weights.values())))
 
 
 def test_a_true_model_in_which_nothing_repeats_has_no_alias() -> None:
@@ -150,13 +150,16 @@ def test_a_motion_that_turns_is_found_among_random_ones(angle_deg: float) -> Non
     pivot = np.array([2.0, 0.0, -1.0])
     motion = Rigid3(turn, pivot - turn @ pivot)
     (alias,) = _turned_aliases(suggestions_of(motion, rng, pairs=4, noise=0.005))
-    assert set(alias.votes) == {(number, number + 1) for number in range(4)}
+    assert set(alias.signed_weights) == {(number, number + 1) for number in range(4)}
     assert alias.own_inverse == (angle_deg == 180)
-    found = alias.motion(inverse=bool(alias.votes[1, 2] < 0))
+    found = alias.motion(inverse=bool(alias.signed_weights[1, 2] < 0))
     assert geodesic_angle(found.rotation, turn) < 0.02
     np.testing.assert_allclose(found.apply(pivot), pivot, atol=0.05)
     if not alias.own_inverse:
-        assert [np.sign(alias.votes[number, number + 1]) for number in range(4)] in ([1, -1, 1, -1], [-1, 1, -1, 1])
+        assert [np.sign(alias.signed_weights[number, number + 1]) for number in range(4)] in (
+            [1, -1, 1, -1],
+            [-1, 1, -1, 1],
+        )
 
 
 def test_one_pair_or_random_motions_do_not_make_an_alias_that_turns() -> None:

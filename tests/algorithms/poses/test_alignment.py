@@ -203,7 +203,7 @@ def test_blocks_change_nothing(room: Room, monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_only_the_longest_tracks_are_aligned_where_there_are_many(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
     poses, pictures = room
-    monkeypatch.setattr(alignment, "_MOST_PER_IMAGE", 300)
+    monkeypatch.setattr(alignment, "_MAX_PER_IMAGE", 300)
     cut = np.ones(6000, np.bool_)
     cut[: 4 * 1200 : 4] = False  # the first 1200 tracks have an observation less
     shorter = replace(

@@ -85,7 +85,7 @@ def test_one_known_camera_gives_no_points_to_see(capture: Capture) -> None:
     poses = extend_poses(known_of(truth, ["0.jpg"]), features, two_views)
     assert poses.names == ("0.jpg",)
     assert len(poses.rejected) == 5
-    assert all("known from two other pictures" in reason for reason in poses.rejected.values())
+    assert all("known from two other images" in reason for reason in poses.rejected.values())
 
 
 def test_wrong_known_poses_reject_the_new_one(capture: Capture) -> None:
@@ -124,7 +124,7 @@ def test_colmap_leaves_known_ones_alone_where_nothing_fits(capture: Capture, tmp
         known_of(truth, ["0.jpg"]), features, two_views, rng=np.random.default_rng(0), scratch=tmp_path / "one"
     )
     assert one.names == ("0.jpg",)
-    assert set(one.rejected.values()) == {"the known pictures give no point that it could see"}
+    assert set(one.rejected.values()) == {"the known images give no point that it could see"}
     views = {pair: TwoView.failed("a blurred picture") if "5.jpg" in pair else view for pair, view in two_views.items()}
     poses = extend_with_colmap(
         known_of(truth, list(truth)[:4]), features, views, rng=np.random.default_rng(0), scratch=tmp_path

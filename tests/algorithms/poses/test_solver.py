@@ -183,7 +183,7 @@ def test_an_image_that_fits_a_third_of_the_known_points_is_rejected(capture: Cap
     poses = solve(features, kept)
     assert poses.names == ("0.jpg", "1.jpg", "2.jpg", "4.jpg")
     assert "seen where they should be" in poses.rejected["3.jpg"]
-    assert "or an image that is no panorama" in poses.rejected["3.jpg"]
+    assert "or an image that is not a panorama" in poses.rejected["3.jpg"]
 
 
 def test_every_group_is_solved_in_its_own_frame() -> None:

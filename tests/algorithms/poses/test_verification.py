@@ -236,7 +236,7 @@ def test_a_group_whose_pairs_contradict_one_another_is_doubted(
     monkeypatch.setattr(arbitration, "_MIN_EXPLAINED_BY_OTHERS", 1.01)
     found = verified(displaced(), matches)
     assert set(found.doubts) == set(NAMES)
-    assert all("agree with one arrangement" in reason for reason in found.doubts.values())
+    assert all("agree with a common arrangement" in reason for reason in found.doubts.values())
 
 
 def test_pictures_without_any_texture_are_no_reason_to_doubt() -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.two_view.cheirality import agreement, facing_costs, facing_pose, least_essentials
 from pano_mvs.algorithms.two_view.five_point import essentials_from_five
-from pano_mvs.algorithms.two_view.redirection import voted_directions
+from pano_mvs.algorithms.two_view.redirection import direction_candidates
 from pano_mvs.algorithms.two_view.refinement import refine_relative_pose
 from pano_mvs.algorithms.two_view.rotation_only import estimate_rotation
 from pano_mvs.algorithms.two_view.significance import chance_of_pose
@@ -132,7 +132,7 @@ def test_refinement_kernel_leaves_its_input_alone() -> None:
 @pytest.mark.kernel("two_view.kernels_agreement")
 def test_kernel_costs_of_directions_are_those_of_plain_poses() -> None:
     p, q, pose, rng = paired("directions kernel")
-    directions, costs = voted_directions(pose.rotation, p, q, rng=rng, threshold_rad=THRESHOLD_RAD, count=30)
+    directions, costs = direction_candidates(pose.rotation, p, q, rng=rng, threshold_rad=THRESHOLD_RAD, count=30)
     both = [plain.facing_costs([Rigid3(pose.rotation, sign * d) for d in directions], p, q, THRESHOLD_RAD)
             for sign in (1, -1)]  # fmt: skip
     np.testing.assert_allclose(costs, both[0], atol=1e-6)

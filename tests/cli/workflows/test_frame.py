@@ -160,7 +160,7 @@ def test_what_gives_no_scale_stops_with_the_reason(pano_mvs: Command, capture: P
 @pytest.mark.parametrize(
     ("settings", "problem"),
     [("", "give exactly one of baseline"), (", factor: 2, gps: true", "give exactly one of baseline"),
-     (", factor: 2, align: gps", "needs gps: true"), (", factor: -2", "greater than 0"),
+     (", factor: 2, align: gps", "requires gps: true"), (", factor: -2", "greater than 0"),
      (", baseline: {from: a, metres: 1}", "'baseline.to' is missing")],
 )  # fmt: skip
 def test_settings_that_contradict_each_other_are_found_before_anything_runs(

@@ -54,7 +54,7 @@ def test_one_pose_is_not_given_to_several_pictures(pano_mvs: Command, known: Pat
     write(known, capture, ["000.png", "001.png"])
     result = pano_mvs("run", known, "--out", "out")
     assert result.code == 4
-    assert "that several pictures could mean" in result.flat
+    assert "that matches several images" in result.flat
 
 
 def test_cameras_in_one_place_are_refused(pano_mvs: Command, known: Path, capture: Path) -> None:
@@ -86,12 +86,12 @@ def test_poses_of_other_pictures_of_the_same_names_are_refused(pano_mvs: Command
             cv2.imwrite(str(path), picture)
     touched = pano_mvs("run", known, "--out", "out")
     assert touched.code == 0
-    assert "001.png is not the picture, byte for byte, whose pose poses.json records" in touched.flat
+    assert "001.png is not the image whose pose poses.json records: the files differ" in touched.flat
     for path in sorted((capture / "images").iterdir()):
         cv2.imwrite(str(path), 255 - read_picture(path))
     others = pano_mvs("run", known, "--out", "out")
     assert others.code == 2
-    assert "records other pictures under these names: not one of 4" in others.flat
+    assert "records other images under these names: not one of 4" in others.flat
     for path in sorted((capture / "images").iterdir()):
         cv2.imwrite(str(path.with_suffix(".jpg")), read_picture(path))
         path.unlink()

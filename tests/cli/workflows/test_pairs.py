@@ -59,5 +59,5 @@ def test_loop_closure_needs_looks_and_says_so(pano_mvs: Command, capture: Path) 
 def test_pictures_without_positions_are_a_clear_error(pano_mvs: Command, capture: Path) -> None:
     outcome = run(pano_mvs, capture, "position", looks="")
     assert outcome.code != 0
-    assert "no picture has a position" in outcome.flat
+    assert "no image has a position" in outcome.flat
     assert "pairs.retrieval" in outcome.flat

@@ -23,7 +23,7 @@ _MIN_DAMPING, _MAX_DAMPING = 1e-9, 1e6
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Cameras, points, and the observations that join them, sorted by point.
+    """Cameras, points, and observations sorted by point.
 
     Attributes:
         rotations: (N, 3, 3) of cam_from_world.
@@ -32,7 +32,7 @@ class Bundle:
         point_idx: (T,) ascending.
         image_idx: (T,).
         bearings: (T, 3) unit rays in the camera.
-        sigmas: (T,) standard deviation of each ray in units of a usual one's, positive; None: all are alike.
+        sigmas: (T,) standard deviation of each ray relative to a typical one, positive; None if all are equal.
     """
 
     rotations: FloatArray
@@ -51,7 +51,7 @@ class Bundle:
             raise UsageError("a bundle needs one positive sigma for each observation, or none at all")
 
     def errors_rad(self) -> FloatArray:
-        """Return the angle between every observed ray and the one to its point, (T,), in [0, π]."""
+        """Return the angle between every observed ray and the ray to its point, (T,), in [0, π]."""
         in_cam = np.einsum(
             "tij,tj->ti", self.rotations[self.image_idx], self.points[self.point_idx] - self.centers[self.image_idx]
         )
@@ -60,7 +60,7 @@ class Bundle:
         return angles
 
     def scaled_errors_rad(self) -> FloatArray:
-        """Return the errors divided by the sigmas, (T,): what the robust loss is of."""
+        """Return the errors divided by the sigmas, (T,), to which the robust loss is applied."""
         errors = self.errors_rad()
         return errors if self.sigmas is None else errors / self.sigmas
 
@@ -79,18 +79,18 @@ def adjust_bundle(
     tolerance: float = 1e-7,
     fixed_camera: int = 0,
 ) -> Bundle:
-    """Return the bundle with the least robust sum of squared angular errors; one camera stays where it is.
+    """Minimise the robust sum of squared angular errors; one camera stays fixed.
 
-    Errors are divided by the sigmas of their observations, so that precise rays count for more than coarse ones.
-    The length that only the gauge decides (the scale) stays near where it was, held by the damping.
+    Errors are divided by the sigmas of their observations, so precise rays have more weight than coarse ones. The
+    scale, which only the gauge determines, stays near its initial value because of the damping.
 
     Args:
-        bundle: where to begin.
+        bundle: initial values.
         loss: "huber" min(r², 2 s r − s²), or "cauchy" s² log(1 + r²/s²).
-        scale_rad: s, the error from which an observation of sigma 1 loses influence.
+        scale_rad: s, the error at which an observation with sigma 1 starts to lose influence.
         max_iterations: maximum number of steps.
         tolerance: the adjustment ends with a step that lowers the cost by a smaller share than this.
-        fixed_camera: position of the camera that is not moved.
+        fixed_camera: position of the camera that stays fixed.
 
     Raises:
         UsageError: if the observations are not sorted by point.
@@ -101,9 +101,13 @@ def adjust_bundle(
     order = camera_order(bundle.point_idx, bundle.image_idx, len(bundle.centers))
     place = np.argsort(order)
     ordered = _adjust_ordered(
-        with_camera_order(bundle, order, place), loss=loss, scale_rad=scale_rad, max_iterations=max_iterations,
-        tolerance=tolerance, fixed_camera=int(place[fixed_camera]),
-    )  # fmt: skip
+        with_camera_order(bundle, order, place),
+        loss=loss,
+        scale_rad=scale_rad,
+        max_iterations=max_iterations,
+        tolerance=tolerance,
+        fixed_camera=int(place[fixed_camera]),
+    )
     return with_camera_order(ordered, place, order)
 
 
@@ -120,7 +124,7 @@ def with_camera_order(bundle: Bundle, order: NDArray[np.intp], place: NDArray[np
 def _adjust_ordered(
     bundle: Bundle, *, loss: Loss, scale_rad: float, max_iterations: int, tolerance: float, fixed_camera: int
 ) -> Bundle:
-    # Importing numba takes most of a second; who adjusts nothing does not pay for it.
+    # Importing numba takes most of a second, so import it only where it is used.
     from pano_mvs.algorithms.poses.adjustment.kernels_bundle import ray_errors
 
     layout = _Layout.of(bundle)
@@ -166,14 +170,14 @@ def robust_cost(errors_rad: FloatArray, *, loss: Loss, scale_rad: float) -> floa
 
 @dataclass(frozen=True, eq=False)
 class ReducedCameras:
-    """The system of the cameras after elimination of the points, and what gets the points back.
+    """The reduced system of the cameras after elimination of the points, and what is needed to recover the points.
 
     Attributes:
         band: (6N, width), see `camera_system`.
         gradient: (6N,).
         diagonal: (6N,) of the cameras' own blocks, before elimination.
-        couplings: (T, 6, 3) of camera and point of every observation.
-        inverses: (P, 3, 3) of the points' own blocks.
+        couplings: (T, 6, 3) blocks of camera and point of every observation.
+        inverses: (P, 3, 3) inverses of the points' own blocks.
         point_gradients: (P, 3).
     """
 
@@ -187,11 +191,11 @@ class ReducedCameras:
 
 @dataclass(frozen=True, eq=False)
 class _Layout:
-    """What stays the same in all steps of an adjustment.
+    """Data that do not change during an adjustment.
 
     Attributes:
         starts: (P + 1,) the observations of point p are starts[p] to starts[p + 1].
-        width: of the band, see `camera_system`.
+        width: width of the band, see `camera_system`.
         bases: (T, 3, 2) two vectors normal to each observed ray.
     """
 
@@ -208,7 +212,7 @@ class _Layout:
 
 
 def reduced_cameras(bundle: Bundle, weights: FloatArray, *, damping: float) -> ReducedCameras:
-    """Return the cameras' system of a weighted bundle; points are damped, cameras are not."""
+    """Return the reduced camera system of a weighted bundle; points are damped, cameras are not."""
     return _reduced_cameras(bundle, _Layout.of(bundle), weights, damping=damping)
 
 
@@ -217,10 +221,17 @@ def _reduced_cameras(bundle: Bundle, layout: _Layout, weights: FloatArray, *, da
 
     return ReducedCameras(
         *reduced_system(
-            bundle.rotations, bundle.centers, bundle.points, layout.starts, bundle.image_idx, layout.bases, weights,
-            damping, layout.width,
+            bundle.rotations,
+            bundle.centers,
+            bundle.points,
+            layout.starts,
+            bundle.image_idx,
+            layout.bases,
+            weights,
+            damping,
+            layout.width,
         )
-    )  # fmt: skip
+    )
 
 
 def _step(bundle: Bundle, layout: _Layout, weights: FloatArray, *, damping: float, fixed_camera: int) -> Bundle:
@@ -240,7 +251,12 @@ def _step(bundle: Bundle, layout: _Layout, weights: FloatArray, *, damping: floa
         rotations=rotation_from_rotvec(steps[:, :3]) @ bundle.rotations,
         centers=bundle.centers + steps[:, 3:],
         points=moved_points(
-            bundle.points, layout.starts, bundle.image_idx, system.couplings, system.inverses, system.point_gradients,
+            bundle.points,
+            layout.starts,
+            bundle.image_idx,
+            system.couplings,
+            system.inverses,
+            system.point_gradients,
             np.ascontiguousarray(steps),
         ),
-    )  # fmt: skip
+    )

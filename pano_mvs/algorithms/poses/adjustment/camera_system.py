@@ -1,7 +1,7 @@
-"""The cameras' part of bundle adjustment as a banded system: cameras in an order in which neighbours stand together.
+"""The reduced camera system of bundle adjustment as a banded matrix, with cameras that share points close together.
 
-A walk of N cameras then costs about N in memory and time, where the whole matrix costs N² and N³. The band is stored by
-columns: band[j, d] is the entry in row j + d, column j (LAPACK's lower band storage, transposed).
+For a path of N cameras, memory and time are then about proportional to N, where the full matrix needs N² and N³. The
+band is stored by columns: band[j, d] is the entry in row j + d, column j (LAPACK's lower band storage, transposed).
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int32]
 
-# A band wider than this share of the matrix is quicker solved as a whole one.
+# A band wider than this share of the matrix is solved faster as a full matrix.
 _WIDE = 0.4
 
 
 def camera_order(point_idx: IndexArray, image_idx: IndexArray, count: int) -> NDArray[np.intp]:
-    """Return the order of cameras, (count,), in which those that share points stand near each other.
+    """Return the order of cameras, (count,), in which cameras that share points are close to each other.
 
     Cuthill & McKee, "Reducing the bandwidth of sparse symmetric matrices", 1969, reversed (George 1971).
 
@@ -39,10 +39,10 @@ def camera_order(point_idx: IndexArray, image_idx: IndexArray, count: int) -> ND
 
 
 def camera_span(starts: NDArray[np.intp], image_idx: IndexArray) -> int:
-    """Return how many positions apart two cameras that share a point are, at most.
+    """Return the largest distance in positions of two cameras that share a point.
 
     Args:
-        starts: (P + 1,) the first observation of every point, and the number of observations; none is without.
+        starts: (P + 1,) the first observation of every point, then the number of observations; every point has one.
         image_idx: (T,) camera of every observation, sorted by point.
     """
     last = np.maximum.reduceat(image_idx, starts[:-1])
@@ -63,7 +63,7 @@ def held(band: FloatArray, gradient: FloatArray, camera: int) -> tuple[FloatArra
 
 
 def camera_solver(band: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """Return the function that solves the symmetric positive definite system for right-hand sides (6N,) or (6N, K).
+    """Return a function that solves the symmetric positive definite system for right-hand sides (6N,) or (6N, K).
 
     Raises:
         LinAlgError: if the system is not positive definite.

@@ -1,4 +1,4 @@
-"""Finer places for the observations of tracks: patches of the images, aligned with one another on the sphere."""
+"""Refine the observations of tracks by aligning patches of the images with one another on the sphere."""
 
 from __future__ import annotations
 
@@ -18,41 +18,41 @@ FloatArray = NDArray[np.float64]
 Picture = tuple[NDArray[np.uint8], NDArray[np.bool_]]
 
 SIZE, MARGIN = 13, 4
-_MAX_WIDTH = 4096  # panoramas of more columns are hardly sharp to a pixel, and their patches would show too little
+_MAX_WIDTH = 4096  # wider panoramas are rarely sharp to a pixel, and their patches would contain too little detail
 _SMOOTHING = 0.5  # standard deviation, in samples
 _PAD_PX = 8
-# All of these were tried on rendered and synthetic captures; the result changes little around them.
+# All of these were tuned on rendered and synthetic captures; the result changes little around them.
 _WINDOW = SIZE / 4  # standard deviation of the weights, in samples
 _STIFFNESS = 6.0
 _MIN_CORRELATION = 0.85
 _MAX_SHIFT = 1.0  # samples
-_FLOOR = 0.1  # samples: what the aligned patches' own deviation leaves out
-_NOT_ALIGNED = 0.3  # samples: of an observation that does not align and stays where the detector put it …
-_NOT_TRIED = 0.15  # … and of one of a track beyond the most that are aligned
-_MOST_PER_IMAGE = 1500  # observations: where there are more, their number makes for precision
-_AT_ONCE = 100_000  # observations whose patches are in memory
+_FLOOR = 0.1  # samples: error that the deviation of the aligned patches does not include
+_NOT_ALIGNED = 0.3  # samples: sigma of an observation that does not align and keeps its detected position …
+_NOT_TRIED = 0.15  # … and of an observation of a track beyond the maximum that is aligned
+_MAX_PER_IMAGE = 1500  # observations: if there are more, their number gives enough precision
+_AT_ONCE = 100_000  # observations whose patches are in memory at a time
 
 
 def align_tracks(poses: Poses, load: Callable[[str], Picture]) -> Poses:
-    """Return poses whose observations lie where the images agree best, with how precise each is.
+    """Return poses whose observations are refined by the images, with the precision of each observation.
 
-    A key point is found in each image on its own, to a fifth of a pixel or worse; what is around it in two images can
-    be aligned far better. Each track has a reference, the observation that looks at the point most as all others do on
-    average. A patch of 13 × 13 pixels about it, normal to the reference's ray, is sampled in all images of the track
-    as the poses and the point's range predict, and aligned with the reference's by Lucas and Kanade's method with an
-    affine warp. Observations that do not align (too faint, hidden, on an edge of depth, next to what the mask ignores)
-    stay where they are and count for less. Where there are more than 1500 observations an image on average, only the
-    longest tracks are aligned.
+    A key point is located in each image on its own, to a fifth of a pixel or worse; its surroundings in two images can
+    be aligned far more precisely. Each track has a reference, the observation whose viewing direction is nearest to the
+    average of the track. A patch of 13 × 13 pixels around it, normal to the reference's ray, is sampled in all images
+    of the track as the poses and the point's range predict, and aligned with the reference's patch by the method of
+    Lucas and Kanade with an affine warp. Observations that do not align (low contrast, occluded, at a depth
+    discontinuity, next to masked pixels) stay where they are and get less weight. If there are more than 1500
+    observations per image on average, only the longest tracks are aligned.
 
-    Cameras and points are not moved: adjust them afterwards (`refine_poses`). Nothing is drawn at random.
+    Cameras and points do not move: adjust them afterwards (`refine_poses`). The method is deterministic.
 
     Args:
-        poses: poses with tracks, good to a pixel or two.
-        load: returns the panorama (H, W, 3) and the mask (H, W) of an image by its name. Called once or a few times
-            for each image.
+        poses: poses with tracks, accurate to a pixel or two.
+        load: returns the panorama (H, W, 3) and the mask (H, W) of an image by its name. Called once or a few times for
+            each image.
 
     Returns:
-        The same poses with other `track_bearings`, and `track_sigmas_rad`.
+        The same poses with new `track_bearings`, and with `track_sigmas_rad`.
     """
     return per_group(poses, lambda group: _aligned(group, load))
 
@@ -63,7 +63,7 @@ def _aligned(poses: Poses, load: Callable[[str], Picture]) -> Poses:
     step_rad = _step_rad(load(poses.names[0])[0].shape[1])
     sightings = _sightings(poses, step_rad)
     bearings = np.array(poses.track_bearings)
-    chosen = _longest_tracks(poses.track_point_idx, _MOST_PER_IMAGE * len(poses.names))
+    chosen = _longest_tracks(poses.track_point_idx, _MAX_PER_IMAGE * len(poses.names))
     sigmas_rad = np.where(chosen, _NOT_ALIGNED, _NOT_TRIED) * step_rad
     for block in _blocks(sightings.reference_idx, poses.track_image_idx, chosen):
         _align_block(poses, sightings, block, load, step_rad, bearings, sigmas_rad)
@@ -71,7 +71,7 @@ def _aligned(poses: Poses, load: Callable[[str], Picture]) -> Poses:
 
 
 def _longest_tracks(point_idx: NDArray[np.int32], most: int) -> NDArray[np.bool_]:
-    """Return which observations, (T,), are of the longest tracks, `most` of them at most."""
+    """Return which observations, (T,), belong to the longest tracks, at most `most` observations."""
     lengths = np.bincount(point_idx)
     order = np.argsort(-lengths, kind="stable")
     chosen = np.zeros(len(lengths), np.bool_)
@@ -81,10 +81,11 @@ def _longest_tracks(point_idx: NDArray[np.int32], most: int) -> NDArray[np.bool_
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sightings:
-    """For each observation: (T,) its track's reference observation, and rays in its camera, (T, 3).
+    """The reference of each observation, (T,), and the rays of its patch in its camera, (T, 3).
 
-    `middles` points along the observed ray, as far as the point is; the patch's sample (u, v) is in the direction of
-    middles + u first_axes + v second_axes. A sample is `step_rad` times `zoom` (T,) wide as the camera sees it.
+    `middles` points along the observed ray, with the length of the point's range. The patch's sample (u, v) is in the
+    direction middles + u first_axes + v second_axes. A sample is `step_rad` times `zoom` (T,) wide as seen by the
+    camera.
     """
 
     reference_idx: NDArray[np.intp]
@@ -120,7 +121,7 @@ def _references(point_idx: NDArray[np.int32], rays: FloatArray, ranges: FloatArr
     """Return the reference observation of every point, (count,): the ray nearest to the mean, the nearer of two."""
     total = np.stack([np.bincount(point_idx, column, count) for column in rays.T], axis=1)
     mean = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
-    # Of two observations either is as near to their mean, but for the last digits.
+    # Two observations are equally near to their mean, except for rounding errors.
     likeness = np.round(np.sum(rays * mean[point_idx], axis=1), 9)
     order = np.lexsort((ranges, -likeness, point_idx))
     first = np.concatenate([[True], np.diff(point_idx[order]) > 0])
@@ -132,7 +133,7 @@ def _references(point_idx: NDArray[np.int32], rays: FloatArray, ranges: FloatArr
 def _blocks(
     reference_idx: NDArray[np.intp], image_idx: NDArray[np.int32], chosen: NDArray[np.bool_]
 ) -> Iterator[NDArray[np.intp]]:
-    """Yield positions of chosen observations, whole tracks, about `_AT_ONCE` at a time, those of one image together."""
+    """Yield positions of chosen observations, whole tracks, about `_AT_ONCE` at a time, sorted by image."""
     order = np.lexsort((reference_idx, image_idx[reference_idx]))
     order = order[chosen[order]]
     if not len(order):
@@ -151,7 +152,7 @@ def _align_block(
     bearings: FloatArray,
     sigmas_rad: FloatArray,
 ) -> None:
-    """Write the bearings and sigmas of some tracks' observations."""
+    """Write the bearings and sigmas of the observations of some tracks."""
     place = np.full(len(bearings), -1, np.intp)
     place[block] = np.arange(len(block))
     targets = block[sightings.reference_idx[block] != block]
@@ -169,7 +170,7 @@ def _align_block(
         + shifts[:, 1:] * sightings.second_axes[targets]
     )
     bearings[targets] = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    # Two patches of one standard deviation differ by √(2 (1 − correlation)).
+    # Two patches with the same standard deviation differ by √(2 (1 − correlation)).
     noise = np.sqrt(np.maximum(2 * (1 - correlations[good]), 1e-4))
     sigmas_rad[targets] = step_rad * np.hypot(_FLOOR, deviations[good] * noise * zoom[good])
     np.minimum.at(sigmas_rad, references, sigmas_rad[targets])
@@ -178,8 +179,8 @@ def _align_block(
 def _patches(
     poses: Poses, sightings: _Sightings, block: NDArray[np.intp], load: Callable[[str], Picture]
 ) -> NDArray[np.float32]:
-    """Return the patches of observations with their margins, (M, n, n) grey levels; one image is loaded at a time."""
-    # Importing numba takes most of a second; who aligns nothing does not pay for it.
+    """Return the patches of observations with their margins, (M, n, n) grey levels, loading one image at a time."""
+    # Importing numba takes most of a second, so import it only where it is used.
     from pano_mvs.algorithms.poses.adjustment.kernels_patch_alignment import sample_patches
 
     side = SIZE + 2 * MARGIN
@@ -200,7 +201,7 @@ def _patches(
 def _masked(
     mask: NDArray[np.bool_], middles: FloatArray, first_axes: FloatArray, second_axes: FloatArray
 ) -> NDArray[np.bool_]:
-    """Return which patches, (M,), reach into the ignored part of an image; five by five rays of each are looked up."""
+    """Return which patches, (M,), extend into the masked part of an image; 5 × 5 rays of each patch are tested."""
     masked = np.zeros(len(middles), np.bool_)
     if mask.all():
         return masked
@@ -214,7 +215,7 @@ def _masked(
 
 
 def smoothed_gray(panorama: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return the grey levels that patches are sampled from, (H + 16, W + 16), a margin of 8 pixels around them."""
+    """Return the grey levels from which patches are sampled, (H + 16, W + 16), with a margin of 8 pixels."""
     gray = cv2.cvtColor(panorama, cv2.COLOR_RGB2GRAY).astype(np.float32)
     sigma_px = _SMOOTHING * max(1.0, panorama.shape[1] / _MAX_WIDTH)
     return np.asarray(cv2.GaussianBlur(pad_panorama(gray, _PAD_PX), (0, 0), sigma_px), np.float32)
@@ -223,7 +224,7 @@ def smoothed_gray(panorama: NDArray[np.uint8]) -> NDArray[np.float32]:
 def aligned_shifts(
     patches: NDArray[np.float32], reference_idx: NDArray[np.intp], target_idx: NDArray[np.intp]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return by how much the middles of patches must move to show what the middles of their references show.
+    """Return the shifts of patch centres that align the patches with their references.
 
     Args:
         patches: (T, 21, 21) grey levels: 13 × 13 samples and a margin of 4 around them.
@@ -231,8 +232,8 @@ def aligned_shifts(
         target_idx: (M,) patches to align.
 
     Returns:
-        shifts (M, 2) in samples along a patch's columns and rows; correlations (M,) after alignment, 0 where there is
-        no contrast or no alignment within the margin; deviations (M,) of the shift along its least certain axis, in
+        shifts (M, 2) in samples along a patch's columns and rows; correlations (M,) after alignment, 0 if there is no
+        contrast or no alignment within the margin; deviations (M,) of the shift along its least certain axis, in
         samples, for noise as large as the contrast.
     """
     from pano_mvs.algorithms.poses.adjustment.kernels_patch_alignment import align_patches

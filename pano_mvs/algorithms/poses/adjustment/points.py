@@ -1,4 +1,4 @@
-"""Triangulate many tracks at once, and drop the observations that do not fit."""
+"""Triangulate many tracks at once, and drop observations that do not fit."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ ROUNDS = 8
 
 @dataclass(frozen=True, eq=False)
 class Triangulated:
-    """Points of tracks, and which observations bear them out.
+    """Triangulated points of tracks, and the observations that support them.
 
     Attributes:
-        points_in_world: (P, 3), NaN where a track gives no point.
+        points_in_world: (P, 3), NaN if a track gives no point.
         valid: (P,) bool.
         used: (T,) bool, the observations that fit a valid point.
-        errors_rad: (T,) angle between the observed ray and the one to the point; π where there is none.
+        errors_rad: (T,) angle between the observed ray and the ray to the point; π if there is no point.
     """
 
     points_in_world: FloatArray
@@ -39,29 +39,33 @@ def triangulate_observations(
     max_error_rad: float,
     min_angle_rad: float,
 ) -> Triangulated:
-    """Return the points of tracks; the worst observation of a track goes until all that remain fit.
+    """Triangulate tracks; the worst observation of a track is removed until all remaining ones fit.
 
     Args:
         centers: (T, 3) camera centre of every observation, in the world.
-        rays_in_world: (T, 3) its unit ray, turned into the world.
+        rays_in_world: (T, 3) its unit ray, rotated into the world.
         point_idx: (T,) the track of every observation.
         count: P, number of tracks.
-        max_error_rad: largest angle between an observed ray and the one to the point.
+        max_error_rad: largest angle between an observed ray and the ray to the point.
         min_angle_rad: smallest angle between the rays of a track of two; longer tracks must be as well conditioned.
     """
-    # Importing numba takes most of a second; who triangulates nothing does not pay for it.
+    # Importing numba takes most of a second, so import it only where it is used.
     from pano_mvs.algorithms.poses.adjustment.kernels_points import triangulate
 
     if np.any(np.diff(point_idx) < 0):
         order = np.argsort(point_idx, kind="stable")
         found = triangulate_observations(
-            centers[order], rays_in_world[order], point_idx[order], count=count, max_error_rad=max_error_rad,
+            centers[order],
+            rays_in_world[order],
+            point_idx[order],
+            count=count,
+            max_error_rad=max_error_rad,
             min_angle_rad=min_angle_rad,
-        )  # fmt: skip
+        )
         place = np.argsort(order)
         return Triangulated(found.points_in_world, found.valid, found.used[place], found.errors_rad[place])
     starts = np.searchsorted(point_idx, np.arange(count + 1))
-    # For two rays at angle α the least eigenvalue of Σ (I − r rᵀ) is 1 − cos α; more rays only add to it.
+    # For two rays at angle α the smallest eigenvalue of Σ (I − r rᵀ) is 1 − cos α; more rays only increase it.
     least = float(1 - np.cos(min_angle_rad))
     return Triangulated(
         *triangulate(

@@ -21,10 +21,10 @@ from pano_mvs.scene.pose_groups import per_group
 FloatArray = NDArray[np.float64]
 
 _ROUNDS = 3
-# The first rounds only choose the observations of the last.
+# The first rounds only select the observations of the last round.
 _TOLERANCES = (1e-3, 1e-3, 1e-7)
 _MIN_ANGLE_RAD = float(np.deg2rad(1.0))
-# Of a key point in a panorama of 1024 columns, a fifth of a pixel; the scale of the loss is for this.
+# Sigma of a key point in a panorama of 1024 columns, a fifth of a pixel, to which the scale of the loss refers.
 _USUAL_SIGMA_RAD = float(np.deg2rad(0.07))
 
 
@@ -37,33 +37,35 @@ def refine_poses(
     max_error_deg: float = 0.4,
     load: Callable[[str], Picture] | None = None,
 ) -> Poses:
-    """Return the poses and points with the least robust sum of squared angles between observed and expected rays.
+    """Refine poses and points by minimising the robust sum of squared angles between observed and predicted rays.
 
-    The angle is measured on the tangent plane of each observed ray, so that a pixel near a pole counts for as little
-    as it covers, and nothing happens at the seam. Between rounds points are triangulated again, and observations that
-    do not fit are dropped. The world frame is kept: the first camera does not move and neither does the length of its
-    first baseline; where lengths are metres, the cameras as a whole stay where they were.
-    How sure each camera is, relative to the first camera and first baseline, is in `center_stds` and
-    `rotation_stds_rad`; see `camera_deviations`. Groups are adjusted one by one, each in its own world.
+    The angle is measured on the tangent plane of each observed ray, so that pixels near a pole have the weight of the
+    area they cover, and the seam has no effect. Between rounds, points are triangulated again, and observations that do
+    not fit are dropped. The world frame stays the same: the first camera and the length of its first baseline are
+    fixed; if lengths are metres, the cameras as a whole stay in place. The uncertainty of each camera, relative to the
+    first camera and first baseline, is in `center_stds` and `rotation_stds_rad`; see `camera_deviations`. Groups are
+    adjusted one by one, each in its own world frame.
 
-    With the images, observations are then placed again where the images agree best, each with how precise it is (see
-    `align_tracks`), and all is adjusted once more. That halves the error where key points are few or coarse.
+    If the images are given, observations are then refined by aligning patches, each with its precision (see
+    `align_tracks`), and everything is adjusted once more. This halves the error if key points are few or coarse.
 
     Args:
-        poses: poses with tracks; without tracks they are returned as they are.
+        poses: poses with tracks; poses without tracks are returned unchanged.
         loss: "huber" or "cauchy".
-        loss_scale_deg: error from which an observation loses influence; where the precision of observations is known,
-            of one with a standard deviation of 0.07°, and of others in proportion.
+        loss_scale_deg: error at which an observation starts to lose influence. If the precision of observations is
+            known, this is for a standard deviation of 0.07°, and scales with it.
         max_iterations: maximum number of steps in each round.
         max_error_deg: observations with a larger error are dropped.
-        load: returns the panorama and the mask of an image by its name; None leaves the observations where they are.
+        load: returns the panorama and the mask of an image by its name; None keeps the observations as they are.
 
     Raises:
         UsageError: if a limit is not positive.
     """
     if min(loss_scale_deg, max_iterations, max_error_deg) <= 0:
-        raise UsageError("loss_scale_deg, max_iterations and max_error_deg must be positive, got "
-                         f"{loss_scale_deg}, {max_iterations} and {max_error_deg}")  # fmt: skip
+        raise UsageError(
+            "loss_scale_deg, max_iterations and max_error_deg must be positive, got "
+            f"{loss_scale_deg}, {max_iterations} and {max_error_deg}"
+        )
     refined = partial(
         _refined,
         loss=loss,
@@ -81,13 +83,16 @@ def _refined(
     """Return one group, refined."""
     bundle, colors = _bundle(poses)
     for round_idx in range(rounds):
-        # Wide at first: observations that were far off by wrong poses alone shall pull, not go.
+        # Wide at first: observations that are far off only because of wrong poses shall pull, not be dropped.
         widen = 2 ** (rounds - 1 - round_idx)
         bundle, colors = _fitting(bundle, colors, max_error_rad=float(np.deg2rad(max_error_deg * widen)))
         bundle = adjust_bundle(
-            bundle, loss=loss, scale_rad=float(np.deg2rad(loss_scale_deg * widen)), max_iterations=max_iterations,
+            bundle,
+            loss=loss,
+            scale_rad=float(np.deg2rad(loss_scale_deg * widen)),
+            max_iterations=max_iterations,
             tolerance=_TOLERANCES[round_idx],
-        )  # fmt: skip
+        )
     bundle, colors = _without_outliers(bundle, colors, max_error_rad=float(np.deg2rad(max_error_deg)))
     refined = _poses(poses, bundle, colors)
     neighbour = first_neighbour(poses.centers)
@@ -117,7 +122,7 @@ def _bundle(poses: Poses) -> tuple[Bundle, NDArray[np.uint8]]:
 
 
 def _fitting(bundle: Bundle, colors: NDArray[np.uint8], *, max_error_rad: float) -> tuple[Bundle, NDArray[np.uint8]]:
-    """Triangulate all points again, and keep what fits."""
+    """Triangulate all points again, and keep the observations and points that fit."""
     found = triangulate_observations(
         bundle.centers[bundle.image_idx],
         np.einsum("tji,tj->ti", bundle.rotations[bundle.image_idx], bundle.bearings),
@@ -132,7 +137,7 @@ def _fitting(bundle: Bundle, colors: NDArray[np.uint8], *, max_error_rad: float)
 def _without_outliers(
     bundle: Bundle, colors: NDArray[np.uint8], *, max_error_rad: float
 ) -> tuple[Bundle, NDArray[np.uint8]]:
-    """Drop observations that are off, and then points that fewer than two are left of."""
+    """Drop observations with large errors, then points with fewer than two observations."""
     used = bundle.errors_rad() <= max_error_rad
     valid = np.bincount(bundle.point_idx[used], minlength=len(bundle.points)) >= 2
     return _selected(bundle, colors, used & valid[bundle.point_idx], valid)

@@ -1,4 +1,4 @@
-"""Tracks: the key points of many images that show one point, and their triangulation with given poses."""
+"""Tracks: key points of several images that show the same point, and their triangulation with given poses."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ class Tracks:
 def build_tracks(features: Mapping[str, Features], two_views: TwoViews) -> Tracks:
     """Return the tracks that verified matches form, by union of all matches.
 
-    Where the union would bring two key points of one image together, the matches are taken again one after the other,
-    those with the smallest residual first, and those that would do so are left out.
+    If the union would join two key points of one image, the matches are added again one at a time, those with the
+    smallest residual first, and matches that would cause such a conflict are left out.
 
     Args:
         features: key points by image name, in the capture's order.
@@ -91,16 +91,16 @@ def triangulate_tracks(
     max_error_deg: float = 0.4,
     min_angle_deg: float = 1.0,
 ) -> Poses:
-    """Return the same poses, not moved by a digit, with the points that the verified matches give.
+    """Return the same poses with points triangulated from the verified matches; the poses stay exactly as they are.
 
-    Matches between images of different groups are left out: the groups' worlds have nothing in common.
+    Matches between images of different groups are left out, since each group has its own world frame.
 
     Args:
         poses: known poses; its points, if any, are replaced.
         features: key points by image name.
         two_views: verified pairs.
-        max_error_deg: largest angle between an observed ray and the one to its point.
-        min_angle_deg: smallest angle between the rays of a point seen twice.
+        max_error_deg: largest angle between an observed ray and the ray to its point.
+        min_angle_deg: smallest angle between the rays of a point that is seen twice.
     """
 
     def triangulated(group: Poses) -> Poses:
@@ -114,9 +114,9 @@ def triangulate_tracks(
 
 
 def poses_with_points(poses: Poses, tracks: Tracks, *, max_error_deg: float, min_angle_deg: float) -> Poses:
-    """Return the same poses with the points of tracks, whose names are all registered or are left out.
+    """Return the same poses with the points of tracks; images of tracks without a pose are ignored.
 
-    A track that is seen from several groups gives each of them a point of its own.
+    A track that is seen from several groups gives a separate point in each of them.
     """
     return per_group(
         poses, lambda group: _with_points(group, tracks, max_error_deg=max_error_deg, min_angle_deg=min_angle_deg)
@@ -157,7 +157,7 @@ def _with_points(poses: Poses, tracks: Tracks, *, max_error_deg: float, min_angl
 def _match_nodes(
     names: tuple[str, ...], offsets: NDArray[np.intp], two_views: TwoViews
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return all matches between nodes (key points counted through all images), (M, 2), and their residuals."""
+    """Return all matches between nodes (key points numbered across all images), (M, 2), and their residuals."""
     start = {name: int(offset) for name, offset in zip(names, offsets[:-1], strict=True)}
     nodes, residuals = [np.zeros((0, 2), np.int64)], [np.zeros(0, np.float32)]
     for first, second in sorted(pair for pair, view in two_views.items() if view):
@@ -173,7 +173,7 @@ def _labels(nodes: NDArray[np.int64], total: int) -> NDArray[np.intp]:
 
 
 def _conflicting(label: NDArray[np.intp], image_of_node: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Return, for every label, whether it holds two key points of one image."""
+    """Return, for every label, whether it contains two key points of one image."""
     order = np.lexsort((image_of_node, label))
     same = (np.diff(label[order]) == 0) & (np.diff(image_of_node[order]) == 0)
     conflicting = np.zeros(len(label) + 1, np.bool_)
@@ -184,7 +184,7 @@ def _conflicting(label: NDArray[np.intp], image_of_node: NDArray[np.intp]) -> ND
 def _without_conflicts(
     nodes: NDArray[np.int64], residuals: NDArray[np.float32], image_of_node: NDArray[np.intp]
 ) -> NDArray[np.int64]:
-    """Return the matches that can be joined, best first, without two key points of one image in one track."""
+    """Return the matches that can be joined, best first, without two key points of one image in a track."""
     members: dict[int, dict[int, int]] = {}
     root: dict[int, int] = {}
     kept = np.zeros(len(nodes), np.bool_)

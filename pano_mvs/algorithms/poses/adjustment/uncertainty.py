@@ -1,4 +1,4 @@
-"""How sure the cameras of an adjusted bundle are, from the curvature of its cost."""
+"""Uncertainty of the cameras of an adjusted bundle, from the curvature of its cost."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from pano_mvs.algorithms.poses.adjustment.camera_system import camera_order, cam
 FloatArray = NDArray[np.float64]
 
 _COLUMNS_AT_ONCE = 64  # cameras
-_HELD_LENGTH = 1e6  # how much stiffer than the stiffest camera the unit of length is
+_HELD_LENGTH = 1e6  # stiffness of the unit of length, relative to the stiffest camera
 
 
 def camera_deviations(bundle: Bundle, *, loss: Loss, scale_rad: float, neighbour: int) -> tuple[FloatArray, FloatArray]:
     """Return the standard deviations of camera centres and rotations, given the first camera and first baseline.
 
-    The covariance is σ² S⁻¹, S being the reduced system of the cameras with the robust weights w at the optimum
-    (divided by the squared sigmas), and σ² = Σ w r² / (2T − 6N − 3P + 7) the variance of the residuals r; Triggs et
-    al., "Bundle Adjustment — A Modern Synthesis", 2000, sections 4 and 9. It speaks of noise in the rays; of wrong
-    stitching or repeated structure it knows nothing.
+    The covariance is σ² S⁻¹, where S is the reduced system of the cameras with the robust weights w at the optimum
+    (divided by the squared sigmas), and σ² = Σ w r² / (2T − 6N − 3P + 7) is the variance of the residuals r; Triggs et
+    al., "Bundle Adjustment — A Modern Synthesis", 2000, sections 4 and 9. It covers noise in the rays only, not
+    stitching errors or repeated structure.
 
     Args:
         bundle: an adjusted bundle.
-        loss: the loss it was adjusted with.
+        loss: the loss of the adjustment.
         scale_rad: the scale of that loss.
         neighbour: position of the camera whose distance to the first is the unit of length.
 
     Returns:
-        centers (N,) roots of the traces of the centres' covariances, in scene units; rotations (N,) likewise, in
-        radians. Zero for the first camera; NaN where nothing is known: a camera without observations, or a system
-        that is singular.
+        centers (N,), square roots of the traces of the centres' covariances, in scene units; rotations (N,), likewise,
+        in radians. Zero for the first camera; NaN if unknown: for a camera without observations, or if the system is
+        singular.
     """
     order = camera_order(bundle.point_idx, bundle.image_idx, len(bundle.centers))
     place = np.argsort(order)
@@ -57,7 +57,7 @@ def camera_deviations(bundle: Bundle, *, loss: Loss, scale_rad: float, neighbour
 
 
 def _hold_length(band: FloatArray, centers: FloatArray, first: int, neighbour: int) -> None:
-    """Add to the system that the distance of two cameras does not change."""
+    """Constrain the system so that the distance between two cameras does not change."""
     along = centers[neighbour] - centers[first]
     along /= np.linalg.norm(along)
     stiffness = _HELD_LENGTH * float(band[:, 0].max())

@@ -1,1 +1,1 @@
-"""Pose solvers that run COLMAP; the only place besides `io.colmap` that may import pycolmap."""
+"""Pose solvers that run COLMAP; only this package and `io.colmap` may import pycolmap."""

@@ -1,4 +1,4 @@
-"""Key points and verified matches as a COLMAP database: panoramas as they are, or as rigs of pinhole faces."""
+"""Write key points and verified matches to a COLMAP database, as panoramas or as rigs of pinhole faces."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ TwoViews = Mapping[tuple[str, str], TwoView]
 
 @dataclass(frozen=True, eq=False)
 class DatabaseImage:
-    """One COLMAP image: a panorama, or one face of it.
+    """One COLMAP image: a panorama, or one of its faces.
 
     Attributes:
         panorama_idx: position of the panorama among the features.
-        keypoint_idx: (N,) the panorama's key points that lie in it: number n of the image is keypoint_idx[n].
+        keypoint_idx: (N,) the panorama's key points in this image; keypoint_idx[n] is key point n of the image.
         face_from_panorama: (3, 3) rotation; the identity for a whole panorama.
     """
 
@@ -42,14 +42,14 @@ def write_database(
     """Write a database for COLMAP's mappers, in a fixed order: the same input gives the same rows.
 
     Args:
-        path: the file to make; it must not exist.
+        path: file to create; it must not exist.
         features: key points by image name, in the capture's order.
         two_views: verified pairs; those without a general geometry are left out.
-        cameras: "sphere": one EQUIRECTANGULAR image for each panorama; "faces": six pinhole faces of one rig, every
-            key point in the face in which it lies.
+        cameras: "sphere": one EQUIRECTANGULAR image per panorama; "faces": six pinhole faces of one rig, with every key
+            point in the face that contains it.
 
     Returns:
-        COLMAP's image id to what the image shows.
+        COLMAP's image id to the content of the image.
     """
     import pycolmap
 
@@ -72,7 +72,7 @@ def _write_sphere(database: Any, sensors: dict[Any, Any], idx: int, name: str, f
 
     height, width = found.size_hw
     if found.size_hw not in sensors:
-        # Without its params an EQUIRECTANGULAR camera takes the process down when it is used.
+        # An EQUIRECTANGULAR camera without params crashes the process when it is used.
         camera = pycolmap.Camera(model="EQUIRECTANGULAR", width=width, height=height, params=[width, height])
         sensors[found.size_hw] = _write_rig(database, [camera], np.eye(3)[None])
     rig_id, camera_ids = sensors[found.size_hw]
@@ -86,7 +86,7 @@ def _write_faces(database: Any, sensors: dict[Any, Any], idx: int, name: str, fo
 
     size = face_size(found.size_hw)
     if found.size_hw not in sensors:
-        half = size / 2  # of a face of 90° the focal length is half the width
+        half = size / 2  # the focal length of a face of 90° is half its width
         faces = [
             pycolmap.Camera(model="SIMPLE_PINHOLE", width=size, height=size, params=[half, half, half])
             for _ in CUBE_ROTATIONS
@@ -108,7 +108,7 @@ def _write_faces(database: Any, sensors: dict[Any, Any], idx: int, name: str, fo
 
 
 def _write_rig(database: Any, cameras: list[Any], face_from_panorama: FloatArray) -> tuple[int, list[int]]:
-    """Write the cameras of one rig, whose frame is the panorama's, and return the ids of the rig and of the cameras."""
+    """Write the cameras of one rig, whose frame is the panorama's; return the ids of the rig and of the cameras."""
     import pycolmap
 
     camera_ids = [database.write_camera(camera) for camera in cameras]
@@ -120,7 +120,7 @@ def _write_rig(database: Any, cameras: list[Any], face_from_panorama: FloatArray
 
 
 def _write_frame(database: Any, rig_id: int, camera_ids: list[int], names: list[str]) -> list[int]:
-    """Write the images that one panorama consists of, and the frame that joins them; return their ids."""
+    """Write the images of one panorama, and the frame that joins them; return the image ids."""
     import pycolmap
 
     frame = pycolmap.Frame()
@@ -143,7 +143,7 @@ def _camera_sensor(camera_id: int) -> Any:
 def _write_pairs(
     database: Any, names: tuple[str, ...], two_views: TwoViews, images: Mapping[int, DatabaseImage]
 ) -> None:
-    """Write matches and geometry of every pair of images that share some."""
+    """Write matches and geometry of every pair of images with common matches."""
     position = {name: idx for idx, name in enumerate(names)}
     place = _places(images, len(names))
     for (first, second), view in sorted(two_views.items(), key=lambda item: tuple(position[n] for n in item[0])):
@@ -174,7 +174,7 @@ def _geometry(second_from_first: Rigid3, matches: NDArray[np.uint32]) -> Any:
 
 
 def _places(images: Mapping[int, DatabaseImage], count: int) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Return for each panorama, by key point, the id of the image that it lies in and its number there."""
+    """Return for each panorama, by key point, the id of the image that contains it and its number in that image."""
     sizes = np.zeros(count, np.int64)
     for image in images.values():
         sizes[image.panorama_idx] += len(image.keypoint_idx)

@@ -1,4 +1,4 @@
-"""Run COLMAP's mappers quietly and reproducibly, and read what they found."""
+"""Run COLMAP's mappers quietly and reproducibly, and read their results."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from pano_mvs.scene import Features, Poses
 
 Mapper = Literal["incremental", "global"]
 
-# With more threads the order of Ceres' sums, and so the last digits, would depend on the scheduler.
+# With more threads the order of Ceres' sums, and thus the last digits, would depend on the scheduler.
 _THREADS = 1
 _WIDTH_OF_LIMITS_PX = 1024
 
 
 @contextmanager
 def quiet_colmap() -> Iterator[None]:
-    """Keep COLMAP's progress log off the terminal; its errors are still shown."""
+    """Keep COLMAP's progress log off the terminal; errors are still shown."""
     import pycolmap
 
     before = pycolmap.logging.minloglevel
@@ -38,15 +38,15 @@ def quiet_colmap() -> Iterator[None]:
 def run_mapper(
     database: Path, folder: Path, *, mapper: Mapper, cameras: Cameras, seed: int, width_px: float
 ) -> list[Any]:
-    """Return the models that a mapper makes of a database, the one with most panoramas first.
+    """Run a mapper on a database and return its models, the one with most panoramas first.
 
     Args:
-        database: as `write_database` made it.
+        database: a database from `write_database`.
         folder: an empty folder for COLMAP's own files.
-        mapper: COLMAP's incremental or its global mapper (GLOMAP).
-        cameras: what the database holds.
-        seed: of COLMAP's random numbers, positive.
-        width_px: width of the panoramas, to which COLMAP's limits in pixels are fitted.
+        mapper: COLMAP's incremental or global mapper (GLOMAP).
+        cameras: the kind of cameras in the database.
+        seed: seed of COLMAP's random numbers, positive.
+        width_px: width of the panoramas, to which COLMAP's limits in pixels are adapted.
     """
     import pycolmap
 
@@ -60,24 +60,30 @@ def run_mapper(
 
 
 def extend_model(
-    database: Path, folder: Path, known: Mapping[int, Rigid3], images: Mapping[int, DatabaseImage], *,
-    cameras: Cameras, seed: int, width_px: float,
-) -> Any:  # fmt: skip
-    """Return the model that COLMAP's incremental mapper makes by adding panoramas to known ones.
+    database: Path,
+    folder: Path,
+    known: Mapping[int, Rigid3],
+    images: Mapping[int, DatabaseImage],
+    *,
+    cameras: Cameras,
+    seed: int,
+    width_px: float,
+) -> Any:
+    """Add panoramas to a model of known ones by COLMAP's incremental mapper, and return the model.
 
-    Those do not move against each other; the world as a whole may be moved and scaled.
+    Known panoramas do not move relative to each other; the world as a whole may be moved and scaled.
 
     Args:
-        database: as `write_database` made it.
+        database: a database from `write_database`.
         folder: an empty folder for COLMAP's own files.
-        known: cam_from_world by position of the panorama, two at least.
-        images: what each COLMAP image shows.
-        cameras: what the database holds.
-        seed: of COLMAP's random numbers, positive.
-        width_px: width of the panoramas, to which COLMAP's limits in pixels are fitted.
+        known: cam_from_world by position of the panorama, at least two.
+        images: the content of each COLMAP image.
+        cameras: the kind of cameras in the database.
+        seed: seed of COLMAP's random numbers, positive.
+        width_px: width of the panoramas, to which COLMAP's limits in pixels are adapted.
 
     Returns:
-        The model, or None where the known panoramas give no point that a new one could see.
+        The model, or None if the known panoramas give no point that a new panorama could see.
     """
     import pycolmap
 
@@ -119,13 +125,13 @@ def poses_from_model(
     *,
     rejected: Mapping[str, str],
 ) -> Poses:
-    """Return the panoramas of a COLMAP model with its points, their rays and colours being those of the key points.
+    """Return the panoramas of a COLMAP model with its points, using the rays and colours of our key points.
 
     Args:
-        model: a reconstruction from the database that gave `images`.
+        model: a reconstruction from the database that `images` belongs to.
         features: key points by image name, in the capture's order.
-        images: what each COLMAP image shows.
-        rejected: reasons of the panoramas that are not in the model.
+        images: the content of each COLMAP image.
+        rejected: reasons for the panoramas that are not in the model.
     """
     names = tuple(features)
     cameras = registered_panoramas(model, images)
@@ -142,8 +148,9 @@ def poses_from_model(
     seen = _observations(model, images, point_ids)
     position = np.full(len(names), -1)
     position[registered] = np.arange(len(registered))
-    return with_observations(poses, points, features, point_idx=seen[:, 0], image_idx=position[seen[:, 1]],
-                             keypoint_idx=seen[:, 2])  # fmt: skip
+    return with_observations(
+        poses, points, features, point_idx=seen[:, 0], image_idx=position[seen[:, 1]], keypoint_idx=seen[:, 2]
+    )
 
 
 def registered_panoramas(model: Any, images: Mapping[int, DatabaseImage]) -> dict[int, Rigid3]:
@@ -164,7 +171,7 @@ def with_observations(
     image_idx: NDArray[np.int64],
     keypoint_idx: NDArray[np.int64],
 ) -> Poses:
-    """Return poses with points, (P, 3), and their observations; of two in one image the one that fits better stays."""
+    """Return poses with points, (P, 3), and their observations; of two in one image, the better one is kept."""
     count = len(points)
     bearings, colors = np.zeros((len(point_idx), 3)), np.zeros((len(point_idx), 3))
     for idx, name in enumerate(poses.names):
@@ -192,7 +199,7 @@ def with_observations(
 
 
 def _observations(model: Any, images: Mapping[int, DatabaseImage], point_ids: list[int]) -> NDArray[np.int64]:
-    """Return (point, panorama, key point) of all observations, (T, 3), points by their position in `point_ids`."""
+    """Return (point, panorama, key point) of all observations, (T, 3); points by their position in `point_ids`."""
     rows = [
         (number, images[element.image_id].panorama_idx, images[element.image_id].keypoint_idx[element.point2D_idx])
         for number, point_id in enumerate(point_ids)
@@ -215,13 +222,13 @@ def _incremental_options(*, cameras: Cameras, seed: int, width_px: float) -> Any
     options.triangulation.random_seed = seed
     options.extract_colors = False
     options.min_model_size = 2
-    # A verified match of two panoramas is a sound point, and few captures have many seen three times.
+    # A verified match of two panoramas gives a reliable point, and few captures have many points seen three times.
     options.triangulation.ignore_two_view_tracks = False
-    # A panorama's camera has nothing to refine, and a face's is what we made it.
+    # A panorama's camera has no intrinsics to refine, and those of a face are exact.
     options.ba_refine_focal_length = options.ba_refine_extra_params = options.ba_refine_sensor_from_rig = False
     options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
-    # COLMAP's limits are pixels of pinhole pictures. Held at what they are in a panorama of 1024 columns, they are
-    # angles: 4 px are 1.4°, and would be 4.5° in one of 320.
+    # COLMAP's limits are pixels of pinhole images. They are kept at their values for a panorama of 1024 columns, where
+    # they correspond to angles: 4 px are 1.4°, and would be 4.5° with 320 columns.
     scale = width_px / _WIDTH_OF_LIMITS_PX
     options.mapper.filter_max_reproj_error *= scale
     options.mapper.abs_pose_max_error *= scale
@@ -229,8 +236,8 @@ def _incremental_options(*, cameras: Cameras, seed: int, width_px: float) -> Any
     options.triangulation.merge_max_reproj_error *= scale
     options.triangulation.complete_max_reproj_error *= scale
     if cameras == "faces":
-        # The verified matches of two panoramas are spread over many pairs of faces; only one pair begins the model,
-        # which then has few points for the next panorama to be seen from.
+        # The verified matches of two panoramas are spread over many pairs of faces. Only one pair starts the model,
+        # which then has few points for the next panorama.
         options.min_num_matches = 1
         options.mapper.abs_pose_min_num_inliers = 15
     return options
@@ -251,11 +258,11 @@ def _global_options(*, cameras: Cameras, seed: int) -> Any:
     mapper.global_positioning.refine_sensor_from_rig = mapper.bundle_adjustment.refine_sensor_from_rig = False
     mapper.global_positioning.use_gpu = mapper.bundle_adjustment.ceres.use_gpu = False
     options.min_model_size = 2
-    # A verified match of two panoramas is a sound point, and few captures have many seen three times.
+    # A verified match of two panoramas gives a reliable point, and few captures have many points seen three times.
     mapper.retriangulation.ignore_two_view_tracks = False
     mapper.track_min_num_views_per_track = mapper.global_positioning.min_num_view_per_track = 2
     mapper.bundle_adjustment.min_track_length = 2
-    # The pairs come with their relative poses.
+    # The pairs already have relative poses.
     options.decompose_relative_pose = False
     if cameras == "faces":
         options.min_num_matches = 1

@@ -15,9 +15,9 @@ from pano_mvs.algorithms.two_view.essential import sampson_angles
 from pano_mvs.geometry import Rigid3, ray_from_pixel, skew
 from pano_mvs.scene import Features, TwoView
 
-# With more threads COLMAP numbers the pictures in the order in which they are finished.
+# With more threads COLMAP numbers the images in the order in which they are finished.
 _THREADS = 1
-_SIFT_PATCH_SCALES = 12.0  # SIFT describes four by four bins of three scales each
+_SIFT_PATCH_SCALES = 12.0  # SIFT describes 4 × 4 bins of three scales each
 
 
 def colmap_sift(
@@ -27,16 +27,16 @@ def colmap_sift(
     rng: np.random.Generator,
     scratch: Path,
 ) -> tuple[dict[str, Features], dict[tuple[str, str], TwoView]]:
-    """Return COLMAP's SIFT key points of panoramas, and all pairs as it matched and verified them.
+    """Return COLMAP's SIFT key points of panoramas, and all pairs as matched and verified by COLMAP.
 
-    It is planar SIFT: key points thin out beside the seam and towards the poles.
+    This is planar SIFT: there are fewer key points near the seam and the poles.
 
     Args:
         pictures: name, (H, W, 3) uint8 RGB and (H, W) bool valid pixels of each panorama, in the capture's order;
-            taken one after the other, so that they need not all be in memory.
-        max_keypoints: of each picture, at most.
+            loaded one at a time, so they need not all be in memory.
+        max_keypoints: maximum number per panorama.
         rng: gives COLMAP's seed.
-        scratch: an empty folder for the pictures, their masks and COLMAP's database.
+        scratch: an empty folder for the images, their masks and COLMAP's database.
     """
     import pycolmap
 
@@ -58,7 +58,7 @@ def colmap_sift(
 
 
 def _exported(pictures: Iterable[tuple[str, NDArray[np.uint8], NDArray[np.bool_]]], scratch: Path) -> list[str]:
-    """Write pictures and masks under numbers, in COLMAP's naming, and return the pictures' names."""
+    """Write images and masks under numbers, in COLMAP's naming, and return the image names."""
     names = []
     for folder in ("images", "masks"):
         (scratch / folder).mkdir()
@@ -111,7 +111,7 @@ def _verification_options(seed: int) -> Any:
 
 
 def _read(path: Path, names: list[str], folder: Path) -> tuple[dict[str, Features], dict[tuple[str, str], TwoView]]:
-    """Return what the database holds as records."""
+    """Return the content of the database as records."""
     import pycolmap
 
     database = pycolmap.Database.open(path)
@@ -150,7 +150,7 @@ def _features(database: Any, image_id: int, picture: Path) -> Features:
 
 
 def _two_view(geometry: Any, first: Features, second: Features) -> TwoView:
-    """Return COLMAP's geometry of a pair; one without a relative pose is none."""
+    """Return COLMAP's geometry of a pair; a failed one if COLMAP found no relative pose."""
     matches = np.asarray(geometry.inlier_matches, np.int32).reshape(-1, 2)
     pose = geometry.cam2_from_cam1
     length = 0.0 if pose is None else float(np.linalg.norm(pose.translation))

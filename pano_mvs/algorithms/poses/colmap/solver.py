@@ -1,4 +1,4 @@
-"""Register a capture through COLMAP's mappers, with our key points and verified matches."""
+"""Register a capture by COLMAP's mappers, with our key points and verified matches."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def solve_colmap(
     rng: np.random.Generator,
     scratch: Path,
 ) -> Poses:
-    """Return the poses of a capture by COLMAP's incremental or global mapper.
+    """Estimate the poses of a capture by COLMAP's incremental or global mapper.
 
     Schönberger & Frahm, "Structure-from-Motion Revisited", 2016; Pan et al., "Global Structure-from-Motion
     Revisited", 2024. The mapper runs on one thread with a seed, so that the same input gives the same poses.
@@ -48,9 +48,9 @@ def solve_colmap(
         scratch: an empty folder for COLMAP's files.
 
     Returns:
-        Poses in the frame of the first registered camera, the first baseline being 1. Several models become as many
-        groups, each in such a frame of its own; a panorama that is in two models is taken from the larger one. What no
-        model of two panoramas or more holds is in `rejected`, with the reason.
+        Poses in the frame of the first registered camera, with a first baseline of length 1. Several models become
+        several groups, each in its own frame; a panorama in two models is taken from the larger one. Panoramas that are
+        in no model of two or more are in `rejected`, with the reason.
     """
     seed = int(rng.integers(1, _SEED_LIMIT))
     (scratch / "models").mkdir()
@@ -65,7 +65,7 @@ def solve_colmap(
             width_px=_width_px(features),
         )
     except (RuntimeError, ValueError, IndexError) as error:
-        return _nothing(features, f"COLMAP's {mapper} mapper stopped: {error}")
+        return _nothing(features, f"COLMAP's {mapper} mapper failed: {error}")
     groups: list[Poses] = []
     registered: set[str] = set()
     for model in models:
@@ -75,7 +75,7 @@ def solve_colmap(
             groups.append(normalised_poses(group))
             registered.update(group.names)
     if not groups:
-        return _nothing(features, f"COLMAP's {mapper} mapper found no model of two panoramas or more")
+        return _nothing(features, f"COLMAP's {mapper} mapper found no model of two or more panoramas")
     return join_groups(groups, order=tuple(features), rejected=_rejected(features, two_views, registered))
 
 
@@ -88,10 +88,10 @@ def extend_with_colmap(
     rng: np.random.Generator,
     scratch: Path,
 ) -> Poses:
-    """Return known poses, not moved by a digit, with those that COLMAP's incremental mapper adds to them.
+    """Add images to known poses by COLMAP's incremental mapper; the known poses stay exactly as they are.
 
     Args:
-        known: poses by the names of `features`; others are left out. Its points are replaced.
+        known: poses by the names in `features`; others are ignored. The points of these poses are replaced.
         features: key points by image name, in the capture's order.
         two_views: verified pairs; those without a general geometry are left out.
         cameras: see `solve_colmap`.
@@ -99,15 +99,15 @@ def extend_with_colmap(
         scratch: an empty folder for COLMAP's files.
 
     Returns:
-        Poses in the frame and unit of the known ones; what COLMAP does not add is in `rejected`, with the reason, and
-        so is a known image without any sound pair, which COLMAP does not load (`extend_poses` keeps it).
+        Poses in the frame and unit of the known poses. Images that COLMAP does not add are in `rejected`, with the
+        reason; so are known images without any reliable pair, which COLMAP does not load (`extend_poses` keeps them).
     """
     seed = int(rng.integers(1, _SEED_LIMIT))
     (scratch / "models").mkdir()
     images = write_database(scratch / "database.db", features, two_views, cameras=cameras)
     position = {name: idx for idx, name in enumerate(features)}
     fixed = {position[name]: known.cam_from_world(idx) for idx, name in enumerate(known.names) if name in position}
-    model, stopped = None, "the known pictures give no point that it could see"
+    model, stopped = None, "the known images give no point that it could see"
     try:
         if len(fixed) > 1:
             model = extend_model(
@@ -120,15 +120,17 @@ def extend_with_colmap(
                 width_px=_width_px(features),
             )
     except (RuntimeError, ValueError, IndexError) as error:
-        stopped = f"COLMAP's incremental mapper stopped: {error}"
+        stopped = f"COLMAP's incremental mapper failed: {error}"
     if model is None:
         return Poses.without_points(
             {name: fixed[idx] for name, idx in position.items() if idx in fixed},
             rejected={
                 name: why_no_pair(name, two_views) or stopped for name, idx in position.items() if idx not in fixed
             },
-            frame=known.frame, scale=known.scale, metric=known.metric,
-        )  # fmt: skip
+            frame=known.frame,
+            scale=known.scale,
+            metric=known.metric,
+        )
     names = tuple(features)
     registered = {names[idx] for idx in registered_panoramas(model, images)}
     rejected = _rejected(features, two_views, registered)
@@ -137,9 +139,9 @@ def extend_with_colmap(
 
 
 def _in_world_of(known: Poses, poses: Poses) -> Poses:
-    """Return poses in the world of the known ones among them, and those to the last digit.
+    """Return poses in the world frame of the known ones, with the known poses exactly as they were.
 
-    COLMAP moves and scales the world of a model that it has adjusted as a whole, but does not turn it.
+    COLMAP moves and scales the world of a model after a global adjustment, but does not rotate it.
     """
     common = [(idx, known.names.index(name)) for idx, name in enumerate(poses.names) if name in known.names]
     here, there = (np.array(column) for column in zip(*common, strict=True))
@@ -156,9 +158,12 @@ def _width_px(features: Mapping[str, Features]) -> float:
 
 def _nothing(features: Mapping[str, Features], reason: str) -> Poses:
     return Poses.without_points(
-        {}, rejected=dict.fromkeys(features, reason), frame="the first registered camera",
-        scale="none: no image is registered", metric=False,
-    )  # fmt: skip
+        {},
+        rejected=dict.fromkeys(features, reason),
+        frame="the first registered camera",
+        scale="none: no image is registered",
+        metric=False,
+    )
 
 
 def _rejected(features: Mapping[str, Features], two_views: TwoViews, registered: Collection[str]) -> dict[str, str]:
@@ -171,5 +176,7 @@ def _why_unregistered(name: str, two_views: TwoViews) -> str:
     if pair is None or not two_views[pair]:
         return why_no_pair(name, two_views)
     partner = pair[1] if pair[0] == name else pair[0]
-    return (f"COLMAP did not register it, although its best partner, {partner!r}, shares {len(two_views[pair])} "
-            "verified matches")  # fmt: skip
+    return (
+        f"COLMAP did not register it, although its best partner, {partner!r}, shares {len(two_views[pair])} "
+        "verified matches"
+    )

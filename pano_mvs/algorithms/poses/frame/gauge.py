@@ -1,4 +1,4 @@
-"""Choose the world frame and the unit of length that the product promises."""
+"""Choose the world frame and the unit of length: first camera and first baseline."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from pano_mvs.scene.pose_groups import per_group
 
 FloatArray = NDArray[np.float64]
 
-# A neighbour nearer than this share of the median distance to the first camera makes no sound unit of length.
+# A neighbour closer than this share of the median distance to the first camera gives no reliable unit of length.
 _MIN_NEIGHBOUR_SHARE = 0.1
 
 
 def normalised_poses(poses: Poses) -> Poses:
     """Return the same scene with the first camera as the world and its first baseline as the unit of length.
 
-    The baseline is that to the first other camera, in the capture's order, that does not all but coincide with it.
-    Each group has its own first camera and first baseline.
+    The baseline is that to the first other camera, in the capture's order, that does not nearly coincide with the
+    first. Each group has its own first camera and first baseline.
     """
     return per_group(poses, _normalised)
 
@@ -33,16 +33,16 @@ def _normalised(poses: Poses) -> Poses:
     neighbour = first_neighbour(poses.centers)
     scale = 1 / _distance(poses.centers, neighbour) if neighbour else 1.0
     moved = moved_poses(poses, Similarity3(scale, first.rotation, scale * first.translation))
-    # Exactly, not but for rounding.
+    # Exact, without rounding errors.
     moved.rotations[0], moved.translations[0] = np.eye(3), 0.0
     return moved
 
 
 def in_gauge_of(poses: Poses, centers: FloatArray) -> Poses:
-    """Return refined poses in the world frame and unit of length of the (N, 3) centres from before the refinement.
+    """Return refined poses in the world frame and unit of length of the (N, 3) centres before the refinement.
 
-    Metric poses keep the frame by the similarity of all centres; others keep the first camera and first baseline.
-    The poses are of one group.
+    Metric poses keep the frame by the similarity of all centres; others keep the first camera and first baseline. The
+    poses are of one group.
     """
     if poses.metric and len(centers) >= 3:
         return moved_poses(poses, similarity_from_points(poses.centers, centers))
@@ -62,7 +62,7 @@ def first_neighbour(centers: FloatArray) -> int:
 
 
 def moved_poses(poses: Poses, new_from_old: Similarity3) -> Poses:
-    """Return poses and points, which are of one group, in another world frame."""
+    """Return poses of one group, with their points, in another world frame."""
     cameras = [new_from_old.move_camera(poses.cam_from_world(idx)) for idx in range(len(poses.names))]
     return replace(
         poses,

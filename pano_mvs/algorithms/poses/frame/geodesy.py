@@ -1,4 +1,4 @@
-"""Positions on the Earth as coordinates in a local frame, and back.
+"""Convert positions on the Earth to coordinates in a local frame, and back.
 
 WGS 84 (NIMA TR8350.2): semi-major axis and flattening of the ellipsoid. The local frame follows the camera convention:
 x east, y DOWN, z north, right-handed.
@@ -58,7 +58,7 @@ def _earth_from_lla(position_lla: ArrayLike) -> FloatArray:
 
 
 def _earth_from_local(origin_lla: ArrayLike) -> FloatArray:
-    """Return the rotation (3, 3) whose columns are east, down and north at a place."""
+    """Return the rotation (3, 3) whose columns are the east, down and north directions at a position."""
     latitude, longitude = np.deg2rad(np.asarray(origin_lla, dtype=np.float64)[:2])
     sin_lat, cos_lat, sin_lon, cos_lon = np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)
     east = [-sin_lon, cos_lon, 0.0]

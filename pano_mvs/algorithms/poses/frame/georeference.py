@@ -1,4 +1,4 @@
-"""Fit solved camera positions to GPS: the unit becomes the metre, and on request the world east, down, north."""
+"""Fit camera positions to GPS: scale to metres and, on request, a world frame of east, down, north."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 _UP = np.array([0.0, -1.0, 0.0])
-_FEWEST_POSITIONS = 3
-_MOST_HYPOTHESES = 2000
-# A scale that is less certain than this is no scale.
+_MIN_POSITIONS = 3
+_MAX_HYPOTHESES = 2000
+# A scale with a larger relative uncertainty than this is not used.
 _MAX_SCALE_ERROR = 0.1
 _OUTLIER_SIGMAS = 3.0
 _GEOREFERENCED = re.compile(r"x east, y down, z north, by GPS; [^(]*\((-?[\d.]+)°, (-?[\d.]+)°, (-?[\d.]+) m\)")
@@ -30,7 +30,7 @@ _GEOREFERENCED = re.compile(r"x east, y down, z north, by GPS; [^(]*\((-?[\d.]+)
 
 @dataclass(frozen=True, eq=False)
 class GpsFit:
-    """How solved positions lie on the Earth, or why that is not known (falsy then).
+    """A fit of camera positions to GPS; falsy, with the reason, if there is no reliable one.
 
     Attributes:
         local_from_world: the similarity into metres east, down, north of `origin_lla`.
@@ -38,8 +38,8 @@ class GpsFit:
         used: number of positions that agree with the fit.
         of: number of registered panoramas with a position.
         residual_m: median horizontal distance between the positions and the fit.
-        scale_error: standard deviation of the scale, relative to it.
-        reason: why nothing is known; empty if something is.
+        scale_error: relative standard deviation of the scale.
+        reason: why there is no reliable fit; "" if there is one.
     """
 
     local_from_world: Similarity3
@@ -51,14 +51,16 @@ class GpsFit:
     reason: str = ""
 
     def __bool__(self) -> bool:
-        """Return whether the fit is sound."""
+        """Return whether the fit is reliable."""
         return not self.reason
 
     @property
     def words(self) -> str:
         """The fit in words."""
-        return (f"GPS of {self.used} of {self.of} panoramas (median residual {self.residual_m:.2f} m, scale ± "
-                f"{100 * self.scale_error:.1f} %)")  # fmt: skip
+        return (
+            f"GPS of {self.used} of {self.of} panoramas (median residual {self.residual_m:.2f} m, scale ± "
+            f"{100 * self.scale_error:.1f} %)"
+        )
 
 
 def fit_gps(
@@ -69,24 +71,28 @@ def fit_gps(
     gps_noise_m: float = 3.0,
     rng: np.random.Generator,
 ) -> GpsFit:
-    """Fit camera centres to GPS positions by scale, heading and shift; the vertical is given.
+    """Fit camera centres to GPS positions by scale, heading and shift, given the vertical.
 
-    Latitude and longitude alone decide on scale and heading, since altitudes are several times as noisy or missing
-    altogether: x' = a x + b in the complex plane of the ground. The start is the pair of positions that agrees with
-    most others (MSAC), then least squares with Cauchy weights.
+    Only latitude and longitude determine scale and heading, since altitudes are several times as noisy or missing
+    altogether: x' = a x + b in the complex plane of the ground. The initial fit is the pair of positions that agrees
+    with most others (MSAC), followed by least squares with Cauchy weights.
 
     Args:
         poses: registered images, in any unit and world frame.
         positions_lla: image name to (latitude deg, longitude deg, altitude m).
         up_in_world: (3,) unit vector away from gravity.
-        gps_noise_m: standard deviation of a position along an axis; the fit's own residuals count if they are larger.
-        rng: draws the pairs where there are too many to try all.
+        gps_noise_m: standard deviation of a position along an axis; if the residuals of the fit are larger, they are
+            used.
+        rng: draws pairs if there are too many to try all.
     """
     located = [(idx, positions_lla[name]) for idx, name in enumerate(poses.names) if name in positions_lla]
     unknown = GpsFit(Similarity3(1.0, np.eye(3), np.zeros(3)), np.zeros(3), 0, len(located))
-    if len(located) < _FEWEST_POSITIONS:
-        return replace(unknown, reason=f"{len(located)} of {len(poses.names)} registered panoramas "
-                       f"{plural(len(located), 'has', 'have')} a GPS position; {_FEWEST_POSITIONS} needed")  # fmt: skip
+    if len(located) < _MIN_POSITIONS:
+        return replace(
+            unknown,
+            reason=f"{len(located)} of {len(poses.names)} registered panoramas "
+            f"{plural(len(located), 'has', 'have')} a GPS position; {_MIN_POSITIONS} are needed",
+        )
     lla = np.array([position for _, position in located], np.float64)
     origin_lla = np.median(lla, axis=0)
     local = local_from_lla(lla, origin_lla)
@@ -107,11 +113,11 @@ def fit_gps(
 
 
 def scaled_by_gps(poses: Poses, fit: GpsFit) -> Poses:
-    """Return the same scene in metres, its world frame turned and moved nowhere.
+    """Return the same scene in metres, without rotating or moving the world frame.
 
     Args:
-        poses: those that the fit was made for.
-        fit: a sound one.
+        poses: the poses that were fitted.
+        fit: a reliable fit.
     """
     similarity = Similarity3(fit.local_from_world.scale, np.eye(3), np.zeros(3))
     return replace(moved_poses(poses, similarity), scale=f"metres, by {fit.words}", metric=True)
@@ -121,53 +127,61 @@ def georeferenced_poses(poses: Poses, fit: GpsFit) -> Poses:
     """Return the same scene in metres, x east, y down, z north, with the first camera as its origin.
 
     Args:
-        poses: those that the fit was made for.
-        fit: a sound one.
+        poses: the poses that were fitted.
+        fit: a reliable fit.
     """
     first_in_local = fit.local_from_world.apply(poses.centers[0])
     latitude, longitude, altitude = lla_from_local(first_in_local, fit.origin_lla)
     to_first = Similarity3(1.0, np.eye(3), -first_in_local)
     moved = moved_poses(poses, to_first @ fit.local_from_world)
     moved.translations[0] = 0.0
-    frame = (f"x east, y down, z north, by GPS; origin at the first registered camera ({latitude:z.7f}°, "
-             f"{longitude:z.7f}°, {altitude:z.1f} m)")  # fmt: skip
+    frame = (
+        f"x east, y down, z north, by GPS; origin at the first registered camera ({latitude:z.7f}°, "
+        f"{longitude:z.7f}°, {altitude:z.1f} m)"
+    )
     return replace(moved, frame=frame, scale=f"metres, by {fit.words}", metric=True)
 
 
 def origin_of_frame(frame: str) -> tuple[float, float, float] | None:
-    """Return latitude deg, longitude deg and altitude m of a world's origin, as `georeferenced_poses` states them.
+    """Return latitude deg, longitude deg and altitude m of the origin that `georeferenced_poses` has written.
 
     Args:
-        frame: what the world frame is, in words (`Poses.frame`).
+        frame: the description of the world frame (`Poses.frame`).
 
     Returns:
-        None if the world is not turned east, down, north by GPS.
+        None if GPS did not determine the world frame.
     """
     found = _GEOREFERENCED.match(frame)
     return None if found is None else (float(found[1]), float(found[2]), float(found[3]))
 
 
 def _judged(fit: GpsFit, factor: complex, source: ComplexArray, residuals_m: FloatArray, gps_noise_m: float) -> GpsFit:
-    """Return the fit with its uncertainty, refused if it says too little."""
-    if fit.used < max(_FEWEST_POSITIONS, fit.of / 2):
-        return replace(fit, reason=f"only {fit.used} of {fit.of} GPS positions fit the camera poses; the others are "
-                       f"more than {_OUTLIER_SIGMAS:g} times {gps_noise_m:g} m off")  # fmt: skip
+    """Return the fit with its uncertainty, rejected if it is not reliable."""
+    if fit.used < max(_MIN_POSITIONS, fit.of / 2):
+        return replace(
+            fit,
+            reason=f"only {fit.used} of {fit.of} GPS positions fit the camera poses; the others are "
+            f"more than {_OUTLIER_SIGMAS:g} times {gps_noise_m:g} m off",
+        )
     freedom = 2 * len(source) - 4
     noise_m = max(gps_noise_m, float(np.sqrt(np.sum(residuals_m**2) / freedom)))
     spread_m = float(abs(factor) * np.sqrt(np.sum(np.abs(source - source.mean()) ** 2)))
     fit = replace(fit, scale_error=noise_m / spread_m if spread_m > 0 else float("inf"))
     if fit.scale_error > _MAX_SCALE_ERROR:
         side_m = spread_m / np.sqrt(len(source))
-        return replace(fit, reason=f"the GPS positions lie within about {side_m:.1f} m of their middle, too close for "
-                       f"GPS that is good to {noise_m:.1f} m: the scale would be known to ± "
-                       f"{100 * fit.scale_error:.0f} %")  # fmt: skip
+        return replace(
+            fit,
+            reason=f"the GPS positions lie within about {side_m:.1f} m of their middle, too close for "
+            f"GPS that is good to {noise_m:.1f} m: the scale would be known to ± "
+            f"{100 * fit.scale_error:.0f} %",
+        )
     return fit
 
 
 def _fit_plane(
     source: ComplexArray, target: ComplexArray, noise_m: float, rng: np.random.Generator
 ) -> tuple[complex, complex]:
-    """Return a and b of target ≈ a source + b, whatever single positions say."""
+    """Return a and b of target ≈ a source + b, robust to outliers."""
     first, second = _pairs(len(source), rng)
     baselines = source[second] - source[first]
     usable = np.abs(baselines) > 1e-6 * np.abs(source - source.mean()).max()
@@ -193,12 +207,12 @@ def _fit_plane(
 
 
 def _pairs(count: int, rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return all pairs of positions, or a draw of them if they are too many."""
-    if count * (count - 1) // 2 <= _MOST_HYPOTHESES:
+    """Return all pairs of positions, or a random sample if there are too many."""
+    if count * (count - 1) // 2 <= _MAX_HYPOTHESES:
         pairs = np.array(list(combinations(range(count), 2)))
     else:
-        first = rng.integers(count, size=_MOST_HYPOTHESES)
-        pairs = np.stack([first, (first + rng.integers(1, count, size=_MOST_HYPOTHESES)) % count], axis=1)
+        first = rng.integers(count, size=_MAX_HYPOTHESES)
+        pairs = np.stack([first, (first + rng.integers(1, count, size=_MAX_HYPOTHESES)) % count], axis=1)
     return pairs[:, 0], pairs[:, 1]
 
 
@@ -207,7 +221,7 @@ def _similarity(
 ) -> Similarity3:
     """Return local_from_world of a fit on the ground; the height is the median over the positions used."""
     scale = abs(factor)
-    # Turning by α in the complex plane x + iz is a turn by −α about y, which points down.
+    # A rotation by α in the complex plane x + iz is a rotation by −α about y, which points down.
     turn = rotation_from_rotvec([0.0, -np.angle(factor), 0.0])
     down_m = float(np.median(local[:, 1] - scale * level[:, 1])) if len(local) else 0.0
     return Similarity3(scale, turn @ levelling, np.array([shift.real, down_m, shift.imag]))

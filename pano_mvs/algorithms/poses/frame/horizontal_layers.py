@@ -13,29 +13,29 @@ from pano_mvs.geometry import rotation_from_rotvec, rotation_from_two_vectors
 
 FloatArray = NDArray[np.float64]
 
-# Search around the given up direction: half width and step in degrees, width of a layer relative to the typical range.
+# Search around a given up direction: half width and step in degrees, layer thickness relative to the typical range.
 _ROUNDS = ((20.0, 2.0, 0.04), (2.0, 0.5, 0.02), (0.5, 0.1, 0.01))
-_FEWEST_POINTS = 100
-# How much sharper than the median over all directions within 8° the layers must be. Sparse points of rooms, 200 to
-# 4,000 of them, give 1.3 to 2.0; points without level surfaces 1.0 to 1.2.
-_LEAST_CONTRAST = 1.3
+_MIN_POINTS = 100
+# Minimum ratio of the sharpness of the layers to the median over all directions within 8°. Sparse points of rooms, 200
+# to 4,000 of them, give 1.3 to 2.0; points without level surfaces 1.0 to 1.2.
+_MIN_CONTRAST = 1.3
 _CONTRAST_HALF_DEG, _CONTRAST_STEP_DEG = 8.0, 1.0
 _BINS_PER_WIDTH = 2.0
 # The floor: density along the logarithm of the depth below the cameras, which makes it independent of the unit.
 _LOG_WIDTH = 0.03
 _LOG_STEP = 0.005
 _STEEPEST_SHARE = 0.25
-_FEWEST_FLOOR_POINTS = 12
+_MIN_FLOOR_POINTS = 12
 
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """The direction along which points lie in the sharpest layers, or why there is none (falsy then).
+    """The direction along which points lie in the sharpest layers; falsy, with the reason, if there is none.
 
     Attributes:
         up: (3,) unit vector.
-        contrast: how much sharper the layers are than along the median direction within 8°.
-        reason: why there is none; else empty.
+        contrast: sharpness of the layers relative to the median direction within 8°.
+        reason: why there is none; else "".
     """
 
     up: FloatArray
@@ -49,13 +49,13 @@ class Layers:
 
 @dataclass(frozen=True)
 class Floor:
-    """How deep below the cameras the floor lies, or why it was not found (falsy then).
+    """The depth of the floor below the cameras; falsy, with the reason, if no floor was found.
 
     Attributes:
-        depth: median over the cameras of their height above the floor, scene units.
-        points: number of sparse points on it.
-        spread: median distance of these points from it, scene units.
-        reason: why it was not found; else empty.
+        depth: median height of the cameras above the floor, scene units.
+        points: number of sparse points on the floor.
+        spread: median distance of these points from the floor, scene units.
+        reason: why no floor was found; else "".
     """
 
     depth: float
@@ -72,15 +72,15 @@ def sharpest_up(points: FloatArray, centers: FloatArray, up: FloatArray) -> Laye
     """Return the direction within 20° of `up` along which the points' heights are most concentrated.
 
     Concentration is the integral of the squared density of heights (the exponential of the negative Rényi entropy of
-    order 2), which level surfaces make large and any tilt makes small.
+    order 2). It is large for level surfaces and decreases with any tilt.
 
     Args:
         points: (P, 3) in the world.
         centers: (N, 3) camera centres in the world.
-        up: (3,) unit vector to search around.
+        up: (3,) unit vector around which to search.
     """
-    if len(points) < _FEWEST_POINTS:
-        return Layers(up, 0.0, f"{len(points)} sparse points do not tell level surfaces; {_FEWEST_POINTS} are needed")
+    if len(points) < _MIN_POINTS:
+        return Layers(up, 0.0, f"{len(points)} sparse points are too few for level surfaces; {_MIN_POINTS} are needed")
     offsets = points - np.median(centers, axis=0)
     ranges = np.linalg.norm(offsets, axis=1)
     typical = float(np.median(ranges))
@@ -92,17 +92,17 @@ def sharpest_up(points: FloatArray, centers: FloatArray, up: FloatArray) -> Laye
     others = _directions_around(best, _CONTRAST_HALF_DEG, _CONTRAST_STEP_DEG)
     usual = np.median([_concentration(near @ other, width) for other in others])
     contrast = float(_concentration(near @ best, width) / usual)
-    if contrast < _LEAST_CONTRAST:
-        return Layers(up, contrast, f"the sparse points lie in no clear level surfaces (contrast {contrast:.2f})")
+    if contrast < _MIN_CONTRAST:
+        return Layers(up, contrast, f"the sparse points show no clear level surfaces (contrast {contrast:.2f})")
     return Layers(best, contrast)
 
 
 def floor_below(points: FloatArray, centers: FloatArray, up: FloatArray) -> Floor:
-    """Return the lowest level surface that many points below the cameras lie on.
+    """Return the lowest level surface that contains many points below the cameras.
 
     Args:
         points: (P, 3) in the world.
-        centers: (N, 3) camera centres in the world, all about as high above one floor.
+        centers: (N, 3) camera centres in the world, all at about the same height above one floor.
         up: (3,) unit vector away from gravity.
     """
     heights = centers @ up
@@ -111,7 +111,7 @@ def floor_below(points: FloatArray, centers: FloatArray, up: FloatArray) -> Floo
     offsets = points - np.median(centers, axis=0)
     aside = np.linalg.norm(offsets - (offsets @ up)[:, None] * up, axis=1)
     below = depths[(depths > lowest) & (depths > 0) & (depths > _STEEPEST_SHARE * aside)]
-    if len(below) < _FEWEST_FLOOR_POINTS:
+    if len(below) < _MIN_FLOOR_POINTS:
         return Floor(
             0.0, reason=f"only {len(below)} sparse {plural(len(below), 'point lies', 'points lie')} below the cameras"
         )
@@ -122,14 +122,14 @@ def floor_below(points: FloatArray, centers: FloatArray, up: FloatArray) -> Floo
     strong = peaks[density[peaks] >= _STEEPEST_SHARE * density.max()]
     depth_log = logs.min() + (strong[-1] - 0.5) * _LOG_STEP
     on_floor = below[np.abs(logs - depth_log) < 2 * _LOG_WIDTH]
-    if len(on_floor) < _FEWEST_FLOOR_POINTS:
-        return Floor(0.0, reason=f"no level surface below the cameras holds {_FEWEST_FLOOR_POINTS} sparse points")
+    if len(on_floor) < _MIN_FLOOR_POINTS:
+        return Floor(0.0, reason=f"no level surface below the cameras contains {_MIN_FLOOR_POINTS} sparse points")
     depth = float(np.median(on_floor))
     return Floor(depth, len(on_floor), float(np.median(np.abs(on_floor - depth))))
 
 
 def _directions_around(up: FloatArray, half_deg: float, step_deg: float) -> FloatArray:
-    """Return unit vectors (K, 3) on a grid of tilts; the first is `up` turned the most one way, and so on."""
+    """Return unit vectors (K, 3) on a grid of tilts; the first is `up` tilted the most in one direction, and so on."""
     tilts = np.deg2rad(np.arange(-half_deg, half_deg + step_deg / 2, step_deg))
     x, y = np.meshgrid(tilts, tilts, indexing="ij")
     rotvecs = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
@@ -139,7 +139,7 @@ def _directions_around(up: FloatArray, half_deg: float, step_deg: float) -> Floa
 
 
 def _concentration(heights: FloatArray, width: float) -> float:
-    """Return the integral of the squared density of heights, smoothed to a width."""
+    """Return the integral of the squared density of heights, smoothed to a given width."""
     step = width / _BINS_PER_WIDTH
     positions = (heights - heights.min()) / step
     lower = positions.astype(np.int64)

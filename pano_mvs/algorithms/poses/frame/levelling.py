@@ -1,4 +1,4 @@
-"""Turn the world so that y points down, along gravity, and z north where compasses agree."""
+"""Rotate the world so that y points down, along gravity, and z north if compass headings agree."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pano_mvs.scene import Poses
 FloatArray = NDArray[np.float64]
 
 _UP = np.array([0.0, -1.0, 0.0])
-_FEWEST_HEADINGS = 2
+_MIN_HEADINGS = 2
 _MAX_HEADING_DISAGREEMENT_DEG = 15.0
 
 
@@ -30,18 +30,18 @@ def level_poses(
 ) -> tuple[Poses, Vertical]:
     """Return the same scene in a level world: origin at the first camera, y down along gravity, unit unchanged.
 
-    The z axis points north if at least two compass headings agree; else the world is turned no further than
-    levelling needs, so that z stays close to where it was.
+    The z axis points north if at least two compass headings agree; otherwise the world is rotated only as far as
+    levelling requires, so that z stays close to its direction.
 
     Args:
         poses: registered images.
-        up_in_cam: image name to the up direction (3,) that its camera's sensors measured, in the camera frame.
+        up_in_cam: image name to the up direction (3,) measured by its camera's sensors, in the camera frame.
         heading_deg: image name to the compass heading of its centre, clockwise from north.
         evidence: as in `find_vertical`.
 
     Returns:
-        The poses, and what they were levelled by; if nothing tells the vertical, the poses as they were and a falsy
-        record with the reason.
+        The poses, and the evidence that they were levelled by. If the vertical cannot be determined, the unchanged
+        poses and a falsy record with the reason.
     """
     vertical = find_vertical(poses, up_in_cam, evidence=evidence)
     if not vertical:
@@ -49,7 +49,7 @@ def level_poses(
     levelling = rotation_from_two_vectors(vertical.up_in_world, _UP)
     level = moved_poses(poses, Similarity3(1.0, levelling, -levelling @ poses.centers[0]))
     towards, heading = _northward(level, heading_deg or {})
-    # Adding 0 makes −0 a plain 0: the first camera is at the origin exactly.
+    # Adding 0 turns −0 into 0: the first camera is exactly at the origin.
     level = moved_poses(level, Similarity3(1.0, towards, np.zeros(3)))
     level.translations[0] = 0.0
     frame = f"origin at the first registered camera; y down along gravity, by {vertical.evidence}; {heading}"
@@ -57,11 +57,11 @@ def level_poses(
 
 
 def _northward(level: Poses, heading_deg: Mapping[str, float]) -> tuple[FloatArray, str]:
-    """Return the turn about the vertical that brings z north, and words for it."""
+    """Return the rotation about the vertical that makes z point north, and its description."""
     headings = [(idx, heading_deg[name]) for idx, name in enumerate(level.names) if name in heading_deg]
     unturned = "z close to where it pointed before levelling"
-    # Zero throughout is what software writes that knows no heading.
-    if len(headings) < _FEWEST_HEADINGS or not any(heading for _, heading in headings):
+    # Software that knows no heading writes zero for all images.
+    if len(headings) < _MIN_HEADINGS or not any(heading for _, heading in headings):
         return np.eye(3), unturned
     forward = np.array([level.rotations[idx][2] for idx, _ in headings])
     measured_rad = np.deg2rad([heading for _, heading in headings])

@@ -1,4 +1,4 @@
-"""Give poses the metre as their unit, by a length that is known."""
+"""Scale poses to metres by a known length."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from pano_mvs.scene import Poses
 
 FloatArray = NDArray[np.float64]
 
-# Cameras that are closer than this share of the capture's extent stand in one place: their distance is noise.
+# Cameras closer than this share of the capture's extent are at the same place: their distance is noise.
 _COINCIDENT_SHARE = 1e-3
 
 
 def scaled_poses(poses: Poses, factor: float, *, origin: str) -> Poses:
-    """Return the same scene with all lengths multiplied, in metres from now on.
+    """Return the same scene with all lengths multiplied by a factor, in metres.
 
-    Angles, and with them the points' errors, do not change.
+    Angles, including the errors of points, do not change.
 
     Args:
         poses: in any unit.
         factor: metres per unit of the poses.
-        origin: where the factor comes from, in words.
+        origin: description of where the factor comes from.
 
     Raises:
         UsageError: if the factor is not positive.
@@ -39,33 +39,37 @@ def scaled_poses(poses: Poses, factor: float, *, origin: str) -> Poses:
 
 
 def scaled_by_baseline(poses: Poses, first: str, second: str, *, metres: float) -> Poses:
-    """Return the same scene in metres, from the distance between two cameras.
+    """Return the same scene in metres, given the distance between two cameras.
 
     Args:
         poses: in any unit.
         first: name of a registered image.
-        second: name of another one.
-        metres: the distance between their centres.
+        second: name of another registered image.
+        metres: distance between their centres.
 
     Raises:
-        UsageError: if an image is not registered, or the two stand in one place.
+        UsageError: if an image is not registered, or both are at the same place.
     """
     for name in (first, second):
         if name not in poses.names:
             why = poses.rejected.get(name, "no such image")
-            raise UsageError(f"the baseline's image {name} is not registered ({why}). Name two that are: "
-                             f"{', '.join(poses.names[:8])}")  # fmt: skip
+            raise UsageError(
+                f"the baseline's image {name} is not registered ({why}). Use two registered images, such as: "
+                f"{', '.join(poses.names[:8])}"
+            )
     centers = poses.centers
     distance = float(np.linalg.norm(centers[poses.names.index(second)] - centers[poses.names.index(first)]))
     extent = float(np.linalg.norm(np.ptp(centers, axis=0)))
     if distance <= _COINCIDENT_SHARE * extent:
-        raise UsageError(f"{first} and {second} were taken in one place, so the distance between them gives no scale. "
-                         "Name two images that are further apart")  # fmt: skip
+        raise UsageError(
+            f"{first} and {second} were taken in one place, so the distance between them gives no scale. "
+            "Use two images that are farther apart"
+        )
     return scaled_poses(poses, metres / distance, origin=f"the baseline of {metres:g} m from {first} to {second}")
 
 
 def scaled_by_camera_height(poses: Poses, up_in_world: FloatArray, *, metres: float) -> tuple[Poses, Floor]:
-    """Return the same scene in metres, from the height of the cameras above the floor.
+    """Return the same scene in metres, given the height of the cameras above the floor.
 
     Args:
         poses: in any unit, with sparse points.
@@ -73,8 +77,7 @@ def scaled_by_camera_height(poses: Poses, up_in_world: FloatArray, *, metres: fl
         metres: median height of the cameras above the floor.
 
     Returns:
-        The poses and the floor that was found; if there is none, the poses as they were and a falsy floor with the
-        reason.
+        The poses and the floor that was found. If there is none, the unchanged poses and a falsy floor with the reason.
     """
     floor = floor_below(poses.points_in_world, poses.centers, up_in_world)
     if not floor:

@@ -1,4 +1,4 @@
-"""Which way is up in the world of solved poses: what sensors, cameras and floors say, and how well they agree."""
+"""The vertical in the world frame of poses, from sensors, level surfaces and cameras, with their agreement."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ FloatArray = NDArray[np.float64]
 Evidence = Literal["auto", "sensors", "structure", "cameras"]
 
 _UP = np.array([0.0, -1.0, 0.0])
-# Sensors of one rigid capture that differ by more than this measured something else than gravity.
+# Sensors of one rigid capture that differ by more than this did not measure gravity.
 _MAX_SENSOR_DISAGREEMENT_DEG = 5.0
-# Cameras that were held so far apart from each other were not held upright at all.
+# Cameras whose up directions differ by more than this were not held upright.
 _MAX_CAMERA_DISAGREEMENT_DEG = 20.0
-# Level surfaces further from the cameras' mean than the cameras (three deviations and this) are a slope or a ramp.
+# Level surfaces farther than this (plus three deviations) from the cameras' mean up direction are a slope or a ramp.
 _MAX_STRUCTURE_TILT_DEG = 2.0
-# Agreement that is better than this rejects nothing: readings are whole tenths of degrees at best.
+# Agreement better than this rejects nothing: readings are tenths of degrees at best.
 _MIN_LIMIT_DEG = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class Vertical:
-    """The direction away from gravity, or the reason why it is not known (it is falsy then).
+    """The direction away from gravity; falsy, with the reason, if it is unknown.
 
     Attributes:
         up_in_world: (3,) unit vector.
-        source: what said so: "sensors", "structure" or "cameras".
-        evidence: the same in words, with its amount and agreement.
-        disagreement_deg: median angle between the single readings and `up_in_world`; NaN where there is one only.
-        reason: why nothing is known; empty if something is.
+        source: "sensors", "structure" or "cameras".
+        evidence: description of the source, with its amount and agreement.
+        disagreement_deg: median angle between single readings and `up_in_world`; NaN if there is only one.
+        reason: why the direction is unknown; "" if it is known.
     """
 
     up_in_world: FloatArray
@@ -54,14 +54,14 @@ class Vertical:
 def find_vertical(
     poses: Poses, up_in_cam: Mapping[str, Sequence[float]] | None = None, *, evidence: Evidence = "auto"
 ) -> Vertical:
-    """Return the direction away from gravity in the world of some poses.
+    """Return the direction away from gravity in the world frame of poses.
 
     Args:
         poses: registered images, and their sparse points for `structure`.
-        up_in_cam: image name to the up direction (3,) that its camera's sensors measured, in the camera frame.
-        evidence: "sensors" of the cameras; the "structure" of floors, ceilings and tables within 20° of where the
-            cameras' own up directions point; these "cameras" directions alone; or "auto": the first of them that can
-            be used, in this order.
+        up_in_cam: image name to the up direction (3,) measured by its camera's sensors, in the camera frame.
+        evidence: "sensors" of the cameras; the "structure" of floors, ceilings and tables within 20° of the cameras'
+            mean up direction; the up directions of the "cameras" alone; or "auto": the first of these, in this order,
+            that can be used.
     """
     finders: dict[str, Callable[[], Vertical]] = {
         "sensors": lambda: vertical_from_sensors(poses, up_in_cam or {}),
@@ -78,10 +78,10 @@ def find_vertical(
 
 
 def vertical_from_sensors(poses: Poses, up_in_cam: Mapping[str, Sequence[float]]) -> Vertical:
-    """Return the robust mean of the up directions that the cameras' sensors measured, each turned into the world."""
+    """Return the robust mean of the up directions measured by the cameras' sensors, in the world frame."""
     measured = [(idx, up_in_cam[name]) for idx, name in enumerate(poses.names) if name in up_in_cam]
     if not measured:
-        return _unknown("no registered panorama states its pitch and roll")
+        return _unknown("no registered panorama has pitch and roll in its metadata")
     readings = np.array([poses.rotations[idx].T @ np.asarray(up, np.float64) for idx, up in measured])
     up, deviations_deg, kept = robust_mean_direction(readings)
     disagreement_deg = float(np.median(deviations_deg))
@@ -94,19 +94,21 @@ def vertical_from_sensors(poses: Poses, up_in_cam: Mapping[str, Sequence[float]]
 
 
 def vertical_from_cameras(poses: Poses) -> Vertical:
-    """Return the robust mean of the cameras' own up directions: panoramas are taken with the camera nearly upright."""
+    """Return the robust mean of the cameras' up directions: panoramas are taken with the camera nearly upright."""
     if len(poses.names) < 2:
-        return _unknown("one camera alone cannot tell how it was held")
+        return _unknown("a single camera does not determine the vertical")
     up, deviations_deg, _ = robust_mean_direction(poses.rotations.transpose(0, 2, 1) @ _UP)
     disagreement_deg = float(np.median(deviations_deg))
     if disagreement_deg > _MAX_CAMERA_DISAGREEMENT_DEG:
-        return _unknown(f"the cameras were held {disagreement_deg:.0f}° apart from each other, not upright")
+        return _unknown(
+            f"the up directions of the cameras differ by {disagreement_deg:.0f}°, so they were not held upright"
+        )
     evidence = f"the common up direction of {len(poses.names)} cameras, median disagreement {disagreement_deg:.2f}°"
     return Vertical(up, "cameras", evidence, disagreement_deg)
 
 
 def vertical_from_structure(poses: Poses) -> Vertical:
-    """Return the direction, not far from the cameras' own, along which the sparse points lie in the sharpest layers."""
+    """Return the direction near the cameras' mean up direction along which sparse points lie in the sharpest layers."""
     prior = vertical_from_cameras(poses)
     if not prior:
         return prior
@@ -116,20 +118,22 @@ def vertical_from_structure(poses: Poses) -> Vertical:
     moved_deg = float(np.rad2deg(angle_between(layers.up, prior.up_in_world)))
     limit_deg = _MAX_STRUCTURE_TILT_DEG + 3 * 1.4826 * prior.disagreement_deg
     if moved_deg > limit_deg:
-        return _unknown(f"the layers of sparse points are {moved_deg:.1f}° from level as the cameras were held")
-    evidence = (f"the level surfaces among {len(poses.points_in_world)} sparse points, {moved_deg:.2f}° from the mean "
-                f"of {len(poses.names)} cameras")  # fmt: skip
+        return _unknown(f"the layers of sparse points are tilted by {moved_deg:.1f}° against the cameras' up direction")
+    evidence = (
+        f"the level surfaces among {len(poses.points_in_world)} sparse points, {moved_deg:.2f}° from the mean "
+        f"of {len(poses.names)} cameras"
+    )
     return Vertical(layers.up, "structure", evidence, prior.disagreement_deg)
 
 
 def robust_mean_direction(directions: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Return the mean of unit vectors (N, 3), N ≥ 1, without those that lie far from most.
+    """Return the mean of unit vectors (N, 3), N ≥ 1, without outliers.
 
-    It starts at the vector with the least sum of angles to all others, and twice leaves out what is further from the
-    mean than three standard deviations, as the median of the angles tells them.
+    It starts at the vector with the smallest sum of angles to all others, and twice rejects vectors farther from the
+    mean than three standard deviations, estimated from the median of the angles.
 
     Returns:
-        The mean (3,), the angle of every vector to it in degrees (N,), and which vectors it is the mean of (N,).
+        The mean (3,), the angle of every vector to it in degrees (N,), and which vectors are inliers (N,).
     """
     angles = np.rad2deg(angle_between(directions[:, None], directions[None, :]))
     mean = directions[int(np.argmin(angles.sum(axis=1)))]

@@ -1,1 +1,1 @@
-"""Incremental registration: where the pairs of an image place it, and how a model grows."""
+"""Incremental registration: place an image by its pairs, and grow a model."""

@@ -1,4 +1,4 @@
-"""What the pairs of an image say about its pose: a rotation, a direction and a length for every geometry of a pair."""
+"""Evidence of pairs for the pose of an image: a rotation, a direction and a length for every geometry of a pair."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ FloatArray = NDArray[np.float64]
 
 _MIN_ANGLE_RAD = float(np.deg2rad(1.0))
 _MIN_RATIOS = 6
-# Ratios within this factor of their centre agree with it; a length that fewer than this share agree on is no length.
+# Ratios within this factor of their centre agree with it. A length needs the agreement of at least this share of
+# ratios.
 _AGREEING, _MIN_AGREEING = 1.25, 0.4
 _FEW_MATCHES = 15
-# Standard deviation that is assumed for the direction of a geometry that comes without one.
+# Standard deviation of the direction that is assumed for a geometry without one.
 _ALTERNATIVE_STD_DEG = 0.5
 
 
@@ -30,8 +31,8 @@ class Geometry:
 
     Attributes:
         view: second_from_first with the matches that support it.
-        weight: how much it counts: grows slowly with its matches, since a repeated floor may give hundreds of them to a
-            false geometry, and with its share of the matches of the pair's best geometry.
+        weight: grows slowly with the number of matches, since a repeated floor may give hundreds of matches to a false
+            geometry, and with their share of the matches of the pair's best geometry.
         direction_std_deg: standard deviation of its direction.
         parallax_deg: median angle between the rays of its matches after de-rotation.
     """
@@ -43,12 +44,12 @@ class Geometry:
 
 
 def geometries_of(view: TwoView, bearings_first: FloatArray, bearings_second: FloatArray) -> tuple[Geometry, ...]:
-    """Return all geometries of a pair, the best supported first.
+    """Return all geometries of a pair, the one with most support first.
 
     Args:
         view: the pair's two-view geometry with its alternatives.
-        bearings_first: (N, 3) of all key points of the first image.
-        bearings_second: (N, 3) of the second.
+        bearings_first: (N, 3) unit rays of all key points of the first image.
+        bearings_second: (N, 3) unit rays of the second image.
     """
     found = []
     most = max(len(view), 1)
@@ -67,17 +68,17 @@ def geometries_of(view: TwoView, bearings_first: FloatArray, bearings_second: Fl
 
 @dataclass(frozen=True, eq=False)
 class Witnesses:
-    """All geometries that join an image to registered ones, W of them.
+    """The W geometries that join an image to registered images.
 
     Attributes:
-        partner: (W,) the registered image.
-        rank: (W,) position of the geometry in its pair.
-        weight: (W,) how much it counts.
-        rotations: (W, 3, 3) of cam_from_world for the image, as the geometry has it.
+        partner: (W,) position of the registered image.
+        rank: (W,) rank of the geometry in its pair.
+        weight: (W,) weight of the geometry.
+        rotations: (W, 3, 3) rotation of cam_from_world of the image according to the geometry.
         origins: (W, 3) centre of the partner in the world.
         directions: (W, 3) unit vector from there to the image.
-        lengths: (W,) the distance that puts points where they are known to be; NaN where too few points tell.
-        tolerance_rad: (W,) by how much a direction may be off.
+        lengths: (W,) the distance at which points are at their known ranges; NaN if too few points determine it.
+        tolerance_rad: (W,) largest error of a direction.
     """
 
     partner: NDArray[np.intp]
@@ -95,12 +96,12 @@ class Witnesses:
 
     @property
     def total(self) -> float:
-        """The weight that a pose has which agrees with every partner's heaviest geometry."""
+        """The weight of a pose that agrees with every partner's heaviest geometry."""
         return float(best_by_partner(self.partner, self.weight[None])[0])
 
 
 def best_by_partner(partner: NDArray[np.intp], weights: FloatArray) -> FloatArray:
-    """Return the sum over partners of the largest weight among its geometries, (C,), for weights (C, W)."""
+    """Return the sum over partners of the largest weight among their geometries, (C,), for weights (C, W)."""
     total = np.zeros(len(weights))
     for idx in np.unique(partner):
         total += weights[:, partner == idx].max(axis=1)
@@ -118,15 +119,15 @@ def gather_witnesses(
     estimator: ScaleEstimator,
     kappa: float,
 ) -> Witnesses:
-    """Return what the pairs of an image with registered partners say.
+    """Return the evidence of the pairs of an image with registered partners.
 
     Args:
         image: the image to place.
         partners: registered images that share a pair with it.
         geometries: of all pairs (i, j), i < j.
         cameras: cam_from_world of registered images.
-        bearings: (N, 3) of every image's key points.
-        ranges: (N,) known range of every image's key points in scene units, NaN where it is not known.
+        bearings: (N, 3) unit rays of every image's key points.
+        ranges: (N,) known range of every image's key points in scene units, NaN where unknown.
         estimator: see `estimate_scale`.
         kappa: see `estimate_scale`.
     """
@@ -136,16 +137,25 @@ def gather_witnesses(
         for rank, geometry in enumerate(geometries[min(image, partner), max(image, partner)]):
             from_partner, matches = oriented(geometry.view, partner, image)
             length = _length(
-                from_partner, bearings[partner][matches[:, 0]], bearings[image][matches[:, 1]],
-                ranges[partner][matches[:, 0]], estimator=estimator, kappa=kappa,
-            )  # fmt: skip
+                from_partner,
+                bearings[partner][matches[:, 0]],
+                bearings[image][matches[:, 1]],
+                ranges[partner][matches[:, 0]],
+                estimator=estimator,
+                kappa=kappa,
+            )
             rows.append(
                 (
-                    partner, rank, geometry.weight, from_partner.rotation @ camera.rotation, camera.center,
-                    camera.rotation.T @ from_partner.center, length,
+                    partner,
+                    rank,
+                    geometry.weight,
+                    from_partner.rotation @ camera.rotation,
+                    camera.center,
+                    camera.rotation.T @ from_partner.center,
+                    length,
                     np.deg2rad(1.0 + 2 * min(geometry.direction_std_deg, 1.0) + 5 * geometry.view.residual_deg),
                 )
-            )  # fmt: skip
+            )
     columns = list(zip(*rows, strict=True)) if rows else [()] * 8
     return Witnesses(
         partner=np.array(columns[0], np.intp),
@@ -160,9 +170,9 @@ def gather_witnesses(
 
 
 def oriented(view: TwoView, first: int, second: int) -> tuple[Rigid3, NDArray[np.int32]]:
-    """Return second_from_first with |t| = 1, and the matches with the first image's key points first.
+    """Return second_from_first with |t| = 1, and the matches with the first image's key points in the first column.
 
-    `view` is stored for the smaller of the two images as the first.
+    `view` is stored with the smaller position as the first image.
     """
     pose, matches = Rigid3(view.rotation, view.direction), view.matches_idx
     if first < second:
@@ -180,7 +190,7 @@ def _length(
     estimator: ScaleEstimator,
     kappa: float,
 ) -> float:
-    """Return the length of the translation at which points come to lie at their known ranges; NaN if none does."""
+    """Return the length of the translation that puts points at their known ranges; NaN if it is not determined."""
     known = np.isfinite(known_ranges)
     if known.sum() < _MIN_RATIOS:
         return np.nan

@@ -1,4 +1,4 @@
-"""A model that grows by one image at a time: its cameras, the geometry chosen for every pair, and known ranges."""
+"""A model that grows by one image at a time: its cameras, the chosen geometry of every pair, and known ranges."""
 
 from __future__ import annotations
 
@@ -65,11 +65,16 @@ class Pairs:
 
     @staticmethod
     def without(names: Sequence[str]) -> Pairs:
-        """Return the pairs of images of which neither key points nor matches are known."""
+        """Return pairs without key points and matches, for images of which only the names are known."""
         nothing = Features(
-            bearings=np.zeros((0, 3)), descriptors=np.zeros((0, 1), np.float32), sizes_rad=np.zeros(0, np.float32),
-            scores=np.zeros(0, np.float32), colors_rgb=np.zeros((0, 3), np.uint8), metric="l2", size_hw=(1, 2),
-        )  # fmt: skip
+            bearings=np.zeros((0, 3)),
+            descriptors=np.zeros((0, 1), np.float32),
+            sizes_rad=np.zeros(0, np.float32),
+            scores=np.zeros(0, np.float32),
+            colors_rgb=np.zeros((0, 3), np.uint8),
+            metric="l2",
+            size_hw=(1, 2),
+        )
         return Pairs(dict.fromkeys(names, nothing), {})
 
 
@@ -80,7 +85,7 @@ def pairs_of(
     estimator: ScaleEstimator = "cauchy",
     kappa: float = 0.01,
 ) -> Pairs:
-    """Return the pairs of a capture whose rotations do not contradict the pairs around them, with all their geometries.
+    """Return the pairs of a capture, with all geometries; pairs whose rotations contradict other pairs are left out.
 
     Args:
         features: key points by image name, in the capture's order.
@@ -98,13 +103,13 @@ def pairs_of(
 
 @dataclass(eq=False)
 class PlacedModel:
-    """Registered cameras; the world is the first camera that was added.
+    """Registered cameras; the world frame is that of the first camera that was added.
 
     Attributes:
-        pairs: of the capture.
+        pairs: all pairs of the capture.
         cameras: image position to cam_from_world.
-        chosen: for pairs of registered images, the position of the geometry that agrees with their cameras; pairs of
-            which none agrees are left out.
+        chosen: pair of registered images to the rank of the geometry that agrees with their cameras. Pairs without such
+            a geometry are left out.
     """
 
     pairs: Pairs
@@ -123,7 +128,7 @@ class PlacedModel:
         return model
 
     def witnesses(self, image: int, partners: Sequence[int] | None = None) -> Witnesses:
-        """Return what the pairs of an image with registered images, or with some of them, say about its pose."""
+        """Return the evidence of the pairs of an image with all, or with the given, registered images for its pose."""
         if partners is None:
             partners = [idx for idx in self.pairs.partners[image] if idx in self.cameras][:_MAX_PARTNERS]
         return gather_witnesses(
@@ -138,12 +143,12 @@ class PlacedModel:
         )
 
     def place(self, image: int) -> tuple[Witnesses, list[Placement]]:
-        """Return what the pairs of an image say about its pose, and the poses on which they agree, best first."""
+        """Return the evidence of the pairs of an image for its pose, and the poses on which they agree, best first."""
         witnesses = self.witnesses(image)
         return witnesses, placements(witnesses)
 
     def add(self, image: int, cam_from_world: Rigid3) -> None:
-        """Register an image, choose the geometries of its pairs that agree, and learn ranges from them."""
+        """Register an image, choose the geometries of its pairs that agree, and update ranges from them."""
         self.cameras[image] = cam_from_world
         witnesses = self.witnesses(image)
         for edge in [edge for edge in self.chosen if image in edge]:
@@ -153,31 +158,31 @@ class PlacedModel:
         agrees = agreement(witnesses, cam_from_world.rotation[None], cam_from_world.center[None])[0]
         for idx in np.flatnonzero(agrees):
             edge = _edge(image, int(witnesses.partner[idx]))
-            # Geometries are sorted by weight, so the first that agrees is the heaviest.
+            # Geometries are sorted by weight, so the first one that agrees is the heaviest.
             if edge not in self.chosen:
                 self.chosen[edge] = int(witnesses.rank[idx])
                 self._learn_ranges(edge)
 
     def remove(self, image: int) -> None:
-        """Take an image out of the model."""
+        """Remove an image from the model."""
         del self.cameras[image]
         self.chosen = {edge: rank for edge, rank in self.chosen.items() if image not in edge}
         self._ranges[image][:] = np.nan
         self._parallax[image][:] = 0
 
     def seed(self, edge: Edge, rank: int) -> None:
-        """Begin with a pair of images, in the frame of the first, one unit of length apart."""
+        """Start with a pair of images, in the frame of the first image, one unit of length apart."""
         view = self.pairs.geometries[edge][rank].view
         self.cameras = {edge[0]: Rigid3.identity(), edge[1]: Rigid3(view.rotation, view.direction)}
         self.chosen = {edge: rank}
         self._learn_ranges(edge)
 
     def known_points(self, image: int, explained: Mapping[int, int]) -> tuple[FloatArray, FloatArray]:
-        """Return points with known positions, (M, 3), that an image matches, and its rays to them, (M, 3).
+        """Return known points that an image matches, (M, 3), and its rays to them, (M, 3).
 
         Args:
             image: the image.
-            explained: registered partners with the rank of the geometry whose matches count.
+            explained: registered partners, each with the rank of the geometry whose matches are used.
         """
         points, rays = [np.zeros((0, 3))], [np.zeros((0, 3))]
         seen = np.zeros(len(self.pairs.bearings[image]), np.bool_)
@@ -194,7 +199,7 @@ class PlacedModel:
         return np.concatenate(points), np.concatenate(rays)
 
     def polished(self, image: int, witnesses: Witnesses, placement: Placement) -> tuple[Rigid3, int, int]:
-        """Return a placement refined on known points, how many of them it sees where they should be, and how many.
+        """Return the pose refined on known points, how many of them it sees where it should, and how many it matches.
 
         A placement that matches too few known points is returned as it is.
         """
@@ -207,15 +212,15 @@ class PlacedModel:
         return pose, int((resection_errors(pose, points, rays) < _MAX_ERROR_RAD).sum()), len(points)
 
     def adjust(self, *, cameras: bool = True) -> None:
-        """Refine all cameras but the first together with the points, and learn all ranges again.
+        """Refine all cameras except the first together with the points, and compute all ranges again.
 
         Args:
-            cameras: False leaves the cameras where they are and only triangulates.
+            cameras: False keeps the cameras fixed and only triangulates.
         """
         tracks, members = self.tracks()
         model = GrowingModel(tracks, {}, self.pairs.estimator, self.pairs.kappa)
         first = next(iter(self.cameras))
-        # The camera that comes first is the one that stays.
+        # The first camera stays fixed.
         order = [members.index(first), *(idx for idx, image in enumerate(members) if image != first)]
         model.cameras = {idx: self.cameras[members[idx]] for idx in order}
         if cameras:
@@ -237,7 +242,7 @@ class PlacedModel:
             self._parallax[image][tracks.keypoint_idx[mine]] = np.pi
 
     def tracks(self) -> tuple[Tracks, list[int]]:
-        """Return the tracks that the chosen geometries form among registered images, and which image is which."""
+        """Return the tracks that the chosen geometries form among registered images, and the position of each image."""
         members = sorted(self.cameras)
         names = self.pairs.names
         return build_tracks(
@@ -245,14 +250,14 @@ class PlacedModel:
         ), members
 
     def views(self) -> dict[tuple[str, str], TwoView]:
-        """Return the chosen geometries by the names of their images."""
+        """Return the chosen geometries by image names."""
         names = self.pairs.names
         return {
             (names[a], names[b]): self.pairs.geometries[a, b][rank].view for (a, b), rank in sorted(self.chosen.items())
         }
 
     def choose_again(self) -> None:
-        """Choose the geometry of every pair of registered images by the cameras as they are now."""
+        """Choose the geometry of every pair of registered images again, by the current cameras."""
         self.chosen = {}
         for image in sorted(self.cameras):
             witnesses = self.witnesses(image)
@@ -264,17 +269,17 @@ class PlacedModel:
                 self.chosen.setdefault(_edge(image, int(witnesses.partner[idx])), int(witnesses.rank[idx]))
 
     def learn_ranges(self) -> None:
-        """Compute the ranges of all matches of chosen geometries again."""
+        """Compute the ranges of all matches of the chosen geometries again."""
         for ranges, parallax in zip(self._ranges, self._parallax, strict=True):
             ranges[:], parallax[:] = np.nan, 0
         for edge in sorted(self.chosen):
             self._learn_ranges(edge)
 
     def explained_share(self, *, without: Collection[int] = ()) -> float:
-        """Return the share of all pairs of registered images, by weight, that a geometry of theirs explains.
+        """Return the share of all pairs of registered images, by weight, that have a geometry that agrees.
 
         Args:
-            without: images whose pairs do not count.
+            without: images whose pairs are ignored.
         """
         images = set(self.cameras) - set(without)
         total = sum(found[0].weight for edge, found in self.pairs.geometries.items() if images.issuperset(edge))
@@ -284,11 +289,11 @@ class PlacedModel:
         return kept / total if total else 1.0
 
     def explained_weight(self) -> float:
-        """Return the weight of all geometries that agree with the cameras."""
+        """Return the total weight of the geometries that agree with the cameras."""
         return sum(self.pairs.geometries[edge][rank].weight for edge, rank in self.chosen.items())
 
     def explained_share_of(self, image: int) -> float:
-        """Return the share of a registered image's pairs, by weight, that its camera explains; 1 without any."""
+        """Return the share of a registered image's pairs, by weight, that its camera explains; 1 if it has no pair."""
         total = kept = 0.0
         for partner in self.pairs.partners[image]:
             if partner in self.cameras:
@@ -299,7 +304,7 @@ class PlacedModel:
         return kept / total if total else 1.0
 
     def _learn_ranges(self, edge: Edge) -> None:
-        """Take the ranges of a pair's matches where they are seen under a larger parallax than known ones."""
+        """Use the ranges of a pair's matches where their parallax is larger than that of the known ranges."""
         first, second = edge
         view = self.pairs.geometries[edge][self.chosen[edge]].view
         relative = self.cameras[second] @ self.cameras[first].inverse()
@@ -317,7 +322,7 @@ class PlacedModel:
 
 
 def explained_partners(witnesses: Witnesses, explained: NDArray[np.bool_]) -> dict[int, int]:
-    """Return the partners of which a geometry agrees, each with the rank of its heaviest one that does."""
+    """Return the partners with a geometry that agrees, each with the rank of its heaviest such geometry."""
     found: dict[int, int] = {}
     for idx in np.flatnonzero(explained):
         found.setdefault(int(witnesses.partner[idx]), int(witnesses.rank[idx]))
@@ -325,13 +330,13 @@ def explained_partners(witnesses: Witnesses, explained: NDArray[np.bool_]) -> di
 
 
 def enough_points(support: int, known: int, *, agreeing: int = 1) -> bool:
-    """Return whether a camera that sees `support` of `known` points where they should be is to be believed.
+    """Return whether a camera is reliable that sees `support` of `known` points where they should be.
 
     Args:
         support: number of points that it sees where they should be.
         known: number of known points that it matches.
-        agreeing: number of pairs that agree with its pose. Two pairs or more are evidence of their own, so that
-            imprecise matches, as the paper's are, do not cost the camera.
+        agreeing: number of pairs that agree with its pose. Two or more pairs are independent evidence, so that
+            imprecise matches, as in the paper, do not lead to rejection.
     """
     return support >= max(MIN_POINTS, (MIN_SHARE if agreeing < 2 else MIN_SHARE_OF_AGREEING) * known)
 

@@ -1,4 +1,4 @@
-"""Where an image may stand: poses on which its pairs agree, the best first."""
+"""Candidate poses of an image on which its pairs agree, best first."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ FloatArray = NDArray[np.float64]
 
 _MAX_TURN_RAD = float(np.deg2rad(2.0))
 _MAX_LENGTH_FACTOR = 1.25
-# A candidate by one chain is off by the error of its length, so that directions are compared more loosely at first.
+# A candidate from a single chain has the error of its length, so directions are compared with more tolerance at first.
 _LOOSE_RAD = float(np.deg2rad(3.0))
 _LENGTH_STD = 0.05
-_POLISHED = 6  # candidates that are refined
-_CROSSED = 8  # witnesses whose rays are crossed where lengths are not known
+_POLISHED = 6  # number of candidates that are refined
+_CROSSED = 8  # number of geometries without known length whose rays are intersected
 _MIN_CROSSING_SINE = float(np.sin(np.deg2rad(5.0)))
 _SAME_TURN_RAD, _SAME_PLACE = float(np.deg2rad(1.0)), 0.03
 
@@ -29,7 +29,7 @@ class Placement:
 
     Attributes:
         cam_from_world: the pose.
-        explained: (W,) bool, the witnesses that agree.
+        explained: (W,) bool, the geometries that agree.
         score: sum over the partners of the weight of their heaviest geometry that agrees.
     """
 
@@ -39,13 +39,14 @@ class Placement:
 
 
 def placements(witnesses: Witnesses) -> list[Placement]:
-    """Return the distinct poses that the witnesses suggest, best score first.
+    """Return the distinct poses that the geometries suggest, best score first.
 
-    Each geometry with a known length suggests a pose, and so do two rays that cross. All witnesses vote on all of them,
-    with one vote a partner: a geometry agrees with a pose that has its rotation, lies in its direction and, if its
-    length is known, at its distance. The best are refined on what agrees with them (weighted least squares of the
-    angles to the rays), and voted on again. This is translation averaging over one camera at a time with several
-    hypotheses a pair, where a false geometry of a repeated structure is outvoted however many matches it has.
+    Each geometry with a known length suggests a pose, and so do two intersecting rays. Each candidate is scored by all
+    geometries, counting at most one per partner: a geometry agrees with a pose that has its rotation, lies in its
+    direction and, if its length is known, at its distance. The best candidates are refined on the geometries that agree
+    with them (weighted least squares of the angles to the rays) and scored again. This is translation averaging for one
+    camera at a time with several hypotheses per pair, in which a false geometry of a repeated structure is outweighed
+    however many matches it has.
     """
     rotations, centers = _candidates(witnesses)
     if not len(centers):
@@ -77,13 +78,13 @@ def placements(witnesses: Witnesses) -> list[Placement]:
 def agreement(
     witnesses: Witnesses, rotations: FloatArray, centers: FloatArray, *, loose_rad: float = 0.0
 ) -> NDArray[np.bool_]:
-    """Return which witnesses agree with poses, (C, W), given rotations (C, 3, 3) and centres (C, 3).
+    """Return which geometries agree with poses, (C, W), given rotations (C, 3, 3) and centres (C, 3).
 
     Args:
-        witnesses: W of them.
-        rotations: of cam_from_world.
-        centers: in the world.
-        loose_rad: is added to the tolerance of the directions.
+        witnesses: the W geometries.
+        rotations: (C, 3, 3) of cam_from_world.
+        centers: (C, 3) in the world.
+        loose_rad: added to the tolerance of the directions.
     """
     offsets = centers[:, None] - witnesses.origins
     distances = np.linalg.norm(offsets, axis=2)
@@ -103,7 +104,7 @@ def agreement(
 
 
 def _candidates(witnesses: Witnesses) -> tuple[FloatArray, FloatArray]:
-    """Return rotations (C, 3, 3) and centres (C, 3) that single chains, or two crossing rays, suggest."""
+    """Return rotations (C, 3, 3) and centres (C, 3) suggested by single chains and by intersecting rays."""
     known = np.flatnonzero(np.isfinite(witnesses.lengths))
     rotations = [witnesses.rotations[known]]
     centers = [witnesses.origins[known] + witnesses.lengths[known, None] * witnesses.directions[known]]
@@ -121,7 +122,7 @@ def _candidates(witnesses: Witnesses) -> tuple[FloatArray, FloatArray]:
 
 
 def _crossing(witnesses: Witnesses, a: np.intp, b: np.intp) -> FloatArray | None:
-    """Return the point midway between two rays where they are nearest, if that lies ahead of both."""
+    """Return the midpoint of two rays at their closest approach, if it is in front of both."""
     u, v = witnesses.directions[a], witnesses.directions[b]
     gap = witnesses.origins[b] - witnesses.origins[a]
     normal = np.cross(u, v)
@@ -136,7 +137,7 @@ def _crossing(witnesses: Witnesses, a: np.intp, b: np.intp) -> FloatArray | None
 
 
 def _refined(witnesses: Witnesses, agree: NDArray[np.bool_], center: FloatArray) -> Rigid3:
-    """Return the pose nearest to the rays and rotations that agree, from a first centre."""
+    """Return the pose nearest to the rays and rotations that agree, starting from a first centre."""
     if not agree.any():
         return Rigid3.from_center(np.eye(3), center)
     weight = witnesses.weight[agree]
@@ -158,7 +159,7 @@ def _refined(witnesses: Witnesses, agree: NDArray[np.bool_], center: FloatArray)
 
 
 def _same(pose: Rigid3, other: Rigid3, witnesses: Witnesses) -> bool:
-    """Return whether two poses are one, measured by the distances to the partners."""
+    """Return whether two poses are the same, relative to the distances to the partners."""
     nearest = float(np.median(np.linalg.norm(pose.center - witnesses.origins, axis=1)))
     cosine = (float(np.sum(pose.rotation * other.rotation)) - 1) / 2
     turned = float(np.arccos(np.clip(cosine, -1, 1)))

@@ -1,4 +1,4 @@
-"""Why an image is left out, in a photographer's words."""
+"""Reasons for leaving out an image, in words for photographers."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from pano_mvs.scene import TwoView
 
 
 def best_pair(name: str, two_views: Mapping[tuple[str, str], TwoView]) -> tuple[str, str] | None:
-    """Return the pair of an image that says most: sound before unsound, then with most matches; None without any."""
+    """Return the best pair of an image, reliable pairs first, then by number of matches; None if it has no pair."""
     tried = [(bool(view), len(view), view.candidates, pair) for pair, view in two_views.items() if name in pair]
     return max(tried)[-1] if tried else None
 
 
 def why_no_pair(name: str, two_views: Mapping[tuple[str, str], TwoView]) -> str:
-    """Return why an image has no sound pair with any other; empty if it has one."""
+    """Return why an image has no reliable pair with any other image; "" if it has one."""
     pair = best_pair(name, two_views)
     if pair is None:
-        return "it was compared with no other picture"
+        return "it was not compared with any other image"
     if two_views[pair]:
         return ""
     partner = pair[1] if pair[0] == name else pair[0]
-    return f"no sound pair; the best partner is {partner!r}: {two_views[pair].reason}"
+    return f"it has no reliable pair; its best partner is {partner!r}: {two_views[pair].reason}"

@@ -1,4 +1,4 @@
-"""A model that grows by one image at a time: its cameras, its points, and the verdict on every new image."""
+"""A model that grows by one image at a time: its cameras, its points, and the decision on every new image."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ _MIN_POINTS = 15
 _MIN_SHARE = 0.4
 _MAX_PARTNERS = 8
 _ADJUST_STEPS = 20
-# What further steps would gain, the refinement of the finished model gains as well.
+# Further steps are not needed: the finished model is refined anyway.
 _ADJUST_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Attachment:
-    """The pose of an image against the model so far; falsy, with the reason, where it cannot be trusted.
+    """The pose of an image relative to the current model; falsy, with the reason, if it is not reliable.
 
     Attributes:
         cam_from_world: the pose.
         support: number of known points that it sees where they should be.
         known: number of known points that its tracks contain.
-        reason: why it is not to be trusted.
+        reason: why the pose is not reliable.
     """
 
     cam_from_world: Rigid3
@@ -55,7 +55,7 @@ class Attachment:
 
 @dataclass(eq=False)
 class GrowingModel:
-    """Registered cameras and triangulated tracks; the world is the first camera of the seed pair.
+    """Registered cameras and triangulated tracks; the world frame is the first camera of the seed pair.
 
     Attributes:
         tracks: all tracks of the capture.
@@ -73,7 +73,7 @@ class GrowingModel:
 
     def __post_init__(self) -> None:
         self._points = np.full((self.tracks.count, 3), np.nan)
-        # Positions of the observations of every image, and its pairs, those with most verified matches first.
+        # Positions of the observations of every image, and its pairs, sorted by number of verified matches.
         by_image = np.argsort(self.tracks.image_idx, kind="stable")
         sizes = np.bincount(self.tracks.image_idx, minlength=len(self.tracks.names))
         self._track_of_image = np.split(by_image, np.cumsum(sizes)[:-1])
@@ -86,7 +86,7 @@ class GrowingModel:
 
     @property
     def points_in_world(self) -> FloatArray:
-        """The point of every track, (count, 3), NaN where it is not triangulated."""
+        """Points of all tracks, (count, 3), NaN where not triangulated."""
         return self._points
 
     def add(self, image: int, cam_from_world: Rigid3) -> None:
@@ -95,10 +95,10 @@ class GrowingModel:
         self.triangulate(self.tracks.track_idx[self._track_of_image[image]])
 
     def triangulate(self, track_idx: NDArray[np.int32] | None = None) -> tuple[NDArray[np.intp], Triangulated]:
-        """Compute the points of some tracks, or of all, from all registered cameras.
+        """Triangulate some tracks, or all, from all registered cameras.
 
         Returns:
-            The positions of the observations that were looked at, and what came of them.
+            The positions of the observations that were used, and the triangulated points.
         """
         tracks = self.tracks
         chosen = np.ones(tracks.count, np.bool_)
@@ -122,7 +122,7 @@ class GrowingModel:
         return seen, found
 
     def adjust(self) -> None:
-        """Refine all cameras but the first together with the points (bundle adjustment), and triangulate again."""
+        """Refine all cameras except the first together with the points (bundle adjustment), and triangulate again."""
         seen, found = self.triangulate()
         used = seen[found.used]
         images = sorted(self.cameras)
@@ -150,18 +150,18 @@ class GrowingModel:
         self.triangulate()
 
     def known_points(self, image: int) -> tuple[FloatArray, FloatArray]:
-        """Return the triangulated points, (M, 3), that an image's tracks contain, and its rays to them, (M, 3)."""
+        """Return the triangulated points of an image's tracks, (M, 3), and its rays to them, (M, 3)."""
         observations = self._track_of_image[image]
         points = self._points[self.tracks.track_idx[observations]]
         known = np.isfinite(points[:, 0])
         return points[known], self.tracks.bearings[observations[known]]
 
     def known_count(self, image: int) -> int:
-        """Return how many triangulated points an image's tracks contain."""
+        """Return the number of triangulated points in an image's tracks."""
         return int(np.isfinite(self._points[self.tracks.track_idx[self._track_of_image[image]], 0]).sum())
 
     def attach_all(self, images: Iterable[int], *, after_each: Callable[[], None] = lambda: None) -> dict[int, str]:
-        """Attach image after image, the one that sees most known points first; return why the rest was refused."""
+        """Attach images, the one with most known points first; return the reasons for those that cannot be attached."""
         left = list(images)
         while left:
             known = self.known_counts()
@@ -176,42 +176,47 @@ class GrowingModel:
         return {image: self.attach(image).reason for image in left}
 
     def known_counts(self) -> NDArray[np.intp]:
-        """Return how many triangulated points the tracks of each image contain, (N,)."""
+        """Return the number of triangulated points in the tracks of each image, (N,)."""
         known = np.isfinite(self._points[self.tracks.track_idx, 0])
         return np.bincount(self.tracks.image_idx[known], minlength=len(self.tracks.names))
 
     def attach(self, image: int) -> Attachment:
-        """Return the best pose of an image, from its pairs with registered images, and whether to trust it."""
+        """Estimate the pose of an image from its pairs with registered images, and decide whether it is reliable."""
         points, bearings = self.known_points(image)
         if len(points) < _MIN_POINTS:
             return Attachment(Rigid3.identity(), 0, len(points), self._too_few(image, len(points)))
         guesses = [guess for partner in self._partners(image) if (guess := self._chained(image, partner))]
         if not guesses:
             return Attachment(
-                Rigid3.identity(), 0, len(points),
-                "no pair with a registered picture shares enough points with a third to tell how far apart they are",
-            )  # fmt: skip
+                Rigid3.identity(),
+                0,
+                len(points),
+                "no pair with a registered image shares enough points with a third image to determine the distance",
+            )
         pose = max(guesses, key=lambda g: int((resection_errors(g, points, bearings) < _FIRST_GUESS_RAD).sum()))
         pose = _polished(pose, points, bearings)
         support = int((resection_errors(pose, points, bearings) < _MAX_ERROR_RAD).sum())
         if support < max(_MIN_POINTS, _MIN_SHARE * len(points)):
             return Attachment(
-                pose, support, len(points),
-                f"only {support} of {len(points)} points known from other pictures {plural(support, 'is', 'are')} seen "
-                f"where they should be, {max(_MIN_POINTS, int(np.ceil(_MIN_SHARE * len(points))))} needed: repeated "
-                "structure, something that moved, stitching errors, or a picture that is no panorama",
-            )  # fmt: skip
+                pose,
+                support,
+                len(points),
+                f"only {support} of {len(points)} points known from other images {plural(support, 'is', 'are')} seen "
+                f"where they should be; {max(_MIN_POINTS, int(np.ceil(_MIN_SHARE * len(points))))} are needed. "
+                "Possible causes: repeated structure, moving objects, stitching errors, or an image that is not a "
+                "panorama",
+            )
         return Attachment(pose, support, len(points))
 
     def _partners(self, image: int) -> list[int]:
-        """Return the registered partners of an image, those with most verified matches first."""
+        """Return the registered partners of an image, sorted by number of verified matches."""
         return [partner for _, partner in self._pairs[image] if partner in self.cameras][:_MAX_PARTNERS]
 
     def _chained(self, image: int, partner: int) -> Rigid3 | None:
-        """Return the pose through one partner: the pair's rotation and direction, the length by known points.
+        """Return the pose from one partner: rotation and direction of the pair, and the length from known points.
 
-        A point at range d from the partner in the world, and at range d' in units of the pair's translation, says
-        that the translation is d / d' long (the paper's translation scale factor).
+        For a point at range d from the partner in the world and at range d' in units of the pair's translation, the
+        length of the translation is d / d' (the paper's translation scale factor).
         """
         image_from_partner = relative_pose(self.edges, partner, image)
         seen, mine, theirs = np.intersect1d(
@@ -236,9 +241,11 @@ class GrowingModel:
 
     def _too_few(self, image: int, known: int) -> str:
         count, partner = max((-negative, partner) for negative, partner in self._pairs[image])
-        return (f"{known} of its points {plural(known, 'is', 'are')} known from two other pictures, {_MIN_POINTS} "
-                f"needed; its best partner is {self.tracks.names[partner]!r} with {count} "
-                f"{plural(count, 'match', 'matches')}: take pictures in between")  # fmt: skip
+        return (
+            f"only {known} of its points {plural(known, 'is', 'are')} known from two other images; {_MIN_POINTS} are "
+            f"needed. Its best partner is {self.tracks.names[partner]!r} with {count} "
+            f"{plural(count, 'match', 'matches')}. Take panoramas in between"
+        )
 
     def _arrays(self) -> tuple[FloatArray, FloatArray]:
         rotations = np.tile(np.eye(3), (len(self.tracks.names), 1, 1))

@@ -1,4 +1,4 @@
-"""The pose of one panorama from points whose positions are known."""
+"""Estimate the pose of one panorama from points with known positions."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ FloatArray = NDArray[np.float64]
 
 
 def resection_errors(cam_from_world: Rigid3, points_in_world: FloatArray, bearings: FloatArray) -> FloatArray:
-    """Return the angle in radians between each observed ray and the one to its point, (M,)."""
+    """Return the angles in radians between the observed rays and the rays to their points, (M,)."""
     return angle_between(cam_from_world.apply(points_in_world), bearings)
 
 
 def refine_resection(
     cam_from_world: Rigid3, points_in_world: FloatArray, bearings: FloatArray, *, scale_rad: float, iterations: int = 10
 ) -> Rigid3:
-    """Return the pose with the least Cauchy loss of the angular error, near the one given (damped Gauss–Newton).
+    """Minimise the Cauchy loss of the angular errors, starting from a given pose (damped Gauss–Newton).
 
     Args:
-        cam_from_world: where to begin.
+        cam_from_world: initial pose.
         points_in_world: (M, 3) known points, M ≥ 3.
         bearings: (M, 3) their unit rays in the camera.
-        scale_rad: error at which the weight has fallen to a half.
-        iterations: number of steps at most.
+        scale_rad: error at which the weight is one half.
+        iterations: maximum number of steps.
     """
     pose, damping = cam_from_world, 1e-6
     cost = _cost(pose, points_in_world, bearings, scale_rad)

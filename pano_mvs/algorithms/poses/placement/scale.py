@@ -1,4 +1,4 @@
-"""Translation scale factors: how long one pair's translation is against lengths that are known already."""
+"""Estimate translation scale factors: the length of a pair's translation in the unit of the model."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ _CAUCHY_STEPS, _CONVERGED = 20, 1e-7
 
 
 def estimate_scale(ratios: FloatArray, weights: FloatArray, *, estimator: ScaleEstimator, kappa: float) -> float:
-    """Return one scale factor from the ratios that single features give.
+    """Estimate one scale factor from the ratios of single features.
 
-    "kappa" is the paper's: the ratio with most others within κ of it (absolute). "log_median" is the median of the
-    log-ratios; "cauchy" their centre under a Cauchy loss, weighted, by iterated reweighting from the median.
+    "kappa" is the paper's estimator: the ratio with most other ratios within κ (absolute). "log_median" is the median
+    of the log-ratios. "cauchy" is their weighted centre under a Cauchy loss, by iterated reweighting from the median.
 
     Args:
         ratios: (M,) positive, M ≥ 1.
-        weights: (M,) inverse variances of the log-ratios, up to a factor; "cauchy" alone uses them.
-        estimator: which of the three.
-        kappa: the κ of the paper.
+        weights: (M,) inverse variances of the log-ratios, up to a factor; only used by "cauchy".
+        estimator: "kappa", "log_median" or "cauchy".
+        kappa: the paper's κ.
 
     Raises:
-        UsageError: if there is no ratio, or one is not positive.
+        UsageError: if there is no ratio, or a ratio is not positive.
     """
     if len(ratios) == 0 or not np.all(ratios > 0):
         raise UsageError("a scale factor needs at least one ratio, all positive")
@@ -42,7 +42,7 @@ def estimate_scale(ratios: FloatArray, weights: FloatArray, *, estimator: ScaleE
 def _most_neighbours(ratios: FloatArray, kappa: float) -> float:
     ordered = np.sort(ratios)
     neighbours = np.searchsorted(ordered, ordered + kappa, "right") - np.searchsorted(ordered, ordered - kappa, "left")
-    # Of several with equally many the middle one, so that no end of the range is preferred.
+    # Of several ratios with equally many neighbours take the middle one, so that no end of the range is preferred.
     best = np.flatnonzero(neighbours == neighbours.max())
     return float(ordered[best[len(best) // 2]])
 
@@ -61,6 +61,6 @@ def _cauchy_center(logs: FloatArray, weights: FloatArray, center: float) -> floa
 
 
 def _median(values: FloatArray) -> float:
-    """Return the median; of some hundred values several times as fast as numpy's, which is called very often here."""
+    """Return the median; for a few hundred values several times as fast as numpy's, and called very often here."""
     ordered = np.sort(values)
     return float(0.5 * (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]))

@@ -1,4 +1,4 @@
-"""The graph of images joined by verified pairs: which pairs contradict the others, what hangs together."""
+"""View graph: images joined by verified pairs, consistency of its edges, and connected groups."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ Edge = tuple[int, int]
 def consistent_edges(
     names: tuple[str, ...], two_views: Mapping[tuple[str, str], TwoView], *, max_loop_deg: float = 3.0
 ) -> dict[Edge, TwoView]:
-    """Return the pairs with a general geometry, less those whose rotations contradict the pairs around them.
+    """Return the pairs with a general geometry whose rotations are consistent with the pairs around them.
 
-    Around a triangle of images the three rotations must cancel (Zach et al. 2010). While there are triangles where
-    they do not, the pair is taken out that has the largest share of them; of equals the one with fewest matches.
+    The three rotations around a triangle of images must cancel (Zach et al. 2010). While any triangle does not close,
+    remove the pair with the largest share of such triangles; of equals, the one with fewest matches.
 
     Args:
         names: image names in the capture's order.
         two_views: verified pairs, in either order of names.
-        max_loop_deg: largest rotation left over around a triangle.
+        max_loop_deg: largest residual rotation around a triangle.
 
     Returns:
         (first, second) positions in `names`, first < second, to the geometry second_from_first.
@@ -50,7 +50,7 @@ def consistent_edges(
 
 
 def connected_groups(edges: Iterable[Edge], count: int) -> list[list[int]]:
-    """Return the groups of images that hang together, largest first, of equals that with the earliest image."""
+    """Return the connected groups of images, largest first; of equals, the group with the earliest image first."""
     neighbours: list[set[int]] = [set() for _ in range(count)]
     for first, second in edges:
         neighbours[first].add(second)
@@ -68,7 +68,7 @@ def connected_groups(edges: Iterable[Edge], count: int) -> list[list[int]]:
 
 
 def relative_pose(edges: Mapping[Edge, TwoView], first: int, second: int) -> Rigid3:
-    """Return second_from_first of an edge, with a translation of length 1, whichever way it is stored."""
+    """Return second_from_first of an edge, with a translation of length 1, for either order of the images."""
     if (first, second) in edges:
         return Rigid3(edges[first, second].rotation, edges[first, second].direction)
     return Rigid3(edges[second, first].rotation, edges[second, first].direction).inverse()
@@ -104,14 +104,14 @@ def _triangles(keys: list[Edge]) -> NDArray[np.intp]:
 
 
 def _triangles_of_edges(triangles: NDArray[np.intp], count: int) -> list[NDArray[np.intp]]:
-    """Return, for every edge, the positions of its triangles."""
+    """Return the positions of the triangles of every edge."""
     edge_of_corner = triangles.ravel()
     by_edge = np.argsort(edge_of_corner, kind="stable") // 3
     return np.split(by_edge, np.cumsum(np.bincount(edge_of_corner, minlength=count))[:-1]) if count else []
 
 
 def _loop_errors_rad(views: list[TwoView], triangles: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Return the rotation left over around each triangle, (T,)."""
+    """Return the residual rotation around each triangle, (T,)."""
     rotations = np.array([view.rotation for view in views]).reshape(-1, 3, 3)
     there, on, directly = (rotations[triangles[:, side]] for side in range(3))
     return geodesic_angle(on @ there, directly)

@@ -1,9 +1,9 @@
-"""Blocks of cameras that repeated structure has shifted together, and the moves that would put them back.
+"""Blocks of cameras that repeated structure has shifted together, and the motions that put them back.
 
-Where a row of equal doors or columns repeats, all pairs between two blocks of cameras may agree on a relative place
+Where a row of equal doors or columns repeats, all pairs between two blocks of cameras may agree on a relative position
 that is one period off: each camera is then well supported, and no camera can be moved alone. But some pairs also have a
-runner-up geometry, supported by what does not repeat, and all of these suggest the same move of one block. Of two equal
-rooms that face one another, one may lie on the other: the move then turns the block, too.
+runner-up geometry, supported by structure that does not repeat, and all of these suggest the same move of one block. If
+two identical rooms face each other, one may be placed on top of the other; the motion then also rotates the block.
 """
 
 from __future__ import annotations
@@ -22,38 +22,38 @@ FloatArray = NDArray[np.float64]
 _MAX_TURN_RAD = float(np.deg2rad(3.0))
 # A move shorter than this share of the pair's distance is an error, not another place.
 _MIN_MOVE = 0.05
-# Moves are one if they differ by less than this share of their length and of the usual distance between cameras.
+# Moves are the same if they differ by less than this share of their length and of the usual distance between cameras.
 _SAME_MOVE, _SAME_PLACE = 0.06, 0.02
 _MIN_PAIRS, _MIN_PAIR_SHARE = 3, 0.1
-# A move that turns a block by more than this has six degrees of freedom, on which two pairs hardly agree by chance.
+# A motion that rotates a block by more than this has six degrees of freedom; two pairs hardly agree on it by chance.
 _MIN_TURN_RAD = float(np.deg2rad(20.0))
 _MIN_TURNED_PAIRS = 2
-_SAME_TURNED_PLACE = 0.1  # of the move and of the usual distance between cameras
+_SAME_TURNED_PLACE = 0.1  # share of the move and of the usual distance between cameras
 _MAX_ALIASES, _ATTEMPTS = 2, 6
-# How much a pair that agrees as things are counts against separating its images.
+# Weight of a pair that agrees with the current arrangement against separating its images.
 _HELD = 0.1
 _LABELLINGS = 2
 _STARTS = 50
-# Of very many suggested moves the heaviest are compared with one another.
+# If very many motions are suggested, only the heaviest are compared with one another.
 _MAX_MOVES, _MAX_TURNED = 1500, 60
 
 
 @dataclass(frozen=True, eq=False)
 class Alias:
-    """A move that runner-up geometries of several pairs suggest alike.
+    """A motion that runner-up geometries of several pairs suggest alike.
 
     Attributes:
-        move: (3,) in the world, after the turn about its origin.
+        move: (3,) in the world, after the rotation about the origin.
         support: weight of the pairs that suggest it.
-        votes: (i, j), i < j, to a signed weight: positive if j is to move by the motion x → turn x + move relative to
-            i, negative if by its inverse.
-        turn: (3, 3) rotation of the world, the identity for most.
-        own_inverse: whether the motion is its own inverse, as a half turn is.
+        signed_weights: (i, j), i < j, to a signed weight: positive if j is to move by the motion x → turn x + move
+            relative to i, negative if by its inverse.
+        turn: (3, 3) rotation of the world, usually the identity.
+        own_inverse: whether the motion is its own inverse, like a half turn.
     """
 
     move: FloatArray
     support: float
-    votes: dict[Edge, float]
+    signed_weights: dict[Edge, float]
     turn: FloatArray = field(default_factory=lambda: np.eye(3))
     own_inverse: bool = False
 
@@ -65,7 +65,7 @@ class Alias:
 
 @dataclass(frozen=True, eq=False)
 class _Suggestion:
-    """How a geometry that was not chosen would move the second image of a pair relative to the first."""
+    """The motion of the second image of a pair relative to the first that an unchosen geometry suggests."""
 
     edge: Edge
     weight: float
@@ -75,10 +75,10 @@ class _Suggestion:
 
 
 def find_aliases(model: PlacedModel) -> list[Alias]:
-    """Return the moves that runner-up geometries of several pairs suggest alike, best supported first.
+    """Return the motions that runner-up geometries of several pairs suggest alike, best supported first.
 
-    Fewer than three pairs, or than a tenth of those that agree as things are, may do so by chance; of moves that turn
-    a block, two are enough.
+    At least three pairs must suggest a motion, and at least a tenth of the pairs that agree with the current
+    arrangement; fewer may agree by chance. For motions that rotate a block, two pairs are enough.
     """
     suggestions = _suggestions(model)
     straight = [found for found in suggestions if _angle(found.motion) < _MAX_TURN_RAD]
@@ -103,22 +103,24 @@ def _straight_aliases(model: PlacedModel, suggestions: list[_Suggestion]) -> lis
     for _ in range(_ATTEMPTS):
         if not left.any() or len(found) == _MAX_ALIASES:
             break
-        votes = [_votes(edges, weights, apart[row] <= opposite[row], near[row] & left) for row in range(len(edges))]
-        support = np.array([sum(map(abs, vote.values())) for vote in votes]) * left
+        signed_weights = [
+            _signed_weights(edges, weights, apart[row] <= opposite[row], near[row] & left) for row in range(len(edges))
+        ]
+        support = np.array([sum(map(abs, signed.values())) for signed in signed_weights]) * left
         best = int(np.argmax(support))
         members = np.flatnonzero(near[best] & left)
         left[members] = False
         left[best] = False
-        if len(votes[best]) < max(_MIN_PAIRS, _MIN_PAIR_SHARE * len(model.chosen)):
+        if len(signed_weights[best]) < max(_MIN_PAIRS, _MIN_PAIR_SHARE * len(model.chosen)):
             continue
         signs = np.where(apart[best, members] <= opposite[best, members], 1.0, -1.0)
         move = np.average(moves[members] * signs[:, None], axis=0, weights=weights[members])
-        found.append(Alias(move, float(support[best]), votes[best]))
+        found.append(Alias(move, float(support[best]), signed_weights[best]))
     return found
 
 
 def _turned_aliases(suggestions: list[_Suggestion]) -> list[Alias]:
-    """Return the motion with a turn that most pairs suggest, if at least two do; the heaviest are compared."""
+    """Return the motion with a rotation that most pairs suggest, if at least two do; the heaviest ones are compared."""
     suggestions = sorted(suggestions, key=lambda found: (-found.weight, found.edge))[:_MAX_TURNED]
     if len(suggestions) < _MIN_TURNED_PAIRS:
         return []
@@ -140,20 +142,20 @@ def _turned_aliases(suggestions: list[_Suggestion]) -> list[Alias]:
     motions = [found.motion if way else found.motion.inverse() for found, way in zip(alike, same, strict=True)]
     weights = np.array([found.weight for found in alike])
     turn = nearest_rotation(np.einsum("n,nij->ij", weights, [motion.rotation for motion in motions]))
-    # The translations belong to slightly different turns, so that they are averaged where the cameras are.
+    # The translations belong to slightly different rotations, so they are averaged at the cameras.
     pivot = np.average([found.center for found in alike], axis=0, weights=weights)
     move = np.average([motion.apply(pivot) for motion in motions], axis=0, weights=weights) - turn @ pivot
     motion = Rigid3(turn, move)
     own_inverse = all(_same_motion(motion.inverse(), replace(found, motion=motion), spread) for found in alike)
-    votes: dict[Edge, float] = {}
+    signed_weights: dict[Edge, float] = {}
     for found, way in zip(alike, same, strict=True):
-        if found.weight > abs(votes.get(found.edge, 0.0)):
-            votes[found.edge] = found.weight if way or own_inverse else -found.weight
-    return [Alias(move, support, votes, turn, own_inverse)]
+        if found.weight > abs(signed_weights.get(found.edge, 0.0)):
+            signed_weights[found.edge] = found.weight if way or own_inverse else -found.weight
+    return [Alias(move, support, signed_weights, turn, own_inverse)]
 
 
 def _same_motion(motion: Rigid3, other: _Suggestion, spread: float) -> bool:
-    """Return whether a motion is that of a suggestion: its turn, and where it puts the suggestion's camera."""
+    """Return whether a motion matches a suggestion, in rotation and in the position of the suggestion's camera."""
     apart = float(np.linalg.norm(motion.apply(other.center) - other.motion.apply(other.center)))
     length = float(np.linalg.norm(other.displacement))
     turned = float(geodesic_angle(motion.rotation, other.motion.rotation))
@@ -165,27 +167,27 @@ def _angle(motion: Rigid3) -> float:
 
 
 def labellings(model: PlacedModel, alias: Alias) -> list[dict[int, int]]:
-    """Return which cameras an alias may have shifted, image position to 0 or 1 (to be moved); the likeliest first.
+    """Return labellings of cameras that an alias may have shifted, image position to 0 or 1 (move), likeliest first.
 
-    A labelling is good if many pairs that suggest the move join images with different labels, the right way round, and
-    few pairs join such images that do not suggest it. Each is the best that single changes lead to from one vote. The
-    last is the best that takes a part out of the capture's order, since people take panoramas along a way.
+    A labelling is good if many pairs that suggest the motion join images with different labels, in the right order, and
+    few other pairs do. Each labelling is the best one reached by single changes from one suggesting pair. The last
+    labelling is the best contiguous part of the capture's order, since people take panoramas along a path.
     """
     images = sorted(model.cameras)
     place = {image: idx for idx, image in enumerate(images)}
-    # gain[a, b]: what moving b while a stays gains.
+    # gain[a, b]: the gain from moving b while a stays.
     gain = np.zeros((len(images), len(images)))
     for (i, j), rank in model.chosen.items():
         held = _HELD * model.pairs.geometries[i, j][rank].weight
         gain[place[i], place[j]] -= held
         gain[place[j], place[i]] -= held
-    for (i, j), vote in alias.votes.items():
-        a, b = (i, j) if vote > 0 else (j, i)
-        gain[place[a], place[b]] += abs(vote)
-        gain[place[b], place[a]] += abs(vote) if alias.own_inverse else -abs(vote)
+    for (i, j), signed in alias.signed_weights.items():
+        a, b = (i, j) if signed > 0 else (j, i)
+        gain[place[a], place[b]] += abs(signed)
+        gain[place[b], place[a]] += abs(signed) if alias.own_inverse else -abs(signed)
     found: dict[tuple[int, ...], float] = {}
-    for (i, j), vote in sorted(alias.votes.items(), key=lambda item: (-abs(item[1]), item[0]))[:_STARTS]:
-        a, b = (place[i], place[j]) if vote > 0 else (place[j], place[i])
+    for (i, j), signed in sorted(alias.signed_weights.items(), key=lambda item: (-abs(item[1]), item[0]))[:_STARTS]:
+        a, b = (place[i], place[j]) if signed > 0 else (place[j], place[i])
         labels = np.zeros(len(images), np.intp)
         labels[b] = 1
         labels, score = _improved(gain, labels, kept=(a, b))
@@ -199,7 +201,8 @@ def labellings(model: PlacedModel, alias: Alias) -> list[dict[int, int]]:
 def moved_cameras(model: PlacedModel, alias: Alias, labels: dict[int, int]) -> dict[int, Rigid3]:
     """Return the cameras of a model with a block moved by an alias.
 
-    Those with label 1 move; if they are the larger part, the others move the other way, which is the same arrangement.
+    Cameras with label 1 move. If they are the larger part, the others move the other way, which is the same
+    arrangement.
     """
     mover = 1 if 2 * sum(labels.values()) <= len(labels) else 0
     motion = alias.motion(inverse=mover == 0)
@@ -211,7 +214,7 @@ def moved_cameras(model: PlacedModel, alias: Alias, labels: dict[int, int]) -> d
 
 
 def _suggestions(model: PlacedModel) -> list[_Suggestion]:
-    """Return how geometries that were not chosen would move the second image of a pair relative to the first."""
+    """Return the motions of second images relative to first images that unchosen geometries suggest."""
     suggestions: list[_Suggestion] = []
     for i, j in model.pairs.geometries:
         if i not in model.cameras or j not in model.cameras:
@@ -235,20 +238,20 @@ def _suggestions(model: PlacedModel) -> list[_Suggestion]:
     return [suggestions[idx] for idx in heaviest]
 
 
-def _votes(
+def _signed_weights(
     edges: list[Edge], weights: FloatArray, same_way: NDArray[np.bool_], near: NDArray[np.bool_]
 ) -> dict[Edge, float]:
-    """Return the heaviest vote of each pair among the moves that are near one of them."""
-    votes: dict[Edge, float] = {}
+    """Return the heaviest signed weight of each pair among the motions that are near one of them."""
+    signed_weights: dict[Edge, float] = {}
     for idx in np.flatnonzero(near):
         signed = float(weights[idx]) if same_way[idx] else -float(weights[idx])
-        if abs(signed) > abs(votes.get(edges[idx], 0.0)):
-            votes[edges[idx]] = signed
-    return votes
+        if abs(signed) > abs(signed_weights.get(edges[idx], 0.0)):
+            signed_weights[edges[idx]] = signed
+    return signed_weights
 
 
 def _best_cut(gain: FloatArray) -> list[tuple[int, ...]]:
-    """Return the best labelling in which images that follow one another have one label, and all others the other."""
+    """Return the best labelling in which a run of consecutive images has one label, and all others the other."""
     count = len(gain)
     total = np.zeros((count + 1, count + 1))
     total[1:, 1:] = gain.cumsum(axis=0).cumsum(axis=1)
@@ -266,14 +269,14 @@ def _best_cut(gain: FloatArray) -> list[tuple[int, ...]]:
 
 
 def _improved(gain: FloatArray, labels: NDArray[np.intp], *, kept: tuple[int, int]) -> tuple[NDArray[np.intp], float]:
-    """Change one label after another as long as the score rises; the two labels of the first vote stay.
+    """Change single labels as long as the score rises; the two labels of the initial pair stay fixed.
 
     The score is the sum of gain[a, b] over all a with label 0 and b with label 1.
     """
     labels = labels.copy()
     for _ in range(4 * len(labels)):
         stays, moves = (labels == 0).astype(np.float64), (labels == 1).astype(np.float64)
-        # What an image contributes as one that moves, less what it contributes as one that stays.
+        # The contribution of an image with label 1 minus its contribution with label 0.
         rise = stays @ gain - gain @ moves
         rise = np.where(labels == 0, rise, -rise)
         rise[list(kept)] = -np.inf

@@ -1,4 +1,4 @@
-"""Let the images decide between places that the matches support: move cameras, leave them out, or doubt them."""
+"""Resolve ambiguous poses by the images: move cameras, leave them out, or report them as doubtful."""
 
 from __future__ import annotations
 
@@ -13,60 +13,60 @@ from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, ne
 from pano_mvs.algorithms.poses.verification.pair_weights import pair_shares
 from pano_mvs.geometry import Rigid3, geodesic_angle
 
-# A camera whose images confirm less than this share of what its neighbours lead to expect is looked at again …
+# A camera is examined again if its images confirm less than this share of what its neighbours suggest …
 _SUSPICIOUS = 0.75
-# … and is doubtful if no other place does better and it stays below this share …
+# … is doubtful if no other pose is better and the confirmed share stays below this …
 _DOUBTFUL = 0.55
-# … or is left out, if its pairs do not support it either.
+# … and is left out if its pairs do not support it either.
 _HOPELESS, _MIN_EXPLAINED = 0.3, 0.5
-# Of all pairs of a group; below this, a camera that looks right may still be the wrong one.
+# Share of all pairs of a group; below this, a camera that looks right may still be the wrong one …
 _MIN_EXPLAINED_IN_ALL = 0.7
-# … unless the pairs of the cameras that are not doubted are explained to this share.
+# … unless the pairs of all reliable cameras are explained to this share.
 _MIN_EXPLAINED_BY_OTHERS = 0.85
-# Nobody doubts a camera that confirms this share of what is expected, whatever its pairs say.
+# A camera that confirms this share of what is expected is never doubtful, whatever its pairs suggest.
 _CONFIRMED = 0.9
-# A geometry under which two images confirm this share of what they confirm under their best one is likely.
+# A geometry is likely if two images confirm under it at least this share of what they confirm under their best one.
 _LIKELY = 0.9
-_MOST_PAIRS = 0.75
-# A second geometry of this share of the best one's weight is a rival.
+_PERIODIC_SHARE = 0.75
+# A second geometry with this share of the best one's weight is a rival.
 _RIVAL = 0.4
-# Another place must be better by this factor, and by this much, to be taken; within the factor it is a rival.
+# Another pose is used if it is better by this factor and by this difference; within the factor it is a rival.
 _BETTER, _MARGIN = 1.15, 0.03
-# Where nothing more than this can be expected to be confirmed, nothing can be said.
+# If no more than this can be expected to be confirmed, nothing can be concluded.
 _MIN_EXPECTED = 0.1
 _NEIGHBOURS = 6
-# From this many cameras on the first look is by shared sweeps; a second one follows below this share of the expected.
+# With this many cameras or more, the first pass uses shared sweeps; a second one follows below this expected share.
 _MANY, _SECOND_LOOK = 8, 0.9
 _ALTERNATIVES = 4
-_MIN_SCORE = 0.2  # of the best placement's score by matches, for a place to be tried at all
+_MIN_SCORE = 0.2  # minimum share of the best placement's score by matches, for a pose to be tried at all
 _ROUNDS = 3
 _BLOCK_ROUNDS = 2
-# A block is moved if the images around the cut confirm this much more of themselves; where a first choice of the block
-# loses no more than this, others like it are tried.
+# A block is moved if the images around the cut confirm this much more. If a first choice of the block loses no more
+# than this, similar blocks are tried.
 _MIN_BLOCK_GAIN, _PROMISING_GAIN = 0.05, -0.1
-# If they would confirm hardly less than now, nobody can tell which is true.
+# If the images would confirm hardly less than now, the arrangement is ambiguous.
 _AMBIGUOUS_GAIN = -0.2
-# Where almost every pair of images would agree with the same move, the place is periodic throughout.
+# If almost every pair of images would agree with the same motion, the place is periodic throughout.
 _PERIODIC, _AMBIGUOUS_GAIN_PERIODIC = 0.7, -0.3
 _NAMED, _NAMED_TURN_DEG = 4, 5.0
 _FLIPPED = 3
 _ASKED = 6
-# How much the share of the pairs that an arrangement explains counts beside the share of the images.
+# Exponent of the share of explained pairs relative to the share of confirmed texture.
 PAIRS_POWER = 0.25
-_HOPELESS_GAINS = -0.45, -0.1  # of the first that is asked, and of the first two or more: no more are asked then
+_HOPELESS_GAINS = -0.45, -0.1  # of the first image, and of the first two or more; below it no more images are consulted
 
 
 @dataclass(eq=False)
 class Arbitration:
-    """What the images say about the cameras of a model.
+    """Evidence of the images for or against the cameras of a model.
 
     Attributes:
-        shares: image position to the confirmed share of its textured pixels; NaN where too little can be judged.
-        expected: image position to the share that its neighbours lead to expect; NaN likewise.
-        moved: images that were put in another place.
-        doubts: images whose pose is doubtful, with the reason.
-        removed: images that were taken out of the model, with the reason.
-        asked: whether the images were looked at.
+        shares: image position to the confirmed share of its textured pixels; NaN if too little can be judged.
+        expected: image position to the share that its neighbours suggest; NaN likewise.
+        moved: images that were moved to another pose.
+        doubts: images with a doubtful pose, with the reason.
+        removed: images that were removed from the model, with the reason.
+        asked: whether the images were consulted.
     """
 
     shares: dict[int, float] = field(default_factory=dict)
@@ -85,16 +85,16 @@ class Arbitration:
 def arbitrate(
     model: PlacedModel, confirmation: Confirmation, *, fixed: Collection[int] = (), remove: bool = True
 ) -> Arbitration:
-    """Judge all cameras of a model by the images, and put right what another place explains better.
+    """Check all cameras of a model by the images, and correct those for which another pose explains more.
 
-    Cameras that confirm much less than their neighbours are tried in the other places that their pairs suggest,
-    against cameras that are beyond suspicion. The model is changed in place.
+    Cameras that confirm much less than their neighbours are tried at the other poses that their pairs suggest, against
+    cameras that are not suspect. The model is changed in place.
 
     Args:
-        model: at least two cameras.
+        model: a model with two or more cameras.
         confirmation: of the same capture.
-        fixed: images that are never moved or removed, only doubted.
-        remove: whether a camera that nothing explains is taken out of the model.
+        fixed: images that are never moved or removed, only reported as doubtful.
+        remove: whether a camera that nothing explains is removed from the model.
     """
     found = Arbitration()
     ambiguity = ""
@@ -127,23 +127,23 @@ def arbitrate(
 
 
 def _contradiction(model: PlacedModel, doubted: Collection[int]) -> str:
-    """Say so if the pairs contradict one another so much that no arrangement can be relied on.
+    """Return a warning if the pairs contradict one another too much for any reliable arrangement; "" otherwise.
 
-    A single wrong camera contradicts all of its pairs. So nothing is said if the pairs agree well once the cameras that
-    are doubted already are left aside.
+    A single wrong camera contradicts all of its pairs. So there is no warning if the pairs agree well without the
+    cameras that are already doubtful.
     """
     explained, by_others = model.explained_share(), model.explained_share(without=doubted)
     if len(model.cameras) < 3 or explained >= _MIN_EXPLAINED_IN_ALL or by_others >= _MIN_EXPLAINED_BY_OTHERS:
         return ""
-    return f"only {100 * explained:.0f} % of all pairs, by weight, agree with one arrangement of the cameras"
+    return f"only {100 * explained:.0f} % of all pairs, by weight, agree with a common arrangement of the cameras"
 
 
 def _unshift_blocks(model: PlacedModel, confirmation: Confirmation) -> tuple[set[int], str]:
-    """Move blocks of cameras that the images confirm clearly better elsewhere.
+    """Move blocks of cameras to where the images confirm clearly more.
 
     Returns:
-        The images that were moved, and what is ambiguous: a move of a block after which the images would confirm about
-        as much as they do now; "" if there is none.
+        The images that were moved, and a description of an ambiguity: a motion of a block after which the images would
+        confirm about as much as they do now; "" if there is none.
     """
     moved: set[int] = set()
     for remaining in reversed(range(_BLOCK_ROUNDS + 1)):
@@ -159,7 +159,7 @@ def _unshift_blocks(model: PlacedModel, confirmation: Confirmation) -> tuple[set
         if gain > _PROMISING_GAIN and remaining:
             labels, gain = _with_better_labels(model, alias, labels, gain, confirmation)
         if gain <= _MIN_BLOCK_GAIN or not remaining:
-            periodic = len(alias.votes) > _PERIODIC * len(model.chosen)
+            periodic = len(alias.signed_weights) > _PERIODIC * len(model.chosen)
             limit = _AMBIGUOUS_GAIN_PERIODIC if periodic else _AMBIGUOUS_GAIN
             if gain > limit:
                 return moved, _ambiguity(model, alias, labels)
@@ -172,7 +172,7 @@ def _unshift_blocks(model: PlacedModel, confirmation: Confirmation) -> tuple[set
 
 
 def _with_block_moved(model: PlacedModel, alias: Alias, labels: dict[int, int]) -> PlacedModel:
-    """Return a copy of a model with a block of cameras moved by an alias, and the geometries that agree then."""
+    """Return a copy of a model with a block of cameras moved by an alias, and with geometries chosen again."""
     after = model.copy()
     after.cameras = moved_cameras(model, alias, labels)
     after.choose_again()
@@ -182,7 +182,7 @@ def _with_block_moved(model: PlacedModel, alias: Alias, labels: dict[int, int]) 
 
 
 def _ambiguity(model: PlacedModel, alias: Alias, labels: dict[int, int]) -> str:
-    """Say which images might as well stand elsewhere."""
+    """Return a description of the images that might as well be elsewhere."""
     block = [image for image, label in labels.items() if label]
     rest = [image for image, label in labels.items() if not label]
     smaller = [model.pairs.names[image] for image in min(block, rest, key=len)]
@@ -191,21 +191,21 @@ def _ambiguity(model: PlacedModel, alias: Alias, labels: dict[int, int]) -> str:
     distance = max(float(np.linalg.norm(after[image].center - pose.center)) for image, pose in model.cameras.items())
     turned = f", turned by {_turn_deg(alias):.0f}°" if _turn_deg(alias) else ""
     return (
-        f"the place repeats: the images would confirm about as much if {named} stood {distance:.2g} units away from "
+        f"the place repeats: the images would confirm about as much if {named} were {distance:.2g} units away from "
         f"where they are{turned}, relative to the others"
     )
 
 
 def _turned_ambiguity(alias: Alias) -> str:
-    """Say that a part of the capture may be turned; which images it has is hardly known from a few pairs."""
+    """Return a warning that part of the capture may be rotated; a few pairs hardly determine which images."""
     return (
-        f"the place repeats: {len(alias.votes)} pairs would agree if some of the images were turned by "
-        f"{_turn_deg(alias):.0f}° and stood elsewhere, as in a second room like the first"
+        f"the place repeats: {len(alias.signed_weights)} pairs would agree if some of the images were rotated by "
+        f"{_turn_deg(alias):.0f}° and placed elsewhere, as in a second, similar room"
     )
 
 
 def _turn_deg(alias: Alias) -> float:
-    """Return by how much an alias turns a block; 0 if it only moves it."""
+    """Return the angle by which an alias rotates a block; 0 if it only translates it."""
     turn_deg = float(np.rad2deg(geodesic_angle(alias.turn, np.eye(3))))
     return turn_deg if turn_deg > _NAMED_TURN_DEG else 0.0
 
@@ -213,7 +213,7 @@ def _turn_deg(alias: Alias) -> float:
 def _with_better_labels(
     model: PlacedModel, alias: Alias, labels: dict[int, int], gain: float, confirmation: Confirmation
 ) -> tuple[dict[int, int], float]:
-    """Change the labels of the images that confirm least, one after the other, as long as that gains; return both."""
+    """Change the labels of the images that confirm least, one at a time, while that gains; return labels and gain."""
     for _ in range(_FLIPPED):
         cameras = moved_cameras(model, alias, labels)
         shares = {image: confirmation.share(image, pose, cameras) for image, pose in cameras.items()}
@@ -230,13 +230,12 @@ def _with_better_labels(
 
 
 def _gain_of(model: PlacedModel, alias: Alias, labels: dict[int, int], confirmation: Confirmation) -> float:
-    """Return by how much better images and pairs agree when a block is moved, as a factor less one.
+    """Return the relative gain in agreement of images and pairs if a block is moved (the factor minus one).
 
-    The factor is that of the share that images confirm of themselves, times a power of the factor of the share of the
-    pairs that are explained: repeats lead matches astray more often than images, but an arrangement that the images
-    confirm a little more and most pairs contradict is not the true one either. The images that have most neighbours on
-    the other side of the cut are asked. Those whose neighbours all move with them, or all stay with them, see no
-    difference.
+    The factor is the ratio of confirmed shares, times a power of the ratio of explained shares of pairs: repeated
+    structure misleads matches more often than images, but an arrangement that the images confirm slightly more and most
+    pairs contradict is not the true one either. Only images with most neighbours on the other side of the cut are
+    consulted. Images whose neighbours all move with them, or all stay with them, see no difference.
     """
     cameras = moved_cameras(model, alias, labels)
     crossing: dict[int, int] = {}
@@ -260,7 +259,7 @@ def _gain_of(model: PlacedModel, alias: Alias, labels: dict[int, int], confirmat
 
 
 def judge(model: PlacedModel, confirmation: Confirmation | None) -> Arbitration:
-    """Return what the images, or without them the pairs alone, say about the cameras of a model; nothing is changed."""
+    """Return the evidence of the images, or of the pairs alone, for the cameras of a model, without changing it."""
     found = Arbitration(asked=confirmation is not None)
     if confirmation is None:
         found.shares = found.expected = dict.fromkeys(model.cameras, float("nan"))
@@ -271,10 +270,10 @@ def judge(model: PlacedModel, confirmation: Confirmation | None) -> Arbitration:
 
 
 def _judge(model: PlacedModel, confirmation: Confirmation, found: Arbitration) -> None:
-    """Compare what each image confirms with what its nearest neighbours' experience leads to expect.
+    """Compare the confirmed share of each image with the share that its nearest neighbours suggest.
 
-    In larger captures the images share their small sweeps; those that then look less than perfect are judged again by
-    sweeps of their neighbours without them.
+    In larger captures the images share their small sweeps. Images whose result is then less than perfect are judged
+    again by sweeps of their neighbours without them.
     """
     shared = len(model.cameras) >= _MANY
     evidence = {
@@ -282,10 +281,11 @@ def _judge(model: PlacedModel, confirmation: Confirmation, found: Arbitration) -
         for image, pose in sorted(model.cameras.items())
     }
     neighbours = {
-        image: nearest_cameras(pose, {idx: camera for idx, camera in model.cameras.items() if idx != image},
-                               count=_NEIGHBOURS)
+        image: nearest_cameras(
+            pose, {idx: camera for idx, camera in model.cameras.items() if idx != image}, count=_NEIGHBOURS
+        )
         for image, pose in model.cameras.items()
-    }  # fmt: skip
+    }
 
     def expected_of(image: int) -> float:
         return evidence[image].expected_share([evidence[idx] for idx in neighbours[image]])
@@ -299,7 +299,7 @@ def _judge(model: PlacedModel, confirmation: Confirmation, found: Arbitration) -
 
 
 def _suspects(found: Arbitration) -> list[int]:
-    """Return the images that confirm much less than expected, the worst first."""
+    """Return the images that confirm much less than expected, worst first."""
     ratios = {image: share / max(found.expected[image], 1e-9) for image, share in found.shares.items()}
     return sorted(
         (image for image, ratio in ratios.items() if ratio < _SUSPICIOUS and found.expected[image] > _MIN_EXPECTED),
@@ -310,7 +310,7 @@ def _suspects(found: Arbitration) -> list[int]:
 def _better_place(
     model: PlacedModel, image: int, trusted: Mapping[int, Rigid3], confirmation: Confirmation
 ) -> Rigid3 | None:
-    """Return another pose of an image that the images confirm clearly better than its own, or None."""
+    """Return another pose of an image that the images confirm clearly better than its own; None if there is none."""
     cameras = {idx: camera for idx, camera in trusted.items() if idx != image}
     if len(cameras) < 2:
         return None
@@ -324,7 +324,7 @@ def _better_place(
 
 
 def _alternatives(model: PlacedModel, image: int, cameras: Mapping[int, Rigid3]) -> list[Rigid3]:
-    """Return the poses that an image's pairs with some cameras suggest, polished on known points."""
+    """Return the poses that an image's pairs with some cameras suggest, refined on known points."""
     without = model.copy()
     without.cameras = dict(cameras)
     witnesses, places = without.place(image)
@@ -346,12 +346,12 @@ def _conclude(
     fixed: Collection[int],
     remove: bool,
 ) -> None:
-    """Doubt or take out what is still confirmed much less than expected, or what its own pairs contradict."""
+    """Report or remove cameras that are still confirmed much less than expected or contradicted by their own pairs."""
     for image, share in found.shares.items():
         expected, explained = found.expected[image], model.explained_share_of(image)
         ratio = share / expected if expected > _MIN_EXPECTED else float("nan")
         reasons = []
-        # Images and pairs may each be short of what makes a camera doubtful, and both speak against it.
+        # Neither images nor pairs alone may be enough to doubt a camera, although both are evidence against it.
         if ratio < (_SUSPICIOUS if explained < _MIN_EXPLAINED_IN_ALL else _DOUBTFUL):
             reasons.append(
                 f"other images confirm {100 * share:.0f} % of its texture, where its neighbours lead to expect "
@@ -359,7 +359,7 @@ def _conclude(
             )
         contradicted = explained < _MIN_EXPLAINED and not ratio > _CONFIRMED
         if contradicted and not _confirmed_by_pairs(model, image, confirmation):
-            reasons.append(f"only {100 * explained:.0f} % of its pairs, by weight, agree with its place")
+            reasons.append(f"only {100 * explained:.0f} % of its pairs, by weight, agree with its pose")
         if not reasons:
             continue
         removable = remove and image not in fixed and len(model.cameras) - len(found.removed) > 2
@@ -374,15 +374,15 @@ def _conclude(
 
 
 def _confirmed_by_pairs(model: PlacedModel, image: int, confirmation: Confirmation | None) -> bool:
-    """Return whether most pairs of a camera have a geometry that agrees with it, and the images speak for these.
+    """Return whether most pairs of a camera have a geometry that agrees with it and is confirmed by the images.
 
-    Repeats may give false geometries more matches than the true ones have.
+    Repeated structure may give false geometries more matches than the true ones.
     """
     if confirmation is None:
         return False
     partners = [idx for idx in model.pairs.partners[image] if idx in model.cameras]
     agreeing = sum((min(image, idx), max(image, idx)) in model.chosen for idx in partners)
-    if agreeing < _MOST_PAIRS * len(partners):
+    if agreeing < _PERIODIC_SHARE * len(partners):
         return False
     asked = confirmed = 0
     for partner in partners[:_NEIGHBOURS]:
@@ -394,7 +394,7 @@ def _confirmed_by_pairs(model: PlacedModel, image: int, confirmation: Confirmati
 
 
 def _doubt_pairs_alone(model: PlacedModel, found: Arbitration) -> None:
-    """Doubt two cameras that stand alone with several geometries, of which nothing else can tell the true one."""
+    """Report two isolated cameras with several geometries as doubtful, since nothing else can decide between these."""
     if len(model.cameras) != 2:
         return
     first, second = sorted(model.cameras)
@@ -402,6 +402,6 @@ def _doubt_pairs_alone(model: PlacedModel, found: Arbitration) -> None:
     if len(geometries) > 1 and geometries[1].weight > _RIVAL * geometries[0].weight:
         for image in (first, second):
             found.doubts[image] = (
-                f"its only pair has another geometry that {len(geometries[1].view)} matches support "
-                f"({len(geometries[0].view)} support the one that was taken): take panoramas in between"
+                f"its only pair has another geometry with {len(geometries[1].view)} matches "
+                f"({len(geometries[0].view)} support the one in use): take panoramas in between"
             )

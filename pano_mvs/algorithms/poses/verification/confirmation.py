@@ -1,4 +1,4 @@
-"""Ask the images about their poses: how much of what one sees do the others see where its pose puts it?"""
+"""Check poses against the images: how much of what one image sees do others see where its pose puts it?"""
 
 from __future__ import annotations
 
@@ -20,22 +20,23 @@ from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
 Picture = tuple[NDArray[np.uint8], NDArray[np.bool_]]
-"""A panorama (H, W, 3) uint8 RGB with its mask (H, W), False is ignored."""
+"""A panorama (H, W, 3) uint8 RGB with its mask (H, W); False is ignored."""
 
 WIDTH_PX = 256
 _SETTINGS = SweepSettings(planes=64, cost="census", no_match="keep")
 _SOURCES = 4
-# In units of the median baseline. A near limit by the longest would lose the foreground where one source is far away.
+# In units of the median baseline. A near limit from the longest one would lose the foreground if one source is far
+# away.
 _NEAREST_BASELINES = 0.15
 _MAX_RELATIVE_ERROR, _MAX_REPROJECTION_PX, _MIN_SUPPORT, _MIN_MOTION_PX = 0.05, 1.0, 0.5, 0.05
-# Less texture than this share of the sphere says nothing about a pose.
+# With less textured area than this share of the sphere, nothing can be concluded about a pose.
 MIN_TEXTURED = 0.05
-# Maps that are kept for an image with the same sources; relative poses that differ by less than this give the same map.
+# Maps kept for an image with the same sources; relative poses that differ by less than this give the same map.
 _MAPS_PER_IMAGE, _MAX_KEPT = 3, 400
 _SAME_PLACE, _SAME_TURN_RAD = 0.005, float(np.deg2rad(0.1))
 _PARALLAX_EDGES_DEG = np.array([2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 50.0, 65.0, 180.0])
 _CLASSES = len(_PARALLAX_EDGES_DEG)
-# Solid angle with which the overall share counts in each class.
+# Weight, as solid angle, of the overall share in each class.
 _PRIOR = 0.05
 
 
@@ -46,7 +47,7 @@ class _Small:
     Attributes:
         image: (128, 256, 3) uint8.
         mask: (128, 256) bool, False is ignored.
-        textured: (128, 256) bool, where there is something to match.
+        textured: (128, 256) bool, True where there is texture to match.
     """
 
     image: NDArray[np.uint8]
@@ -56,11 +57,11 @@ class _Small:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """How much of what an image sees other images confirm, by the parallax under which they see it.
+    """How much of what an image sees other images confirm, by parallax.
 
     Attributes:
-        textured: (B,) solid angle of the textured pixels in each class of parallax.
-        confirmed: (B,) solid angle of those that other images confirm.
+        textured: (B,) solid angle of the textured pixels in each parallax class.
+        confirmed: (B,) solid angle of the pixels that other images confirm.
     """
 
     textured: NDArray[np.float64]
@@ -68,16 +69,16 @@ class Evidence:
 
     @property
     def share(self) -> float:
-        """The confirmed share of the textured pixels; NaN if too little of the sphere has any texture."""
+        """The confirmed share of the textured pixels; NaN if too little of the sphere is textured."""
         if self.textured.sum() < MIN_TEXTURED * 4 * np.pi:
             return float("nan")
         return float(self.confirmed.sum() / self.textured.sum())
 
     def expected_share(self, others: Sequence[Evidence]) -> float:
-        """Return the share that other cameras' experience leads to expect, class by class; NaN without any.
+        """Return the share that the evidence of other cameras suggests, class by class; NaN without other cameras.
 
-        A camera far from its neighbours sees everything under a large parallax, of which little is confirmed wherever
-        it stands: what counts is how much of the same classes others have confirmed.
+        A camera far from its neighbours sees everything under a large parallax, of which little is confirmed at any
+        pose. The expectation is therefore the confirmed share of the same classes in other cameras.
         """
         known = [other for other in others if np.isfinite(other.share)]
         if not known or not np.isfinite(self.share):
@@ -90,15 +91,15 @@ class Evidence:
 
 
 class Confirmation:
-    """Small sweeps of panoramas with given poses, and how far they confirm one another.
+    """Small sweeps of panoramas with given poses, to measure how well the images confirm one another.
 
     Each panorama is swept against its nearest neighbours at 256×128 (about 0.05 s), and the ranges are compared with
-    the neighbours' own. Wrong poses, even those that repeated structure suggests, confirm much less: whatever does not
-    repeat is then in the wrong place.
+    the neighbours' own. Wrong poses, even those that repeated structure suggests, confirm much less, since everything
+    that does not repeat is then in the wrong place.
 
     Args:
-        load: returns a panorama and its mask by its position in the capture. It is called once for each panorama;
-            only a small copy is kept.
+        load: returns a panorama and its mask by its position in the capture. It is called once per panorama; only a
+            small copy is kept.
     """
 
     def __init__(self, load: Callable[[int], Picture]) -> None:
@@ -118,9 +119,9 @@ class Confirmation:
         Args:
             image: position of the image.
             pose: the cam_from_world to judge.
-            cameras: cam_from_world of other images, which are taken as they are.
-            independent: whether the neighbours are swept without this image. If not, all images of a capture share
-                their maps, one sweep each, and a wrong pose spoils its neighbours' maps a little.
+            cameras: cam_from_world of other images, which stay fixed.
+            independent: whether the neighbours are swept without this image. If False, all images of a capture share
+                their maps, one sweep each, and a wrong pose slightly degrades its neighbours' maps.
         """
         with _one_thread():
             return self._evidence(image, pose, cameras, independent=independent)
@@ -138,15 +139,20 @@ class Confirmation:
         for source in sources:
             around = {idx: camera for idx, camera in others.items() if idx != source}
             everybody = {**around, image: pose}
-            # Of two images each can only be checked against the other.
+            # With two images, each can only be checked against the other.
             seen_by = nearest_cameras(others[source], around if independent else everybody) or [image]
             maps.append(self._swept(source, others[source], seen_by, everybody))
             poses.append(others[source])
         checked = check_consistency(
-            own, pose, maps, poses,
-            max_relative_error=_MAX_RELATIVE_ERROR, max_reprojection_px=_MAX_REPROJECTION_PX,
-            min_support=_MIN_SUPPORT, min_motion_px=_MIN_MOTION_PX,
-        )  # fmt: skip
+            own,
+            pose,
+            maps,
+            poses,
+            max_relative_error=_MAX_RELATIVE_ERROR,
+            max_reprojection_px=_MAX_REPROJECTION_PX,
+            min_support=_MIN_SUPPORT,
+            min_motion_px=_MIN_MOTION_PX,
+        )
         confirmed = (checked.confidence >= CONSISTENT_CONFIDENCE[0]) & textured
         classes = _parallax_classes(own.range, pose, poses)
         return Evidence(
@@ -167,8 +173,7 @@ class Confirmation:
     def _swept(self, image: int, pose: Rigid3, sources: Sequence[int], cameras: Mapping[int, Rigid3]) -> RangeMap:
         """Return the small range map of an image against its sources.
 
-        A map that was swept with nearly the same relative poses is used again: an adjustment moves all cameras a
-        little.
+        A map with nearly the same relative poses is reused: an adjustment moves all cameras slightly.
         """
         relative = [cameras[idx] @ pose.inverse() for idx in sources]
         scale = float(np.median([np.linalg.norm(to.translation) for to in relative]))
@@ -200,14 +205,14 @@ class Confirmation:
 
 
 def _nearly(pose: Rigid3, scale: float, other: Rigid3, other_scale: float) -> bool:
-    """Return whether two relative poses, each in its unit, are one for a sweep at 256 columns."""
+    """Return whether two relative poses, each in its own unit, are equivalent for a sweep at 256 columns."""
     moved = float(np.linalg.norm(pose.translation / scale - other.translation / other_scale))
     return moved < _SAME_PLACE and float(geodesic_angle(pose.rotation, other.rotation)) < _SAME_TURN_RAD
 
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Let sweeps work in the calling thread: maps as small as these cost less than handing them to others."""
+    """Run sweeps in the calling thread: maps this small take less time than starting other threads."""
     import numba
 
     threads = numba.get_num_threads()
@@ -221,7 +226,8 @@ def _one_thread() -> Iterator[None]:
 def _parallax_classes(ranges: NDArray[np.float32], pose: Rigid3, sources: Sequence[Rigid3]) -> NDArray[np.intp]:
     """Return the class of each pixel, (H, W): the smallest angle under which a source and the image see its point.
 
-    Angles under 2° do not count, since they tell little. Pixels without such a source are in the last class.
+    Angles below 2° are ignored, since they carry little information. Pixels without such a source are in the last
+    class.
     """
     points = ray_grid(ranges.shape) * np.where(np.isnan(ranges), 1.0, ranges)[..., None]
     smallest = np.full(ranges.shape, np.inf)
@@ -235,7 +241,7 @@ def _parallax_classes(ranges: NDArray[np.float32], pose: Rigid3, sources: Sequen
 
 
 def nearest_cameras(pose: Rigid3, cameras: Mapping[int, Rigid3], *, count: int = _SOURCES) -> list[int]:
-    """Return the cameras nearest to a pose, nearest first; those in the very same place are left out."""
+    """Return the cameras nearest to a pose, nearest first; cameras at the same position are left out."""
     distances = {idx: float(np.linalg.norm(camera.center - pose.center)) for idx, camera in cameras.items()}
     farthest = max(distances.values(), default=0.0)
     apart = [idx for idx, distance in distances.items() if distance > 1e-6 * farthest]

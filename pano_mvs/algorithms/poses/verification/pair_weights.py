@@ -1,4 +1,4 @@
-"""Weigh the geometries of ambiguous pairs by what the two images confirm under each."""
+"""Weight the geometries of ambiguous pairs by how much the two images confirm under each of them."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from pano_mvs.geometry import Rigid3
 _RIVAL = 0.25
 _MIN_AMBIGUOUS = 1 / 3
 _ASKED_PARTNERS = 6
-# What is left of the weight of an ambiguous pair that is not asked for, since others suffice.
+# Factor on the weight of an ambiguous pair that is not checked because other pairs suffice.
 _UNDECIDED = 0.3
 _SHARPNESS = 3
 
 
 def weighed_by_images(pairs: Pairs, confirmation: Confirmation) -> Pairs:
-    """Return pairs with the weights of ambiguous ones decided by the images.
+    """Return pairs in which the images decide the weights of ambiguous pairs.
 
-    Two panoramas are swept against one another under each geometry of their pair. Under the true one they confirm
-    more than under those that repeated structure suggests, however many matches these have. A geometry's weight is
-    multiplied by the cube of its confirmed share relative to the pair's best. This is done for the pairs of every
-    image with its six best partners; the other ambiguous pairs count for less. Where less than a third of the pairs
-    are ambiguous, the others decide, and nothing is asked.
+    Two panoramas are swept against each other under each geometry of their pair. Under the true one they confirm more
+    than under those that repeated structure suggests, however many matches these have. A geometry's weight is
+    multiplied by the cube of its confirmed share relative to the pair's best share. This is done for the pairs of every
+    image with its six best partners; the weights of other ambiguous pairs are lowered. If less than a third of the
+    pairs are ambiguous, the other pairs decide and no image is loaded.
 
     Args:
-        pairs: of a capture.
+        pairs: all pairs of a capture.
         confirmation: of the same capture.
     """
     ambiguous = sum(is_ambiguous(found) for found in pairs.geometries.values())
@@ -59,7 +59,7 @@ def is_ambiguous(found: tuple[Geometry, ...]) -> bool:
 
 
 def pair_shares(edge: Edge, found: tuple[Geometry, ...], confirmation: Confirmation) -> list[float]:
-    """Return the mean share of their texture that two images confirm of one another under each of their geometries."""
+    """Return the mean share of their texture that two images confirm of each other under each of their geometries."""
     first, second = edge
     shares = []
     for one in found:
@@ -69,14 +69,15 @@ def pair_shares(edge: Edge, found: tuple[Geometry, ...], confirmation: Confirmat
 
 
 def _weighed(edge: Edge, found: tuple[Geometry, ...], confirmation: Confirmation) -> tuple[Geometry, ...]:
-    """Return the geometries of a pair, weighed by the images, the heaviest first."""
+    """Return the geometries of a pair, weighted by the images, the heaviest first."""
     shares = pair_shares(edge, found, confirmation)
     most = max(shares)
     if most <= 0:
         return found
     heaviest = found[0].weight
     weighed = [
-        # The best by the images counts like the best by the matches: how many of these it has says little here.
+        # The best geometry by the images gets the weight of the best one by matches: its number of matches says little
+        # here.
         replace(one, weight=max(one.weight, heaviest * share / most) * (share / most) ** _SHARPNESS)
         for one, share in zip(found, shares, strict=True)
     ]

@@ -1,4 +1,4 @@
-"""Check poses of any origin against the images, and put right what another place explains better."""
+"""Check poses of any origin against the images, and correct cameras for which another pose explains more."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ def verify_poses(
     two_views: Mapping[tuple[str, str], TwoView] | None = None,
     correct: bool = True,
 ) -> Poses:
-    """Return poses with what the images say about them: confirmed and expected shares, doubts, corrections.
+    """Check poses against the images: confirmed and expected shares, doubts, corrections.
 
     Every camera is swept with its neighbours at 256 columns. A camera that confirms much less than its neighbours is
-    tried in the other places that its pairs suggest; if the images confirm one of them clearly better it is moved
+    tried at the other poses that its pairs suggest; if the images confirm one of them clearly better, it is moved
     there. A camera that neither images nor pairs support is left out; one that remains doubtful is reported.
 
     Args:
-        poses: of any origin. Cameras that are not moved keep their poses to the last digit.
+        poses: of any origin. Cameras that are not moved keep their poses exactly.
         load: returns the panorama and the mask of an image by its name.
-        features: key points by image name; without them and `two_views` nothing is moved or left out.
+        features: key points by image name; without them and `two_views` no camera is moved or left out.
         two_views: verified pairs.
         correct: False only reports.
 
     Returns:
-        The poses with `confirmed_shares`, `expected_shares` and `doubts`. Points are triangulated again where a camera
-        was moved or left out.
+        The poses with `confirmed_shares`, `expected_shares` and `doubts`. Points are triangulated again if a camera was
+        moved or left out.
     """
     if len(poses.names) < 2:
         return poses
@@ -59,7 +59,7 @@ def _verified(
     two_views: Mapping[tuple[str, str], TwoView],
     correct: bool,
 ) -> Poses:
-    """Return poses of one group, judged and put right."""
+    """Return poses of one group, checked and corrected."""
     known = all(name in features for name in poses.names)
     inside = {pair: view for pair, view in two_views.items() if known and {*pair} <= {*poses.names}}
     pairs = pairs_of({name: features[name] for name in poses.names}, inside) if known else Pairs.without(poses.names)
@@ -74,7 +74,7 @@ def _verified(
 
 
 def model_of(poses: Poses, pairs: Pairs) -> PlacedModel:
-    """Return a model with the cameras of poses, whose names are those of the pairs, and the geometries that agree."""
+    """Return a model with the given cameras, whose names are those of the pairs, and the geometries that agree."""
     model = PlacedModel(pairs, {idx: poses.cam_from_world(idx) for idx in range(len(poses.names))})
     model.choose_again()
     model.learn_ranges()
@@ -95,7 +95,7 @@ def poses_of(model: PlacedModel) -> Poses:
 
 
 def with_arbitration(poses: Poses, pairs: Pairs, arbitration: Arbitration) -> Poses:
-    """Return poses of one group with what the images say about them."""
+    """Return poses of one group with the evidence of the images."""
     position = {name: idx for idx, name in enumerate(pairs.names)}
 
     def of_each(values: Mapping[int, float]) -> np.ndarray:
