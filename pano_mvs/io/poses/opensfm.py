@@ -1,7 +1,7 @@
 """Poses from OpenSfM's reconstruction.json.
 
-OpenSfM's spherical camera maps longitude and latitude to u = lon / 2π, v = −lat / 2π about the picture's middle, so
-that its camera frame is x right, y down, z forward: ours. A shot's rotation is the angle-axis vector of
+OpenSfM's spherical camera maps longitude and latitude to u = lon / 2π, v = −lat / 2π about the image centre, so
+that its camera frame is x right, y down, z forward, as ours. A shot's rotation is the angle-axis vector of
 cam_from_world, and x_in_cam = R x_in_world + t.
 """
 
@@ -21,30 +21,30 @@ _SPHERICAL = ("spherical", "equirectangular")
 
 def is_opensfm(data: Any) -> bool:
     """Return whether a JSON value looks like the list of reconstructions that OpenSfM writes."""
-    return isinstance(data, list) and bool(data) and all(isinstance(part, dict) and "shots" in part for part in data)
+    return isinstance(data, list) and bool(data) and all(isinstance(item, dict) and "shots" in item for item in data)
 
 
 def opensfm_poses(data: list[dict[str, Any]], path: Path) -> tuple[dict[str, Rigid3], bool]:
-    """Return the poses of the reconstruction with most shots, by image name, and whether lengths are metres.
+    """Return the poses of the reconstruction with the most shots, by image name, and whether lengths are metres.
 
-    The world is east, north, up in metres about `reference_lla`; a reference at latitude and longitude 0 is what
-    OpenSfM writes where the pictures had no GPS position, and the unit of length then means nothing.
+    The world is east, north, up in metres about `reference_lla`. Without GPS positions, OpenSfM writes a reference at
+    latitude and longitude 0, and the unit of length is arbitrary.
 
     Args:
-        data: what the file holds; see `is_opensfm`.
-        path: of the file, for messages.
+        data: the contents of the file; see `is_opensfm`.
+        path: the file, for error messages.
 
     Raises:
-        InputError: naming the shot and the key that cannot be used.
+        InputError: if a value is invalid; it names the shot and the key.
     """
     for item in data:
         if not isinstance(item.get("cameras"), dict) or not isinstance(item["shots"], dict):
             raise InputError(f"{path}: 'cameras' and 'shots' must be objects by name")
-    part = max(data, key=lambda item: len(item["shots"]))
-    cameras, shots = part["cameras"], part["shots"]
+    largest = max(data, key=lambda item: len(item["shots"]))
+    cameras, shots = largest["cameras"], largest["shots"]
     poses = {name: _pose(name, shot, cameras, path) for name, shot in shots.items()}
     require_distinct(list(poses), path)
-    reference = part.get("reference_lla")
+    reference = largest.get("reference_lla")
     somewhere = isinstance(reference, dict) and bool(reference.get("latitude") or reference.get("longitude"))
     return poses, somewhere
 
