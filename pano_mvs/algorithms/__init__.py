@@ -3,8 +3,6 @@
 Compiled kernels are kept in a folder of the user's, see `pano_mvs.core.kernel_cache`.
 """
 
-from pathlib import Path
-
 from pano_mvs.core.kernel_cache import use_kernel_cache
 
-use_kernel_cache(Path(__file__).parent)
+use_kernel_cache()

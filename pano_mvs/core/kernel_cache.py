@@ -20,14 +20,16 @@ from pano_mvs.core.digest import digest_from_value
 from pano_mvs.core.paths import below, exists, home_folder, is_folder
 
 VARIABLE = "NUMBA_CACHE_DIR"
+PACKAGE = Path(__file__).parent.parent
+"""The folder of `pano_mvs`, whose kernels are cached."""
 
 _PLACES = {"win32": ("LOCALAPPDATA", "AppData/Local"), "darwin": ("", "Library/Caches")}
 
 
-def use_kernel_cache(package: Path) -> None:
+def use_kernel_cache(package: Path = PACKAGE) -> None:
     """Set numba's cache folder for the kernels in a package, unless the user has set one.
 
-    Call this before any of the kernels is imported.
+    Packages with kernels call this when they are imported, before any of their kernels is; later calls do nothing.
 
     Args:
         package: folder that contains the kernel files, `kernels_*.py`.
@@ -45,7 +47,7 @@ def use_kernel_cache(package: Path) -> None:
         numba.config.CACHE_DIR = folder
 
 
-def kernel_cache_folder(package: Path) -> Path:
+def kernel_cache_folder(package: Path = PACKAGE) -> Path:
     """Return the cache folder for the present kernels of a package.
 
     Raises:

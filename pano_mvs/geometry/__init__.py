@@ -29,6 +29,7 @@ Units
     `_bytes`; `_m` is written only where the scale is metric.
 """
 
+from pano_mvs.core import kernel_cache
 from pano_mvs.geometry.pinhole import PinholeView
 from pano_mvs.geometry.resample import (
     pad_panorama,
@@ -56,6 +57,8 @@ from pano_mvs.geometry.sphere import (
 )
 from pano_mvs.geometry.transforms import Rigid3, Similarity3, similarity_from_points
 from pano_mvs.geometry.triangulation import ranges_from_bearings, triangulate_bearings
+
+kernel_cache.use_kernel_cache()
 
 __all__ = [
     "PinholeView",

@@ -1,4 +1,4 @@
-"""What stages on range maps take in memory, as measured: `python -m tests.benchmarks.stage_memory`."""
+"""What stages on range maps take in memory, as measured: `python -m tests.benchmarks.engine.stage_memory`."""
 
 from __future__ import annotations
 

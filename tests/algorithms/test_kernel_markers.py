@@ -1,7 +1,7 @@
 """Every kernel module is compared with its plain counterpart by a test that carries the marker `kernel`.
 
-The marker names the modules that a test compares, as `package.module` below `pano_mvs.algorithms`. CI runs these tests
-compiled with the others, and again as plain Python (`NUMBA_DISABLE_JIT=1 pytest -m kernel`).
+The marker names the modules that a test compares, as `package.module` below `pano_mvs.algorithms` or `pano_mvs`. CI
+runs these tests compiled with the others, and again as plain Python (`NUMBA_DISABLE_JIT=1 pytest -m kernel`).
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ import ast
 from collections import defaultdict
 from pathlib import Path
 
-import pano_mvs.algorithms
+import pano_mvs
 
-ALGORITHMS = Path(pano_mvs.algorithms.__file__).parent
+PACKAGE = Path(pano_mvs.__file__).parent
 TESTS = Path(__file__).parent.parent
 
 
@@ -25,8 +25,8 @@ def marked_modules(source: str) -> set[str]:
 
 def test_every_kernel_module_has_a_test_and_no_marker_names_another() -> None:
     kernels = {
-        ".".join(path.relative_to(ALGORITHMS).with_suffix("").parts)
-        for path in ALGORITHMS.rglob("kernels_*.py")
+        ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removeprefix("algorithms.")
+        for path in PACKAGE.rglob("kernels_*.py")
         if "\n@" in path.read_text(encoding="utf-8")  # others hold constants and records of arguments
     }
     files_by_module = defaultdict(list)

@@ -24,7 +24,7 @@ from pano_mvs.session.session import presets_folder
 from tests.benchmarks.captures import Capture, read_capture
 from tests.benchmarks.dense_chain import DenseChain, score_view
 from tests.benchmarks.depth_metrics import DepthMetrics, constant_baseline
-from tests.benchmarks.sparse_chain import SparseChain
+from tests.benchmarks.poses.sparse_chain import SparseChain
 
 # What the paper reports: (cameras, poses) to MSE ×10⁻² and PSNR, window 7 (Table 2), …
 PAPER_TABLE_2 = {

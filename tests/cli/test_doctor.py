@@ -168,7 +168,7 @@ def test_every_variable_that_the_program_reads_is_known() -> None:
 
 
 def test_a_folder_for_kernels_that_cannot_be_written(tmp_path: Path) -> None:
-    package = Path(pano_mvs.__file__).parent / "algorithms"
+    package = Path(pano_mvs.__file__).parent
     assert kernel_cache_finding(package, {"NUMBA_CACHE_DIR": str(tmp_path / "new")}).state == "ok"
     (tmp_path / "file").write_text("x")
     finding = kernel_cache_finding(package, {"NUMBA_CACHE_DIR": str(tmp_path / "file")})

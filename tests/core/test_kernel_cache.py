@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -27,26 +28,45 @@ def test_folder_that_the_user_has_chosen_is_kept(tmp_path: Path, monkeypatch: py
     assert os.environ[kernel_cache.VARIABLE] == "mine"
 
 
+def test_folder_changes_with_the_kernels_of_every_layer(tmp_path: Path) -> None:
+    copy = tmp_path / "pano_mvs"
+    shutil.copytree(kernel_cache.PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    folder = kernel_cache.kernel_cache_folder()
+    assert kernel_cache.kernel_cache_folder(copy) == folder
+    with (copy / "geometry" / "kernels_sphere.py").open("a") as file:
+        file.write("# edited\n")
+    assert kernel_cache.kernel_cache_folder(copy) != folder
+
+
 CALL = """
-import numpy as np
 from numba import config
-from pano_mvs.algorithms.filters.speckle import remove_speckles
-from pano_mvs.scene import RangeMap
-remove_speckles(RangeMap(np.ones((8, 16), np.float32), np.full((8, 16), 99, np.uint8)))
+from pano_mvs.core.kernel_cache import kernel_cache_folder
+from pano_mvs.{module} import {kernel}
+{call}
 print(config.CACHE_DIR)
+assert config.CACHE_DIR == str(kernel_cache_folder())
 """
+KERNELS = {
+    "geometry.kernels_sphere": ("wrapped_row", "wrapped_row(-1, 4)"),
+    "algorithms.filters.kernels_components": (
+        "label_surfaces",
+        "import numpy; label_surfaces(numpy.ones((8, 16), numpy.float32), 1.0)",
+    ),
+}
 
 
+@pytest.mark.parametrize("module", KERNELS)
 @pytest.mark.parametrize("first", ["", "import numba\n"])
-def test_kernels_are_kept_there_whichever_is_imported_first(tmp_path: Path, first: str) -> None:
+def test_kernels_are_kept_there_whichever_is_imported_first(tmp_path: Path, first: str, module: str) -> None:
+    kernel, call = KERNELS[module]
     environment = {key: value for key, value in os.environ.items() if key != kernel_cache.VARIABLE}
     environment["XDG_CACHE_HOME"] = environment["LOCALAPPDATA"] = str(tmp_path)
-    command = [sys.executable, "-c", first + CALL]
+    command = [sys.executable, "-c", first + CALL.format(module=module, kernel=kernel, call=call)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     folder = Path(done.stdout.strip())
     if sys.platform != "darwin":
         assert folder.is_relative_to(tmp_path)
-    assert folder.is_dir()
+    assert list(folder.rglob("*.nbi"))
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="permissions as POSIX has them")

@@ -9,7 +9,7 @@ import pytest
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.running.run import Run
 from pano_mvs.session.session import open_session
-from tests.benchmarks.plan import PLUGIN, WORKFLOW
+from tests.benchmarks.engine.plan import PLUGIN, WORKFLOW
 from tests.engine.conftest import settle
 
 COUNT = 60

@@ -1,4 +1,4 @@
-"""Compiled: corners on a triangular lattice, their strength and place, and their binary descriptors."""
+"""Compiled: corners on a triangular lattice, their responses and positions, and their binary descriptors."""
 
 from __future__ import annotations
 
@@ -6,13 +6,18 @@ import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
+
+from pano_mvs.geometry.kernels_sphere import bilinear
+
+FloatArray = NDArray[np.float64]
 
 ARC = 10  # of the 18 cells of the ring
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def segment_score(differences):  # type: ignore[no-untyped-def]
-    """Return the greatest threshold at which an arc of a ring (18,) int64 is all brighter, or all darker."""
+def segment_score(differences: NDArray[np.int64]) -> np.int64:
+    """Return the greatest threshold at which an arc of a ring (18,) int64 is entirely brighter or entirely darker."""
     best = np.int64(0)
     for start in range(18):
         brighter, darker = np.int64(255), np.int64(255)
@@ -25,16 +30,23 @@ def segment_score(differences):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def score_corners(pictures, ring, margin, reach, threshold, scores):  # type: ignore[no-untyped-def]
+def score_corners(
+    pictures: NDArray[np.uint8],
+    ring: NDArray[np.int64],
+    margin: int,
+    reach: int,
+    threshold: int,
+    scores: NDArray[np.uint8],
+) -> None:
     """Write the segment test's score at every cell of the faces and `reach` cells beyond, 0 where it fails.
 
     Args:
         pictures: (20, side, side) uint8.
         ring: (18,) int64 offsets of the ring in a flat face.
         margin: cells of the array beyond the face.
-        reach: cells beyond the face to be scored.
+        reach: number of cells beyond the face to score.
         threshold: a difference must be greater.
-        scores: (20, side, side) uint8, zeros; written.
+        scores: (20, side, side) uint8, all 0; written.
     """
     side = pictures.shape[1]
     steps = side - 1 - 2 * margin
@@ -46,7 +58,7 @@ def score_corners(pictures, ring, margin, reach, threshold, scores):  # type: ig
                 at = (v + margin) * side + u + margin
                 center = np.int64(picture[at])
                 low, high = center - threshold, center + threshold
-                # An arc of ten of eighteen takes one of every two opposite cells.
+                # An arc of ten of the eighteen cells contains at least one of any two opposite cells.
                 a, b = np.int64(picture[at + ring[0]]), np.int64(picture[at + ring[9]])
                 c, d = np.int64(picture[at + ring[4]]), np.int64(picture[at + ring[13]])
                 brighter = (a > high or b > high) and (c > high or d > high)
@@ -61,15 +73,17 @@ def score_corners(pictures, ring, margin, reach, threshold, scores):  # type: ig
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def local_maxima(scores, neighbours, margin, reach, cells):  # type: ignore[no-untyped-def]
+def local_maxima(
+    scores: NDArray[np.uint8], neighbours: NDArray[np.int64], margin: int, reach: int, cells: NDArray[np.int64]
+) -> int:
     """Write the cells, (face, v, u), whose score is greatest among their six neighbours; return their number.
 
     Args:
         scores: (20, side, side) uint8.
-        neighbours: (6,) int64 offsets in a flat face; of two equal neighbours the one earlier in memory stays.
+        neighbours: (6,) int64 offsets in a flat face; of two equal neighbours, the one earlier in memory is kept.
         margin: cells of the array beyond the face.
-        reach: cells beyond the face to be looked at.
-        cells: (N, 3) int64; written as far as there is room.
+        reach: cells beyond the face to be searched.
+        cells: (N, 3) int64, written; further maxima are dropped.
     """
     side = scores.shape[1]
     steps = side - 1 - 2 * margin
@@ -94,7 +108,9 @@ def local_maxima(scores, neighbours, margin, reach, cells):  # type: ignore[no-u
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def harris_response(picture, at, side, window, weights):  # type: ignore[no-untyped-def]
+def harris_response(
+    picture: NDArray[np.uint8], at: int, side: int, window: NDArray[np.int64], weights: FloatArray
+) -> float:
     """Return det M − 0.04 tr² M at a cell of a flat picture, M the weighted sum of the gradients' squares.
 
     The gradient is Σ d_k I_k / 3 over the unit steps d_k to the six neighbours.
@@ -114,10 +130,10 @@ def harris_response(picture, at, side, window, weights):  # type: ignore[no-unty
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def hexagon_peak(center, around):  # type: ignore[no-untyped-def]
-    """Return lattice steps (u, v) from a cell to the top of the paraboloid through it and its six neighbours (6,).
+def hexagon_peak(center: float, around: FloatArray) -> tuple[float, float]:
+    """Return lattice steps (u, v) from a cell to the maximum of the paraboloid through it and its six neighbours (6,).
 
-    Nothing, (0, 0), where the paraboloid has no top within one step.
+    Returns (0, 0) if the paraboloid has no maximum within one step.
     """
     diagonal = math.sqrt(0.75)
     gx = (around[0] - around[3] + 0.5 * (around[1] + around[5] - around[2] - around[4])) / 3
@@ -137,8 +153,17 @@ def hexagon_peak(center, around):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def refine_corners(pictures, cells, window, weights, neighbours, margin, places, responses):  # type: ignore[no-untyped-def]
-    """Climb from cells to the nearest peak of the Harris response, at most two steps, and place it between the cells.
+def refine_corners(
+    pictures: NDArray[np.uint8],
+    cells: NDArray[np.int64],
+    window: NDArray[np.int64],
+    weights: FloatArray,
+    neighbours: NDArray[np.int64],
+    margin: int,
+    places: FloatArray,
+    responses: FloatArray,
+) -> None:
+    """Move corners to the nearest peak of the Harris response, at most two cells away, with subcell precision.
 
     Args:
         pictures: (20, side, side) uint8.
@@ -172,8 +197,16 @@ def refine_corners(pictures, cells, window, weights, neighbours, margin, places,
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def disc_is_clear(valid, faces, places, lattice_from_tangent, disc, margin, clear):  # type: ignore[no-untyped-def]
-    """Write whether all cells of a disc in the tangent plane around each place are valid.
+def disc_is_clear(
+    valid: NDArray[np.uint8],
+    faces: NDArray[np.int64],
+    places: FloatArray,
+    lattice_from_tangent: FloatArray,
+    disc: FloatArray,
+    margin: int,
+    clear: NDArray[np.bool_],
+) -> None:
+    """Write whether all cells of a disc in the tangent plane around each position are valid.
 
     Args:
         valid: (20, side, side) uint8, 0 where masked.
@@ -197,18 +230,28 @@ def disc_is_clear(valid, faces, places, lattice_from_tangent, disc, margin, clea
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def sample_lattice(picture, u, v):  # type: ignore[no-untyped-def]
-    """Return a picture (side, side) between four cells, at column u and row v."""
+def sample_lattice(picture: NDArray[np.uint8], u: float, v: float) -> float:
+    """Return the bilinear value of a picture (side, side) at column u and row v."""
     column, row = math.floor(u), math.floor(v)
-    right, down = u - column, v - row
-    upper = picture[row, column] * (1 - right) + picture[row, column + 1] * right
-    lower = picture[row + 1, column] * (1 - right) + picture[row + 1, column + 1] * right
-    return upper * (1 - down) + lower * down
+    upper_left, upper_right = picture[row, column], picture[row, column + 1]
+    lower_left, lower_right = picture[row + 1, column], picture[row + 1, column + 1]
+    value: float = bilinear(upper_left, upper_right, lower_left, lower_right, u - column, v - row)
+    return value
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def describe_corners(pictures, faces, places, lattice_from_tangent, disc, tests, margin, angles, bits):  # type: ignore[no-untyped-def]
-    """Write each corner's orientation, the direction of the disc's centroid, and its tests turned by it.
+def describe_corners(
+    pictures: NDArray[np.uint8],
+    faces: NDArray[np.int64],
+    places: FloatArray,
+    lattice_from_tangent: FloatArray,
+    disc: FloatArray,
+    tests: FloatArray,
+    margin: int,
+    angles: FloatArray,
+    bits: NDArray[np.uint8],
+) -> None:
+    """Write each corner's orientation (the direction of its disc's intensity centroid) and its rotated binary tests.
 
     Args:
         pictures: (20, side, side) uint8, smoothed.
@@ -216,10 +259,10 @@ def describe_corners(pictures, faces, places, lattice_from_tangent, disc, tests,
         places: (N, 2) float64 lattice coordinates (u, v).
         lattice_from_tangent: (N, 2, 2) float64.
         disc: (K, 2) float64 steps in the tangent plane.
-        tests: (8 B, 4) float64 steps (x, y) of the first and the second place of each test.
+        tests: (8 B, 4) float64 steps (x, y) of the first and the second point of each test.
         margin: cells of the array beyond the face.
         angles: (N,) float64; written.
-        bits: (N, B) uint8; bit i of byte j is test 8 j + i: whether the first place is darker. Written.
+        bits: (N, B) uint8; bit i of byte j is test 8 j + i: 1 if the first point is darker. Written.
     """
     for n in range(len(faces)):
         picture, turn = pictures[faces[n]], lattice_from_tangent[n]

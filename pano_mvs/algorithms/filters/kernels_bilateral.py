@@ -4,6 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+# The arguments of `apply_system` after the values.
+System = tuple[
+    float,
+    FloatArray,
+    FloatArray,
+    NDArray[np.int64],
+    NDArray[np.int32],
+    FloatArray,
+    float,
+    NDArray[np.int32],
+    FloatArray,
+]
 
 _EMPTY = -1
 # Colours are numbered within a cube of 128 bins per channel, of which the outermost stay empty.
@@ -13,31 +28,31 @@ _PRIME, _MULTIPLIER = 2147483647, 1640531527
 
 
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
-def _slot(key, bits):  # type: ignore[no-untyped-def]
-    """Return where to look first for a key in a table of 2^bits slots (multiplicative hashing without overflow)."""
-    return ((np.int64(key) % _PRIME * _MULTIPLIER) >> 20) & ((1 << bits) - 1)
+def _slot(key: int, bits: int) -> int:
+    """Return the first slot to probe for a key in a table of 2^bits slots (multiplicative hashing without overflow)."""
+    return int(((np.int64(key) % _PRIME * _MULTIPLIER) >> 20) & ((1 << bits) - 1))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _find(table, numbers, key, bits):  # type: ignore[no-untyped-def]
+def _find(table: NDArray[np.int64], numbers: NDArray[np.int32], key: int, bits: int) -> int:
     """Return the number of a key, or −1."""
     slot = _slot(key, bits)
     mask = (1 << bits) - 1
     while table[slot] != _EMPTY:
         if table[slot] == key:
-            return numbers[slot]
+            return int(numbers[slot])
         slot = (slot + 1) & mask
     return -1
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _find_or_add(table, numbers, key, bits, count):  # type: ignore[no-untyped-def]
+def _find_or_add(table: NDArray[np.int64], numbers: NDArray[np.int32], key: int, bits: int, count: int) -> int:
     """Return the number of a key; a new key gets the number `count`."""
     slot = _slot(key, bits)
     mask = (1 << bits) - 1
     while table[slot] != _EMPTY:
         if table[slot] == key:
-            return numbers[slot]
+            return int(numbers[slot])
         slot = (slot + 1) & mask
     table[slot] = key
     numbers[slot] = count
@@ -45,7 +60,7 @@ def _find_or_add(table, numbers, key, bits, count):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _bits_for(count):  # type: ignore[no-untyped-def]
+def _bits_for(count: int) -> int:
     """Return the size of a table, as a power of two, that stays at most half full."""
     bits = 4
     while (1 << bits) < 2 * count:
@@ -54,7 +69,9 @@ def _bits_for(count):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def number_elements(colors, cell_elements, gap_of_row):  # type: ignore[no-untyped-def]
+def number_elements(
+    colors: NDArray[np.int64], cell_elements: NDArray[np.int32], gap_of_row: NDArray[np.int32]
+) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """Return the coloured element of each pixel, (H, W) int32, and the key of each, in order of appearance.
 
     A key is element · COLOR_BINS³ + colour.
@@ -82,8 +99,8 @@ def number_elements(colors, cell_elements, gap_of_row):  # type: ignore[no-untyp
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _grow(keys, count, bits):  # type: ignore[no-untyped-def]
-    """Return a table of twice the size that holds the keys under their numbers, with its bits."""
+def _grow(keys: NDArray[np.int64], count: int, bits: int) -> tuple[NDArray[np.int64], NDArray[np.int32], int]:
+    """Return a table of twice the size that holds the same keys and numbers, and its bits."""
     bits += 1
     table, numbers = np.full(1 << bits, _EMPTY, np.int64), np.empty(1 << bits, np.int32)
     for number in range(count):
@@ -92,7 +109,9 @@ def _grow(keys, count, bits):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def number_vertices(element_keys, corners):  # type: ignore[no-untyped-def]
+def number_vertices(
+    element_keys: NDArray[np.int64], corners: NDArray[np.int32]
+) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """Return the four vertices of each coloured element, (E, 4) int32, and the key cell · COLOR_BINS³ + colour."""
     count = len(element_keys)
     bits = _bits_for(4 * count)
@@ -114,14 +133,16 @@ def number_vertices(element_keys, corners):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def blur_graph(vertex_keys, starts, neighbours, strengths):  # type: ignore[no-untyped-def]
+def blur_graph(
+    vertex_keys: NDArray[np.int64], starts: NDArray[np.int32], neighbours: NDArray[np.int32], strengths: FloatArray
+) -> tuple[NDArray[np.int64], NDArray[np.int32], FloatArray]:
     """Return the neighbours of each vertex in space and in colour as compressed rows: starts, indices, strengths."""
     count = len(vertex_keys)
     bits = _bits_for(count)
     table, numbers = np.full(1 << bits, _EMPTY, np.int64), np.empty(1 << bits, np.int32)
     for vertex in range(count):
         _find_or_add(table, numbers, vertex_keys[vertex], bits, vertex)
-    # Each edge is looked up from one end only: a look-up costs more than sorting edges by their ends.
+    # Look up each edge from one end only: a look-up costs more than sorting the edges by their ends.
     heads, tails, values = np.empty(count * 9, np.int32), np.empty(count * 9, np.int32), np.empty(count * 9)
     used = 0
     for vertex in range(count):
@@ -134,16 +155,21 @@ def blur_graph(vertex_keys, starts, neighbours, strengths):  # type: ignore[no-u
                     heads[used], tails[used], values[used] = vertex, other, strengths[position]
                     used += 1
         for step in (_LUMA, _BLUE, _RED):
-            # The outermost bins of the cube are never used, so that a step cannot run into the next row of it.
+            # The outermost bins of the cube are never used, so a step never wraps into the next row.
             other = _find(table, numbers, key + step, bits)
             if other >= 0:
                 heads[used], tails[used], values[used] = vertex, other, 1.0
                 used += 1
-    return _rows_from_edges(heads[:used], tails[:used], values[:used], count)
+    rows: tuple[NDArray[np.int64], NDArray[np.int32], FloatArray] = _rows_from_edges(
+        heads[:used], tails[:used], values[:used], count
+    )
+    return rows
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _rows_from_edges(heads, tails, values, count):  # type: ignore[no-untyped-def]
+def _rows_from_edges(
+    heads: NDArray[np.int32], tails: NDArray[np.int32], values: FloatArray, count: int
+) -> tuple[NDArray[np.int64], NDArray[np.int32], FloatArray]:
     """Return a symmetric graph as compressed rows: starts, indices, strengths."""
     starts = np.zeros(count + 1, np.int64)
     for edge in range(len(heads)):
@@ -161,7 +187,7 @@ def _rows_from_edges(heads, tails, values, count):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
-def _corner_weights(weights, weight_row, upper, lower):  # type: ignore[no-untyped-def]
+def _corner_weights(weights: FloatArray, weight_row: float, upper: float, lower: float) -> None:
     weights[0] = (1 - weight_row) * (1 - upper)
     weights[1] = (1 - weight_row) * upper
     weights[2] = weight_row * (1 - lower)
@@ -169,7 +195,16 @@ def _corner_weights(weights, weight_row, upper, lower):  # type: ignore[no-untyp
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def assemble(elements, targets, weights, count, gap_of_row, weight_row, weight_upper, weight_lower):  # type: ignore[no-untyped-def]
+def assemble(
+    elements: NDArray[np.int32],
+    targets: FloatArray,
+    weights: FloatArray,
+    count: int,
+    gap_of_row: NDArray[np.int32],
+    weight_row: FloatArray,
+    weight_upper: FloatArray,
+    weight_lower: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return, per coloured element, S 1 (E, 4), S C Sᵀ (E, 4, 4) and S C t (E, 4) restricted to its pixels."""
     height, width = elements.shape
     mass, gram, right = np.zeros((count, 4)), np.zeros((count, 4, 4)), np.zeros((count, 4))
@@ -190,8 +225,8 @@ def assemble(elements, targets, weights, count, gap_of_row, weight_row, weight_u
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def sum_at_vertices(values, vertices, count):  # type: ignore[no-untyped-def]
-    """Return the sum of the elements' corner values, (E, 4), at each vertex, (V,)."""
+def sum_at_vertices(values: FloatArray, vertices: NDArray[np.int32], count: int) -> FloatArray:
+    """Return the sum at each vertex, (V,), of the elements' corner values, (E, 4)."""
     result = np.zeros(count)
     for element in range(len(vertices)):
         for corner in range(4):
@@ -200,7 +235,15 @@ def sum_at_vertices(values, vertices, count):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def slice_pixels(elements, vertices, values, gap_of_row, weight_row, weight_upper, weight_lower):  # type: ignore[no-untyped-def]
+def slice_pixels(
+    elements: NDArray[np.int32],
+    vertices: NDArray[np.int32],
+    values: FloatArray,
+    gap_of_row: NDArray[np.int32],
+    weight_row: FloatArray,
+    weight_upper: FloatArray,
+    weight_lower: FloatArray,
+) -> FloatArray:
     """Return Sᵀ values at each pixel, (H, W)."""
     height, width = elements.shape
     result = np.empty((height, width))
@@ -218,7 +261,9 @@ def slice_pixels(elements, vertices, values, gap_of_row, weight_row, weight_uppe
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def blur(values, starts, indices, strengths, center):  # type: ignore[no-untyped-def]
+def blur(
+    values: FloatArray, starts: NDArray[np.int64], indices: NDArray[np.int32], strengths: FloatArray, center: float
+) -> FloatArray:
     """Return B̄ values: `center` times each value plus the strengths times its neighbours' values."""
     result = np.empty_like(values)
     for vertex in range(len(values)):
@@ -230,23 +275,41 @@ def blur(values, starts, indices, strengths, center):  # type: ignore[no-untyped
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def bistochastise(mass, starts, indices, strengths, center, iterations):  # type: ignore[no-untyped-def]
+def bistochastise(
+    mass: FloatArray,
+    starts: NDArray[np.int64],
+    indices: NDArray[np.int32],
+    strengths: FloatArray,
+    center: float,
+    iterations: int,
+) -> tuple[FloatArray, FloatArray]:
     """Return the diagonals n and m of D_n and D_m (Barron and Poole, algorithm 1)."""
     n = np.ones_like(mass)
     for _ in range(iterations):
         blurred = blur(n, starts, indices, strengths, center)
         for vertex in range(len(n)):
-            # No pixel has a share in some corners of cells: 0 / 0 there would stop the whole solution.
+            # Some corners receive no weight from any pixel; 0 / 0 there would make the whole solution NaN.
             n[vertex] = np.sqrt(n[vertex] * mass[vertex] / blurred[vertex]) if mass[vertex] > 0 else 0.0
-    # m from n, not the mass itself: then the rows of D_m − D_n B̄ D_n sum to exactly zero.
+    # Compute m from n instead of taking the mass: the rows of D_m − D_n B̄ D_n then sum to exactly zero.
     return n, n * blur(n, starts, indices, strengths, center)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def apply_system(values, smoothness, n, m, starts, indices, strengths, center, vertices, gram):  # type: ignore[no-untyped-def]
+def apply_system(
+    values: FloatArray,
+    smoothness: float,
+    n: FloatArray,
+    m: FloatArray,
+    starts: NDArray[np.int64],
+    indices: NDArray[np.int32],
+    strengths: FloatArray,
+    center: float,
+    vertices: NDArray[np.int32],
+    gram: FloatArray,
+) -> FloatArray:
     """Return (λ (D_m − D_n B̄ D_n) + S C Sᵀ) values."""
     blurred = blur(n * values, starts, indices, strengths, center)
-    result = smoothness * (m * values - n * blurred)
+    result: FloatArray = smoothness * (m * values - n * blurred)
     for element in range(len(vertices)):
         for a in range(4):
             total = 0.0
@@ -257,8 +320,10 @@ def apply_system(values, smoothness, n, m, starts, indices, strengths, center, v
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def solve(right, initial, diagonal, tolerance, iterations, system):  # type: ignore[no-untyped-def]
-    """Return the solution of the system by conjugate gradients with Jacobi preconditioning, and the iterations.
+def solve(
+    right: FloatArray, initial: FloatArray, diagonal: FloatArray, tolerance: float, iterations: int, system: System
+) -> tuple[FloatArray, int]:
+    """Return the solution by conjugate gradients with Jacobi preconditioning, and the number of iterations.
 
     `system` holds the arguments of `apply_system` after the values.
     """

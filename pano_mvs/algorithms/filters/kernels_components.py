@@ -6,10 +6,13 @@ import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
+
+from pano_mvs.geometry.kernels_sphere import wrapped_column
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _root(parents, index):  # type: ignore[no-untyped-def]
+def _root(parents: NDArray[np.int64], index: int) -> int:
     while parents[index] != index:
         parents[index] = parents[parents[index]]
         index = parents[index]
@@ -17,7 +20,7 @@ def _root(parents, index):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _join(parents, first, second):  # type: ignore[no-untyped-def]
+def _join(parents: NDArray[np.int64], first: int, second: int) -> None:
     a, b = _root(parents, first), _root(parents, second)
     # The smaller index wins, so that a component's label is its first pixel.
     if a < b:
@@ -27,7 +30,7 @@ def _join(parents, first, second):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def label_surfaces(ranges, max_step):  # type: ignore[no-untyped-def]
+def label_surfaces(ranges: NDArray[np.float32], max_step: float) -> NDArray[np.int64]:
     """Return for each pixel the flat index of the first pixel of its component, (H W) int64; −1 is invalid.
 
     Neighbours in a row or a column (over the seam, over the poles) are connected if neither range exceeds the other
@@ -39,16 +42,16 @@ def label_surfaces(ranges, max_step):  # type: ignore[no-untyped-def]
     for row in range(height):
         for column in range(width):
             here = row * width + column
-            right = row * width + (column + 1) % width
+            right = row * width + wrapped_column(row, column + 1, height, width)
             below = here + width
             if row == height - 1:
-                below = row * width + (column + width // 2) % width
+                below = row * width + wrapped_column(height, column, height, width)
             for other in (right, below):
                 a, b = flat[here], flat[other]
                 if math.isfinite(a) and math.isfinite(b) and max(a, b) <= min(a, b) * (1 + max_step):
                     _join(parents, here, other)
             if row == 0:
-                other = (column + width // 2) % width
+                other = wrapped_column(-1, column, height, width)
                 a, b = flat[here], flat[other]
                 if math.isfinite(a) and math.isfinite(b) and max(a, b) <= min(a, b) * (1 + max_step):
                     _join(parents, here, other)

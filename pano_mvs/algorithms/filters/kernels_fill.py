@@ -1,4 +1,4 @@
-"""Compiled: the nearest trusted ranges around each hole, and what they say of it."""
+"""Compiled: fill holes from the nearest trusted ranges around them."""
 
 from __future__ import annotations
 
@@ -6,15 +6,27 @@ import math
 
 import numpy as np
 from numba import njit, prange
+from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.kernels_reprojection import wrapped_column, wrapped_row
+from pano_mvs.geometry.kernels_sphere import wrapped_column, wrapped_row
+
+FloatArray = NDArray[np.float64]
 
 _DIRECTIONS = ((0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def nearest_trusted(inverse, trusted, stretches, row, column, d_row, d_column, max_steps):  # type: ignore[no-untyped-def]
-    """Return (1/range, steps) of the first trusted pixel in a direction; steps is 0 where there is none."""
+def nearest_trusted(
+    inverse: FloatArray,
+    trusted: NDArray[np.bool_],
+    stretches: NDArray[np.int64],
+    row: int,
+    column: int,
+    d_row: int,
+    d_column: int,
+    max_steps: int,
+) -> tuple[float, float]:
+    """Return (1/range, steps) of the first trusted pixel in a direction; steps is 0 if there is none."""
     height, width = inverse.shape
     # prange counts in unsigned integers, and unsigned plus signed would be a float.
     y, x = np.int64(row), np.int64(column)
@@ -29,10 +41,10 @@ def nearest_trusted(inverse, trusted, stretches, row, column, d_row, d_column, m
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def background_mean(values, steps, count, max_ratio):  # type: ignore[no-untyped-def]
-    """Return the mean of the farther ones of some 1/ranges, weighted by 1/steps, and the steps to the nearest.
+def background_mean(values: FloatArray, steps: FloatArray, count: int, max_ratio: float) -> tuple[float, float]:
+    """Return the mean of the farther of some 1/ranges, weighted by 1/steps, and the steps to the nearest of them.
 
-    The farther ones are those that exceed the second smallest by no more than a factor.
+    Values up to `max_ratio` times the second smallest count as far.
     """
     smallest, second = np.inf, np.inf
     for idx in range(count):
@@ -50,8 +62,15 @@ def background_mean(values, steps, count, max_ratio):  # type: ignore[no-untyped
 
 
 @njit(cache=True, error_model="numpy", nogil=True, parallel=True)
-def fill_holes(inverse, wanted, trusted, stretches, max_steps, max_ratio):  # type: ignore[no-untyped-def]
-    """Return for each wanted pixel its 1/range and the steps to the nearest pixel behind it; steps 0 is not filled."""
+def fill_holes(
+    inverse: FloatArray,
+    wanted: NDArray[np.bool_],
+    trusted: NDArray[np.bool_],
+    stretches: NDArray[np.int64],
+    max_steps: int,
+    max_ratio: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Return, for each wanted pixel, 1/range and the steps to the nearest background pixel (0: not filled)."""
     height, width = inverse.shape
     filled, distances = np.zeros((height, width)), np.zeros((height, width))
     for row in prange(height):

@@ -1,70 +1,53 @@
-"""Compiled: what a source view says about the points of a reference view."""
+"""Compiled: consistency of the points of a reference view with the range map of a source view."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-# What a source says of a point: it cannot tell, it sees the same surface, it sees through the point to something
-# farther away, or something nearer hides the point.
+from pano_mvs.geometry.kernels_sphere import angle_between, corners_at, pixel_from_ray
+
+FloatArray = NDArray[np.float64]
+Triple = FloatArray | tuple[float, float, float]
+
+# Verdicts of a source on a point: no information; it sees the same surface; it sees something farther away through
+# the point; something nearer hides the point.
 UNKNOWN, AGREES, CONTRADICTS, HIDDEN = 0, 1, 2, 3
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
-def wrapped_column(row, column, height, width):  # type: ignore[no-untyped-def]
-    """Return the column, in the picture, of a pixel at most one picture height outside of it."""
-    if row < 0 or row >= height:
-        column += width // 2
-    return column % width
-
-
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
-def wrapped_row(row, height):  # type: ignore[no-untyped-def]
-    """Return the row, in the picture, of a pixel at most one picture height outside of it."""
-    if row < 0:
-        return -1 - row
-    if row >= height:
-        return 2 * height - 1 - row
-    return row
-
-
 @njit(cache=True, error_model="numpy", nogil=True)
-def sample_range(ranges, x, y, max_step):  # type: ignore[no-untyped-def]
-    """Return the range between pixels: bilinear in 1/range where the four are one surface, else the nearest."""
+def sample_range(ranges: NDArray[np.float32], x: float, y: float, max_step: float) -> float:
+    """Return the range between pixels: bilinear in 1/range if the four lie on one surface, else that of the nearest."""
     height, width = ranges.shape
-    left, top = math.floor(x - 0.5), math.floor(y - 0.5)
-    weight_x, weight_y = x - 0.5 - left, y - 0.5 - top
-    row_0, row_1 = wrapped_row(top, height), wrapped_row(top + 1, height)
-    r00 = ranges[row_0, wrapped_column(top, left, height, width)]
-    r01 = ranges[row_0, wrapped_column(top, left + 1, height, width)]
-    r10 = ranges[row_1, wrapped_column(top + 1, left, height, width)]
-    r11 = ranges[row_1, wrapped_column(top + 1, left + 1, height, width)]
+    row_0, row_1, column_00, column_01, column_10, column_11, weight_x, weight_y = corners_at(x, y, height, width)
+    r00, r01 = ranges[row_0, column_00], ranges[row_0, column_01]
+    r10, r11 = ranges[row_1, column_10], ranges[row_1, column_11]
     near, far = min(min(r00, r01), min(r10, r11)), max(max(r00, r01), max(r10, r11))
     # min and max may swallow a NaN; the sum does not.
     if math.isfinite(r00 + r01 + r10 + r11) and far <= near * (1 + max_step):
         upper = (1 - weight_x) / r00 + weight_x / r01
         lower = (1 - weight_x) / r10 + weight_x / r11
-        return 1.0 / ((1 - weight_y) * upper + weight_y * lower)
+        return float(1.0 / ((1 - weight_y) * upper + weight_y * lower))
     if weight_y < 0.5:
         return float(r00) if weight_x < 0.5 else float(r01)
     return float(r10) if weight_x < 0.5 else float(r11)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def project(point, rotation, translation, height, width):  # type: ignore[no-untyped-def]
-    """Return (x, y, distance) of a point (3 numbers) of the reference frame in a source panorama."""
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def transformed(point: Triple, rotation: FloatArray, translation: FloatArray) -> tuple[float, float, float]:
+    """Return R x + t of a point (3 numbers)."""
     a = rotation[0, 0] * point[0] + rotation[0, 1] * point[1] + rotation[0, 2] * point[2] + translation[0]
     b = rotation[1, 0] * point[0] + rotation[1, 1] * point[1] + rotation[1, 2] * point[2] + translation[1]
     c = rotation[2, 0] * point[0] + rotation[2, 1] * point[1] + rotation[2, 2] * point[2] + translation[2]
-    x = (math.atan2(a, c) / (2 * math.pi) + 0.5) * width
-    y = (0.5 - math.atan2(-b, math.hypot(a, c)) / math.pi) * height
-    return x, y, math.sqrt(a * a + b * b + c * c)
+    return a, b, c
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def reprojection_angle(point, baseline, ratio):  # type: ignore[no-untyped-def]
-    """Return the angle, at the reference, between a point and where the source puts it along its own ray.
+def reprojection_angle(point: Triple, baseline: FloatArray, ratio: float) -> float:
+    """Return the angle, at the reference, between a point and the source's point along its own ray.
 
     `baseline` is the source's centre in the reference frame; the source puts the point at
     baseline + ratio (point − baseline).
@@ -72,21 +55,27 @@ def reprojection_angle(point, baseline, ratio):  # type: ignore[no-untyped-def]
     other_0 = baseline[0] + ratio * (point[0] - baseline[0])
     other_1 = baseline[1] + ratio * (point[1] - baseline[1])
     other_2 = baseline[2] + ratio * (point[2] - baseline[2])
-    cross_0 = point[1] * other_2 - point[2] * other_1
-    cross_1 = point[2] * other_0 - point[0] * other_2
-    cross_2 = point[0] * other_1 - point[1] * other_0
-    dot = point[0] * other_0 + point[1] * other_1 + point[2] * other_2
-    return math.atan2(math.sqrt(cross_0 * cross_0 + cross_1 * cross_1 + cross_2 * cross_2), dot)
+    angle: float = angle_between(point[0], point[1], point[2], other_0, other_1, other_2)
+    return angle
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def judge_point(point, rotation, translation, baseline, ranges, limits):  # type: ignore[no-untyped-def]
-    """Return (verdict, relative error, x, y, the source's range) of one source on one point.
+def judge_point(
+    point: Triple,
+    rotation: FloatArray,
+    translation: FloatArray,
+    baseline: FloatArray,
+    ranges: NDArray[np.float32],
+    limits: Triple,
+) -> tuple[int, float, float, float, float]:
+    """Return (verdict, relative error, x, y, source range) of one source on one point.
 
-    `limits` holds the largest relative error, the largest reprojection angle in radians, and the largest relative
-    step between neighbours that still count as one surface.
+    `limits` holds the maximum relative error, the maximum reprojection angle in radians, and the maximum relative
+    step between neighbours on one surface.
     """
-    x, y, distance = project(point, rotation, translation, ranges.shape[0], ranges.shape[1])
+    a, b, c = transformed(point, rotation, translation)
+    x, y = pixel_from_ray(a, b, c, ranges.shape[0], ranges.shape[1])
+    distance = math.sqrt(a * a + b * b + c * c)
     if not distance > 0:
         return UNKNOWN, 0.0, x, y, 0.0
     seen = sample_range(ranges, x, y, limits[2])
@@ -103,24 +92,36 @@ def judge_point(point, rotation, translation, baseline, ranges, limits):  # type
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def squared_motion(point, distance, baseline):  # type: ignore[no-untyped-def]
-    """Return the square of how far, in radians at the source, a point moves for its relative change of range.
+def squared_motion(point: Triple, distance: float, baseline: FloatArray) -> float:
+    """Return the squared motion of a point, in radians at the source, per relative change of its range.
 
-    That is (sin γ r / d)², γ the angle at the point between the two rays, r and d its distances from the two cameras.
+    It is (sin γ r / d)², where γ is the angle between the two rays and r and d are the distances of the cameras.
     """
     square = point[0] * point[0] + point[1] * point[1] + point[2] * point[2]
     along = point[0] * baseline[0] + point[1] * baseline[1] + point[2] * baseline[2]
     length = baseline[0] * baseline[0] + baseline[1] * baseline[1] + baseline[2] * baseline[2]
-    return max(square * length - along * along, 0.0) / distance**4
+    motion: float = max(square * length - along * along, 0.0) / distance**4
+    return motion
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def judge_rows(first, rows, ranges, rays, view, source_ranges, limits, verdicts, supports, motions):  # type: ignore[no-untyped-def]
-    """Write what one source says of the pixels of some rows.
+def judge_rows(
+    first: int,
+    rows: int,
+    ranges: NDArray[np.float32],
+    rays: FloatArray,
+    view: tuple[FloatArray, FloatArray],
+    source_ranges: NDArray[np.float32],
+    limits: FloatArray,
+    verdicts: NDArray[np.uint8],
+    supports: FloatArray,
+    motions: FloatArray,
+) -> None:
+    """Write the verdicts of one source on the pixels of some rows.
 
     Args:
         first: the first row.
-        rows: how many.
+        rows: number of rows.
         ranges: (H, W) float32 of the reference.
         rays: (H, W, 3) its rays.
         view: rotation (3, 3) and translation (3,) source_from_reference.
@@ -143,7 +144,8 @@ def judge_rows(first, rows, ranges, rays, view, source_ranges, limits, verdicts,
             verdict, _, _, _, seen = judge_point(point, rotation, translation, baseline, source_ranges, limits)
             verdicts[row, column] = verdict
             if verdict == AGREES:
-                _, _, distance = project(point, rotation, translation, ranges.shape[0], ranges.shape[1])
+                a, b, c = transformed(point, rotation, translation)
+                distance = math.sqrt(a * a + b * b + c * c)
                 share = reprojection_angle(point, baseline, seen / distance) / limits[1]
                 supports[row, column] = (1.0 - share * share) ** 2
                 motions[row, column] = squared_motion(point, distance, baseline)

@@ -6,12 +6,15 @@ import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.kernels_reprojection import wrapped_column, wrapped_row
+from pano_mvs.geometry.kernels_sphere import wrapped_column, wrapped_row
+
+FloatArray = NDArray[np.float64]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def solve_symmetric(a, b):  # type: ignore[no-untyped-def]
+def solve_symmetric(a: FloatArray, b: FloatArray) -> tuple[float, float, float, bool]:
     """Return the solution of a symmetric 3×3 system, a = (xx, xy, xz, yy, yz, zz), and whether it is well posed."""
     c00, c01, c02 = a[3] * a[5] - a[4] * a[4], a[2] * a[4] - a[1] * a[5], a[1] * a[4] - a[2] * a[3]
     determinant = a[0] * c00 + a[1] * c01 + a[2] * c02
@@ -26,7 +29,17 @@ def solve_symmetric(a, b):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def fit_plane(inverse, rays, row, column, stretch, radius, max_step, a, b):  # type: ignore[no-untyped-def]
+def fit_plane(
+    inverse: FloatArray,
+    rays: FloatArray,
+    row: int,
+    column: int,
+    stretch: int,
+    radius: int,
+    max_step: float,
+    a: FloatArray,
+    b: FloatArray,
+) -> tuple[float, float, float, bool]:
     """Return (x, y, z, ok) of the plane p with p · ray = 1 / range around a pixel, in units of its own 1 / range.
 
     `a` (6,) and `b` (3,) are scratch space.
@@ -58,18 +71,26 @@ def fit_plane(inverse, rays, row, column, stretch, radius, max_step, a, b):  # t
             b[1] += weight * value * y
             b[2] += weight * value * z
             count += 1
-    # Three points on a line leave the plane open; half of the smallest window does not.
+    # Three points may lie on a line; half of the smallest window cannot.
     if count < 5:
         return 0.0, 0.0, 0.0, False
-    return solve_symmetric(a, b)
+    plane: tuple[float, float, float, bool] = solve_symmetric(a, b)
+    return plane
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def fit_normals(pixels, stretches, radius, max_step, rows, normals):  # type: ignore[no-untyped-def]
+def fit_normals(
+    pixels: tuple[FloatArray, FloatArray, NDArray[np.bool_]],
+    stretches: NDArray[np.int64],
+    radius: int,
+    max_step: float,
+    rows: tuple[int, int],
+    normals: NDArray[np.float32],
+) -> None:
     """Write unit normals towards the camera of the rows [first, end) into (H, W, 3) float32.
 
-    `pixels` is (inverse ranges, rays, bool where a normal is wanted), (H, W, ...). Pixels that have a normal already
-    keep it; where no plane is defined nothing is written.
+    `pixels` is (inverse ranges, rays, bool where a normal is wanted), (H, W, ...). Pixels that already have a
+    normal keep it; nothing is written where the plane is undefined.
     """
     inverse, rays, wanted = pixels
     a, b = np.empty(6), np.empty(3)
@@ -80,7 +101,7 @@ def fit_normals(pixels, stretches, radius, max_step, rows, normals):  # type: ig
                 x, y, z, ok = fit_plane(inverse, rays, row, column, stretches[row], radius, max_step, a, b)
                 length = math.sqrt(x * x + y * y + z * z)
                 if ok and length > 0:
-                    # p · ray > 0 at the surface, so −p looks back at the camera.
+                    # p · ray > 0 at the surface, so −p points towards the camera.
                     normals[row, column, 0] = -x / length
                     normals[row, column, 1] = -y / length
                     normals[row, column, 2] = -z / length

@@ -1,4 +1,4 @@
-"""Compiled: how much of the surface around a pixel other views confirm."""
+"""Compiled: the share of the surface around a pixel that other views confirm."""
 
 from __future__ import annotations
 
@@ -6,13 +6,22 @@ import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.kernels_reprojection import wrapped_column, wrapped_row
+from pano_mvs.geometry.kernels_sphere import wrapped_column, wrapped_row
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def support_share(ranges, confirmed, stretches, radius, max_step, row, column):  # type: ignore[no-untyped-def]
-    """Return the share of a window, by number of pixels, that is confirmed and of the surface of the pixel."""
+def support_share(
+    ranges: NDArray[np.float32],
+    confirmed: NDArray[np.bool_],
+    stretches: NDArray[np.int64],
+    radius: int,
+    max_step: float,
+    row: int,
+    column: int,
+) -> float:
+    """Return the share of a window's pixels that are confirmed and on the surface of the pixel."""
     height, width = ranges.shape
     center = ranges[row, column]
     count = 0
@@ -28,8 +37,15 @@ def support_share(ranges, confirmed, stretches, radius, max_step, row, column): 
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def find_supported(ranges, confirmed, stretches, radius, max_step, least):  # type: ignore[no-untyped-def]
-    """Return the pixels, (H, W) bool, that are not confirmed while at least a share `least` of their window is."""
+def find_supported(
+    ranges: NDArray[np.float32],
+    confirmed: NDArray[np.bool_],
+    stretches: NDArray[np.int64],
+    radius: int,
+    max_step: float,
+    least: float,
+) -> NDArray[np.bool_]:
+    """Return the pixels, (H, W) bool, that are not confirmed although at least a share `least` of their window is."""
     height, width = ranges.shape
     supported = np.zeros((height, width), np.bool_)
     for row in range(height):

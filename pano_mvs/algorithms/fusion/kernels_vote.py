@@ -1,67 +1,71 @@
-"""Compiled: what one source says about the pixels of a reference view, and what its points add to theirs."""
+"""Compiled: the vote of one source on the pixels of a reference view, and the merging of its points and colours."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.kernels_reprojection import (
     AGREES,
     CONTRADICTS,
+    Triple,
     judge_point,
-    wrapped_column,
-    wrapped_row,
 )
+from pano_mvs.geometry.kernels_sphere import bilinear, corners_at, pixel_at
+
+FloatArray = NDArray[np.float64]
+Reference = tuple[NDArray[np.float32], FloatArray, NDArray[np.float32], NDArray[np.bool_]]
+Source = tuple[FloatArray, FloatArray, NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]]
+Tallies = tuple[NDArray[np.bool_], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8], FloatArray, FloatArray]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def add_color(image, x, y, weight, color):  # type: ignore[no-untyped-def]
-    """Add the colour between the pixels of a picture, bilinear, times a weight, to color (4,): r, g, b, weight."""
+def add_color(image: NDArray[np.uint8], x: float, y: float, weight: float, color: FloatArray) -> None:
+    """Add the bilinear colour at a position, times a weight, to color (4,): r, g, b, weight."""
     height, width = image.shape[0], image.shape[1]
-    left, top = math.floor(x - 0.5), math.floor(y - 0.5)
-    weight_x, weight_y = x - 0.5 - left, y - 0.5 - top
-    row_0, row_1 = wrapped_row(top, height), wrapped_row(top + 1, height)
-    column_00, column_01 = wrapped_column(top, left, height, width), wrapped_column(top, left + 1, height, width)
-    column_10 = wrapped_column(top + 1, left, height, width)
-    column_11 = wrapped_column(top + 1, left + 1, height, width)
+    row_0, row_1, column_00, column_01, column_10, column_11, weight_x, weight_y = corners_at(x, y, height, width)
     for channel in range(3):
-        upper = (1 - weight_x) * image[row_0, column_00, channel] + weight_x * image[row_0, column_01, channel]
-        lower = (1 - weight_x) * image[row_1, column_10, channel] + weight_x * image[row_1, column_11, channel]
-        color[channel] += weight * ((1 - weight_y) * upper + weight_y * lower)
+        upper_left, upper_right = image[row_0, column_00, channel], image[row_0, column_01, channel]
+        lower_left, lower_right = image[row_1, column_10, channel], image[row_1, column_11, channel]
+        value = bilinear(upper_left, upper_right, lower_left, lower_right, weight_x, weight_y)
+        color[channel] += weight * value
     color[3] += weight
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def pixel_footprint(view, normal):  # type: ignore[no-untyped-def]
+def pixel_footprint(view: Triple, normal: NDArray[np.float32]) -> float:
     """Return the surface area, per steradian, that a camera sees along `view` (camera to point): r² / cosine.
 
-    The cosine is held above 0.05, beyond which a normal is not known well enough.
+    The cosine is at least 0.05: normals are not accurate enough for less.
     """
     squared = view[0] * view[0] + view[1] * view[1] + view[2] * view[2]
     cosine = -(view[0] * normal[0] + view[1] * normal[1] + view[2] * normal[2]) / math.sqrt(squared)
-    return squared / max(cosine, 0.05)
+    footprint: float = squared / max(cosine, 0.05)
+    return footprint
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def confidence_at(confidence, x, y):  # type: ignore[no-untyped-def]
-    """Return the confidence of the pixel that holds a place."""
-    height, width = confidence.shape
-    row = min(max(math.floor(y), 0), height - 1)
-    return confidence[row, math.floor(x) % width]
+def confidence_at(confidence: NDArray[np.uint8], x: float, y: float) -> int:
+    """Return the confidence of the pixel at a position."""
+    row, column = pixel_at(x, y, confidence.shape[0], confidence.shape[1])
+    value: int = confidence[row, column]
+    return value
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def vote(reference, source, limits, rows, tallies):  # type: ignore[no-untyped-def]
+def vote(reference: Reference, source: Source, limits: FloatArray, rows: tuple[int, int], tallies: Tallies) -> None:
     """Add one source's vote on the pixels of the rows [first, end) of a reference view.
 
     `reference` is (ranges, rays, normals, bool where a point may be written); `source` is (rotation, translation of
-    source_from_reference, ranges, confidence, image); `limits` holds the three of `judge_point`, how many times larger
-    than the source's this view's footprint may be, the relative difference up to which points are merged, and the
-    confidence from which on a contradiction counts. `tallies` changes in place: yields (H, W) bool is set where the
+    source_from_reference, ranges, confidence, image); `limits` holds the three of `judge_point`, the maximum ratio
+    of this view's footprint to the source's, the maximum relative difference of merged points, and the minimum
+    confidence of a contradiction. `tallies` changes in place: yields (H, W) bool is set where the
     footprint is too large; counts, violations and confidence (H, W) uint8 of agreeing views, of contradicting ones, and
     the largest confidence; sums (H, W, 4) of weighted points in the reference frame and their weights; colors (H, W, 4)
-    likewise. Where no point may be written only counts and violations are kept.
+    likewise. Where no point may be written, only counts and violations change.
     """
     ranges, rays, normals, written = reference
     rotation, translation, source_ranges, source_confidence, image = source

@@ -1,7 +1,7 @@
 """Compiled to vector instructions: scalar products of descriptors of small whole numbers, and the nearest two of each.
 
 A product of two 16-bit numbers costs half of what a float's does (PMADDWD multiplies pairs and adds them up), all
-sums are exact, and the products never leave the registers: what is compared is taken from there.
+sums are exact, and the products are compared in the registers.
 """
 
 from __future__ import annotations
@@ -13,20 +13,21 @@ from llvmlite import ir
 from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import REGISTER_BYTES, element_pointer, load_unaligned
 
 LANES: Final = REGISTER_BYTES // 4
-"""How many products one register holds."""
+"""Number of products in one register."""
 
 # Registers for the products of some rows with some columns; 32 registers of 64 bytes, 16 of the narrower kinds.
 ROWS: Final = 6 if REGISTER_BYTES == 64 else 4
-"""How many rows are multiplied at once; the number of rows must be a multiple."""
+"""Number of rows that are multiplied at once; the number of rows must be a multiple."""
 _REGISTERS: Final = 4 if REGISTER_BYTES == 64 else 2
 COLUMNS: Final = _REGISTERS * LANES
-"""How many columns are multiplied at once; the number of columns must be a multiple."""
+"""Number of columns that are multiplied at once; the number of columns must be a multiple."""
 
-# Columns whose packed descriptors stay in the first-level cache while all rows pass by.
+# Panels whose packed descriptors stay in the first-level cache during one pass over the rows.
 _PANELS_PER_BLOCK: Final = max(1, 128 // COLUMNS)
 _PAIRS = {16: "llvm.x86.sse2.pmadd.wd", 32: "llvm.x86.avx2.pmadd.wd", 64: "llvm.x86.avx512.pmaddw.d.512"}
 
@@ -70,7 +71,7 @@ def _products(builder: Any, steps: Any, row_places: list[Any], panel: Any) -> li
 
 
 def _take(builder: Any, values: list[Any], indices: list[Any], places: list[Any]) -> None:
-    """Take the values of some columns into one row's greatest, second greatest and the column of the greatest."""
+    """Update one row's greatest value, second greatest value and column of the greatest."""
     best, second, nearest = (load_unaligned(builder, place) for place in places)
     for value, index in zip(values, indices, strict=True):
         second = _larger(builder, second, _smaller(builder, best, value))
@@ -81,29 +82,36 @@ def _take(builder: Any, values: list[Any], indices: list[Any], places: list[Any]
 
 
 @intrinsic
-def _match_tile(  # type: ignore[no-untyped-def]
-    typingctx, rows, packed, row_squares, column_squares, state, column_best, row, panel, steps
-):
+def _match_tile(
+    typingctx: Any,
+    rows: Any,
+    packed: Any,
+    row_squares: Any,
+    column_squares: Any,
+    state: Any,
+    column_best: Any,
+    row: Any,
+    panel: Any,
+    steps: Any,
+) -> Any:
     """Compare ROWS descriptors from `row` on with those of a panel of COLUMNS.
 
     Args:
-        typingctx: numba's.
+        typingctx: the typing context of numba.
         rows: (n, 2 steps) int16.
         packed: (panels, steps, COLUMNS, 2) int16.
         row_squares: (n,) int32 squared lengths.
         column_squares: (m,) int32.
         state: (n, 3, LANES) int32: greatest 2 a·b − |b|², the second greatest, the column of the greatest; updated.
         column_best: (m,) int32 greatest 2 a·b − |a|²; updated.
-        row: of the first row.
-        panel: which.
-        steps: pairs of components.
+        row: position of the first row.
+        panel: position of the panel.
+        steps: number of pairs of components.
     """
     place = types.uint64
-    signature = types.void(
-        rows, packed, row_squares, column_squares, state, column_best, place, place, place
-    )  # fmt: skip
+    signature = types.void(rows, packed, row_squares, column_squares, state, column_best, place, place, place)
 
-    def emit(context, builder, sig, args):  # type: ignore[no-untyped-def]
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> None:
         def pointer(argument: int, position: Any, to: Any) -> Any:
             return element_pointer(context, builder, sig.args[argument], args[argument], position, to)
 
@@ -140,7 +148,14 @@ def _match_tile(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def compare_all(rows, packed, row_squares, column_squares, state, column_best):  # type: ignore[no-untyped-def]
+def compare_all(
+    rows: NDArray[np.int16],
+    packed: NDArray[np.int16],
+    row_squares: NDArray[np.int32],
+    column_squares: NDArray[np.int32],
+    state: NDArray[np.int32],
+    column_best: NDArray[np.int32],
+) -> None:
     """Compare all descriptors of two pictures; see `_match_tile` for the arrays."""
     steps = np.uint64(packed.shape[1])
     for first_panel in range(0, packed.shape[0], _PANELS_PER_BLOCK):

@@ -1,21 +1,27 @@
-"""Compiled: how well planes through the pixels of a stretch of a row match the sources, and which way is better.
+"""Compiled: match planes through the pixels of part of a row with the sources, with the slopes of the match.
 
 A plane p holds the points X with p · X = 1, so that a ray d meets it at 1 / range = p · d, and a source sees the ray in
-the direction (R + t pᵀ) d: a homography of rays. Pixels of a stretch are computed together, one window sample at a
-time, in short separate loops (project, gather, blend, sum), as in the sweep.
+the direction (R + t pᵀ) d: a homography of rays. The pixels of a stretch are computed together, one window sample at
+a time, in short separate loops (project, gather, blend, sum), as in the sweep.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
+
+from pano_mvs.geometry.kernels_sphere import elevation_from_y, fast_azimuth, fast_dip
+
+FloatArray = NDArray[np.float64]
+Place = tuple[int, int, int, float, int, NDArray[np.int64], NDArray[np.int64]]
+Sources = tuple[
+    NDArray[np.uint64], NDArray[np.int64], NDArray[np.int64], FloatArray, NDArray[np.uint8], NDArray[np.int64]
+]
 
 _F = np.float32
 _U = np.uint64
-_HALF_PI, _PI, _TINY, _ONE = _F(np.pi / 2), _F(np.pi), _F(1e-30), _F(1)
-# Abramowitz and Stegun, Handbook of Mathematical Functions, 4.4.49: |error| ≤ 2e-8 on [0, 1].
-_A2, _A4, _A6, _A8 = _F(-0.3333314528), _F(0.1999355085), _F(-0.1420889944), _F(0.1065626393)
-_A10, _A12, _A14, _A16 = _F(-0.0752896400), _F(0.0429096138), _F(-0.0161657367), _F(0.0028662257)
+_TINY, _ONE = _F(1e-30), _F(1)
 _LOW, _STEP = _U(65535), _F(1 / 256)
 
 # Rows of the sums over a window, per source: samples b (less the reference's mean), products with the reference a
@@ -25,17 +31,16 @@ SUM_G, SUM_GG, SUM_GB, SUM_GA = 3, 6, 12, 15
 SUMS = 18
 
 
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
-def _atan_unit(a):  # type: ignore[no-untyped-def]
-    """Return atan of a number in [0, 1], float32."""
-    s = a * a
-    tail = _A8 + s * (_A10 + s * (_A12 + s * (_A14 + s * _A16)))
-    return a * (_ONE + s * (_A2 + s * (_A4 + s * (_A6 + s * tail))))
-
-
 @njit(cache=True, error_model="numpy", nogil=True)
-def weigh_window(grey, place, color_scale, weights, centred, moments):  # type: ignore[no-untyped-def]
-    """Weigh the window samples of a stretch of pixels by likeness to the window's centre.
+def weigh_window(
+    grey: NDArray[np.float32],
+    place: Place,
+    color_scale: np.float32,
+    weights: NDArray[np.float32],
+    centred: NDArray[np.float32],
+    moments: NDArray[np.float32],
+) -> None:
+    """Weight the window samples of a stretch of pixels by their similarity to the window's centre.
 
     Args:
         grey: (H + 2 pad, W + 2 pad) float32.
@@ -73,7 +78,14 @@ def weigh_window(grey, place, color_scale, weights, centred, moments):  # type: 
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def inverse_ranges(planes, azimuth, first, level, dip, inverse):  # type: ignore[no-untyped-def]
+def inverse_ranges(
+    planes: NDArray[np.float32],
+    azimuth: NDArray[np.float32],
+    first: int,
+    level: np.float32,
+    dip: np.float32,
+    inverse: NDArray[np.float32],
+) -> None:
     """Write q = p · d, (n,), for planes (3, n) and rays of one row: sin θ and cos θ from column `first` on."""
     start = _U(first)
     for i in range(_U(inverse.shape[0])):
@@ -82,10 +94,17 @@ def inverse_ranges(planes, azimuth, first, level, dip, inverse):  # type: ignore
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def project_samples(  # type: ignore[no-untyped-def]
-    azimuth, first, inverse, matrix, shape, index, weights, slopes
-):
-    """Find where rays of one row, of inverse ranges q, arrive in a packed source, and how fast that moves with q.
+def project_samples(
+    azimuth: NDArray[np.float32],
+    first: int,
+    inverse: NDArray[np.float32],
+    matrix: NDArray[np.float32],
+    shape: NDArray[np.int64],
+    index: NDArray[np.int32],
+    weights: NDArray[np.float32],
+    slopes: NDArray[np.float32],
+) -> None:
+    """Project rays of one row, at inverse ranges q, into a packed source, with the derivative by q.
 
     Args:
         azimuth: (2, ·) float32 sin θ and cos θ of the columns.
@@ -110,22 +129,10 @@ def project_samples(  # type: ignore[no-untyped-def]
         x = m00 * s + m01 * c + o0 + t0 * q
         y = m10 * s + m11 * c + o1 + t1 * q
         z = m20 * s + m21 * c + o2 + t2 * q
-        ax, ay, az = abs(x), abs(y), abs(z)
-        small = ax if ax < az else az
-        large = az if ax < az else ax
-        turn = _atan_unit(small / (large + _TINY))
-        turn = _HALF_PI - turn if ax > az else turn
-        turn = _PI - turn if z < _F(0) else turn
-        turn = -turn if x < _F(0) else turn
         level_squared = x * x + z * z + _TINY
         level = np.sqrt(level_squared)
-        small = ay if ay < level else level
-        large = level if ay < level else ay
-        dip = _atan_unit(small / (large + _TINY))
-        dip = _HALF_PI - dip if ay > level else dip
-        dip = -dip if y < _F(0) else dip
-        px = turn * x_scale + x_middle
-        py = dip * y_scale + y_middle
+        px = fast_azimuth(x, z) * x_scale + x_middle
+        py = fast_dip(y, level) * y_scale + y_middle
         column, row = np.int32(px), np.int32(py)
         column = last_column if column > last_column else column
         row = last_row if row > last_row else row
@@ -137,7 +144,9 @@ def project_samples(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def gather_samples(packed, start, index, patches):  # type: ignore[no-untyped-def]
+def gather_samples(
+    packed: NDArray[np.uint64], start: int, index: NDArray[np.int32], patches: NDArray[np.uint64]
+) -> None:
     """Fetch the 2×2 patches, four numbers of 16 bits each, at `start + index`; all (n,) but `packed`."""
     base = _U(start)
     for i in range(_U(index.shape[0])):
@@ -145,7 +154,14 @@ def gather_samples(packed, start, index, patches):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def blend_samples(patches, weights, slopes, means, samples, gradients):  # type: ignore[no-untyped-def]
+def blend_samples(
+    patches: NDArray[np.uint64],
+    weights: NDArray[np.float32],
+    slopes: NDArray[np.float32],
+    means: NDArray[np.float32],
+    samples: NDArray[np.float32],
+    gradients: NDArray[np.float32],
+) -> None:
     """Blend 2×2 patches into samples less `means`, and their slopes along the epipolar curve against q; all (n,)."""
     for i in range(_U(patches.shape[0])):
         patch = patches[i]
@@ -162,7 +178,12 @@ def blend_samples(patches, weights, slopes, means, samples, gradients):  # type:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def add_samples(samples, window_weights, reference, sums):  # type: ignore[no-untyped-def]
+def add_samples(
+    samples: NDArray[np.float32],
+    window_weights: NDArray[np.float32],
+    reference: NDArray[np.float32],
+    sums: NDArray[np.float32],
+) -> None:
     """Add one window sample of each pixel to the sums of one source; (n,) each, sums (SUMS, n)."""
     for i in range(_U(samples.shape[0])):
         b = samples[i]
@@ -173,7 +194,15 @@ def add_samples(samples, window_weights, reference, sums):  # type: ignore[no-un
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def add_gradients(samples, gradients, window_weights, reference, u, v, sums):  # type: ignore[no-untyped-def]
+def add_gradients(
+    samples: NDArray[np.float32],
+    gradients: NDArray[np.float32],
+    window_weights: NDArray[np.float32],
+    reference: NDArray[np.float32],
+    u: np.float32,
+    v: np.float32,
+    sums: NDArray[np.float32],
+) -> None:
     """Add the slopes of one window sample, at columns u and rows v from the centre, to the sums of one source."""
     for i in range(_U(samples.shape[0])):
         g = gradients[i]
@@ -197,7 +226,7 @@ def add_gradients(samples, gradients, window_weights, reference, u, v, sums):  #
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def row_matrix(pose, elevation, matrix):  # type: ignore[no-untyped-def]
+def row_matrix(pose: FloatArray, elevation: float, matrix: NDArray[np.float32]) -> None:
     """Write the (3, 4) matrix that takes (sin θ, cos θ, 1, q) of a row to directions in a source of pose (3, 4)."""
     level, dip = np.cos(elevation), -np.sin(elevation)
     for a in range(3):
@@ -208,7 +237,15 @@ def row_matrix(pose, elevation, matrix):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def sum_windows(planes, place, azimuth, window, sources, sums, votes):  # type: ignore[no-untyped-def]
+def sum_windows(
+    planes: NDArray[np.float32],
+    place: Place,
+    azimuth: NDArray[np.float32],
+    window: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
+    sources: Sources,
+    sums: NDArray[np.float32],
+    votes: NDArray[np.bool_],
+) -> None:
     """Sum up the windows of a stretch of pixels, on their planes, over each source.
 
     Args:
@@ -219,7 +256,7 @@ def sum_windows(planes, place, azimuth, window, sources, sums, votes):  # type: 
         sources: (·,) uint64 packed pictures, (S,) where each begins, (S, 2) their sizes, (S, 3, 4) float64
             source_from_reference, (·,) uint8 which patches may vote, empty if all may, and (S,) where each begins.
         sums: (S, SUMS, n) float32, written.
-        votes: (S, n) bool, written: whether the source may vote on the pixel.
+        votes: (S, n) bool, written: True where the source may vote on the pixel.
     """
     row, first, height, stretch, pad, rows, columns = place
     weights, centred, means = window
@@ -232,7 +269,7 @@ def sum_windows(planes, place, azimuth, window, sources, sums, votes):  # type: 
     sums[:] = _F(0)
     for k in range(side * side):
         v, column = rows[k // side], columns[k % side]
-        elevation = np.pi * (0.5 - (row + v + 0.5) / height)
+        elevation = elevation_from_y(row + v + 0.5, height)
         start = pad + first + column
         inverse_ranges(planes, azimuth, start, _F(np.cos(elevation)), _F(-np.sin(elevation)), inverse)
         for s in range(len(starts)):

@@ -1,9 +1,10 @@
-"""Compiled: the most likely planes of the pixels of some rows, given the pictures and the planes so far."""
+"""Compiled: the most likely planes of the pixels of some rows, given the pictures and the current planes."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from pano_mvs.algorithms.patchmatch.kernels_match import (
     SUM_AB,
@@ -14,21 +15,32 @@ from pano_mvs.algorithms.patchmatch.kernels_match import (
     SUM_GB,
     SUM_GG,
     SUMS,
+    Sources,
     sum_windows,
     weigh_window,
 )
 from pano_mvs.algorithms.patchmatch.kernels_planes import tangent_basis
 
+FloatArray = NDArray[np.float64]
+Reference = tuple[NDArray[np.float32], NDArray[np.float32], int, FloatArray, NDArray[np.int64], NDArray[np.int64]]
+Numbers = tuple[np.float32, np.float32, float, float, float, np.float32]
+
 _F = np.float32
 _U = np.uint64
-# So many pixels of a row are computed together: their sums then fit the cache.
+# Number of pixels of a row that are computed together, so that their sums fit the cache.
 STRETCH = 256
-# Windows that correlate less show different things.
-_LEAST_CORRELATION = 0.2
+# Windows with a lower correlation show different surfaces.
+_MIN_CORRELATION = 0.2
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def correlate_sources(sums, votes, variance, noise, correlations):  # type: ignore[no-untyped-def]
+def correlate_sources(
+    sums: NDArray[np.float32],
+    votes: NDArray[np.bool_],
+    variance: NDArray[np.float32],
+    noise: np.float32,
+    correlations: NDArray[np.float32],
+) -> None:
     """Write the correlation of each source with the reference, (S, n); −2 where it has no vote."""
     for s in range(correlations.shape[0]):
         for i in range(_U(correlations.shape[1])):
@@ -39,7 +51,7 @@ def correlate_sources(sums, votes, variance, noise, correlations):  # type: igno
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def least_of_best(correlations, i, held):  # type: ignore[no-untyped-def]
+def least_of_best(correlations: NDArray[np.float32], i: int, held: NDArray[np.float32]) -> np.float32:
     """Return the least correlation of the better half of the voting sources (rounded up); 1 if there is none."""
     votes = 0
     for s in range(correlations.shape[0]):
@@ -55,19 +67,31 @@ def least_of_best(correlations, i, held):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def add_source(sums, i, correlation, variance, noise, samples, normal, right):  # type: ignore[no-untyped-def]
-    """Add what one source says of pixel i to the normal equations of (α, β, γ).
+def add_source(
+    sums: NDArray[np.float32],
+    i: int,
+    correlation: float,
+    variance: np.float32,
+    noise: np.float32,
+    samples: float,
+    normal: FloatArray,
+    right: FloatArray,
+) -> None:
+    """Add one source's measurement of pixel i to the normal equations of (α, β, γ).
 
-    With ã and b̃ the samples over their spread and J = ∂b̃ / ∂(α, β, γ), freed of its mean and of its part along b̃ (both
-    are blind to brightness and contrast): Σ w J Jᵀ and Σ w J ã, over the variance of what b̃ leaves unexplained of ã.
+    With ã and b̃ the samples over their spread and J = ∂b̃ / ∂(α, β, γ), less its mean and its component along b̃ (which
+    makes both invariant to brightness and contrast): Σ w J Jᵀ and Σ w J ã, over the variance of ã that b̃ leaves
+    unexplained.
     """
     mean = np.float64(sums[SUM_B, i])
     spread = sums[SUM_BB, i] - mean * mean + noise
     information = samples * spread / (noise + spread * (1 - correlation * correlation))
     both = np.sqrt(np.float64(variance + noise) * spread)
-    along = ((sums[SUM_GB, i] - sums[SUM_G, i] * mean) / spread,
-             (sums[SUM_GB + 1, i] - sums[SUM_G + 1, i] * mean) / spread,
-             (sums[SUM_GB + 2, i] - sums[SUM_G + 2, i] * mean) / spread)  # fmt: skip
+    along = (
+        (sums[SUM_GB, i] - sums[SUM_G, i] * mean) / spread,
+        (sums[SUM_GB + 1, i] - sums[SUM_G + 1, i] * mean) / spread,
+        (sums[SUM_GB + 2, i] - sums[SUM_G + 2, i] * mean) / spread,
+    )
     entry = 0
     for a in range(3):
         right[a] += information * (sums[SUM_GA + a, i] / both - correlation * along[a])
@@ -78,24 +102,33 @@ def add_source(sums, i, correlation, variance, noise, samples, normal, right):  
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def solve_first(a, b):  # type: ignore[no-untyped-def]
+def solve_first(a: FloatArray, b: FloatArray) -> float:
     """Return the first unknown of a positive definite 3×3 system, a = (xx, xy, xz, yy, yz, zz)."""
     c00, c01, c02 = a[3] * a[5] - a[4] * a[4], a[2] * a[4] - a[1] * a[5], a[1] * a[4] - a[2] * a[3]
     determinant = a[0] * c00 + a[1] * c01 + a[2] * c02
-    return (c00 * b[0] + c01 * b[1] + c02 * b[2]) / determinant
+    first: float = (c00 * b[0] + c01 * b[1] + c02 * b[2]) / determinant
+    return first
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def most_likely_steps(sums, correlations, variance, noise, prior, samples, steps):  # type: ignore[no-untyped-def]
-    """Write the step of α, (n,), that is most likely given the pictures and the planes so far.
+def most_likely_steps(
+    sums: NDArray[np.float32],
+    correlations: NDArray[np.float32],
+    variance: NDArray[np.float32],
+    noise: np.float32,
+    prior: tuple[float, float],
+    samples: float,
+    steps: NDArray[np.float32],
+) -> None:
+    """Write the most likely step of α, (n,), given the pictures and the current planes.
 
     Args:
         sums: (S, SUMS, n) float32 of the windows, see `sum_windows`.
-        correlations: (S, n) float32; the better half of the sources counts, for the others may be hidden.
+        correlations: (S, n) float32; only the better half of the sources counts, as the others may be occluded.
         variance: (n,) float32 of the reference's windows.
         noise: variance of a grey level.
-        prior: (2,) information on α, and on β and γ, of the planes so far, in 1 / q².
-        samples: how many independent samples a window counts for.
+        prior: information on α, and on β and γ, of the current planes, in 1 / q².
+        samples: number of independent samples that a window counts for.
         steps: (n,) float32, written.
     """
     normal, right = np.empty(6), np.empty(3)
@@ -104,7 +137,7 @@ def most_likely_steps(sums, correlations, variance, noise, prior, samples, steps
         normal[:] = 0.0
         right[:] = 0.0
         normal[0], normal[3], normal[5] = prior[0], prior[1], prior[1]
-        least = max(least_of_best(correlations, i, held), _F(_LEAST_CORRELATION))
+        least = max(least_of_best(correlations, i, held), _F(_MIN_CORRELATION))
         for s in range(correlations.shape[0]):
             if correlations[s, i] >= least:
                 add_source(sums[s], i, np.float64(correlations[s, i]), variance[i], noise, samples, normal, right)
@@ -112,19 +145,27 @@ def most_likely_steps(sums, correlations, variance, noise, prior, samples, steps
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def refine_rows(first_row, rows, planes, reference, sources, numbers, inverse):  # type: ignore[no-untyped-def]
+def refine_rows(
+    first_row: int,
+    rows: int,
+    planes: NDArray[np.float32],
+    reference: Reference,
+    sources: Sources,
+    numbers: Numbers,
+    inverse: NDArray[np.float32],
+) -> None:
     """Write the refined inverse ranges of some rows.
 
     Args:
         first_row: the first row.
-        rows: how many.
-        planes: (3, H, W) float32, the planes so far, which are also the prior.
+        rows: number of rows.
+        planes: (3, H, W) float32, the current planes, which are also the prior.
         reference: of the reference picture: (H + 2 pad, W + 2 pad) float32 grey, (2, W + 2 pad) float32 sin θ and cos θ
-            of the columns, pad, (H,) columns that make a step in u, (side,) int64 rows of the window, (H, side) int64
+            of the columns, pad, (H,) columns per step in u, (side,) int64 rows of the window, (H, side) int64
             columns of the window.
         sources: see `sum_windows`.
         numbers: 1 / width in grey levels of the window's weights, noise, information of the prior on α, the same on β
-            and γ, samples, largest step in q.
+            and γ, samples, maximum step in q.
         inverse: (H, W) float32, written.
     """
     grey, azimuth, pad, stretches, window_rows, window_columns = reference

@@ -1,8 +1,8 @@
-"""Compiled: how well matches agree with essential matrices and relative poses.
+"""Compiled: agreement of matches with essential matrices and relative poses.
 
 The cost of a match is min(r² / threshold², 1) with the squared Sampson error r² = e² / D. For a pose with |t| = 1 and
 a = R p: e = t · (a × q), D = 2 − (t·a)² − (t·q)² − 2 e². With c = a·q the rays meet in front of both cameras where
-t·a < c t·q and c t·a < t·q; where the angle between a and q is below twice the threshold, noise decides that.
+t·a < c t·q and c t·a < t·q; if the angle between a and q is below twice the threshold, noise decides.
 """
 
 from __future__ import annotations
@@ -11,12 +11,15 @@ import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-_CHECKS = (16, 32, 64, 128)  # matches after which a hypothesis is given up if it lags too far behind
+FloatArray = NDArray[np.float64]
+
+_CHECKS = (16, 32, 64, 128)  # number of matches after which a hypothesis that lags too far behind is dropped
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _squared_error(e, p, q):  # type: ignore[no-untyped-def]
+def _squared_error(e: FloatArray, p: FloatArray, q: FloatArray) -> tuple[float, float]:
     """Return the numerator and denominator of the squared Sampson error for an essential matrix."""
     x = e[0, 0] * p[0] + e[0, 1] * p[1] + e[0, 2] * p[2]
     y = e[1, 0] * p[0] + e[1, 1] * p[1] + e[1, 2] * p[2]
@@ -30,8 +33,10 @@ def _squared_error(e, p, q):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _essential_cost(essential, first, second, squared_threshold, limit, sigmas):  # type: ignore[no-untyped-def]
-    """Return the cost of all matches, or infinity once it is at least, or in all likelihood, above the limit."""
+def _essential_cost(
+    essential: FloatArray, first: FloatArray, second: FloatArray, squared_threshold: float, limit: float, sigmas: float
+) -> float:
+    """Return the cost of all matches, or infinity once it reaches the limit or most likely will."""
     count = len(first)
     mean = limit / count
     total = 0.0
@@ -49,18 +54,27 @@ def _essential_cost(essential, first, second, squared_threshold, limit, sigmas):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def rank_essentials(essentials, first, second, threshold, limit, sigmas, best, costs):  # type: ignore[no-untyped-def]
-    """Write the essential matrices of least cost, in ascending order.
+def rank_essentials(
+    essentials: FloatArray,
+    first: FloatArray,
+    second: FloatArray,
+    threshold: float,
+    limit: float,
+    sigmas: float,
+    best: NDArray[np.int64],
+    costs: FloatArray,
+) -> None:
+    """Write the essential matrices with the lowest costs, in ascending order of cost.
 
     Args:
         essentials: (N, 3, 3).
-        first: (M, 3) unit bearings in random order: what the first few say of a hypothesis is taken for all.
+        first: (M, 3) unit bearings in random order: the first few stand for all.
         second: (M, 3) unit bearings.
         threshold: in radians.
-        limit: only costs below this.
-        sigmas: how far, in standard deviations, the cost of a hypothesis may lag behind the best after some matches.
-        best: (K,) int64, written: positions in `essentials`, -1 where there are fewer.
-        costs: (K,) float64, written, infinity where there are fewer.
+        limit: costs of at least this are ignored.
+        sigmas: standard deviations by which the cost of a hypothesis may exceed the best after some matches.
+        best: (K,) int64, written: positions in `essentials`, -1 if there are fewer.
+        costs: (K,) float64, written, infinity if there are fewer.
     """
     best[:] = -1
     costs[:] = np.inf
@@ -78,7 +92,15 @@ def rank_essentials(essentials, first, second, threshold, limit, sigmas, best, c
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def pose_residuals(rotation, t, first, second, threshold, residuals, agreeing):  # type: ignore[no-untyped-def]
+def pose_residuals(
+    rotation: FloatArray,
+    t: FloatArray,
+    first: FloatArray,
+    second: FloatArray,
+    threshold: float,
+    residuals: FloatArray,
+    agreeing: NDArray[np.bool_],
+) -> None:
     """Write the Sampson error of each match, and whether it agrees: a small error, and in front of both cameras."""
     far = math.cos(2.0 * threshold)
     for idx in range(len(first)):
@@ -97,7 +119,7 @@ def pose_residuals(rotation, t, first, second, threshold, residuals, agreeing): 
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def pose_cost(rotation, t, first, second, threshold):  # type: ignore[no-untyped-def]
+def pose_cost(rotation: FloatArray, t: FloatArray, first: FloatArray, second: FloatArray, threshold: float) -> float:
     """Return the cost of all matches for a pose; a match behind a camera costs 1."""
     far = math.cos(2.0 * threshold)
     squared_threshold = threshold * threshold
@@ -121,8 +143,10 @@ def pose_cost(rotation, t, first, second, threshold):  # type: ignore[no-untyped
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def direction_costs(rotated, second, directions, threshold, costs):  # type: ignore[no-untyped-def]
-    """Write the costs of each direction and of its opposite, (N, 2), where the rotation is known.
+def direction_costs(
+    rotated: FloatArray, second: FloatArray, directions: FloatArray, threshold: float, costs: FloatArray
+) -> None:
+    """Write the costs of each direction and of its opposite, (N, 2), given the rotation.
 
     Args:
         rotated: (M, 3) bearings of the first image turned into the second.
@@ -164,7 +188,7 @@ def direction_costs(rotated, second, directions, threshold, costs):  # type: ign
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _rotation_of(essential, t, sign, rotation):  # type: ignore[no-untyped-def]
+def _rotation_of(essential: FloatArray, t: FloatArray, sign: float, rotation: FloatArray) -> None:
     """Write the rotation of E = ±[t]× R, made orthonormal row by row.
 
     With |t| = 1 it is cof(E) ∓ [t]× E (Horn 1990, "Recovering baseline and orientation from essential matrix").
@@ -192,9 +216,11 @@ def _rotation_of(essential, t, sign, rotation):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def decompose_facing(essential, first, second, threshold, rotation, t):  # type: ignore[no-untyped-def]
-    """Write the decomposition of an essential matrix of norm √2 with most inliers in front of both cameras."""
-    # t is normal to all columns; the longest product of two of them is the most exact.
+def decompose_facing(
+    essential: FloatArray, first: FloatArray, second: FloatArray, threshold: float, rotation: FloatArray, t: FloatArray
+) -> None:
+    """Write the decomposition of an essential matrix of norm √2 with the most inliers in front of both cameras."""
+    # t is normal to all columns; the longest cross product of two of them is the most accurate.
     longest = -1.0
     normal = np.empty(3)
     for column in range(3):
@@ -242,8 +268,15 @@ def decompose_facing(essential, first, second, threshold, rotation, t):  # type:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def count_chance(rotation, t, first, second, pairs, threshold):  # type: ignore[no-untyped-def]
-    """Return how many of the pairs (N, 2) of different matches agree when their rays are swapped, and how many."""
+def count_chance(
+    rotation: FloatArray,
+    t: FloatArray,
+    first: FloatArray,
+    second: FloatArray,
+    pairs: NDArray[np.int64],
+    threshold: float,
+) -> tuple[int, int]:
+    """Return how many pairs (N, 2) of different matches agree with their rays swapped, and the number of such pairs."""
     squared_threshold = threshold * threshold
     agreeing, drawn = 0, 0
     for n in range(len(pairs)):
@@ -265,8 +298,10 @@ def count_chance(rotation, t, first, second, pairs, threshold):  # type: ignore[
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def best_turn(first, second, samples, squared_chord, rotation):  # type: ignore[no-untyped-def]
-    """Write the rotation, of those through two matches each, (N, 2), that most matches agree on.
+def best_turn(
+    first: FloatArray, second: FloatArray, samples: NDArray[np.int64], squared_chord: float, rotation: FloatArray
+) -> None:
+    """Write the rotation, of those through the pairs of matches (N, 2), with which most matches agree.
 
     The frames (a + b, a − b, their product) of two rays correspond in the least-squares sense.
     """

@@ -14,24 +14,26 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+FloatArray = NDArray[np.float64]
+
 _DEGREE = 10
-_MOST_INTERVALS = 64
-# Exponents of x, y, z. Quadratic monomials, then cubic ones: the ten that are eliminated, then x (z², z, 1),
-# y (z², z, 1) and (z³, z², z, 1).
-_QUADRATIC = (
-    (2, 0, 0), (1, 1, 0), (0, 2, 0), (1, 0, 1), (0, 1, 1), (0, 0, 2), (1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0),
-)  # fmt: skip
-_CUBIC = (
-    (3, 0, 0), (0, 3, 0), (2, 1, 0), (1, 2, 0), (2, 0, 1), (2, 0, 0), (0, 2, 1), (0, 2, 0), (1, 1, 1), (1, 1, 0),
-    (1, 0, 2), (1, 0, 1), (1, 0, 0), (0, 1, 2), (0, 1, 1), (0, 1, 0), (0, 0, 3), (0, 0, 2), (0, 0, 1), (0, 0, 0),
-)  # fmt: skip
-_LINEAR = ((1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0))
+_MAX_INTERVALS = 64
+Monomials = tuple[tuple[int, ...], ...]
 
 
-def _product_idx(
-    left: tuple[tuple[int, ...], ...], right: tuple[tuple[int, ...], ...], products: tuple[tuple[int, ...], ...]
-) -> NDArray[np.int64]:
-    """Return which monomial the product of two is."""
+def _monomials(text: str) -> Monomials:
+    """Return the exponents of x, y and z of monomials, such as (2, 0, 1) of "xxz"."""
+    return tuple(tuple(name.count(variable) for variable in "xyz") for name in text.split())
+
+
+# Cubic monomials: the ten that are eliminated, then x (z², z, 1), y (z², z, 1) and (z³, z², z, 1).
+_LINEAR = _monomials("x y z 1")
+_QUADRATIC = _monomials("xx xy yy xz yz zz x y z 1")
+_CUBIC = _monomials("xxx yyy xxy xyy xxz xx yyz yy xyz xy xzz xz x yzz yz y zzz zz z 1")
+
+
+def _product_idx(left: Monomials, right: Monomials, products: Monomials) -> NDArray[np.int64]:
+    """Return the position among `products` of the product of each two monomials."""
     return np.array([[products.index(tuple(i + j for i, j in zip(a, b, strict=True))) for b in right] for a in left])
 
 
@@ -40,7 +42,7 @@ _CUBES = _product_idx(_QUADRATIC, _LINEAR, _CUBIC)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _null_space(first, second, basis):  # type: ignore[no-untyped-def]
+def _null_space(first: FloatArray, second: FloatArray, basis: FloatArray) -> bool:
     """Write four orthonormal solutions of the five equations, (4, 9), by Householder reflections."""
     columns = np.empty((5, 9))
     for n in range(5):
@@ -56,7 +58,7 @@ def _null_space(first, second, basis):  # type: ignore[no-untyped-def]
             return False
         head = columns[n, n]
         columns[n, n] = head + length if head > 0 else head - length
-        # The reflection's vector stays in the column, with |v|² = 2.
+        # The column now holds the reflection's vector, with |v|² = 2.
         factor = 1.0 / math.sqrt(length * (length + abs(head)))
         for k in range(n, 9):
             columns[n, k] *= factor
@@ -79,21 +81,21 @@ def _null_space(first, second, basis):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _add_square(a, b, sign, out):  # type: ignore[no-untyped-def]
+def _add_square(a: FloatArray, b: FloatArray, sign: float, out: FloatArray) -> None:
     for i in range(4):
         for j in range(4):
             out[_SQUARES[i, j]] += sign * a[i] * b[j]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _add_cube(a, b, sign, out):  # type: ignore[no-untyped-def]
+def _add_cube(a: FloatArray, b: FloatArray, sign: float, out: FloatArray) -> None:
     for i in range(10):
         for j in range(4):
             out[_CUBES[i, j]] += sign * a[i] * b[j]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def cubic_equations(basis, equations):  # type: ignore[no-untyped-def]
+def cubic_equations(basis: FloatArray, equations: FloatArray) -> None:
     """Write the coefficients (10, 20) of 2 E Eᵀ E − tr(E Eᵀ) E = 0 and det E = 0 in the monomials `_CUBIC`."""
     linear = np.empty((3, 3, 4))
     for i in range(3):
@@ -126,8 +128,8 @@ def cubic_equations(basis, equations):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _eliminate(equations):  # type: ignore[no-untyped-def]
-    """Reduce the first ten columns to the identity, as far as rows 4 to 9 need it; return whether that is possible."""
+def _eliminate(equations: FloatArray) -> bool:
+    """Reduce the first ten columns to the identity as far as rows 4 to 9 need it; return False if they are singular."""
     for column in range(10):
         pivot = column
         for row in range(column + 1, 10):
@@ -154,7 +156,7 @@ def _eliminate(equations):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _coefficients_in_z(equations, table):  # type: ignore[no-untyped-def]
+def _coefficients_in_z(equations: FloatArray, table: FloatArray) -> None:
     """Write B(z), (3, 3, 5), ascending powers, with B (x, y, 1)ᵀ = 0: rows 4, 6, 8 less z times rows 5, 7, 9."""
     table[:] = 0.0
     for n in range(3):
@@ -167,7 +169,7 @@ def _coefficients_in_z(equations, table):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _add_determinant(table, polynomial):  # type: ignore[no-untyped-def]
+def _add_determinant(table: FloatArray, polynomial: FloatArray) -> None:
     """Write det B(z), ascending powers, (11,)."""
     polynomial[:] = 0.0
     minor = np.empty(7)
@@ -183,16 +185,16 @@ def _add_determinant(table, polynomial):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _value(polynomial, degree, z):  # type: ignore[no-untyped-def]
-    value = polynomial[degree]
+def _value(polynomial: FloatArray, degree: int, z: float) -> float:
+    value: float = polynomial[degree]
     for power in range(degree - 1, -1, -1):
         value = value * z + polynomial[power]
     return value
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _bracketed_root(polynomial, low, high, low_value):  # type: ignore[no-untyped-def]
-    """Return the root between two points of different sign: Newton's method, halving where it leaves the bracket."""
+def _bracketed_root(polynomial: FloatArray, low: float, high: float, low_value: float) -> float:
+    """Return the root between two points of different sign: Newton's method, bisection when it leaves the bracket."""
     z = 0.5 * (low + high)
     for _ in range(80):
         value, derivative = polynomial[_DEGREE], 0.0
@@ -214,10 +216,10 @@ def _bracketed_root(polynomial, low, high, low_value):  # type: ignore[no-untype
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _sturm_chain(polynomial, chain):  # type: ignore[no-untyped-def]
-    """Write the polynomial, its derivative, and each time what is left of a division, negated; return how many.
+def _sturm_chain(polynomial: FloatArray, chain: FloatArray) -> int:
+    """Write the Sturm chain (polynomial, derivative, negated remainders); return its number of members.
 
-    Member n is of degree 10 − n. All are scaled to coefficients of 1 at most, which leaves the signs as they are.
+    Member n is of degree 10 − n. All are scaled to coefficients of at most 1, which does not change the signs.
     """
     chain[0, _DEGREE] = polynomial[_DEGREE]
     for power in range(_DEGREE):
@@ -243,7 +245,7 @@ def _sturm_chain(polynomial, chain):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _sign_changes(chain, members, z):  # type: ignore[no-untyped-def]
+def _sign_changes(chain: FloatArray, members: int, z: float) -> int:
     changes = 0
     negative = _value(chain[0], _DEGREE, z) < 0.0
     for n in range(1, members):
@@ -255,17 +257,17 @@ def _sign_changes(chain, members, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def roots_within_one(polynomial, roots):  # type: ignore[no-untyped-def]
-    """Write the real roots in [-1, 1] where a polynomial of degree ten changes sign; return how many there are.
+def roots_within_one(polynomial: FloatArray, roots: FloatArray) -> int:
+    """Write the real roots in [-1, 1] where a polynomial of degree ten changes sign; return their number.
 
-    Sturm's theorem tells how many there are in an interval; intervals are halved until they hold one each.
+    Sturm's theorem counts the roots in an interval; intervals are halved until each holds one.
     """
     chain = np.empty((_DEGREE + 1, _DEGREE + 1))
     members = _sturm_chain(polynomial, chain)
     if members < 2:
         return 0
-    bounds = np.empty((_MOST_INTERVALS, 2))
-    changes = np.empty((_MOST_INTERVALS, 2), np.int64)
+    bounds = np.empty((_MAX_INTERVALS, 2))
+    changes = np.empty((_MAX_INTERVALS, 2), np.int64)
     bounds[0, 0], bounds[0, 1] = -1.0, 1.0
     changes[0, 0], changes[0, 1] = _sign_changes(chain, members, -1.0), _sign_changes(chain, members, 1.0)
     waiting, found = 1, 0
@@ -281,7 +283,7 @@ def roots_within_one(polynomial, roots):  # type: ignore[no-untyped-def]
                 roots[found] = _bracketed_root(chain[0], low, high, low_value)
                 found += 1
                 continue
-        if waiting + 2 > _MOST_INTERVALS or found == _DEGREE:
+        if waiting + 2 > _MAX_INTERVALS or found == _DEGREE:
             break
         middle = 0.5 * (low + high)
         at_middle = _sign_changes(chain, members, middle)
@@ -294,8 +296,8 @@ def roots_within_one(polynomial, roots):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _write_essential(basis, table, z, essential):  # type: ignore[no-untyped-def]
-    """Write the matrix of norm √2 of a root z, with (x, y, 1) normal to the rows of B(z); return whether it exists."""
+def _write_essential(basis: FloatArray, table: FloatArray, z: float, essential: FloatArray) -> bool:
+    """Write the matrix of norm √2 for a root z, with (x, y, 1) normal to the rows of B(z); return whether it exists."""
     rows = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -322,8 +324,14 @@ def _write_essential(basis, table, z, essential):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def solve_five(first, second, samples, essentials, sample_idx):  # type: ignore[no-untyped-def]
-    """Write all essential matrices through the samples, and return how many there are.
+def solve_five(
+    first: FloatArray,
+    second: FloatArray,
+    samples: NDArray[np.int64],
+    essentials: FloatArray,
+    sample_idx: NDArray[np.int64],
+) -> int:
+    """Write all essential matrices through the samples, and return their number.
 
     Args:
         first: (M, 3) unit bearings.

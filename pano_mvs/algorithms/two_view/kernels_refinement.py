@@ -1,4 +1,4 @@
-"""Compiled: the least Cauchy loss of the spherical Sampson error over the five degrees of freedom of a relative pose.
+"""Compiled: minimise the Cauchy loss of the spherical Sampson error over the five degrees of freedom of a pose.
 
 With a = R p, e = q·(t × a) and D = |t × a|² + |t × q|² − 2 e² = 2 − (t·a)² − (t·q)² − 2 e² the residual is e / √D, and
 ∂e/∂ω = (t·a) q − (q·a) t, ∂e/∂t = a × q, ∂D/∂ω = 2 (t·a) (t × a) − 4 e ∂e/∂ω,
@@ -11,11 +11,14 @@ import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _tangents(t, basis):  # type: ignore[no-untyped-def]
-    """Write two unit vectors that are normal to t and to one another, (2, 3)."""
+def _tangents(t: FloatArray, basis: FloatArray) -> None:
+    """Write two orthonormal vectors that are normal to t, (2, 3)."""
     least = 0
     for axis in range(1, 3):
         if abs(t[axis]) < abs(t[least]):
@@ -29,8 +32,8 @@ def _tangents(t, basis):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _cost(rotation, t, first, second, squared_scale):  # type: ignore[no-untyped-def]
-    """Return Σ log(1 + r² / scale²); one logarithm serves many factors."""
+def _cost(rotation: FloatArray, t: FloatArray, first: FloatArray, second: FloatArray, squared_scale: float) -> float:
+    """Return Σ log(1 + r² / scale²), with one logarithm for the product of many factors."""
     total, factor = 0.0, 1.0
     for idx in range(len(first)):
         p, q = first[idx], second[idx]
@@ -49,7 +52,15 @@ def _cost(rotation, t, first, second, squared_scale):  # type: ignore[no-untyped
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _normal_equations(rotation, t, first, second, squared_scale, hessian, gradient):  # type: ignore[no-untyped-def]
+def _normal_equations(
+    rotation: FloatArray,
+    t: FloatArray,
+    first: FloatArray,
+    second: FloatArray,
+    squared_scale: float,
+    hessian: FloatArray,
+    gradient: FloatArray,
+) -> None:
     """Write the weighted normal equations, (5, 5) and (5,)."""
     basis = np.empty((2, 3))
     _tangents(t, basis)
@@ -93,7 +104,7 @@ def _normal_equations(rotation, t, first, second, squared_scale, hessian, gradie
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _solve(hessian, gradient, step):  # type: ignore[no-untyped-def]
+def _solve(hessian: FloatArray, gradient: FloatArray, step: FloatArray) -> bool:
     """Write the solution of H s = −g by Cholesky's factors of H, and return whether H is positive."""
     for i in range(5):
         for j in range(i + 1):
@@ -119,7 +130,14 @@ def _solve(hessian, gradient, step):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _move(rotation, t, step, shrink, moved_rotation, moved_t):  # type: ignore[no-untyped-def]
+def _move(
+    rotation: FloatArray,
+    t: FloatArray,
+    step: FloatArray,
+    shrink: float,
+    moved_rotation: FloatArray,
+    moved_t: FloatArray,
+) -> None:
     """Write the pose after a step: exp(ω) R by Rodrigues' formula, and t moved along its tangents."""
     x, y, z = shrink * step[0], shrink * step[1], shrink * step[2]
     squared = x * x + y * y + z * z
@@ -144,15 +162,17 @@ def _move(rotation, t, step, shrink, moved_rotation, moved_t):  # type: ignore[n
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def refine_pose(rotation, t, first, second, scale, max_iterations):  # type: ignore[no-untyped-def]
-    """Move a pose to the least Cauchy loss: Gauss–Newton with reweighting and step halving.
+def refine_pose(
+    rotation: FloatArray, t: FloatArray, first: FloatArray, second: FloatArray, scale: float, max_iterations: int
+) -> None:
+    """Minimise the Cauchy loss of a pose by Gauss–Newton with reweighting and step halving.
 
     Args:
         rotation: (3, 3) of second_from_first, overwritten.
         t: (3,) its unit translation, overwritten.
         first: (M, 3) unit bearings.
         second: (M, 3) unit bearings.
-        scale: residual, in radians, at which the weight has fallen to a half.
+        scale: residual, in radians, with weight ½.
         max_iterations: maximum number of steps.
     """
     squared_scale = scale * scale

@@ -49,7 +49,6 @@ def all_findings(cache: Path | None = None, out: Path | None = None) -> Iterator
         cache: the cache folder; by default that of a preset that is run in the current folder.
         out: the folder of the results, with the same default.
     """
-    import pano_mvs
     from pano_mvs.cli.doctor.libraries import library_findings
     from pano_mvs.cli.doctor.machine import folder_findings, kernel_cache_finding, machine_findings
     from pano_mvs.cli.doctor.packages import package_findings
@@ -61,7 +60,7 @@ def all_findings(cache: Path | None = None, out: Path | None = None) -> Iterator
     yield from package_findings()
     yield from library_findings()
     yield from machine_findings()
-    yield kernel_cache_finding(Path(pano_mvs.__file__).parent / "algorithms")
+    yield kernel_cache_finding()
     variable = os.environ.get(CACHE_VARIABLE)
     yield from folder_findings("cache", cache or Path(variable or ".pano-mvs"), "--cache DIR")
     yield from folder_findings("results", out or Path("out"), "--out DIR")

@@ -11,8 +11,8 @@ from functools import partial
 from pathlib import Path
 
 from pano_mvs.cli.doctor.finding import Finding
+from pano_mvs.core.kernel_cache import PACKAGE, kernel_cache_folder
 from pano_mvs.core.kernel_cache import VARIABLE as KERNEL_VARIABLE
-from pano_mvs.core.kernel_cache import kernel_cache_folder
 from pano_mvs.core.memory import free_memory_bytes, size_text
 from pano_mvs.core.paths import below, exists, is_folder
 from pano_mvs.engine.executors.threads import available_threads
@@ -63,7 +63,7 @@ def machine_findings(
             yield _finding(name, "warning", "is set, but nothing reads it", remedy)
 
 
-def kernel_cache_finding(package: Path, environment: Mapping[str, str] = os.environ) -> Finding:
+def kernel_cache_finding(package: Path = PACKAGE, environment: Mapping[str, str] = os.environ) -> Finding:
     """Return whether compiled kernels can be cached; otherwise every process compiles them again."""
     chosen = environment.get(KERNEL_VARIABLE)
     try:

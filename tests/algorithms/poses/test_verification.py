@@ -20,7 +20,7 @@ from pano_mvs.testing.room import capture_poses, default_room, render
 from pano_mvs.testing.scenes import white_room
 from tests.algorithms.poses.aliased_capture import same_matches, view_of
 from tests.algorithms.room_pictures import SIZE_HW, WHOLE, Vector, moved, room_capture, room_matches
-from tests.benchmarks.placements import judge_placements
+from tests.benchmarks.poses.placements import judge_placements
 from tests.known import known
 
 Matches = tuple[dict[str, Features], dict[tuple[str, str], TwoView]]

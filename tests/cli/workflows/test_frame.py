@@ -18,9 +18,9 @@ from pano_mvs.io.poses.files import read_poses
 from pano_mvs.io.ranges.files import read_range_tiff
 from tests.algorithms.poses.synthetic_capture import random_rotation
 from tests.cli.conftest import SMALL, Command, run_json
+from tests.docs.test_frames import block
 from tests.io.images.pictures import app1, exif, full_sphere, xmp
 from tests.stored import read_picture
-from tests.test_docs_frames import block
 
 UP = np.array([0.0, -1.0, 0.0])
 

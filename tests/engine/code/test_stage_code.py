@@ -65,11 +65,11 @@ def changed_by(module: str, old: str, new: str) -> set[str]:
     [
         ("algorithms.poses.adjustment.kernels_patch_alignment", "= 12, 0.003", "= 12, 0.004", {"poses.refine"}),
         ("algorithms.features.kernels_sphorb", "ARC = 10", "ARC = 9", {"features.sphorb"}),
-        ("algorithms.patchmatch.kernels_planes", "_FEWEST, _LEAST_SPREAD = 5.0", "_FEWEST, _LEAST_SPREAD = 6.0",
+        ("algorithms.patchmatch.kernels_planes", "_MIN_WEIGHT, _MIN_SPREAD = 5.0", "_MIN_WEIGHT, _MIN_SPREAD = 6.0",
          {"depth.patchmatch"}),
         ("algorithms.sweep.numba.kernels_sgm", "_BLOCK = ", "_BLOCK = 1 * ", SWEEPS),
         ("algorithms.filters.kernels_fill", "_DIRECTIONS = ", "_DIRECTIONS = 1 * ", {"filters.fill"}),
-        ("algorithms.two_view.kernels_five_point", "_MOST_INTERVALS = ", "_MOST_INTERVALS = 1 + ",
+        ("algorithms.two_view.kernels_five_point", "_MAX_INTERVALS = ", "_MAX_INTERVALS = 1 + ",
          {"matches.brute_force"}),
     ],
 )  # fmt: skip

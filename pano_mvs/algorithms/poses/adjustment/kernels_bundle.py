@@ -1,7 +1,7 @@
 """Compiled: the reduced camera system of bundle adjustment (Schur complement), point by point.
 
 The residual of an observation is r = Bᵀ x / |x| with x = R (X − C) and B (3, 2) the tangent plane of the observed
-ray: it is the sine of the angular error, wherever on the sphere. Triggs et al., "Bundle Adjustment — A Modern
+ray: it is the sine of the angular error anywhere on the sphere. Triggs et al., "Bundle Adjustment — A Modern
 Synthesis", 2000, section 6.1.
 """
 
@@ -9,10 +9,25 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
+
+from pano_mvs.geometry.kernels_sphere import angle_between
+
+FloatArray = NDArray[np.float64]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _derivatives(rotations, centers, points, bases, weights, t, k, p, rows):  # type: ignore[no-untyped-def]
+def _derivatives(
+    rotations: FloatArray,
+    centers: FloatArray,
+    points: FloatArray,
+    bases: FloatArray,
+    weights: FloatArray,
+    t: int,
+    k: int,
+    p: int,
+    rows: FloatArray,
+) -> None:
     """Write √w-scaled rows of derivatives by (ω, C) and X, and the residual, (2, 10), of observation t."""
     dx, dy, dz = points[p, 0] - centers[k, 0], points[p, 1] - centers[k, 1], points[p, 2] - centers[k, 2]
     r00, r01, r02 = rotations[k, 0, 0], rotations[k, 0, 1], rotations[k, 0, 2]
@@ -24,7 +39,7 @@ def _derivatives(rotations, centers, points, bases, weights, t, k, p, rows):  # 
     for k2 in range(2):
         b0, b1, b2 = bases[t, 0, k2], bases[t, 1, k2], bases[t, 2, k2]
         along = (b0 * x0 + b1 * x1 + b2 * x2) * inverse
-        # ∂r/∂x, the row that the chain rule multiplies from the left
+        # ∂r/∂x, which the chain rule multiplies from the left
         d0 = root * (b0 - along * x0 * inverse) * inverse
         d1 = root * (b1 - along * x1 * inverse) * inverse
         d2 = root * (b2 - along * x2 * inverse) * inverse
@@ -41,8 +56,8 @@ def _derivatives(rotations, centers, points, bases, weights, t, k, p, rows):  # 
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _invert_symmetric(matrix, inverses, p):  # type: ignore[no-untyped-def]
-    """Write the inverse of a symmetric positive definite (3, 3) matrix to the place p."""
+def _invert_symmetric(matrix: FloatArray, inverses: FloatArray, p: int) -> None:
+    """Write the inverse of a symmetric positive definite (3, 3) matrix to inverses[p]."""
     a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
     d, e, f = matrix[1, 1], matrix[1, 2], matrix[2, 2]
     i00, i01, i02 = d * f - e * e, c * e - b * f, b * e - c * d
@@ -54,7 +69,18 @@ def _invert_symmetric(matrix, inverses, p):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _add_observation(rows, t, row, p, band, gradient, diagonal, couplings, block, point_gradients):  # type: ignore[no-untyped-def]
+def _add_observation(
+    rows: FloatArray,
+    t: int,
+    row: int,
+    p: int,
+    band: FloatArray,
+    gradient: FloatArray,
+    diagonal: FloatArray,
+    couplings: FloatArray,
+    block: FloatArray,
+    point_gradients: FloatArray,
+) -> None:
     """Add one observation's products of derivatives to its camera's and its point's blocks."""
     p0, p1, p2, residual_0 = rows[0, 6], rows[0, 7], rows[0, 8], rows[0, 9]
     q0, q1, q2, residual_1 = rows[1, 6], rows[1, 7], rows[1, 8], rows[1, 9]
@@ -79,10 +105,21 @@ def _add_observation(rows, t, row, p, band, gradient, diagonal, couplings, block
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _eliminate(start, stop, p, image_idx, couplings, inverses, point_gradients, product, band, gradient):  # type: ignore[no-untyped-def]
-    """Take one point out of the system: S −= W V⁻¹ Wᵀ, g −= W V⁻¹ b, over all pairs of its observations.
+def _eliminate(
+    start: int,
+    stop: int,
+    p: int,
+    image_idx: NDArray[np.int32],
+    couplings: FloatArray,
+    inverses: FloatArray,
+    point_gradients: FloatArray,
+    product: FloatArray,
+    band: FloatArray,
+    gradient: FloatArray,
+) -> None:
+    """Eliminate one point from the system: S −= W V⁻¹ Wᵀ, g −= W V⁻¹ b, over all pairs of its observations.
 
-    Rows are written out: a compiler that cannot know that the arrays lie apart would load W V⁻¹ again for each entry.
+    Rows are written out: the compiler cannot know that the arrays do not overlap, and would reload W V⁻¹ every time.
     """
     for t in range(start, stop):
         row = 6 * image_idx[t]
@@ -124,12 +161,22 @@ def _eliminate(start, stop, p, image_idx, couplings, inverses, point_gradients, 
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def reduced_system(rotations, centers, points, starts, image_idx, bases, weights, damping, width):  # type: ignore[no-untyped-def]
-    """Return the camera system after elimination of all points, and what is needed to get the points back.
+def reduced_system(
+    rotations: FloatArray,
+    centers: FloatArray,
+    points: FloatArray,
+    starts: NDArray[np.intp],
+    image_idx: NDArray[np.int32],
+    bases: FloatArray,
+    weights: FloatArray,
+    damping: float,
+    width: int,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return the camera system after elimination of all points, and the blocks for back-substitution.
 
     Observations are sorted by point; those of point p are starts[p] to starts[p + 1]. One thread, fixed order.
 
-    `width` diagonals are kept: 6 (d + 1) where cameras d positions apart share a point.
+    The band has `width` diagonals: 6 (d + 1) if cameras up to d positions apart share a point.
 
     Returns:
         band (6N, width), the lower half of the symmetric system: band[j, d] is its entry in row j + d, column j;
@@ -157,8 +204,16 @@ def reduced_system(rotations, centers, points, starts, image_idx, bases, weights
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def moved_points(points, starts, image_idx, couplings, inverses, point_gradients, steps):  # type: ignore[no-untyped-def]
-    """Return where the points go, (P, 3), when the cameras take their steps (N, 6): X − V⁻¹ (b + Wᵀ s)."""
+def moved_points(
+    points: FloatArray,
+    starts: NDArray[np.intp],
+    image_idx: NDArray[np.int32],
+    couplings: FloatArray,
+    inverses: FloatArray,
+    point_gradients: FloatArray,
+    steps: FloatArray,
+) -> FloatArray:
+    """Return the points, (P, 3), after the cameras' steps s (N, 6): X − V⁻¹ (b + Wᵀ s)."""
     moved = np.empty_like(points)
     for p in range(len(points)):
         x, y, z = point_gradients[p, 0], point_gradients[p, 1], point_gradients[p, 2]
@@ -174,7 +229,14 @@ def moved_points(points, starts, image_idx, couplings, inverses, point_gradients
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def ray_errors(rotations, centers, points, point_idx, image_idx, bearings):  # type: ignore[no-untyped-def]
+def ray_errors(
+    rotations: FloatArray,
+    centers: FloatArray,
+    points: FloatArray,
+    point_idx: NDArray[np.int32],
+    image_idx: NDArray[np.int32],
+    bearings: FloatArray,
+) -> FloatArray:
     """Return the angle between every observed ray and the one to its point, (T,)."""
     errors = np.empty(len(point_idx))
     for t in range(len(point_idx)):
@@ -183,7 +245,5 @@ def ray_errors(rotations, centers, points, point_idx, image_idx, bearings):  # t
         x = rotations[k, 0, 0] * dx + rotations[k, 0, 1] * dy + rotations[k, 0, 2] * dz
         y = rotations[k, 1, 0] * dx + rotations[k, 1, 1] * dy + rotations[k, 1, 2] * dz
         z = rotations[k, 2, 0] * dx + rotations[k, 2, 1] * dy + rotations[k, 2, 2] * dz
-        u, v, w = bearings[t, 0], bearings[t, 1], bearings[t, 2]
-        sine = np.sqrt((v * z - w * y) ** 2 + (w * x - u * z) ** 2 + (u * y - v * x) ** 2)
-        errors[t] = np.arctan2(sine, u * x + v * y + w * z)
+        errors[t] = angle_between(bearings[t, 0], bearings[t, 1], bearings[t, 2], x, y, z)
     return errors

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
+
+from pano_mvs.geometry.kernels_sphere import pixel_from_ray
+
+FloatArray = NDArray[np.float64]
 
 _PARAMETERS = 6
 _ITERATIONS, _CONVERGED = 12, 0.003
-_LEAST_CONTRAST = 0.5  # grey levels
+_MIN_CONTRAST = 0.5  # grey levels
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _cubic(t, weights):  # type: ignore[no-untyped-def]
-    """Write the weights of cubic convolution (a = −1/2) of four neighbours, the place being t after the second."""
+def _cubic(t: float, weights: FloatArray) -> None:
+    """Write the weights of cubic convolution (a = −1/2) of four neighbours, at a position t past the second."""
     weights[0] = t * (-0.5 + t * (1.0 - 0.5 * t))
     weights[1] = 1.0 + t * t * (-2.5 + 1.5 * t)
     weights[2] = t * (0.5 + t * (2.0 - 1.5 * t))
@@ -20,7 +25,14 @@ def _cubic(t, weights):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def sample_patches(padded, pad_px, middles, first_axes, second_axes, patches):  # type: ignore[no-untyped-def]
+def sample_patches(
+    padded: NDArray[np.float32],
+    pad_px: int,
+    middles: FloatArray,
+    first_axes: FloatArray,
+    second_axes: FloatArray,
+    patches: NDArray[np.float32],
+) -> None:
     """Fill patches (M, n, n) from a panorama with a margin, by cubic convolution.
 
     Entry (j, i) of patch m is the panorama along the ray middles[m] + (i − k) first_axes[m] + (j − k) second_axes[m],
@@ -37,8 +49,8 @@ def sample_patches(padded, pad_px, middles, first_axes, second_axes, patches):  
                 x = middles[m, 0] + a * first_axes[m, 0] + b * second_axes[m, 0]
                 y = middles[m, 1] + a * first_axes[m, 1] + b * second_axes[m, 1]
                 z = middles[m, 2] + a * first_axes[m, 2] + b * second_axes[m, 2]
-                column = (0.5 + np.arctan2(x, z) / (2 * np.pi)) * width - 0.5 + pad_px
-                row = (0.5 + np.arctan2(y, np.sqrt(x * x + z * z)) / np.pi) * height - 0.5 + pad_px
+                x_px, y_px = pixel_from_ray(x, y, z, height, width)
+                column, row = x_px - 0.5 + pad_px, y_px - 0.5 + pad_px
                 left, top = int(np.floor(column)), int(np.floor(row))
                 _cubic(column - left, across)
                 _cubic(row - top, down)
@@ -52,8 +64,8 @@ def sample_patches(padded, pad_px, middles, first_axes, second_axes, patches):  
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _factorise(matrix):  # type: ignore[no-untyped-def]
-    """Replace a symmetric positive definite matrix by its Cholesky factor L; what is above the diagonal stays."""
+def _factorise(matrix: FloatArray) -> None:
+    """Replace a symmetric positive definite matrix by its Cholesky factor L; entries above the diagonal stay."""
     size = len(matrix)
     for j in range(size):
         for k in range(j):
@@ -66,7 +78,7 @@ def _factorise(matrix):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _substitute(factor, vector):  # type: ignore[no-untyped-def]
+def _substitute(factor: FloatArray, vector: FloatArray) -> None:
     """Replace a vector v by the solution of L Lᵀ x = v."""
     size = len(vector)
     for i in range(size):
@@ -80,8 +92,8 @@ def _substitute(factor, vector):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _normalised(values, window, total):  # type: ignore[no-untyped-def]
-    """Give values weighted mean 0 and variance 1; return their standard deviation before."""
+def _normalised(values: FloatArray, window: FloatArray, total: float) -> float:
+    """Normalise values to weighted mean 0 and variance 1; return their original standard deviation."""
     mean = 0.0
     for k in range(len(values)):
         mean += window[k] * values[k]
@@ -90,14 +102,14 @@ def _normalised(values, window, total):  # type: ignore[no-untyped-def]
     for k in range(len(values)):
         values[k] -= mean
         variance += window[k] * values[k] * values[k]
-    deviation = np.sqrt(variance / total)
+    deviation: float = np.sqrt(variance / total)
     for k in range(len(values)):
         values[k] /= deviation + 1e-12
     return deviation
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _warped(patch, warp, size, margin, values):  # type: ignore[no-untyped-def]
+def _warped(patch: NDArray[np.float32], warp: FloatArray, size: int, margin: int, values: FloatArray) -> bool:
     """Write the inner size × size samples of a patch under an affine warp; return False if it leaves the patch."""
     outer = patch.shape[0]
     half = (size - 1) // 2
@@ -123,13 +135,21 @@ def _warped(patch, warp, size, margin, values):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _prepare(reference, size, margin, weights, total, template, columns):  # type: ignore[no-untyped-def]
-    """Write the normalised template and its derivatives by the warp, free of gain and offset; return its contrast."""
+def _prepare(
+    reference: NDArray[np.float32],
+    size: int,
+    margin: int,
+    weights: FloatArray,
+    total: float,
+    template: FloatArray,
+    columns: FloatArray,
+) -> float:
+    """Write the normalised template and its derivatives by the warp, less gain and offset; return its contrast."""
     half = (size - 1) // 2
     for j in range(size):
         for i in range(size):
             template[j * size + i] = reference[j + margin, i + margin]
-    contrast = _normalised(template, weights, total)
+    contrast: float = _normalised(template, weights, total)
     for j in range(size):
         for i in range(size):
             row, column, k = j + margin, i + margin, j * size + i
@@ -149,8 +169,8 @@ def _prepare(reference, size, margin, weights, total, template, columns):  # typ
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _normal_matrix(columns, weights, stiffness, matrix):  # type: ignore[no-untyped-def]
-    """Write Jᵀ W J, the prior on the linear part of the warp added."""
+def _normal_matrix(columns: FloatArray, weights: FloatArray, stiffness: float, matrix: FloatArray) -> None:
+    """Write Jᵀ W J plus the prior on the linear part of the warp."""
     for p in range(_PARAMETERS):
         for q in range(p + 1):
             entry = 0.0
@@ -162,7 +182,7 @@ def _normal_matrix(columns, weights, stiffness, matrix):  # type: ignore[no-unty
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _largest_deviation(factor, unit):  # type: ignore[no-untyped-def]
+def _largest_deviation(factor: FloatArray, unit: FloatArray) -> float:
     """Return the root of the largest eigenvalue of the shift's block of the inverse of L Lᵀ."""
     unit[:] = 0.0
     unit[0] = 1.0
@@ -172,12 +192,13 @@ def _largest_deviation(factor, unit):  # type: ignore[no-untyped-def]
     unit[1] = 1.0
     _substitute(factor, unit)
     second = unit[1]
-    return np.sqrt(0.5 * (first + second) + np.sqrt(0.25 * (first - second) ** 2 + mixed * mixed))
+    deviation: float = np.sqrt(0.5 * (first + second) + np.sqrt(0.25 * (first - second) ** 2 + mixed * mixed))
+    return deviation
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _compose(warp, step):  # type: ignore[no-untyped-def]
-    """Replace W by W ∘ Δ⁻¹, Δ x = (I + E) x + e with the step (e, E); return False where Δ folds the patch."""
+def _compose(warp: FloatArray, step: FloatArray) -> bool:
+    """Replace W by W ∘ Δ⁻¹, Δ x = (I + E) x + e with the step (e, E); return False if Δ folds the patch."""
     e00, e01, e10, e11 = 1.0 + step[2], step[3], step[4], 1.0 + step[5]
     determinant = e00 * e11 - e01 * e10
     if not determinant > 0.1:
@@ -193,7 +214,20 @@ def _compose(warp, step):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _align(target, size, margin, weights, total, stiffness, factor, template, columns, values, step, warp):  # type: ignore[no-untyped-def]
+def _align(
+    target: NDArray[np.float32],
+    size: int,
+    margin: int,
+    weights: FloatArray,
+    total: float,
+    stiffness: float,
+    factor: FloatArray,
+    template: FloatArray,
+    columns: FloatArray,
+    values: FloatArray,
+    step: FloatArray,
+    warp: FloatArray,
+) -> float:
     """Write the warp that aligns a patch with the template; return their correlation, 0 if it leaves the patch."""
     warp[:] = 0.0
     warp[2], warp[5] = 1.0, 1.0
@@ -225,16 +259,25 @@ def _align(target, size, margin, weights, total, stiffness, factor, template, co
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def align_patches(patches, reference_idx, target_idx, window, stiffness, shifts, correlations, deviations):  # type: ignore[no-untyped-def]
-    """Align patches with reference patches: inverse compositional Gauss–Newton, affine, free of gain and offset.
+def align_patches(
+    patches: NDArray[np.float32],
+    reference_idx: NDArray[np.intp],
+    target_idx: NDArray[np.intp],
+    window: FloatArray,
+    stiffness: float,
+    shifts: FloatArray,
+    correlations: FloatArray,
+    deviations: FloatArray,
+) -> None:
+    """Align patches with reference patches by inverse compositional Gauss–Newton, invariant to gain and offset.
 
     Baker & Matthews, "Lucas–Kanade 20 Years On: A Unifying Framework", 2004, section 3.2. `patches`
-    (T, n + 2 m, n + 2 m) have a margin of m samples around the n × n that the `window` (n, n) weighs. `stiffness` is
-    the weight of the prior that holds the linear part of the warp near the identity, contrast being 1.
+    (T, n + 2 m, n + 2 m) have a margin of m samples around the n × n that the `window` (n, n) weights. `stiffness` is
+    the weight of the prior that keeps the linear part of the warp near the identity, for a contrast of 1.
 
-    Writes for every target: shifts (M, 2) of its middle in samples, correlations (M,) after alignment, 0 where there is
-    no contrast or the warp left the patch, and deviations (M,) of the shift along its least certain axis, for noise of
-    the size of the contrast.
+    Writes for every target: shifts (M, 2) of its centre in samples; correlations (M,) after alignment, 0 without
+    contrast or if the warp left the patch; and standard deviations (M,) of the shift along its least certain axis, for
+    noise as large as the contrast.
     """
     size = window.shape[0]
     margin = (patches.shape[1] - size) // 2
@@ -247,14 +290,24 @@ def align_patches(patches, reference_idx, target_idx, window, stiffness, shifts,
         shifts[m, :] = 0.0
         correlations[m], deviations[m] = 0.0, np.inf
         contrast = _prepare(patches[reference_idx[m]], size, margin, weights, total, template, columns)
-        if contrast < _LEAST_CONTRAST:
+        if contrast < _MIN_CONTRAST:
             continue
         _normal_matrix(columns, weights, stiffness, factor)
         _factorise(factor)
         deviations[m] = _largest_deviation(factor, step)
         correlations[m] = _align(
-            patches[target_idx[m]], size, margin, weights, total, stiffness, factor, template, columns, values, step,
+            patches[target_idx[m]],
+            size,
+            margin,
+            weights,
+            total,
+            stiffness,
+            factor,
+            template,
+            columns,
+            values,
+            step,
             warp,
-        )  # fmt: skip
+        )
         if correlations[m] != 0.0:
             shifts[m, 0], shifts[m, 1] = warp[0], warp[1]

@@ -1,16 +1,21 @@
-"""Compiled: triangulation of tracks, track by track; see `points` for what it computes."""
+"""Compiled: triangulation of tracks, one after the other; see `points`."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
+
+from pano_mvs.geometry.kernels_sphere import angle_between
+
+FloatArray = NDArray[np.float64]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _solved(matrix, vector, least, point):  # type: ignore[no-untyped-def]
-    """Write the solution of a symmetric (3, 3) system; return whether its least eigenvalue exceeds a bound.
+def _solved(matrix: FloatArray, vector: FloatArray, least: float, point: FloatArray) -> bool:
+    """Write the solution of a symmetric (3, 3) system; return whether its smallest eigenvalue exceeds `least`.
 
-    A − λ I is positive definite just if all eigenvalues of A exceed λ: its LDLᵀ decomposition tells.
+    All eigenvalues of A exceed λ if and only if A − λ I is positive definite, which its LDLᵀ decomposition shows.
     """
     for shift in (least, 0.0):
         a, b, c = matrix[0, 0] - shift, matrix[0, 1], matrix[0, 2]
@@ -34,8 +39,19 @@ def _solved(matrix, vector, least, point):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _nearest_point(centers, rays, used, start, stop, least, weights, matrix, vector, point):  # type: ignore[no-untyped-def]
-    """Write the point nearest to the rays in use, twice reweighted by range; return whether they tell one."""
+def _nearest_point(
+    centers: FloatArray,
+    rays: FloatArray,
+    used: NDArray[np.bool_],
+    start: int,
+    stop: int,
+    least: float,
+    weights: FloatArray,
+    matrix: FloatArray,
+    vector: FloatArray,
+    point: FloatArray,
+) -> bool:
+    """Write the point nearest to the rays in use, reweighted twice by range; return whether it is well defined."""
     count = 0
     for t in range(start, stop):
         count += used[t]
@@ -66,7 +82,7 @@ def _nearest_point(centers, rays, used, start, stop, least, weights, matrix, vec
                     (point[0] - centers[t, 0]) ** 2 + (point[1] - centers[t, 1]) ** 2 + (point[2] - centers[t, 2]) ** 2
                 )
                 mean += weights[t] / count
-        # Rays that cross in the very place of their cameras (one place for all) say nothing of a point.
+        # Rays from a single camera position meet in that position, not in a point of the scene.
         if not mean > 0:
             return False
         for t in range(start, stop):
@@ -75,7 +91,9 @@ def _nearest_point(centers, rays, used, start, stop, least, weights, matrix, vec
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def triangulate(centers, rays, starts, least, max_error, rounds):  # type: ignore[no-untyped-def]
+def triangulate(
+    centers: FloatArray, rays: FloatArray, starts: NDArray[np.intp], least: float, max_error: float, rounds: int
+) -> tuple[FloatArray, NDArray[np.bool_], NDArray[np.bool_], FloatArray]:
     """Return points (P, 3), whether they are valid (P,), which observations fit (T,), and their errors (T,).
 
     Observations are sorted by track; those of track p are starts[p] to starts[p + 1].
@@ -94,9 +112,7 @@ def triangulate(centers, rays, starts, least, max_error, rounds):  # type: ignor
                 errors[t] = np.pi
                 if fits:
                     x, y, z = point[0] - centers[t, 0], point[1] - centers[t, 1], point[2] - centers[t, 2]
-                    u, v, w = rays[t, 0], rays[t, 1], rays[t, 2]
-                    sine = np.sqrt((v * z - w * y) ** 2 + (w * x - u * z) ** 2 + (u * y - v * x) ** 2)
-                    errors[t] = np.arctan2(sine, u * x + v * y + w * z)
+                    errors[t] = angle_between(rays[t, 0], rays[t, 1], rays[t, 2], x, y, z)
                     if used[t] and errors[t] > worst:
                         worst = errors[t]
             if not fits or worst <= max_error:

@@ -1,4 +1,6 @@
-"""Poses where structure repeats, against COLMAP's own: `python -m tests.benchmarks.aliasing --captures 50 --width 768`.
+"""Poses where structure repeats, against COLMAP's own.
+
+Run it with `python -m tests.benchmarks.poses.aliasing --captures 50 --width 768`.
 
 Captures of places in which floors, columns, doors or whole rooms repeat are drawn
 (`pano_mvs.testing.repeating.places`) and rendered. For each method and capture the table has the number of cameras
@@ -35,8 +37,8 @@ from pano_mvs.testing import paint, room, surfaces
 from pano_mvs.testing.repeating import drawings, fittings, prints
 from pano_mvs.testing.repeating.places import draw_arguments, draw_capture
 from pano_mvs.testing.scenes import Scene
-from tests.benchmarks.placements import judge_placements
-from tests.benchmarks.poses import MAPPERS, SEED, Cameras, Pictures, matched, native
+from tests.benchmarks.poses.captures_with_truth import MAPPERS, SEED, Cameras, Pictures, matched, native
+from tests.benchmarks.poses.placements import judge_placements
 
 OURS = "ours"
 

@@ -12,7 +12,7 @@ from tests.io.images.videos import write_video
 
 __all__ = ["pano_mvs"]  # the fixture
 
-DOCS = Path(__file__).parent.parent / "docs"
+DOCS = Path(__file__).parents[2] / "docs"
 INPUT = (DOCS / "input.md").read_text(encoding="utf-8")
 INSTALLATION = (DOCS / "installation.md").read_text(encoding="utf-8")
 

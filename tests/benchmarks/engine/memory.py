@@ -1,4 +1,4 @@
-"""How much memory a sweep takes: `python -m tests.benchmarks.memory [--small | --large]`.
+"""How much memory a sweep takes: `python -m tests.benchmarks.engine.memory [--small | --large]`.
 
 The peak of the resident memory of a fresh process for each configuration, less that of one that has made the pictures
 and loaded the kernels but swept nothing larger than 16 × 32. With --large: all that a process takes in which a panorama
@@ -53,7 +53,7 @@ def large_peak_mb(rows: int, planes: int, aggregation: Literal["box", "sgm"], th
 
 def fresh_peak_mb(*configuration: object) -> float:
     """Return `peak_mb` of a fresh process."""
-    command = [sys.executable, "-m", "tests.benchmarks.memory", "--one", json.dumps(configuration)]
+    command = [sys.executable, "-m", "tests.benchmarks.engine.memory", "--one", json.dumps(configuration)]
     return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
 
 

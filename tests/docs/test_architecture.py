@@ -12,7 +12,7 @@ import pytest
 from pano_mvs import stages
 from pano_mvs.engine.stages.registry import Registry
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 PATHS = sorted(set(re.findall(r"`((?:pano_mvs|workflows|plugins|tests)(?:/[\w./]*)?)`", PAGE)))
 

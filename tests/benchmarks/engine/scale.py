@@ -1,4 +1,4 @@
-"""Captures of thousands of panoramas: `python -m tests.benchmarks.scale [COUNT…] [--folder DIR] [--real]`.
+"""Captures of thousands of panoramas: `python -m tests.benchmarks.engine.scale [COUNT…] [--folder DIR] [--real]`.
 
 For each size a simulated capture (see `simulated_capture`) goes through the commands as a user would call them: a plan
 before anything is cached, a run that is interrupted half-way, its resumption, a run and a plan when all is cached,
@@ -22,8 +22,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.benchmarks.simulated_capture import UNITS_PER_PICTURE, write_picture, write_simulated
-from tests.benchmarks.simulated_executor import STOP_VARIABLE
+from tests.benchmarks.engine.simulated_capture import UNITS_PER_PICTURE, write_picture, write_simulated
+from tests.benchmarks.engine.simulated_executor import STOP_VARIABLE
 
 COUNTS = (1000, 2000, 5000)
 
@@ -110,7 +110,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, help="where the captures are made; by default a temporary folder")
     parser.add_argument("--real", action="store_true", help="compute the units")
     arguments = parser.parse_args()
-    module = "pano_mvs" if arguments.real else "tests.benchmarks.simulated_executor"
+    module = "pano_mvs" if arguments.real else "tests.benchmarks.engine.simulated_executor"
     for count in arguments.counts:
         folder = Path(tempfile.mkdtemp(prefix="pano-mvs-scale-", dir=arguments.folder)).absolute()
         units = count * UNITS_PER_PICTURE

@@ -13,7 +13,7 @@ from pano_mvs.cli.app import app
 from pano_mvs.testing.room import capture_poses, default_room, write_capture
 from tests.stored import read_picture
 
-README = Path(__file__).parent.parent / "README.md"
+README = Path(__file__).parents[2] / "README.md"
 
 
 def block(mark: str) -> str:

@@ -15,7 +15,7 @@ from ruamel.yaml import YAML
 from pano_mvs import api
 from pano_mvs.engine.workflows.policy import RESERVED_KEYS
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 HOOKS = ROOT / "docs" / "_hooks"
 
 

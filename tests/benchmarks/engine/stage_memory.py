@@ -1,4 +1,6 @@
-"""What each dense stage of a workflow takes in memory: `python -m tests.benchmarks.stage_memory [--workflow quality]`.
+"""What each dense stage of a workflow takes in memory.
+
+Run it with `python -m tests.benchmarks.engine.stage_memory [--workflow quality]`.
 
 The stages run in this process on a rendered room, at two sizes. Before each unit the peak that Linux keeps of the
 resident memory is reset; what the unit adds to what was there before is its own. The difference between the two sizes

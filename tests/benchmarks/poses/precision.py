@@ -1,12 +1,12 @@
-"""How precise poses are where texture is weak: `python -m tests.benchmarks.precision [DATA_DIR…] --cache DIR`.
+"""How precise poses are where texture is weak: `python -m tests.benchmarks.poses.precision [DATA_DIR…] --cache DIR`.
 
-A DATA_DIR is as in `tests.benchmarks.poses`; every panorama is turned by an arbitrary rotation, another one in each
-draw. The synthetic scenes are drawn with another seed each time. One draw says little: the error of nine poses varies
-by a factor of two from one draw to the next, so the table has means over the draws. For the solver alone and after
-`poses.refine` it prints the mean over the draws of the median over all pairs of the larger of rotation and direction
-error, cameras registered, and CPU seconds. Cameras that stand in a wrong place are left out of the medians and counted.
-Pictures, key points and verified matches are kept in the cache folder: empty it when their stages have changed.
-`--native` adds COLMAP on its own (see `tests.benchmarks.poses`).
+A DATA_DIR is as in `tests.benchmarks.poses.captures_with_truth`; every panorama is turned by an arbitrary rotation,
+another one in each draw. The synthetic scenes are drawn with another seed each time. One draw says little: the error of
+nine poses varies by a factor of two from one draw to the next, so the table has means over the draws. For the solver
+alone and after `poses.refine` it prints the mean over the draws of the median over all pairs of the larger of rotation
+and direction error, cameras registered, and CPU seconds. Cameras that stand in a wrong place are left out of the
+medians and counted. Pictures, key points and verified matches are kept in the cache folder: empty it when their stages
+have changed. `--native` adds COLMAP on its own (see `tests.benchmarks.poses.captures_with_truth`).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from pano_mvs.algorithms.two_view import verify_pair
 from pano_mvs.evaluation.poses.errors import relative_pose_errors
 from pano_mvs.geometry import Rigid3, rotate_panorama, rotation_from_quat_wxyz
 from pano_mvs.testing.scenes import large_plain_room, poles, weak_room, white_room
-from tests.benchmarks.poses import Cameras, Pictures, cameras_of, load, native
+from tests.benchmarks.poses.captures_with_truth import Cameras, Pictures, cameras_of, load, native
 
 SCENES = {scene.__name__: scene for scene in (large_plain_room, white_room, weak_room, poles)}
 SIZE_HW = (512, 1024)

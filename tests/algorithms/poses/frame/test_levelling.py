@@ -10,8 +10,8 @@ from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.algorithms.poses.frame.levelling import level_poses
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec
 from pano_mvs.scene import Poses
+from tests.algorithms.poses.frame.test_vertical import UP, room_poses, sensed
 from tests.algorithms.poses.synthetic_capture import random_rotation
-from tests.algorithms.poses.test_vertical import UP, room_poses, sensed
 
 
 def in_cameras(poses: Poses) -> list[NDArray[np.float64]]:

@@ -1,4 +1,4 @@
-"""How long large captures take: `python -m tests.benchmarks.large [--cameras 30 60 100 300] [--plot FILE.png]`.
+"""How long large captures take: `python -m tests.benchmarks.poses.large [--cameras 30 60 100 300] [--plot FILE.png]`.
 
 Cameras 0.7 apart along a corridor, each finding some hundred key points with noise of 0.03°, a fifth of the matches
 wrong; pairs by retrieval among all. Seconds are CPU time of one process; each size runs in a process of its own,
@@ -122,7 +122,7 @@ def main() -> None:
         return
     rows = []
     for cameras in arguments.cameras:
-        command = [sys.executable, "-m", "tests.benchmarks.large", "--one", str(cameras)]
+        command = [sys.executable, "-m", "tests.benchmarks.poses.large", "--one", str(cameras)]
         output = subprocess.run([*command, "--keypoints", str(arguments.keypoints)], check=True, capture_output=True)
         rows.append(json.loads(output.stdout))
     print_table(rows)

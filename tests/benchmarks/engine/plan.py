@@ -1,4 +1,4 @@
-"""Planning at scale: `python -m tests.benchmarks.plan [ITEMS]`.
+"""Planning at scale: `python -m tests.benchmarks.engine.plan [ITEMS]`.
 
 A capture of ITEMS small files, features of each, pairs of each with its eight followers, a match of each pair, one
 solve of all, a range and a filtered range of each view with four neighbours, and one file for all: at 5,000 items
@@ -170,7 +170,9 @@ def main() -> None:
         for step in ("plan cold", "run cold", "plan cached", "run cached", "plan one more", "run one more"):
             if step == "plan one more":
                 (folder / "capture" / f"{items // 2:05d}x.txt").write_text("12345")
-            subprocess.run([sys.executable, "-m", "tests.benchmarks.plan", "--step", step, str(folder)], check=True)
+            subprocess.run(
+                [sys.executable, "-m", "tests.benchmarks.engine.plan", "--step", step, str(folder)], check=True
+            )
 
 
 def _measure(step: str, folder: Path) -> None:

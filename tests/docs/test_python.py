@@ -17,7 +17,7 @@ from pano_mvs.geometry import Rigid3
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.session import progress
 
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = Path(__file__).parents[2] / "docs"
 PAGE = (DOCS / "python.md").read_text(encoding="utf-8")
 NOTEBOOK: dict[str, Any] = json.loads((DOCS / "python.ipynb").read_text(encoding="utf-8"))
 

@@ -15,7 +15,7 @@ from pano_mvs.testing.conformance import stage_laws
 from tests.cli.conftest import Command, capture, pano_mvs, rendered  # noqa: F401  # fixtures
 from tests.stored import read_picture
 
-PAGE = (Path(__file__).parent.parent / "docs" / "masks.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "masks.md").read_text(encoding="utf-8")
 
 
 def block(mark: str, language: str) -> str:

@@ -1,4 +1,4 @@
-"""How long each extractor takes: `python -m tests.benchmarks.features`.
+"""How long each extractor takes: `python -m tests.benchmarks.poses.features`.
 
 On the synthetic room with its strong texture, rendered at three sizes. "cold" is the first call at a size, which builds
 SPHORB's grid (and, at the first size, compiles its kernels or loads them); "warm" the median of those that follow.

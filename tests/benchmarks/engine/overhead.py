@@ -1,4 +1,4 @@
-"""What the engine itself costs: `python -m tests.benchmarks.engine [UNITS]`.
+"""What the engine itself costs: `python -m tests.benchmarks.engine.overhead [UNITS]`.
 
 A capture of UNITS small text files, read and scaled twice: three stages of UNITS units each whose own work is next to
 nothing, so that the time of a run is the engine's. Times are the processor's (all processes) and the wall's; the limits

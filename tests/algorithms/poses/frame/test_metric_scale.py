@@ -9,9 +9,9 @@ from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.algorithms.poses.frame.metric_scale import scaled_by_baseline, scaled_by_camera_height, scaled_poses
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, Similarity3
+from tests.algorithms.poses.frame.test_levelling import in_cameras
+from tests.algorithms.poses.frame.test_vertical import FLOOR_Y, UP, room_poses, with_points
 from tests.algorithms.poses.synthetic_capture import random_rotation
-from tests.algorithms.poses.test_levelling import in_cameras
-from tests.algorithms.poses.test_vertical import FLOOR_Y, UP, room_poses, with_points
 
 
 @pytest.mark.parametrize("factor", [0.01, 1.0, 37.5])

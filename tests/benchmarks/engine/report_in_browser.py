@@ -1,4 +1,4 @@
-"""Try a report in a real browser: `python -m tests.benchmarks.report_in_browser OUT/report.html FOLDER`.
+"""Try a report in a real browser: `python -m tests.benchmarks.engine.report_in_browser OUT/report.html FOLDER`.
 
 Needs Chromium or Chrome. Moves a slider, changes what it shows, turns the pages of the table and searches in it, by the
 events that a finger, a mouse or a key cause, at the width of a desk and of a phone; checks that the policy of the page

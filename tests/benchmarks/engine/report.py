@@ -1,4 +1,6 @@
-"""How long the report of a large run takes to write, and how large it is: `python -m tests.benchmarks.report [views]`.
+"""How long the report of a large run takes to write, and how large it is.
+
+Run it with `python -m tests.benchmarks.engine.report [views]`.
 
 Poses with 400 observations a view, eight pairs a view, small range maps, and one full-sized preview that all views
 share. The second time is that of a run that computed nothing: its page takes the pictures from the first.

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from pano_mvs.cli.app import app
 
-PAGE = Path(__file__).parent.parent / "docs" / "frames_and_scale.md"
+PAGE = Path(__file__).parents[2] / "docs" / "frames_and_scale.md"
 
 
 def block(mark: str) -> str:

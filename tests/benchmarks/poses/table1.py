@@ -1,4 +1,6 @@
-"""Poses against the paper's Table 1: `python -m tests.benchmarks.table1 [--trials 100] [--sets 1 2 3] [--presets 0 c]`.
+"""Poses against the paper's Table 1.
+
+Run it with `python -m tests.benchmarks.poses.table1 [--trials 100] [--sets 1 2 3] [--presets 0 c]`.
 
 Five test sets of five views in a furnished room of 6 × 8 × 3 m. View 0 is the first of the seed pair, view 1 its
 second, with the paper's roll, pitch, yaw and direction; views 2 to 4 lie at the paper's scale factors. What the paper

@@ -1,4 +1,6 @@
-"""Poses on rendered captures with truth, ours beside COLMAP's own: `python -m tests.benchmarks.poses DATA_DIR…`.
+"""Poses on rendered captures with truth, ours beside COLMAP's own.
+
+Run it with `python -m tests.benchmarks.poses.captures_with_truth DATA_DIR…`.
 
 A DATA_DIR holds poses.json ({"views": [{"R": …, "t": …}, …]}, cam_from_world) and the pictures rgb/*.png in the same
 order. For the first 4 and the first 9 views, as they are and each turned by an arbitrary rotation, it prints the

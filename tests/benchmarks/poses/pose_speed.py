@@ -1,8 +1,8 @@
-"""What poses cost, beside COLMAP: `python -m tests.benchmarks.pose_speed --views 20 --colmap [--work DIR]`.
+"""What poses cost, beside COLMAP: `python -m tests.benchmarks.poses.pose_speed --views 20 --colmap [--work DIR]`.
 
-A suite of furnished rooms (`tests.benchmarks.suite_of_rooms`) is rendered once into `--work`, ten panoramas to a room.
-Printed are the CPU-seconds of one thread from pictures to refined poses, step by step: of our functions called one
-after the other in this process, of the same chain as a workflow through the engine (`pano-mvs run` with the serial
+A suite of furnished rooms (`tests.benchmarks.poses.suite_of_rooms`) is rendered once into `--work`, ten panoramas to a
+room. Printed are the CPU-seconds of one thread from pictures to refined poses, step by step: of our functions called
+one after the other in this process, of the same chain as a workflow through the engine (`pano-mvs run` with the serial
 executor and a fresh cache, `--engine`), and of COLMAP on its own on the same pictures (`--colmap`: EQUIRECTANGULAR
 cameras, its SIFT, all pairs, its defaults). Kernels are compiled before. With each comes the number of registered
 cameras and the median over all pairs of the larger of rotation and direction error. `--neighbours N` matches each
@@ -37,7 +37,7 @@ from pano_mvs.evaluation.poses.errors import relative_pose_errors
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.scene.image_files.image_file import decode_image
 from pano_mvs.scene.pose_groups import split_groups
-from tests.benchmarks.poses import (
+from tests.benchmarks.poses.captures_with_truth import (
     MAPPERS,
     SEED,
     Cameras,
@@ -46,7 +46,7 @@ from tests.benchmarks.poses import (
     native_matches,
     native_model,
 )
-from tests.benchmarks.suite_of_rooms import write_suite
+from tests.benchmarks.poses.suite_of_rooms import write_suite
 
 Result = TypeVar("Result")
 

@@ -14,7 +14,7 @@ from pano_mvs.cli.plugins.new import KINDS, rendered
 from pano_mvs.engine.stages.plugin_files import declared_names
 from pano_mvs.scene import Record
 
-PAGE = (Path(__file__).parent.parent / "docs" / "plugins.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "plugins.md").read_text(encoding="utf-8")
 PLUGINS = {
     kind: (name, text)
     for kind, name, text in re.findall(r"<!-- plugin: (\w+) (\w+) -->\n```python\n(.*?)```", PAGE, re.DOTALL)

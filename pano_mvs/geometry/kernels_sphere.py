@@ -1,0 +1,129 @@
+"""Compiled: the equirectangular camera for single pixels and rays, for use in other kernels.
+
+The conventions are those of `pano_mvs.geometry`, the arithmetic that of `sphere` and `resample`. The functions take and
+return plain numbers and are inlined where they are called. The `fast_` functions are for float32 in vectorised loops.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+_F = np.float32
+_HALF_PI, _PI, _TINY, _ONE = _F(np.pi / 2), _F(np.pi), _F(1e-30), _F(1)
+# Abramowitz and Stegun, Handbook of Mathematical Functions, 4.4.49: |error| ≤ 2e-8 on [0, 1].
+_A2, _A4, _A6, _A8 = _F(-0.3333314528), _F(0.1999355085), _F(-0.1420889944), _F(0.1065626393)
+_A10, _A12, _A14, _A16 = _F(-0.0752896400), _F(0.0429096138), _F(-0.0161657367), _F(0.0028662257)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def azimuth_from_x(x: float, width: int) -> float:
+    """Return the azimuth θ of a column position, in radians."""
+    return 2 * math.pi * (x / width - 0.5)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def elevation_from_y(y: float, height: int) -> float:
+    """Return the elevation φ of a row position, in radians."""
+    return math.pi * (0.5 - y / height)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def pixel_from_ray(x: float, y: float, z: float, height: int, width: int) -> tuple[float, float]:
+    """Return the position (x, y) in pixels of a ray of any length but zero, x in [0, w], y in [0, h]."""
+    azimuth = math.atan2(x, z)
+    elevation = math.atan2(-y, math.sqrt(x * x + z * z))  # hypot costs as much as an arc tangent
+    return (azimuth / (2 * math.pi) + 0.5) * width, (0.5 - elevation / math.pi) * height
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def pixel_at(x: float, y: float, height: int, width: int) -> tuple[int, int]:
+    """Return (row, column) of the pixel that contains a position; x wraps, y is clipped."""
+    return min(max(math.floor(y), 0), height - 1), math.floor(x) % width
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def wrapped_row(row: int, height: int) -> int:
+    """Return the row, in the panorama, of a pixel at most one height outside of it: reflected at the poles."""
+    if row < 0:
+        return -1 - row
+    if row >= height:
+        return 2 * height - 1 - row
+    return row
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def wrapped_column(row: int, column: int, height: int, width: int) -> int:
+    """Return the column, in the panorama, of a pixel: wrapped at the seam, half a turn further beyond a pole."""
+    if row < 0 or row >= height:
+        column += width // 2
+    return column % width
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def corners_at(x: float, y: float, height: int, width: int) -> tuple[int, int, int, int, int, int, float, float]:
+    """Return the four pixels around a position, and the weights of the right and of the lower ones.
+
+    Returns:
+        upper row, lower row, columns of the upper left, upper right, lower left and lower right pixel, weight_x,
+        weight_y.
+    """
+    left, top = math.floor(x - 0.5), math.floor(y - 0.5)
+    return (
+        wrapped_row(top, height),
+        wrapped_row(top + 1, height),
+        wrapped_column(top, left, height, width),
+        wrapped_column(top, left + 1, height, width),
+        wrapped_column(top + 1, left, height, width),
+        wrapped_column(top + 1, left + 1, height, width),
+        x - 0.5 - left,
+        y - 0.5 - top,
+    )
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def bilinear(v00: float, v01: float, v10: float, v11: float, weight_x: float, weight_y: float) -> float:
+    """Return the bilinear mean of values upper left, upper right, lower left and lower right."""
+    upper = (1 - weight_x) * v00 + weight_x * v01
+    lower = (1 - weight_x) * v10 + weight_x * v11
+    return (1 - weight_y) * upper + weight_y * lower
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def angle_between(ax: float, ay: float, az: float, bx: float, by: float, bz: float) -> float:
+    """Return the angle between two vectors, in radians in [0, π], by atan2(|a × b|, a · b)."""
+    x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    return math.atan2(math.sqrt(x * x + y * y + z * z), ax * bx + ay * by + az * bz)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def _fast_atan(a: np.float32) -> np.float32:
+    """Return atan of a float32 in [0, 1]."""
+    s = a * a
+    tail = _A8 + s * (_A10 + s * (_A12 + s * (_A14 + s * _A16)))
+    return a * (_ONE + s * (_A2 + s * (_A4 + s * (_A6 + s * tail))))
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def fast_azimuth(x: np.float32, z: np.float32) -> np.float32:
+    """Return atan2(x, z), the azimuth, float32."""
+    ax, az = abs(x), abs(z)
+    small = ax if ax < az else az
+    large = az if ax < az else ax
+    turn: np.float32 = _fast_atan(small / (large + _TINY))
+    turn = _HALF_PI - turn if ax > az else turn
+    turn = _PI - turn if z < _F(0) else turn
+    return -turn if x < _F(0) else turn
+
+
+@njit(cache=True, error_model="numpy", nogil=True, inline="always")
+def fast_dip(y: np.float32, level: np.float32) -> np.float32:
+    """Return atan2(y, level), the angle below the horizon, for level = hypot(x, z), float32."""
+    ay = abs(y)
+    small = ay if ay < level else level
+    large = level if ay < level else ay
+    dip: np.float32 = _fast_atan(small / (large + _TINY))
+    dip = _HALF_PI - dip if ay > level else dip
+    return -dip if y < _F(0) else dip
