@@ -25,7 +25,8 @@ def inside_crop(size_hw: tuple[int, int], crop_ltwh: Crop, whole_hw: tuple[int, 
         whole_hw: height and width of that sphere.
     """
     left, top, width, height = crop_ltwh
-    return _inner(size_hw[0], whole_hw[0], top, height), _inner(size_hw[1], whole_hw[1], left, width)
+    rows = _inner(size_hw[0], whole_hw[0], first=top, length=height)
+    return rows, _inner(size_hw[1], whole_hw[1], first=left, length=width)
 
 
 def placed_picture(
@@ -47,15 +48,15 @@ def placed_picture(
             return sphere
         return np.asarray(cv2.resize(sphere, size_hw[::-1], interpolation=cv2.INTER_AREA), np.uint8)
     rows, columns = inside_crop(size_hw, of, whole_hw)
-    part = _means(picture.astype(np.float32), rows, size_hw[0], whole_hw[0], top, height)
-    part = _means(np.swapaxes(part, 0, 1), columns, size_hw[1], whole_hw[1], left, width)
+    part = _means(picture.astype(np.float32), rows, count=size_hw[0], whole=whole_hw[0], first=top, length=height)
+    part = _means(np.swapaxes(part, 0, 1), columns, count=size_hw[1], whole=whole_hw[1], first=left, length=width)
     sphere = np.zeros((*size_hw, 3), np.uint8)
     sphere[rows, columns] = np.rint(np.swapaxes(part, 0, 1)).astype(np.uint8)
     return sphere
 
 
 def _means(
-    picture: NDArray[np.float32], wanted: slice, count: int, whole: int, first: int, length: int
+    picture: NDArray[np.float32], wanted: slice, *, count: int, whole: int, first: int, length: int
 ) -> NDArray[np.float32]:
     """Return the mean over the extent of each wanted row, which is at least one row (linear interpolation)."""
     from scipy.sparse import csr_array  # slow to import and rarely needed
@@ -74,6 +75,6 @@ def _means(
     return np.asarray(means, np.float32).reshape(len(middles), *picture.shape[1:])
 
 
-def _inner(count: int, whole: int, first: int, length: int) -> slice:
+def _inner(count: int, whole: int, *, first: int, length: int) -> slice:
     """Return the pixels of `count` on a side of `whole` that lie between `first` and `first + length`."""
     return slice(-(-first * count // whole), (first + length) * count // whole)

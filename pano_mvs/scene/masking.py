@@ -68,8 +68,8 @@ def placed_mask(mask: Mask, size_hw: tuple[int, int], *, of: Crop, whole_hw: tup
     left, top, width, height = of
     if mask.shape == size_hw and of == (0, 0, whole_hw[1], whole_hw[0]):
         return mask
-    upper, lower = _spans(size_hw[0], whole_hw[0], top, height, mask.shape[0])
-    first, last = _spans(size_hw[1], whole_hw[1], left, width, mask.shape[1])
+    upper, lower = _spans(size_hw[0], whole_hw[0], first=top, length=height, pixels=mask.shape[0])
+    first, last = _spans(size_hw[1], whole_hw[1], first=left, length=width, pixels=mask.shape[1])
     before = cv2.integral((~mask).astype(np.uint8), sdepth=cv2.CV_32S)
     masked = before[lower] - before[upper]
     return np.asarray(masked[:, last] == masked[:, first])
@@ -106,7 +106,9 @@ def painted_over(picture: NDArray[np.uint8], valid: Mask) -> NDArray[np.uint8]:
     return painted
 
 
-def _spans(count: int, whole: int, first: int, length: int, pixels: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _spans(
+    count: int, whole: int, *, first: int, length: int, pixels: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the mask pixels, start to stop, that each of `count` pixels on a side of length `whole` touches.
 
     The mask's `pixels` pixels cover the side from `first` over `length`.

@@ -28,7 +28,9 @@ def split_groups(poses: Poses) -> list[Poses]:
     groups = poses.groups
     group_of_point = np.zeros(len(poses.points_in_world), np.int32)
     group_of_point[poses.track_point_idx] = groups[poses.track_image_idx]
-    return [_subset(poses, groups == number, group_of_point == number, number) for number in range(len(poses.worlds))]
+    return [
+        _subset(poses, groups == number, group_of_point == number, number=number) for number in range(len(poses.worlds))
+    ]
 
 
 def join_groups(
@@ -104,10 +106,10 @@ def with_cameras(poses: Poses, kept: NDArray[np.bool_]) -> Poses:
     if kept.all():
         return poses
     seen = np.bincount(poses.track_point_idx[kept[poses.track_image_idx]], minlength=len(poses.points_in_world)) >= 2
-    return replace(_subset(poses, kept, seen, 0), rejected=poses.rejected)
+    return replace(_subset(poses, kept, seen, number=0), rejected=poses.rejected)
 
 
-def _subset(poses: Poses, cameras: NDArray[np.bool_], points: NDArray[np.bool_], number: int) -> Poses:
+def _subset(poses: Poses, cameras: NDArray[np.bool_], points: NDArray[np.bool_], *, number: int) -> Poses:
     names = tuple(np.array(poses.names, object)[cameras])
     tracks = cameras[poses.track_image_idx] & points[poses.track_point_idx]
     world = poses.worlds[number]

@@ -240,7 +240,10 @@ def _binary_images(path: Path) -> Iterator[tuple[int, ModelImage]]:
         if offset > len(data):
             raise ValueError(f"it ends within image {name[:80]!r}")
         rows = np.frombuffer(data, _POINT2D, points, start)
-        yield image_id, _image(name, np.array(numbers), camera_id, rows["xy"], rows["point_id"], path)
+        yield (
+            image_id,
+            _image(path, name, np.array(numbers), camera_id=camera_id, pixels=rows["xy"], point_ids=rows["point_id"]),
+        )
 
 
 def _text_images(path: Path) -> Iterator[tuple[int, ModelImage]]:
@@ -261,16 +264,20 @@ def _text_images(path: Path) -> Iterator[tuple[int, ModelImage]]:
             rows = values.reshape(-1, 3)
             ids = np.where(np.abs(rows[:, 2]) < 2**53, rows[:, 2], -1).astype(np.int64)
             numbers = np.array([float(cell) for cell in cells[1:8]])
-            yield _number(cells[0]), _image(name, numbers, _number(cells[8]), rows[:, :2], ids, path)
+            yield (
+                _number(cells[0]),
+                _image(path, name, numbers, camera_id=_number(cells[8]), pixels=rows[:, :2], point_ids=ids),
+            )
 
 
 def _image(
+    path: Path,
     name: str,
     numbers: NDArray[np.float64],
+    *,
     camera_id: int,
     pixels: NDArray[np.float64],
     point_ids: NDArray[np.int64],
-    path: Path,
 ) -> ModelImage:
     if not np.isfinite(pixels[point_ids >= 0]).all():
         raise ValueError(f"image {name[:80]!r} has a key point without a finite position")

@@ -106,7 +106,7 @@ def read_colmap_model(folder: Path) -> Poses:
                 f"{image.where}: its camera {image.camera_id} is not in {files[0].name}. Do the files belong together?"
             )
     points = read_points(files[2])
-    tracks = [_observations(image, cameras[image.camera_id], points, files[2]) for image in images]
+    tracks = [_observations(image, cameras[image.camera_id], points, path=files[2]) for image in images]
     width_by_id = {image_id: cameras[image.camera_id].size_hw[1] for image_id, image in by_id.items()}
     return Poses(
         names=tuple(image.name for image in images),
@@ -153,7 +153,7 @@ def _pose(image: ModelImage) -> Rigid3:
 
 
 def _observations(
-    image: ModelImage, camera: ModelCamera, points: ModelPoints3D, path: Path
+    image: ModelImage, camera: ModelCamera, points: ModelPoints3D, *, path: Path
 ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """Return the points that an image observes, and the bearings of the observations.
 

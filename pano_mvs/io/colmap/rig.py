@@ -62,7 +62,8 @@ def write_rig_model(
         cut = cuts[name]
         rig_id, camera_ids = rigs[id(cut.views)]
         image_ids = [len(seen) + number + 1 for number in range(len(cut.views))]
-        _add_frame(model, frame_id, rig_id, dict(zip(image_ids, camera_ids, strict=True)), _rig_pose(poses, idx, cut))
+        frame = pycolmap.Frame(frame_id=frame_id, rig_id=rig_id)
+        _add_frame(model, frame, dict(zip(image_ids, camera_ids, strict=True)), pose=_rig_pose(poses, idx, cut))
         observations = _by_face(poses.track_bearings, points.observations(idx), cut.views)
         for view, image_name, image_id, camera_id, (observed, pixels) in zip(
             cut.views, cut.image_names, image_ids, camera_ids, observations, strict=True
@@ -110,10 +111,9 @@ def _add_camera(model: Any, camera_id: int, view: PinholeView) -> None:
     model.add_camera(pycolmap.Camera(camera_id=camera_id, model="PINHOLE", width=width, height=height, params=params))
 
 
-def _add_frame(model: Any, frame_id: int, rig_id: int, camera_of_image: Mapping[int, int], pose: Rigid3) -> None:
+def _add_frame(model: Any, frame: Any, camera_of_image: Mapping[int, int], *, pose: Rigid3) -> None:
     import pycolmap
 
-    frame = pycolmap.Frame(frame_id=frame_id, rig_id=rig_id)
     for image_id, camera_id in camera_of_image.items():
         frame.add_data_id(pycolmap.data_t(_sensor(camera_id), image_id))
     frame.rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(pose.rotation), pose.translation)

@@ -129,7 +129,7 @@ def describe_picture(path: Path, data: bytes | None = None, *, max_pixels: int =
         )
     sphere, crop = (height, width), None
     if gpano is not None and gpano.full_size_hw is not None and gpano.crop_ltwh is not None:
-        sphere, crop, more = _placed(path, (height, width), gpano.full_size_hw, gpano.crop_ltwh)
+        sphere, crop, more = _placed(path, (height, width), full_hw=gpano.full_size_hw, crop_ltwh=gpano.crop_ltwh)
         warnings = (*warnings, *more)
     elif width != 2 * height:
         raise InputError(
@@ -190,7 +190,7 @@ def _is_file(path: Path) -> bool:
 
 
 def _placed(
-    path: Path, size_hw: tuple[int, int], full_hw: tuple[int, int], crop_ltwh: tuple[int, int, int, int]
+    path: Path, size_hw: tuple[int, int], *, full_hw: tuple[int, int], crop_ltwh: tuple[int, int, int, int]
 ) -> tuple[tuple[int, int], tuple[int, int, int, int] | None, tuple[str, ...]]:
     """Return the size of the sphere, the part in the file (None: all), and warnings."""
     (height, width), (full_height, full_width) = size_hw, full_hw

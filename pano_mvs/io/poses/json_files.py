@@ -113,7 +113,7 @@ def read_transforms(path: Path) -> dict[str, Rigid3]:
             raise InputError(
                 f"{where} ({name}): camera_model is {model}, expected EQUIRECTANGULAR. Only panoramas can be used"
             )
-        matrix = number_array(frame, "transform_matrix", (4, 4), where)
+        matrix = number_array(frame, "transform_matrix", (4, 4), where=where)
         if not np.isfinite(matrix).all():
             raise InputError(f"{where} ({name}): the pose holds NaN or infinite numbers")
         if not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
@@ -156,7 +156,7 @@ def require_distinct(names: list[str], path: Path) -> None:
 def _posed_view(entry: Any, where: str) -> PosedView:
     name = _name(entry, "image", where)
     pose = rigid_from_arrays(
-        number_array(entry, "R", (3, 3), where), number_array(entry, "t", (3,), where), f"{where} ({name})"
+        number_array(entry, "R", (3, 3), where=where), number_array(entry, "t", (3,), where=where), f"{where} ({name})"
     )
     number, digest = entry.get("id"), entry.get("sha256")
     return PosedView(name, pose, number if type(number) is int else None, digest if isinstance(digest, str) else None)
@@ -171,7 +171,7 @@ def _name(entry: Any, key: str, where: str) -> str:
     return name.replace("\\", "/").removeprefix("./")
 
 
-def number_array(entry: dict[str, Any], key: str, shape: tuple[int, ...], where: str) -> NDArray[np.float64]:
+def number_array(entry: dict[str, Any], key: str, shape: tuple[int, ...], *, where: str) -> NDArray[np.float64]:
     """Return the numbers under a key of a JSON object as an array.
 
     Raises:

@@ -42,15 +42,14 @@ def opensfm_poses(data: list[dict[str, Any]], path: Path) -> tuple[dict[str, Rig
             raise InputError(f"{path}: 'cameras' and 'shots' must be objects by name")
     largest = max(data, key=lambda item: len(item["shots"]))
     cameras, shots = largest["cameras"], largest["shots"]
-    poses = {name: _pose(name, shot, cameras, path) for name, shot in shots.items()}
+    poses = {name: _pose(shot, cameras, f"{path}: shot {name!r}") for name, shot in shots.items()}
     require_distinct(list(poses), path)
     reference = largest.get("reference_lla")
     somewhere = isinstance(reference, dict) and bool(reference.get("latitude") or reference.get("longitude"))
     return poses, somewhere
 
 
-def _pose(name: str, shot: Any, cameras: dict[str, Any], path: Path) -> Rigid3:
-    where = f"{path}: shot {name!r}"
+def _pose(shot: Any, cameras: dict[str, Any], where: str) -> Rigid3:
     if not isinstance(shot, dict):
         raise InputError(f"{where}: expected an object, got {type(shot).__name__}")
     camera = cameras.get(str(shot.get("camera", "")))
@@ -59,7 +58,7 @@ def _pose(name: str, shot: Any, cameras: dict[str, Any], path: Path) -> Rigid3:
         raise InputError(
             f"{where}: its camera's projection_type is {projection}, expected spherical. Only panoramas can be used"
         )
-    rotvec, translation = (number_array(shot, key, (3,), where) for key in ("rotation", "translation"))
+    rotvec, translation = (number_array(shot, key, (3,), where=where) for key in ("rotation", "translation"))
     if not np.isfinite(rotvec).all():
         raise InputError(f"{where}: key 'rotation' holds NaN or infinite numbers")
     return rigid_from_arrays(rotation_from_rotvec(rotvec), translation, where)
