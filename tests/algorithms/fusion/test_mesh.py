@@ -171,7 +171,7 @@ def test_other_files_are_no_meshes(tmp_path: Path) -> None:
     (tmp_path / "quad.ply").write_bytes(whole[:-13] + b"\x04" + whole[-12:])
     write_ply(tmp_path / "cloud.ply", room_cloud(10))
     for name, what in (
-        ("gone", "cannot be read"), ("cut", "promises 3 vertices and 1 faces"), ("quad", "not all of its faces"),
+        ("gone", "cannot be read"), ("cut", "states 3 vertices and 1 faces"), ("quad", "not all of its faces"),
         ("cloud", "not a PLY mesh"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=rf"{name}\.ply: .*{what}"):
