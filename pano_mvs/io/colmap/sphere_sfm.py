@@ -12,7 +12,7 @@ from pathlib import Path
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import is_file
-from pano_mvs.io.colmap.files import read_images
+from pano_mvs.io.colmap.model_reader import read_images
 from pano_mvs.io.images.captures import natural_key
 from pano_mvs.io.poses.json_files import require_distinct
 from pano_mvs.scene import Poses

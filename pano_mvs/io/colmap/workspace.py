@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.io.colmap.images import write_picture
+from pano_mvs.io.colmap.image_copies import write_picture
 from pano_mvs.io.colmap.maps import write_depth_map, write_normal_map
 from pano_mvs.scene.image_files.image_file import write_png
 

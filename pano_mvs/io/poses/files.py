@@ -11,7 +11,7 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import exists, is_file, is_folder
 from pano_mvs.core.text import plural, shortened
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
-from pano_mvs.io.colmap.model import is_colmap_model, read_colmap_model
+from pano_mvs.io.colmap.model_writer import is_colmap_model, read_colmap_model
 from pano_mvs.io.poses.json_files import (
     read_json_value,
     read_posed_views,

@@ -1,4 +1,4 @@
-"""COLMAP sparse models with EQUIRECTANGULAR cameras: written through pycolmap, read by `files`."""
+"""COLMAP sparse models with EQUIRECTANGULAR cameras: written through pycolmap, read by `model_reader`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_from_pixel
-from pano_mvs.io.colmap.files import (
+from pano_mvs.io.colmap.model_reader import (
     ModelCamera,
     ModelImage,
     ModelPoints3D,
