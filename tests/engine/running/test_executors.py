@@ -389,7 +389,8 @@ def test_memory_may_depend_on_settings_and_inputs(toy: Toy, monkeypatch: pytest.
         "plug.py",
         lambda text: text.replace(
             '@stage("toy.mean")',
-            'def needed(params, inputs):\n    return 2_000_000 * (inputs["own"].value > 50 and bool(inputs["around"]))\n\n'
+            "def needed(params, inputs):\n"
+            '    return 2_000_000 * (inputs["own"].value > 50 and bool(inputs["around"]))\n\n'
             '@stage("toy.mean", memory=needed)',
         ),
     )
