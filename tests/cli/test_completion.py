@@ -73,7 +73,7 @@ def test_a_shell_stays_silent_whatever_is_wrong(pano_mvs: Command, text: str) ->
 def test_other_shells_get_the_help_too(shell: str) -> None:
     (text,) = offered("run", "quickstart", "--set", "depth.planes", shell=shell)
     assert "depth.planes=" in text
-    assert "virtual" in text
+    assert "hypotheses" in text
 
 
 def test_the_script_for_a_shell_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
