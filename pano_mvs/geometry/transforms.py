@@ -54,7 +54,7 @@ class Rigid3:
     @property
     def center(self) -> FloatArray:
         """The origin of the target frame in source coordinates: for cam_from_world, the camera's centre (3,)."""
-        return -self.rotation.T @ self.translation
+        return np.asarray(0.0 - self.rotation.T @ self.translation)  # not -0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -167,7 +167,8 @@ class Poses(Record):
     @property
     def centers(self) -> NDArray[np.float64]:
         """The camera centres, (N, 3), in the world."""
-        centers: NDArray[np.float64] = -np.einsum("nji,nj->ni", self.rotations, self.translations)
+        # Subtracted from zero, so that no centre is at -0.0.
+        centers: NDArray[np.float64] = 0.0 - np.einsum("nji,nj->ni", self.rotations, self.translations)
         return centers
 
     @property

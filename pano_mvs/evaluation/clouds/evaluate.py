@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -90,10 +90,10 @@ class CloudEvaluation:
     source: str
     truth: str
     scores: tuple[CloudScore, ...]
-    cloud: PointSource
+    cloud: PointSource = field(repr=False)
     is_aligned: bool
-    compared: CloudTruth
-    distances: CloudDistances
+    compared: CloudTruth = field(repr=False)
+    distances: CloudDistances = field(repr=False)
     limits: tuple[float, ...]
     farthest: float
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -42,7 +42,7 @@ class DepthEvaluation:
     settings: ScoreSettings
     scale: FoundScale
     views: Mapping[str, ViewScores]
-    pairs: RangePairs
+    pairs: RangePairs = field(repr=False)
     sizes: Mapping[Sizes, int]
 
     @cached_property
