@@ -11,7 +11,7 @@ from pano_mvs.algorithms.features.sphorb import extract_sphorb
 from pano_mvs.algorithms.features.tangent import extract_orb, extract_sift
 from pano_mvs.algorithms.filters.bilateral_solver import fast_bilateral_solver
 from pano_mvs.algorithms.filters.confidence import require_confidence
-from pano_mvs.algorithms.filters.consistency import check_consistency
+from pano_mvs.algorithms.filters.consistency import checked_with_agreement
 from pano_mvs.algorithms.filters.fill import fill_from_neighbours
 from pano_mvs.algorithms.filters.gaussian import gaussian_range
 from pano_mvs.algorithms.filters.guided import guided_range
@@ -64,7 +64,7 @@ FUNCTIONS = {
     "filters.planes": lay_planes,
     "filters.confidence": require_confidence,
     "filters.speckle": remove_speckles,
-    "filters.consistency": check_consistency,
+    "filters.consistency": checked_with_agreement,
     "filters.fast_bilateral_solver": fast_bilateral_solver,
     "filters.fill": fill_from_neighbours,
     "fusion.vote": FusionSettings,

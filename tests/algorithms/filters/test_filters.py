@@ -159,9 +159,9 @@ def test_fill_does_not_trust_weak_pixels() -> None:
     ("call", "words"),
     [
         (lambda m: median_range(m, window=4), "odd"),
-        (lambda m: gaussian_range(m, window=2), "odd window"),
-        (lambda m: gaussian_range(m, sigma_px=0), "positive sigma_px"),
-        (lambda m: remove_speckles(m, max_size_px=-1), "must not be negative"),
+        (lambda m: gaussian_range(m, window=2), "odd"),
+        (lambda m: gaussian_range(m, sigma_px=0), "sigma_px must be positive"),
+        (lambda m: remove_speckles(m, max_size_px=-1), "max_size_px must be positive"),
         (lambda m: fill_from_neighbours(m, max_distance_px=0), "max_distance_px"),
     ],
 )
