@@ -14,7 +14,7 @@ Model = TypeVar("Model", bound=Params)
 Settings = TypeVar("Settings")
 
 
-def params_from(*sources: Callable[..., Any]) -> Callable[[type[Model]], type[Model]]:
+def params_from(*sources: Callable[..., Any], own_last: bool = False) -> Callable[[type[Model]], type[Model]]:
     """Add the settings of algorithms to the parameters of a stage.
 
     @params_from(SweepSettings)
@@ -24,11 +24,18 @@ def params_from(*sources: Callable[..., Any]) -> Callable[[type[Model]], type[Mo
     Args:
         sources: dataclasses whose fields are `core.settings.setting`, or functions whose keyword-only parameters are
             `Annotated` with a `core.settings.Setting`.
+        own_last: whether the fields of the class itself come after the added ones in the schema and the reference.
     """
     added: dict[str, Any] = {name: _field(one) for source in sources for name, one in settings_of(source).items()}
 
     def decorate(model: type[Model]) -> type[Model]:
-        return create_model(model.__name__, __base__=model, __module__=model.__module__, __doc__=model.__doc__, **added)
+        name = model.__name__
+        bases: Any = (model, create_model(name, __base__=Params, **added)) if own_last else model
+        rest = {} if own_last else added
+        made: type[Model] = create_model(
+            name, __base__=bases, __module__=model.__module__, __doc__=model.__doc__, **rest
+        )
+        return made
 
     return decorate
 

@@ -43,6 +43,20 @@ def test_the_parameters_have_the_settings_with_their_defaults() -> None:
     assert (ZooParams.__name__, ZooParams.__doc__) == ("ZooParams", "Settings of a zoo.")
 
 
+@params_from(ZooSettings, own_last=True)
+class OwnLastParams(Params):
+    """Settings of a zoo."""
+
+    place: str = Field(default="here", description="where")
+
+
+def test_fields_of_the_class_come_first_or_last() -> None:
+    settings = list(settings_of(ZooSettings))
+    assert list(ZooParams.model_fields) == ["place", *settings]
+    assert list(OwnLastParams.model_fields) == [*settings, "place"]
+    assert OwnLastParams.model_validate({"count": 4, "place": "there"}).place == "there"
+
+
 def test_the_schema_has_bounds_and_help() -> None:
     fields = ZooParams.model_json_schema()["properties"]
     stated = {"default": 3, "description": "how many", "minimum": 1, "maximum": 9}
