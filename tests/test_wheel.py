@@ -46,9 +46,13 @@ def test_the_wheel_holds_all_of_the_package(names: set[str]) -> None:
     workflows = {f"pano_mvs/workflows/{name}" for name in ours}
     inside = {name for name in names if name.startswith("pano_mvs/")}
     assert inside == package | workflows
-    assert {"pano_mvs/py.typed", "pano_mvs/__main__.py", "pano_mvs/workflows/quickstart.yaml",
-            "pano_mvs/workflows/samples/classroom/images/000.png",
-            "pano_mvs/workflows/samples/classroom/ATTRIBUTION.md"} <= inside  # fmt: skip
+    assert {
+        "pano_mvs/py.typed",
+        "pano_mvs/__main__.py",
+        "pano_mvs/workflows/quickstart.yaml",
+        "pano_mvs/workflows/samples/classroom/images/000.png",
+        "pano_mvs/workflows/samples/classroom/ATTRIBUTION.md",
+    } <= inside
     assert any(name.endswith(".py.jinja") for name in inside)
     assert any("report/templates/" in name for name in inside)
     assert not [name for name in names if name.startswith(("tests", "plugins", "docs"))]
@@ -98,8 +102,9 @@ def test_the_wheel_works_outside_of_the_checkout(wheel: Path, tmp_path: Path) ->
         return done.stdout
 
     where = "import pano_mvs; print(pano_mvs.__file__)"
-    found = subprocess.run([sys.executable, "-c", where], cwd=empty, env=environment, capture_output=True, text=True,
-                           check=True)  # fmt: skip
+    found = subprocess.run(
+        [sys.executable, "-c", where], cwd=empty, env=environment, capture_output=True, text=True, check=True
+    )
     assert found.stdout.startswith(str(site))
     assert "no mistakes" in call("check", "quickstart")
     assert "depth.sweep" in call("plugins")

@@ -20,7 +20,7 @@ from pano_mvs.cli.cache.app import cache_app
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.doctor.command import doctor
 from pano_mvs.cli.evaluate.app import evaluate_app
-from pano_mvs.cli.guard import guarded
+from pano_mvs.cli.exit_codes import guarded
 from pano_mvs.cli.options import (
     AcceptOption,
     CacheOption,

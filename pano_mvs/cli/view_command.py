@@ -121,7 +121,7 @@ def mesh_points(path: Path) -> NDArray[np.float32]:
     Raises:
         InputError: if it cannot be read.
     """
-    from pano_mvs.io.clouds.ply_points import read_ply_points
+    from pano_mvs.io.clouds.ply_reader import read_ply_points
 
     points = read_ply_points(path)
     if not len(points):

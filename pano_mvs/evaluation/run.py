@@ -17,7 +17,7 @@ from pano_mvs.evaluation.inputs.range_files import find_ranges
 from pano_mvs.evaluation.inputs.truth import find_true_ranges
 from pano_mvs.evaluation.ranges.evaluate import DepthEvaluation, evaluate_depth
 from pano_mvs.geometry import Rigid3
-from pano_mvs.io.colmap.model import is_colmap_model
+from pano_mvs.io.colmap.model_writer import is_colmap_model
 from pano_mvs.scene import Scores
 
 _RANGES = "range"

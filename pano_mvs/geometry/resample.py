@@ -34,8 +34,10 @@ def pad_panorama(panorama: NDArray[Scalar], pad_px: int) -> NDArray[Scalar]:
     """
     height, width = panorama.shape[:2]
     if width % 2 or not 0 <= pad_px <= min(height, width):
-        raise UsageError(f"cannot pad a {width}×{height} panorama by {pad_px} px: the width must be even, the margin "
-                         f"at most the height")  # fmt: skip
+        raise UsageError(
+            f"cannot pad a {width}×{height} panorama by {pad_px} px: the width must be even, the margin "
+            f"at most the height"
+        )
     turned = np.roll(panorama, width // 2, axis=1)
     rows = np.concatenate([turned[:pad_px][::-1], panorama, turned[height - pad_px :][::-1]], axis=0)
     return np.concatenate([rows[:, width - pad_px :], rows, rows[:, :pad_px]], axis=1)

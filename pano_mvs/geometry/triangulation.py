@@ -54,8 +54,10 @@ def triangulate_bearings(bearings: ArrayLike, cams_from_world: list[Rigid3]) -> 
     """
     rays = np.asarray(bearings, dtype=np.float64)
     if len(cams_from_world) < 2 or len(rays) != len(cams_from_world):
-        raise UsageError(f"triangulation needs one bearing for each of two or more cameras, got {len(rays)} bearings "
-                         f"and {len(cams_from_world)} cameras")  # fmt: skip
+        raise UsageError(
+            f"triangulation needs one bearing for each of two or more cameras, got {len(rays)} bearings "
+            f"and {len(cams_from_world)} cameras"
+        )
     matrix = np.zeros((*rays.shape[1:-1], 3, 3))
     vector = np.zeros((*rays.shape[1:-1], 3))
     for ray, camera in zip(rays, cams_from_world, strict=True):

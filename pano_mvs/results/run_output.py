@@ -13,7 +13,7 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import is_file, is_folder
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.geometry import Rigid3
-from pano_mvs.io.clouds.ply import read_ply
+from pano_mvs.io.clouds.ply_writer import read_ply
 from pano_mvs.io.poses.files import read_groups
 from pano_mvs.io.ranges.files import read_confidence_png, read_range_tiff
 from pano_mvs.results.records import Verdict, ViewSummary

@@ -17,16 +17,16 @@ from pano_mvs.scene.record import Axis, Record, require, require_array
 class PointCloud(Record):
     """A coloured point cloud with normals, in the world frame.
 
-    Where the cameras are in several groups, the points of each group are in that group's own world; `groups` tells them
-    apart.
+    Where the cameras are in several groups, the points of each group are in that group's own world; `groups`
+    separates them.
 
     Attributes:
         points_in_world: (N, 3) float32, scene units.
-        normals_in_world: (N, 3) float32 unit vectors towards the side from which the surface was seen.
+        normals_in_world: (N, 3) float32 unit vectors, on the side of the surface that was seen.
         colors_rgb: (N, 3) uint8.
         view_counts: (N,) uint8 number of views that agree on the point.
-        confidence: (N,) uint8, as of the range maps: the largest of the views that agree; None if not known.
-        group_sizes: number of points of each group, which follow one after the other; empty with one group.
+        confidence: (N,) uint8, the largest confidence in the range maps of the views that agree; None if unknown.
+        group_sizes: number of points of each group, in the order of the points; empty with one group.
     """
 
     axis: ClassVar[Axis | None] = Axis.ONE
@@ -73,7 +73,7 @@ class PointCloud(Record):
 
     @staticmethod
     def of_groups(clouds: Sequence[PointCloud]) -> PointCloud:
-        """Return the clouds of all groups, the first being group 0, as one; confidence is kept if all have it."""
+        """Join the clouds of all groups, beginning with group 0; confidence is kept if all have it."""
         confidences = [cloud.confidence for cloud in clouds if cloud.confidence is not None]
         if len(clouds) == 1:
             return clouds[0]

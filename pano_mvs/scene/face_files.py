@@ -1,4 +1,4 @@
-"""The files of one panorama's faces, and how it was cut."""
+"""The files of the faces of one panorama, and their layout."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ FaceLayout = Literal["cube", "octagon", "icosahedron"]
 
 @dataclass(frozen=True, eq=False)
 class FaceFiles(Files):
-    """Files of the faces of one panorama, to be delivered, with what whoever describes the faces must know.
+    """Files of the faces of one panorama for the output folder, with the layout of the faces.
 
     Attributes:
-        layout: name of the layout, as of `panorama_faces`.
-        fov_deg: field of view of a face, both ways.
+        layout: name of the layout; see `panorama_faces`.
+        fov_deg: horizontal and vertical field of view of a face.
         size_px: width and height of a face.
-        suffix: of the pictures' files, such as ".jpg".
+        suffix: suffix of the image files, such as ".jpg".
     """
 
     axis: ClassVar[Axis | None] = Axis.VIEW
@@ -35,7 +35,7 @@ class FaceFiles(Files):
         require(self.size_px > 0, self, f"size_px must be positive, got {self.size_px}")
 
     def to_parts(self) -> Parts:
-        """Return the files as `Files` does, with the cut beside the targets."""
+        """Return the files as `Files` does, with the layout in `meta`."""
         parts = dict(Files.to_parts(self))
         meta = parts["meta"]
         assert isinstance(meta, dict)
@@ -44,7 +44,7 @@ class FaceFiles(Files):
 
     @classmethod
     def from_parts(cls, parts: Parts) -> Self:
-        """Return what `to_parts` gave."""
+        """Return the record from the result of `to_parts`."""
         meta = parts["meta"]
         assert isinstance(meta, dict)
         files = Files.from_parts(parts).files

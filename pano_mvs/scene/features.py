@@ -22,7 +22,7 @@ class Features(Record):
         scores: (N,) float32 strength of the detector's response.
         colors_rgb: (N, 3) uint8 colour of the panorama at the key point.
         metric: "l2" or "hamming".
-        size_hw: (height, width) of the panorama in which they were found.
+        size_hw: (height, width) of the panorama in which they were detected.
     """
 
     axis: ClassVar[Axis | None] = Axis.IMAGE

@@ -1,4 +1,4 @@
-"""Files to deliver into the output folder."""
+"""Files that are written to the output folder."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from pano_mvs.scene.record import Axis, FilePart, Parts, Record, require
 
 @dataclass(frozen=True, eq=False)
 class Files(Record):
-    """Files to deliver into the output folder; the store keeps them, so that a deleted one is written again.
+    """Files for the output folder. The store keeps them, so that a deleted file is written again.
 
     Attributes:
-        files: target, relative to the output folder with forward slashes, to the file that a stage wrote into its
-            scratch folder. `{item}` in a target stands for the image's path relative to the capture without its
-            extension, `{name}` for the path with it; the stage need not know them, so renaming an image recomputes
-            nothing.
+        files: target, relative to the output folder with forward slashes, to the file that a stage wrote to its
+            scratch folder. In a target, `{name}` stands for the image's path relative to the capture, and `{item}`
+            for the same without its extension. Stages do not use the names themselves, so that renaming an image
+            recomputes nothing.
     """
 
     axis: ClassVar[Axis | None] = None
@@ -43,7 +43,7 @@ class Files(Record):
 
     @classmethod
     def from_parts(cls, parts: Parts) -> Self:
-        """Return the files that `to_parts` gave, at their places in the store."""
+        """Return the record from the result of `to_parts`; its files are in the store."""
         meta = parts["meta"]
         assert isinstance(meta, dict)
         files: dict[str, Path] = {}
@@ -65,10 +65,10 @@ def group_file(name: str, group: int) -> str:
 
 
 def item_stems(names: Iterable[str]) -> dict[str, str]:
-    """Return the `{item}` of each image: its path without the extension, kept where two would collide.
+    """Return the `{item}` of each image: its path without the extension, if that is unique.
 
-    It is kept too where a folder of images is called like an image without its extension, and then a dot: a file
-    `{item}.tiff` of the image `000.png` would stand where the folder `000.tiff` of others belongs.
+    The extension is also kept if a folder of images is named like an image without its extension, followed by a dot:
+    the file `{item}.tiff` of the image `000.png` would collide with the folder `000.tiff`.
     """
     found = list(names)
     stems = {name: str(PurePosixPath(name).with_suffix("")) for name in found}
@@ -87,5 +87,5 @@ def item_stems(names: Iterable[str]) -> dict[str, str]:
 
 
 def _dots(folder: str) -> list[int]:
-    """Return where the dots are in the last part of a path."""
+    """Return the positions of dots in the last component of a path."""
     return [idx for idx in range(folder.rfind("/") + 1, len(folder)) if folder[idx] == "."]

@@ -1,4 +1,4 @@
-"""What a panorama looks like as a whole, to find panoramas of the same place."""
+"""Global image descriptors, which retrieve panoramas of the same place."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from pano_mvs.scene.record import Axis, Record, require_array
 
 @dataclass(frozen=True, eq=False)
 class GlobalDescriptor(Record):
-    """What a panorama looks like as a whole; the larger the scalar product of two vectors, the more alike they are.
+    """Global descriptor of a panorama; similar panoramas have vectors with a large scalar product.
 
     Attributes:
         vector: (D,) float32 of about the same length for all panoramas; zero for a panorama without key points.
-        sample: (S, B) int16 descriptors of a few key points in whole numbers; matching them against the sample of
+        sample: (S, B) int16 descriptors of a few key points; matching them against the sample of
             another panorama identifies neighbours far better than the vectors do. May be empty.
     """
 

@@ -1,4 +1,4 @@
-"""Which images are looked at together: pairs to match, and neighbours to sweep against."""
+"""Pairs of images to match, and source images of each reference view."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Pairs(Record):
         require(all(first != second for first, second in self.pairs), self, "an image is paired with itself")
 
     def units(self) -> Mapping[str, tuple[str, ...]]:
-        """Return the pair axis: unit name to the two images it joins."""
+        """Return the pair axis: unit name to its two images."""
         return {pair_name(first, second): (first, second) for first, second in self.pairs}
 
 
@@ -55,11 +55,11 @@ class Views(Record):
 
 
 def pair_name(first: str, second: str) -> str:
-    """Return the name of the unit that joins two images."""
+    """Return the name of the unit of two images."""
     return f"{first}{PAIR_SEPARATOR}{second}"
 
 
 def pair_from_name(name: str) -> tuple[str, str]:
-    """Return the two images that a unit of the pair axis joins."""
+    """Return the two images of a unit of the pair axis."""
     first, _, second = name.partition(PAIR_SEPARATOR)
     return first, second

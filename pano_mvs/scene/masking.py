@@ -1,4 +1,4 @@
-"""Masks: read from whatever people draw them in, brought to size without losing a line, and painted over."""
+"""Read masks, resize them conservatively, and fill masked pixels of images."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from pano_mvs.scene.record import FilePart
 Mask = NDArray[np.bool_]
 
 _JPEG_START = b"\xff\xd8"
-_JPEG_LEAST = 127  # compression turns black and white into greys
-# What is painted over takes the mean colour of the smallest box that sees anything, up to this radius.
-_WIDEST_BOX = 64
-_NOTHING_SEEN = 128
+_JPEG_THRESHOLD = 127  # compression turns black and white into greys
+# Masked pixels take the mean colour of the smallest box with valid pixels, up to this radius.
+_MAX_BOX_RADIUS = 64
+_GREY_WITHOUT_VALID_PIXELS = 128
 
 
 def decode_mask(path: Path, data: bytes | None = None) -> Mask:
-    """Return a mask file as (H, W) bool, False where its value is 0: to be ignored.
+    """Return a mask file as (H, W) bool, False where its value is 0: these pixels are ignored.
 
-    Grey or colour (the brightest channel counts) of any depth, with a palette (its colours count), or with an alpha
-    channel: what is transparent is ignored as well, and where all colours are black alpha alone decides. A JPEG's
-    blacks are not 0, so there half the brightness decides.
+    The image is grey or colour (the brightest channel counts) with any depth, or has a palette (its colours count).
+    Pixels that are transparent by an alpha channel are ignored too; if all colours are black, only alpha counts. In a
+    JPEG, where black is not exactly 0, the threshold is half the brightness.
 
     Args:
         path: the file.
         data: its bytes, if they have been read already.
 
     Raises:
-        InputError: if the file cannot be read or is no picture.
+        InputError: if the file cannot be read or is not an image.
     """
     if data is None:
         data = FilePart(path).read_bytes()
@@ -45,8 +45,8 @@ def decode_mask(path: Path, data: bytes | None = None) -> Mask:
     channels = np.atleast_3d(picture)
     has_alpha = channels.shape[2] in (2, 4)
     colors = channels[..., :-1] if has_alpha else channels
-    least = _JPEG_LEAST if data.startswith(_JPEG_START) else 0
-    valid = np.asarray((colors > least).any(axis=-1))
+    threshold = _JPEG_THRESHOLD if data.startswith(_JPEG_START) else 0
+    valid = np.asarray((colors > threshold).any(axis=-1))
     if not has_alpha:
         return valid
     opaque = np.asarray(channels[..., -1] > 0)
@@ -54,13 +54,13 @@ def decode_mask(path: Path, data: bytes | None = None) -> Mask:
 
 
 def placed_mask(mask: Mask, size_hw: tuple[int, int], *, of: Crop, whole_hw: tuple[int, int]) -> Mask:
-    """Return a mask at the size of a panorama, (H, W): a pixel is valid if all that it is made of is.
+    """Return a mask at the size of a panorama, (H, W): a pixel is valid if all mask pixels that it touches are valid.
 
-    However thin a masked line is, no pixel that it touches stays valid.
+    Even a thin masked line makes every pixel invalid that it touches.
 
     Args:
-        mask: (h, w), False is to be ignored, of any size.
-        size_hw: (H, W) that is wanted, of the full sphere.
+        mask: (h, w) of any size, False is ignored.
+        size_hw: (H, W) of the returned full sphere.
         of: (left, top, width, height) of what the mask covers, in pixels of the sphere at `whole_hw`; nothing
             outside of it is masked.
         whole_hw: height and width of that sphere.
@@ -68,25 +68,26 @@ def placed_mask(mask: Mask, size_hw: tuple[int, int], *, of: Crop, whole_hw: tup
     left, top, width, height = of
     if mask.shape == size_hw and of == (0, 0, whole_hw[1], whole_hw[0]):
         return mask
-    upper, lower = _spans(size_hw[0], whole_hw[0], top, height, mask.shape[0])
-    first, last = _spans(size_hw[1], whole_hw[1], left, width, mask.shape[1])
+    upper, lower = _spans(size_hw[0], whole_hw[0], first=top, length=height, pixels=mask.shape[0])
+    first, last = _spans(size_hw[1], whole_hw[1], first=left, length=width, pixels=mask.shape[1])
     before = cv2.integral((~mask).astype(np.uint8), sdepth=cv2.CV_32S)
     masked = before[lower] - before[upper]
     return np.asarray(masked[:, last] == masked[:, first])
 
 
 def painted_over(picture: NDArray[np.uint8], valid: Mask) -> NDArray[np.uint8]:
-    """Return a panorama, (H, W, C), whose masked pixels show the colours around them instead of what was there.
+    """Return a panorama, (H, W, C), whose masked pixels are filled with surrounding colours.
 
-    Each has the mean of the valid pixels in the smallest box around it that holds any, over the seam and the poles;
-    far from all the mean of all. Nothing of what they showed is left, and no edge is drawn around them.
+    Each masked pixel has the mean of the valid pixels in the smallest box around it that contains any, across the seam
+    and the poles; far from valid pixels, the mean of all. The result does not depend on the masked content, and has no
+    edges at the mask.
     """
     painted = picture.copy()
     shown = valid.astype(np.uint8)
     if not shown.any():
-        painted[...] = _NOTHING_SEEN
+        painted[...] = _GREY_WITHOUT_VALID_PIXELS
         return painted
-    margin = min(_WIDEST_BOX, picture.shape[0])
+    margin = min(_MAX_BOX_RADIUS, picture.shape[0])
     seen = pad_panorama(np.dstack([cv2.bitwise_and(picture, picture, mask=shown), shown]), margin)
     todo, radius = 1 - shown, 1
     while radius <= margin and todo.any():
@@ -105,8 +106,10 @@ def painted_over(picture: NDArray[np.uint8], valid: Mask) -> NDArray[np.uint8]:
     return painted
 
 
-def _spans(count: int, whole: int, first: int, length: int, pixels: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return for `count` pixels of a side of `whole` which pixels of a mask, start to stop, they touch.
+def _spans(
+    count: int, whole: int, *, first: int, length: int, pixels: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the mask pixels, start to stop, that each of `count` pixels on a side of length `whole` touches.
 
     The mask's `pixels` pixels cover the side from `first` over `length`.
     """
@@ -117,11 +120,11 @@ def _spans(count: int, whole: int, first: int, length: int, pixels: int) -> tupl
 
 
 def _bounds(pixels: NDArray[np.uint8]) -> tuple[slice, slice]:
-    """Return the rows and columns between which all pixels lie that are not 0."""
+    """Return the rows and columns of the bounding box of all nonzero pixels."""
     left, top, width, height = cv2.boundingRect(pixels)
     return slice(top, top + height), slice(left, left + width)
 
 
-def _widened(part: slice, margin: int, radius: int) -> slice:
-    """Return a part of a picture, and `radius` pixels around it, in the picture with its margin."""
-    return slice(part.start + margin - radius, part.stop + margin + radius)
+def _widened(span: slice, margin: int, radius: int) -> slice:
+    """Return a slice, extended by `radius` pixels, in the coordinates of the padded image."""
+    return slice(span.start + margin - radius, span.stop + margin + radius)

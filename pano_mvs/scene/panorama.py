@@ -1,4 +1,4 @@
-"""One equirectangular picture, by reference to its file."""
+"""An equirectangular image, by reference to its file."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ from pano_mvs.scene.record import Axis, FilePart, Record, require
 
 @dataclass(frozen=True, eq=False)
 class Panorama(Record):
-    """One equirectangular picture, decoded on demand.
+    """An equirectangular image, decoded on demand.
 
     Attributes:
-        image: the picture's file.
+        image: the image file.
         size_hw: (height, width) of the full sphere at working resolution, width = 2 × height.
         source_size_hw: (height, width) of the full sphere at the file's own resolution.
-        crop_ltwh: (left, top, width, height) in source pixels of the part of the sphere that the file holds, if it is
-            not all of it (GPano's CroppedArea).
-        mask_file: a picture, 0 where the panorama must be ignored, or None. It covers what the picture covers, at any
-            resolution, or the whole sphere: its shape tells, and of a crop twice as wide as high only a mask of
-            source_size_hw covers the sphere.
-        nadir_deg: everything closer than this to the straight down direction is ignored (tripod, operator).
-        zenith_deg: likewise around the straight up direction.
-        up_in_cam: the direction away from gravity as the camera's own sensors saw it, unit (3,), or None.
-        heading_deg: compass heading of the picture's centre, or None.
+        crop_ltwh: (left, top, width, height) in source pixels of the part of the sphere in the file (GPano's
+            CroppedArea), or None for all of it.
+        mask_file: an image, 0 where the panorama is ignored, or None. It covers the same part as the image, at any
+            resolution, or the whole sphere, depending on its aspect ratio. For a crop twice as wide as high, only a
+            mask of source_size_hw covers the sphere.
+        nadir_deg: pixels closer than this to straight down are ignored (tripod, operator).
+        zenith_deg: the same around straight up.
+        up_in_cam: the direction away from gravity by the camera's sensors, unit (3,), or None.
+        heading_deg: compass heading of the image centre, or None.
         position_lla: (latitude deg, longitude deg, altitude m) from GPS, or None.
     """
 
     axis: ClassVar[Axis | None] = Axis.IMAGE
-    kind_version: ClassVar[int] = 2  # what is masked is not shown
+    kind_version: ClassVar[int] = 2  # since masked pixels are filled
 
     image: FilePart
     size_hw: tuple[int, int]
@@ -58,35 +58,33 @@ class Panorama(Record):
         require(width == 2 * height and height > 0, self, f"size_hw {self.size_hw} is not that of a full sphere")
 
     def loading_bytes(self) -> int:
-        """Return the memory that `load` and `load_mask` take for a moment: the files at their own resolution."""
+        """Return the peak memory of `load` and `load_mask`, which decode the files at their own resolution."""
         _, _, width, height = self.covers_ltwh
         masked = 0
-        if self.mask_file is not None:  # a stage's mask, which the store keeps, has the working resolution
+        if self.mask_file is not None:  # a stage's mask, which is in the store, has the working resolution
             masked = height * width if self.mask_file.external else self.size_hw[0] * self.size_hw[1]
         return max(height * width * decoding_bytes_per_pixel(self.image.path), masked * MASK_BYTES_PER_PIXEL)
 
     def load(self) -> NDArray[np.uint8]:
-        """Return the picture at working resolution, (H, W, 3) uint8 RGB, without what is masked.
+        """Return the image at working resolution, (H, W, 3) uint8 RGB, with masked pixels filled.
 
-        Masked pixels, and those that a cropped file does not have, show the colours of what is around them
-        (`painted_over`): nothing that a stage makes of the picture depends on what they showed.
+        Masked pixels and pixels outside of a crop have the colours around them (`painted_over`), so that no result
+        depends on masked content.
 
         Raises:
-            ChangedFileError: if the file, or its mask, has changed since the run listed it.
-            InputError: if one of them is gone, truncated or no picture, or has changed its size.
+            ChangedFileError: if the file or its mask has changed since the run listed it.
+            InputError: if one of them is missing, truncated, not an image, or has another size.
         """
         picture, valid = self.load_unmasked(), self.load_mask()
         return picture if valid.all() else painted_over(picture, valid)
 
     def load_unmasked(self) -> NDArray[np.uint8]:
-        """Return the picture as it was taken, with all that is masked, (H, W, 3) uint8 RGB: for people to look at.
-
-        Where a cropped file has nothing it is black.
+        """Return the image with its masked pixels, (H, W, 3) uint8 RGB, for display; black outside of a crop.
 
         Raises:
-            InputError: as `load`.
+            InputError: see `load`.
         """
-        height, width = self.source_size_hw  # the source has accepted it, perhaps beyond the usual limit
+        height, width = self.source_size_hw  # which the source accepted, possibly above the usual limit
         image = decode_image(self.image.path, self.image.read_bytes(), max_pixels=max(MAX_PIXELS, height * width))
         _, _, width, height = self.covers_ltwh
         if (not same_shape(image.shape[:2], (height, width))) or (
@@ -94,20 +92,20 @@ class Panorama(Record):
         ):
             raise InputError(
                 f"{self.image.path}: {image.shape[1]}×{image.shape[0]} px, but it had {width}×{height} "
-                "when it was listed. Run again to read it anew"
+                "when it was listed. Run again to use it as it is now"
             )
         if self.crop_ltwh is None:
             return _resized(image, self.size_hw)
         return placed_picture(image, self.size_hw, of=self.crop_ltwh, whole_hw=self.source_size_hw)
 
     def load_mask(self) -> NDArray[np.bool_]:
-        """Return the valid pixels at working resolution, (H, W) bool: False is to be ignored by every stage.
+        """Return the valid pixels at working resolution, (H, W) bool; every stage ignores the others.
 
-        A pixel is valid if no part of it is masked, within the nadir's or the zenith's cut, or outside of the crop.
+        A pixel is valid if no part of it is masked, near the nadir or the zenith, or outside of the crop.
 
         Raises:
             ChangedFileError: if the mask file has changed since the run listed it.
-            InputError: if it is gone or no picture, or covers neither the sphere nor the crop.
+            InputError: if it is missing, not an image, or has the shape of neither the sphere nor the crop.
         """
         height = self.size_hw[0]
         valid = np.zeros(self.size_hw, np.bool_)
@@ -120,14 +118,14 @@ class Panorama(Record):
         return valid
 
     def with_mask(self, valid: NDArray[np.bool_], folder: Path) -> Panorama:
-        """Return the panorama with more of it to be ignored, besides all that already is.
+        """Return the panorama with further masked pixels.
 
         Args:
-            valid: bool, False is to be ignored: (H, W), or of any other size that a mask file may have.
-            folder: where the mask file is written: `ctx.scratch` of a stage.
+            valid: (H, W) bool, or of another size that a mask file may have; False is ignored.
+            folder: the folder of the new mask file: `ctx.scratch` of a stage.
 
         Raises:
-            InputError: if the size fits neither the sphere nor the crop.
+            InputError: if it has the shape of neither the sphere nor the crop.
         """
         further = np.asarray(valid, np.bool_)
         keep = self.load_mask() & (
@@ -142,12 +140,12 @@ class Panorama(Record):
 
     @property
     def covers_ltwh(self) -> tuple[int, int, int, int]:
-        """What the file covers: (left, top, width, height) in source pixels; the whole sphere unless it is cropped."""
+        """The part of the sphere in the file: (left, top, width, height) in source pixels."""
         height, width = self.source_size_hw
         return self.crop_ltwh or (0, 0, width, height)
 
     def _placed(self, mask: NDArray[np.bool_], what: str) -> NDArray[np.bool_]:
-        """Return a mask at working resolution; its size, or else its shape, says whether it is of sphere or crop."""
+        """Return a mask at working resolution; its size or shape shows whether it covers the sphere or the crop."""
         height, width = self.source_size_hw
         sphere, crop = (0, 0, width, height), self.covers_ltwh
         size = mask.shape[0], mask.shape[1]

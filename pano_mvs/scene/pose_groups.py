@@ -1,4 +1,4 @@
-"""Groups of cameras that no reliable pair connects: taken apart, put together, treated one by one."""
+"""Split, join and process groups of cameras that no reliable pair connects."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.scene.poses import Pose, Poses
 
 _PER_CAMERA = ("center_stds", "rotation_stds_rad", "confirmed_shares", "expected_shares")
-ALONE = "no other picture shares its frame, so that its place tells nothing"
+ALONE = "no other picture shares its frame, so that its position is meaningless"
 
 
 def split_groups(poses: Poses) -> list[Poses]:
     """Return the groups of poses, the largest first, each as poses of one group.
 
-    A group has its own cameras, in the capture's order, the points that they see, their tracks and doubts, and its own
+    A group has its own cameras, in the capture's order, with their points, tracks and doubts, and its own
     frame and scale. Points that no camera sees go to group 0. Poses of one group are returned as they are; with several
     groups, `rejected` of each is empty.
     """
@@ -28,7 +28,9 @@ def split_groups(poses: Poses) -> list[Poses]:
     groups = poses.groups
     group_of_point = np.zeros(len(poses.points_in_world), np.int32)
     group_of_point[poses.track_point_idx] = groups[poses.track_image_idx]
-    return [_part(poses, groups == number, group_of_point == number, number) for number in range(len(poses.worlds))]
+    return [
+        _subset(poses, groups == number, group_of_point == number, number=number) for number in range(len(poses.worlds))
+    ]
 
 
 def join_groups(
@@ -36,14 +38,14 @@ def join_groups(
 ) -> Poses:
     """Return several poses, each of one group, as poses with groups.
 
-    Groups are numbered by their number of cameras, the largest first; of two of one size the one with the earliest
-    image comes first. A camera that is alone in its group is rejected, unless there is no other group.
+    Groups are sorted by their number of cameras, the largest first; of groups of equal size, the one with the earliest
+    image is first. A camera that is alone in its group is rejected, unless there is no other group.
 
     Args:
         groups: poses of one group each; no image may be in two of them. At least one.
-        order: names of images in the capture's order, all registered ones at least; the names of all groups one after
-            the other if not given.
-        rejected: reasons to state besides those of the groups. Images that some group registers are left out.
+        order: names of images in the capture's order, including all registered ones; by default the names of all
+            groups in their order.
+        rejected: further reasons of rejection. Images that a group registers are ignored.
 
     Returns:
         Cameras in the capture's order; points and tracks group by group. A single group is returned without groups.
@@ -66,7 +68,7 @@ def join_groups(
     kept = kept or list(groups[:1])
     registered = {name for group in kept for name in group.names}
     places = [position[name] for name in kept[0].names]
-    # A capture in one piece, the usual case, is not copied.
+    # A capture with one group, the usual case, is not copied.
     alone = len(kept) == 1 and places == sorted(places)
     joined = replace(kept[0], group_idx=None) if alone else _concatenated(kept, position)
     return replace(joined, rejected={name: why for name, why in reasons.items() if name not in registered})
@@ -76,7 +78,7 @@ def per_group(poses: Poses, function: Callable[[Poses], Poses]) -> Poses:
     """Return poses with a function applied to each group, which gets and returns poses of one group.
 
     Poses of one group are simply passed to the function. Otherwise each group comes without `rejected`; what the
-    function rejects is added to the reasons of all. Groups are numbered anew if their sizes change.
+    function rejects is added to the reasons of all. Groups are sorted again if their sizes change.
     """
     if not poses.other_worlds:
         return function(poses)
@@ -84,7 +86,7 @@ def per_group(poses: Poses, function: Callable[[Poses], Poses]) -> Poses:
 
 
 def require_one_group(pose: Pose, others: Iterable[Pose]) -> None:
-    """Raise UsageError unless poses that are to be compared are of one group, and so in one world."""
+    """Raise UsageError unless all poses are in one group, and therefore in one world."""
     groups = {pose.group, *(other.group for other in others)}
     if len(groups) > 1:
         named = ", ".join(map(str, sorted(groups)))
@@ -95,19 +97,19 @@ def require_one_group(pose: Pose, others: Iterable[Pose]) -> None:
 
 
 def with_cameras(poses: Poses, kept: NDArray[np.bool_]) -> Poses:
-    """Return poses of one group with some of its cameras alone; points that fewer than two of them see are left out.
+    """Return poses of one group with a subset of its cameras; points with fewer than two of them are removed.
 
     Args:
-        poses: of one group.
-        kept: (N,) which cameras to keep.
+        poses: poses of one group.
+        kept: (N,) the cameras of the subset.
     """
     if kept.all():
         return poses
     seen = np.bincount(poses.track_point_idx[kept[poses.track_image_idx]], minlength=len(poses.points_in_world)) >= 2
-    return replace(_part(poses, kept, seen, 0), rejected=poses.rejected)
+    return replace(_subset(poses, kept, seen, number=0), rejected=poses.rejected)
 
 
-def _part(poses: Poses, cameras: NDArray[np.bool_], points: NDArray[np.bool_], number: int) -> Poses:
+def _subset(poses: Poses, cameras: NDArray[np.bool_], points: NDArray[np.bool_], *, number: int) -> Poses:
     names = tuple(np.array(poses.names, object)[cameras])
     tracks = cameras[poses.track_image_idx] & points[poses.track_point_idx]
     world = poses.worlds[number]
@@ -188,13 +190,13 @@ def _concatenated(groups: Sequence[Poses], position: Mapping[str, int]) -> Poses
 
 
 def _joined_sigmas(groups: Sequence[Poses]) -> NDArray[np.float32] | None:
-    """Return the sigmas of all groups' observations; None if a group does not know them."""
+    """Return the sigmas of all groups' observations, or None if those of a group are unknown."""
     known = [group.track_sigmas_rad for group in groups if group.track_sigmas_rad is not None]
     return np.concatenate(known) if len(known) == len(groups) else None
 
 
 def _joined_values(groups: Sequence[Poses], order: NDArray[np.intp]) -> dict[str, Any]:
-    """Return what the groups know of each camera, NaN where a group knows nothing; None if no group does."""
+    """Return the values per camera, NaN for groups without them; None if no group has them."""
     joined = {}
     for field in _PER_CAMERA:
         known = [getattr(group, field) for group in groups]

@@ -1,4 +1,4 @@
-"""Where the panoramas were taken, and the sparse points that tell it."""
+"""The poses of the panoramas, and the sparse points and tracks behind them."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class Pose(Record):
 
     Attributes:
         cam_from_world: the rigid transform into the camera frame.
-        group: number of the group whose world this is (see `Poses.group_idx`): poses of different groups have nothing
-            to do with one another.
+        group: number of the group whose world this is (see `Poses.group_idx`). Poses of different groups are
+            unrelated.
     """
 
     axis: ClassVar[Axis | None] = Axis.IMAGE
@@ -29,7 +29,7 @@ class Pose(Record):
     group: int = 0
 
     def check(self) -> None:
-        """Raise ContractError unless the rotation is one."""
+        """Raise ContractError unless the pose is a finite rigid transform."""
         require(self.group >= 0, self, "the number of the group is negative")
         rotation = self.cam_from_world.rotation
         require(bool(np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)), self, "the rotation is not orthonormal")
@@ -37,14 +37,14 @@ class Pose(Record):
         require(bool(np.isfinite(self.cam_from_world.translation).all()), self, "the translation is not finite")
 
     def to_parts(self) -> Parts:
-        """Return the pose as one JSON object (floats keep all their digits)."""
+        """Return the pose as one JSON object (floats without loss of precision)."""
         pose = self.cam_from_world
         meta = {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
         return {"meta": meta | ({"group": self.group} if self.group else {})}
 
     @classmethod
     def from_parts(cls, parts: Parts) -> Self:
-        """Return the pose that `to_parts` gave."""
+        """Return the pose from the result of `to_parts`."""
         meta = parts["meta"]
         assert isinstance(meta, dict)
         pose = Rigid3(np.array(meta["rotation"], np.float64), np.array(meta["translation"], np.float64))
@@ -55,8 +55,8 @@ class World(NamedTuple):
     """The world of one group of cameras.
 
     Attributes:
-        frame: what the world frame is, in words.
-        scale: where the unit of length comes from, in words.
+        frame: description of the world frame.
+        scale: description of the source of the unit of length.
         metric: whether the unit of length is the metre.
     """
 
@@ -80,22 +80,22 @@ class Poses(Record):
         track_image_idx: (T,) int32: … in this image (a position in `names`) …
         track_bearings: (T, 3) float64: … along this unit ray in the camera frame.
         rejected: name of every image that could not be registered, with the reason.
-        frame: what the world frame is, in words; with several groups, that of group 0, as are the next two.
-        scale: where the unit of length comes from, in words.
+        frame: description of the world frame; with several groups, of group 0, as the next two.
+        scale: description of the source of the unit of length.
         metric: whether the unit of length is the metre.
         center_stds: (N,) float64 standard deviation of each camera's centre, scene units, relative to the first camera
-            and the first baseline, from noise in the rays alone; NaN where nothing is known; None if not computed.
-        rotation_stds_rad: (N,) float64 likewise of each camera's rotation.
+            and the first baseline, from noise in the rays only; NaN where unknown; None if not computed.
+        rotation_stds_rad: (N,) float64, the same for each camera's rotation.
         group_idx: (N,) int32 the group of each camera: 0 is the largest. Cameras of different groups are not connected
             by any reliable pair; each group has a world frame and a unit of length of its own, and no point is seen
             from two groups. None: one group. `pano_mvs.scene.pose_groups` splits and joins groups.
         other_worlds: the worlds of groups 1, 2, …; empty with one group.
         confirmed_shares: (N,) float64 share of each image's textured pixels, by solid angle, whose ranges other images
-            confirm in a small sweep with these poses; NaN where too little can be judged; None if not computed.
-        expected_shares: (N,) float64 what that share should be, judged from the neighbouring cameras.
+            confirm in a small sweep with these poses; NaN where too few pixels can be judged; None if not computed.
+        expected_shares: (N,) float64 the expected share, from the neighbouring cameras.
         doubts: name of every registered image whose pose is doubtful, with the reason.
         track_sigmas_rad: (T,) float32 standard deviation of each observation's ray, positive; the adjustment weighs
-            observations by it. None: unknown, all are alike.
+            observations by it. None: unknown, equal weights.
     """
 
     axis: ClassVar[Axis | None] = Axis.ONE
@@ -125,7 +125,7 @@ class Poses(Record):
     track_sigmas_rad: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
-        """Turn the worlds, which are stored as plain lists, back into what they were."""
+        """Convert the worlds, which are stored as lists."""
         object.__setattr__(self, "other_worlds", tuple(World(*world) for world in self.other_worlds))
 
     @staticmethod
@@ -137,7 +137,7 @@ class Poses(Record):
         scale: str,
         metric: bool,
     ) -> Poses:
-        """Return poses that come without sparse points (read from a file, say)."""
+        """Return poses without sparse points, such as poses from a file."""
         count = len(poses)
         return Poses(
             names=tuple(poses),
@@ -177,7 +177,7 @@ class Poses(Record):
 
     @property
     def worlds(self) -> tuple[World, ...]:
-        """The world of each group, that of the largest first."""
+        """The world of each group, beginning with the largest."""
         return (World(self.frame, self.scale, self.metric), *self.other_worlds)
 
     def explode(self) -> Mapping[str, Pose]:

@@ -24,7 +24,7 @@ class RangeMap(Record):
         confidence: (H, W) uint8: 0 invalid, 1–63 filled (interpolated, not seen), 64–127 seen but weak, 128–255
             consistent with other views.
         normals_in_cam: (H, W, 3) float16 unit normals of the surfaces in the camera frame, towards the camera; NaN
-            where unknown. None if whoever made the ranges did not look for them.
+            where unknown. None if they were not computed.
     """
 
     axis: ClassVar[Axis | None] = Axis.VIEW

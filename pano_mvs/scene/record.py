@@ -1,4 +1,4 @@
-"""What every record is: a frozen dataclass that knows its axis and how it is stored."""
+"""The base class of records: frozen dataclasses with an axis and a stored form."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pano_mvs.core.paths import reason_of
 
 
 class Axis(StrEnum):
-    """What one item of a kind belongs to, and so what one unit of work on it is."""
+    """What one item of a kind belongs to, which is also the unit of work on it."""
 
     ONE = "one"
     IMAGE = "image"
@@ -32,10 +32,10 @@ class FilePart:
     """A native file that is part of a record.
 
     Attributes:
-        path: where the bytes are now.
-        external: True for a user's own file, which the store remembers by its digest and never copies; False for
-            a file that a stage wrote into its scratch folder, which the store takes in.
-        digest: of the bytes; filled in by the engine when it hands the part out.
+        path: the file.
+        external: True for a user's own file, of which the store only has the digest; False for a file that a stage
+            wrote to its scratch folder, which the store takes over.
+        digest: digest of the bytes, which the engine sets when it passes the part to a stage.
     """
 
     path: Path
@@ -43,7 +43,7 @@ class FilePart:
     digest: str = ""
 
     def read_bytes(self) -> bytes:
-        """Return the file's bytes; of a user's own file, only if they are those that `digest` stands for.
+        """Return the file's bytes; a user's own file must still have its `digest`.
 
         Raises:
             ChangedFileError: if a user's file has changed since the engine listed it.
@@ -51,7 +51,7 @@ class FilePart:
         """
         try:
             data = self.path.read_bytes()
-        except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+        except (OSError, ValueError) as error:  # ValueError: an impossible file name
             raise InputError(
                 f"{self.path}: cannot be read ({reason_of(error)}). Check that it exists and may be read"
             ) from error
@@ -65,7 +65,7 @@ class FilePart:
 
 
 def changed_text(path: Path) -> str:
-    """Return what to say of a user's file that changed after the run had listed it."""
+    """Return the message about a user's file that changed after the run listed it."""
     return f"{path} changed during the run; run again to use it as it is now"
 
 
@@ -74,7 +74,7 @@ Parts: TypeAlias = Mapping[str, Part]
 
 
 def vanished_text(path: Path) -> str:
-    """Return what to say of a user's file that cannot be read any more after the run had listed it."""
+    """Return the message about a user's file that can no longer be read after the run listed it."""
     return f"{path} vanished during the run, or may not be read any more; put it back, or run again without it"
 
 
@@ -86,9 +86,9 @@ class Record:
     and `from_parts`.
 
     Attributes:
-        axis: what one item belongs to; None if it follows the stage's input (exported files do).
-        kind_version: raise it when the stored form changes; records of other versions are then recomputed.
-        explodes_into: the kind of the items, by image, that a collection holds; see `explode`.
+        axis: what one item belongs to; None if it has the axis of the stage's input, as exported files.
+        kind_version: raise it when the stored form changes, so that records of other versions are recomputed.
+        explodes_into: the kind of a collection's items per image; see `explode`.
     """
 
     axis: ClassVar[Axis | None] = Axis.ONE
@@ -105,16 +105,16 @@ class Record:
         return {}
 
     def doubted(self) -> Mapping[str, str]:
-        """Return the images that the value says are doubtful, with the reason; a run with any ends with exit code 3.
+        """Return the doubtful images with the reason. A run with doubtful images ends with exit code 3.
 
-        A value that is made from another of its kind takes its place here too: what it does not doubt is cleared.
+        If a value is made from another value of its kind, its doubts replace those of the other.
         """
         return {}
 
     def loading_bytes(self) -> int:
-        """Return the memory that reading the record's files takes for a moment, besides what is then kept.
+        """Return the peak memory while the record's files are read, without the result.
 
-        The engine counts it for each unit that reads the record, one record at a time.
+        The engine adds it for each unit that reads the record; records are read one at a time.
         """
         return 0
 
@@ -136,7 +136,7 @@ class Record:
 
     @classmethod
     def from_parts(cls, parts: Parts) -> Self:
-        """Return the record that `to_parts` gave."""
+        """Return the record from the result of `to_parts`."""
         values: dict[str, Any] = {}
         fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
         for name, part in parts.items():

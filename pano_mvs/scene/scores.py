@@ -1,4 +1,4 @@
-"""How good a result is, against ground truth."""
+"""Scores of a result against ground truth."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from pano_mvs.scene.record import Axis, Record
 
 @dataclass(frozen=True, eq=False)
 class Scores(Record):
-    """How good a result is, against ground truth; empty where none is known.
+    """Scores of a result against ground truth; empty without ground truth.
 
     Attributes:
         poses: name of a pose metric to its value.
         views: image name to name of a depth metric to its value.
-        notes: what was left out, and why.
+        notes: what was ignored, with the reason.
     """
 
     axis: ClassVar[Axis | None] = Axis.ONE

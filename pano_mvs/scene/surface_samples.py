@@ -1,4 +1,4 @@
-"""Some points of the surfaces that one view sees, spread evenly over its sphere."""
+"""Points of the surfaces in one view, evenly distributed over its sphere."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from pano_mvs.scene.record import Axis, Record, require, require_array
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSamples(Record):
-    """Points of the surfaces that one view sees.
+    """Points of the surfaces in one view.
 
     Attributes:
         bearings: (N, 3) float64 unit rays in the view's camera frame.
-        ranges: (N,) float32 along them, scene units.
+        ranges: (N,) float32 along the rays, scene units.
         colors_rgb: (N, 3) uint8.
-        confidence: (N,) uint8, as of the range map.
+        confidence: (N,) uint8, of the range map.
     """
 
     axis: ClassVar[Axis | None] = Axis.VIEW
@@ -34,7 +34,7 @@ class SurfaceSamples(Record):
         return len(self.ranges)
 
     def check(self) -> None:
-        """Raise ContractError unless all arrays agree and every point lies before the camera."""
+        """Raise ContractError unless all arrays agree and every range is positive."""
         count = len(self.ranges)
         require_array(self, "bearings", dtype=np.float64, shape=(count, 3))
         require_array(self, "ranges", dtype=np.float32, shape=(count,))

@@ -1,4 +1,4 @@
-"""Points taken from range maps, with the images that see them."""
+"""Points from range maps, with the images that observe them."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from pano_mvs.scene.record import Axis, Record, require, require_array
 
 @dataclass(frozen=True, eq=False)
 class TrackedPoints(Record):
-    """Points with tracks, as `Poses` has them, but taken from range maps.
+    """Points with tracks as in `Poses`, but from range maps.
 
     Attributes:
         names: (N) names of the images that the tracks refer to.
         points_in_world: (P, 3) float64.
         colors_rgb: (P, 3) uint8.
-        errors_rad: (P,) float32 mean angle, at the image that the point was taken from, between it and where the other
-            images of its track put it.
+        errors_rad: (P,) float32 mean angle, in the image of whose range map the point is, to the positions from the
+            range maps of the other images of its track.
         track_point_idx: (T,) int32: observation t is of this point …
         track_image_idx: (T,) int32: … in this image (a position in `names`) …
         track_bearings: (T, 3) float64: … along this unit ray in the camera frame.
@@ -58,10 +58,10 @@ class TrackedPoints(Record):
             require(inside, self, "a track has no image")
 
     def joined_to(self, poses: Poses, *, keep_points: bool) -> Poses:
-        """Return poses with these points, behind their own or in their place.
+        """Return poses with these points, after their own points or instead of them.
 
-        Tracks in images that the poses do not have are left out. With several groups of poses, so are points of which
-        no track is left: nothing tells in which world they are. `track_sigmas_rad` is None, as the new observations
+        Tracks in images that the poses do not have are removed. With several groups of poses, points without tracks
+        are removed too, since their world is unknown. `track_sigmas_rad` is None, as the new observations
         have none.
         """
         position = {name: idx for idx, name in enumerate(poses.names)}

@@ -1,4 +1,4 @@
-"""What two panoramas agree on: verified matches and their relative pose."""
+"""Two-view geometry: verified matches of two panoramas and their relative pose."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from pano_mvs.scene.record import Axis, Record, require_array
 
 @dataclass(frozen=True, eq=False)
 class TwoView(Record):
-    """The two-view geometry of a pair; falsy, with its reason, where none was found.
+    """The two-view geometry of a pair; falsy, with a reason, if none was found.
 
     Attributes:
         matches_idx: (M, 2) int32 verified matches: index of the key point in the first and in the second image.
         rotation: (3, 3) float64 of second_from_first.
         direction: (3,) float64 unit translation of second_from_first; its length is unknown.
         residuals_rad: (M,) float32 angular Sampson error of each verified match.
-        geometry: "general"; "rotation" (both pictures from the same place: no direction, no range); or "none".
-        reason: what is wrong, where the geometry is not general.
+        geometry: "general"; "rotation" (both images from the same position: no direction, no range); or "none".
+        reason: why the geometry is not general.
         candidates: number of matches before verification.
         parallax_deg: median angle between the two rays of a verified match after de-rotation.
-        rotation_std_deg: standard deviation of the rotation about its least certain axis, as far as the matches tell.
-        direction_std_deg: the same of the direction; both are 0 unless the geometry is general.
+        rotation_std_deg: standard deviation of the rotation about its least certain axis, from the matches.
+        direction_std_deg: the same for the direction; both are 0 unless the geometry is general.
         alternative_rotations: (K, 3, 3) float64 of second_from_first of the runner-up geometries, best supported first;
-            None, as are the next four, if there are none. Repeated structure often makes a false geometry the best.
+            None, as the next four, without runners-up. Repeated structure often makes a false geometry the best.
         alternative_directions: (K, 3) float64 their unit translations.
         alternative_sizes: (K,) int32 number of matches that support each.
-        alternative_matches_idx: (S, 2) int32 these matches, one geometry after the other, S = Σ sizes. A match may
+        alternative_matches_idx: (S, 2) int32 these matches, ordered by geometry, S = Σ sizes. A match may
             support several geometries.
         alternative_residuals_rad: (S,) float32 their angular Sampson errors.
     """

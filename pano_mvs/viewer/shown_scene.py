@@ -14,7 +14,7 @@ from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.paths import is_file, is_folder, resolved
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import Rigid3
-from pano_mvs.io.clouds.ply_points import PlyPoints, open_ply_points
+from pano_mvs.io.clouds.ply_reader import PlyPoints, open_ply_points
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.results.records import PosesSummary
 from pano_mvs.results.summary import RunSummary

@@ -77,13 +77,15 @@ def room_matches(
     # After the true key points come repeated things, as each image sees them from where it seems to stand.
     features = {
         f"{idx}.png": features_from_bearings(
-            np.concatenate([
-                noisy_bearings(rng, pose, seen, noise_deg=0.05),
-                noisy_bearings(rng, moved(pose, feigned.get(idx, (0.0, 0.0, 0.0))), repeated, noise_deg=0.05),
-            ])
+            np.concatenate(
+                [
+                    noisy_bearings(rng, pose, seen, noise_deg=0.05),
+                    noisy_bearings(rng, moved(pose, feigned.get(idx, (0.0, 0.0, 0.0))), repeated, noise_deg=0.05),
+                ]
+            )
         )
         for idx, pose in enumerate(poses)
-    }  # fmt: skip
+    }
     true = same_matches(len(seen))
     views = {}
     for (i, a), (j, b) in combinations(enumerate(features), 2):

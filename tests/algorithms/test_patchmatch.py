@@ -119,8 +119,7 @@ def test_compiled_steps_equal_normal_equations() -> None:
     kernels_planes.fit_planes(inverse, 0, 16, column_offsets(size, 3, spherical=True), stretches, 0.2, planes)
     found = np.empty(size, np.float32)
     numbers = (np.float32(1 / 25), np.float32(SETTINGS[0]), *SETTINGS[1:4], np.float32(SETTINGS[4]))
-    arrays = (_reference_arrays(reference, offsets, stretches),
-              _source_arrays(sources, poses, [None, mask], reach=0.0))  # fmt: skip
+    arrays = (_reference_arrays(reference, offsets, stretches), _source_arrays(sources, poses, [None, mask], reach=0.0))
     kernels_refine.refine_rows(0, 16, planes, *arrays, numbers, found)
     grey = [np.rint(256 * (picture @ LUMA)) / 256 for picture in sources]
     rows, off = (-4, -2, 0, 2, 4), []
@@ -132,9 +131,12 @@ def test_compiled_steps_equal_normal_equations() -> None:
         votes = oracle_votes(plane, row, column, size, poses[1], mask)
         steps = np.array([(u / stretches[row], v) for v in rows for u in offsets[row]])
         expected = oracle.likely_inverse(
-            plane, (size, places, values, weights), [(grey[0], poses[0], True), (grey[1], poses[1], votes)], steps,
+            plane,
+            (size, places, values, weights),
+            [(grey[0], poses[0], True), (grey[1], poses[1], votes)],
+            steps,
             SETTINGS,
-        )  # fmt: skip
+        )
         off.append(abs(found[row, column] - expected) / SETTINGS[4])
     # Slopes between pixels jump: where a sample lies on a pixel's centre both sides are right.
     assert np.quantile(off, 0.98) < 2e-3

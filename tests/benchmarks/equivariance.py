@@ -216,8 +216,9 @@ def main() -> None:
         folder = Path(temporary)
         places: list[Place] = [FolderPlace(path, given.width, given.views) for path in given.data]
         scenes = given.scene or ([] if given.data else ["poles"])
-        places += [ScenePlace(SCENES[name](seed=given.seed, views=given.views), folder / name, given.width)
-                   for name in scenes]  # fmt: skip
+        places += [
+            ScenePlace(SCENES[name](seed=given.seed, views=given.views), folder / name, given.width) for name in scenes
+        ]
         print(f"{given.workflow} {' '.join(given.overrides)}, {given.width}×{given.width // 2}, {given.views} views")
         print(HEADER)
         for number, place in enumerate(places):

@@ -114,8 +114,9 @@ def test_subfolder_that_cannot_be_listed_is_a_note(pano_mvs: Command, alone: Pat
     assert result.code == 0, result.text
     assert run_json(Path("out"))["stages"][0]["units"] == 4
     notes = [note for note in run_json(Path("out"))["notes"] if "lost+found" in note]
-    assert notes == [f"{capture / 'images' / 'lost+found'}: cannot be listed (Permission denied); what it holds is "
-                     "left out"]  # fmt: skip
+    assert notes == [
+        f"{capture / 'images' / 'lost+found'}: cannot be listed (Permission denied); what it holds is left out"
+    ]
 
 
 def test_image_that_may_not_be_read_costs_that_image(pano_mvs: Command, alone: Path, capture: Path) -> None:

@@ -43,8 +43,18 @@ def cache(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> Cache:  # noqa: F811
 
 
 def run(toy: Toy, out: str, *options: str) -> tuple[int, str]:  # noqa: F811
-    result = CliRunner().invoke(app, ["run", str(toy.folder / "wf.yaml"), "--cache", str(toy.folder / "cache"), "--out",
-                                      str(toy.folder / out), *options])  # fmt: skip
+    result = CliRunner().invoke(
+        app,
+        [
+            "run",
+            str(toy.folder / "wf.yaml"),
+            "--cache",
+            str(toy.folder / "cache"),
+            "--out",
+            str(toy.folder / out),
+            *options,
+        ],
+    )
     return result.exit_code, " ".join(result.output.split())
 
 
@@ -228,9 +238,12 @@ def test_runs_that_are_too_old_are_forgotten_and_pins_are_not(toy: Toy, cache: C
 def test_pins_are_asked_for_properly(toy: Toy, cache: Cache) -> None:  # noqa: F811
     run(toy, "one")
     run(toy, "two", "--set", "scaled.by=5")
-    for run_name, name, why in (("nothing", "good", "0 runs match"), ("", "good", "2 runs match"),
-                                (str(toy.folder / "one"), "../x", "not a valid name of a pin"),
-                                (str(toy.folder / "one"), "", "not a valid name of a pin")):  # fmt: skip
+    for run_name, name, why in (
+        ("nothing", "good", "0 runs match"),
+        ("", "good", "2 runs match"),
+        (str(toy.folder / "one"), "../x", "not a valid name of a pin"),
+        (str(toy.folder / "one"), "", "not a valid name of a pin"),
+    ):
         code, said = cache("pin", run_name, name)
         assert code == 2
         assert why in said
@@ -272,14 +285,21 @@ def test_foreign_files_and_links_are_left_alone(toy: Toy, cache: Cache) -> None:
     outside.mkdir()
     sound = sorted((root / "blobs").rglob("*.json"))[0]
     shutil.copy(sound, outside / "mine.json")
-    notes = [root / "blobs" / "notes-on-this-capture-of-november-2026.txt", root / "records" / "README.txt",
-             root / "blobs" / "ab" / "short", root / "records" / "zz" / f"{'0' * 32}.json",
-             root / "blobs" / "zz" / f"{'0' * 32}.npy"]  # fmt: skip
+    notes = [
+        root / "blobs" / "notes-on-this-capture-of-november-2026.txt",
+        root / "records" / "README.txt",
+        root / "blobs" / "ab" / "short",
+        root / "records" / "zz" / f"{'0' * 32}.json",
+        root / "blobs" / "zz" / f"{'0' * 32}.npy",
+    ]
     for path in notes:
         path.parent.mkdir(exist_ok=True)
         path.write_text("mine")
-    links = [root / "blobs" / "ab" / f"ab{'0' * 30}.json", root / "records" / "ab" / f"ab{'0' * 30}.json",
-             root / "blobs" / "xx"]  # fmt: skip
+    links = [
+        root / "blobs" / "ab" / f"ab{'0' * 30}.json",
+        root / "records" / "ab" / f"ab{'0' * 30}.json",
+        root / "blobs" / "xx",
+    ]
     for path in links:
         path.parent.mkdir(exist_ok=True)
         path.symlink_to(outside if path.name == "xx" else outside / "mine.json")
@@ -308,8 +328,9 @@ def test_collection_while_a_run_goes_on_costs_time_at_most(toy: Toy, cache: Cach
     toy.run(cache=toy.folder / "clean")
     clean = deliverables(toy.folder / "out")
     results: list[tuple[int, str]] = []
-    thread = threading.Thread(target=lambda: results.append(run(toy, "new", "--executor", "processes", "--workers",
-                                                                "2")))  # fmt: skip
+    thread = threading.Thread(
+        target=lambda: results.append(run(toy, "new", "--executor", "processes", "--workers", "2"))
+    )
     thread.start()
     rounds = 0
     while thread.is_alive():
@@ -448,8 +469,14 @@ def _refuse_writes_below(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         return call
 
     open_, mkdir = Path.open, Path.mkdir
-    for owner, name in ((Path, "open"), (Path, "mkdir"), (Path, "touch"), (Path, "unlink"), (tempfile, "mkstemp"),
-                        (tempfile, "mkdtemp")):  # fmt: skip
+    for owner, name in (
+        (Path, "open"),
+        (Path, "mkdir"),
+        (Path, "touch"),
+        (Path, "unlink"),
+        (tempfile, "mkstemp"),
+        (tempfile, "mkdtemp"),
+    ):
         monkeypatch.setattr(owner, name, refusing(getattr(owner, name)))
 
 

@@ -29,8 +29,17 @@ def test_two_sweeps_side_by_side(pano_mvs: Command, rendered: Path) -> None:
     truth = str(rendered / "truth")
     Path("fixed.yaml").write_text(FIXED.replace("TRUTH", truth), encoding="utf-8")
     Path("both.yaml").write_text(KNOWN, encoding="utf-8")
-    arguments = ("--images", rendered / "images", "--cache", "cache", "--set", "depth.planes=32",
-                 "--set", "features.max_keypoints=1500", *ALIKE)  # fmt: skip
+    arguments = (
+        "--images",
+        rendered / "images",
+        "--cache",
+        "cache",
+        "--set",
+        "depth.planes=32",
+        "--set",
+        "features.max_keypoints=1500",
+        *ALIKE,
+    )
     result = pano_mvs("run", "both.yaml", *arguments, *SAD, "--out", "both")
     assert result.code == 0, result.text
     assert "median over views" in result.text

@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 
 import pano_mvs
-from pano_mvs import algorithms
 from pano_mvs.cli.doctor import command, libraries, machine
 from pano_mvs.cli.doctor.finding import Finding
 from pano_mvs.cli.doctor.libraries import Answer, library_findings, run_probe
@@ -162,8 +161,12 @@ def test_every_variable_that_the_program_reads_is_known() -> None:
     import re
 
     package = Path(pano_mvs.__file__).parent
-    read = {name for path in package.rglob("*.py") if "doctor" not in path.parts
-            for name in re.findall(r'"(PANO_MVS_[A-Z_]+)"', path.read_text(encoding="utf-8"))}  # fmt: skip
+    read = {
+        name
+        for path in package.rglob("*.py")
+        if "doctor" not in path.parts
+        for name in re.findall(r'"(PANO_MVS_[A-Z_]+)"', path.read_text(encoding="utf-8"))
+    }
     assert read <= set(machine.KNOWN_VARIABLES)
 
 
@@ -226,8 +229,13 @@ def test_the_command_shows_the_remedies_and_ends_with_2_if_a_run_cannot_work(
     assert result.code == 2
     said = json.loads(result.text)
     assert said["ok"] is False
-    assert {"group": "libraries", "what": "pycolmap", "state": "failed", "detail": "the process died of signal 11",
-            "remedy": "pip install --force-reinstall --no-deps pycolmap"} in said["findings"]  # fmt: skip
+    assert {
+        "group": "libraries",
+        "what": "pycolmap",
+        "state": "failed",
+        "detail": "the process died of signal 11",
+        "remedy": "pip install --force-reinstall --no-deps pycolmap",
+    } in said["findings"]
     assert not Path("c").exists()
 
 
@@ -236,7 +244,7 @@ def test_the_real_libraries_work_here() -> None:
     findings = list(command.all_findings())
     found = {finding.what: finding.state for finding in findings}
     assert found["numba"] == found["pycolmap"] == found["OpenCV"] == "ok"
-    assert str(kernel_cache_folder(Path(algorithms.__file__).parent)) in next(
+    assert str(kernel_cache_folder()) in next(
         finding.detail for finding in findings if finding.what == "compiled kernels"
     )
     assert sys.version_info >= (3, 11)

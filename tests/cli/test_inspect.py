@@ -175,8 +175,19 @@ def test_the_command_that_mends_it_can_be_copied(run: Path, tmp_path: Path, monk
     """It once left out --images and --set, so that it computed something else, and was not quoted."""
     shutil.copytree(run / "capture" / "images", tmp_path / "it's: a #new" / "hall")
     monkeypatch.chdir(tmp_path)
-    arguments = ("000.png", 40, 28, "--images", "it's: a #new/hall", "--set", "images.nadir_deg=33", "--cache", "a b",
-                 "--set", "depth.planes=9")  # fmt: skip
+    arguments = (
+        "000.png",
+        40,
+        28,
+        "--images",
+        "it's: a #new/hall",
+        "--set",
+        "images.nadir_deg=33",
+        "--cache",
+        "a b",
+        "--set",
+        "depth.planes=9",
+    )
     mistake = call("inspect", run / "wf.yaml", *arguments)
     assert mistake.code == 2
     program, *command = shlex.split(mistake.text[mistake.text.index("pano-mvs run") :])

@@ -29,9 +29,23 @@ def pictures(page: Page) -> dict[str | None, str | None]:
 def test_a_run_its_repetition_and_the_command_show_the_same(pano_mvs: Command, tmp_path: Path) -> None:
     write_capture(tmp_path / "capture", default_room(), capture_poses(3, spread=0.4), (48, 96))
     truth = tmp_path / "capture" / "truth"
-    command = ("known_poses", "--images", tmp_path / "capture" / "images", "--out", "out", "--cache", "cache",
-               "--set", f"poses.path={truth / 'poses.json'}", "--set", f"scores.truth={truth}",
-               "--set", "depth.planes=16", "--set", "features.max_keypoints=400")  # fmt: skip
+    command = (
+        "known_poses",
+        "--images",
+        tmp_path / "capture" / "images",
+        "--out",
+        "out",
+        "--cache",
+        "cache",
+        "--set",
+        f"poses.path={truth / 'poses.json'}",
+        "--set",
+        f"scores.truth={truth}",
+        "--set",
+        "depth.planes=16",
+        "--set",
+        "features.max_keypoints=400",
+    )
     assert pano_mvs("run", *command).code == 0
     out = Path("out")
     first = page_in(out)
@@ -95,8 +109,10 @@ def test_a_run_that_a_gate_stops_says_why_at_once(pano_mvs: Command, toy: Toy) -
 
 
 def test_a_run_that_breaks_has_a_report_and_keeps_its_error(
-    pano_mvs: Command, toy: Toy, monkeypatch: pytest.MonkeyPatch  # noqa: F811
-) -> None:  # fmt: skip
+    pano_mvs: Command,
+    toy: Toy,  # noqa: F811  # the fixture above
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def broken(*_args: object, **_options: object) -> None:
         raise OSError("the disk has gone")
 
@@ -130,9 +146,24 @@ def test_what_an_interrupted_run_had_made_is_shown(
     monkeypatch.setattr("pano_mvs.stages.filters.fast_bilateral_solver", interrupted)
     write_capture(tmp_path / "capture", default_room(), capture_poses(2, spread=0.4), (32, 64))
     truth = tmp_path / "capture" / "truth"
-    result = pano_mvs("run", "known_poses", "--images", tmp_path / "capture" / "images", "--out", "out", "--cache", "c",
-                      "--set", f"poses.path={truth / 'poses.json'}", "--set", f"scores.truth={truth}",
-                      "--set", "depth.planes=8", "--set", "features.max_keypoints=200")  # fmt: skip
+    result = pano_mvs(
+        "run",
+        "known_poses",
+        "--images",
+        tmp_path / "capture" / "images",
+        "--out",
+        "out",
+        "--cache",
+        "c",
+        "--set",
+        f"poses.path={truth / 'poses.json'}",
+        "--set",
+        f"scores.truth={truth}",
+        "--set",
+        "depth.planes=8",
+        "--set",
+        "features.max_keypoints=200",
+    )
     assert result.code == 130
     summary = run_json(Path("out"))
     assert summary["results"]["ranges"] == "checked"

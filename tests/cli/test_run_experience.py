@@ -29,11 +29,27 @@ ON_POSIX = pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has t
 
 
 def start(toy: Toy, *options: str, sleep_s: float = 0.0) -> subprocess.Popen[str]:  # noqa: F811
-    command = [sys.executable, "-m", "pano_mvs", "run", str(toy.folder / "wf.yaml"),
-               "--cache", str(toy.folder / "cache"), "--out", str(toy.folder / "out"), *options]  # fmt: skip
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-                            env=os.environ | {"TOY_SLEEP_S": str(sleep_s)}, cwd=toy.folder,
-                            preexec_fn=heed_interrupts)  # fmt: skip
+    command = [
+        sys.executable,
+        "-m",
+        "pano_mvs",
+        "run",
+        str(toy.folder / "wf.yaml"),
+        "--cache",
+        str(toy.folder / "cache"),
+        "--out",
+        str(toy.folder / "out"),
+        *options,
+    ]
+    return subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"TOY_SLEEP_S": str(sleep_s)},
+        cwd=toy.folder,
+        preexec_fn=heed_interrupts,
+    )
 
 
 def finish(process: subprocess.Popen[str]) -> tuple[int, str, str]:
@@ -77,8 +93,10 @@ def test_events_are_complete_and_nothing_else_is_printed(toy: Toy) -> None:  # n
 
 
 def test_nothing_but_events_is_on_the_standard_output(toy: Toy) -> None:  # noqa: F811
-    toy.edit("plug.py", lambda text: text.replace("def list_items(params):", "print('a')\ndef list_items(params):\n"
-                                                  "    print('b')"))  # fmt: skip
+    toy.edit(
+        "plug.py",
+        lambda text: text.replace("def list_items(params):", "print('a')\ndef list_items(params):\n    print('b')"),
+    )
     code, out, err = finish(start(toy, "--json", "--executor", "serial"))
     assert code == 0
     assert events_of(out)[0]["event"] == "run_started"
@@ -194,8 +212,14 @@ def test_second_interrupt_ends_at_once(toy: Toy) -> None:  # noqa: F811
 @ON_POSIX
 @pytest.mark.slow
 def test_workers_end_with_a_run_that_is_killed(toy: Toy) -> None:  # noqa: F811
-    toy.edit("plug.py", lambda text: text.replace('"""Multiply."""', '''"""Multiply."""
-    open(f"pid-{os.getpid()}", "w").close(); time.sleep(300)'''))  # fmt: skip
+    toy.edit(
+        "plug.py",
+        lambda text: text.replace(
+            '"""Multiply."""',
+            '''"""Multiply."""
+    open(f"pid-{os.getpid()}", "w").close(); time.sleep(300)''',
+        ),
+    )
     process = start(toy, "--executor", "processes", "--workers", "1")
     deadline = time.monotonic() + 60
     while not (found := list(toy.folder.glob("pid-*"))) and time.monotonic() < deadline:
@@ -279,11 +303,14 @@ def test_time_left_is_a_bound_until_all_is_known() -> None:
 
 @ON_POSIX
 @pytest.mark.slow
-@pytest.mark.parametrize(("place", "how"), [
-    ('"""Multiply."""\n    if x.value == 30: ', "os._exit(0)"),
-    ("def list_items(params):\n    ", "sys.exit(0)"),
-    ('"""A toy pipeline."""\nimport os, sys\n', "os._exit(0)"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("place", "how"),
+    [
+        ('"""Multiply."""\n    if x.value == 30: ', "os._exit(0)"),
+        ("def list_items(params):\n    ", "sys.exit(0)"),
+        ('"""A toy pipeline."""\nimport os, sys\n', "os._exit(0)"),
+    ],
+)
 def test_a_plugin_that_exits_in_this_process_is_an_error(toy: Toy, place: str, how: str) -> None:  # noqa: F811
     """Each of them ended the command with exit code 0 and without a word."""
     toy.edit("plug.py", lambda text: text.replace(place.strip().splitlines()[0], f"{place}{how}", 1))

@@ -69,8 +69,12 @@ def test_all_is_written_to_a_pipe_that_is_full_and_does_not_block() -> None:
     read_end, write_end = os.pipe()
     os.set_blocking(write_end, False)
     text = "x" * 1_000_000
-    with subprocess.Popen([sys.executable, "-c", "import sys, time; time.sleep(0.1); print(len(sys.stdin.read()))"],
-                          stdin=read_end, stdout=subprocess.PIPE, text=True) as reader:  # fmt: skip
+    with subprocess.Popen(
+        [sys.executable, "-c", "import sys, time; time.sleep(0.1); print(len(sys.stdin.read()))"],
+        stdin=read_end,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as reader:
         os.close(read_end)
         stream = LenientStream(io.FileIO(write_end, "w"), "utf-8", StreamState(), owned=True)
         stream.write(text)
@@ -133,8 +137,9 @@ def test_a_command_reports_that_its_output_is_full() -> None:
 @pytest.mark.parametrize(("option", "number", "code"), [("--json", "13", 3), ("--keep-going", "30", 0)])
 def test_a_run_whose_reader_left_goes_on_to_its_end(toy: Toy, option: str, number: str, code: int) -> None:  # noqa: F811
     toy.number("3.txt", number)
-    ended = command("run", toy.folder / "wf.yaml", "--out", toy.folder / "out", "--executor", "serial", option,
-                    stdout=closed_pipe())  # fmt: skip
+    ended = command(
+        "run", toy.folder / "wf.yaml", "--out", toy.folder / "out", "--executor", "serial", option, stdout=closed_pipe()
+    )
     assert (ended.returncode, ended.stderr) == (code, "")
     assert {"report.html", "all.txt"} <= {path.name for path in (toy.folder / "out").iterdir()}
 

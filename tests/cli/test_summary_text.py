@@ -21,12 +21,21 @@ def test_scores_of_poses_of_which_no_pair_can_be_measured() -> None:
 
 
 def test_one_of_anything_is_not_named_as_several(tmp_path: Path) -> None:
-    summary = RunSummary.from_json({
-        "units": {"run": 1}, "seconds": 1.0, "left_over": {"a": "0"}, "files": {"b": "1"},
-        "poses": {"registered": ["a"], "points": 1, "scale": "none"},
-    })  # fmt: skip
+    summary = RunSummary.from_json(
+        {
+            "units": {"run": 1},
+            "seconds": 1.0,
+            "left_over": {"a": "0"},
+            "files": {"b": "1"},
+            "poses": {"registered": ["a"], "points": 1, "scale": "none"},
+        }
+    )
     stream = io.StringIO()
     print_summary(RunOutput(tmp_path, summary, StoredValues(), written=("b",)), Console(file=stream, width=200))
-    for words in ("1 unit computed, 0 cached", "1 file of an earlier run, which this one did not write, is still",
-                  "1 point; scale", "(1 file, 1 written now)"):  # fmt: skip
+    for words in (
+        "1 unit computed, 0 cached",
+        "1 file of an earlier run, which this one did not write, is still",
+        "1 point; scale",
+        "(1 file, 1 written now)",
+    ):
         assert words in stream.getvalue()

@@ -36,8 +36,15 @@ def test_leavings_of_dead_processes_go_at_once_and_those_of_others_with_age(tmp_
     (tmp_path / f"{dead}link").symlink_to(tmp_path / f"{here}old")
     clear_abandoned(tmp_path)
     left = {path.name for path in tmp_path.iterdir()}
-    assert left == {f"{here}young", f"{here}old", f"{elsewhere}young", ".tmp-young", "tmp-young", "tmp-old",
-                    ".tmp-00000000-99999999999-young"}  # fmt: skip
+    assert left == {
+        f"{here}young",
+        f"{here}old",
+        f"{elsewhere}young",
+        ".tmp-young",
+        "tmp-young",
+        "tmp-old",
+        ".tmp-00000000-99999999999-young",
+    }
     assert (tmp_path / f"{here}old" / "inside").exists()
     clear_abandoned(tmp_path / "nowhere")
 

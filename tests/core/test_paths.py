@@ -16,8 +16,20 @@ from pano_mvs.core import paths
 from tests.permissions import drop_right_to_ignore_permissions, permissions_hold
 
 PACKAGE = Path(pano_mvs.__file__).parent
-RAISING = {"is_file", "is_dir", "exists", "is_symlink", "resolve", "expanduser", "iterdir", "glob", "rglob", "samefile",
-           "home", "cwd"}  # fmt: skip
+RAISING = {
+    "is_file",
+    "is_dir",
+    "exists",
+    "is_symlink",
+    "resolve",
+    "expanduser",
+    "iterdir",
+    "glob",
+    "rglob",
+    "samefile",
+    "home",
+    "cwd",
+}
 # `Resolver.resolve` resolves a stage, `blobs.exists` takes a reference, the entries of os.scandir know what they are;
 # what a plugin's code is, is asked where any error is the plugin's.
 NOT_OF_PATHS = {
@@ -94,13 +106,17 @@ def test_nothing_else_in_the_package_asks_about_paths() -> None:
 @pytest.mark.skipif(os.name != "posix", reason="permissions as POSIX has them")
 def test_commands_start_where_the_home_folder_may_not_be_searched(tmp_path: Path) -> None:
     """`pano-mvs plugins` crashed, and kernels could not be compiled for want of a folder."""
-    environment = {name: value for name, value in os.environ.items()
-                   if not name.startswith(("PANO_MVS", "XDG", "NUMBA"))}  # fmt: skip
+    environment = {
+        name: value for name, value in os.environ.items() if not name.startswith(("PANO_MVS", "XDG", "NUMBA"))
+    }
     (tmp_path / "home").mkdir(mode=0)
     (tmp_path / "tmp").mkdir()
-    environment |= {"TMPDIR": str(tmp_path / "tmp"), "HOME": str(tmp_path / "home"),
-                    "XDG_CACHE_HOME": str(tmp_path / "home" / "a"),
-                    "XDG_CONFIG_HOME": str(tmp_path / "home" / "b")}  # fmt: skip
+    environment |= {
+        "TMPDIR": str(tmp_path / "tmp"),
+        "HOME": str(tmp_path / "home"),
+        "XDG_CACHE_HOME": str(tmp_path / "home" / "a"),
+        "XDG_CONFIG_HOME": str(tmp_path / "home" / "b"),
+    }
     code = """
 import os
 import pano_mvs.algorithms
@@ -108,7 +124,13 @@ from pano_mvs.engine.stages.plugin_files import plugin_files_in, user_plugin_fol
 os.makedirs(os.environ["NUMBA_CACHE_DIR"])
 print([plugin_files_in(folder) for folder in user_plugin_folders()], os.environ["NUMBA_CACHE_DIR"])
 """
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False,
-                          preexec_fn=drop_right_to_ignore_permissions)  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        preexec_fn=drop_right_to_ignore_permissions,
+    )
     assert done.stdout.startswith("[[]] "), done.stderr
     assert Path(done.stdout.split()[1]).is_relative_to(tmp_path / "tmp")

@@ -37,9 +37,14 @@ def test_one_more_picture_runs_what_it_touches_and_nothing_else(folder: Path) ->
     assert run(folder)["matches"] == 8 * COUNT - 36
     (folder / "capture" / "00030x.txt").write_text("12345")
     assert run(folder) == {
-        "images": 1, "features": 1, "pairs": 1, "matches": 16, "poses": 1, "views": 1,
+        "images": 1,
+        "features": 1,
+        "pairs": 1,
+        "matches": 16,
+        "poses": 1,
+        "views": 1,
         "depth": 5,  # its own, and the four whose neighbours it is now among
         "smooth": 9,  # those that look at one of the five
         "cloud": 1,
-    }  # fmt: skip
+    }
     assert run(folder) == {}

@@ -66,9 +66,15 @@ def test_the_users_folder_is_that_of_the_platform(tmp_path: Path) -> None:
     assert plugin_files_in(tmp_path / "gone") == []
 
 
-@pytest.mark.parametrize("broken", [BROKEN, "def f(:\n" + STAGE.format(name="filters.unlucky"), "import sys\n"
-                                    "sys.exit(3)\n" + STAGE.format(name="filters.unlucky"),
-                                    "raise BaseException\n" + STAGE.format(name="filters.unlucky")])  # fmt: skip
+@pytest.mark.parametrize(
+    "broken",
+    [
+        BROKEN,
+        "def f(:\n" + STAGE.format(name="filters.unlucky"),
+        "import sys\nsys.exit(3)\n" + STAGE.format(name="filters.unlucky"),
+        "raise BaseException\n" + STAGE.format(name="filters.unlucky"),
+    ],
+)
 def test_a_broken_plugin_is_told_when_its_name_is_used_and_only_then(mine: Path, broken: str) -> None:
     (mine / "bad.py").write_text(broken)
     (mine / "same.py").write_text(STAGE.format(name="filters.same"))

@@ -13,7 +13,7 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.evaluation import evaluate_cloud, evaluate_depth, evaluate_poses
 from pano_mvs.evaluation.tables import TextTable
 from pano_mvs.geometry import Rigid3
-from pano_mvs.io.clouds.ply import write_ply
+from pano_mvs.io.clouds.ply_writer import write_ply
 from pano_mvs.scene import PointCloud, Poses, RangeMap
 from tests.stored import write_npz
 

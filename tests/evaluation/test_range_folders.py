@@ -57,7 +57,7 @@ def test_what_is_no_range_is_nan_whatever_stands_there(tmp_path: Path, suffix: s
     write(tmp_path / f"a{suffix}", hard)
     np.testing.assert_array_equal(
         find_ranges(tmp_path)["a"].read(), np.array([[np.nan] * 4, [1, 2, np.nan, 3]], np.float32)
-    )  # fmt: skip
+    )
 
 
 def test_an_output_folder_is_its_ranges_with_their_confidence(tmp_path: Path) -> None:
@@ -125,8 +125,11 @@ def test_pictures_are_matched_by_their_paths_without_extension(
 
 def test_only_extensions_of_pictures_are_dropped() -> None:
     assert [without_extension(name) for name in ("a.b/c.PNG", "v1.5", ".png", "a\\b.tiff")] == [
-        "a.b/c", "v1.5", ".png", "a/b",
-    ]  # fmt: skip
+        "a.b/c",
+        "v1.5",
+        ".png",
+        "a/b",
+    ]
 
 
 class TestFaults:

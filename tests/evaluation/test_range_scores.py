@@ -21,8 +21,21 @@ from tests.oracles import range_scores as oracle
 
 SIZE = (6, 12)
 BAD = (BadLimit(0.05), BadLimit(0.5), BadLimit(1.5), BadLimit(0.3, relative=False))
-NAMES = ["mse", "psnr_db", "rmse", "mae", "abs_rel", "delta_105", "delta_125", "delta_125_2", "delta_125_3",
-         "bad_5", "bad_50", "bad_150", "bad_abs_0.3"]  # fmt: skip
+NAMES = [
+    "mse",
+    "psnr_db",
+    "rmse",
+    "mae",
+    "abs_rel",
+    "delta_105",
+    "delta_125",
+    "delta_125_2",
+    "delta_125_3",
+    "bad_5",
+    "bad_50",
+    "bad_150",
+    "bad_abs_0.3",
+]
 HARD = [np.nan, np.inf, -np.inf, 0.0, -1.0]
 
 
@@ -173,8 +186,12 @@ class TestBestConstant:
     def test_it_is_what_a_minimiser_finds(self, name: str, seed: int) -> None:
         rng = np.random.default_rng(seed)
         true, weight = rng.lognormal(0.7, 0.5, 300), rng.uniform(0.1, 1, 300)
-        found = minimize_scalar(lambda c: range_errors(np.full(300, c), true, weight)[name], bounds=(0.05, 15),
-                                method="bounded", options={"xatol": 1e-10})  # fmt: skip
+        found = minimize_scalar(
+            lambda c: range_errors(np.full(300, c), true, weight)[name],
+            bounds=(0.05, 15),
+            method="bounded",
+            options={"xatol": 1e-10},
+        )
         assert best_constant_errors(true, weight)[name] == pytest.approx(found.fun, rel=1e-6)
 
     def test_what_lies_just_at_a_limit_is_judged_as_the_scores_do(self) -> None:
@@ -237,8 +254,12 @@ class TestFit:
     def test_least_squares_are_the_least(self) -> None:
         estimated, truth, _ = draw(2)
         both = scored_pixels(estimated, truth).only_valid()
-        found = minimize_scalar(lambda s: np.sum(both.weight * (s * both.found - both.true) ** 2), bounds=(0.01, 10),
-                                method="bounded", options={"xatol": 1e-10})  # fmt: skip
+        found = minimize_scalar(
+            lambda s: np.sum(both.weight * (s * both.found - both.true) ** 2),
+            bounds=(0.01, 10),
+            method="bounded",
+            options={"xatol": 1e-10},
+        )
         assert aligning_scale(scored_pixels(estimated, truth), "lsq") == pytest.approx(found.x, rel=1e-5)
 
     def test_the_fit_weights_by_solid_angle(self) -> None:

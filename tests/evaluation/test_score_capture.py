@@ -69,8 +69,10 @@ def test_what_is_masked_is_not_judged() -> None:
 
 def test_a_pair_with_an_unregistered_camera_has_no_error() -> None:
     """Where most pairs had one, the report gave 180° as the median pose error."""
-    true = {name: Rigid3(np.eye(3), np.array(place)) for name, place in
-            (("a", (0.0, 0, 0)), ("b", (1.0, 0, 0)), ("c", (0.0, 1, 0)), ("d", (0.0, 0, 1)))}  # fmt: skip
+    true = {
+        name: Rigid3(np.eye(3), np.array(place))
+        for name, place in (("a", (0.0, 0, 0)), ("b", (1.0, 0, 0)), ("c", (0.0, 1, 0)), ("d", (0.0, 0, 1)))
+    }
     found = score_capture({name: true[name] for name in "ab"}, true).poses
     assert [found[f"median_{kind}_error_deg"] for kind in ("pair", "rotation", "direction")] == [0, 0, 0]
     assert found["auc_5_deg"] == pytest.approx(1 / 6)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.geometry import Rigid3
-from pano_mvs.io.clouds.ply import read_ply, write_ply
+from pano_mvs.io.clouds.ply_writer import read_ply, write_ply
 from pano_mvs.io.images.preview import color_mapped, range_limits, scale_ticks, write_preview
 from pano_mvs.io.ranges.files import read_confidence_png, read_range_tiff, write_confidence_png, write_range_tiff
 from pano_mvs.scene import PointCloud
@@ -73,9 +73,11 @@ def cloud(count: int) -> PointCloud:
     rng = np.random.default_rng(count)
     normals = rng.normal(size=(count, 3)).astype(np.float32)
     return PointCloud(
-        rng.normal(size=(count, 3)).astype(np.float32), normals,
-        rng.integers(0, 256, (count, 3)).astype(np.uint8), np.zeros(count, np.uint8),
-    )  # fmt: skip
+        rng.normal(size=(count, 3)).astype(np.float32),
+        normals,
+        rng.integers(0, 256, (count, 3)).astype(np.uint8),
+        np.zeros(count, np.uint8),
+    )
 
 
 @pytest.mark.parametrize("count", [0, 1, 1000])

@@ -117,8 +117,12 @@ def test_what_holds_no_poses_is_named(tmp_path: Path) -> None:
     (tmp_path / "broken.json").write_text('{\n "views": [}')
     (tmp_path / "binary.json").write_bytes(b"\xff\xfe\x00")
     (tmp_path / "poses.txt").touch()
-    for name, what in (("broken.json", ":2:12: not JSON"), ("binary.json", ": not a text file in UTF-8"),
-                       ("poses.txt", ": poses are read from"), ("gone.csv", ": no such file or folder")):  # fmt: skip
+    for name, what in (
+        ("broken.json", ":2:12: not JSON"),
+        ("binary.json", ": not a text file in UTF-8"),
+        ("poses.txt", ": poses are read from"),
+        ("gone.csv", ": no such file or folder"),
+    ):
         with pytest.raises(InputError, match=name.replace(".", r"\.") + what):
             read_poses(tmp_path / name)
     with pytest.raises(InputError, match="no poses here"):

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from pano_mvs.api import Context, PointCloud
 from pano_mvs.core.errors import UsageError
 from pano_mvs.io.clouds import thinning
-from pano_mvs.io.clouds.ply import read_ply, write_ply
+from pano_mvs.io.clouds.ply_writer import read_ply, write_ply
 from pano_mvs.io.clouds.thinning import Selection, select_points
 from pano_mvs.stages.exports.files import PlyParams, ply
 
@@ -53,8 +53,11 @@ def plainly_kept(cloud: PointCloud, selection: Selection) -> list[int]:
         if views < selection.min_views or (cloud.confidence is not None and confidence < selection.min_confidence):
             continue
         place = tuple(np.floor(point / selection.voxel).astype(int)) if selection.voxel else (idx,)
-        off = np.float32(((point / selection.voxel - np.floor(point / selection.voxel) - 0.5) ** 2).sum()) if (
-            selection.voxel) else 0  # fmt: skip
+        off = (
+            np.float32(((point / selection.voxel - np.floor(point / selection.voxel) - 0.5) ** 2).sum())
+            if (selection.voxel)
+            else 0
+        )
         rank = (-confidence, -views, float(off), idx)
         best[place] = min(best.get(place, rank), rank)
     return sorted(int(rank[-1]) for rank in best.values())
@@ -147,7 +150,7 @@ import sys
 import tracemalloc
 import numpy as np
 from pathlib import Path
-from pano_mvs.io.clouds.ply import write_ply
+from pano_mvs.io.clouds.ply_writer import write_ply
 from pano_mvs.io.clouds.thinning import Selection, select_points
 from pano_mvs.scene import PointCloud
 

@@ -11,15 +11,45 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 SWAPS: dict[type[ast.AST], str] = {
-    ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">", ast.Eq: "!=", ast.NotEq: "==", ast.Is: "is not",
-    ast.IsNot: "is", ast.In: "not in", ast.NotIn: "in", ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*",
-    ast.FloorDiv: "*", ast.Mod: "*", ast.Pow: "*", ast.LShift: ">>", ast.RShift: "<<", ast.BitAnd: "|", ast.BitOr: "&",
-    ast.And: "or", ast.Or: "and",
-}  # fmt: skip
-SIGNS = {operator: SWAPS[other] for other, operator in [
-    (ast.Lt, ast.LtE), (ast.LtE, ast.Lt), (ast.Gt, ast.GtE), (ast.GtE, ast.Gt), (ast.Eq, ast.NotEq),
-    (ast.NotEq, ast.Eq), (ast.Is, ast.IsNot), (ast.IsNot, ast.Is), (ast.In, ast.NotIn), (ast.NotIn, ast.In),
-]}  # fmt: skip
+    ast.Lt: "<=",
+    ast.LtE: "<",
+    ast.Gt: ">=",
+    ast.GtE: ">",
+    ast.Eq: "!=",
+    ast.NotEq: "==",
+    ast.Is: "is not",
+    ast.IsNot: "is",
+    ast.In: "not in",
+    ast.NotIn: "in",
+    ast.Add: "-",
+    ast.Sub: "+",
+    ast.Mult: "/",
+    ast.Div: "*",
+    ast.FloorDiv: "*",
+    ast.Mod: "*",
+    ast.Pow: "*",
+    ast.LShift: ">>",
+    ast.RShift: "<<",
+    ast.BitAnd: "|",
+    ast.BitOr: "&",
+    ast.And: "or",
+    ast.Or: "and",
+}
+SIGNS = {
+    operator: SWAPS[other]
+    for other, operator in [
+        (ast.Lt, ast.LtE),
+        (ast.LtE, ast.Lt),
+        (ast.Gt, ast.GtE),
+        (ast.GtE, ast.Gt),
+        (ast.Eq, ast.NotEq),
+        (ast.NotEq, ast.Eq),
+        (ast.Is, ast.IsNot),
+        (ast.IsNot, ast.Is),
+        (ast.In, ast.NotIn),
+        (ast.NotIn, ast.In),
+    ]
+}
 MESSAGE_CALLS = frozenset({"require", "_problem", "_warn", "warn", "isinstance", "issubclass"})
 
 Node: TypeAlias = ast.stmt | ast.expr

@@ -11,9 +11,27 @@ _SAMPLE = 5
 # Exponents of x, y, z in the twenty monomials up to degree three. The last ten are a basis of what is left of all
 # polynomials once the ten cubic ones before them are expressed by them.
 MONOMIALS = (
-    (3, 0, 0), (2, 1, 0), (1, 2, 0), (0, 3, 0), (2, 0, 1), (1, 1, 1), (0, 2, 1), (1, 0, 2), (0, 1, 2), (0, 0, 3),
-    (2, 0, 0), (1, 1, 0), (0, 2, 0), (1, 0, 1), (0, 1, 1), (0, 0, 2), (1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0),
-)  # fmt: skip
+    (3, 0, 0),
+    (2, 1, 0),
+    (1, 2, 0),
+    (0, 3, 0),
+    (2, 0, 1),
+    (1, 1, 1),
+    (0, 2, 1),
+    (1, 0, 2),
+    (0, 1, 2),
+    (0, 0, 3),
+    (2, 0, 0),
+    (1, 1, 0),
+    (0, 2, 0),
+    (1, 0, 1),
+    (0, 1, 1),
+    (0, 0, 2),
+    (1, 0, 0),
+    (0, 1, 0),
+    (0, 0, 1),
+    (0, 0, 0),
+)
 # x times a basis monomial: one of the cubic monomials (its row among the first ten), or another of the basis.
 _CUBIC_ROWS = (0, 1, 2, 4, 5, 7)
 _BASIS_ROWS = ((6, 0), (7, 1), (8, 3), (9, 6))

@@ -56,8 +56,14 @@ def vote(
         if error < merge_within:
             weight = (1 - (error / merge_within) ** 2) ** 2 / distance**2
             sums[at] = weight * np.append(put, 1)
-    return {"yields": yields, "counts": counts, "violations": violations, "confidence": confidence, "sums": sums,
-            "colors": colors}  # fmt: skip
+    return {
+        "yields": yields,
+        "counts": counts,
+        "violations": violations,
+        "confidence": confidence,
+        "sums": sums,
+        "colors": colors,
+    }
 
 
 def supported(

@@ -76,8 +76,15 @@ def summary_of(tiny: TinyCapture) -> dict[str, Any]:
         "workflow": {"name": "tiny"},
         "exit_code": 0,
         "stages": [{"name": "depth", "use": "depth.sweep", "units": 4, "run": 4, "params": {"planes": 32}}],
-        "poses": {"registered": names, "rejected": {}, "centers": poses.centers.tolist(), "frame": poses.frame,
-                  "scale": poses.scale, "metric": False, "links": links},
+        "poses": {
+            "registered": names,
+            "rejected": {},
+            "centers": poses.centers.tolist(),
+            "frame": poses.frame,
+            "scale": poses.scale,
+            "metric": False,
+            "links": links,
+        },
         "views": [{"name": name, "completeness": 1.0, "consistent": 0.5} for name in names],
         "cloud": {"points": 240},
-    }  # fmt: skip
+    }

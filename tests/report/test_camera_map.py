@@ -20,9 +20,13 @@ NAMES = ["a/1.png", "a/2.png", "a/3.png"]
 POSES = {
     "registered": NAMES,
     "centers": [[0, 0, 0], [1, 0.1, 0.2], [0.4, 0, 2]],
-    "links": [["a/1.png", "a/2.png", 300, 410, 0.02], ["a/2.png", "a/3.png", 30], ["a/1.png", "a/4.png", 3],
-              ["a/1.png", "a/3.png", 0, 12, None]],
-}  # fmt: skip
+    "links": [
+        ["a/1.png", "a/2.png", 300, 410, 0.02],
+        ["a/2.png", "a/3.png", 30],
+        ["a/1.png", "a/4.png", 3],
+        ["a/1.png", "a/3.png", 0, 12, None],
+    ],
+}
 
 
 def camera_maps(
@@ -114,8 +118,9 @@ def test_north_is_shown_where_the_levelled_frame_says_it(tiny: TinyCapture) -> N
     headings = dict(zip(tiny.names, np.rad2deg(np.arctan2(forward[:, 0], forward[:, 2])) + 40, strict=True))
     for known, north in ((headings, True), ({}, False)):
         level, _ = level_poses(poses, up, known)
-        above, side = camera_maps({"registered": list(level.names), "centers": level.centers.tolist(),
-                                   "frame": level.frame, "up": [1, 0, 0]})  # fmt: skip
+        above, side = camera_maps(
+            {"registered": list(level.names), "centers": level.centers.tolist(), "frame": level.frame, "up": [1, 0, 0]}
+        )
         assert (above.north, side.north) == (north, False)
         assert up_of({"frame": level.frame, "up": [1, 0, 0]}).tolist() == [0, -1, 0]
 

@@ -43,13 +43,24 @@ def rooms(tmp_path: Path, tiny: TinyCapture) -> tuple[dict[str, Any], StoredValu
     far_away = replace(cloud, points_in_world=cloud.points_in_world + 1000)
     results = with_values(results, poses=poses, cloud=PointCloud.of_groups([cloud, far_away]))
     names = list(tiny.names)
-    links = [[names[0], names[1], 100, 120, 0.02], [names[2], names[3], 100, 120, 0.02],
-             [names[1], names[2], 0, 31, None], [names[0], names[3], 0, 8, None]]  # fmt: skip
+    links = [
+        [names[0], names[1], 100, 120, 0.02],
+        [names[2], names[3], 100, 120, 0.02],
+        [names[1], names[2], 0, 31, None],
+        [names[0], names[3], 0, 8, None],
+    ]
     groups = [
-        {"images": list(group.names), "frame": world.frame, "scale": world.scale, "metric": world.metric,
-         "points": 240, "up": None, "nearest_pair": [names[1], names[2], 0, 31] if number else None}
+        {
+            "images": list(group.names),
+            "frame": world.frame,
+            "scale": world.scale,
+            "metric": world.metric,
+            "points": 240,
+            "up": None,
+            "nearest_pair": [names[1], names[2], 0, 31] if number else None,
+        }
         for number, (group, world) in enumerate(zip((large, small), poses.worlds, strict=True))
-    ]  # fmt: skip
+    ]
     return {**summary, "poses": {**summary["poses"], "links": links, "groups": groups}}, results
 
 
@@ -87,8 +98,9 @@ def test_groups_are_a_doubt_and_the_pictures_to_take_are_named(rooms: tuple[dict
     assert found.tiles[0].label == "panoramas registered, in 2 groups"
     told = next(finding for finding in found.findings if "groups of panoramas" in finding.text)
     assert (told.mood, told.remedy) == (
-        "fair", "To join them take pictures between 001.png and 002.png (31 candidates)."
-    )  # fmt: skip
+        "fair",
+        "To join them take pictures between 001.png and 002.png (31 candidates).",
+    )
     assert "group 1 has 2 (002.png, 003.png)" in told.text
 
 

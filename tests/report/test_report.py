@@ -31,13 +31,30 @@ SUMMARY: dict[str, Any] = {
     "executor": {"name": "processes", "workers": 2, "threads": 1},
     "machine": {"processor": "x86_64", "cores": 2, "memory_gb": 16.4},
     "stages": [
-        {"name": "depth", "use": "depth.sweep", "units": 4, "run": 2, "cached": 1, "failed": 1, "blocked": 9,
-         "seconds": 90.0, "unit_seconds": 170.0, "metrics": {"planes": 128, "median_error_deg": 0.01234567},
-         "params": {"planes": 128, "near": None, "cost": "census"}},
+        {
+            "name": "depth",
+            "use": "depth.sweep",
+            "units": 4,
+            "run": 2,
+            "cached": 1,
+            "failed": 1,
+            "blocked": 9,
+            "seconds": 90.0,
+            "unit_seconds": 170.0,
+            "metrics": {"planes": 128, "median_error_deg": 0.01234567},
+            "params": {"planes": 128, "near": None, "cost": "census"},
+        },
         {"name": "ply", "use": "export.ply", "units": 1, "run": 1, "cached": 0, "failed": 0, "seconds": 0.2},
     ],
-    "failures": [{"stage": "depth", "item": "a/4.png", "cause": "it is truncated", "consequence": "no range map",
-                  "log": "logs/depth.txt"}],
+    "failures": [
+        {
+            "stage": "depth",
+            "item": "a/4.png",
+            "cause": "it is truncated",
+            "consequence": "no range map",
+            "log": "logs/depth.txt",
+        }
+    ],
     "blocked": [{"stage": "ply", "item": "", "cause": "it needs depth"}],
     "rejected": {"a/5.png": {"stage": "images", "reason": "not a picture"}},
     "warnings": ["a blob was damaged"],
@@ -50,8 +67,12 @@ SUMMARY: dict[str, Any] = {
         "centers": [[0, 0, 0], [1, 0.1, 0.2], [0.4, 0, 2]],
         "frame": "the first camera",
         "scale": "the first baseline is 1",
-        "links": [["a/1.png", "a/2.png", 300, 410, 0.021], ["a/2.png", "a/3.png", 30], ["a/1.png", "a/4.png", 3],
-                  ["a/1.png", "a/3.png", 0, 12, None]],
+        "links": [
+            ["a/1.png", "a/2.png", 300, 410, 0.021],
+            ["a/2.png", "a/3.png", 30],
+            ["a/1.png", "a/4.png", 3],
+            ["a/1.png", "a/3.png", 0, 12, None],
+        ],
     },
     "scores": {
         "poses": {"median_pair_error_deg": 0.0123, "registered": 3},
@@ -70,7 +91,7 @@ SUMMARY: dict[str, Any] = {
     "files": {"cloud.ply": "x", "range/a/1.tiff": "x", "range/a/2.tiff": "x"},
     "workflow_text": "pano_mvs: 1\nstages: {}\n",
     "versions": {"numpy": "2.1"},
-}  # fmt: skip
+}
 
 
 def reported(out_dir: Path, summary: Mapping[str, Any], results: StoredValues | None = None) -> Page:
@@ -107,17 +128,50 @@ def test_everything_that_is_known_is_said(out_dir: Path) -> None:
     page = reported(out_dir, SUMMARY)
     assert_sound(page)
     for text in (
-        "lobby", "Finished, with failed items", "3 of 4", "panoramas registered", "94 % of pixels have a range",
-        "1.23 M points in the cloud", "0.012° median pose error", "3 % median range error", "Took 3 min 07 s",
-        "5 units of work: 3 computed, 1 taken from the cache, 1 failed.", "it is truncated", "no range map",
-        "too few matches", "one picture has no GPano metadata", "the first baseline is 1", "median error, °: 0.01235",
-        "the scale was fitted", "PSNR dB", "pano_mvs: 1 stages: {}", "numpy 2.1", "no preview", "1 min 30 s",
-        "9 blocked", "depth.planes=64", "logs/depth.txt", "1 further unit", "a blob was damaged", "not a picture",
-        "workers: 2", "cores: 2", "range/ (2)", "cloud.ply", "planes", "census", "3 of 4 have a common geometry",
-        "2 min 50 s of work", "show 1 of 1 rejected pair",
-        "1 camera is doubtful: a/1.png (hardly confirmed).", "triangles are doubtful cameras",
-        "a/1.png 12 % 62 % hardly confirmed", "Doubtful (1)", "in scene units, not metres", "no range map",
-    ):  # fmt: skip
+        "lobby",
+        "Finished, with failed items",
+        "3 of 4",
+        "panoramas registered",
+        "94 % of pixels have a range",
+        "1.23 M points in the cloud",
+        "0.012° median pose error",
+        "3 % median range error",
+        "Took 3 min 07 s",
+        "5 units of work: 3 computed, 1 taken from the cache, 1 failed.",
+        "it is truncated",
+        "no range map",
+        "too few matches",
+        "one picture has no GPano metadata",
+        "the first baseline is 1",
+        "median error, °: 0.01235",
+        "the scale was fitted",
+        "PSNR dB",
+        "pano_mvs: 1 stages: {}",
+        "numpy 2.1",
+        "no preview",
+        "1 min 30 s",
+        "9 blocked",
+        "depth.planes=64",
+        "logs/depth.txt",
+        "1 further unit",
+        "a blob was damaged",
+        "not a picture",
+        "workers: 2",
+        "cores: 2",
+        "range/ (2)",
+        "cloud.ply",
+        "planes",
+        "census",
+        "3 of 4 have a common geometry",
+        "2 min 50 s of work",
+        "show 1 of 1 rejected pair",
+        "1 camera is doubtful: a/1.png (hardly confirmed).",
+        "triangles are doubtful cameras",
+        "a/1.png 12 % 62 % hardly confirmed",
+        "Doubtful (1)",
+        "in scene units, not metres",
+        "no range map",
+    ):
         assert text in page.words, text
 
 
@@ -176,14 +230,26 @@ def test_every_element_that_the_script_asks_for_is_there(out_dir: Path) -> None:
 def test_names_and_causes_are_text_and_never_markup(out_dir: Path) -> None:
     evil = '<script>alert("1")</script>&\'">'
     summary = {
-        "workflow": {"name": evil, "path": evil, "overrides": [evil]}, "notes": [evil], "workflow_text": evil,
-        "versions": {evil: evil}, "failures": [{"stage": evil, "item": evil, "cause": evil, "log": evil}],
-        "poses": {"registered": [evil], "centers": [[0, 0, 0]], "rejected": {evil + "2": evil}, "frame": evil,
-                  "scale": evil, "links": [[evil, evil, 0, 2, None]]},
-        "views": [{"name": evil, "preview": evil}], "stopped": evil, "machine": {evil: evil},
+        "workflow": {"name": evil, "path": evil, "overrides": [evil]},
+        "notes": [evil],
+        "workflow_text": evil,
+        "versions": {evil: evil},
+        "failures": [{"stage": evil, "item": evil, "cause": evil, "log": evil}],
+        "poses": {
+            "registered": [evil],
+            "centers": [[0, 0, 0]],
+            "rejected": {evil + "2": evil},
+            "frame": evil,
+            "scale": evil,
+            "links": [[evil, evil, 0, 2, None]],
+        },
+        "views": [{"name": evil, "preview": evil}],
+        "stopped": evil,
+        "machine": {evil: evil},
         "stages": [{"name": evil, "use": evil, "metrics": {evil: 1}, "params": {evil: [evil]}}],
-        "scores": {"poses": {evil: 1}, "views": {evil: {evil: 1}}, "notes": [evil]}, "files": {evil: evil},
-    }  # fmt: skip
+        "scores": {"poses": {evil: 1}, "views": {evil: {evil: 1}}, "notes": [evil]},
+        "files": {evil: evil},
+    }
     page = reported(out_dir, summary)
     assert page.tags.count("script") == 2, "ours and the facts"
     assert_sound(page)

@@ -72,8 +72,18 @@ def test_shares_are_of_the_sphere_and_not_of_the_picture() -> None:
     assert sum(fact_of(shares)) == pytest.approx(1, abs=1e-5)
 
 
-@pytest.mark.parametrize(("value", "name"), [(0, "invalid"), (1, "filled"), (63, "filled"), (64, "weak"),
-                                             (127, "weak"), (128, "consistent"), (255, "consistent")])  # fmt: skip
+@pytest.mark.parametrize(
+    ("value", "name"),
+    [
+        (0, "invalid"),
+        (1, "filled"),
+        (63, "filled"),
+        (64, "weak"),
+        (127, "weak"),
+        (128, "consistent"),
+        (255, "consistent"),
+    ],
+)
 def test_classes_end_where_the_confidence_says(value: int, name: str) -> None:
     assert getattr(shares_of(np.full((8, 16), value, np.uint8)), name) == pytest.approx(1)
 

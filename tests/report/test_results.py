@@ -140,10 +140,15 @@ def drawing(folder: Path, body: str) -> tuple[str, ...]:
 
 @pytest.mark.parametrize(
     "body",
-    ["raise SystemExit(1)", "import os; os.abort()", "", "import numpy, sys; from pathlib import Path\n"
-     "for n in range(3): numpy.save(Path(sys.argv[1]) / f'picture{n}.npy', numpy.zeros((600, 960, 3), 'uint8'))"],
+    [
+        "raise SystemExit(1)",
+        "import os; os.abort()",
+        "",
+        "import numpy, sys; from pathlib import Path\n"
+        "for n in range(3): numpy.save(Path(sys.argv[1]) / f'picture{n}.npy', numpy.zeros((600, 960, 3), 'uint8'))",
+    ],
     ids=["fails", "crashes", "draws nothing", "draws black"],
-)  # fmt: skip
+)
 def test_where_there_is_no_graphics_driver_plainer_pictures_are_drawn(
     tmp_path: Path, results: StoredValues, monkeypatch: pytest.MonkeyPatch, body: str
 ) -> None:

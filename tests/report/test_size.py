@@ -24,14 +24,20 @@ def large(count: int) -> dict[str, Any]:
     links = [[names[i], names[(i + k) % count], 50 * (k % 3), 99, 0.03] for i in range(count) for k in range(1, 9)]
     return {
         "exit_code": 3,
-        "poses": {"registered": names, "rejected": {f"x{name}": "too few matches with any other" for name in names},
-                  "centers": [[i % 70, 0, i // 70] for i in range(count)], "links": links},
-        "views": [{"name": name, "preview": "preview/1.jpg", "completeness": (idx % 997) / 997, "consistent": 0.4}
-                  for idx, name in enumerate(names)],
+        "poses": {
+            "registered": names,
+            "rejected": {f"x{name}": "too few matches with any other" for name in names},
+            "centers": [[i % 70, 0, i // 70] for i in range(count)],
+            "links": links,
+        },
+        "views": [
+            {"name": name, "preview": "preview/1.jpg", "completeness": (idx % 997) / 997, "consistent": 0.4}
+            for idx, name in enumerate(names)
+        ],
         "failures": [{"stage": "depth", "item": name, "cause": "it is truncated " * 9} for name in names],
         "notes": [f"note {number} on something" for number in range(count)],
         "scores": {"views": {name: {"psnr_db": 30.0, "w_mae": 0.1, "completeness": 1.0} for name in names}},
-    }  # fmt: skip
+    }
 
 
 @pytest.mark.parametrize(("width", "most_bytes"), [(768, 80_000), (160, 9_000), (960, 300_000)])
@@ -69,10 +75,16 @@ def test_of_many_views_the_worst_and_some_others_are_shown_in_full(tmp_path: Pat
 @pytest.mark.slow
 def test_a_thousand_views_of_noise_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(1)
-    monkeypatch.setattr(thumbnails, "preview_panels", lambda *_, **__: tuple(
-        rng.integers(0, 255, (80, 160, 3), np.uint8) for _ in range(2)))  # fmt: skip
-    monkeypatch.setattr(view_cards, "preview_panels", lambda *_, **__: tuple(
-        rng.integers(0, 255, (640, 1280, 3), np.uint8) for _ in range(2)))  # fmt: skip
+    monkeypatch.setattr(
+        thumbnails,
+        "preview_panels",
+        lambda *_, **__: tuple(rng.integers(0, 255, (80, 160, 3), np.uint8) for _ in range(2)),
+    )
+    monkeypatch.setattr(
+        view_cards,
+        "preview_panels",
+        lambda *_, **__: tuple(rng.integers(0, 255, (640, 1280, 3), np.uint8) for _ in range(2)),
+    )
     write_report(tmp_path, RunSummary.from_json(large(1000)))
     page = (tmp_path / "report.html").read_text()
     assert page.count("<img ") == 1000 + 2 * 36

@@ -27,10 +27,21 @@ def luminance(color: str) -> float:
 @pytest.mark.parametrize("theme", ["light", "dark"])
 @pytest.mark.parametrize(
     ("text", "ground"),
-    [("ink", "paper"), ("ink", "ground"), ("soft", "paper"), ("soft", "ground"), ("accent", "ground"),
-     ("good", "good-bg"), ("fair", "fair-bg"), ("bad", "bad-bg"), ("fair", "paper"), ("bad", "paper"),
-     ("ink", "bad-bg"), ("soft", "bad-bg")],
-)  # fmt: skip
+    [
+        ("ink", "paper"),
+        ("ink", "ground"),
+        ("soft", "paper"),
+        ("soft", "ground"),
+        ("accent", "ground"),
+        ("good", "good-bg"),
+        ("fair", "fair-bg"),
+        ("bad", "bad-bg"),
+        ("fair", "paper"),
+        ("bad", "paper"),
+        ("ink", "bad-bg"),
+        ("soft", "bad-bg"),
+    ],
+)
 def test_text_stands_out_from_its_ground(theme: str, text: str, ground: str) -> None:
     first, second = sorted((luminance(themes()[theme][name]) for name in (text, ground)), reverse=True)
     assert (first + 0.05) / (second + 0.05) >= LEAST

@@ -65,21 +65,30 @@ def doubting(count: int) -> dict[str, Any]:
         ({"views": [{"completeness": 1.0, "consistent": 0.05}]}, "bad", "confirm only 5"),
         ({"cloud": {"points": 0}}, "bad", "The cloud has no points"),
         ({"scores": {"views": {"1": {"psnr_db": 17.0, "constant_psnr_db": 18.0}}}}, "bad", "17.0 dB to 18.0 dB"),
-        ({"all_scores": {"a": GOOD["scores"], "b": {"views": {"1": {"psnr_db": 9.0, "constant_psnr_db": 18.0}}}}},
-         "bad", "(b)"),
+        (
+            {"all_scores": {"a": GOOD["scores"], "b": {"views": {"1": {"psnr_db": 9.0, "constant_psnr_db": 18.0}}}}},
+            "bad",
+            "(b)",
+        ),
         ({"exit_code": 4, "stopped": "registered is 0.2, but `gate` requires 0.8"}, "bad", "but `gate` requires 0.8"),
         ({"exit_code": 130, "stopped": "interrupted"}, "fair", "was interrupted"),
         ({"exit_code": 3, "failures": [{"stage": "depth", "item": "1.png"}]}, "fair", "1 in depth"),
         ({"exit_code": 1, "stopped": "division by zero"}, "bad", "division by zero"),
-        ({"poses": POSES | {"links": [[NAMES[0], name, 90] for name in NAMES[1:]]}}, "fair",
-         "9 cameras share a verified geometry with one other alone"),
+        (
+            {"poses": POSES | {"links": [[NAMES[0], name, 90] for name in NAMES[1:]]}},
+            "fair",
+            "9 cameras share a verified geometry with one other alone",
+        ),
         ({"exit_code": 3, "poses": doubting(1)}, "fair", "1 camera is doubtful: 0.png (confirmed 1 %)."),
         ({"poses": doubting(5)}, "fair", "5 cameras are doubtful: 0.png (confirmed 1 %); 1.png"),
         ({"poses": doubting(6)}, "bad", "4.png (confirmed 1 %); and 1 more."),
-        ({"poses": POSES | {"groups": [{"images": NAMES[:7]}, {"images": NAMES[7:]}]}}, "fair",
-         "2 groups of panoramas share no reliable connection"),
+        (
+            {"poses": POSES | {"groups": [{"images": NAMES[:7]}, {"images": NAMES[7:]}]}},
+            "fair",
+            "2 groups of panoramas share no reliable connection",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_is_wrong_is_found_and_named(change: dict[str, Any], mood: str, words: str) -> None:
     found = judged(GOOD | change)
     assert found.mood == mood
@@ -113,9 +122,14 @@ def test_the_worst_comes_first() -> None:
 
 @pytest.mark.parametrize(
     ("code", "text", "mood"),
-    [(0, "Finished", "good"), (1, "internal error", "bad"), (4, "Stopped by a quality threshold", "bad"),
-     (130, "Interrupted", "fair"), (77, "Ended with code 77", "bad")],
-)  # fmt: skip
+    [
+        (0, "Finished", "good"),
+        (1, "internal error", "bad"),
+        (4, "Stopped by a quality threshold", "bad"),
+        (130, "Interrupted", "fair"),
+        (77, "Ended with code 77", "bad"),
+    ],
+)
 def test_the_outcome_is_that_of_the_exit_code(code: int, text: str, mood: str) -> None:
     found = judged({"exit_code": code})
     assert text in found.outcome
@@ -152,8 +166,13 @@ def test_one_of_anything_is_not_named_as_several() -> None:
 
 
 def test_reasons_that_differ_in_figures_and_endings_alone_are_counted_together() -> None:
-    reasons = {"a": "1 match, 20 needed", "b": "7 matches, 20 needed", "c": "1 of its points is known",
-               "d": "2 of its points are known", "e": "3 of its points are known"}  # fmt: skip
+    reasons = {
+        "a": "1 match, 20 needed",
+        "b": "7 matches, 20 needed",
+        "c": "1 of its points is known",
+        "d": "2 of its points are known",
+        "e": "3 of its points are known",
+    }
     (finding,) = found_in({"poses": {"registered": NAMES, "rejected": reasons}})
     assert "3 times such as “1 of its points is known”" in finding.text
 

@@ -49,8 +49,10 @@ def test_from_above_it_is_true_to_scale_with_z_upwards() -> None:
     colors = np.array([[9, 9, 9], [255, 0, 0], [0, 255, 0], [0, 0, 255]], np.uint8)
     above, _, _ = viewpoints(points, np.zeros((0, 3)), UP, aspect=1.6)
     image = draw_cloud(points, normals, colors, above, size_hw=SIZE_HW).astype(int)
-    places = {channel: np.argwhere((image[..., channel] == 255) & (image.sum(axis=-1) == 255)).mean(axis=0)
-              for channel in range(3)}  # fmt: skip
+    places = {
+        channel: np.argwhere((image[..., channel] == 255) & (image.sum(axis=-1) == 255)).mean(axis=0)
+        for channel in range(3)
+    }
     red, green, blue = places[0], places[1], places[2]
     assert red[1] > green[1] > blue[1], "x to the right"
     assert green[0] < red[0] < blue[0], "z upwards"

@@ -57,9 +57,14 @@ def test_a_notebook_shows_the_verdict_pictures_and_stages(run: RunOutput) -> Non
 
 def test_a_notebook_shows_names_as_text() -> None:
     evil = "<script>"
-    summary = RunSummary.from_json({
-        "workflow": {"name": evil}, "stopped": evil, "stages": [{"name": evil, "use": evil}], "exit_code": 4,
-    })  # fmt: skip
+    summary = RunSummary.from_json(
+        {
+            "workflow": {"name": evil},
+            "stopped": evil,
+            "stages": [{"name": evil, "use": evil}],
+            "exit_code": 4,
+        }
+    )
     assert evil not in RunOutput(Path(evil), summary, StoredValues())._repr_html_()
 
 

@@ -120,13 +120,15 @@ def test_links_of_early_versions_had_fewer_fields() -> None:
 
 
 def test_poses_by_group_have_the_groups_own_frames_and_the_cameras_doubts() -> None:
-    poses = PosesSummary.model_validate({
-        "registered": ["a", "b", "x"],
-        "centers": [[0, 0, 0], [1, 0, 0], [2, 0, 0]],
-        "doubts": {"x": "dark"},
-        "links": [["a", "b", 9], ["a", "x", 0]],
-        "groups": [{"images": ["a", "b"], "scale": "s"}, {"images": ["x"], "metric": True, "points": 7}],
-    })  # fmt: skip
+    poses = PosesSummary.model_validate(
+        {
+            "registered": ["a", "b", "x"],
+            "centers": [[0, 0, 0], [1, 0, 0], [2, 0, 0]],
+            "doubts": {"x": "dark"},
+            "links": [["a", "b", 9], ["a", "x", 0]],
+            "groups": [{"images": ["a", "b"], "scale": "s"}, {"images": ["x"], "metric": True, "points": 7}],
+        }
+    )
     large, small = poses.by_group()
     assert (large.registered, large.scale, large.links) == (("a", "b"), "s", (PairLink("a", "b", 9),))
     assert (small.centers, small.metric, small.points, small.doubts) == (((2, 0, 0),), True, 7, {"x": "dark"})

@@ -76,10 +76,16 @@ def refuse(*_: object) -> None:
     raise error
 
 
-@pytest.mark.parametrize(("width", "height", "is_limit"), [
-    ((1 << 20) + 1, 1, True), (1, (1 << 20) + 1, True), (1 << 20, 1, False), (1 << 15, 1 << 15, False),
-    (1 << 15, (1 << 15) + 1, True),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("width", "height", "is_limit"),
+    [
+        ((1 << 20) + 1, 1, True),
+        (1, (1 << 20) + 1, True),
+        (1 << 20, 1, False),
+        (1 << 15, 1 << 15, False),
+        (1 << 15, (1 << 15) + 1, True),
+    ],
+)
 def test_what_opencv_does_not_take_is_reported_with_its_limits(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, width: int, height: int, is_limit: bool
 ) -> None:
@@ -100,9 +106,15 @@ def test_a_small_picture_that_opencv_refuses_is_none_that_can_be_decoded(
         decode_picture(b"something else", tmp_path / "a", cv2.IMREAD_COLOR)
 
 
-@pytest.mark.parametrize(("pixels", "size", "believed"), [
-    (64_000_000, 33, True), (64_010_000, 33, False), (70_000_000, 7000, True), (70_010_000, 7000, False),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("pixels", "size", "believed"),
+    [
+        (64_000_000, 33, True),
+        (64_010_000, 33, False),
+        (70_000_000, 7000, True),
+        (70_010_000, 7000, False),
+    ],
+)
 def test_a_header_is_believed_up_to_64_megapixels_or_10000_pixels_for_a_byte(
     tmp_path: Path, pixels: int, size: int, believed: bool
 ) -> None:

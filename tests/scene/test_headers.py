@@ -68,8 +68,10 @@ def test_a_jpeg_is_whole_if_its_end_marker_follows_the_scan(tail: bytes) -> None
     assert is_cut_short(whole[: whole.rfind(b"\x12\x34")])
 
 
-@pytest.mark.parametrize(("frame", "is_frame"), [(0xC0, True), (0xC2, True), (0xCF, True), (0xC4, False),
-                                                 (0xC8, False), (0xCC, False), (0xBF, False)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("frame", "is_frame"),
+    [(0xC0, True), (0xC2, True), (0xCF, True), (0xC4, False), (0xC8, False), (0xCC, False), (0xBF, False)],
+)
 def test_the_size_is_in_the_start_of_a_frame(frame: int, is_frame: bool) -> None:
     assert stated_size(jpeg_of(frame=frame)) == ((48, 80) if is_frame else None)
 
@@ -216,8 +218,14 @@ def test_a_big_tiff_s_larger_values_stand_elsewhere_too() -> None:
 
 
 def test_fields_that_lie_outside_or_come_twice_are_left_out() -> None:
-    data = tiff_of((1, 4, 2, struct.pack("<I", 10_000)), (2, 3, 1, b"\x05\0"), (2, 3, 1, b"\x06\0"), (3, 3, 0, b""),
-                   (4, 99, 4, b"abcd"), tail=bytes(4))  # fmt: skip
+    data = tiff_of(
+        (1, 4, 2, struct.pack("<I", 10_000)),
+        (2, 3, 1, b"\x05\0"),
+        (2, 3, 1, b"\x06\0"),
+        (3, 3, 0, b""),
+        (4, 99, 4, b"abcd"),
+        tail=bytes(4),
+    )
     tiff = open_tiff(data)
     assert tiff is not None
     entries = tiff.directory(8)

@@ -55,7 +55,7 @@ KINDS: dict[str, Record] = {
     "samples": SurfaceSamples(UNITS, FLOATS, COLORS, BYTES),
     "tracked points": TrackedPoints(("a", "b"), UNITS, COLORS, FLOATS, TRACKS, TRACKS % 2, UNITS[:3]),
     "two views": GENERAL.with_alternatives([replace(GENERAL, direction=UNITS[idx]) for idx in (1, 2)]),
-}  # fmt: skip
+}
 ARRAYS = [
     (title, field.name)
     for title, value in KINDS.items()
@@ -394,9 +394,13 @@ def test_what_nobody_states_is_not_known() -> None:
 
 def test_kinds_have_the_axes_that_users_read_of() -> None:
     assert [str(axis) for axis in Axis] == ["one", "image", "pair", "view"]
-    kinds = {Axis.IMAGE: (Panorama, Features, GlobalDescriptor, Pose), Axis.PAIR: (TwoView,),
-             Axis.VIEW: (RangeMap, SurfaceSamples, FaceFiles), None: (Files,),
-             Axis.ONE: (Poses, PointCloud, Pairs, Views, Scores, TrackedPoints)}  # fmt: skip
+    kinds = {
+        Axis.IMAGE: (Panorama, Features, GlobalDescriptor, Pose),
+        Axis.PAIR: (TwoView,),
+        Axis.VIEW: (RangeMap, SurfaceSamples, FaceFiles),
+        None: (Files,),
+        Axis.ONE: (Poses, PointCloud, Pairs, Views, Scores, TrackedPoints),
+    }
     for axis, those in kinds.items():
         assert {kind.axis for kind in those} == {axis}
     assert Poses.explodes_into is Pose

@@ -126,9 +126,14 @@ def test_further_masks_add_to_those_that_are_there(tmp_path: Path, crop_ltwh: tu
     rng = np.random.default_rng(1)
     file_hw = (crop_ltwh[3], crop_ltwh[2]) if crop_ltwh else (20, 40)
     first = panorama(
-        tmp_path, noise(0, file_hw), mask=rng.random(file_hw) < 0.8, size_hw=(10, 20), whole_hw=(20, 40),
-        crop_ltwh=crop_ltwh, nadir_deg=30.0,
-    )  # fmt: skip
+        tmp_path,
+        noise(0, file_hw),
+        mask=rng.random(file_hw) < 0.8,
+        size_hw=(10, 20),
+        whole_hw=(20, 40),
+        crop_ltwh=crop_ltwh,
+        nadir_deg=30.0,
+    )
     moving, sky = rng.random((10, 20)) < 0.8, np.ones((20, 40), np.bool_)
     sky[:5, 7:9] = False
     (tmp_path / "scratch").mkdir()

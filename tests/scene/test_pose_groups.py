@@ -140,8 +140,13 @@ def test_groups_that_do_not_fit_break_the_contract(changes: dict[str, Any], mess
 
 
 def test_points_that_a_single_camera_is_left_of_go_with_the_others() -> None:
-    large = replace(_LARGE, track_point_idx=_LARGE.track_point_idx[10:], track_image_idx=_LARGE.track_image_idx[10:],
-                    track_bearings=_LARGE.track_bearings[10:], track_sigmas_rad=None)  # fmt: skip
+    large = replace(
+        _LARGE,
+        track_point_idx=_LARGE.track_point_idx[10:],
+        track_image_idx=_LARGE.track_image_idx[10:],
+        track_bearings=_LARGE.track_bearings[10:],
+        track_sigmas_rad=None,
+    )
     kept = with_cameras(large, np.array([True, True, False]))
     kept.check()
     assert kept.names == _LARGE.names[:2]

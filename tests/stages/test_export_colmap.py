@@ -101,8 +101,11 @@ def test_depths_made_for_pixel_centers_would_be_half_a_pixel_off(workspace: Path
 
 
 def test_every_file_of_a_picture_is_where_colmap_looks(workspace: Path) -> None:
-    names = [f"{item}_{face}.jpg" for item in ("a/000", "a/b/001", "002")
-             for face in ("front", "right", "back", "left", "up", "down")]  # fmt: skip
+    names = [
+        f"{item}_{face}.jpg"
+        for item in ("a/000", "a/b/001", "002")
+        for face in ("front", "right", "back", "left", "up", "down")
+    ]
     assert (workspace / "stereo/fusion.cfg").read_text().split() == names
     for folder in ("sparse", "sparse/0"):
         model = pycolmap.Reconstruction(workspace / folder)

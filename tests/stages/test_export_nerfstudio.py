@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from pano_mvs.api import Context, FilePart, InputError, Panorama, PointCloud, Poses, RangeMap
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.running.publish import Publisher
-from pano_mvs.io.clouds.ply import read_ply
+from pano_mvs.io.clouds.ply_writer import read_ply
 from pano_mvs.io.nerfstudio.frames import NerfstudioFrames
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.stages.exports.nerfstudio import (
@@ -174,8 +174,11 @@ def test_a_picture_is_delivered_as_it_is_and_not_kept_twice(plain: Path) -> None
     for name in tiny_capture(PLAIN).names:
         given = tiny_capture(PLAIN).folder / "images" / name
         assert (plain / "equirectangular" / "images" / name).read_bytes() == given.read_bytes()
-        cached = [path for path in (plain.parents[1] / "cache" / "blobs").rglob("*.png")
-                  if path.read_bytes() == given.read_bytes()]  # fmt: skip
+        cached = [
+            path
+            for path in (plain.parents[1] / "cache" / "blobs").rglob("*.png")
+            if path.read_bytes() == given.read_bytes()
+        ]
         assert not cached
 
 

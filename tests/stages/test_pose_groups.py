@@ -17,7 +17,7 @@ from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.ports import Names
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec
-from pano_mvs.io.clouds.ply import read_ply
+from pano_mvs.io.clouds.ply_writer import read_ply
 from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, NerfstudioFrames
 from pano_mvs.scene import Files, Panorama, PointCloud, Pose, Poses, RangeMap
 from pano_mvs.scene.face_files import FaceFiles
@@ -256,8 +256,15 @@ def test_a_dense_workspace_is_of_the_largest_room(rooms: Rooms, ctx: Context, tm
 
 
 def test_each_room_has_transforms_and_a_seed(rooms: Rooms, ctx: Context, tmp_path: Path) -> None:
-    frame = NerfstudioFrame("equirectangular", "images/{name}", "", "", (64, 32), (32.0, 32.0),
-                            ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))  # fmt: skip
+    frame = NerfstudioFrame(
+        "equirectangular",
+        "images/{name}",
+        "",
+        "",
+        (64, 32),
+        (32.0, 32.0),
+        ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    )
     frames = {name: NerfstudioFrames({}, {}, (frame,), 0.001) for name in _ORDER}
     cloud = _fused(rooms)
     files = nerfstudio(frames=frames, poses=rooms.poses, cloud=cloud, params=NerfstudioParams(), ctx=ctx)
@@ -359,9 +366,12 @@ def test_a_camera_height_scales_every_room_with_a_floor(rooms: Rooms, ctx: Conte
     poses = _scaled(rooms, ctx, camera_height_m=1.5, vertical="sensors")
     assert [world.metric for world in poses.worlds] == [True, True]
     assert _metres(poses, "b0.png", "b1.png") == pytest.approx(
-        _metres(rooms.poses, "b0.png", "b1.png") * 2 * _metres(poses, "000.png", "001.png")
-        / _metres(rooms.poses, "000.png", "001.png"), rel=0.1,
-    )  # fmt: skip
+        _metres(rooms.poses, "b0.png", "b1.png")
+        * 2
+        * _metres(poses, "000.png", "001.png")
+        / _metres(rooms.poses, "000.png", "001.png"),
+        rel=0.1,
+    )
 
 
 @pytest.mark.parametrize(

@@ -49,8 +49,9 @@ def test_volumes_end_at_their_limit() -> None:
     assert needed(planes=512, volume_limit_gb=0.5) - needed(aggregation="box") == 500_000_000
 
 
-@pytest.mark.parametrize(("function", "least"), [(patchmatch, 163), (consistency, 115), (bilateral_solver, 166),
-                                                 (fill, 83), (planes, 149)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("function", "least"), [(patchmatch, 163), (consistency, 115), (bilateral_solver, 166), (fill, 83), (planes, 149)]
+)
 def test_other_dense_stages_say_more_than_was_measured_with_three_sources(
     function: Callable[..., Any], least: int
 ) -> None:

@@ -176,8 +176,11 @@ def main(arguments: list[str] | None = None) -> int:
     folder = Path(tempfile.mkdtemp(prefix="pano-mvs-damage-"))
     try:
         patient = make_patient(folder / "toy", executor=options.executor)
-        for what, check in (("read", unnoticed_when_read), ("verified and run", not_healed_after_verification),
-                            ("run", not_healed_by_running)):  # fmt: skip
+        for what, check in (
+            ("read", unnoticed_when_read),
+            ("verified and run", not_healed_after_verification),
+            ("run", not_healed_by_running),
+        ):
             found = check(patient, options.count, rng)
             wrong += len(found)
             print(f"{what}: {options.count} damaged, {len(found)} faults", *found[:10], sep="\n  ", flush=True)

@@ -42,8 +42,24 @@ count, seed, scratch, first, extra_bytes = sys.argv[1:]
 serve(int(count), int(seed), Path(scratch), int(first), int(extra_bytes))
 """
 _EXTREMES = (0, 1, 0x7F, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 2**40, 2**63, 2**64 - 1)
-_TEXTS = (b"nan", b"-inf", b"1e999", b"-1", b"9" * 5000, b"", b"null", b"[]", b"{}", b'"', b"\0", b"\xff\xfe",
-          b"\x1b[2J", b"0", b"true", b"[" * 2000)  # fmt: skip
+_TEXTS = (
+    b"nan",
+    b"-inf",
+    b"1e999",
+    b"-1",
+    b"9" * 5000,
+    b"",
+    b"null",
+    b"[]",
+    b"{}",
+    b'"',
+    b"\0",
+    b"\xff\xfe",
+    b"\x1b[2J",
+    b"0",
+    b"true",
+    b"[" * 2000,
+)
 
 
 @dataclass(frozen=True)
@@ -181,8 +197,9 @@ def outcomes(count: int, seed: int, extra_bytes: int) -> Iterator[tuple[str, int
             folder = scratch / f"process-{started}"
             folder.mkdir()
             arguments = [str(count), str(seed), str(folder), str(first), str(extra_bytes)]
-            process = subprocess.Popen([sys.executable, "-c", _SERVE, *arguments], stdout=subprocess.PIPE,
-                                       stderr=subprocess.PIPE, text=True)  # fmt: skip
+            process = subprocess.Popen(
+                [sys.executable, "-c", _SERVE, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            )
             try:
                 out, errors = process.communicate(timeout=_SECONDS_EACH + (len(found) - first) * 2)
             except subprocess.TimeoutExpired:
@@ -247,8 +264,10 @@ def main(arguments: list[str] | None = None) -> int:
         pictures, faults = faults_of_run(options.count, options.seed, Path(name))
     print(*faults, sep="\n")
     kinds = Counter(text.partition(":")[0] == "crafted" for text in wrong)
-    print(f"{total} inputs read, {len(wrong)} faults ({kinds[True]} crafted), at most {peak / 1e6:.0f} MB; a run with "
-          f"{pictures} hostile pictures: {len(faults)} faults; {time.monotonic() - started:.0f} s")  # fmt: skip
+    print(
+        f"{total} inputs read, {len(wrong)} faults ({kinds[True]} crafted), at most {peak / 1e6:.0f} MB; a run with "
+        f"{pictures} hostile pictures: {len(faults)} faults; {time.monotonic() - started:.0f} s"
+    )
     return 1 if wrong or faults else 0
 
 

@@ -87,8 +87,18 @@ def _entities() -> bytes:
 
 
 def _arrays(good: Mapping[str, Sample]) -> Iterator[Crafted]:
-    shapes = ["(1000000000000,)", "(2000000, 1000000)", "(-1, 5)", "(4611686018427387904, 4)", "(9,) * 9", "(1, 2, 3)",
-              f"({'9' * 5000},)", "[64, 128]", "(64.5, 128)", "()"]  # fmt: skip
+    shapes = [
+        "(1000000000000,)",
+        "(2000000, 1000000)",
+        "(-1, 5)",
+        "(4611686018427387904, 4)",
+        "(9,) * 9",
+        "(1, 2, 3)",
+        f"({'9' * 5000},)",
+        "[64, 128]",
+        "(64.5, 128)",
+        "()",
+    ]
     for shape in shapes:
         header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}"
         yield f"npy of shape {shape[:30]}", "range_npy", {"range.npy": _npy(header)}
@@ -108,8 +118,9 @@ def _arrays(good: Mapping[str, Sample]) -> Iterator[Crafted]:
         yield f"npy of {descr}", "range_npy", {"range.npy": _npy(header)}
     for header in ("{", "(" * 5000, "{'descr': '<f4'}", "[]", "\0", "{'shape': lambda: 0}"):
         yield f"npy with the header {header[:10]!r}", "range_npy", {"range.npy": _npy(header)}
-    big = _npz({"range.npy": _npy("{'descr': '<f4', 'fortran_order': False, 'shape': (20000, 40000), }")
-                + bytes(60_000_000)})  # fmt: skip
+    big = _npz(
+        {"range.npy": _npy("{'descr': '<f4', 'fortran_order': False, 'shape': (20000, 40000), }") + bytes(60_000_000)}
+    )
     yield "npz that inflates a thousandfold", "range_npz", {"range.npz": big}
     yield "npz with a name that is none", "range_npz", {"range.npz": _npz({"../../a.npy": b"", "\x1b[2J.npy": b""})}
     encrypted = bytearray(good["range_npz"].files["range.npz"])
@@ -148,8 +159,17 @@ def _models(good: Mapping[str, Sample]) -> Iterator[Crafted]:
         for count in (0, 10**6, 2**40, 2**63, 2**64 - 1):
             yield f"{count} entries in {name}", "colmap_bin", {name: struct.pack("<Q", count) + data[8:]}
     for name in ("cameras.txt", "images.txt", "points3D.txt"):
-        for text in ("", "x", "1 " * 100, f"{'9' * 5000} 1 2 3", "nan " * 20, "\0", "1 EQUIRECTANGULAR 1024 512",
-                     "1 PINHOLE 1 1", "-1 -1 -1 -1 -1 -1 -1 -1 -1 a\n"):  # fmt: skip
+        for text in (
+            "",
+            "x",
+            "1 " * 100,
+            f"{'9' * 5000} 1 2 3",
+            "nan " * 20,
+            "\0",
+            "1 EQUIRECTANGULAR 1024 512",
+            "1 PINHOLE 1 1",
+            "-1 -1 -1 -1 -1 -1 -1 -1 -1 a\n",
+        ):
             yield f"{name} with {text[:20]!r}", "colmap_txt", {name: text.encode()}
     points, images = (good["colmap_bin"].files[name] for name in ("points3D.bin", "images.bin"))
     yield "a track without end", "colmap_bin", {"points3D.bin": points[:51] + struct.pack("<Q", 2**60) + points[59:]}
@@ -199,8 +219,19 @@ def _clouds(good: Mapping[str, Sample]) -> Iterator[Crafted]:
 
 def _workflows() -> Iterator[Crafted]:
     bomb = "a: &a0 [x]\n" + "".join(f"b{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, 12))
-    texts = (bomb, "pano_mvs: " + "9" * 5000, "[" * 5000, "? " * 3000, "pano_mvs: 1\nstages: &a {x: *a}", "\0",
-             "pano_mvs: 1\nextends: workflow.yaml\n", "!!python/object/apply:os.system [id]", "\ufeff", "- " * 9999,
-             "pano_mvs: 1\nstages: {a\x1b[2J: {use: x}}", "pano_mvs: 1\nplugins: [/dev/zero]\nstages: {}")  # fmt: skip
+    texts = (
+        bomb,
+        "pano_mvs: " + "9" * 5000,
+        "[" * 5000,
+        "? " * 3000,
+        "pano_mvs: 1\nstages: &a {x: *a}",
+        "\0",
+        "pano_mvs: 1\nextends: workflow.yaml\n",
+        "!!python/object/apply:os.system [id]",
+        "\ufeff",
+        "- " * 9999,
+        "pano_mvs: 1\nstages: {a\x1b[2J: {use: x}}",
+        "pano_mvs: 1\nplugins: [/dev/zero]\nstages: {}",
+    )
     for text in texts:
         yield f"workflow {text[:30]!r}", "workflow", {"workflow.yaml": text.encode()}

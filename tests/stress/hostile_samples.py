@@ -17,11 +17,11 @@ from pano_mvs.engine.stages.registry import Registry
 from pano_mvs.engine.workflows.workflow import load_workflow
 from pano_mvs.evaluation.inputs.range_files import find_ranges
 from pano_mvs.evaluation.inputs.truth import read_truth
-from pano_mvs.io.clouds.ply import read_ply, write_ply
-from pano_mvs.io.clouds.ply_mesh import read_ply_mesh, write_ply_mesh
-from pano_mvs.io.clouds.ply_points import open_ply_points
+from pano_mvs.io.clouds.mesh_writer import read_ply_mesh, write_ply_mesh
+from pano_mvs.io.clouds.ply_reader import open_ply_points
+from pano_mvs.io.clouds.ply_writer import read_ply, write_ply
 from pano_mvs.io.colmap.maps import read_colmap_map, write_depth_map
-from pano_mvs.io.colmap.model import write_colmap_model
+from pano_mvs.io.colmap.model_writer import write_colmap_model
 from pano_mvs.io.images.captures import describe_picture
 from pano_mvs.io.images.exr import has_exr, write_exr
 from pano_mvs.io.poses.files import read_groups, recorded_pictures
@@ -167,8 +167,11 @@ def _clouds(scratch: Path) -> dict[str, Sample]:
     head = "ply\nformat ascii 1.0\ncomment by hand\nelement vertex 50\n"
     head += "".join(f"property float {name}\n" for name in ("x", "y", "z")) + "end_header\n"
     text = head + "\n".join(" ".join(f"{value:.4f}" for value in point) for point in points) + "\n"
-    files = {"ply": (scratch / "cloud.ply").read_bytes(), "ply_text": text.encode(),
-             "ply_mesh": (scratch / "mesh.ply").read_bytes()}  # fmt: skip
+    files = {
+        "ply": (scratch / "cloud.ply").read_bytes(),
+        "ply_text": text.encode(),
+        "ply_mesh": (scratch / "mesh.ply").read_bytes(),
+    }
     return {kind: Sample({"cloud.ply": data}, _read_cloud(kind)) for kind, data in files.items()}
 
 

@@ -95,8 +95,14 @@ class Runner:
 
     def _start(self) -> subprocess.Popen[str]:
         command = [*self._setting.command, "--cache", str(self._store), "--out", str(self.out)]
-        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-                                env=self._setting.environment, cwd=self._setting.folder)  # fmt: skip
+        return subprocess.Popen(
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env=self._setting.environment,
+            cwd=self._setting.folder,
+        )
 
     def look(self) -> str:
         """Start again if it was killed; return what is wrong, if anything."""
@@ -164,8 +170,11 @@ def kill_runs(setting: Setting, count: int, rng: random.Random) -> Killed:
     while killed.total < count and not killed.wrong:
         killed.rounds += 1
         _one_round(setting, killed, count, rng, typical_s=typical_s, expected=expected)
-        print(f"round {killed.rounds}: {killed.total} of {count} killed, "
-              f"{killed.wrong[-1] if killed.wrong else 'all as it should be'}", flush=True)  # fmt: skip
+        print(
+            f"round {killed.rounds}: {killed.total} of {count} killed, "
+            f"{killed.wrong[-1] if killed.wrong else 'all as it should be'}",
+            flush=True,
+        )
     return killed
 
 
@@ -213,8 +222,13 @@ def _faults(setting: Setting, runners: list[Runner], expected: dict[str, bytes])
         if names:
             faults.append(f"{runner.out.name} differs from a clean run in {', '.join(sorted(names))}")
     store = setting.folder / "store"
-    verified = subprocess.run([sys.executable, "-m", "pano_mvs", "cache", "verify", "--cache", str(store)],
-                              capture_output=True, text=True, env=setting.environment, check=False)  # fmt: skip
+    verified = subprocess.run(
+        [sys.executable, "-m", "pano_mvs", "cache", "verify", "--cache", str(store)],
+        capture_output=True,
+        text=True,
+        env=setting.environment,
+        check=False,
+    )
     if verified.returncode or ", 0 damaged" not in " ".join(verified.stdout.split()):
         faults.append(f"cache verify: {verified.stdout}{verified.stderr}")
     if "not of the cache" in verified.stdout:
@@ -229,9 +243,14 @@ def _leftovers(setting: Setting, runner: Runner, store: Path) -> list[str]:
     `cache verify` names what lies there, but that is no fault while runs may go on. The next run on a store removes
     what killed processes have left.
     """
-    again = subprocess.run([*setting.command, "--cache", str(store), "--out", str(runner.out)],
-                           capture_output=True, text=True, env=setting.environment, cwd=setting.folder,
-                           check=False)  # fmt: skip
+    again = subprocess.run(
+        [*setting.command, "--cache", str(store), "--out", str(runner.out)],
+        capture_output=True,
+        text=True,
+        env=setting.environment,
+        cwd=setting.folder,
+        check=False,
+    )
     faults = [] if "0 units computed" in again.stdout else [f"a run after all has units to compute:\n{again.stdout}"]
     left = half_written(store)
     return [*faults, f"half written files are left: {', '.join(left)}"] if left else faults
@@ -262,11 +281,15 @@ def main(arguments: list[str] | None = None) -> int:
         environment = os.environ | {SLEEP_VARIABLE: os.environ.get(SLEEP_VARIABLE, "0.05"), "COLUMNS": "400"}
         started = time.monotonic()
         killed = kill_runs(Setting(command, environment, folder), options.count, random.Random(options.seed))
-    quarters = [sum(n for done, n in killed.at.items() if quarter == min(3, 4 * done // max(1, killed.units)))
-                for quarter in range(4)]  # fmt: skip
-    print(f"{killed.total} killed ({killed.mains} main processes, {killed.workers} workers; {quarters} in the quarters "
-          f"of {killed.units} units) in {killed.rounds} rounds of two runs on one store, "
-          f"{time.monotonic() - started:.0f} s")  # fmt: skip
+    quarters = [
+        sum(n for done, n in killed.at.items() if quarter == min(3, 4 * done // max(1, killed.units)))
+        for quarter in range(4)
+    ]
+    print(
+        f"{killed.total} killed ({killed.mains} main processes, {killed.workers} workers; {quarters} in the quarters "
+        f"of {killed.units} units) in {killed.rounds} rounds of two runs on one store, "
+        f"{time.monotonic() - started:.0f} s"
+    )
     print("FAILED: " + "\n".join(killed.wrong) if killed.wrong else "deliverables as of a clean run, 0 bad records")
     return 1 if killed.wrong else 0
 

@@ -99,9 +99,16 @@ class Killer:
 
 
 def load(
-    folder: Path, *, count: int, bad: int, executor: str = "processes", workers: int = 2, kills: int = 5,
-    every_s: float = 3.0, seed: int = 0,
-) -> Verdict:  # fmt: skip
+    folder: Path,
+    *,
+    count: int,
+    bad: int,
+    executor: str = "processes",
+    workers: int = 2,
+    kills: int = 5,
+    every_s: float = 3.0,
+    seed: int = 0,
+) -> Verdict:
     """Run a capture with all that can go wrong, and compare with a clean run; `folder` is an empty one."""
     capture = write_capture(folder / "capture", count=count, bad=bad, seed=seed)
     clean = _command(capture.clean, folder / "clean-cache", folder / "clean", "--executor", "serial")
@@ -228,8 +235,13 @@ def _dask_cluster(folder: Path, workers: int, disk: Disk) -> Iterator[tuple[str,
     address_file = folder / "scheduler.json"
 
     def start(*command: str) -> subprocess.Popen[bytes]:
-        return subprocess.Popen([sys.executable, "-m", *command, "--scheduler-file", str(address_file)], cwd=folder,
-                                env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)  # fmt: skip
+        return subprocess.Popen(
+            [sys.executable, "-m", *command, "--scheduler-file", str(address_file)],
+            cwd=folder,
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
 
     processes = [start("distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard")]
     try:
@@ -291,13 +303,25 @@ def main(arguments: list[str] | None = None) -> int:
     failed = False
     for executor in options.executors:
         with tempfile.TemporaryDirectory(prefix="pano-mvs-load-", dir=options.folder) as name:
-            verdict = load(Path(name), count=options.count, bad=bad, executor=executor, workers=options.workers,
-                           kills=options.kills, every_s=options.every, seed=options.seed)  # fmt: skip
+            verdict = load(
+                Path(name),
+                count=options.count,
+                bad=bad,
+                executor=executor,
+                workers=options.workers,
+                kills=options.kills,
+                every_s=options.every,
+                seed=options.seed,
+            )
         per_unit_ms = 1000 * verdict.cpu_s / max(1, verdict.units)
-        print(f"{executor}: {options.count} panoramas, {bad} bad, {verdict.units} units, {verdict.killed} workers "
-              f"killed, {verdict.runs} runs, {verdict.wall_s:.0f} s, {verdict.cpu_s:.0f} CPU s "
-              f"({per_unit_ms:.0f} ms a unit), peak {verdict.peak_mb:.0f} MB",
-              *verdict.wrong[:20], sep="\n  WRONG: ", flush=True)  # fmt: skip
+        print(
+            f"{executor}: {options.count} panoramas, {bad} bad, {verdict.units} units, {verdict.killed} workers "
+            f"killed, {verdict.runs} runs, {verdict.wall_s:.0f} s, {verdict.cpu_s:.0f} CPU s "
+            f"({per_unit_ms:.0f} ms a unit), peak {verdict.peak_mb:.0f} MB",
+            *verdict.wrong[:20],
+            sep="\n  WRONG: ",
+            flush=True,
+        )
         failed |= bool(verdict.wrong)
     print("FAILED" if failed else "all that was delivered is as of a clean run, and only what is bad is missing")
     return int(failed)

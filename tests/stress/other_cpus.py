@@ -41,8 +41,9 @@ def variants() -> dict[str, dict[str, str]]:
             "NUMBA_CPU_NAME": "generic",
             "NPY_DISABLE_CPU_FEATURES": " ".join(dispatched_features()),
             "OPENBLAS_CORETYPE": "Nehalem",
-        } | threads(1),
-    }  # fmt: skip
+        }
+        | threads(1),
+    }
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -305,12 +305,20 @@ def backend(work):
     ("name", "body", "contract_test", "why"),
     [
         ("large", "return np.abs(reference - warped)[..., 0]", "from 0 to 1", "must return .* from 0 to 1"),
-        ("constant", "return np.full(reference.shape[:2], 0.5)", "lower where images are the same",
-         "is 0.500 of an image against itself and 0.500 against another image"),
-        ("random", "return np.random.default_rng().random(reference.shape[:2]) * (reference[..., 0] != warped[..., 0])",
-         "the same when called again", "something else when called again"),
+        (
+            "constant",
+            "return np.full(reference.shape[:2], 0.5)",
+            "lower where images are the same",
+            "is 0.500 of an image against itself and 0.500 against another image",
+        ),
+        (
+            "random",
+            "return np.random.default_rng().random(reference.shape[:2]) * (reference[..., 0] != warped[..., 0])",
+            "the same when called again",
+            "something else when called again",
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_part_that_breaks_its_contract_is_caught(
     tmp_path: Path, name: str, body: str, contract_test: str, why: str
 ) -> None:

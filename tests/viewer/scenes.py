@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from pano_mvs.geometry import Rigid3, ray_grid, rotation_from_quat_wxyz
-from pano_mvs.io.clouds.ply import write_ply
-from pano_mvs.io.colmap.model import write_colmap_model
+from pano_mvs.io.clouds.ply_writer import write_ply
+from pano_mvs.io.colmap.model_writer import write_colmap_model
 from pano_mvs.scene import PointCloud, Poses
 from pano_mvs.scene.image_files.image_file import write_png
 
@@ -44,8 +44,13 @@ def box_cloud(count: int, *, quality: bool) -> PointCloud:
     normals = np.zeros((count, 3), np.float32)
     normals[np.arange(count), axis] = -side
     confidence = rng.integers(1, 256, count).astype(np.uint8) if quality else None
-    return PointCloud((points * HALF).astype(np.float32), normals, world_color(points),
-                      rng.integers(1, 6, count).astype(np.uint8), confidence)  # fmt: skip
+    return PointCloud(
+        (points * HALF).astype(np.float32),
+        normals,
+        world_color(points),
+        rng.integers(1, 6, count).astype(np.uint8),
+        confidence,
+    )
 
 
 def write_output(

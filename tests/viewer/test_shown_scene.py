@@ -9,8 +9,8 @@ import pytest
 from numpy.lib.recfunctions import drop_fields
 
 from pano_mvs.core.errors import InputError, UsageError
-from pano_mvs.io.clouds.ply import write_ply
-from pano_mvs.io.clouds.ply_points import open_ply_points
+from pano_mvs.io.clouds.ply_reader import open_ply_points
+from pano_mvs.io.clouds.ply_writer import write_ply
 from pano_mvs.io.images.preview import write_preview
 from pano_mvs.scene import PointCloud
 from pano_mvs.scene.image_files.image_file import decode_image

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pano_mvs.geometry import Rigid3
-from pano_mvs.io.clouds.ply_mesh import write_ply_mesh
+from pano_mvs.io.clouds.mesh_writer import write_ply_mesh
 from pano_mvs.viewer.cloud_colors import drawn_cloud
 from pano_mvs.viewer.controller import Tour
 from pano_mvs.viewer.display import quiet_vtk, require_drawing
@@ -154,8 +154,9 @@ def test_the_mouse_of_the_window_steps_in_looks_around_and_steps_out(
     at(100, 300, "LeftButtonPressEvent")
     at(160, 300, "MouseMoveEvent", "LeftButtonReleaseEvent")  # the trackball turns the scene
     assert np.linalg.norm(tour.state.viewpoint.eye - start.eye) > 0.1
-    np.testing.assert_allclose(np.linalg.norm(tour.state.viewpoint.eye - start.target),
-                               np.linalg.norm(start.eye - start.target), rtol=1e-6)  # fmt: skip
+    np.testing.assert_allclose(
+        np.linalg.norm(tour.state.viewpoint.eye - start.target), np.linalg.norm(start.eye - start.target), rtol=1e-6
+    )
 
 
 def test_keys_reach_the_tour_and_the_picture(tmp_path: Path, windows: list[SceneWindow]) -> None:

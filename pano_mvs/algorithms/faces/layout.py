@@ -1,7 +1,7 @@
 """Layouts of faces: overlapping pinhole views that share the panorama's centre.
 
-        for face in panorama_faces((512, 1024)):
-            picture = face_image(panorama, face.view)
+    for face in panorama_faces((512, 1024)):
+        picture = face_image(panorama, face.view)
 
 A layout is a list of directions. All faces of one panorama are squares with the same size and focal length, so that one
 camera model is enough for a rig.

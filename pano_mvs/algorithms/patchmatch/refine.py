@@ -4,11 +4,11 @@ A sweep compares fronto-parallel windows at fixed ranges; its result is accurate
 slanted surfaces. Here two steps alternate, the data term and the smoothness term of one energy:
 
 * a plane is fitted robustly to the ranges around each pixel (planes of disparity: Bleyer, Rhemann and Rother,
-"PatchMatch stereo", 2011, section 3; the sphere's counterpart of disparity is the inverse range q, linear in the ray on
-a plane: q = p · d);
+  "PatchMatch stereo", 2011, section 3; the sphere's counterpart of disparity is the inverse range q, linear in the ray
+  on a plane: q = p · d);
 * a window on that plane is sampled in the sources through the homography R + t pᵀ of rays, and q is moved to its most
-likely value: a Gauss–Newton step on the zero-mean normalised correlation (Lucas and Kanade, 1981) in q and its two
-slopes, with the plane as a prior whose weight depends on the texture of the images.
+  likely value: a Gauss–Newton step on the zero-mean normalised correlation (Lucas and Kanade, 1981) in q and its two
+  slopes, with the plane as a prior whose weight depends on the texture of the images.
 
 Unlike PatchMatch, there is no random search: starting from a sweep there is little to search for, and propagating
 planes of neighbours by correlation alone extends the nearer surface across edges that semi-global matching had found

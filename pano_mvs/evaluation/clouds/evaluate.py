@@ -34,7 +34,7 @@ from pano_mvs.evaluation.inputs.truth import find_true_ranges
 from pano_mvs.evaluation.poses.alignment import align_centers
 from pano_mvs.evaluation.tables import Summary, TextTable, finite_or_none
 from pano_mvs.geometry import Rigid3, Similarity3
-from pano_mvs.io.clouds.ply_points import open_ply_points
+from pano_mvs.io.clouds.ply_reader import open_ply_points
 from pano_mvs.scene import PointCloud
 from pano_mvs.scene.up_direction import WORLD_UP, mean_up_direction
 

@@ -101,7 +101,7 @@ def select_points(cloud: PointCloud, selection: Selection, scratch: Path) -> Sel
     if selection.max_points:
         voxel = voxel_for_count(cloud, SelectedPoints(bits, voxel=0), selection)
     if voxel:
-        bits = _thinned_bits(cloud, SelectedPoints(bits, voxel=0), voxel, scratch)
+        bits = _thinned_bits(cloud, SelectedPoints(bits, voxel=voxel), scratch)
     return SelectedPoints(bits, voxel=voxel)
 
 
@@ -187,12 +187,12 @@ def _hashed(place: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return hashed
 
 
-def _thinned_bits(cloud: PointCloud, good: SelectedPoints, edge: float, scratch: Path) -> NDArray[np.uint8]:
+def _thinned_bits(cloud: PointCloud, good: SelectedPoints, scratch: Path) -> NDArray[np.uint8]:
     """Return the bits of the best point of each voxel."""
     number = min(_MAX_BUCKETS, -(-len(cloud) // _BUCKET_POINTS))
     paths = [scratch / f"bucket_{idx}" for idx in range(number)]
     for chunk in chunks(len(cloud)):
-        candidates = _best(_candidates(cloud, good, chunk, edge))
+        candidates = _best(_candidates(cloud, good, chunk))
         bucket = (_hashed(candidates["place"]) >> np.uint64(32)) % np.uint64(number)
         for idx, path in enumerate(paths):
             with path.open("ab") as stream:
@@ -205,10 +205,10 @@ def _thinned_bits(cloud: PointCloud, good: SelectedPoints, edge: float, scratch:
     return bits
 
 
-def _candidates(cloud: PointCloud, good: SelectedPoints, chunk: slice, edge: float) -> NDArray[np.void]:
+def _candidates(cloud: PointCloud, good: SelectedPoints, chunk: slice) -> NDArray[np.void]:
     selected = np.flatnonzero(good.within(chunk))
     candidates = np.zeros(len(selected), _CANDIDATE)
-    candidates["place"], candidates["off_center"] = _places(cloud.points_in_world[chunk][selected], edge)
+    candidates["place"], candidates["off_center"] = _places(cloud.points_in_world[chunk][selected], good.voxel)
     confidence = 0 if cloud.confidence is None else cloud.confidence[chunk][selected].astype(np.uint16)
     candidates["rank"] = 65535 - (256 * confidence + cloud.view_counts[chunk][selected].astype(np.uint16))
     candidates["idx"] = chunk.start + selected

@@ -1,4 +1,4 @@
-"""The points of a COLMAP model with their tracks, gathered image by image."""
+"""The points of a COLMAP model with their tracks, which are collected image by image."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ ModelForm = Literal["bin", "txt", "both"]
 
 
 class ModelPoints:
-    """Adds the observations of images to the tracks of points, and then the points to a pycolmap model.
+    """Collect the observations of images in tracks, and add the points to a pycolmap model.
 
     Args:
-        poses: with the points and their tracks.
+        poses: poses with points and tracks.
     """
 
     def __init__(self, poses: Poses) -> None:
-        """Begin with empty tracks."""
+        """Create empty tracks."""
         import pycolmap
 
         self._poses = poses
@@ -33,19 +33,19 @@ class ModelPoints:
         self._of_image = [order[first:end] for first, end in pairwise(ends)]
 
     def observations(self, image_idx: int) -> NDArray[np.intp]:
-        """Return the positions, among all track entries, of those in one image of the poses, in order."""
+        """Return the indices of the track entries in one image of the poses, in order."""
         return self._of_image[image_idx]
 
     def observe(self, image_id: int, observed: NDArray[np.intp], *, pixels_per_rad: float) -> None:
-        """Say that the model's image has key points 0, 1, … for these track entries."""
+        """Add observations: key points 0, 1, … of the model's image observe these track entries."""
         for point2d_idx, point_idx in enumerate(self._poses.track_point_idx[observed].tolist()):
             self._tracks[point_idx].add_element(image_id, point2d_idx)
             self._pixels_per_rad[point_idx] += pixels_per_rad
 
     def add_to(self, model: Any, *, only_seen: bool = False) -> int:
-        """Add the points, and return how many; with `only_seen` those alone that an image observes.
+        """Add the points and return their number; with `only_seen`, only those that an image observes.
 
-        A point's error is its angle in pixels of the images that observe it, on average.
+        The error of a point is its angle in pixels, averaged over the images that observe it.
         """
         poses, added = self._poses, 0
         for idx, track in enumerate(self._tracks):
@@ -59,7 +59,7 @@ class ModelPoints:
 
 
 def write_model(model: Any, folder: Path, form: ModelForm) -> None:
-    """Write a pycolmap model as "bin", "txt" or "both"; the folder is made if it is not there."""
+    """Write a pycolmap model as "bin", "txt" or "both"; the folder is created if necessary."""
     folder.mkdir(parents=True, exist_ok=True)
     if form in ("bin", "both"):
         model.write_binary(str(folder))

@@ -1,4 +1,4 @@
-"""COLMAP models of panoramas that were cut into faces: one rig of pinhole cameras for each way of cutting."""
+"""COLMAP models of panoramas that were cut into faces: one rig of pinhole cameras for each layout of faces."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CutPanorama:
-    """How one panorama was cut.
+    """The faces of one panorama.
 
     Attributes:
-        views: the faces. Panoramas that were cut alike share one sequence, and then one rig.
-        image_names: of the faces' pictures, in the same order, relative to the folder of the pictures.
+        views: the faces. Panoramas that share the same sequence object share a rig.
+        image_names: names of the faces' images in the same order, relative to the image folder.
     """
 
     views: Sequence[PinholeView]
@@ -33,20 +33,20 @@ class CutPanorama:
 def write_rig_model(
     folder: Path, poses: Poses, cuts: Mapping[str, CutPanorama], *, form: ModelForm = "both"
 ) -> Mapping[str, int]:
-    """Write a COLMAP model of the faces of panoramas: rigs, one PINHOLE camera for each face, frames, points, tracks.
+    """Write a COLMAP model of the faces of panoramas: rigs, a PINHOLE camera per face, frames, points, tracks.
 
-    The rig's frame is that of its first face; `cam_from_rig` of the others are pure rotations. A frame is a panorama;
-    its images are its faces. An observation of a point lies in the face whose axis is nearest to it, if it lies inside
-    of that face's picture. Points that no face observes are left out: OpenMVS reads no further than the first of them.
+    The first face defines the rig's coordinate frame; `cam_from_rig` of the others are pure rotations. Each panorama is
+    a frame whose images are its faces. An observation belongs to the face whose axis is nearest, if it is inside that
+    face. Points that no face observes are omitted, because OpenMVS stops reading at the first of them.
 
     Args:
-        folder: where the files go; made if it is not there.
-        poses: of the panoramas, with points and tracks. Errors become pixels at a face's centre (f per radian).
-        cuts: panorama to how it was cut; panoramas of the poses that are not in it are left out.
-        form: "bin", "txt" or "both": COLMAP prefers the binary files, some versions of OpenMVS read text alone.
+        folder: the folder of the files, which is created if necessary.
+        poses: poses of the panoramas with points and tracks. Errors become pixels at a face's centre (f per radian).
+        cuts: panorama name to its faces; panoramas without an entry are omitted.
+        form: "bin", "txt" or "both". COLMAP prefers binary files; some versions of OpenMVS read only text.
 
     Returns:
-        How many points each image observes, by its name: COLMAP fuses no image that observes none.
+        Image name to the number of points that it observes. COLMAP does not fuse images without points.
     """
     import pycolmap
 
@@ -62,10 +62,11 @@ def write_rig_model(
         cut = cuts[name]
         rig_id, camera_ids = rigs[id(cut.views)]
         image_ids = [len(seen) + number + 1 for number in range(len(cut.views))]
-        _add_frame(model, frame_id, rig_id, dict(zip(image_ids, camera_ids, strict=True)), _rig_pose(poses, idx, cut))
-        parts = _by_face(poses.track_bearings, points.observations(idx), cut.views)
+        frame = pycolmap.Frame(frame_id=frame_id, rig_id=rig_id)
+        _add_frame(model, frame, dict(zip(image_ids, camera_ids, strict=True)), pose=_rig_pose(poses, idx, cut))
+        observations = _by_face(poses.track_bearings, points.observations(idx), cut.views)
         for view, image_name, image_id, camera_id, (observed, pixels) in zip(
-            cut.views, cut.image_names, image_ids, camera_ids, parts, strict=True
+            cut.views, cut.image_names, image_ids, camera_ids, observations, strict=True
         ):
             image = pycolmap.Image(name=image_name, keypoints=pixels, camera_id=camera_id, image_id=image_id)
             image.frame_id = frame_id
@@ -79,7 +80,7 @@ def write_rig_model(
 
 
 def _add_rigs(model: Any, all_views: Sequence[Sequence[PinholeView]]) -> dict[int, tuple[int, list[int]]]:
-    """Add one rig with its cameras for each distinct sequence of faces; return the ids of both by the sequence's id."""
+    """Add a rig with cameras for each distinct sequence of faces; return the ids of both by the sequence's `id()`."""
     import pycolmap
 
     rigs: dict[int, tuple[int, list[int]]] = {}
@@ -110,10 +111,9 @@ def _add_camera(model: Any, camera_id: int, view: PinholeView) -> None:
     model.add_camera(pycolmap.Camera(camera_id=camera_id, model="PINHOLE", width=width, height=height, params=params))
 
 
-def _add_frame(model: Any, frame_id: int, rig_id: int, camera_of_image: Mapping[int, int], pose: Rigid3) -> None:
+def _add_frame(model: Any, frame: Any, camera_of_image: Mapping[int, int], *, pose: Rigid3) -> None:
     import pycolmap
 
-    frame = pycolmap.Frame(frame_id=frame_id, rig_id=rig_id)
     for image_id, camera_id in camera_of_image.items():
         frame.add_data_id(pycolmap.data_t(_sensor(camera_id), image_id))
     frame.rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(pose.rotation), pose.translation)
@@ -133,13 +133,13 @@ def _rig_pose(poses: Poses, idx: int, cut: CutPanorama) -> Rigid3:
 def _by_face(
     bearings: FloatArray, observed: NDArray[np.intp], views: Sequence[PinholeView]
 ) -> list[tuple[NDArray[np.intp], FloatArray]]:
-    """Return for each face its track entries and their pixels, (n, 2)."""
+    """Return the track entries in each face and their pixels, (n, 2)."""
     rays = bearings[observed]
     owner = (rays @ np.array([view.view_from_cam[2] for view in views]).T).argmax(axis=1)
-    parts = []
+    by_face = []
     for face_idx, view in enumerate(views):
         of_face = np.flatnonzero(owner == face_idx)
         pixels = view.pixels_from_rays(rays[of_face]).reshape(-1, 2)
         inside = view.contains(pixels).reshape(-1)
-        parts.append((observed[of_face[inside]], pixels[inside]))
-    return parts
+        by_face.append((observed[of_face[inside]], pixels[inside]))
+    return by_face

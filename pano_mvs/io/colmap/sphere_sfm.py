@@ -1,7 +1,8 @@
-"""Poses of SphereSfM's models, which look like COLMAP's but number a camera of their own.
+"""Poses of SphereSfM's models, which are like COLMAP's but have a camera model of their own.
 
 SphereSfM, a fork of COLMAP, writes panoramas as camera model SPHERE, number 11 with three parameters (f, cx, cy). In
-COLMAP number 11 is another model with more of them, so that pycolmap cannot read the files. The camera frame is ours.
+COLMAP, number 11 is another model with more parameters, so that pycolmap cannot read the files. The camera frame is
+the same as ours.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from pathlib import Path
 
 from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import is_file
-from pano_mvs.io.colmap.files import read_images
+from pano_mvs.io.colmap.model_reader import read_images
 from pano_mvs.io.images.captures import natural_key
 from pano_mvs.io.poses.json_files import require_distinct
 from pano_mvs.scene import Poses
@@ -22,7 +23,7 @@ _COUNT = struct.Struct("<Q")
 
 
 def has_sphere_cameras(folder: Path) -> bool:
-    """Return whether the cameras of a COLMAP model are all SphereSfM's SPHERE, told by number and parameters."""
+    """Return whether all cameras of a model are SphereSfM's SPHERE, by number and parameters."""
     try:
         if is_file(folder / "cameras.bin"):
             return _is_sphere_binary((folder / "cameras.bin").read_bytes())
@@ -35,13 +36,13 @@ def has_sphere_cameras(folder: Path) -> bool:
 
 
 def read_sphere_model(folder: Path) -> Poses:
-    """Return the images of SphereSfM's model, without its points, in its own world and unit.
+    """Return the poses of a SphereSfM model without its points, in its own world and unit.
 
     Args:
-        folder: holds cameras and images as .bin or .txt; images come in the natural order of their names.
+        folder: contains cameras and images as .bin or .txt. Images are sorted in the natural order of names.
 
     Raises:
-        InputError: if the images cannot be read, or there is none.
+        InputError: if the images cannot be read, or the model has no image.
     """
     binary = folder / "images.bin"
     path = binary if is_file(binary) else folder / "images.txt"

@@ -1,10 +1,10 @@
-"""The files of a COLMAP dense workspace, beside its sparse model.
+"""The files of a COLMAP dense workspace, except its sparse model.
 
 images/IMAGE_FACE.jpg
 masks/IMAGE_FACE.jpg.png                            255 valid, 0 ignored
 stereo/depth_maps/IMAGE_FACE.jpg.geometric.bin      z-depth, 0 unknown
 stereo/normal_maps/IMAGE_FACE.jpg.geometric.bin     in the face's camera frame
-stereo/patch-match.cfg, stereo/fusion.cfg           which pictures there are
+stereo/patch-match.cfg, stereo/fusion.cfg           the list of images
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.io.colmap.images import write_picture
+from pano_mvs.io.colmap.image_copies import write_picture
 from pano_mvs.io.colmap.maps import write_depth_map, write_normal_map
 from pano_mvs.scene.image_files.image_file import write_png
 
 WORKSPACE = "colmap_dense"
-_SOURCES = 20  # what COLMAP's own undistorter writes
+_SOURCES = 20  # as COLMAP's image_undistorter writes
 
 
 def face_image_name(face: str, item: str, suffix: str) -> str:
-    """Return the name of a face's picture in the model: `a/b_front.jpg` of the image `a/b`.
+    """Return the name of a face's image in the model: `a/b_front.jpg` for the image `a/b`.
 
-    Splat trainers look at the last part of the name alone, so it is not the folder that tells the faces apart. Names of
-    faces hold no `_`, so that no two pictures share a name.
+    The face is in the file name and not in the folder, because splat trainers ignore folders. Names of faces do not
+    contain `_`, so that names are distinct.
     """
     return f"{item}_{face}{suffix}"
 
@@ -42,14 +42,14 @@ def write_face(
     z_depth: NDArray[np.float32],
     normals_in_face: NDArray[np.float32],
 ) -> dict[str, Path]:
-    """Write the four files of one face of one panorama, and return where in the output folder each belongs.
+    """Write the four files of one face of one panorama, and return their paths by target in the output folder.
 
     Args:
-        scratch: a folder to write into.
-        face: name of the face.
-        suffix: of the picture, ".jpg" or ".png".
+        scratch: the folder to write to.
+        face: the name of the face.
+        suffix: suffix of the image, ".jpg" or ".png".
         image: (h, w, 3) uint8 RGB.
-        mask: (h, w) bool, False is to be ignored.
+        mask: (h, w) bool, False is ignored.
         z_depth: (h, w) float32, NaN unknown.
         normals_in_face: (h, w, 3) float32 in the face's camera frame, NaN unknown.
     """
@@ -69,15 +69,15 @@ def write_face(
 
 
 def sparse_targets(files: Iterable[Path]) -> dict[str, Path]:
-    """Return where in the output folder the files of the model belong: in sparse/ and again in sparse/0.
+    """Return the targets of the files of the model in the output folder: in sparse/ and again in sparse/0.
 
-    COLMAP's dense tools and OpenMVS look in the one, splat trainers in the other.
+    COLMAP's dense tools and OpenMVS read the former, splat trainers the latter.
     """
     return {f"{WORKSPACE}/{folder}/{path.name}": path for folder in ("sparse", "sparse/0") for path in files}
 
 
 def write_stereo_configs(scratch: Path, image_names: Iterable[str]) -> dict[str, Path]:
-    """Write patch-match.cfg and fusion.cfg for pictures in order, and return where each belongs."""
+    """Write patch-match.cfg and fusion.cfg for images in order, and return their paths by target."""
     names = list(image_names)
     targets = {
         f"{WORKSPACE}/stereo/patch-match.cfg": scratch / "patch-match.cfg",

@@ -29,16 +29,16 @@ _TURNED = (
 
 @dataclass(frozen=True)
 class PictureInfo:
-    """What is known of a panorama without decoding it.
+    """The size and the metadata of a panorama.
 
     Attributes:
-        size_hw: (height, width) of the full sphere, width = 2 × height: at the file's own resolution, or, of a crop
-            that was resized since, at that of the original, in whose pixels alone its place is exact.
-        file_size_hw: (height, width) of the picture in the file.
-        crop_ltwh: (left, top, width, height) of the part of the sphere that the file holds, or None for all of it.
-        gpano: its metadata, or None.
-        warnings: what the user should know of this picture, without the file's name.
-        traits: what else it has that the user should know, in words that are the same for all such pictures.
+        size_hw: (height, width) of the full sphere, width = 2 × height, at the resolution of the file. For a crop that
+            was resized, at the resolution of the original, in whose pixels its position is an integer.
+        file_size_hw: (height, width) of the image in the file.
+        crop_ltwh: (left, top, width, height) of the part of the sphere in the file, or None for all of it.
+        gpano: its GPano metadata, or None.
+        warnings: warnings about this image, without the file's name.
+        traits: warnings that have the same text for all images to which they apply.
         position_lla: (latitude deg, longitude deg, altitude m) from its EXIF metadata, or None.
     """
 
@@ -52,22 +52,22 @@ class PictureInfo:
 
     @property
     def full_width_px(self) -> int:
-        """How many columns the full sphere has at the file's own resolution."""
+        """Width of the full sphere at the file's own resolution."""
         share = 1.0 if self.crop_ltwh is None else self.file_size_hw[1] / self.crop_ltwh[2]
         return max(1, round(self.size_hw[1] * share))
 
 
 def list_pictures(folder: Path, notes: list[str] | None = None) -> list[Path]:
-    """Return the pictures in a folder and below it, ordered as people order them (2 before 10, case aside).
+    """Return the images in a folder and its subfolders in natural order (2 before 10, ignoring case).
 
-    Hidden files, hidden folders, folders called `masks`, output folders of earlier runs and caches are left out.
+    Hidden files, hidden folders, folders called `masks`, output folders of runs and caches are ignored.
 
     Args:
         folder: the folder.
-        notes: as of `files_below`.
+        notes: see `files_below`.
 
     Raises:
-        InputError: if the folder does not exist, cannot be listed, or holds no picture.
+        InputError: if the folder does not exist, cannot be listed, or contains no image.
     """
     if not is_folder(folder):
         raise InputError(
@@ -93,24 +93,24 @@ def list_pictures(folder: Path, notes: list[str] | None = None) -> list[Path]:
 
 
 def natural_key(name: str) -> tuple[list[tuple[int, int, str]], str]:
-    """Return a sort key that puts 2 before 10 and ignores case; names that differ at all have different keys."""
+    """Return a sort key that puts 2 before 10 and ignores case; different names have different keys."""
     chunks = re.split(r"([0-9]+)", name.casefold())
     return [(0, int(chunk), "") if chunk.isdecimal() else (1, 0, chunk) for chunk in chunks if chunk], name
 
 
 def describe_picture(path: Path, data: bytes | None = None, *, max_pixels: int = MAX_PIXELS) -> PictureInfo:
-    """Return what is known of a panorama without decoding it (but for HEIC and AVIF).
+    """Return the size and the metadata of a panorama without decoding it (except HEIC and AVIF).
 
-    A picture is a panorama if its GPano metadata say so, whole or cropped, or, with a warning, if it is exactly
+    An image is a panorama if its GPano metadata describe a whole or cropped one, or, with a warning, if it is exactly
     twice as wide as high.
 
     Args:
         path: the file.
         data: its bytes, if they have been read already.
-        max_pixels: larger pictures are refused.
+        max_pixels: the limit of pixels.
 
     Raises:
-        InputError: if the file cannot be read, is no picture, is larger than the limit, or is no equirectangular
+        InputError: if the file cannot be read, is not an image, is larger than the limit, or is not an equirectangular
             panorama.
     """
     if data is None:
@@ -129,12 +129,12 @@ def describe_picture(path: Path, data: bytes | None = None, *, max_pixels: int =
         )
     sphere, crop = (height, width), None
     if gpano is not None and gpano.full_size_hw is not None and gpano.crop_ltwh is not None:
-        sphere, crop, more = _placed(path, (height, width), gpano.full_size_hw, gpano.crop_ltwh)
+        sphere, crop, more = _placed(path, (height, width), full_hw=gpano.full_size_hw, crop_ltwh=gpano.crop_ltwh)
         warnings = (*warnings, *more)
     elif width != 2 * height:
         raise InputError(
             f"{path}: {width}×{height} px is not a full sphere (the width must be twice the height) and no GPano "
-            "metadata place it on one. Remove it, export it anew as a full equirectangular panorama, or, if it is "
+            "metadata place it on one. Remove it, export it again as a full equirectangular panorama, or, if it is "
             "cropped, write the GPano FullPano and CroppedArea fields into it"
         )
     exif = container.exif
@@ -145,11 +145,11 @@ def describe_picture(path: Path, data: bytes | None = None, *, max_pixels: int =
 
 
 def files_below(folder: Path, notes: list[str]) -> Iterator[Path]:
-    """Yield the files of a capture, through links too, without hidden ones, masks, outputs of runs and caches.
+    """Yield the files of a capture, following links, except hidden files, masks, outputs of runs and caches.
 
     Args:
         folder: the folder.
-        notes: for each subfolder that cannot be listed, what to tell the user is added to it.
+        notes: a warning is appended for each subfolder that cannot be listed.
 
     Raises:
         InputError: if the folder itself cannot be listed, or is a cache.
@@ -185,14 +185,14 @@ def _is_left_out(folder: Path) -> bool:
 
 
 def _is_file(path: Path) -> bool:
-    """Return whether a path leads to a file, or to something that may be one: reading it then says what is wrong."""
+    """Return whether a path is a file, or cannot be examined; reading it then raises an error with the reason."""
     return is_file(path) or is_denied(path)
 
 
 def _placed(
-    path: Path, size_hw: tuple[int, int], full_hw: tuple[int, int], crop_ltwh: tuple[int, int, int, int]
+    path: Path, size_hw: tuple[int, int], *, full_hw: tuple[int, int], crop_ltwh: tuple[int, int, int, int]
 ) -> tuple[tuple[int, int], tuple[int, int, int, int] | None, tuple[str, ...]]:
-    """Return the sphere's size, the part that the file holds (None: all), and warnings."""
+    """Return the size of the sphere, the part in the file (None: all), and warnings."""
     (height, width), (full_height, full_width) = size_hw, full_hw
     left, top, crop_width, crop_height = crop_ltwh
     warnings: tuple[str, ...] = ()

@@ -1,4 +1,4 @@
-"""Float pictures as OpenEXR files, by the package OpenEXR where it is installed: OpenCV's wheels have none."""
+"""OpenEXR files with float channels, through the optional package OpenEXR; OpenCV's wheels do not support them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.scene.image_files.decoding import MAX_PIXELS
 
-# All that the package OpenEXR raises on damaged files.
+# The exceptions that OpenEXR raises for damaged files.
 _DAMAGE = (OSError, RuntimeError, ValueError, TypeError, LookupError, OverflowError, MemoryError)
 
 REMEDY = "EXR files need the package OpenEXR: pip install 'pano-mvs[exr]'"
@@ -23,14 +23,14 @@ def has_exr() -> bool:
 
 
 def write_exr(path: Path, channels: dict[str, NDArray[np.float32]]) -> None:
-    """Write channels of one size as a scan-line EXR file, 32-bit float, ZIP compression; no bit is lost.
+    """Write channels of one size as a scan-line EXR file, 32-bit float, with lossless ZIP compression.
 
     Args:
         path: the file to write.
         channels: name to (H, W) float32.
 
     Raises:
-        UsageError: if OpenEXR is not installed, or an array is another.
+        UsageError: if OpenEXR is not installed, or an array has another shape or type.
     """
     if not has_exr():
         raise UsageError(REMEDY)
@@ -49,7 +49,7 @@ def read_exr(path: Path) -> dict[str, NDArray[np.float32]]:
 
     Raises:
         UsageError: if OpenEXR is not installed.
-        InputError: if the file cannot be read, or its header states more pixels than are read of any picture.
+        InputError: if the file cannot be read, or its header states more pixels than the limit.
     """
     if not has_exr():
         raise UsageError(REMEDY)

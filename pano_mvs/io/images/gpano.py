@@ -1,7 +1,7 @@
-"""Google's photo sphere metadata (GPano XMP): is it a panorama, which part of the sphere, which way is up.
+"""Google's photo sphere metadata (GPano XMP): the projection, the part of the sphere, and the camera's orientation.
 
 The fields are those of the "Photo Sphere XMP Metadata" specification. Cameras write them as elements, editors as
-attributes, and both are read, where the container keeps its metadata or wherever else in the file a packet lies.
+attributes. Both are read, from the container's metadata or, without those, from packets anywhere in the file.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ _MAX_WARNINGS = 3
 
 @dataclass(frozen=True)
 class GPano:
-    """What a picture says of the panorama that it holds.
+    """The GPano metadata of an image.
 
     Attributes:
-        projection_type: "equirectangular" and, rarely, others; in lower case.
+        projection_type: "equirectangular" or, rarely, another, in lower case.
         full_size_hw: (height, width) of the whole sphere in pixels, or None.
-        crop_ltwh: (left, top, width, height) in those pixels of the part that the picture holds, or None.
-        heading_deg: compass heading of the picture's centre, or None.
+        crop_ltwh: (left, top, width, height) of the part in the image, in the same pixels, or None.
+        heading_deg: compass heading of the image centre, or None.
         pitch_deg: pitch of the camera, or None.
         roll_deg: roll of the camera, or None.
     """
@@ -43,9 +43,10 @@ class GPano:
 
     @property
     def up_in_cam(self) -> tuple[float, float, float] | None:
-        """The direction away from gravity, a unit vector in the camera frame, or None where the camera did not say.
+        """The direction away from gravity, a unit vector in the camera frame, or None if it is not stated.
 
-        (−sin r, −cos p cos r, sin p cos r) for pitch p and roll r, as eleven level-tested photographs have it.
+        (−sin r, −cos p cos r, sin p cos r) for pitch p and roll r. Eleven photographs of known
+        orientation confirm the signs.
         """
         if self.pitch_deg is None or self.roll_deg is None:
             return None
@@ -54,25 +55,25 @@ class GPano:
 
 
 def read_gpano(path: Path) -> GPano | None:
-    """Return a picture's GPano metadata, or None where it has none that can be read.
+    """Return the GPano metadata of an image file, or None without valid metadata.
 
     Raises:
-        InputError: if the file cannot be read at all.
+        InputError: if the file cannot be read.
     """
     data = FilePart(path).read_bytes()
     return find_gpano(read_container(data).xmp, data)[0]
 
 
 def find_gpano(chunks: Iterable[bytes], data: bytes = b"") -> tuple[GPano | None, tuple[str, ...]]:
-    """Return the GPano metadata of a picture file, if any, and what was wrong with it.
+    """Return the GPano metadata of an image file, if any, and warnings.
 
     Args:
-        chunks: what the container keeps as XMP.
-        data: the whole file, searched where those have no such fields: some programs append packets behind the
-            pixels, or write containers that are read here for their marks alone.
+        chunks: the XMP metadata of the container.
+        data: the whole file, which is searched if the chunks have no GPano fields: some programs append packets behind
+            the pixels, and HEIC and AVIF containers are not parsed.
 
     Returns:
-        The metadata or None, and warnings: packets and fields that were left out because they are malformed.
+        The metadata or None, and warnings about malformed packets and fields, which are ignored.
     """
     warnings: list[str] = []
     seen: set[bytes] = set()
@@ -93,13 +94,13 @@ def find_gpano(chunks: Iterable[bytes], data: bytes = b"") -> tuple[GPano | None
 
 
 def _packets(source: bytes) -> Iterator[bytes]:
-    """Yield every XMP packet in some bytes."""
+    """Yield all XMP packets in the data."""
     wrapped = list(_between(source, *_WRAPPED))
     yield from wrapped or _between(source, *_BARE)
 
 
 def _between(source: bytes, start_mark: bytes, end_mark: bytes) -> Iterator[bytes]:
-    """Yield every stretch of at most 1 MiB from a start mark to the next end mark, both included."""
+    """Yield all parts of at most 1 MiB from a start mark to the next end mark, inclusive."""
     start = source.find(start_mark)
     while start >= 0:
         end = source.find(end_mark, start)
@@ -125,7 +126,7 @@ def _fields(packet: bytes) -> dict[str, str]:
 
 
 def _gpano(fields: dict[str, str], warnings: list[str]) -> GPano:
-    """Return the record; fields that make no sense are left out with a warning."""
+    """Return the record; invalid fields are ignored with a warning."""
 
     def number(name: str) -> float | None:
         text = fields.get(name)

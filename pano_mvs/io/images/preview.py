@@ -72,10 +72,10 @@ def _scale_bar(near: float, far: float) -> NDArray[np.uint8]:
     for value in scale_ticks(near, far):
         x = left + round((right - left - 1) * np.log(value / near) / np.log(far / near))
         cv2.line(strip, (x, bottom), (x, bottom + 7), _INK, 2)
-        _write(strip, f"{value:g}", x, bottom + 35, centered=True)
+        _write(strip, f"{value:g}", (x, bottom + 35), centered=True)
     box = (right + 28, _MARGIN), (right + 28 + _BAR_HEIGHT, bottom)
     cv2.rectangle(strip, *box, (_INVALID_GREY,) * 3, cv2.FILLED)
-    _write(strip, "no range", right + 64, bottom - 3, centered=False)
+    _write(strip, "no range", (right + 64, bottom - 3), centered=False)
     return strip
 
 
@@ -95,7 +95,8 @@ def scale_ticks(near: float, far: float) -> list[float]:
     return [near, far]
 
 
-def _write(picture: NDArray[np.uint8], text: str, x: int, y: int, *, centered: bool) -> None:
+def _write(picture: NDArray[np.uint8], text: str, position_xy: tuple[int, int], *, centered: bool) -> None:
+    x, y = position_xy
     if centered:
         x -= cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, _TEXT_SIZE, _TEXT_WEIGHT)[0][0] // 2
     cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, _TEXT_SIZE, _INK, _TEXT_WEIGHT, cv2.LINE_AA)

@@ -1,7 +1,6 @@
-"""Videos of panoramas: what they are, and their frames between two times.
+"""Panoramic videos: their headers, and their frames between two times.
 
-Times are the container's own time stamps, so that a frame rate that varies does no harm; a frame is never looked up by
-its number.
+Times are the container's time stamps, so that the frame rate may vary. Frames are not addressed by number.
 """
 
 from __future__ import annotations
@@ -20,22 +19,22 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import is_file, is_folder, problem_of
 from pano_mvs.io.images.captures import VIDEO_SUFFIXES, files_below, natural_key
 
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # what FFmpeg prints of a damaged video is said better below
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # our own errors replace FFmpeg's messages
 
 _UNSTITCHED_SUFFIXES = frozenset({".insv", ".360", ".lrv", ".osv"})
 _UNSTITCHED = "export it as an equirectangular video with the camera maker's program first"
-_SLACK_S = 0.0015  # containers that count milliseconds round time stamps to them
+_SLACK_S = 0.0015  # some containers round time stamps to milliseconds
 
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """What the header of a video says.
+    """The header of a video.
 
     Attributes:
         size_hw: (height, width) of a frame as stored.
-        frames: how many there are, as the header has it.
-        frames_per_s: on average.
-        is_turned: whether players are told to turn the frames.
+        frames: number of frames.
+        frames_per_s: average frame rate.
+        is_turned: whether the header asks players to rotate the frames.
     """
 
     size_hw: tuple[int, int]
@@ -45,19 +44,19 @@ class VideoInfo:
 
     @property
     def duration_s(self) -> float:
-        """How long it lasts."""
+        """Duration of the video."""
         return self.frames / self.frames_per_s
 
 
 def list_videos(path: Path, notes: list[str] | None = None) -> list[Path]:
-    """Return a video, or all videos in a folder and below it in the order in which people count.
+    """Return a video, or all videos in a folder and its subfolders in natural order.
 
     Args:
         path: the video, or the folder.
-        notes: as of `files_below`.
+        notes: see `files_below`.
 
     Raises:
-        InputError: if there is none, or only recordings that must be stitched first.
+        InputError: if there is no video, or only recordings that must be stitched first.
     """
     if is_file(path):
         if path.suffix.lower() in _UNSTITCHED_SUFFIXES:
@@ -82,7 +81,7 @@ def list_videos(path: Path, notes: list[str] | None = None) -> list[Path]:
 
 
 def describe_video(path: Path) -> VideoInfo:
-    """Return what the header of a video says, after checking that it may hold panoramas.
+    """Return the header of a video after checking that its frames may be panoramas.
 
     Raises:
         InputError: if it cannot be opened, or its frames are not twice as wide as high.
@@ -108,15 +107,15 @@ def describe_video(path: Path) -> VideoInfo:
 def frames_between(
     path: Path, begin_s: float, end_s: float, *, threads: int = 1
 ) -> Iterator[tuple[float, NDArray[np.uint8]]]:
-    """Yield the frames from one time to another, both included, each with its time in seconds; (H, W, 3) uint8 BGR.
+    """Yield the time in seconds and the frame, (H, W, 3) uint8 BGR, of all frames between two times, inclusive.
 
-    A frame that is damaged so much that nothing can be decoded ends what is yielded.
+    Iteration ends at a frame that cannot be decoded.
 
     Args:
         path: the video.
-        begin_s: the earliest time, from the start of the video.
-        end_s: the latest.
-        threads: of the decoder; each of them may hold a frame of its own.
+        begin_s: the first time, from the start of the video.
+        end_s: the last time.
+        threads: number of threads of the decoder, each of which may hold a frame in memory.
 
     Raises:
         InputError: if the video cannot be opened, or its time stamps do not increase.
@@ -134,8 +133,8 @@ def frames_between(
             if time_s > end_s + _SLACK_S:
                 return
             if time_s >= begin_s - _SLACK_S:
-                is_sound, frame = capture.retrieve()
-                if not is_sound:
+                is_decoded, frame = capture.retrieve()
+                if not is_decoded:
                     return
                 yield time_s, frame
             previous = time_s
@@ -143,9 +142,9 @@ def frames_between(
 
 
 def _seek(capture: cv2.VideoCapture, time_s: float) -> bool:
-    """Go to a frame at a time or before it; return whether there is one.
+    """Seek a frame at or before a time; return whether it exists.
 
-    OpenCV counts on an even frame rate when it seeks, and so may land behind the time: then from further ahead.
+    OpenCV assumes a constant frame rate and may arrive behind the time. Then an earlier time is tried.
     """
     ahead_s = 0.0
     while True:
@@ -165,7 +164,7 @@ def _opened(path: Path, threads: int = 1) -> Iterator[cv2.VideoCapture]:
     try:
         if not capture.isOpened():
             raise InputError(
-                f"{path}: cannot be opened as a video: it is none, is damaged, or the recording was not "
+                f"{path}: cannot be opened as a video: it is not a video, is damaged, or its recording was not "
                 "finished. Copy it again from the camera, or repair it with a video program"
             )
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)

@@ -1,4 +1,4 @@
-"""What nerfstudio gets of one panorama: frames without poses, and their files."""
+"""The frames, without poses, and the files that are exported to nerfstudio for one panorama."""
 
 from __future__ import annotations
 
@@ -14,17 +14,16 @@ Variant = Literal["equirectangular", "faces"]
 
 @dataclass(frozen=True, slots=True)
 class NerfstudioFrame:
-    """One frame, but for the pose of its panorama.
+    """One frame without its pose.
 
     Attributes:
-        variant: of which transforms.json it is.
-        image: path beside that file, likewise `mask` (empty: nothing is masked) and `depth` (empty: there is none);
-            `{name}` in them stands for the panorama's name.
-        mask: see `image`.
-        depth: see `image`.
+        variant: the transforms.json to which it belongs.
+        image: path of the image relative to that file; `{name}` stands for the panorama's name.
+        mask: path of the mask; empty if nothing is masked.
+        depth: path of the depth; empty without one.
         size_wh: (width, height) in pixels.
-        focal_xy: fl_x, fl_y in pixels; the principal point is the middle.
-        frame_from_cam: rotation, three rows, from the panorama's camera frame (y down, z forward).
+        focal_xy: fl_x, fl_y in pixels; the principal point is the image centre.
+        frame_from_cam: rotation from the panorama's camera frame (y down, z forward), as three rows.
     """
 
     variant: Variant
@@ -49,11 +48,11 @@ class NerfstudioFrame:
 
 @dataclass(frozen=True, eq=False)
 class NerfstudioFrames(Files):
-    """The frames that nerfstudio gets of one panorama, with their files.
+    """The frames of one panorama for nerfstudio, with their files.
 
     Attributes:
-        pictures: targets of pictures that are delivered as they were given, in the source's files.
-        frames: what transforms.json says of each, but for the pose.
+        pictures: target to source file of images that are exported unchanged.
+        frames: the entries of transforms.json without poses.
         depth_unit: scene units of one step of the depths.
     """
 

@@ -1,12 +1,12 @@
-"""Nerfstudio's transforms.json, as its data parser `nerfstudio-data` reads it.
+"""Write nerfstudio's transforms.json for its data parser `nerfstudio-data`.
 
-Cameras are OpenGL's (x right, y up, z backwards), `transform_matrix` is world_from_cam for them; a pixel's centre is at
-(0.5, 0.5), as ours. An EQUIRECTANGULAR camera has fl_x = w / 2 and fl_y = h: its rays are of unit length, so that a
-depth is the distance along the ray. A PINHOLE camera's depth is z, unless the trainer is told `is-euclidean-depth`.
-Depths are 16-bit numbers times `depth_unit_scale_factor`, an option of the data parser (0.001 unless set), in the unit
-of the camera positions; 0 is unknown. Masks are 0 where a pixel is to be ignored; they, and depths, must be there for
-all frames or for none. `applied_transform` says how the file's world came from the one before: it did not change, which
-must be said, since another one is assumed where a COLMAP model lies beside the file.
+Camera frames are OpenGL's (x right, y up, z backwards), and `transform_matrix` is world_from_cam. The centre of the
+first pixel is (0.5, 0.5), as ours. An EQUIRECTANGULAR camera has fl_x = w / 2 and fl_y = h. Its rays have unit length,
+so that depth is the distance along the ray. The depth of a PINHOLE camera is z, unless the trainer has the option
+`is-euclidean-depth`. Depths are 16-bit numbers times `depth_unit_scale_factor`, an option of the data parser (0.001 by
+default), in the unit of the camera positions; 0 is unknown. Masks are 0 where a pixel is ignored. Either all frames or
+none have masks; the same holds for depths. `applied_transform` is the identity. It must be stated, because nerfstudio
+assumes another one if a COLMAP model is in the same folder.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ def transforms_document(
 ) -> dict[str, Any]:
     """Return the contents of a transforms.json.
 
-    Intrinsics are said once if all frames share them, else for each. Where some frames are masked the others get the
-    mask of `open_mask`. `panorama` is the name of the picture in the capture, by which our own reader knows it.
+    Intrinsics are stated once if all frames share them, otherwise per frame. If some frames have masks, the others have
+    the mask of `open_mask`. `panorama` is the name of the image in the capture, which our own reader uses.
 
     Args:
-        variant: which camera model; one file has one.
-        frames: each with its panorama's name and cam_from_world.
-        depth_unit: scene units of one step of the depths.
-        about: further entries for people, which nerfstudio does not read.
-        seed: path of the points to start from, beside the file; empty: none.
+        variant: the camera model; a file has only one.
+        frames: frames with their panorama's name and cam_from_world.
+        depth_unit: scene units per step of the depths.
+        about: further entries for readers, which nerfstudio ignores.
+        seed: path of the initial points relative to the file; empty without points.
     """
     masked = any(frame.mask for _, _, frame in frames)
     with_depth = all(frame.depth for _, _, frame in frames)
@@ -64,14 +64,14 @@ def transforms_document(
 
 
 def open_mask(size_wh: tuple[int, int]) -> str:
-    """Return the path of the mask, beside a transforms.json, of frames of a size in which nothing is masked."""
+    """Return the path, relative to a transforms.json, of the mask of frames of a size without masked pixels."""
     return f"masks/none_{size_wh[0]}x{size_wh[1]}.png"
 
 
 def is_common_picture(path: Path) -> bool:
-    """Return whether a file is a JPEG or an 8-bit PNG, either of three channels, which every trainer reads as it is.
+    """Return whether a file is a JPEG or an 8-bit PNG with three channels, which every trainer can read.
 
-    A JPEG of four channels is CMYK, which trainers take for red, green, blue and alpha.
+    A JPEG with four channels is CMYK, which trainers would read as red, green, blue and alpha.
     """
     with path.open("rb") as stream:
         start = stream.read(26)
@@ -81,7 +81,7 @@ def is_common_picture(path: Path) -> bool:
 
 
 def _jpeg_channels(data: bytes) -> int:
-    """Return how many channels a JPEG has, as its first start of frame says (ITU-T T.81, B.2.2); 0 if it has none."""
+    """Return the number of channels in a JPEG's first start of frame (ITU-T T.81, B.2.2); 0 without one."""
     for marker, start, _ in jpeg_segments(data):
         if marker in JPEG_FRAMES:
             return data[start + 5]

@@ -1,4 +1,4 @@
-"""Poses from whatever file or folder the user has."""
+"""Read poses from any supported file or folder."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.core.paths import exists, is_file, is_folder
 from pano_mvs.core.text import plural, shortened
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
-from pano_mvs.io.colmap.model import is_colmap_model, read_colmap_model
+from pano_mvs.io.colmap.model_writer import is_colmap_model, read_colmap_model
 from pano_mvs.io.poses.json_files import (
     read_json_value,
     read_posed_views,
@@ -29,20 +29,20 @@ _IN_A_FOLDER = ("transforms.json", "poses.json", "truth/poses.json", "poses.csv"
 
 
 def read_poses(path: Path) -> Poses:
-    """Return the poses in a file or folder. Image names are as written there: `match_image_names` pairs them.
+    """Return the poses in a file or folder, with image names as stored (see `match_image_names`).
 
-    Understood are
-      * a folder with a COLMAP model of EQUIRECTANGULAR cameras (.bin or .txt), or with one in sparse/0; SphereSfM's,
-        with its SPHERE cameras, without its points;
+    Supported are
+      * a folder with a COLMAP model of EQUIRECTANGULAR cameras (.bin or .txt), itself or in sparse/0, or with a model
+        of SphereSfM with SPHERE cameras, whose points are ignored;
       * nerfstudio's transforms.json (camera_model EQUIRECTANGULAR);
-      * OpenSfM's reconstruction.json with a spherical camera, of several reconstructions the largest;
+      * OpenSfM's reconstruction.json with a spherical camera; the largest of several reconstructions;
       * our own poses.json: {"metric": true, "views": [{"image": …, "R": 3 × 3, "t": 3}]}, cam_from_world;
       * a CSV file whose first line is name,tx,ty,tz,qw,qx,qy,qz: cam_from_world as x_in_cam = R(q) x_in_world + t in
         the camera frame x right, y down, z forward; quaternions of any length; empty lines and lines that begin
-        with # are left out.
+        with # are ignored.
 
     Raises:
-        InputError: naming the file, and the line or the key, that cannot be used.
+        InputError: if the file is invalid; it names the file, and the line or the key.
     """
     path = _file_or_model(path)
     if is_folder(path):
@@ -69,10 +69,10 @@ def read_poses(path: Path) -> Poses:
 
 
 def read_groups(path: Path) -> list[Poses]:
-    """Return the poses in a file or folder, and those of the further groups beside them.
+    """Return the poses in a file or folder, and those of further groups.
 
-    Further groups are the models sparse/1, sparse/2 … beside sparse/0, where a folder above these is given. Each is in
-    a world of its own. Images that an earlier group has are left out.
+    Further groups are the models sparse/1, sparse/2 … next to sparse/0 if a folder above them is given. Each has its
+    own world. Images of an earlier group are omitted.
 
     Raises:
         InputError: as `read_poses`.
@@ -89,7 +89,7 @@ def read_groups(path: Path) -> list[Poses]:
 
 
 def recorded_pictures(path: Path) -> dict[str, str]:
-    """Return the SHA-256 of the pictures that poses belong to, by name, as far as a file states them (poses.json).
+    """Return the SHA-256 of the images of poses by name, if the file states them (poses.json).
 
     Raises:
         InputError: as `read_poses`.
@@ -105,7 +105,7 @@ def read_csv(path: Path) -> dict[str, Rigid3]:
     """Return the cam_from_world of each image in a CSV file; see `read_poses` for its columns.
 
     Raises:
-        InputError: naming the line that cannot be used.
+        InputError: if the file is invalid; it names the line.
     """
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
@@ -126,7 +126,7 @@ def read_csv(path: Path) -> dict[str, Rigid3]:
 
 
 def _file_or_model(path: Path) -> Path:
-    """Return the file with poses, or the folder of a COLMAP model, that a file or folder is or holds."""
+    """Return the file with poses or the folder of a COLMAP model, given it or a folder above it."""
     if not exists(path):
         raise InputError(
             f"{path}: no such file or folder. Give a COLMAP model, a transforms.json, a "

@@ -24,10 +24,10 @@ class PosedView:
     """One view of a poses.json.
 
     Attributes:
-        name: of the picture, forward slashes.
+        name: the image's name with forward slashes.
         cam_from_world: its pose.
         number: its id, or None.
-        sha256: of the picture's bytes in hex, or None.
+        sha256: hex digest of the image file, or None.
     """
 
     name: str
@@ -40,16 +40,16 @@ def read_json(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file.
 
     Raises:
-        InputError: if the file cannot be read or holds no JSON object.
+        InputError: if the file cannot be read or does not contain a JSON object.
     """
     return require_object(read_json_value(path), path)
 
 
 def read_json_value(path: Path) -> Any:
-    """Return what a JSON file holds, of whatever type.
+    """Return the value in a JSON file, of any type.
 
     Raises:
-        InputError: if the file cannot be read or is no JSON.
+        InputError: if the file cannot be read or is not JSON.
     """
     try:
         return json.loads(path.read_text(encoding="utf-8-sig"))
@@ -74,11 +74,11 @@ def read_posed_views(path: Path) -> tuple[list[PosedView], bool]:
     """Return the views of a poses.json, and whether its lengths are metres.
 
     The file is {"metric": true, "views": [{"image": "images/000.png", "R": 3 × 3, "t": 3, "id": 0, "sha256": …}, …]}:
-    x_in_cam = R x_in_world + t in the camera frame x right, y down, z forward. `id` and `sha256` may be missing;
-    `metric` is true unless it says otherwise.
+    x_in_cam = R x_in_world + t in the camera frame x right, y down, z forward. `id` and `sha256` are optional;
+    `metric` is true by default.
 
     Raises:
-        InputError: naming the file and the key that is missing or malformed.
+        InputError: if a key is missing or malformed; it names the file and the key.
     """
     data = read_json(path)
     entries = data.get("views")
@@ -93,12 +93,12 @@ def read_posed_views(path: Path) -> tuple[list[PosedView], bool]:
 
 
 def read_transforms(path: Path) -> dict[str, Rigid3]:
-    """Return the poses of a nerfstudio transforms.json by image name (its file_path, or `panorama`, as we write it).
+    """Return the poses of a nerfstudio transforms.json by image name (`panorama`, which we write, or `file_path`).
 
     `transform_matrix` is world_from_cam for OpenGL's camera (x right, y up, z backwards). The world is the file's.
 
     Raises:
-        InputError: naming the file and the key that is missing or malformed, or a camera that is no EQUIRECTANGULAR.
+        InputError: if a key is missing or malformed, or a camera is not EQUIRECTANGULAR; it names the file and the key.
     """
     data = read_json(path)
     frames = data.get("frames")
@@ -113,7 +113,7 @@ def read_transforms(path: Path) -> dict[str, Rigid3]:
             raise InputError(
                 f"{where} ({name}): camera_model is {model}, expected EQUIRECTANGULAR. Only panoramas can be used"
             )
-        matrix = number_array(frame, "transform_matrix", (4, 4), where)
+        matrix = number_array(frame, "transform_matrix", (4, 4), where=where)
         if not np.isfinite(matrix).all():
             raise InputError(f"{where} ({name}): the pose holds NaN or infinite numbers")
         if not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
@@ -125,10 +125,10 @@ def read_transforms(path: Path) -> dict[str, Rigid3]:
 
 
 def rigid_from_arrays(rotation: NDArray[np.float64], translation: NDArray[np.float64], where: str) -> Rigid3:
-    """Return the transform; small rounding errors of the rotation are taken out.
+    """Return the transform; small rounding errors of the rotation are corrected.
 
     Raises:
-        InputError: beginning with `where`, if the matrix is no rotation or a number is not finite.
+        InputError: beginning with `where`, if the matrix is not a rotation or a number is not finite.
     """
     if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
         raise InputError(f"{where}: the pose holds NaN or infinite numbers")
@@ -143,7 +143,7 @@ def rigid_from_arrays(rotation: NDArray[np.float64], translation: NDArray[np.flo
 
 
 def require_distinct(names: list[str], path: Path) -> None:
-    """Raise InputError if an image is named twice, or none at all."""
+    """Raise InputError if an image is listed twice, or if there is no image."""
     if not names:
         raise InputError(f"{path}: holds no poses")
     seen: set[str] = set()
@@ -156,7 +156,7 @@ def require_distinct(names: list[str], path: Path) -> None:
 def _posed_view(entry: Any, where: str) -> PosedView:
     name = _name(entry, "image", where)
     pose = rigid_from_arrays(
-        number_array(entry, "R", (3, 3), where), number_array(entry, "t", (3,), where), f"{where} ({name})"
+        number_array(entry, "R", (3, 3), where=where), number_array(entry, "t", (3,), where=where), f"{where} ({name})"
     )
     number, digest = entry.get("id"), entry.get("sha256")
     return PosedView(name, pose, number if type(number) is int else None, digest if isinstance(digest, str) else None)
@@ -171,11 +171,11 @@ def _name(entry: Any, key: str, where: str) -> str:
     return name.replace("\\", "/").removeprefix("./")
 
 
-def number_array(entry: dict[str, Any], key: str, shape: tuple[int, ...], where: str) -> NDArray[np.float64]:
+def number_array(entry: dict[str, Any], key: str, shape: tuple[int, ...], *, where: str) -> NDArray[np.float64]:
     """Return the numbers under a key of a JSON object as an array.
 
     Raises:
-        InputError: beginning with `where`, if they have not that shape.
+        InputError: beginning with `where`, if they have another shape.
     """
     try:
         array = np.array(entry.get(key), dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Arrays of anybody's .npy and .npz files, whose headers are believed only as far as the bytes reach."""
+"""Read .npy and .npz files of any program, after checking their headers against the size of the file."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from pano_mvs.core.errors import InputError
 from pano_mvs.core.text import shortened
 from pano_mvs.scene.image_files.decoding import MAX_PIXELS
 
-# All that zipfile, its decompressors and the parser of .npy headers raise on damaged files.
+# The exceptions that zipfile, its decompressors and the parser of .npy headers raise for damaged files.
 DAMAGE = (
     *(OSError, ValueError, TypeError, LookupError, AttributeError, EOFError, RuntimeError, SyntaxError, OverflowError),
     *(MemoryError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error, lzma.LZMAError),
 )
 _MAX_DIMENSIONS = 4
 _MAX_REASON = 300  # characters; numpy repeats whole headers
-_RATIOS = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 1032}  # how many bytes a decompressor makes of one at most
+_RATIOS = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 1032}  # largest ratio of decompression
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
@@ -33,7 +33,7 @@ def read_npy(path: Path) -> NDArray[Any]:
     """Return the array in a .npy file.
 
     Raises:
-        InputError: if the file cannot be read, holds no array of numbers, or fewer bytes than its header promises.
+        InputError: if the file cannot be read, contains no array of numbers, or fewer bytes than its header states.
     """
     try:
         with path.open("rb") as stream:
@@ -48,17 +48,17 @@ def read_npz(path: Path, key: str, *, what: str = "") -> NDArray[Any]:
     Args:
         path: the file.
         key: the array's name.
-        what: what the array is, for messages; its name by default.
+        what: description of the array in error messages; its name by default.
 
     Raises:
-        InputError: if the file cannot be read, or has no array of numbers of that name that is whole.
+        InputError: if the file cannot be read, or has no complete array of numbers of that name.
     """
     try:
         with zipfile.ZipFile(path) as archive:
             member = archive.getinfo(f"{key}.npy")
-            most = member.compress_size * _RATIOS.get(member.compress_type, member.file_size)
+            max_bytes = member.compress_size * _RATIOS.get(member.compress_type, member.file_size)
             with archive.open(member) as stream:
-                return _read_array(stream, min(member.file_size, most))
+                return _read_array(stream, min(member.file_size, max_bytes))
     except DAMAGE as error:
         raise InputError(
             f"{path}: {what or f'the array {key}'} cannot be read ({_reason(error)}). Fetch the file again"
@@ -79,11 +79,11 @@ def keys_of_npz(path: Path) -> list[str]:
 
 
 def _read_array(stream: IO[bytes], size_bytes: int) -> NDArray[Any]:
-    """Return the array in a stream of so many bytes at most.
+    """Return the array in a stream of at most `size_bytes` bytes.
 
     Raises:
-        ValueError: if it holds objects, or is larger than the stream or than the limit of pictures.
-        Exception: whatever of `DAMAGE` a damaged stream leads to.
+        ValueError: if it contains objects, or is larger than the stream or than the limit of images.
+        Exception: one of `DAMAGE` if the stream is damaged.
     """
     version = np.lib.format.read_magic(stream)
     if version not in _HEADERS:
@@ -95,7 +95,7 @@ def _read_array(stream: IO[bytes], size_bytes: int) -> NDArray[Any]:
         raise ValueError(f"its header states the shape {shape}")
     count = math.prod(shape)
     if count * dtype.itemsize > size_bytes:
-        raise ValueError(f"its header promises {count * dtype.itemsize} bytes, there are {size_bytes} at most")
+        raise ValueError(f"its header states {count * dtype.itemsize} bytes, there are at most {size_bytes}")
     if count > MAX_PIXELS:
         raise ValueError(f"its {count} numbers are more than the limit of {MAX_PIXELS}")
     values = np.frombuffer(_read_exactly(stream, count * dtype.itemsize), dtype)
@@ -110,5 +110,5 @@ def _read_exactly(stream: IO[bytes], size_bytes: int) -> bytes:
 
 
 def _reason(error: BaseException) -> str:
-    """Return an exception's text in few words, or its kind where it has none."""
+    """Return an exception's shortened text, or its type without one."""
     return shortened(str(error), _MAX_REASON) or type(error).__name__

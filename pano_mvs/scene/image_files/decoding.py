@@ -1,4 +1,4 @@
-"""Decode the bytes of a picture file within limits, and find out from the decoder itself whether they are damaged."""
+"""Decode image files within limits of memory, and detect damage from the messages of the decoder."""
 
 from __future__ import annotations
 
@@ -20,55 +20,55 @@ from pano_mvs.scene.image_files.header import PNG_START, TIFF_STARTS, Size, stat
 from pano_mvs.scene.image_files.jpeg import JPEG_START, is_cut_short
 
 MAX_PIXELS = 512_000_000
-"""The pixels of a picture that is decoded, unless a setting says otherwise."""
+"""Default limit of pixels of an image that is decoded."""
 
 MASK_BYTES_PER_PIXEL = 8
-"""What a mask takes while it is read and brought to size: grey levels, flags, and counts of masked pixels."""
+"""Peak memory while a mask is read and resized: grey levels, flags, and counts of masked pixels."""
 
-# Measured at their most, the file included: TIFF of 16 bits, uncompressed, and PNG of 16 bits; JPEG takes 6.
+# Measured worst cases, including the file: uncompressed TIFF of 16 bits, and PNG of 16 bits; JPEG takes 6.
 _TIFF_BYTES_PER_PIXEL, _BYTES_PER_PIXEL = 18, 8
 
-# What OpenCV prints of pictures that it cannot decode is said better by our own errors.
+# Our own errors replace OpenCV's messages about images that it cannot decode.
 _SILENT = 0
 if hasattr(cv2, "setLogLevel"):  # OpenCV 4
     cv2.setLogLevel(_SILENT)
 else:
     cv2.utils.logging.setLogLevel(_SILENT)
 
-# A header is believed up to here whatever the size of the file; beyond it, a JPEG, PNG or TIFF has no more pixels in
-# a byte: deflate, their best compression, makes 1032 bytes of one, and a bilevel picture has 8 pixels in each.
-_BELIEVED_PIXELS = 64_000_000
-_PIXELS_PER_BYTE = 10_000
+# Headers that state at most this many pixels are accepted whatever the size of the file. Above that, a JPEG, PNG or
+# TIFF cannot have more pixels per byte than this: deflate expands one byte to at most 1032, each with 8 bilevel pixels.
+_ACCEPTED_PIXELS = 64_000_000
+_MAX_PIXELS_PER_BYTE = 10_000
 _COMPRESSED_STARTS = (JPEG_START, PNG_START, *TIFF_STARTS)
 
 _OPENCV_PIXELS, _OPENCV_SIDE = 1 << 30, 1 << 20  # CV_IO_MAX_IMAGE_PIXELS, _WIDTH and _HEIGHT
 _OPENCV_NO_MEMORY, _OPENCV_ASSERTION = -4, -215
 
-# libjpeg's warnings about the data. Bytes too many in front of a marker other than a restart marker lose nothing:
-# some cameras pad what they write.
+# libjpeg's warnings about the data. Extraneous bytes before a marker other than a restart marker are harmless: some
+# cameras write padding.
 _JPEG_WARNING = re.compile(r"(?:Corrupt JPEG data|Premature end of JPEG file|Inconsistent progression sequence).*")
 _HARMLESS = re.compile(r".*extraneous bytes before marker 0x(?!d[0-7])..$")
 _STDERR = 2
-_turned = threading.Lock()
+_redirected = threading.Lock()
 
 
 def decoding_bytes_per_pixel(path: Path) -> int:
-    """Return the memory in bytes that decoding takes for each pixel of a picture file at most, the file included."""
+    """Return the peak memory in bytes per pixel of decoding an image file, including the file."""
     return _TIFF_BYTES_PER_PIXEL if path.suffix.lower() in {".tif", ".tiff"} else _BYTES_PER_PIXEL
 
 
 def decode_picture(data: bytes, path: Path, flags: int, *, max_pixels: int = MAX_PIXELS) -> NDArray[np.generic] | None:
-    """Return a picture as OpenCV decodes it, BGR; None if the bytes are no picture that it knows.
+    """Return an image as OpenCV decodes it, BGR, or None if OpenCV does not know its format.
 
     Args:
         data: the file's bytes.
-        path: of the file, for messages.
+        path: the file, for error messages.
         flags: `cv2.IMREAD_…`.
-        max_pixels: larger pictures are refused by their header, before they take memory.
+        max_pixels: the limit of pixels, which is compared with the header before memory is allocated.
 
     Raises:
-        InputError: if the picture has more pixels than that, or than OpenCV or the memory can take, or if the header
-            states more than the file can hold, or if a JPEG is cut short or damaged.
+        InputError: if the image has more pixels than the limit, or than OpenCV or the memory allow, if the header
+            states more pixels than the file can contain, or if a JPEG is truncated or damaged.
     """
     size = check_stated_size(data, path, max_pixels)
     if data.startswith(JPEG_START) and is_cut_short(data):
@@ -90,10 +90,10 @@ def decode_picture(data: bytes, path: Path, flags: int, *, max_pixels: int = MAX
 
 
 def check_stated_size(data: bytes, path: Path, max_pixels: int = MAX_PIXELS) -> Size | None:
-    """Return the (height, width) that a picture's header states, if it states one that can be read and believed.
+    """Return the (height, width) in an image's header, or None if it cannot be read.
 
     Raises:
-        InputError: if that is more than the limit, or than the file can hold.
+        InputError: if that is more than the limit, or than the file can contain.
     """
     size = stated_size(data)
     if size is None:
@@ -106,36 +106,36 @@ def check_stated_size(data: bytes, path: Path, max_pixels: int = MAX_PIXELS) -> 
             f"{what}, more than the limit of {max_pixels / 1e6:.0f}. Scale it down; for panoramas, the "
             "source's setting max_megapixels raises the limit"
         )
-    if data.startswith(_COMPRESSED_STARTS) and pixels > max(_BELIEVED_PIXELS, _PIXELS_PER_BYTE * len(data)):
+    if data.startswith(_COMPRESSED_STARTS) and pixels > max(_ACCEPTED_PIXELS, _MAX_PIXELS_PER_BYTE * len(data)):
         raise InputError(
             f"{what}, but a file of {len(data)} bytes cannot hold them: it is damaged or cut short. Copy "
-            "it again, or write it anew"
+            "it again, or export it again"
         )
     return size
 
 
 def _decoded(data: bytes, flags: int) -> tuple[NDArray[np.generic] | None, str]:
-    """Return the picture or None, and what libjpeg says of damaged data: it fills in what is missing."""
+    """Return the image or None, and the warning of libjpeg about damaged data, for which it substitutes grey."""
     array = np.frombuffer(data, np.uint8)
     if not data.startswith(JPEG_START):
         return cv2.imdecode(array, flags), ""
-    said: list[str] = []
-    with _warnings_of_libjpeg(said):
+    messages: list[str] = []
+    with _warnings_of_libjpeg(messages):
         image = cv2.imdecode(array, flags)
-    return image, next((line for line in said if not _HARMLESS.fullmatch(line)), "")
+    return image, next((line for line in messages if not _HARMLESS.fullmatch(line)), "")
 
 
 @contextmanager
-def _warnings_of_libjpeg(said: list[str]) -> Iterator[None]:
-    """Collect what libjpeg warns of inside: it prints it to the error stream of the process and tells nobody else.
+def _warnings_of_libjpeg(messages: list[str]) -> Iterator[None]:
+    """Collect the warnings of libjpeg, which it only prints to the error stream of the process.
 
-    That stream leads into a file meanwhile; what others wrote to it is passed on. Where it cannot be turned, nothing is
+    The stream is redirected to a file; other output is forwarded afterwards. If redirection fails, nothing is
     collected.
     """
-    with _turned, ExitStack() as stack:
+    with _redirected, ExitStack() as stack:
         try:
-            kept = os.dup(_STDERR)
-            stack.callback(os.close, kept)
+            original = os.dup(_STDERR)
+            stack.callback(os.close, original)
             caught = stack.enter_context(_file_in_memory())
             os.dup2(caught.fileno(), _STDERR)
         except OSError:
@@ -144,12 +144,12 @@ def _warnings_of_libjpeg(said: list[str]) -> Iterator[None]:
         try:
             yield
         finally:
-            os.dup2(kept, _STDERR)
+            os.dup2(original, _STDERR)
         caught.seek(0)
         for line in caught.read().splitlines(keepends=True):
             text = line.decode(errors="replace").strip()
             if _JPEG_WARNING.fullmatch(text):
-                said.append(text)
+                messages.append(text)
             else:
                 with suppress(OSError):
                     os.write(_STDERR, line)
@@ -162,7 +162,7 @@ def _file_in_memory() -> BinaryIO:
 
 
 def _why_not(error: Exception, size: Size | None) -> str:
-    """Return what the user should know of a picture that OpenCV refused."""
+    """Return the message about an image that OpenCV could not decode."""
     height, width = size or (0, 0)
     of = f" of {width}×{height} px ({width * height / 1e6:.0f} megapixels)" if size else ""
     code = error.code if isinstance(error, cv2.error) else _OPENCV_NO_MEMORY

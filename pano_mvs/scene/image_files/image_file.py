@@ -1,4 +1,4 @@
-"""Decode a picture file into an RGB array, or say why not."""
+"""Decode image files to RGB arrays, and write PNG files."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ _HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", 
 
 
 def decode_image(path: Path, data: bytes | None = None, *, max_pixels: int = MAX_PIXELS) -> NDArray[np.uint8]:
-    """Return a picture as (H, W, 3) uint8 RGB; 16-bit pictures are scaled, EXIF orientation is ignored.
+    """Return an image as (H, W, 3) uint8 RGB. 16-bit images are scaled; EXIF orientation and transparency are ignored.
 
-    Of pictures with transparency the colours are taken, of those with several pages the first.
+    Only the first page of an image with several pages is read.
 
     Args:
         path: the file.
         data: its bytes, if they have been read already.
-        max_pixels: larger pictures are refused by their header, before they take memory.
+        max_pixels: the limit of pixels, which is compared with the header before memory is allocated.
 
     Raises:
-        InputError: if the file cannot be read, is no picture, is truncated or damaged, is larger than the limit, or
+        InputError: if the file cannot be read, is not an image, is truncated or damaged, is larger than the limit, or
             needs an extra that is not installed.
     """
     if data is None:
@@ -37,7 +37,7 @@ def decode_image(path: Path, data: bytes | None = None, *, max_pixels: int = MAX
         check_stated_size(data, path, max_pixels)
         return _decode_heic(data, path)
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    if not data.startswith(PNG_START):  # whose 16 bits OpenCV takes to 8 as we do, with half of the memory
+    if not data.startswith(PNG_START):  # whose 16 bits OpenCV reduces to 8 as we do, with half of the memory
         flags |= cv2.IMREAD_ANYDEPTH
     image = decode_picture(data, path, flags, max_pixels=max_pixels)
     if image is None and data[4:12] in (b"ftypavif", b"ftypavis"):
@@ -50,9 +50,9 @@ def decode_image(path: Path, data: bytes | None = None, *, max_pixels: int = MAX
             f"{path}: not a picture that can be decoded ({len(data)} bytes). Remove it or convert it to "
             f"JPEG, or to PNG or TIFF of 8 or 16 bits"
         )
-    del data  # of large pictures each copy counts
+    del data  # frees memory
     if image.dtype == np.uint16:
-        np.right_shift(image, 8, out=image)  # both 257 v and 256 v, as which programs write 8 bits in 16, give v
+        np.right_shift(image, 8, out=image)  # programs write 8 bits v in 16 as 257 v or 256 v; both give v
         return np.asarray(image[..., ::-1].astype(np.uint8, order="C"))
     if image.dtype != np.uint8:
         raise InputError(f"{path}: {image.dtype} pictures are not supported. Convert it to 8 or 16 bits")
@@ -61,7 +61,7 @@ def decode_image(path: Path, data: bytes | None = None, *, max_pixels: int = MAX
 
 
 def _decode_heic(data: bytes, path: Path) -> NDArray[np.uint8]:
-    """Return a HEIC picture as (H, W, 3) uint8 RGB; what it holds of 10 or 12 bits is scaled."""
+    """Return a HEIC image as (H, W, 3) uint8 RGB; 10 or 12 bits are scaled."""
     try:
         pillow_heif = import_module("pillow_heif")
     except ImportError as error:
@@ -70,7 +70,7 @@ def _decode_heic(data: bytes, path: Path) -> NDArray[np.uint8]:
         ) from error
     try:
         picture = pillow_heif.open_heif(data, convert_hdr_to_8bit=True)
-        image = np.array(picture, copy=True)  # what is merely looked at may go with the picture
+        image = np.array(picture, copy=True)  # a view may not outlive the image
     except (ValueError, EOFError, OSError, RuntimeError, SyntaxError) as error:
         raise InputError(
             f"{path}: not a HEIC picture that can be decoded ({error}). Copy it again, or convert it to JPEG"
@@ -80,6 +80,6 @@ def _decode_heic(data: bytes, path: Path) -> NDArray[np.uint8]:
 
 
 def write_png(path: Path, picture: NDArray[np.uint8]) -> None:
-    """Write a picture, (H, W) grey or (H, W, 3) RGB uint8, as PNG."""
+    """Write an image, (H, W) grey or (H, W, 3) RGB uint8, as PNG."""
     ordered = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
     path.write_bytes(cv2.imencode(".png", ordered)[1].tobytes())

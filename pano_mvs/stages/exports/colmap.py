@@ -15,8 +15,8 @@ from pano_mvs.api import All, Context, Each, Files, Names, One, Panorama, Params
 from pano_mvs.core.paths import children
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import PinholeView
-from pano_mvs.io.colmap.images import resized_mask, write_picture
-from pano_mvs.io.colmap.model import write_colmap_model
+from pano_mvs.io.colmap.image_copies import resized_mask, write_picture
+from pano_mvs.io.colmap.model_writer import write_colmap_model
 from pano_mvs.io.colmap.points import ModelForm
 from pano_mvs.io.colmap.rig import CutPanorama, write_rig_model
 from pano_mvs.io.colmap.workspace import WORKSPACE, face_image_name, sparse_targets, write_face, write_stereo_configs

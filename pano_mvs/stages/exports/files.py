@@ -12,7 +12,7 @@ from pydantic import Field, field_validator
 
 from pano_mvs.algorithms.fusion.normals import normals_from_range
 from pano_mvs.api import Context, Each, Files, One, Panorama, Params, PointCloud, RangeMap, stage
-from pano_mvs.io.clouds.ply import write_ply
+from pano_mvs.io.clouds.ply_writer import write_ply
 from pano_mvs.io.clouds.thinning import Selection, select_points
 from pano_mvs.io.images import exr
 from pano_mvs.io.images.preview import write_preview

@@ -11,8 +11,8 @@ from pano_mvs.algorithms.mesh.poisson import MIN_POINTS, poisson_depth, solve_po
 from pano_mvs.algorithms.mesh.triangles import Mesh, point_spacings, trimmed_mesh, without_crumbs
 from pano_mvs.api import Context, Files, InputError, One, Params, PointCloud, stage
 from pano_mvs.core.text import plural
-from pano_mvs.io.clouds.ply import read_ply, write_ply
-from pano_mvs.io.clouds.ply_mesh import read_ply_mesh, write_ply_mesh
+from pano_mvs.io.clouds.mesh_writer import read_ply_mesh, write_ply_mesh
+from pano_mvs.io.clouds.ply_writer import read_ply, write_ply
 from pano_mvs.io.clouds.thinning import Selection, select_points
 from pano_mvs.scene.files import group_file
 

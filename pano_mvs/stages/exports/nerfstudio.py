@@ -31,9 +31,9 @@ from pano_mvs.api import (
     write_png,
 )
 from pano_mvs.core.text import plural
-from pano_mvs.io.clouds.ply import write_ply
+from pano_mvs.io.clouds.ply_writer import write_ply
 from pano_mvs.io.clouds.thinning import Selection, select_points
-from pano_mvs.io.colmap.images import write_picture
+from pano_mvs.io.colmap.image_copies import write_picture
 from pano_mvs.io.nerfstudio.frames import NerfstudioFrame, NerfstudioFrames, Variant
 from pano_mvs.io.nerfstudio.transforms import is_common_picture, open_mask, transforms_document
 from pano_mvs.io.ranges.files import write_range_png

@@ -50,8 +50,10 @@ def inspect_pixel(
     read = _SweepRead.of(unit, store)
     height, width = read.reference.size_hw
     if not (0 <= column < width and 0 <= row < height):
-        raise UsageError(f"{unit.item} was swept at {width}×{height}: there is no pixel ({column}, {row}); x is 0 to "
-                         f"{width - 1}, y 0 to {height - 1}")  # fmt: skip
+        raise UsageError(
+            f"{unit.item} was swept at {width}×{height}: there is no pixel ({column}, {row}); x is 0 to "
+            f"{width - 1}, y 0 to {height - 1}"
+        )
     params = unit.entry.params
     assert isinstance(params, SweepParams)
     settings = SweepSettings(**{field.name: getattr(params, field.name) for field in dataclasses.fields(SweepSettings)})
@@ -59,9 +61,17 @@ def inspect_pixel(
     masks = [view.load_mask() for view in (read.reference, *read.sources)]
     near, far = _limits(params, record, pictures, read, masks)
     work = sweep_input(
-        pictures[0], pictures[1:], read.source_from_reference, near=near, far=far, settings=settings,
-        backend=params.backend, device=params.device, reference_mask=masks[0], source_masks=masks[1:],
-    )  # fmt: skip
+        pictures[0],
+        pictures[1:],
+        read.source_from_reference,
+        near=near,
+        far=far,
+        settings=settings,
+        backend=params.backend,
+        device=params.device,
+        reference_mask=masks[0],
+        source_masks=masks[1:],
+    )
     curve = cost_curve(work, column=column, row=row, masked=not masks[0][row, column])
     ray = ray_from_pixel([column + 0.5, row + 0.5], (height, width))
     pose = read.poses[0]
@@ -157,17 +167,19 @@ def _sights(
         x, y = pixel_from_ray(point, (height, width))
         column, row = int(x) % width, min(int(y), height - 1)
         between = np.cross(pose.rotation @ ray, point / np.linalg.norm(point))
-        sights.append(SourceSight(
-            name=read.names[idx],
-            baseline=float(np.linalg.norm(pose.translation)),
-            parallax_deg=float(np.rad2deg(np.arcsin(min(1.0, float(np.linalg.norm(between)))))),
-            pixel_px=(float(x), float(y)),
-            color_rgb=_color(
-                pictures[idx] if masks[idx][row, column] else read.sources[idx].load_unmasked(), row, column
-            ),
-            masked=not masks[idx][row, column],
-            cost=float(curve.by_source[idx, curve.winner]),
-        ))  # fmt: skip
+        sights.append(
+            SourceSight(
+                name=read.names[idx],
+                baseline=float(np.linalg.norm(pose.translation)),
+                parallax_deg=float(np.rad2deg(np.arcsin(min(1.0, float(np.linalg.norm(between)))))),
+                pixel_px=(float(x), float(y)),
+                color_rgb=_color(
+                    pictures[idx] if masks[idx][row, column] else read.sources[idx].load_unmasked(), row, column
+                ),
+                masked=not masks[idx][row, column],
+                cost=float(curve.by_source[idx, curve.winner]),
+            )
+        )
     return tuple(sights)
 
 
@@ -205,8 +217,10 @@ def _curve_notes(
             "version): the curve was computed for this alone"
         )
     if settings.levels > 1:
-        notes.append(f"{name} goes from coarse to fine (levels: {settings.levels}) and tries a few ranges around a "
-                     "guide; the curve tries all")  # fmt: skip
+        notes.append(
+            f"{name} goes from coarse to fine (levels: {settings.levels}) and tries a few ranges around a "
+            "guide; the curve tries all"
+        )
     stored = next((found for found in stages if found.stage == name), None)
     if stored is not None and not _alike(stored.range, curve):
         notes.append(f"{name} stored {stored.range:.6g}, the curve's winner is {curve.range:.6g}")

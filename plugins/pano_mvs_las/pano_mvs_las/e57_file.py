@@ -49,10 +49,11 @@ def _describe_file(file: libe57.ImageFile, guid: uuid.UUID, placement: Placement
     file.extensionsAdd("nor", _NORMALS_URI)
     root = file.root()
     texts = {
-        "formatName": "ASTM E57 3D Imaging Data File", "guid": f"{{{guid}}}",
+        "formatName": "ASTM E57 3D Imaging Data File",
+        "guid": f"{{{guid}}}",
         "e57LibraryVersion": libe57.E57_LIBRARY_ID,
         "coordinateMetadata": "" if placement.crs is None else placement.crs.to_wkt(),
-    }  # fmt: skip
+    }
     for name, text in texts.items():
         root.set(name, libe57.StringNode(file, text))
     root.set("versionMajor", libe57.IntegerNode(file, libe57.E57_FORMAT_MAJOR))
@@ -68,8 +69,11 @@ def _scan(
     scan = libe57.StructureNode(file)
     scan.set("guid", libe57.StringNode(file, f"{{{uuid.uuid5(guid, 'scan')}}}"))
     scan.set("name", libe57.StringNode(file, "pano_mvs"))
-    box = {f"{axis}{end}": float(value) for end, values in (("Minimum", low), ("Maximum", high))
-           for axis, value in zip("xyz", values, strict=True)}  # fmt: skip
+    box = {
+        f"{axis}{end}": float(value)
+        for end, values in (("Minimum", low), ("Maximum", high))
+        for axis, value in zip("xyz", values, strict=True)
+    }
     scan.set("cartesianBounds", _structure(file, box))
     limits = {f"{name}{end}": value for name in _COLORS for end, value in (("Minimum", 0), ("Maximum", 255))}
     scan.set("colorLimits", _structure(file, limits))

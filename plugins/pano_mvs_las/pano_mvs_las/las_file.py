@@ -38,8 +38,10 @@ def write_las(
     """
     low, high = bounds(cloud, placement, kept)
     if (high - low).max() / step > _MOST_STEPS:
-        raise UsageError(f"a cloud that is {(high - low).max():g} wide does not fit into steps of {step:g}: set `step` "
-                         f"to {(high - low).max() / _MOST_STEPS:.1g} or more")  # fmt: skip
+        raise UsageError(
+            f"a cloud that is {(high - low).max():g} wide does not fit into steps of {step:g}: set `step` "
+            f"to {(high - low).max() / _MOST_STEPS:.1g} or more"
+        )
     header = laspy.LasHeader(point_format=_POINT_FORMAT, version="1.4")
     header.add_extra_dims([laspy.ExtraBytesParams(name, np.float32, "surface normal") for name in _NORMALS])
     header.add_extra_dims([laspy.ExtraBytesParams(name, np.uint8) for name in ("views", "confidence")])

@@ -64,15 +64,19 @@ def placement_of(poses: Poses, epsg: int | None) -> Placement:
     if epsg == 0 or (origin is None and epsg is None):
         return Placement(origin)
     if origin is None:
-        raise UsageError(f"epsg: {epsg} needs cameras that GPS has placed: a stage poses.scale with `gps: true` and "
-                         "`align: gps` before")  # fmt: skip
+        raise UsageError(
+            f"epsg: {epsg} needs cameras that GPS has placed: a stage poses.scale with `gps: true` and "
+            "`align: gps` before"
+        )
     try:
         crs = CRS.from_epsg(_utm_epsg(origin[0], origin[1]) if epsg is None else epsg)
     except CRSError as error:
         raise UsageError(f"epsg: {epsg} is no coordinate system that PROJ knows") from error
     if not crs.is_projected:
-        raise UsageError(f"epsg: {epsg} ({crs.name}) is not projected: its unit is no length. Take a map's, such as "
-                         f"{_utm_epsg(origin[0], origin[1])}")  # fmt: skip
+        raise UsageError(
+            f"epsg: {epsg} ({crs.name}) is not projected: its unit is no length. Take a map's, such as "
+            f"{_utm_epsg(origin[0], origin[1])}"
+        )
     return Placement(origin, crs)
 
 

@@ -133,8 +133,10 @@ def _nothing() -> tuple[NDArray[np.uint8], list[NDArray[np.uint8]], list[Rigid3]
 
 
 def test_torch_is_not_imported_before_it_is_used() -> None:
-    code = "import sys; from importlib.metadata import entry_points as e\n" \
-           "[p.load() for p in e(group='pano_mvs.plugins')]\n" \
-           "from pano_mvs.algorithms.sweep.backends.registry import SWEEP_BACKENDS as b\n" \
-           "assert 'torch' in b.names() and 'torch' not in sys.modules"  # fmt: skip
+    code = (
+        "import sys; from importlib.metadata import entry_points as e\n"
+        "[p.load() for p in e(group='pano_mvs.plugins')]\n"
+        "from pano_mvs.algorithms.sweep.backends.registry import SWEEP_BACKENDS as b\n"
+        "assert 'torch' in b.names() and 'torch' not in sys.modules"
+    )
     subprocess.run([sys.executable, "-c", code], check=True)

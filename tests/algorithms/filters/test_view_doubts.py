@@ -40,13 +40,14 @@ def agreement_of(maps: list[RangeMap], poses: list[Rigid3], view: int) -> Agreem
     others = [idx for idx in range(len(poses)) if idx != view]
     return checked_with_agreement(
         maps[view], poses[view], [maps[idx] for idx in others], [poses[idx] for idx in others], **LIMITS
-    )[1]  # fmt: skip
+    )[1]
 
 
 def line(agreements: list[Agreement]) -> tuple[dict[str, Agreement], dict[str, np.ndarray]]:
     names = [f"{idx}.jpg" for idx in range(len(agreements))]
-    return dict(zip(names, agreements, strict=True)), {name: np.array([idx, 0.0, 0.0])
-                                                       for idx, name in enumerate(names)}  # fmt: skip
+    return dict(zip(names, agreements, strict=True)), {
+        name: np.array([idx, 0.0, 0.0]) for idx, name in enumerate(names)
+    }
 
 
 def test_sources_agree_with_true_ranges(true_maps: list[RangeMap]) -> None:

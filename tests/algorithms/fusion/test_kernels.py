@@ -40,9 +40,13 @@ def test_votes_of_a_source_equal_the_plain_ones() -> None:
     image = rng.integers(0, 256, (*SOURCE_SIZE, 3)).astype(np.uint8)
     pose = Rigid3(rotation_from_rotvec((0.4, -1.9, 0.7)), np.array([0.05, -0.03, 0.06]))
     found: dict[str, NDArray[Any]] = {
-        "yields": np.zeros(SIZE, np.bool_), "counts": np.zeros(SIZE, np.uint8), "violations": np.zeros(SIZE, np.uint8),
-        "confidence": np.zeros(SIZE, np.uint8), "sums": np.zeros((*SIZE, 4)), "colors": np.zeros((*SIZE, 4)),
-    }  # fmt: skip
+        "yields": np.zeros(SIZE, np.bool_),
+        "counts": np.zeros(SIZE, np.uint8),
+        "violations": np.zeros(SIZE, np.uint8),
+        "confidence": np.zeros(SIZE, np.uint8),
+        "sums": np.zeros((*SIZE, 4)),
+        "colors": np.zeros((*SIZE, 4)),
+    }
     source = (np.array(pose.rotation), np.array(pose.translation), source_ranges, confidence, image)
     for rows in ((0, 5), (5, 12)):
         vote((ranges, rays, normals, written), source, LIMITS, rows, tuple(found[name] for name in FIELDS))

@@ -12,8 +12,8 @@ from pano_mvs.algorithms.mesh import poisson
 from pano_mvs.algorithms.mesh.poisson import poisson_depth, solve_poisson
 from pano_mvs.algorithms.mesh.triangles import Mesh, point_spacings, trimmed_mesh, without_crumbs
 from pano_mvs.api import Context, InputError, PointCloud
-from pano_mvs.io.clouds.ply import write_ply
-from pano_mvs.io.clouds.ply_mesh import read_ply_mesh, write_ply_mesh
+from pano_mvs.io.clouds.mesh_writer import read_ply_mesh, write_ply_mesh
+from pano_mvs.io.clouds.ply_writer import write_ply
 from pano_mvs.stages.exports.mesh import MeshParams, mesh
 
 HALF_SIZE = np.array([2.0, 1.2, 1.6])
@@ -34,9 +34,12 @@ def room_cloud(count: int = 6_000, *, window: bool = True) -> PointCloud:
     colors = np.array([[200, 0, 0], [0, 200, 0], [0, 0, 200], [200, 200, 0], [0, 200, 200], [200, 0, 200]], np.uint8)
     seen = np.abs(points - WINDOW[0]).max(axis=1) > (WINDOW[1] if window else -1)
     return PointCloud(
-        points[seen].astype(np.float32), normals[seen].astype(np.float32), colors[wall[seen]],
-        np.full(seen.sum(), 3, np.uint8), np.full(seen.sum(), 200, np.uint8),
-    )  # fmt: skip
+        points[seen].astype(np.float32),
+        normals[seen].astype(np.float32),
+        colors[wall[seen]],
+        np.full(seen.sum(), 3, np.uint8),
+        np.full(seen.sum(), 200, np.uint8),
+    )
 
 
 def distance_to_walls(points: np.ndarray) -> np.ndarray:
@@ -171,8 +174,10 @@ def test_other_files_are_no_meshes(tmp_path: Path) -> None:
     (tmp_path / "quad.ply").write_bytes(whole[:-13] + b"\x04" + whole[-12:])
     write_ply(tmp_path / "cloud.ply", room_cloud(10))
     for name, what in (
-        ("gone", "cannot be read"), ("cut", "promises 3 vertices and 1 faces"), ("quad", "not all of its faces"),
+        ("gone", "cannot be read"),
+        ("cut", "states 3 vertices and 1 faces"),
+        ("quad", "not all of its faces"),
         ("cloud", "not a PLY mesh"),
-    ):  # fmt: skip
+    ):
         with pytest.raises(InputError, match=rf"{name}\.ply: .*{what}"):
             read_ply_mesh(tmp_path / f"{name}.ply")

@@ -148,8 +148,9 @@ def test_what_a_view_does_not_see_is_not_in_its_tracks(room: Room) -> None:
     nearer = RangeMap(0.8 * maps[NAMES[2]].range, maps[NAMES[2]].confidence)
     doubtful = RangeMap(maps[NAMES[2]].range, np.full(SIZE, 40, np.uint8))
     for other in (nearer, doubtful):
-        mine = {name: samples[name] for name in NAMES[:2]} | {NAMES[2]: sample_surface(
-            np.zeros((*SIZE, 3), np.uint8), np.zeros(SIZE, np.bool_), other)}  # fmt: skip
+        mine = {name: samples[name] for name in NAMES[:2]} | {
+            NAMES[2]: sample_surface(np.zeros((*SIZE, 3), np.uint8), np.zeros(SIZE, np.bool_), other)
+        }
         found = tracked((poses, maps | {NAMES[2]: other}, mine), count=500)
         assert set(found.track_image_idx.tolist()) == {0, 1}
 

@@ -136,10 +136,13 @@ def suggestions_of(motion: Rigid3, rng: np.random.Generator, *, pairs: int, nois
         shaken = Rigid3(rotation_from_rotvec(noise * rng.normal(size=3)) @ true.rotation, true.translation)
         found.append(
             _Suggestion(
-                (number, number + 1), 1.0 + 0.1 * rng.random(), shaken if number % 2 else shaken.inverse(), center,
+                (number, number + 1),
+                1.0 + 0.1 * rng.random(),
+                shaken if number % 2 else shaken.inverse(),
+                center,
                 true.apply(center) - center,
             )
-        )  # fmt: skip
+        )
     return found
 
 

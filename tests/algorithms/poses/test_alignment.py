@@ -88,8 +88,9 @@ def test_deviation_is_that_of_many_draws() -> None:
     """The stated deviation, times the noise, is that of the shift; twice as large where the patch is an edge."""
     rng = np.random.default_rng(4)
     clean = crop(texture(rng), 40, 40)
-    contrast = np.sqrt(np.average((clean[4:17, 4:17] - np.average(clean[4:17, 4:17], weights=window())) ** 2,
-                                  weights=window()))  # fmt: skip
+    contrast = np.sqrt(
+        np.average((clean[4:17, 4:17] - np.average(clean[4:17, 4:17], weights=window())) ** 2, weights=window())
+    )
     noise = 0.02 * contrast
     patches = (clean + rng.normal(0, noise, (400, 21, 21))).astype(np.float32)
     patches[0] = clean
@@ -234,8 +235,11 @@ def test_poses_without_tracks_and_single_observations_stay(room: Room) -> None:
 
 def test_refinement_with_the_images_is_twice_as_good(room: Room) -> None:
     poses, pictures = room
-    bent = replace(poses, rotations=rotation_from_rotvec(np.array([[0, 0, 0], [2, 1, 0], [0, -2, 1], [1, 0, 2]]) * 1e-3)
-                   @ poses.rotations)  # fmt: skip
+    bent = replace(
+        poses,
+        rotations=rotation_from_rotvec(np.array([[0, 0, 0], [2, 1, 0], [0, -2, 1], [1, 0, 2]]) * 1e-3)
+        @ poses.rotations,
+    )
     plain, fine = refine_poses(bent), refine_poses(bent, load=pictures.__getitem__)
 
     def error(found: Poses) -> float:

@@ -107,8 +107,10 @@ def test_each_image_is_loaded_once_and_only_when_it_is_needed() -> None:
 
 
 def test_large_panoramas_are_judged_at_the_same_size(confirmation: Confirmation) -> None:
-    large = {idx: (np.repeat(np.repeat(one, 2, axis=0), 2, axis=1), np.ones((256, 512), np.bool_))
-             for idx, one in enumerate(PICTURES)}  # fmt: skip
+    large = {
+        idx: (np.repeat(np.repeat(one, 2, axis=0), 2, axis=1), np.ones((256, 512), np.bool_))
+        for idx, one in enumerate(PICTURES)
+    }
     judged = confirmation_of(large)
     assert judged.small(0).image.shape == (*SIZE_HW, 3)
     expected = confirmation.share(0, POSES[0], CAMERAS)

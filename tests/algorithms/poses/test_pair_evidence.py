@@ -35,14 +35,15 @@ def gathered(view: TwoView = TRUE, *, image: int = 1, ranges: list[np.ndarray] =
     """Return what the pair says about one of the two images, the other being registered where it truly stands."""
     partner = 1 - image
     return gather_witnesses(
-        image, [partner],
+        image,
+        [partner],
         geometries={(0, 1): geometries_of(view, *BEARINGS)},
         cameras={partner: (FIRST, SECOND)[partner]},
         bearings=BEARINGS,
         ranges=[known if idx == partner else np.full(len(POINTS), np.nan) for idx, known in enumerate(ranges)],
         estimator="cauchy",
         kappa=0.01,
-    )  # fmt: skip
+    )
 
 
 def test_oriented_turns_a_pair_round_and_back() -> None:

@@ -122,11 +122,11 @@ def test_of_many_pairs_only_those_of_the_best_partners_are_asked_and_the_others_
     true, feigned = few.geometries[AMBIGUOUS]
     geometries = {
         (i, j): tuple(
-            replace(one, view=replace(one.view, matches_idx=one.view.matches_idx[: 50 - (j - i)])) for one in
-            (true, feigned)
+            replace(one, view=replace(one.view, matches_idx=one.view.matches_idx[: 50 - (j - i)]))
+            for one in (true, feigned)
         )
         for i, j in combinations(range(count), 2)
-    }  # fmt: skip
+    }
     features = {f"{idx}.jpg": next(iter(few.features.values())) for idx in range(count)}
     asked = Asked()
     after = weighed_by_images(Pairs(features, geometries), asked)

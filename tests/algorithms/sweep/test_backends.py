@@ -122,8 +122,9 @@ def test_a_cost_out_of_bounds_is_blamed(ours: None, value: float) -> None:
     picture = np.zeros((16, 32, 3), np.uint8)
     pose = Rigid3(np.eye(3), np.array([0.3, 0, 0]))
     with pytest.raises(ContractError, match=r"'wrong' must return \(16, 32\) from 0 to 1"):
-        sweep_range(picture, [picture], [pose], near=1, far=2,
-                    settings=SweepSettings(planes=3, cost="wrong"), backend="opencv")  # fmt: skip
+        sweep_range(
+            picture, [picture], [pose], near=1, far=2, settings=SweepSettings(planes=3, cost="wrong"), backend="opencv"
+        )
 
 
 def test_the_small_sweeps_behind_a_sweep_need_not_be_the_backends_own(ours: None) -> None:
@@ -143,9 +144,15 @@ def test_the_small_sweeps_behind_a_sweep_need_not_be_the_backends_own(ours: None
     near, far = limits_by_sweeping(pictures, poses, masks=masks, backend="differences")
     assert 0 < near < far
     found = sweep_range(
-        pictures[0], pictures[1:], [poses[1] @ poses[0].inverse()], near=near, far=far,
-        settings=SweepSettings(planes=8, cost="sad"), backend="differences", device="cuda:3",
-    )  # fmt: skip
+        pictures[0],
+        pictures[1:],
+        [poses[1] @ poses[0].inverse()],
+        near=near,
+        far=far,
+        settings=SweepSettings(planes=8, cost="sad"),
+        backend="differences",
+        device="cuda:3",
+    )
     found.check()
     with pytest.raises(UsageError, match="'differences' does not have the cost 'census'; those that do: numba, numpy"):
         backend_for("differences", SweepSettings())

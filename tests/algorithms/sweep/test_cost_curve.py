@@ -23,9 +23,15 @@ from pano_mvs.testing.sweep_backends import CASES, FAR, NEAR, SweepCase, sweep_c
 
 def work_of(case: SweepCase) -> SweepInput:
     return sweep_input(
-        case.pictures[0], case.pictures[1:], case.source_from_reference, near=NEAR, far=FAR, settings=case.settings,
-        reference_mask=case.masks[0], source_masks=case.masks[1:],
-    )  # fmt: skip
+        case.pictures[0],
+        case.pictures[1:],
+        case.source_from_reference,
+        near=NEAR,
+        far=FAR,
+        settings=case.settings,
+        reference_mask=case.masks[0],
+        source_masks=case.masks[1:],
+    )
 
 
 @pytest.mark.parametrize("number", range(0, CASES, 5))
@@ -85,9 +91,13 @@ def test_a_distinct_surface_has_a_sharp_curve_at_its_true_range() -> None:
     room = default_room()
     views = [render(room, pose, (96, 192)) for pose in poses]
     work = sweep_input(
-        views[0][0], [view[0] for view in views[1:]], [pose @ poses[0].inverse() for pose in poses[1:]],
-        near=NEAR, far=FAR, settings=SweepSettings(planes=48),
-    )  # fmt: skip
+        views[0][0],
+        [view[0] for view in views[1:]],
+        [pose @ poses[0].inverse() for pose in poses[1:]],
+        near=NEAR,
+        far=FAR,
+        settings=SweepSettings(planes=48),
+    )
     errors, sharp = [], []
     for row, column in [(48, 30), (45, 96), (51, 150), (30, 60), (66, 120)]:
         curve = cost_curve(work, column=column, row=row)

@@ -44,10 +44,15 @@ def panorama(folder: Path, picture: NDArray[np.uint8], crop: tuple[int, int, int
 
 def swept(panoramas: list[Panorama], poses: list[Rigid3], settings: SweepSettings) -> NDArray[np.float32]:
     return sweep_range(
-        panoramas[0].load(), [source.load() for source in panoramas[1:]],
-        [pose @ poses[0].inverse() for pose in poses[1:]], near=0.5, far=8, settings=settings,
-        reference_mask=panoramas[0].load_mask(), source_masks=[source.load_mask() for source in panoramas[1:]],
-    ).range  # fmt: skip
+        panoramas[0].load(),
+        [source.load() for source in panoramas[1:]],
+        [pose @ poses[0].inverse() for pose in poses[1:]],
+        near=0.5,
+        far=8,
+        settings=settings,
+        reference_mask=panoramas[0].load_mask(),
+        source_masks=[source.load_mask() for source in panoramas[1:]],
+    ).range
 
 
 def inside(pixels: NDArray[np.float64], crop: tuple[int, int, int, int]) -> NDArray[np.bool_]:

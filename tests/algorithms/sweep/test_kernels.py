@@ -80,9 +80,17 @@ def test_running_sums_equal_the_mean_over_each_window(radius: int) -> None:
 @pytest.mark.kernel("sweep.numba.kernels_sad")
 @pytest.mark.parametrize(
     ("sources", "share", "most", "pad", "serves"),
-    [(3, 1.0, 3, 4, True), (3, 0.5, 3, 4, False), (3, 1.0, 2, 4, False), (3, 0.5, 1, 4, False), (1, 0.5, 1, 4, True),
-     (85, 1.0, 85, 4, True), (86, 1.0, 86, 4, False), (80, 1.0, 80, 4096, False)],
-)  # fmt: skip
+    [
+        (3, 1.0, 3, 4, True),
+        (3, 0.5, 3, 4, False),
+        (3, 1.0, 2, 4, False),
+        (3, 0.5, 1, 4, False),
+        (1, 0.5, 1, 4, True),
+        (85, 1.0, 85, 4, True),
+        (86, 1.0, 86, 4, False),
+        (80, 1.0, 80, 4096, False),
+    ],
+)
 def test_one_box_serves_where_all_sources_count_and_nothing_overflows(
     sources: int, share: float, most: int, pad: int, serves: bool
 ) -> None:

@@ -44,8 +44,10 @@ def test_limits_follow_the_unit_of_length(capture: Capture) -> None:
 def test_rolling_all_pictures_changes_nothing(capture: Capture) -> None:
     pictures, poses, _ = capture
     rolled = [roll_panorama(picture, 48) for picture in pictures]
-    turned = [Rigid3(new_from_old @ pose.rotation, new_from_old @ pose.translation)
-              for (_, new_from_old), pose in zip(rolled, poses, strict=True)]  # fmt: skip
+    turned = [
+        Rigid3(new_from_old @ pose.rotation, new_from_old @ pose.translation)
+        for (_, new_from_old), pose in zip(rolled, poses, strict=True)
+    ]
     expected = limits_by_sweeping(pictures, poses, masks=no_masks(4))
     assert limits_by_sweeping([picture for picture, _ in rolled], turned, masks=no_masks(4)) == expected
 

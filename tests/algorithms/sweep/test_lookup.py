@@ -118,8 +118,9 @@ def test_differences_added_while_sampling_are_those_of_what_is_sampled() -> None
     warped = _warped(source, TRANSLATIONS[1], (48, 64), vector=True, first=5, rows=8)
     expected = np.zeros(warped.shape[1:], np.uint16)
     add_differences(reference, 20, warped, 4, expected)
-    added = _warped(source, TRANSLATIONS[1], (48, 64), vector=True, first=5, rows=8,
-                    against=interleave_rows(reference, 20, 14, 4))  # fmt: skip
+    added = _warped(
+        source, TRANSLATIONS[1], (48, 64), vector=True, first=5, rows=8, against=interleave_rows(reference, 20, 14, 4)
+    )
     assert added[:, 4:-4].tolist() == expected[:, 4:-4].tolist()
     whole = np.abs(reference[:, 20:34, 4:-4].astype(int) - warped[..., 4:-4]).sum(axis=0)
     assert added[:, 4:-4].tolist() == whole.tolist()

@@ -32,9 +32,13 @@ def swept(
 ) -> RangeMap:
     relative = [pose @ poses[0].inverse() for pose in poses[1:]]
     return sweep_range(
-        pictures[0], pictures[1:], relative, near=limits[0], far=limits[1],
+        pictures[0],
+        pictures[1:],
+        relative,
+        near=limits[0],
+        far=limits[1],
         settings=SweepSettings(planes=64).replace(**settings),
-    )  # fmt: skip
+    )
 
 
 def test_limits_outdoors_reach_as_far_as_the_pictures_can_tell(

@@ -41,8 +41,10 @@ NAMES = {"cost": tuple(BUILTIN)} | {
 def capture() -> Capture:
     poses = capture_poses(4, seed=11)
     views = [render(default_room(4), pose, (64, 128)) for pose in poses]
-    pictures = [np.clip(picture + np.random.default_rng(3).normal(0, 1, picture.shape), 0, 255).astype(np.uint8)
-                for picture, _ in views]  # fmt: skip
+    pictures = [
+        np.clip(picture + np.random.default_rng(3).normal(0, 1, picture.shape), 0, 255).astype(np.uint8)
+        for picture, _ in views
+    ]
     return pictures, [pose @ poses[0].inverse() for pose in poses[1:]], views[0][1]
 
 
@@ -54,9 +56,13 @@ def swept(
 ) -> RangeMap:
     pictures, own_poses, _ = capture
     return sweep_range(
-        pictures[0], sources or pictures[1:], poses or own_poses, near=0.6, far=6.0,
+        pictures[0],
+        sources or pictures[1:],
+        poses or own_poses,
+        near=0.6,
+        far=6.0,
         settings=SweepSettings(**{"planes": 32} | settings),
-    )  # fmt: skip
+    )
 
 
 def good_share(result: RangeMap, truth: NDArray[np.float32], ratio: float = 1.07) -> float:
@@ -74,11 +80,16 @@ def test_correlation_by_running_sums_equals_the_definition(first: int) -> None:
     pad, rows = int(reach.max()) + 1, 3
     means = np.zeros((rows, SIZE[1]), np.float32)
     zncc_rows(
-        first, pad_panorama(reference, pad),
+        first,
+        pad_panorama(reference, pad),
         np.ascontiguousarray(pad_panorama(warped, pad)[first + pad - 2 : first + pad + rows + 2]),
-        reach[first : first + rows], 2, pad, np.zeros((rows + 4, SIZE[1] + 2 * pad), np.uint16),
-        np.zeros((2, SIZE[1] + 2 * pad), np.int32), means,
-    )  # fmt: skip
+        reach[first : first + rows],
+        2,
+        pad,
+        np.zeros((rows + 4, SIZE[1] + 2 * pad), np.uint16),
+        np.zeros((2, SIZE[1] + 2 * pad), np.int32),
+        means,
+    )
     expected = [
         [
             oracle.zncc_cost(reference, warped, row, column, radius=2, reach=int(reach[row]), noise=ZNCC_NOISE_VARIANCE)
@@ -214,8 +225,9 @@ def _winners_of_curve(
 @pytest.mark.parametrize(("shape", "curve"), [("parabola", np.square), ("vfit", np.abs)])
 def test_a_fit_finds_the_minimum_of_its_own_curve(shape: Any, curve: Callable[..., Any]) -> None:
     winners, offsets = _winners_of_curve(lambda x: 3 + 5 * curve(x))
-    np.testing.assert_allclose(winners.plane[0] - 20 + subplane_offset(winners, planes=41, shape=shape)[0], offsets,
-                               atol=1e-5)  # fmt: skip
+    np.testing.assert_allclose(
+        winners.plane[0] - 20 + subplane_offset(winners, planes=41, shape=shape)[0], offsets, atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("measure", NAMES["confidence"])

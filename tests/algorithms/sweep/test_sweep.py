@@ -21,9 +21,14 @@ from pano_mvs.testing.room import capture_poses, default_room, render
 NEAR, FAR = 0.5, 6.0
 FAST = SweepSettings(planes=24, window=5)
 PAPER = SweepSettings(
-    planes=32, spacing="uniform", cost="sad", spherical_window=False, combination="sum", aggregation="box",
+    planes=32,
+    spacing="uniform",
+    cost="sad",
+    spherical_window=False,
+    combination="sum",
+    aggregation="box",
     selection="winner",
-)  # fmt: skip
+)
 
 
 @functools.cache

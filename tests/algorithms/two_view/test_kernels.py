@@ -133,8 +133,10 @@ def test_refinement_kernel_leaves_its_input_alone() -> None:
 def test_kernel_costs_of_directions_are_those_of_plain_poses() -> None:
     p, q, pose, rng = paired("directions kernel")
     directions, costs = direction_candidates(pose.rotation, p, q, rng=rng, threshold_rad=THRESHOLD_RAD, count=30)
-    both = [plain.facing_costs([Rigid3(pose.rotation, sign * d) for d in directions], p, q, THRESHOLD_RAD)
-            for sign in (1, -1)]  # fmt: skip
+    both = [
+        plain.facing_costs([Rigid3(pose.rotation, sign * d) for d in directions], p, q, THRESHOLD_RAD)
+        for sign in (1, -1)
+    ]
     np.testing.assert_allclose(costs, both[0], atol=1e-6)
     assert np.all(both[0] <= both[1] + 1e-6)
 

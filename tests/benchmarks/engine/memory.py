@@ -46,8 +46,16 @@ def large_peak_mb(rows: int, planes: int, aggregation: Literal["box", "sgm"], th
     masks = [np.ones(image.shape[:2], np.bool_) for image in images]
     near, far = limits_by_sweeping(images, cams, masks=masks)
     settings = SweepSettings(planes=planes, aggregation=aggregation)
-    sweep_range(images[0], images[1:], poses, near=near, far=far, settings=settings,
-                reference_mask=masks[0], source_masks=masks[1:])  # fmt: skip
+    sweep_range(
+        images[0],
+        images[1:],
+        poses,
+        near=near,
+        far=far,
+        settings=settings,
+        reference_mask=masks[0],
+        source_masks=masks[1:],
+    )
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
@@ -76,10 +84,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     part = 4 if options.small else 1
     rows, planes = ROWS // part, PLANES // part
     configurations = [
-        (rows, planes // 4, SOURCES, "box", 1), (rows, planes, SOURCES, "box", 1), (rows, planes, SOURCES, "box", 2),
-        (rows, planes // 4, 2 * SOURCES, "box", 1), (2 * rows, planes // 4, SOURCES, "box", 1),
-        (rows, planes // 4, SOURCES, "sgm", 1), (rows, planes, SOURCES, "sgm", 1),
-    ]  # fmt: skip
+        (rows, planes // 4, SOURCES, "box", 1),
+        (rows, planes, SOURCES, "box", 1),
+        (rows, planes, SOURCES, "box", 2),
+        (rows, planes // 4, 2 * SOURCES, "box", 1),
+        (2 * rows, planes // 4, SOURCES, "box", 1),
+        (rows, planes // 4, SOURCES, "sgm", 1),
+        (rows, planes, SOURCES, "sgm", 1),
+    ]
     print("| rows | planes | sources | aggregation | threads | peak, MB |\n|---|---|---|---|---|---|")
     peaks = {}
     for configuration in configurations:

@@ -97,14 +97,18 @@ def _report_run(label: str, folder: Path, make: Callable[[Store], Executor], *, 
     count = result.computed + result.cached
     own = sum(stage.unit_seconds for stage in result.stages)
     limit = EXECUTED_LIMIT_MS if result.computed else CACHED_LIMIT_MS
-    print(f"{label:22s} {count} units, each: processor {1e3 * used / count:.3f} ms, wall {1e3 * wall / count:.3f} ms, "
-          f"inside units {1e3 * own / count:.3f} ms (limit {limit} ms)", flush=True)  # fmt: skip
+    print(
+        f"{label:22s} {count} units, each: processor {1e3 * used / count:.3f} ms, wall {1e3 * wall / count:.3f} ms, "
+        f"inside units {1e3 * own / count:.3f} ms (limit {limit} ms)",
+        flush=True,
+    )
 
 
 def _report_gain(folder: Path) -> None:
     """Compare one worker with two, in turns with the control, so that what else the machine does hits both alike."""
-    (folder / "spin.py").write_text(PLUGIN.replace("from helper import double", "double = lambda x: 2 * x") + SPIN
-                                    + SPIN_STAGE.format(turns=SPINS))  # fmt: skip
+    (folder / "spin.py").write_text(
+        PLUGIN.replace("from helper import double", "double = lambda x: 2 * x") + SPIN + SPIN_STAGE.format(turns=SPINS)
+    )
     (folder / "spin_wf.yaml").write_text(SPIN_WORKFLOW)
     _write_capture(folder / "capture", SPIN_UNITS)
     gains, controls = [], []
@@ -114,8 +118,10 @@ def _report_gain(folder: Path) -> None:
         one, two = _control_s(1), _control_s(2)
         controls.append(one / two)
     gain, control = max(gains), max(controls)
-    print(f"two workers gain {gain:.2f}, two plain processes {control:.2f}: ratio {gain / control:.2f} "
-          f"(limit {GAIN_LIMIT}); all turns: {_shown(gains)} beside {_shown(controls)}")  # fmt: skip
+    print(
+        f"two workers gain {gain:.2f}, two plain processes {control:.2f}: ratio {gain / control:.2f} "
+        f"(limit {GAIN_LIMIT}); all turns: {_shown(gains)} beside {_shown(controls)}"
+    )
 
 
 def _spun_s(folder: Path, workers: int, cache: Path) -> float:

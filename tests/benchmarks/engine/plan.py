@@ -187,8 +187,10 @@ def _measure(step: str, folder: Path) -> None:
         result = Run(session.workflow, session.graph, store, out=session.out, executor=SerialExecutor(store)).execute()
         counts = f"{sum(s.cached for s in result.stages)} / {sum(s.run for s in result.stages)}"
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000
-    print(f"| {step} | {counts} | {time.process_time() - cpu:.2f} | {time.perf_counter() - wall:.2f} | {peak:.0f} |",
-          flush=True)  # fmt: skip
+    print(
+        f"| {step} | {counts} | {time.process_time() - cpu:.2f} | {time.perf_counter() - wall:.2f} | {peak:.0f} |",
+        flush=True,
+    )
 
 
 def _count(plans: list[StagePlan]) -> str:

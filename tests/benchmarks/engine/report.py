@@ -94,8 +94,10 @@ def main(count: int) -> None:
                 folder / "out", RunSummary.from_json(summary), StoredValues(Store(folder / "cache"), results.refs)
             )
             size = (folder / "out" / "report.html").stat().st_size
-            print(f"{count} views, {what}: {time.process_time() - worked:.2f} s of work, "
-                  f"{time.perf_counter() - passed:.2f} s passed, {size / 1e6:.1f} MB")  # fmt: skip
+            print(
+                f"{count} views, {what}: {time.process_time() - worked:.2f} s of work, "
+                f"{time.perf_counter() - passed:.2f} s passed, {size / 1e6:.1f} MB"
+            )
 
 
 if __name__ == "__main__":

@@ -18,8 +18,17 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-_QUIET = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--hide-scrollbars",
-          "--disable-background-networking", "--disable-component-update", "--disable-sync")  # fmt: skip
+_QUIET = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--hide-scrollbars",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
 _PROBE = """<script>
 window.addEventListener("load", function () {
   const found = {errors: window.errors, wide: document.documentElement.scrollWidth - window.innerWidth};
@@ -60,8 +69,13 @@ def browse(*options: str) -> subprocess.CompletedProcess[str]:
     if browser is None:
         raise SystemExit(f"none of {', '.join(_BROWSERS)} is installed")
     with TemporaryDirectory() as profile:
-        return subprocess.run([browser, *_QUIET, f"--user-data-dir={profile}", *options], capture_output=True,
-                              text=True, timeout=120, check=False)  # fmt: skip
+        return subprocess.run(
+            [browser, *_QUIET, f"--user-data-dir={profile}", *options],
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
 
 
 def probed(page: Path, folder: Path, *, width: int) -> dict[str, Any]:
@@ -71,9 +85,12 @@ def probed(page: Path, folder: Path, *, width: int) -> dict[str, Any]:
     copy = folder / "probed.html"
     copy.write_text(text.replace("</body>", f"{_PROBE}</body>"), encoding="utf-8")
     frame = folder / "frame.html"  # a browser's window is no narrower than 500 pixels, a frame is
-    frame.write_text(f"<iframe src='{copy.resolve().as_uri()}' style='width:{width}px;height:900px'></iframe>"
-                     "<script>setInterval(function () { try { document.title = frames[0].document.title; } "
-                     "catch (e) {} }, 50);</script>", encoding="utf-8")  # fmt: skip
+    frame.write_text(
+        f"<iframe src='{copy.resolve().as_uri()}' style='width:{width}px;height:900px'></iframe>"
+        "<script>setInterval(function () { try { document.title = frames[0].document.title; } "
+        "catch (e) {} }, 50);</script>",
+        encoding="utf-8",
+    )
     dumped = browse("--allow-file-access-from-files", "--virtual-time-budget=8000", "--dump-dom", frame.as_uri())
     found = re.search(r"<title>PROBE(.*?)</title>", dumped.stdout, re.DOTALL)
     for path in (copy, frame):
@@ -102,8 +119,11 @@ def check(answer: dict[str, Any]) -> None:
 def pictures(page: Path, folder: Path) -> None:
     """Write pictures of the page at the desk, on the phone, in the dark, and printed."""
     frame = folder / "frame.html"
-    frame.write_text(f"<body style='margin:0;background:#888'><iframe src='{page.as_uri()}' "
-                     "style='width:360px;height:8000px;border:0'></iframe></body>", encoding="utf-8")  # fmt: skip
+    frame.write_text(
+        f"<body style='margin:0;background:#888'><iframe src='{page.as_uri()}' "
+        "style='width:360px;height:8000px;border:0'></iframe></body>",
+        encoding="utf-8",
+    )
     for name, where, options in (
         ("desk", page, ("--window-size=1200,6000",)),
         ("dark", page, ("--window-size=1200,6000", "--blink-settings=preferredColorScheme=0")),

@@ -78,8 +78,11 @@ def measure(folder: Path, count: int, *, module: str, show: Callable[[Step], Non
     write_picture(folder, count // 2, version=1)
     step("plan, one picture changed", ["plan", workflow, *place])
     step("run, one picture changed", run)
-    print(f"entries: {_most_entries(folder / 'cache')} in the cache, {_most_entries(folder / 'out')} in the output, "
-          f"{_count(folder / 'cache')} files in the cache", flush=True)  # fmt: skip
+    print(
+        f"entries: {_most_entries(folder / 'cache')} in the cache, {_most_entries(folder / 'out')} in the output, "
+        f"{_count(folder / 'cache')} files in the cache",
+        flush=True,
+    )
     step("cache gc --delete, everything", [*collect, "--unused", "0s", "--older-than", "0s", "--delete"])
 
 
@@ -91,8 +94,14 @@ def _command(name: str, command: list[str], folder: Path, environment: dict[str,
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     lines = output.read_text(errors="replace").strip().splitlines()
-    return Step(name, usage.ru_utime + usage.ru_stime, time.perf_counter() - started, usage.ru_maxrss / 1000,
-                process.returncode, lines[-1] if lines else "")  # fmt: skip
+    return Step(
+        name,
+        usage.ru_utime + usage.ru_stime,
+        time.perf_counter() - started,
+        usage.ru_maxrss / 1000,
+        process.returncode,
+        lines[-1] if lines else "",
+    )
 
 
 def _most_entries(folder: Path) -> int:
@@ -114,12 +123,17 @@ def main() -> None:
     for count in arguments.counts:
         folder = Path(tempfile.mkdtemp(prefix="pano-mvs-scale-", dir=arguments.folder)).absolute()
         units = count * UNITS_PER_PICTURE
-        print(f"\n{count} panoramas, {units} units\n\n| step | CPU s | CPU s per 1,000 units | peak MB | exit code |\n"
-              "|---|---|---|---|---|")  # fmt: skip
+        print(
+            f"\n{count} panoramas, {units} units\n\n| step | CPU s | CPU s per 1,000 units | peak MB | exit code |\n"
+            "|---|---|---|---|---|"
+        )
 
         def show(step: Step, units: int = units) -> None:
-            print(f"| {step.name} | {step.cpu_s:.1f} | {1000 * step.cpu_s / units:.3f} | {step.peak_mb:.0f} | "
-                  f"{step.exit_code} | <!-- {step.wall_s:.0f} s by the clock: {step.said} -->", flush=True)  # fmt: skip
+            print(
+                f"| {step.name} | {step.cpu_s:.1f} | {1000 * step.cpu_s / units:.3f} | {step.peak_mb:.0f} | "
+                f"{step.exit_code} | <!-- {step.wall_s:.0f} s by the clock: {step.said} -->",
+                flush=True,
+            )
 
         try:
             measure(folder, count, module=module, show=show)

@@ -150,8 +150,10 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file for all figures")
     options = parser.parse_args()
     methods = [OURS, *(MAPPERS if options.colmap else ())]
-    print(f"{'seed':>5s} {'place':12s} {'layout':10s} {'views':>5s} {'unique':>6s}" + "".join(
-        f" | {method:11s} reg right wrong unrep  CPU-s" for method in methods))  # fmt: skip
+    print(
+        f"{'seed':>5s} {'place':12s} {'layout':10s} {'views':>5s} {'unique':>6s}"
+        + "".join(f" | {method:11s} reg right wrong unrep  CPU-s" for method in methods)
+    )
     captures: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as temporary:
         for seed in range(options.first_seed, options.first_seed + options.captures):

@@ -83,11 +83,12 @@ def native_features(database: Path, images: Path) -> None:
 
     with quiet_colmap():
         pycolmap.extract_features(
-            database, images,
+            database,
+            images,
             camera_mode=pycolmap.CameraMode.SINGLE,
             reader_options=pycolmap.ImageReaderOptions(camera_model="EQUIRECTANGULAR"),
             extraction_options=pycolmap.FeatureExtractionOptions(num_threads=1),
-        )  # fmt: skip
+        )
 
 
 def native_matches(database: Path) -> None:

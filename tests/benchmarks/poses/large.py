@@ -30,10 +30,18 @@ Result = TypeVar("Result")
 
 NEIGHBOURS = 8
 COLUMNS = {
-    "cameras": "{:.0f}", "registered": "{:.0f}", "pairs": "{:.0f}", "points": "{:.0f}", "observations": "{:.0f}",
-    "select_s": "{:.2f}", "solve_s": "{:.1f}", "refine_s": "{:.1f}", "peak_mb": "{:.0f}", "drift_percent": "{:.4f}",
+    "cameras": "{:.0f}",
+    "registered": "{:.0f}",
+    "pairs": "{:.0f}",
+    "points": "{:.0f}",
+    "observations": "{:.0f}",
+    "select_s": "{:.2f}",
+    "solve_s": "{:.1f}",
+    "refine_s": "{:.1f}",
+    "peak_mb": "{:.0f}",
+    "drift_percent": "{:.4f}",
     "deviation_percent": "{:.4f}",
-}  # fmt: skip
+}
 
 
 def measure(cameras: int, keypoints: int) -> dict[str, float]:
@@ -56,12 +64,18 @@ def measure(cameras: int, keypoints: int) -> dict[str, float]:
     last = np.linalg.norm(laid.apply(refined.centers) - truth, axis=1)[-1]
     assert refined.center_stds is not None
     return {
-        "cameras": cameras, "registered": len(refined.names), "pairs": len(views),
-        "points": len(refined.points_in_world), "observations": len(refined.track_point_idx),
-        "select_s": select_s, "solve_s": solve_s, "refine_s": refine_s, "peak_mb": _peak_mb() - base_mb,
+        "cameras": cameras,
+        "registered": len(refined.names),
+        "pairs": len(views),
+        "points": len(refined.points_in_world),
+        "observations": len(refined.track_point_idx),
+        "select_s": select_s,
+        "solve_s": solve_s,
+        "refine_s": refine_s,
+        "peak_mb": _peak_mb() - base_mb,
         "drift_percent": 100 * last / capture.length,
         "deviation_percent": 100 * laid.scale * float(refined.center_stds[-1]) / capture.length,
-    }  # fmt: skip
+    }
 
 
 def print_table(rows: Sequence[dict[str, float]]) -> None:

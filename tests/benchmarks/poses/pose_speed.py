@@ -129,8 +129,21 @@ def through_the_engine(images: Path, steps: Steps, *, neighbours: int = 0) -> Ca
         folder = Path(name)
         pairs = _SIMILAR_PAIRS.format(neighbours=neighbours) if neighbours else _ALL_PAIRS
         (folder / "workflow.yaml").write_text(WORKFLOW.format(images=images.resolve(), pairs=pairs))
-        command = [sys.executable, "-m", "pano_mvs", "run", str(folder / "workflow.yaml"), "--out", str(folder / "out"),
-                   "--cache", str(folder / "cache"), "--executor", "serial", "--threads-per-worker", "1"]  # fmt: skip
+        command = [
+            sys.executable,
+            "-m",
+            "pano_mvs",
+            "run",
+            str(folder / "workflow.yaml"),
+            "--out",
+            str(folder / "out"),
+            "--cache",
+            str(folder / "cache"),
+            "--executor",
+            "serial",
+            "--threads-per-worker",
+            "1",
+        ]
         steps.take("pano-mvs run", lambda: subprocess.run(command, check=True, capture_output=True))
         model = read_poses(folder / "out" / "colmap")
     return cameras_of(model)
@@ -148,8 +161,10 @@ def show(label: str, steps: Steps, found: Cameras, truth: Cameras) -> None:
     """Print one method's figures."""
     errors = relative_pose_errors(found, truth)
     registered = f"{errors.registered}/{errors.expected}"
-    print(f"  {label:24s} {steps.total:8.1f} CPU-s  registered {registered}  median pair error "
-          f"{errors.median_pair_deg:.4f}°")  # fmt: skip
+    print(
+        f"  {label:24s} {steps.total:8.1f} CPU-s  registered {registered}  median pair error "
+        f"{errors.median_pair_deg:.4f}°"
+    )
     print("    " + ", ".join(f"{step} {cpu_s:.1f}" for step, cpu_s in steps.cpu_s.items()), flush=True)
 
 

@@ -133,8 +133,11 @@ def main() -> None:
             each = " ".join(f"{median:.4f}" for median in medians)
             wrong, registered = sum(item[1] for item in row), sum(item[2] for item in row)
             expected, seconds = given.draws * given.views, float(np.mean([item[3] for item in row]))
-            print(f"| {name} | {label} | {each} | {np.nanmean(medians):.4f} | {wrong} | {registered}/{expected} | "
-                  f"{seconds:.2f} |", flush=True)  # fmt: skip
+            print(
+                f"| {name} | {label} | {each} | {np.nanmean(medians):.4f} | {wrong} | {registered}/{expected} | "
+                f"{seconds:.2f} |",
+                flush=True,
+            )
 
 
 def measured(pictures: Pictures, pairs: dict[str, Any]) -> list[tuple[str, Cameras, float]]:

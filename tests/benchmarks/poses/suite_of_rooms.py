@@ -93,9 +93,13 @@ def _door_at(door: int) -> float:
 def _partition(room: int, seed: int) -> Iterator[Painted]:
     """Yield the wall before a room: both sides of its door, and the lintel."""
     x, low, high = room * _LONG, _door_at(room) - _HALF_DOOR, _door_at(room) + _HALF_DOOR
-    for part, (top, bottom, left, right) in enumerate((
-        (_CEILING, _FLOOR, -_HALF_WIDE, low), (_CEILING, _FLOOR, high, _HALF_WIDE), (_CEILING, _LINTEL, low, high),
-    )):  # fmt: skip
+    for part, (top, bottom, left, right) in enumerate(
+        (
+            (_CEILING, _FLOOR, -_HALF_WIDE, low),
+            (_CEILING, _FLOOR, high, _HALF_WIDE),
+            (_CEILING, _LINTEL, low, high),
+        )
+    ):
         paint = _Fading(_COLORS[room % len(_COLORS)], seed + 100 * room + 50 + part)
         yield _bounded(Cuboid((x - 0.06, top, left), (x + 0.06, bottom, right), paint.colors)), paint
 
@@ -126,5 +130,8 @@ def _bounded(surface: Ball | Cuboid | Rod) -> Bounded:
     ends = (surface.low, surface.high) if isinstance(surface, Cuboid) else (surface.foot, surface.head)
     low, high = np.array(ends)
     center = 0.5 * (low + high)
-    return Bounded(surface, (float(center[0]), float(center[1]), float(center[2])),
-                   0.5 * float(np.linalg.norm(high - low)) + getattr(surface, "radius", 0.0))  # fmt: skip
+    return Bounded(
+        surface,
+        (float(center[0]), float(center[1]), float(center[2])),
+        0.5 * float(np.linalg.norm(high - low)) + getattr(surface, "radius", 0.0),
+    )

@@ -14,8 +14,8 @@ from pano_mvs.evaluation.clouds.evaluate import evaluate_cloud
 from pano_mvs.evaluation.clouds.true_surface import TrueView, view_points
 from pano_mvs.evaluation.inputs.truth import read_truth
 from pano_mvs.geometry import Rigid3, Similarity3, rotation_from_rotvec
-from pano_mvs.io.clouds.ply import write_ply
-from pano_mvs.io.clouds.ply_points import open_ply_points
+from pano_mvs.io.clouds.ply_reader import open_ply_points
+from pano_mvs.io.clouds.ply_writer import write_ply
 from pano_mvs.scene import PointCloud
 from tests.algorithms.poses.synthetic_capture import random_rotation
 from tests.cli.conftest import Command
@@ -40,11 +40,13 @@ def folder(rendered: Path) -> Path:
 def surface(folder: Path) -> np.ndarray:
     """The true surface of all views."""
     truth = read_truth(folder)
-    return np.concatenate([
-        view_points(TrueView(view.cam_from_world, ranges))
-        for view in truth.views.values()
-        if (ranges := truth.range_map(view)) is not None
-    ])  # fmt: skip
+    return np.concatenate(
+        [
+            view_points(TrueView(view.cam_from_world, ranges))
+            for view in truth.views.values()
+            if (ranges := truth.range_map(view)) is not None
+        ]
+    )
 
 
 def test_the_truth_is_perfect_in_its_own_frame_and_in_any_other(
@@ -98,9 +100,7 @@ def test_only_what_the_cameras_used_see_must_be_found(
     text = pano_mvs("evaluate", "cloud", save(tmp_path / "a.ply", half), *arguments).flat
     assert f"{len(half)} points against the surface that 4 views see" in text
     assert "at least 2 of 2 cameras see" in text
-    (score,) = json.loads(
-        pano_mvs("evaluate", "cloud", tmp_path / "a.ply", *arguments, "--json").text
-    )["scores"]  # fmt: skip
+    (score,) = json.loads(pano_mvs("evaluate", "cloud", tmp_path / "a.ply", *arguments, "--json").text)["scores"]
     assert 0.3 < score["completeness"] < 0.7
     assert score["accuracy"] == 1
 
@@ -191,10 +191,7 @@ def test_errors_are_written_as_clouds_and_drawn(
         assert picture is not None
         assert picture.shape == (28 + 3 * (28 + 640), 1024, 3)
         above = picture[56 : 56 + 640]
-        red, right = (
-            (np.abs(above.astype(int) - color).max(axis=-1) < 3)
-            for color in ((45, 30, 190), (142, 130, 38))
-        )  # fmt: skip
+        red, right = ((np.abs(above.astype(int) - color).max(axis=-1) < 3) for color in ((45, 30, 190), (142, 130, 38)))
         assert min(red.mean(), right.mean()) > 0.01
         assert np.nonzero(red)[1].mean() > np.nonzero(right)[1].mean()  # x grows to the right
 

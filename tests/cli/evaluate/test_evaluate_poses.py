@@ -106,8 +106,11 @@ def test_what_cannot_be_compared_is_named(pano_mvs: Command, tmp_path: Path, tru
 
 
 def test_the_old_form_still_takes_an_output_folder(pano_mvs: Command, tmp_path: Path) -> None:
-    for call in (("evaluate", tmp_path, "--truth", tmp_path), ("evaluate", "run", tmp_path, "--truth", tmp_path),
-                 ("evaluate", "--truth", tmp_path, tmp_path)):  # fmt: skip
+    for call in (
+        ("evaluate", tmp_path, "--truth", tmp_path),
+        ("evaluate", "run", tmp_path, "--truth", tmp_path),
+        ("evaluate", "--truth", tmp_path, tmp_path),
+    ):
         result = pano_mvs(*call)
         assert result.code == 2
         assert "Give the output folder of a finished run" in result.flat

@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from pano_mvs.io.clouds.ply import read_ply
+from pano_mvs.io.clouds.ply_writer import read_ply
 from pano_mvs.io.ranges.files import read_range_tiff
 from tests.cli.conftest import SIZE_HW, SMALL, Command
 from tests.io.images.pictures import png_chunk, xmp
@@ -24,10 +24,16 @@ def cut(path: Path, *, half: bool = False) -> None:
     part = read_picture(path)[TOP : TOP + HEIGHT, LEFT : LEFT + WIDTH]
     if half:
         part = cv2.resize(part, (WIDTH // 2, round(HEIGHT / 2)), interpolation=cv2.INTER_AREA)
-    packet = xmp({
-        "FullPanoWidthPixels": SIZE_HW[1], "FullPanoHeightPixels": SIZE_HW[0], "CroppedAreaImageWidthPixels": WIDTH,
-        "CroppedAreaImageHeightPixels": HEIGHT, "CroppedAreaLeftPixels": LEFT, "CroppedAreaTopPixels": TOP,
-    })  # fmt: skip
+    packet = xmp(
+        {
+            "FullPanoWidthPixels": SIZE_HW[1],
+            "FullPanoHeightPixels": SIZE_HW[0],
+            "CroppedAreaImageWidthPixels": WIDTH,
+            "CroppedAreaImageHeightPixels": HEIGHT,
+            "CroppedAreaLeftPixels": LEFT,
+            "CroppedAreaTopPixels": TOP,
+        }
+    )
     data = bytes(cv2.imencode(".png", part)[1])
     path.write_bytes(data[:33] + png_chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + packet) + data[33:])
 
@@ -49,10 +55,20 @@ def test_cropped_and_masked_panoramas_from_files_to_cloud(pano_mvs: Command, cap
     cv2.imwrite(str(capture / "drawn" / "000.png.png"), of_picture)
     cv2.imwrite(str(capture / "drawn" / "001.png"), of_sphere)
     result = pano_mvs(
-        "run", "known_poses", "--images", capture / "images", "--out", "out", *SMALL,
-        "--set", f"poses.path={capture / 'truth' / 'poses.json'}", "--set", f"scores.truth={capture / 'truth'}",
-        "--set", f"images.masks={capture / 'drawn'}",
-    )  # fmt: skip
+        "run",
+        "known_poses",
+        "--images",
+        capture / "images",
+        "--out",
+        "out",
+        *SMALL,
+        "--set",
+        f"poses.path={capture / 'truth' / 'poses.json'}",
+        "--set",
+        f"scores.truth={capture / 'truth'}",
+        "--set",
+        f"images.masks={capture / 'drawn'}",
+    )
     assert result.code == 0, result.text
     assert "fields count the original's pixels" in result.flat
     cameras = pycolmap.Reconstruction("out/colmap/sparse/0").cameras.values()

@@ -88,8 +88,11 @@ def test_a_doubtful_camera_is_said_once_and_the_run_ends_with_code_3_every_time(
         }
         assert summary["poses"]["doubts"] == {"001.png": "the images see nothing of it where it stands"}
         assert summary["poses"]["confirmed"] == {
-            "000.png": [0.25, 0.5], "001.png": [0.25, 0.5], "002.png": [0.25, 0.5], "003.png": [0.25, None]
-        }  # fmt: skip
+            "000.png": [0.25, 0.5],
+            "001.png": [0.25, 0.5],
+            "002.png": [0.25, 0.5],
+            "003.png": [0.25, None],
+        }
 
 
 def test_a_camera_that_a_later_stage_clears_is_not_doubted(pano_mvs: Command, doubting: Path) -> None:
@@ -128,7 +131,8 @@ def test_programs_are_told_the_verdict_and_the_doubts(pano_mvs: Command, doubtin
 @pytest.mark.slow
 @pytest.mark.parametrize("moved", ["", "000.png", "003.png"])
 def test_dense_results_of_the_sample_doubt_what_was_moved(pano_mvs: Command, tmp_path: Path, moved: str) -> None:
-    result = pano_mvs("run", write_dense(tmp_path, SAMPLE, width=512, move=moved), "--out", "out",
-                      "--set", "depth.planes=64")  # fmt: skip
+    result = pano_mvs(
+        "run", write_dense(tmp_path, SAMPLE, width=512, move=moved), "--out", "out", "--set", "depth.planes=64"
+    )
     assert result.code == (3 if moved else 0), result.text
     assert list(run_json(Path("out"))["poses"]["doubts"]) == ([moved] if moved else [])

@@ -34,8 +34,21 @@ def test_all_executors_give_the_same_bytes(rendered: Path, tmp_path: Path) -> No
     # Nothing is bound from outside: what bounds the libraries is ours.
     unbound = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
     for name, options in WAYS.items():
-        command = [sys.executable, "-m", "pano_mvs", "run", "quickstart", "--images", str(rendered), *SMALL, *options,
-                   "--out", str(tmp_path / f"out-{name}"), "--cache", str(tmp_path / f"cache-{name}")]  # fmt: skip
+        command = [
+            sys.executable,
+            "-m",
+            "pano_mvs",
+            "run",
+            "quickstart",
+            "--images",
+            str(rendered),
+            *SMALL,
+            *options,
+            "--out",
+            str(tmp_path / f"out-{name}"),
+            "--cache",
+            str(tmp_path / f"cache-{name}"),
+        ]
         done = subprocess.run(command, env=unbound, capture_output=True, text=True, check=False, timeout=600)
         assert done.returncode == 0, done.stdout + done.stderr
         assert deliverables(tmp_path / f"out-{name}") == deliverables(tmp_path / "out-serial"), name

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pano_mvs.io.clouds.ply import read_ply
+from pano_mvs.io.clouds.ply_writer import read_ply
 from pano_mvs.io.ranges.files import read_range_tiff
 from tests.cli.conftest import Command, run_json
 
@@ -16,9 +16,17 @@ from tests.cli.conftest import Command, run_json
 def test_fast_runs_from_pictures_to_cloud(pano_mvs: Command, rendered: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     result = pano_mvs(
-        "run", "fast", "--images", rendered / "images", "--out", out,
-        "--set", f"scores.truth={rendered / 'truth'}", "--set", "features.max_keypoints=1500",
-    )  # fmt: skip
+        "run",
+        "fast",
+        "--images",
+        rendered / "images",
+        "--out",
+        out,
+        "--set",
+        f"scores.truth={rendered / 'truth'}",
+        "--set",
+        "features.max_keypoints=1500",
+    )
     assert result.code == 0, result.text
     assert {stage["name"]: stage["run"] for stage in run_json(out)["stages"]}["depth"] == 4
     ranges = [read_range_tiff(out / f"range/00{view}.tiff") for view in range(4)]

@@ -92,8 +92,12 @@ def test_a_known_baseline_makes_everything_metric(pano_mvs: Command, capture: Pa
     assert np.linalg.norm(centers["002.png"] - centers["000.png"]) == pytest.approx(baseline, rel=1e-5)
     # The room's floor is level, whichever way the first camera was held.
     points = np.array([point.xyz for point in model.points3D.values()])
-    ups = np.array([image.cam_from_world().rotation.matrix().T @ truth[image.name].rotation @ UP
-                    for image in model.images.values()])  # fmt: skip
+    ups = np.array(
+        [
+            image.cam_from_world().rotation.matrix().T @ truth[image.name].rotation @ UP
+            for image in model.images.values()
+        ]
+    )
     assert np.rad2deg(np.arccos(-ups[:, 1])).max() < 1.0
     assert len(points) > 50
     again = pano_mvs(*run)
@@ -135,8 +139,9 @@ def test_gps_gives_metres_and_the_compass(pano_mvs: Command, capture: Path, turn
     told = run_json(Path("out"))["poses"]
     assert told["metric"] is True
     assert told["scale"].startswith("metres, by GPS of 4 of 4 panoramas")
-    assert told["frame"] == ("x east, y down, z north, by GPS; origin at the first registered camera (47.5000000°, "
-                             "8.2500000°, 410.0 m)")  # fmt: skip
+    assert told["frame"] == (
+        "x east, y down, z north, by GPS; origin at the first registered camera (47.5000000°, 8.2500000°, 410.0 m)"
+    )
     np.testing.assert_allclose(told["centers"], [60 * pose.center for pose in turned.values()], atol=0.01)
     indoors = pano_mvs("run", workflow, "--out", "out", "--set", "metres.gps_noise_m=20")
     assert indoors.code != 0
@@ -159,10 +164,14 @@ def test_what_gives_no_scale_stops_with_the_reason(pano_mvs: Command, capture: P
 
 @pytest.mark.parametrize(
     ("settings", "problem"),
-    [("", "give exactly one of baseline"), (", factor: 2, gps: true", "give exactly one of baseline"),
-     (", factor: 2, align: gps", "requires gps: true"), (", factor: -2", "greater than 0"),
-     (", baseline: {from: a, metres: 1}", "'baseline.to' is missing")],
-)  # fmt: skip
+    [
+        ("", "give exactly one of baseline"),
+        (", factor: 2, gps: true", "give exactly one of baseline"),
+        (", factor: 2, align: gps", "requires gps: true"),
+        (", factor: -2", "greater than 0"),
+        (", baseline: {from: a, metres: 1}", "'baseline.to' is missing"),
+    ],
+)
 def test_settings_that_contradict_each_other_are_found_before_anything_runs(
     pano_mvs: Command, capture: Path, turned: dict[str, Rigid3], settings: str, problem: str
 ) -> None:
@@ -184,13 +193,18 @@ def test_cropped_photographs_alone_give_a_level_world_in_metres_and_north(pano_m
         edge = height // 10
         up = pose.rotation @ UP
         fields = full_sphere(
-            height, width, CroppedAreaTopPixels=edge, CroppedAreaImageHeightPixels=height - 2 * edge,
-            PosePitchDegrees=np.rad2deg(np.arctan2(up[2], -up[1])), PoseRollDegrees=np.rad2deg(-np.arcsin(up[0])),
-        )  # fmt: skip
+            height,
+            width,
+            CroppedAreaTopPixels=edge,
+            CroppedAreaImageHeightPixels=height - 2 * edge,
+            PosePitchDegrees=np.rad2deg(np.arctan2(up[2], -up[1])),
+            PoseRollDegrees=np.rad2deg(-np.arcsin(up[0])),
+        )
         latitude, longitude, altitude = lla_from_local(60 * pose.center, [-47.5, -8.25, 410.0])
         angles = [((int(abs(a)), 1), (0, 1), (round((abs(a) % 1) * 3600e6), 10**6)) for a in (latitude, longitude)]
-        position = exif(">", refs=(b"S", b"W", 0), latitude=angles[0], longitude=angles[1],
-                        altitude=(round(altitude * 1000), 1000))  # fmt: skip
+        position = exif(
+            ">", refs=(b"S", b"W", 0), latitude=angles[0], longitude=angles[1], altitude=(round(altitude * 1000), 1000)
+        )
         data = bytes(cv2.imencode(".jpg", picture[edge : height - edge], [cv2.IMWRITE_JPEG_QUALITY, 97])[1])
         packet = b"http://ns.adobe.com/xap/1.0/\0" + xmp(fields, form="attribute")
         path.with_suffix(".JPG").write_bytes(data[:2] + app1(b"Exif\0\0" + position) + app1(packet) + data[2:])

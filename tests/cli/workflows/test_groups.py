@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.run.printing import print_summary
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec
-from pano_mvs.io.clouds.ply import read_ply
+from pano_mvs.io.clouds.ply_writer import read_ply
 from pano_mvs.io.poses.files import read_groups, read_poses
 from pano_mvs.io.ranges.files import read_range_tiff
 from pano_mvs.results.run_output import RunOutput

@@ -23,10 +23,17 @@ def run(rendered: Path, pano_mvs: Command) -> Callable[..., dict[str, Any]]:
     def call(*overrides: str, out: str = "out") -> dict[str, Any]:
         options = [part for override in overrides for part in ("--set", override)]
         result = pano_mvs(
-            "run", "paper", "--images", rendered / "images", "--out", out,
-            "--set", f"scores.truth={rendered / 'truth'}",
-            *SMALL, *options,
-        )  # fmt: skip
+            "run",
+            "paper",
+            "--images",
+            rendered / "images",
+            "--out",
+            out,
+            "--set",
+            f"scores.truth={rendered / 'truth'}",
+            *SMALL,
+            *options,
+        )
         assert result.code == 0, result.text
         return run_json(Path(out))
 

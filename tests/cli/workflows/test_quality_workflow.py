@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pano_mvs.io.clouds.ply import read_ply
+from pano_mvs.io.clouds.ply_writer import read_ply
 from pano_mvs.io.ranges.files import read_range_tiff
 from tests.cli.conftest import SMALL, Command, run_json
 
@@ -20,9 +20,18 @@ def test_quality_is_more_precise_than_the_quickstart_on_the_same_pictures(
     for preset in ("quickstart", "quality"):
         out = tmp_path / preset
         result = pano_mvs(
-            "run", preset, "--images", rendered / "images", "--out", out, "--cache", "cache",
-            "--set", f"scores.truth={rendered / 'truth'}", *SMALL,
-        )  # fmt: skip
+            "run",
+            preset,
+            "--images",
+            rendered / "images",
+            "--out",
+            out,
+            "--cache",
+            "cache",
+            "--set",
+            f"scores.truth={rendered / 'truth'}",
+            *SMALL,
+        )
         assert result.code == 0, result.text
         errors[preset] = np.mean([view["median_relative_error"] for view in run_json(out)["scores"]["views"].values()])
         assert all(np.isfinite(read_range_tiff(out / f"range/00{view}.tiff")).mean() > 0.95 for view in range(4))

@@ -17,8 +17,17 @@ pytestmark = pytest.mark.slow
 
 
 def command(folder: Path) -> list[str]:
-    return [sys.executable, "-m", "pano_mvs", "run", "quickstart", "--out", str(folder / "out"),
-            "--cache", str(folder / "cache")]  # fmt: skip
+    return [
+        sys.executable,
+        "-m",
+        "pano_mvs",
+        "run",
+        "quickstart",
+        "--out",
+        str(folder / "out"),
+        "--cache",
+        str(folder / "cache"),
+    ]
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from pano_mvs.io.clouds.ply import read_ply
+from pano_mvs.io.clouds.ply_writer import read_ply
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.io.ranges.files import read_confidence_png, read_range_tiff
 from tests.cli.conftest import SMALL, Command
@@ -26,8 +26,21 @@ PLAIN_RANGES = (
 @pytest.mark.slow
 def test_splat_writes_panoramas_faces_and_seeds_that_agree(pano_mvs: Command, rendered: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    arguments = ("splat", "--images", rendered / "images", "--out", out, "--executor", "serial", *SMALL, *PLAIN_RANGES,
-                 "--set", f"scores.truth={rendered / 'truth'}", "--set", "images.nadir_deg=20")  # fmt: skip
+    arguments = (
+        "splat",
+        "--images",
+        rendered / "images",
+        "--out",
+        out,
+        "--executor",
+        "serial",
+        *SMALL,
+        *PLAIN_RANGES,
+        "--set",
+        f"scores.truth={rendered / 'truth'}",
+        "--set",
+        "images.nadir_deg=20",
+    )
     result = pano_mvs("run", *arguments)
     assert result.code == 0, result.text
     solved = read_poses(out / "colmap/sparse/0")
@@ -50,8 +63,11 @@ def test_splat_writes_panoramas_faces_and_seeds_that_agree(pano_mvs: Command, re
         assert not depth[mask == 0].any()
     faces = json.loads((out / "nerfstudio/faces/transforms.json").read_text())
     assert len(faces["frames"]) == 6 * len(document["frames"])
-    assert all((out / "nerfstudio/faces" / frame[key]).is_file() for frame in faces["frames"]
-               for key in ("file_path", "mask_path", "depth_file_path"))  # fmt: skip
+    assert all(
+        (out / "nerfstudio/faces" / frame[key]).is_file()
+        for frame in faces["frames"]
+        for key in ("file_path", "mask_path", "depth_file_path")
+    )
     assert len(read_ply(out / "nerfstudio/faces/seed.ply")) > 5000
     assert len(pycolmap.Reconstruction(str(out / "colmap_dense_init/sparse/0")).points3D) > 1000
     (out / "nerfstudio/faces/images/000.png.front.jpg").unlink()

@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from pano_mvs.io.clouds.ply import read_ply
+from pano_mvs.io.clouds.ply_writer import read_ply
 from pano_mvs.io.ranges.files import read_range_tiff
 from pano_mvs.testing.room import capture_poses, default_room, range_along
 from tests.cli.conftest import SIZE_HW, SMALL, Command, deliverables, run_json
@@ -35,10 +35,22 @@ def quickstart(rendered: Path, tmp_path_factory: pytest.TempPathFactory) -> tupl
     from pano_mvs.cli.app import app
 
     out = tmp_path_factory.mktemp("quickstart")
-    result = CliRunner().invoke(app, [
-        "run", "quickstart", "--images", str(rendered / "images"), "--out", str(out / "out"), "--cache",
-        str(out / "cache"), "--set", f"scores.truth={rendered / 'truth'}", *SMALL,
-    ])  # fmt: skip
+    result = CliRunner().invoke(
+        app,
+        [
+            "run",
+            "quickstart",
+            "--images",
+            str(rendered / "images"),
+            "--out",
+            str(out / "out"),
+            "--cache",
+            str(out / "cache"),
+            "--set",
+            f"scores.truth={rendered / 'truth'}",
+            *SMALL,
+        ],
+    )
     assert result.exit_code == 0, result.output
     return out / "out", result.output
 
@@ -46,8 +58,11 @@ def quickstart(rendered: Path, tmp_path_factory: pytest.TempPathFactory) -> tupl
 def test_quickstart_writes_what_the_contract_promises(quickstart: tuple[Path, str]) -> None:
     out, _ = quickstart
     model = {f"colmap/sparse/0/{name}.bin" for name in ("cameras", "images", "points3D", "rigs", "frames")}
-    views = {f"{folder}/{name}.{suffix}" for name in NAMES
-             for folder, suffix in (("range", "tiff"), ("confidence", "png"), ("preview", "jpg"))}  # fmt: skip
+    views = {
+        f"{folder}/{name}.{suffix}"
+        for name in NAMES
+        for folder, suffix in (("range", "tiff"), ("confidence", "png"), ("preview", "jpg"))
+    }
     files = {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}
     assert files == model | views | {"cloud.ply", "report.html", "run.json", ".pano-mvs-output"}
 

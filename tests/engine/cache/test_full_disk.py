@@ -37,8 +37,16 @@ class Disk:
         self.left: float = float("inf")
         self.calls = 0
         self._number = number
-        for place, name in ((tempfile, "mkstemp"), (tempfile, "mkdtemp"), (Path, "write_bytes"), (Path, "write_text"),
-                            (Path, "mkdir"), (Path, "touch"), (shutil, "copyfile"), (os, "open")):  # fmt: skip
+        for place, name in (
+            (tempfile, "mkstemp"),
+            (tempfile, "mkdtemp"),
+            (Path, "write_bytes"),
+            (Path, "write_text"),
+            (Path, "mkdir"),
+            (Path, "touch"),
+            (shutil, "copyfile"),
+            (os, "open"),
+        ):
             monkeypatch.setattr(place, name, self._metered(getattr(place, name), creates=name == "open"))
 
     def _metered(self, function: Callable[..., Any], *, creates: bool) -> Callable[..., Any]:
@@ -53,8 +61,15 @@ class Disk:
 
 
 def run(toy: Toy, *options: str) -> tuple[int, str]:
-    command = ["run", str(toy.folder / "wf.yaml"), "--cache", str(toy.folder / "cache"), "--out",
-               str(toy.folder / "out"), *options]  # fmt: skip
+    command = [
+        "run",
+        str(toy.folder / "wf.yaml"),
+        "--cache",
+        str(toy.folder / "cache"),
+        "--out",
+        str(toy.folder / "out"),
+        *options,
+    ]
     result = CliRunner().invoke(app, command)
     return result.exit_code, " ".join(result.output.split())
 

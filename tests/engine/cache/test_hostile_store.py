@@ -149,9 +149,21 @@ def test_planted_value_of_another_type_fails_the_units_that_read_it(tmp_path: Pa
 
 
 TARGETS = [
-    ["../outside.txt"], ["/tmp/outside.txt"], ["a/../../outside.txt"], ["..\\outside.txt"], ["C:outside.txt"], ["a\0b"],
-    [""], [5], [None], [["a"]], [], 5, None, "abc",
-]  # fmt: skip
+    ["../outside.txt"],
+    ["/tmp/outside.txt"],
+    ["a/../../outside.txt"],
+    ["..\\outside.txt"],
+    ["C:outside.txt"],
+    ["a\0b"],
+    [""],
+    [5],
+    [None],
+    [["a"]],
+    [],
+    5,
+    None,
+    "abc",
+]
 
 
 @pytest.mark.parametrize("targets", TARGETS)
@@ -169,24 +181,27 @@ def test_planted_targets_write_nothing_outside(patient: Patient, targets: object
     assert {path for path in patient.folder.rglob("*") if not path.is_relative_to(patient.root)} == before
 
 
-@pytest.mark.parametrize("change", [
-    lambda record: record["output"]["parts"].clear(),
-    lambda record: record["output"]["parts"].pop("0"),
-    lambda record: record["output"].update(parts={"0": record["output"]["parts"]["meta"]}),
-    lambda record: record["output"]["parts"].update({"0": ["../../../../etc/passwd", 5, ".txt", False]}),
-    lambda record: record["output"]["parts"].update({"0": [f"{'0' * 32}", 5, "/../../x", False]}),
-    lambda record: record["output"]["parts"].update({"0": [f"{'0' * 32}", 5, ".txt", True]}),
-    lambda record: record["output"]["parts"].update({"0": [f"{'0' * 32}", 1e30, ".txt", False]}),
-    lambda record: record["output"]["parts"].update({"0": [f"{'0' * 32}", 10**400, ".txt", False]}),
-    lambda record: record.update(metrics={"a": float("nan")}),
-    lambda record: record.update(metrics={"a": 10**400}),
-    lambda record: record.update(seconds=float("inf")),
-    lambda record: record.update(items=[]),
-    lambda record: record.update(identity="x"),
-    lambda record: record.update(key="0" * 32),
-    lambda record: record.update(notes=5),
-    lambda record: record.clear(),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda record: record["output"]["parts"].clear(),
+        lambda record: record["output"]["parts"].pop("0"),
+        lambda record: record["output"].update(parts={"0": record["output"]["parts"]["meta"]}),
+        lambda record: record["output"]["parts"].update({"0": ["../../../../etc/passwd", 5, ".txt", False]}),
+        lambda record: record["output"]["parts"].update({"0": [f"{'0' * 32}", 5, "/../../x", False]}),
+        lambda record: record["output"]["parts"].update({"0": [f"{'0' * 32}", 5, ".txt", True]}),
+        lambda record: record["output"]["parts"].update({"0": [f"{'0' * 32}", 1e30, ".txt", False]}),
+        lambda record: record["output"]["parts"].update({"0": [f"{'0' * 32}", 10**400, ".txt", False]}),
+        lambda record: record.update(metrics={"a": float("nan")}),
+        lambda record: record.update(metrics={"a": 10**400}),
+        lambda record: record.update(seconds=float("inf")),
+        lambda record: record.update(items=[]),
+        lambda record: record.update(identity="x"),
+        lambda record: record.update(key="0" * 32),
+        lambda record: record.update(notes=5),
+        lambda record: record.clear(),
+    ],
+)
 def test_planted_records_are_computed_again(patient: Patient, change: Callable[[dict[str, Any]], object]) -> None:
     (path,) = records(patient.root, "toy.write")
     honest = path.read_bytes()
@@ -307,13 +322,19 @@ def nearly_records(wrong: bool) -> st.SearchStrategy[Any]:
         parts = parts.flatmap(lambda some: blob_refs(True).map(lambda one: {**some, "wrong": one})) | anything
     refs = st.fixed_dictionaries({"kind": names, "digest": digests, "parts": parts})
     other = anything if wrong else st.nothing()
-    return st.fixed_dictionaries({
-        "key": digests, "identity": st.dictionaries(names, anything, max_size=2) | other, "output": refs | other,
-        "items": st.dictionaries(names, refs, max_size=2) | other,
-        "metrics": st.dictionaries(names, st.floats(allow_nan=wrong, allow_infinity=wrong), max_size=2) | other,
-        "notes": st.lists(names, max_size=2) | other, "rejected": st.dictionaries(names, names, max_size=1) | other,
-        "doubts": st.dictionaries(names, names, max_size=1) | other, "seconds": st.floats(0, 1e6) | other,
-    })  # fmt: skip
+    return st.fixed_dictionaries(
+        {
+            "key": digests,
+            "identity": st.dictionaries(names, anything, max_size=2) | other,
+            "output": refs | other,
+            "items": st.dictionaries(names, refs, max_size=2) | other,
+            "metrics": st.dictionaries(names, st.floats(allow_nan=wrong, allow_infinity=wrong), max_size=2) | other,
+            "notes": st.lists(names, max_size=2) | other,
+            "rejected": st.dictionaries(names, names, max_size=1) | other,
+            "doubts": st.dictionaries(names, names, max_size=1) | other,
+            "seconds": st.floats(0, 1e6) | other,
+        }
+    )
 
 
 def signed(value: object) -> bytes:
@@ -352,15 +373,25 @@ def test_any_bytes_are_a_record_or_none(data: bytes) -> None:
         require_in_store(record)
 
 
-@given(st.tuples(no_digests, sizes, suffixes, st.booleans()).filter(lambda ref: ref[0] not in ("0" * 32, "ab" * 16))
-       | st.tuples(digests, sizes, st.sampled_from(["/../../x", ".npy/x", "npy", "."]), st.booleans())
-       | st.tuples(digests, st.sampled_from([-1, 2**70, 1.0, True, "1"]), suffixes, st.booleans())
-       | st.tuples(digests, sizes, suffixes, st.sampled_from([0, 1, None, "yes"])))  # fmt: skip
+@given(
+    st.tuples(no_digests, sizes, suffixes, st.booleans()).filter(lambda ref: ref[0] not in ("0" * 32, "ab" * 16))
+    | st.tuples(digests, sizes, st.sampled_from(["/../../x", ".npy/x", "npy", "."]), st.booleans())
+    | st.tuples(digests, st.sampled_from([-1, 2**70, 1.0, True, "1"]), suffixes, st.booleans())
+    | st.tuples(digests, sizes, suffixes, st.sampled_from([0, 1, None, "yes"]))
+)
 @fuzzing
 def test_a_record_with_a_reference_that_is_none_is_none(ref: tuple[Any, ...]) -> None:
     item = {"kind": "Range", "digest": "0" * 32, "parts": {"range": ref}}
-    value = {"key": "0" * 32, "identity": {}, "output": item, "items": {}, "metrics": {}, "notes": [], "rejected": {},
-             "seconds": 1.0}  # fmt: skip
+    value = {
+        "key": "0" * 32,
+        "identity": {},
+        "output": item,
+        "items": {},
+        "metrics": {},
+        "notes": [],
+        "rejected": {},
+        "seconds": 1.0,
+    }
     assert record_from_bytes(signed(value)) is None
 
 
@@ -368,10 +399,20 @@ names_of_units = st.dictionaries(st.text(max_size=4), st.dictionaries(st.text(ma
 TIME = "2026-11-21T08:00:00Z"
 
 
-@given(data=st.binary(max_size=100) | (anything | st.fixed_dictionaries({
-    "workflow": anything, "out": anything, "when": anything | st.datetimes().map(str) | st.just(TIME),
-    "keys": anything | names_of_units | st.dictionaries(st.text(max_size=4), anything)})
-    ).map(signed))  # fmt: skip
+@given(
+    data=st.binary(max_size=100)
+    | (
+        anything
+        | st.fixed_dictionaries(
+            {
+                "workflow": anything,
+                "out": anything,
+                "when": anything | st.datetimes().map(str) | st.just(TIME),
+                "keys": anything | names_of_units | st.dictionaries(st.text(max_size=4), anything),
+            }
+        )
+    ).map(signed)
+)
 @fuzzing
 def test_any_bytes_are_an_entry_of_the_book_or_none(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "entry.json"
@@ -399,9 +440,16 @@ def test_an_entry_of_the_book_is_read_as_it_was_written(tmp_path: Path, keys: di
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"when": "2026-11-21T08:00:00"}, {"when": "soon"}, {"when": "0001-01-01T00:00:00Z"}, {"keys": [1]},
-              {"keys": {"depth": 1}}, {"keys": None}],
-)  # fmt: skip
+    "wrong",
+    [
+        {"when": "2026-11-21T08:00:00"},
+        {"when": "soon"},
+        {"when": "0001-01-01T00:00:00Z"},
+        {"keys": [1]},
+        {"keys": {"depth": 1}},
+        {"keys": None},
+    ],
+)
 def test_an_entry_with_something_else_in_it_is_none(tmp_path: Path, wrong: dict[str, Any]) -> None:
     path = tmp_path / "entry.json"
     path.write_bytes(signed({"workflow": "w", "out": "o", "when": TIME, "keys": {}} | wrong))

@@ -117,12 +117,20 @@ def test_any_file_gives_right_digests(tmp_path: Path, data: bytes, entry: list[o
 
 def test_well_made_lie_about_a_file_costs_time_only(toy: Toy) -> None:
     """A digest of other bytes under the right time stamps: what reads the file's bytes through the store notices."""
-    toy.edit("plug.py", lambda text: text.replace(
-        '    """Read a number."""\n    return Number(float(item.files["text"].read_text()))',
-        '    """Read a number."""\n    return Text(FilePart(item.files["text"], external=True))').replace(
-        "def read(item: SourceItem, params: SourceParams) -> Number:",
-        '''def read(item: SourceItem, params: SourceParams) -> Text:''').replace(
-        "def list_items", '''@dataclass(frozen=True, eq=False)
+    toy.edit(
+        "plug.py",
+        lambda text: (
+            text.replace(
+                '    """Read a number."""\n    return Number(float(item.files["text"].read_text()))',
+                '    """Read a number."""\n    return Text(FilePart(item.files["text"], external=True))',
+            )
+            .replace(
+                "def read(item: SourceItem, params: SourceParams) -> Number:",
+                """def read(item: SourceItem, params: SourceParams) -> Text:""",
+            )
+            .replace(
+                "def list_items",
+                '''@dataclass(frozen=True, eq=False)
 class Text(Record):
     axis: ClassVar[Axis | None] = Axis.IMAGE
     file: FilePart
@@ -141,9 +149,17 @@ def parse(text: Each[Text]) -> Number:
     return Number(float(text.file.read_bytes()))
 
 
-def list_items''').replace("import os\n", "import os\nfrom pano_mvs.scene import FilePart\n"))  # fmt: skip
-    toy.edit("wf.yaml", lambda text: text.replace("  scaled:  ", "  parsed:     {use: toy.parse}\n  scaled:  ").replace(
-        "{names: images}", "{names: parsed}"))  # fmt: skip
+def list_items''',
+            )
+            .replace("import os\n", "import os\nfrom pano_mvs.scene import FilePart\n")
+        ),
+    )
+    toy.edit(
+        "wf.yaml",
+        lambda text: text.replace("  scaled:  ", "  parsed:     {use: toy.parse}\n  scaled:  ").replace(
+            "{names: images}", "{names: parsed}"
+        ),
+    )
     toy.run()
     clean = toy.deliverables()
     path = toy.folder / "cache" / "stat-cache.json"

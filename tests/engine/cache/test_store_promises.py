@@ -89,9 +89,17 @@ def test_a_record_under_another_key_is_damage(tmp_path: Path) -> None:
 
 def record_json(**changes: object) -> dict[str, object]:
     value: dict[str, object] = {
-        "key": KEY, "identity": {}, "output": {"kind": "K", "digest": "d", "parts": {}}, "items": {}, "metrics": {},
-        "notes": [], "rejected": {}, "doubts": {}, "seconds": 1, "checked": True,
-    }  # fmt: skip
+        "key": KEY,
+        "identity": {},
+        "output": {"kind": "K", "digest": "d", "parts": {}},
+        "items": {},
+        "metrics": {},
+        "notes": [],
+        "rejected": {},
+        "doubts": {},
+        "seconds": 1,
+        "checked": True,
+    }
     return value | changes
 
 
@@ -368,10 +376,13 @@ def test_a_cache_whose_layout_cannot_be_read_is_refused(tmp_path: Path) -> None:
         Store(tmp_path)
 
 
-@pytest.mark.parametrize(("number", "error", "said"), [
-    (errno.EROFS, UsageError, "cannot be written .*Choose another"),
-    (errno.ENOSPC, StoreError, "x: no space"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("number", "error", "said"),
+    [
+        (errno.EROFS, UsageError, "cannot be written .*Choose another"),
+        (errno.ENOSPC, StoreError, "x: no space"),
+    ],
+)
 def test_a_cache_that_cannot_be_made_is_refused_unless_it_is_only_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, error: type[Exception], said: str
 ) -> None:

@@ -133,12 +133,22 @@ def reach(tmp_path: Path, start: str = "start:start", edits: Mapping[str, tuple[
 def test_what_is_used_is_reached_and_nothing_else(tmp_path: Path) -> None:
     found = reach(tmp_path)
     assert set(found.definitions) == {
-        "pack.start:start", "pack.start:Settings", "pack.start:helped", "pack.start:LIMIT",
-        "pack.tools:one", "pack.tools:scale",
-        "pack.chosen:TABLE", "pack.chosen:plus", "pack.chosen:<import>",
-        "pack.more:<import>", "pack.registry:register", "pack.registry:KNOWN",
-        "pack.kernels:add", "pack.kernels:twice", "pack.kinds:Kind",
-    }  # fmt: skip
+        "pack.start:start",
+        "pack.start:Settings",
+        "pack.start:helped",
+        "pack.start:LIMIT",
+        "pack.tools:one",
+        "pack.tools:scale",
+        "pack.chosen:TABLE",
+        "pack.chosen:plus",
+        "pack.chosen:<import>",
+        "pack.more:<import>",
+        "pack.registry:register",
+        "pack.registry:KNOWN",
+        "pack.kernels:add",
+        "pack.kernels:twice",
+        "pack.kinds:Kind",
+    }
     assert found.libraries == {"numpy", "numba"}
 
 
@@ -185,9 +195,12 @@ def test_what_changes_nothing_does_not(tmp_path: Path, name: str, old: str, new:
 
 def test_a_name_that_a_function_defines_itself_is_not_that_of_its_module(tmp_path: Path) -> None:
     assert set(reach(tmp_path, "start:local_names").definitions) - {"pack.more:<import>", "pack.chosen:<import>"} == {
-        "pack.start:local_names", "pack.registry:register", "pack.registry:KNOWN",
-        "pack.chosen:plus", "pack.chosen:TABLE",
-    }  # fmt: skip
+        "pack.start:local_names",
+        "pack.registry:register",
+        "pack.registry:KNOWN",
+        "pack.chosen:plus",
+        "pack.chosen:TABLE",
+    }
 
 
 def uses(text: str) -> set[str]:

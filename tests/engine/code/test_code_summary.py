@@ -195,13 +195,20 @@ def test_imports_bind_names_to_paths_from_the_root(module: str, is_package: bool
 def test_a_module_s_imports_load_modules_but_for_those_of_type_checkers() -> None:
     found = summarize_module(
         "import a.b\nfrom c import d\nfrom e import *\nimport typing\nif typing.TYPE_CHECKING:\n    import g\n"
-        "if TYPE_CHECKING:\n    from h import i\ntry:\n    import j\nexcept ImportError:\n    import k\n", "m",
-    )  # fmt: skip
+        "if TYPE_CHECKING:\n    from h import i\ntry:\n    import j\nexcept ImportError:\n    import k\n",
+        "m",
+    )
     assert found.loads == ["a.b", "c.d", "e", "typing", "j", "k"]
     assert found.stars == ["e"]
     assert found.bindings == {
-        "a": "a", "d": "c:d", "typing": "typing", "g": "g", "i": "h:i", "j": "j", "k": "k",
-    }  # fmt: skip
+        "a": "a",
+        "d": "c:d",
+        "typing": "typing",
+        "g": "g",
+        "i": "h:i",
+        "j": "j",
+        "k": "k",
+    }
 
 
 @pytest.mark.parametrize(
@@ -236,10 +243,25 @@ def test_definitions_and_what_a_module_does_on_import(
     assert sorted(found.effect_names) == effect_names
 
 
-@pytest.mark.parametrize("decorator", [
-    "njit", "jit", "vectorize", "guvectorize", "intrinsic", "dataclass", "cache", "lru_cache", "contextmanager",
-    "total_ordering", "wraps", "runtime_checkable", "final", "unique",
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "decorator",
+    [
+        "njit",
+        "jit",
+        "vectorize",
+        "guvectorize",
+        "intrinsic",
+        "dataclass",
+        "cache",
+        "lru_cache",
+        "contextmanager",
+        "total_ordering",
+        "wraps",
+        "runtime_checkable",
+        "final",
+        "unique",
+    ],
+)
 def test_decorators_that_register_nothing_cost_no_other_stage_its_cache(decorator: str) -> None:
     for spelling in (decorator, f"{decorator}(1)", f"lib.sub.{decorator}"):
         assert summarize_module(f"@{spelling}\ndef f(): ...", "m").effects is None
@@ -311,27 +333,38 @@ def reached(folder: Path, files: dict[str, str], *paths: str) -> tuple[set[str],
         ({"m.py": "from pack.m import f as g\ndef f(): return g"}, {"m:f"}, set()),
         ({"m.py": "g: K = 1\ndef f(x: K): return g\nclass K: ..."}, {"m:f", "m:g"}, set()),
     ],
-)  # fmt: skip
+)
 def test_what_a_function_reaches(tmp_path: Path, files: dict[str, str], expected: set[str], used: set[str]) -> None:
     assert reached(tmp_path, files) == (expected, used)
 
 
 def test_annotations_of_what_is_asked_for_count_if_wanted(tmp_path: Path) -> None:
-    files = {"__init__.py": "", "m.py": "def f(x: K, y: 'L') -> R: return g\ndef g(z: M): ...\n"
-             "class K: ...\nclass L: ...\nclass R: ...\nclass M: ...\n"}  # fmt: skip
+    files = {
+        "__init__.py": "",
+        "m.py": "def f(x: K, y: 'L') -> R: return g\ndef g(z: M): ...\n"
+        "class K: ...\nclass L: ...\nclass R: ...\nclass M: ...\n",
+    }
     graph = graph_of(tmp_path, files)
     assert set(graph.reach_of(["pack.m:f"], with_annotations=True).definitions) == {
-        "pack.m:f", "pack.m:g", "pack.m:K", "pack.m:L", "pack.m:R",
-    }  # fmt: skip
+        "pack.m:f",
+        "pack.m:g",
+        "pack.m:K",
+        "pack.m:L",
+        "pack.m:R",
+    }
     assert set(graph.reach_of(["pack.m:f"]).definitions) == {"pack.m:f", "pack.m:g"}
     assert len(graph.reach_of(["pack.m:"]).definitions) == 6
 
 
 def test_left_out_packages_count_nothing_but_what_is_kept_of_them(tmp_path: Path) -> None:
     files = {
-        "__init__.py": "", "m.py": "from pack.a.b import x\nfrom pack.a.c import y\nimport pack.a.d\ndef f(): x, y",
-        "a/__init__.py": "print(0)", "a/b.py": "print(1)\nx = 1", "a/c.py": "print(2)\ny = 1", "a/d.py": "print(3)",
-    }  # fmt: skip
+        "__init__.py": "",
+        "m.py": "from pack.a.b import x\nfrom pack.a.c import y\nimport pack.a.d\ndef f(): x, y",
+        "a/__init__.py": "print(0)",
+        "a/b.py": "print(1)\nx = 1",
+        "a/c.py": "print(2)\ny = 1",
+        "a/d.py": "print(3)",
+    }
     graph = graph_of(tmp_path, files, left_out=["pack.a"], kept=["pack.a.c"])
     assert set(graph.reach_of(["pack.m:f"]).definitions) == {"pack.m:f", "pack.a.c:y", "pack.a.c:<import>"}
 

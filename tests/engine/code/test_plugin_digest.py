@@ -131,8 +131,12 @@ def test_files_of_a_package_have_names_from_above_it(tmp_path: Path) -> None:
     name, texts = code_texts(written(tmp_path, files))
     assert name == "outer/inner/mod.py"
     assert set(texts) == {
-        "outer/inner/mod.py", "outer/__init__.py", "outer/other.py", "outer/inner/__init__.py", "outer/inner/near.py",
-    }  # fmt: skip
+        "outer/inner/mod.py",
+        "outer/__init__.py",
+        "outer/other.py",
+        "outer/inner/__init__.py",
+        "outer/inner/near.py",
+    }
 
 
 def test_files_that_are_no_code_are_errors(tmp_path: Path) -> None:

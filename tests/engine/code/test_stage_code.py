@@ -65,16 +65,28 @@ def changed_by(module: str, old: str, new: str) -> set[str]:
     [
         ("algorithms.poses.adjustment.kernels_patch_alignment", "= 12, 0.003", "= 12, 0.004", {"poses.refine"}),
         ("algorithms.features.kernels_sphorb", "ARC = 10", "ARC = 9", {"features.sphorb"}),
-        ("algorithms.patchmatch.kernels_planes", "_MIN_WEIGHT, _MIN_SPREAD = 5.0", "_MIN_WEIGHT, _MIN_SPREAD = 6.0",
-         {"depth.patchmatch"}),
-        ("geometry.kernels_sphere", "2 * math.pi * (x / width - 0.5)", "2 * math.pi * (x / width - 1.5)",
-         {"depth.patchmatch"}),
+        (
+            "algorithms.patchmatch.kernels_planes",
+            "_MIN_WEIGHT, _MIN_SPREAD = 5.0",
+            "_MIN_WEIGHT, _MIN_SPREAD = 6.0",
+            {"depth.patchmatch"},
+        ),
+        (
+            "geometry.kernels_sphere",
+            "2 * math.pi * (x / width - 0.5)",
+            "2 * math.pi * (x / width - 1.5)",
+            {"depth.patchmatch"},
+        ),
         ("algorithms.sweep.numba.kernels_sgm", "_BLOCK = ", "_BLOCK = 1 * ", SWEEPS),
         ("algorithms.filters.kernels_fill", "_DIRECTIONS = ", "_DIRECTIONS = 1 * ", {"filters.fill"}),
-        ("algorithms.two_view.kernels_five_point", "_MAX_INTERVALS = ", "_MAX_INTERVALS = 1 + ",
-         {"matches.brute_force"}),
+        (
+            "algorithms.two_view.kernels_five_point",
+            "_MAX_INTERVALS = ",
+            "_MAX_INTERVALS = 1 + ",
+            {"matches.brute_force"},
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_kernel_s_constant_changes_the_keys_of_exactly_the_stages_that_depend_on_it(
     module: str, old: str, new: str, stages: set[str]
 ) -> None:

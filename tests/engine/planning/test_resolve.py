@@ -41,8 +41,11 @@ class Resolved:
 
     def __init__(self, toy: Toy) -> None:
         toy.edit("plug.py", lambda text: text + MORE)
-        more = ("plus: {use: toy.plus, in: {x: scaled}}", "again: {use: toy.scale, in: {x: shifted}}",
-                "seen: {use: toy.view, in: {mean: mean, x: shifted}}")  # fmt: skip
+        more = (
+            "plus: {use: toy.plus, in: {x: scaled}}",
+            "again: {use: toy.scale, in: {x: shifted}}",
+            "seen: {use: toy.view, in: {mean: mean, x: shifted}}",
+        )
         toy.edit("wf.yaml", lambda text: text + "".join(f"  {line}\n" for line in more))
         self.toy = toy
         self.session = toy.session()
@@ -188,8 +191,9 @@ def test_a_stage_reads_several_producers(resolved: Resolved) -> None:
     pairs = StageState(Axis.PAIR, {"a | b": ref("ab")}, {}, {"a | b": ("a", "b")})
     units, _ = resolved("all", difference=pairs, shifted=whole(ref("s")))
     assert units[WHOLE].identity["inputs"] == {
-        "differences": [[["a", "b"], "digest of ab"]], "shifted": "digest of s",
-    }  # fmt: skip
+        "differences": [[["a", "b"], "digest of ab"]],
+        "shifted": "digest of s",
+    }
     for state, blocked, waiting in (
         (whole(None, failed=True), {WHOLE: "needs shifted, which failed"}, []),
         (whole(None, pending=True), {}, [WHOLE]),
@@ -206,10 +210,15 @@ def test_a_key_is_made_of_the_identity_and_nothing_else(resolved: Resolved) -> N
     entry = resolved.session.workflow.stages["scaled"]
     code = stage_code(entry.spec, entry.params)
     assert units["a"].identity == {
-        "schema": KEY_SCHEMA, "stage": "toy.scale", "version": 1, "code": code.digest,
-        "libraries": dict(code.libraries), "params": {"by": 3.0}, "kinds": {"Number": 1},
+        "schema": KEY_SCHEMA,
+        "stage": "toy.scale",
+        "version": 1,
+        "code": code.digest,
+        "libraries": dict(code.libraries),
+        "params": {"by": 3.0},
+        "kinds": {"Number": 1},
         "inputs": {"x": "digest of a"},
-    }  # fmt: skip
+    }
     same = images("c", "a")
     same.items["c"] = ref("a")
     again, _ = resolved("scaled", images=same)
@@ -242,9 +251,12 @@ def test_a_source_s_units_are_known_by_name_and_content(toy: Toy) -> None:
 def test_items_of_a_source_that_cannot_be_used_are_blocked(toy: Toy) -> None:
     path = toy.folder / "capture" / "1.txt"
     units, found = sources(
-        toy, SourceItem("a", {"text": path}, problem="too dark"), SourceItem("b", {"text": path.with_name("gone")}),
-        SourceItem("c", {"text": path}), SourceItem("d | e", {"text": path}),
-    )  # fmt: skip
+        toy,
+        SourceItem("a", {"text": path}, problem="too dark"),
+        SourceItem("b", {"text": path.with_name("gone")}),
+        SourceItem("c", {"text": path}),
+        SourceItem("d | e", {"text": path}),
+    )
     assert list(units) == ["c"]
     assert list(found.members) == ["a", "b", "c", "d | e"]
     assert found.blocked.keys() == {"a", "b", "d | e"}

@@ -167,9 +167,13 @@ def delivered(toy: Toy) -> dict[str, bytes]:
 
 @pytest.mark.parametrize(
     ("after", "executor"),
-    [(("first", "2.txt"), "serial"), (("total", ""), "serial"), (("late", "1.txt"), "serial"),
-     (("total", ""), "processes")],
-)  # fmt: skip
+    [
+        (("first", "2.txt"), "serial"),
+        (("total", ""), "serial"),
+        (("late", "1.txt"), "serial"),
+        (("total", ""), "processes"),
+    ],
+)
 def test_image_that_changes_costs_that_image(texts: Toy, executor: str, after: tuple[str, str]) -> None:
     path = texts.folder / "capture" / "2.txt"
     result = run(texts, Meddler(*after, lambda: path.write_text("77")), executor=executor)
@@ -256,12 +260,16 @@ def test_file_of_the_settings_that_changes_fails_what_reads_it(texts: Toy, chang
     path: Path = texts.folder / "truth.txt"
     path.write_text("1000")
     settle(path)
-    texts.edit("plug.py", lambda text: text.replace(
-        "    return Total(total.value + float(params.file.read_text()))",
-        "    import pathlib, os\n    p = pathlib.Path(__file__).with_name('meddle')\n"
-        "    if p.exists():\n        p.unlink()\n        " +
-        ("params.file.write_text('5')" if change == "change" else "params.file.unlink()") +
-        "\n    return Total(total.value + float(params.file.read_text()))"))  # fmt: skip
+    texts.edit(
+        "plug.py",
+        lambda text: text.replace(
+            "    return Total(total.value + float(params.file.read_text()))",
+            "    import pathlib, os\n    p = pathlib.Path(__file__).with_name('meddle')\n"
+            "    if p.exists():\n        p.unlink()\n        "
+            + ("params.file.write_text('5')" if change == "change" else "params.file.unlink()")
+            + "\n    return Total(total.value + float(params.file.read_text()))",
+        ),
+    )
     texts.edit("wf.yaml", lambda text: text.replace("  late:", "  add:    {use: toy.add, file: truth.txt}\n  late:"))
     (texts.folder / "meddle").touch()
     result = run(texts)

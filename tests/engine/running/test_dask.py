@@ -46,16 +46,32 @@ def existing_cluster(folder: Path, *, workers: int = 2) -> Iterator[tuple[str, l
         "cwd": folder,
         "env": environment,
     }
-    command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard",
-               "--scheduler-file", str(address_file)]  # fmt: skip
+    command = [
+        sys.executable,
+        "-m",
+        "distributed.cli.dask_scheduler",
+        "--port",
+        "0",
+        "--no-dashboard",
+        "--scheduler-file",
+        str(address_file),
+    ]
     processes = [subprocess.Popen(command, **quiet)]
     try:
         deadline = time.monotonic() + 60
         while not address_file.exists() and time.monotonic() < deadline:
             time.sleep(0.1)
         for _ in range(workers):
-            command = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(address_file),
-                       "--nthreads", "1", "--no-dashboard"]  # fmt: skip
+            command = [
+                sys.executable,
+                "-m",
+                "distributed.cli.dask_worker",
+                "--scheduler-file",
+                str(address_file),
+                "--nthreads",
+                "1",
+                "--no-dashboard",
+            ]
             processes.append(subprocess.Popen(command, **quiet))
         address = json.loads(address_file.read_text())["address"]
         _wait_for_workers(address, workers)
@@ -119,12 +135,16 @@ def test_plugin_comes_along_as_text(toy: Toy, monkeypatch: pytest.MonkeyPatch) -
 
 def test_unit_whose_process_dies_is_tried_again(toy: Toy) -> None:
     mark = toy.folder / "died"
-    toy.edit("plug.py", lambda text: text.replace(
-        '    """Multiply."""',
-        f'''    """Multiply."""
+    toy.edit(
+        "plug.py",
+        lambda text: text.replace(
+            '    """Multiply."""',
+            f'''    """Multiply."""
     if x.value == 30 and not os.path.exists({str(mark)!r}):
         open({str(mark)!r}, "w").close()
-        os._exit(1)'''))  # fmt: skip
+        os._exit(1)''',
+        ),
+    )
     assert ran(run_with(toy, lambda store: DaskExecutor(store, workers=2, threads=1))) == ALL_UNITS
     assert mark.exists()
 

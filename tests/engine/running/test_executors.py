@@ -102,10 +102,15 @@ def test_what_fails_is_told_the_same_in_the_same_order(toy: Toy) -> None:
 
 def test_the_same_units_deliver_where_several_clash(toy: Toy) -> None:
     """Each clashes with the one before and the one behind it; the first units are done last."""
-    toy.edit("plug.py", lambda text: text.replace(
-        '    return Files({"mean/{item}.txt": path})', """    number = int(path.read_text().partition(".")[0]) // 30
+    toy.edit(
+        "plug.py",
+        lambda text: text.replace(
+            '    return Files({"mean/{item}.txt": path})',
+            """    number = int(path.read_text().partition(".")[0]) // 30
     time.sleep(0.1 * max(0, 4 - number))
-    return Files({f"{number}.txt": path, f"{number + 1}.txt": path})"""))  # fmt: skip
+    return Files({f"{number}.txt": path, f"{number + 1}.txt": path})""",
+        ),
+    )
     serial = run_with(toy, SerialExecutor, name="serial")
     side_by_side = run_with(toy, two_processes, name="processes")
     assert len(serial.failures) > 1
@@ -116,11 +121,15 @@ def test_the_same_units_deliver_where_several_clash(toy: Toy) -> None:
 def test_unit_starts_before_the_stage_before_it_is_complete(toy: Toy) -> None:
     """The second stage's first unit is waited for by the last unit of the first: a barrier would stop it for ever."""
     seen = toy.folder / "seen"
-    toy.edit("plug.py", lambda text: text.replace(
-        '    """Read a number."""',
-        f'''    """Read a number."""
+    toy.edit(
+        "plug.py",
+        lambda text: text.replace(
+            '    """Read a number."""',
+            f'''    """Read a number."""
     import pathlib
-    while item.name == "5.txt" and not pathlib.Path({str(seen)!r}).exists(): time.sleep(0.01)'''))  # fmt: skip
+    while item.name == "5.txt" and not pathlib.Path({str(seen)!r}).exists(): time.sleep(0.01)''',
+        ),
+    )
     touch = f"import pathlib; pathlib.Path({str(seen)!r}).touch()"
     toy.edit("plug.py", lambda text: text.replace('"""Multiply."""', f'"""Multiply."""\n    {touch}'))
     result = run_with(toy, two_processes, "images.timeout_s=60")
@@ -131,13 +140,17 @@ def test_unit_starts_before_the_stage_before_it_is_complete(toy: Toy) -> None:
 def kill_once(toy: Toy, *, when: str = "x.value == 30", how: str = "os.kill(os.getpid(), 9)") -> None:
     """Let the worker that multiplies a certain number die the first time."""
     mark = toy.folder / "died"
-    toy.edit("plug.py", lambda text: text.replace(
-        '    """Multiply."""',
-        f'''    """Multiply."""
+    toy.edit(
+        "plug.py",
+        lambda text: text.replace(
+            '    """Multiply."""',
+            f'''    """Multiply."""
     import pathlib
     if {when} and not pathlib.Path({str(mark)!r}).exists():
         pathlib.Path({str(mark)!r}).touch()
-        {how}'''))  # fmt: skip
+        {how}''',
+        ),
+    )
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
@@ -150,9 +163,15 @@ def test_killed_worker_costs_one_try(toy: Toy) -> None:
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
 def test_unit_that_kills_its_worker_again_is_listed_and_the_others_go_on(toy: Toy) -> None:
-    toy.edit("plug.py", lambda text: text.replace('    """Multiply."""', '''    """Multiply."""
+    toy.edit(
+        "plug.py",
+        lambda text: text.replace(
+            '    """Multiply."""',
+            '''    """Multiply."""
     print("about to go")
-    if x.value == 30: os.kill(os.getpid(), 9)'''))  # fmt: skip
+    if x.value == 30: os.kill(os.getpid(), 9)''',
+        ),
+    )
     result = run_with(toy, two_processes)
     assert result.exit_code == 3
     failure = next(f for f in result.failures if f.stage == "scaled")
@@ -165,9 +184,15 @@ def test_unit_that_kills_its_worker_again_is_listed_and_the_others_go_on(toy: To
 @pytest.mark.parametrize(("how", "cause"), [("os._exit(0)", "exit code 0"), ("os.abort()", "killed by SIGABRT")])
 def test_a_unit_that_ends_its_process_fails_with_one_worker_too(toy: Toy, how: str, cause: str) -> None:
     """One worker was no process: os._exit(0) in a stage ended the run with exit code 0 and without a report."""
-    toy.edit("plug.py", lambda text: text.replace('    """Multiply."""', f'''    """Multiply."""
+    toy.edit(
+        "plug.py",
+        lambda text: text.replace(
+            '    """Multiply."""',
+            f'''    """Multiply."""
     if x.value == 30:
-        {how}'''))  # fmt: skip
+        {how}''',
+        ),
+    )
     result = run_with(toy, lambda store: make_executor(store, workers=1, threads=1))
     (failure,) = (f for f in result.failures if f.stage == "scaled")
     assert (failure.item, result.exit_code) == ("3.txt", 3)
@@ -203,8 +228,14 @@ def test_the_log_of_a_process_that_died_is_named_if_it_holds_anything(
 
 @pytest.mark.parametrize("make", [SerialExecutor, two_processes])
 def test_a_stage_that_calls_sys_exit_is_a_unit_that_failed(toy: Toy, make: Make) -> None:
-    toy.edit("plug.py", lambda text: text.replace('    """Multiply."""', '''    """Multiply."""
-    if x.value == 30: raise SystemExit(0)'''))  # fmt: skip
+    toy.edit(
+        "plug.py",
+        lambda text: text.replace(
+            '    """Multiply."""',
+            '''    """Multiply."""
+    if x.value == 30: raise SystemExit(0)''',
+        ),
+    )
     result = run_with(toy, make)
     failure = next(f for f in result.failures if f.stage == "scaled")
     assert (failure.item, result.exit_code) == ("3.txt", 3)
@@ -222,11 +253,17 @@ def test_an_import_that_ends_the_worker_costs_the_units_that_need_it(toy: Toy) -
 @pytest.mark.parametrize("make", [SerialExecutor, two_processes])
 @pytest.mark.parametrize("kind", ["BaseException", "Exception"])
 def test_whatever_a_stage_raises_is_a_unit_that_failed(toy: Toy, make: Make, kind: str) -> None:
-    toy.edit("plug.py", lambda text: text.replace('    """Multiply."""', f'''    """Multiply."""
+    toy.edit(
+        "plug.py",
+        lambda text: text.replace(
+            '    """Multiply."""',
+            f'''    """Multiply."""
     class Odd({kind}):
         def __str__(self):
             return 1 / 0
-    if x.value == 30: raise Odd'''))  # fmt: skip
+    if x.value == 30: raise Odd''',
+        ),
+    )
     result = run_with(toy, make)
     failure = next(f for f in result.failures if f.stage == "scaled")
     assert failure.item == "3.txt"
@@ -302,24 +339,32 @@ def test_policies_mean_the_same_in_processes(toy: Toy) -> None:
 @pytest.mark.slow
 def test_retries_are_as_many_as_the_workflow_says(toy: Toy) -> None:
     count = toy.folder / "count"
-    toy.edit("plug.py", lambda text: text.replace(
-        '    """Multiply."""',
-        f'''    """Multiply."""
+    toy.edit(
+        "plug.py",
+        lambda text: text.replace(
+            '    """Multiply."""',
+            f'''    """Multiply."""
     if x.value == 30:
         with open({str(count)!r}, "a") as file: file.write("x")
-        raise ValueError("again")'''))  # fmt: skip
+        raise ValueError("again")''',
+        ),
+    )
     assert run_with(toy, two_processes, "scaled.retries=2").exit_code == 3
     assert count.read_text() == "xxx"
 
 
 def test_declared_memory_bounds_how_many_run_at_a_time(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
     log = toy.folder / "log"
-    toy.edit("plug.py", lambda text: text.replace(
-        '    """Mean of the neighbours and the own."""',
-        f'''    """Mean of the neighbours and the own."""
+    toy.edit(
+        "plug.py",
+        lambda text: text.replace(
+            '    """Mean of the neighbours and the own."""',
+            f'''    """Mean of the neighbours and the own."""
     with open({str(log)!r}, "a") as file: file.write("+")
     time.sleep(0.05)
-    with open({str(log)!r}, "a") as file: file.write("-")'''))  # fmt: skip
+    with open({str(log)!r}, "a") as file: file.write("-")''',
+        ),
+    )
     monkeypatch.setattr(ProcessExecutor, "free_memory_bytes", lambda self: 3_000_000_000)
     result = run_with(toy, lambda store: ProcessExecutor(store, workers=3, threads=1), "mean.memory=2GB")
     assert result.exit_code == 0
@@ -340,11 +385,15 @@ def test_stage_may_declare_its_memory(toy: Toy, monkeypatch: pytest.MonkeyPatch)
 
 def test_memory_may_depend_on_settings_and_inputs(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SerialExecutor, "free_memory_bytes", lambda self: 1_000_000)
-    toy.edit("plug.py", lambda text: text.replace(
-        '@stage("toy.mean")',
-        'def needed(params, inputs):\n    return 2_000_000 * (inputs["own"].value > 50 and bool(inputs["around"]))\n\n'
-        '@stage("toy.mean", memory=needed)',
-    ))  # fmt: skip
+    toy.edit(
+        "plug.py",
+        lambda text: text.replace(
+            '@stage("toy.mean")',
+            "def needed(params, inputs):\n"
+            '    return 2_000_000 * (inputs["own"].value > 50 and bool(inputs["around"]))\n\n'
+            '@stage("toy.mean", memory=needed)',
+        ),
+    )
     result = run_with(toy, SerialExecutor)
     refused = [failure for failure in result.failures if failure.stage == "mean"]
     assert all("declares 2 MB of memory, and 1 MB are free" in failure.cause for failure in refused)
@@ -353,19 +402,31 @@ def test_memory_may_depend_on_settings_and_inputs(toy: Toy, monkeypatch: pytest.
 
 
 def test_what_a_unit_prints_is_kept_whoever_prints_it(toy: Toy) -> None:
-    toy.edit("plug.py", lambda text: text.replace('    """Multiply."""', '''    """Multiply."""
+    toy.edit(
+        "plug.py",
+        lambda text: text.replace(
+            '    """Multiply."""',
+            '''    """Multiply."""
     import ctypes, logging, sys
     print("from Python")
     sys.stderr.write("to the error stream\\n")
     logging.getLogger("toy").info("from logging")
     os.write(2, b"from a descriptor\\n")
-    ctypes.CDLL(None).puts(b"from C")'''))  # fmt: skip
+    ctypes.CDLL(None).puts(b"from C")''',
+        ),
+    )
     for name, make in {"serial": SerialExecutor, "processes": two_processes}.items():
         assert run_with(toy, make, name=name).exit_code == 0
         text = (toy.folder / f"out-{name}" / "logs" / "scaled" / "3.txt.log").read_text()
-        assert sorted(text.splitlines()) == sorted([
-            "from Python", "to the error stream", "INFO toy: from logging", "from a descriptor", "from C",
-        ])  # fmt: skip
+        assert sorted(text.splitlines()) == sorted(
+            [
+                "from Python",
+                "to the error stream",
+                "INFO toy: from logging",
+                "from a descriptor",
+                "from C",
+            ]
+        )
     assert not list((toy.folder / "cache-processes" / "tmp").iterdir()), "nothing is left in the store"
 
 
@@ -425,9 +486,15 @@ def test_executors_are_chosen_by_name_and_contradictions_refused(
 
 def test_nothing_of_a_cancelled_run_goes_on(toy: Toy) -> None:
     """An error in the middle ends the units in flight and the processes."""
-    toy.edit("plug.py", lambda text: text.replace('    """Multiply."""', '''    """Multiply."""
+    toy.edit(
+        "plug.py",
+        lambda text: text.replace(
+            '    """Multiply."""',
+            '''    """Multiply."""
     if x.value == 10: raise ValueError("stop here")
-    time.sleep(600)'''))  # fmt: skip
+    time.sleep(600)''',
+        ),
+    )
     before = threading.active_count()
     started = time.monotonic()
     assert run_with(toy, two_processes, "scaled.on_error=stop").exit_code == RunStoppedError.exit_code

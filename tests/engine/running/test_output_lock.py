@@ -51,11 +51,14 @@ def test_a_second_run_is_refused_and_the_lock_goes_with_the_first(tmp_path: Path
 
 
 @ON_POSIX
-@pytest.mark.parametrize("change", [
-    lambda owner: owner | {"process": ended_process()},
-    lambda owner: owner | {"process_started": "1"},  # the number belongs to another process by now
-    lambda owner: owner | {"place": "x", "boot": "before", "machine": "m"},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda owner: owner | {"process": ended_process()},
+        lambda owner: owner | {"process_started": "1"},  # the number belongs to another process by now
+        lambda owner: owner | {"place": "x", "boot": "before", "machine": "m"},
+    ],
+)
 def test_the_lock_of_a_process_that_is_gone_is_taken_over(
     tmp_path: Path, change: Change, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -66,11 +69,14 @@ def test_the_lock_of_a_process_that_is_gone_is_taken_over(
     assert not path.exists()
 
 
-@pytest.mark.parametrize("change", [
-    lambda owner: owner | {"place": "x", "host": "another", "boot": "x"},
-    lambda owner: owner | {"place": "x"},  # another container of this host
-    lambda owner: owner | {"place": "x", "boot": "x", "machine": ""},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda owner: owner | {"place": "x", "host": "another", "boot": "x"},
+        lambda owner: owner | {"place": "x"},  # another container of this host
+        lambda owner: owner | {"place": "x", "boot": "x", "machine": ""},
+    ],
+)
 def test_the_lock_of_another_host_is_left_to_the_user(tmp_path: Path, change: Change) -> None:
     path = left_behind(tmp_path, change)
     before = path.read_bytes()

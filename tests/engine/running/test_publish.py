@@ -26,10 +26,15 @@ def test_item_is_the_name_without_extension_and_name_all_of_it(tmp_path: Path) -
         path.write_text(name)
         publisher.publish("toy", name, store.put_value(Files({"short/{item}.txt": path, "long/{name}.txt": path})))
     assert {path: (tmp_path / "out" / path).read_text() for path in publisher.written} == {
-        "short/a/1.txt": "a/1.jpg", "long/a/1.jpg.txt": "a/1.jpg",
-        "short/2.jpg.txt": "2.jpg", "long/2.jpg.txt": "2.jpg", "short/2.png.txt": "2.png", "long/2.png.txt": "2.png",
-        "short/b/{name}.txt": "b/{name}.png", "long/b/{name}.png.txt": "b/{name}.png",
-    }  # fmt: skip
+        "short/a/1.txt": "a/1.jpg",
+        "long/a/1.jpg.txt": "a/1.jpg",
+        "short/2.jpg.txt": "2.jpg",
+        "long/2.jpg.txt": "2.jpg",
+        "short/2.png.txt": "2.png",
+        "long/2.png.txt": "2.png",
+        "short/b/{name}.txt": "b/{name}.png",
+        "long/b/{name}.png.txt": "b/{name}.png",
+    }
 
 
 def test_folders_that_stale_files_leave_empty_go_with_them(tmp_path: Path) -> None:
@@ -175,8 +180,19 @@ def test_an_image_and_a_folder_of_images_called_alike_do_not_clash(tmp_path: Pat
     }
 
 
-@pytest.mark.parametrize("target", ["run.json", "Report.HTML", "logs/{item}.txt", "{item}", ".pano-mvs-output",
-                                    "sub/.pano-mvs-output", ".tmp-1-2-x", "run.json/x"])  # fmt: skip
+@pytest.mark.parametrize(
+    "target",
+    [
+        "run.json",
+        "Report.HTML",
+        "logs/{item}.txt",
+        "{item}",
+        ".pano-mvs-output",
+        "sub/.pano-mvs-output",
+        ".tmp-1-2-x",
+        "run.json/x",
+    ],
+)
 def test_what_is_the_runs_own_is_not_delivered(tmp_path: Path, target: str) -> None:
     store = Store(tmp_path / "cache")
     publisher = Publisher(tmp_path / "out", store)

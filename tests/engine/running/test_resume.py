@@ -16,10 +16,25 @@ EXEMPT = {"run.json", "report.html"}
 
 
 def start(toy: Toy, *, sleep_s: float = 0.0) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "pano_mvs", "run", str(toy.folder / "wf.yaml"),
-               "--cache", str(toy.folder / "cache"), "--out", str(toy.folder / "out")]  # fmt: skip
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-                            env=os.environ | {"TOY_SLEEP_S": str(sleep_s)}, preexec_fn=heed_interrupts)  # fmt: skip
+    command = [
+        sys.executable,
+        "-m",
+        "pano_mvs",
+        "run",
+        str(toy.folder / "wf.yaml"),
+        "--cache",
+        str(toy.folder / "cache"),
+        "--out",
+        str(toy.folder / "out"),
+    ]
+    return subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=os.environ | {"TOY_SLEEP_S": str(sleep_s)},
+        preexec_fn=heed_interrupts,
+    )
 
 
 def finished_records(toy: Toy) -> int:

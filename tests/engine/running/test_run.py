@@ -11,8 +11,16 @@ from pano_mvs.engine.stages.registry import Registry
 from tests.engine.conftest import Toy, ran
 
 ALL_UNITS = {
-    "images": 5, "scaled": 5, "pairs": 1, "difference": 4, "shifted": 1, "views": 1, "mean": 5, "each": 5, "all": 1,
-}  # fmt: skip
+    "images": 5,
+    "scaled": 5,
+    "pairs": 1,
+    "difference": 4,
+    "shifted": 1,
+    "views": 1,
+    "mean": 5,
+    "each": 5,
+    "all": 1,
+}
 
 
 def test_first_run_computes_every_unit_and_the_second_none(toy: Toy) -> None:
@@ -65,8 +73,16 @@ def test_adding_an_item_runs_its_units_and_those_beside_it(toy: Toy) -> None:
     toy.number("6.txt", "60")
     counts = ran(toy.run())
     assert counts == {
-        "images": 1, "scaled": 1, "pairs": 1, "difference": 1, "shifted": 1, "views": 1, "mean": 2, "each": 2, "all": 1,
-    }  # fmt: skip
+        "images": 1,
+        "scaled": 1,
+        "pairs": 1,
+        "difference": 1,
+        "shifted": 1,
+        "views": 1,
+        "mean": 2,
+        "each": 2,
+        "all": 1,
+    }
 
 
 def test_moving_and_renaming_recomputes_only_what_sees_names(toy: Toy) -> None:
@@ -196,8 +212,12 @@ def test_a_stage_that_gives_all_items_one_file_costs_all_but_the_first(toy: Toy)
 
 def test_a_unit_that_delivers_what_is_the_runs_own_fails_and_nothing_else(toy: Toy) -> None:
     """A stage's file named run.json was written, and lost when the run wrote its own."""
-    toy.edit("plug.py", lambda text: text.replace('"mean/{item}.txt": path', '"Run.json" if mean.value > 130 else '
-                                                  '"mean/{item}.txt": path'))  # fmt: skip
+    toy.edit(
+        "plug.py",
+        lambda text: text.replace(
+            '"mean/{item}.txt": path', '"Run.json" if mean.value > 130 else "mean/{item}.txt": path'
+        ),
+    )
     for _ in range(2):  # computed, and found in the cache
         result = toy.run()
         assert result.exit_code == 3

@@ -137,8 +137,12 @@ def test_a_unit_that_fails_costs_what_needs_it_and_is_listed_with_its_reason(toy
     assert result.exit_code == 3
     failure = next(one for one in result.failures if one.stage == "scaled")
     assert (failure.item, failure.cause, failure.trace, failure.log, failure.said) == (
-        "3.txt", "too dark", "line 1", "", (),
-    )  # fmt: skip
+        "3.txt",
+        "too dark",
+        "line 1",
+        "",
+        (),
+    )
     assert "scaled" in failure.consequence or "3.txt" in failure.consequence
     assert summary(result)["scaled"] == (4, 0, 1, 0)
     assert "mean/3.txt" not in result.published

@@ -98,7 +98,7 @@ BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
         ("pano_mvs: 1\nextends: /dev/zero\nstages: {a: {use: pairs.exhaustive}}", "is not a regular file"),
         ("pano_mvs: 1\nextends: " + "a" * 5000, "extends: there is no file"),
     ],
-)  # fmt: skip
+)
 def test_hostile_texts(text: str, what: str) -> None:
     found = refusals(text)
     assert any(what in line for line in found), found
@@ -140,9 +140,31 @@ def test_large_texts_are_refused_in_time(text: str) -> None:
 
 @pytest.mark.parametrize(
     "to",
-    ["..", "../up", "a/../../b", "/abs", "\\\\host\\share", "a\\..\\b", "C:/x", "c:x", "nul", "a/CON.txt", "a/lpt1",
-     "a\0b", "a\nb", "what?", "a|b", "a.", "a /b", "x" * 300, "logs", "LOGS/x", "run.json", "./report.html"],
-)  # fmt: skip
+    [
+        "..",
+        "../up",
+        "a/../../b",
+        "/abs",
+        "\\\\host\\share",
+        "a\\..\\b",
+        "C:/x",
+        "c:x",
+        "nul",
+        "a/CON.txt",
+        "a/lpt1",
+        "a\0b",
+        "a\nb",
+        "what?",
+        "a|b",
+        "a.",
+        "a /b",
+        "x" * 300,
+        "logs",
+        "LOGS/x",
+        "run.json",
+        "./report.html",
+    ],
+)
 def test_folders_that_lead_outside_or_do_not_exist_everywhere(to: str) -> None:
     assert folder_problem(to)
 
@@ -274,5 +296,11 @@ def test_items_and_links_do_not_lead_a_run_outside(toy: Toy, tmp_path: Path) -> 
     assert (out / "all.txt").is_file()
     assert not (out / "all.txt").is_symlink()
     assert sorted(path.name for path in tmp_path.iterdir() if path.name != "__pycache__") == [
-        "cache", "capture", "helper.py", "out", "outside", "plug.py", "wf.yaml",
-    ]  # fmt: skip
+        "cache",
+        "capture",
+        "helper.py",
+        "out",
+        "outside",
+        "plug.py",
+        "wf.yaml",
+    ]

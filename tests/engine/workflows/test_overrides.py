@@ -89,9 +89,17 @@ def test_values_of_every_form(settings: Path, override: str, key: str, value: ob
 
 def test_names_with_dots_later_ones_and_reserved_keys(settings: Path) -> None:
     found = load(
-        settings, "many.more.limit=1", "many.more.limit=2", "many.retries=null", "many.gate.points={max: 3}",
-        "many.to=draft", "many.on_error=stop", "many.min_success=0.5", "many.timeout_s=9", "many.memory=2GB",
-    ).stages  # fmt: skip
+        settings,
+        "many.more.limit=1",
+        "many.more.limit=2",
+        "many.retries=null",
+        "many.gate.points={max: 3}",
+        "many.to=draft",
+        "many.on_error=stop",
+        "many.min_success=0.5",
+        "many.timeout_s=9",
+        "many.memory=2GB",
+    ).stages
     assert found["many.more"].params.model_dump()["limit"] == 2
     policy = found["many"].policy
     assert (policy.retries, policy.to, policy.on_error, policy.min_success) == (0, "draft", "stop", 0.5)

@@ -105,9 +105,16 @@ def test_every_port_is_fed_and_every_stage_has_its_axis(toy: Toy) -> None:
         "all": {"differences": ("difference", False), "shifted": ("shifted", False)},
     }
     assert graph.axes == {
-        "images": Axis.IMAGE, "scaled": Axis.IMAGE, "pairs": Axis.ONE, "difference": Axis.PAIR, "shifted": Axis.ONE,
-        "views": Axis.ONE, "mean": Axis.VIEW, "each": Axis.VIEW, "all": Axis.ONE,
-    }  # fmt: skip
+        "images": Axis.IMAGE,
+        "scaled": Axis.IMAGE,
+        "pairs": Axis.ONE,
+        "difference": Axis.PAIR,
+        "shifted": Axis.ONE,
+        "views": Axis.ONE,
+        "mean": Axis.VIEW,
+        "each": Axis.VIEW,
+        "all": Axis.ONE,
+    }
     assert graph.order == tuple(graph.axes)
     assert (graph.only, graph.is_part) == ({}, False)
     edge = graph.edges["mean"]["around"]
@@ -163,8 +170,10 @@ def test_files_of_any_axis_feed_a_port_for_one(wired) -> None:  # type: ignore[n
 
 def test_the_nearest_of_several_is_taken_if_it_depends_on_the_others(wired) -> None:  # type: ignore[no-untyped-def]
     """Also where it depends on them through stages in between."""
-    graph = wired(SOURCE + "  a: {use: toy.scale}\n  h: {use: toy.shifted, in: {xs: a}}\n"
-                  "  b: {use: toy.scale, in: {x: h}}\n  c: {use: toy.total}\n")  # fmt: skip
+    graph = wired(
+        SOURCE + "  a: {use: toy.scale}\n  h: {use: toy.shifted, in: {xs: a}}\n"
+        "  b: {use: toy.scale, in: {x: h}}\n  c: {use: toy.total}\n"
+    )
     assert producers(graph, "c") == {"xs": ("b", False)}
 
 

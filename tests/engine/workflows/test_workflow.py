@@ -172,8 +172,17 @@ def test_workflow_that_is_not_there_suggests_a_preset(tmp_path: Path) -> None:
 
 def test_yaml_is_version_1_2() -> None:
     assert parse_yaml("[yes, no, on, 0o17, 0x1F, 1e3, ~, true, 012, 1:30]", "t").plain() == [
-        "yes", "no", "on", 15, 31, 1000.0, None, True, 12, "1:30",
-    ]  # fmt: skip
+        "yes",
+        "no",
+        "on",
+        15,
+        31,
+        1000.0,
+        None,
+        True,
+        12,
+        "1:30",
+    ]
 
 
 @given(st.text(max_size=200))

@@ -15,7 +15,7 @@ import pycolmap
 import pytest
 
 from pano_mvs.core.errors import InputError, UsageError
-from pano_mvs.io.colmap.model import read_colmap_model, write_colmap_model
+from pano_mvs.io.colmap.model_writer import read_colmap_model, write_colmap_model
 from pano_mvs.io.poses.files import read_poses
 from pano_mvs.scene import Poses
 from pano_mvs.testing.room import capture_poses
@@ -264,14 +264,14 @@ def test_a_pose_that_is_no_number_is_named_when_it_is_read(model_folder: Path, t
     [
         ("cameras", "1 EQUIRECTANGULAR 1024", "expected an id, a camera model"),
         ("cameras", "1 EQUIRECTANGULAR 1024 0 1024 0", "camera 1 has 1024×0 px"),
-        ("cameras", f"1 EQUIRECTANGULAR {'9' * 5000} 512", "is no number from 0"),
+        ("cameras", f"1 EQUIRECTANGULAR {'9' * 5000} 512", "is not a number from 0"),
         ("images", "1 1 0 0 0 0 0 0 9 a.jpg\n", "its camera 9 is not in cameras.txt"),
         ("images", "1 1 0 0 0 0 0 0 1 a.jpg\n1 2", "are not three numbers each"),
-        ("images", "1 1 0 0 0 0 0 0 1 a.jpg\nnan 2 1", "a key point without a finite place"),
+        ("images", "1 1 0 0 0 0 0 0 1 a.jpg\nnan 2 1", "a key point without a finite position"),
         ("images", "1 1 0 0 0 0 0 0 1 a.jpg\n1 2 7", "observes point 7"),
-        ("points3D", "1 0 0 0 0 0 0", "expected an id, a place"),
-        ("points3D", "1 0 0 nan 0 0 0 1", "point 1 has no finite place"),
-        ("points3D", "1 0 0 0 0 0 256 1", "is no number from 0 to 255"),
+        ("points3D", "1 0 0 0 0 0 0", "expected an id, a position"),
+        ("points3D", "1 0 0 nan 0 0 0 1", "point 1 has no finite position"),
+        ("points3D", "1 0 0 0 0 0 256 1", "is not a number from 0 to 255"),
         ("points3D", "1 0 0 0 0 0 0 1 8 0", "observed by image 8, which is not in the model"),
         ("points3D", "1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1", "point 1 is listed twice"),
     ],

@@ -80,7 +80,7 @@ def test_a_truncated_file_is_named(tmp_path: Path, keep: int) -> None:
     ("line", "what"),
     [
         ("1 1 0 0 0 0 0 0 1", "expected an id, a quaternion"),
-        ("1 0 0 0 0 1 2 3 1 a.jpg", "its quaternion is no rotation"),
+        ("1 0 0 0 0 1 2 3 1 a.jpg", "its quaternion is not a rotation"),
         ("1 1 0 0 0 nan 2 3 1 a.jpg", "NaN or infinite"),
         ("1 one 0 0 0 1 2 3 1 a.jpg", "could not convert"),
         ("", "holds no poses"),

@@ -114,8 +114,9 @@ def test_headers_are_read_without_decoding(tmp_path: Path, monkeypatch: pytest.M
     write_jpeg(tmp_path / "a.jpg", (32, 64))
     write_jpeg(tmp_path / "b.jpg", (32, 64), progressive=True)
     write_png(tmp_path / "c.png", (32, 64))
-    for number, data in enumerate([*sound_files((32, 64), b""), by_pillow((32, 64), "WEBP"),
-                                   by_pillow((32, 64), "WEBP", lossless=True)]):  # fmt: skip
+    for number, data in enumerate(
+        [*sound_files((32, 64), b""), by_pillow((32, 64), "WEBP"), by_pillow((32, 64), "WEBP", lossless=True)]
+    ):
         (tmp_path / f"{number}.webp").write_bytes(data)
     for path in tmp_path.iterdir():
         assert describe_picture(path).size_hw == (32, 64), path
@@ -154,9 +155,11 @@ def test_a_thumbnail_within_the_metadata_is_not_the_picture(tmp_path: Path) -> N
 
 def test_a_cropped_panorama_is_placed_on_its_sphere(tmp_path: Path) -> None:
     fields = full_sphere(40, 80) | {
-        "CroppedAreaImageWidthPixels": 60, "CroppedAreaImageHeightPixels": 30,
-        "CroppedAreaLeftPixels": 10, "CroppedAreaTopPixels": 7,
-    }  # fmt: skip
+        "CroppedAreaImageWidthPixels": 60,
+        "CroppedAreaImageHeightPixels": 30,
+        "CroppedAreaLeftPixels": 10,
+        "CroppedAreaTopPixels": 7,
+    }
     path = write_png(tmp_path / "a.png", (30, 60), xmp(fields))
     info = describe_picture(path)
     assert (info.size_hw, info.crop_ltwh, info.warnings) == ((40, 80), (10, 7, 60, 30), ())
@@ -168,9 +171,11 @@ def test_a_cropped_panorama_is_placed_on_its_sphere(tmp_path: Path) -> None:
 
 def test_a_panorama_made_smaller_keeps_its_place(tmp_path: Path) -> None:
     fields = full_sphere(400, 800) | {
-        "CroppedAreaImageWidthPixels": 600, "CroppedAreaImageHeightPixels": 300,
-        "CroppedAreaLeftPixels": 100, "CroppedAreaTopPixels": 70,
-    }  # fmt: skip
+        "CroppedAreaImageWidthPixels": 600,
+        "CroppedAreaImageHeightPixels": 300,
+        "CroppedAreaLeftPixels": 100,
+        "CroppedAreaTopPixels": 70,
+    }
     info = describe_picture(write_png(tmp_path / "a.png", (30, 60), xmp(fields)))
     assert (info.size_hw, info.crop_ltwh, info.full_width_px) == ((400, 800), (100, 70, 600, 300), 80)
     assert "resized from 600×300 to 60×30 px" in info.warnings[0]

@@ -29,9 +29,14 @@ def test_south_west_and_below_the_sea_are_negative() -> None:
 
 
 @pytest.mark.parametrize(
-    "change", [{"latitude": ((0, 0), (0, 0), (0, 0))}, {"latitude": ((91, 1), (0, 1), (0, 1))},
-               {"longitude": ((181, 1), (0, 1), (0, 1))}, {"altitude": (0, 0)}]
-)  # fmt: skip
+    "change",
+    [
+        {"latitude": ((0, 0), (0, 0), (0, 0))},
+        {"latitude": ((91, 1), (0, 1), (0, 1))},
+        {"longitude": ((181, 1), (0, 1), (0, 1))},
+        {"altitude": (0, 0)},
+    ],
+)
 def test_what_is_no_position_is_none(change: dict[str, Any]) -> None:
     assert position_from_exif(exif(**change)) is None
 

@@ -16,7 +16,8 @@ from pano_mvs.algorithms.sweep.numba.kernels_combine import combine_row
 from pano_mvs.algorithms.sweep.numba.kernels_lookup import sample_row, vote_row
 from pano_mvs.algorithms.sweep.numba.kernels_records import F32, I64, Guide, Lookup, Sweep
 from pano_mvs.algorithms.sweep.numba.kernels_source_cost import silence, source_cost, store_row
-from pano_mvs.algorithms.sweep.numba.kernels_warp import azimuth_of, dip_of, place_row
+from pano_mvs.algorithms.sweep.numba.kernels_warp import place_row
+from pano_mvs.geometry.kernels_sphere import fast_azimuth, fast_dip
 
 _F = np.float32
 _U = np.uint64
@@ -71,8 +72,8 @@ def project_guided_row(
         x = m00 * s + m01 * c + o0 + t0 * nearness
         y = m10 * s + m11 * c + o1 + t1 * nearness
         z = m20 * s + m21 * c + o2 + t2 * nearness
-        x_px[i] = azimuth_of(x, z) * x_scale + x_middle
-        y_px[i] = dip_of(x, y, z) * y_scale + y_middle
+        x_px[i] = fast_azimuth(x, z) * x_scale + x_middle
+        y_px[i] = fast_dip(y, np.sqrt(x * x + z * z)) * y_scale + y_middle
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

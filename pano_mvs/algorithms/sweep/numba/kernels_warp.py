@@ -14,51 +14,14 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.numba.kernels_records import F32, I32, I64, U8, U32
+from pano_mvs.geometry.kernels_sphere import fast_azimuth, fast_dip
 
 _F = np.float32
 _U = np.uint64
-_HALF_PI, _PI = _F(np.pi / 2), _F(np.pi)
-_HALF, _TINY = _F(0.5), _F(1e-30)
-# Abramowitz and Stegun, Handbook of Mathematical Functions, 4.4.49: |error| ≤ 2e-8 on [0, 1].
-_A2, _A4, _A6, _A8 = _F(-0.3333314528), _F(0.1999355085), _F(-0.1420889944), _F(0.1065626393)
-_A10, _A12, _A14, _A16 = _F(-0.0752896400), _F(0.0429096138), _F(-0.0161657367), _F(0.0028662257)
-_ONE = _F(1)
-
+_HALF = _F(0.5)
 # Weights in integers, see `blend_row`.
 UNIT, HALFWAY_SHIFT, SHIFT = 16384, 6, 22
 HALFWAY_ROUND, ROUND = 1 << (HALFWAY_SHIFT - 1), 1 << (SHIFT - 1)
-
-
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
-def _atan_unit(a: np.float32) -> np.float32:
-    """Return atan of a number in [0, 1], float32."""
-    s = a * a
-    tail = _A8 + s * (_A10 + s * (_A12 + s * (_A14 + s * _A16)))
-    return a * (_ONE + s * (_A2 + s * (_A4 + s * (_A6 + s * tail))))
-
-
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
-def azimuth_of(x: np.float32, z: np.float32) -> np.float32:
-    """Return atan2(x, z), float32."""
-    ax, az = abs(x), abs(z)
-    small = ax if ax < az else az
-    large = az if ax < az else ax
-    turn: np.float32 = _atan_unit(small / (large + _TINY))
-    turn = _HALF_PI - turn if ax > az else turn
-    turn = _PI - turn if z < _F(0) else turn
-    return -turn if x < _F(0) else turn
-
-
-@njit(cache=True, error_model="numpy", nogil=True, inline="always")
-def dip_of(x: np.float32, y: np.float32, z: np.float32) -> np.float32:
-    """Return atan2(y, hypot(x, z)), the angle below the horizon, float32."""
-    ay = abs(y)
-    level = np.sqrt(x * x + z * z)
-    small = ay if ay < level else level
-    large = level if ay < level else ay
-    dip: np.float32 = _atan_unit(small / (large + _TINY))
-    dip = _HALF_PI - dip if ay > level else dip
-    return -dip if y < _F(0) else dip
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -87,8 +50,8 @@ def project_row(
         x = m00 * s + m01 * c + o0
         y = m10 * s + m11 * c + o1
         z = m20 * s + m21 * c + o2
-        x_px[i] = azimuth_of(x, z) * x_scale + x_middle
-        y_px[i] = dip_of(x, y, z) * y_scale + y_middle
+        x_px[i] = fast_azimuth(x, z) * x_scale + x_middle
+        y_px[i] = fast_dip(y, np.sqrt(x * x + z * z)) * y_scale + y_middle
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

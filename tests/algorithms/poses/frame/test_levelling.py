@@ -69,9 +69,12 @@ def test_agreeing_headings_turn_z_north(north_deg: float) -> None:
 
 @pytest.mark.parametrize(
     ("headings", "words"),
-    [({"0.jpg": 0.0, "1.jpg": 0.0, "2.jpg": 0.0}, "z close to"), ({"0.jpg": 12.0}, "z close to"),
-     ({f"{n}.jpg": 60.0 * n * n for n in range(6)}, "the compass headings disagree by")],
-)  # fmt: skip
+    [
+        ({"0.jpg": 0.0, "1.jpg": 0.0, "2.jpg": 0.0}, "z close to"),
+        ({"0.jpg": 12.0}, "z close to"),
+        ({f"{n}.jpg": 60.0 * n * n for n in range(6)}, "the compass headings disagree by"),
+    ],
+)
 def test_headings_that_say_nothing_turn_nothing(headings: dict[str, float], words: str) -> None:
     poses = room_poses(3, cameras=6, points=1)
     readings = sensed(poses, np.random.default_rng(0), 0.0)

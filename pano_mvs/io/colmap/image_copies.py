@@ -1,4 +1,4 @@
-"""Pictures and masks beside a COLMAP model, in the size of its cameras."""
+"""Images and masks of a COLMAP model at the size of its cameras."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _WRITABLE = (".bmp", ".tif", ".tiff", ".webp")
 
 
 def write_picture(path: Path, picture: NDArray[np.uint8], size_hw: tuple[int, int] | None = None) -> None:
-    """Write a picture (H, W, 3) uint8 RGB in the format of the path's suffix; JPEG (quality 95) if we write no such.
+    """Write an image (H, W, 3) uint8 RGB in the format of the path's suffix; other formats become JPEG (quality 95).
 
     Args:
         path: the file.
-        picture: the picture.
-        size_hw: (height, width) that it is enlarged or reduced to; None: it stays as it is.
+        picture: the image.
+        size_hw: (height, width) to which the image is resized; by default its own size.
     """
     if size_hw is not None and picture.shape[:2] != size_hw:
         enlarged = size_hw[1] > picture.shape[1]
@@ -35,7 +35,7 @@ def write_picture(path: Path, picture: NDArray[np.uint8], size_hw: tuple[int, in
 
 
 def resized_mask(mask: NDArray[np.bool_], size_hw: tuple[int, int]) -> NDArray[np.bool_]:
-    """Return a mask (H, W) in another size: what the pixel says in which each new pixel's centre lies."""
+    """Return a mask (H, W) resized with nearest-neighbour sampling at the centres of the new pixels."""
     rows, columns = (
         np.minimum(((np.arange(new) + 0.5) * old / new).astype(np.intp), old - 1)
         for new, old in zip(size_hw, mask.shape, strict=True)

@@ -1,8 +1,8 @@
-"""The files of a COLMAP sparse model, read into arrays: cameras, images and points3D, as .bin or as .txt.
+"""Read the files of a COLMAP sparse model into arrays: cameras, images and points3D, as .bin or as .txt.
 
-Numbers of entries are believed only as far as the files reach, and what the files say of one another is checked, so
-that a damaged model is named with its file and its entry. (pycolmap allocates what a file promises, and ends the
-process where cameras lack parameters.) Formats: COLMAP's documentation, "Output Format".
+Counts and references in the files are checked, and errors name the file and the entry. (pycolmap allocates as many
+entries as a file states, and aborts the process if a camera lacks parameters.) Formats: COLMAP's documentation,
+"Output Format".
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz
 from pano_mvs.io.poses.json_files import rigid_from_arrays
 
 MODEL_FILES = (("cameras.bin", "images.bin", "points3D.bin"), ("cameras.txt", "images.txt", "points3D.txt"))
-"""What files a model has; COLMAP prefers the first of the two forms."""
+"""The files of a model in its two forms, of which COLMAP prefers the first."""
 
 CAMERA_MODELS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
     *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
     *("SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM", "EQUIRECTANGULAR"),
 )
-"""COLMAP's camera models, in the order of their numbers."""
+"""COLMAP's camera models in the order of their numbers."""
 
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")
@@ -60,12 +60,12 @@ class ModelImage:
 
     Attributes:
         name: of the file, relative to the folder of the images.
-        quat_wxyz: rotation of cam_from_world as the file has it, (4,).
+        quat_wxyz: rotation of cam_from_world as stored, (4,).
         translation: of cam_from_world, (3,).
         camera_id: of its camera.
         pixels: (n, 2), its key points.
-        point_ids: (n,), the point that each observes; negative: none.
-        where: the file and the image, for messages.
+        point_ids: (n,), the point that each key point observes; negative without one.
+        where: the file and the image, for error messages.
     """
 
     name: str
@@ -80,12 +80,12 @@ class ModelImage:
         """Return the pose.
 
         Raises:
-            InputError: if its numbers are not finite, or its quaternion is no rotation.
+            InputError: if a number is not finite, or the quaternion is not a rotation.
         """
         if not (np.isfinite(self.quat_wxyz).all() and np.isfinite(self.translation).all()):
             raise InputError(f"{self.where}: the pose holds NaN or infinite numbers")
         if not 1e-6 < np.abs(self.quat_wxyz).max() < 1e100:
-            raise InputError(f"{self.where}: its quaternion is no rotation")
+            raise InputError(f"{self.where}: its quaternion is not a rotation")
         return rigid_from_arrays(rotation_from_quat_wxyz(self.quat_wxyz), self.translation, self.where)
 
 
@@ -97,9 +97,9 @@ class ModelPoints3D:
         ids: (N,), increasing.
         xyz: (N, 3).
         rgb: (N, 3) uint8.
-        errors_px: (N,), mean error of reprojection; COLMAP has −1 where it is not known.
-        track_lengths: (N,), how many observations each has.
-        track_image_ids: the images of these observations, point after point.
+        errors_px: (N,), mean reprojection errors; −1 if unknown.
+        track_lengths: (N,), number of observations.
+        track_image_ids: the images of all observations, ordered by point.
     """
 
     ids: NDArray[np.int64]
@@ -111,7 +111,7 @@ class ModelPoints3D:
 
 
 def model_files(folder: Path) -> tuple[Path, Path, Path] | None:
-    """Return the files with cameras, images and points of the model in a folder; None if there is none."""
+    """Return the files with cameras, images and points in a folder, or None if it does not contain a model."""
     for names in MODEL_FILES:
         cameras, images, points = (folder / name for name in names)
         if all(is_file(path) for path in (cameras, images, points)):
@@ -120,7 +120,7 @@ def model_files(folder: Path) -> tuple[Path, Path, Path] | None:
 
 
 def read_cameras(path: Path) -> dict[int, ModelCamera]:
-    """Return the cameras by id, up to and including the first that is no EQUIRECTANGULAR.
+    """Return the cameras by id, up to and including the first that is not EQUIRECTANGULAR.
 
     Raises:
         InputError: if the file cannot be read, or ends early.
@@ -159,13 +159,13 @@ def read_points(path: Path) -> ModelPoints3D:
     """Return the points.
 
     Raises:
-        InputError: if the file cannot be read, or ends early, or if a point has no finite place or is listed twice.
+        InputError: if the file cannot be read or ends early, or a point has no finite position or is listed twice.
     """
     with _damage_named(path):
         rows, lengths, tracks = _binary_points(path) if path.suffix == ".bin" else _text_points(path)
         lost = ~np.isfinite(rows["xyz"]).all(axis=1)
         if lost.any():
-            raise ValueError(f"point {rows['id'][lost][0]} has no finite place")
+            raise ValueError(f"point {rows['id'][lost][0]} has no finite position")
         order = np.argsort(rows["id"], kind="stable")
         ids = rows["id"][order]
         if (ids[1:] == ids[:-1]).any():
@@ -185,7 +185,7 @@ def read_points(path: Path) -> ModelPoints3D:
 
 @contextmanager
 def _damage_named(path: Path) -> Iterator[None]:
-    """Turn what damaged files lead to into errors that name the file."""
+    """Convert errors that damaged files cause to errors that name the file."""
     try:
         yield
     except OSError as error:
@@ -198,7 +198,7 @@ def _damage_named(path: Path) -> Iterator[None]:
 
 
 def _entries(data: bytes, min_bytes: int) -> int:
-    """Return the number of entries that a binary file states, after checking that it is long enough for them."""
+    """Return the number of entries that a binary file states; the file must be long enough for them."""
     (count,) = _COUNT.unpack_from(data)
     if count * min_bytes > len(data) - _COUNT.size:
         raise ValueError(f"it states {count} entries, but has {len(data)} bytes")
@@ -240,11 +240,14 @@ def _binary_images(path: Path) -> Iterator[tuple[int, ModelImage]]:
         if offset > len(data):
             raise ValueError(f"it ends within image {name[:80]!r}")
         rows = np.frombuffer(data, _POINT2D, points, start)
-        yield image_id, _image(name, np.array(numbers), camera_id, rows["xy"], rows["point_id"], path)
+        yield (
+            image_id,
+            _image(path, name, np.array(numbers), camera_id=camera_id, pixels=rows["xy"], point_ids=rows["point_id"]),
+        )
 
 
 def _text_images(path: Path) -> Iterator[tuple[int, ModelImage]]:
-    """Yield the images of an images.txt: two lines for each, the second its key points, which may be empty."""
+    """Yield the images of an images.txt, which has two lines per image; the second, its key points, may be empty."""
     with path.open(encoding="utf-8") as stream:
         for line in stream:
             cells = line.split(maxsplit=9)
@@ -261,24 +264,28 @@ def _text_images(path: Path) -> Iterator[tuple[int, ModelImage]]:
             rows = values.reshape(-1, 3)
             ids = np.where(np.abs(rows[:, 2]) < 2**53, rows[:, 2], -1).astype(np.int64)
             numbers = np.array([float(cell) for cell in cells[1:8]])
-            yield _number(cells[0]), _image(name, numbers, _number(cells[8]), rows[:, :2], ids, path)
+            yield (
+                _number(cells[0]),
+                _image(path, name, numbers, camera_id=_number(cells[8]), pixels=rows[:, :2], point_ids=ids),
+            )
 
 
 def _image(
+    path: Path,
     name: str,
     numbers: NDArray[np.float64],
+    *,
     camera_id: int,
     pixels: NDArray[np.float64],
     point_ids: NDArray[np.int64],
-    path: Path,
 ) -> ModelImage:
     if not np.isfinite(pixels[point_ids >= 0]).all():
-        raise ValueError(f"image {name[:80]!r} has a key point without a finite place")
+        raise ValueError(f"image {name[:80]!r} has a key point without a finite position")
     return ModelImage(name, numbers[:4], numbers[4:], camera_id, pixels, point_ids, f"{path} ({name})")
 
 
 def _binary_points(path: Path) -> tuple[NDArray[np.void], NDArray[np.int64], NDArray[np.uint32]]:
-    """Return the points without their tracks, the lengths of these, and the ids of the images in them."""
+    """Return the points without tracks, the lengths of the tracks, and the image ids in the tracks."""
     data = path.read_bytes()
     fixed = _POINT3D.itemsize + _COUNT.size
     rows: list[bytes] = []
@@ -303,7 +310,7 @@ def _text_points(path: Path) -> tuple[NDArray[np.void], NDArray[np.int64], NDArr
     for line in _lines(path):
         cells = line.split()
         if len(cells) < 8 or len(cells) % 2:
-            raise ValueError(f"expected an id, a place, a colour, an error and a track, got {line[:80]!r}")
+            raise ValueError(f"expected an id, a position, a colour, an error and a track, got {line[:80]!r}")
         rgb = [_number(cell, below=256) for cell in cells[4:7]]
         rows.append((_number(cells[0], below=1 << 63), [float(cell) for cell in cells[1:4]], rgb, float(cells[7])))
         image_ids.extend(_number(cell) for cell in cells[8::2])
@@ -313,7 +320,7 @@ def _text_points(path: Path) -> tuple[NDArray[np.void], NDArray[np.int64], NDArr
 
 
 def _lines(path: Path) -> Iterator[str]:
-    """Yield the lines of a text file that hold something but comments."""
+    """Yield the lines of a text file except comments and empty lines."""
     with path.open(encoding="utf-8") as stream:
         for line in stream:
             if line.strip() and not line.startswith("#"):
@@ -321,11 +328,11 @@ def _lines(path: Path) -> Iterator[str]:
 
 
 def _number(text: str, *, below: int = 1 << 32) -> int:
-    """Return a whole number in a text.
+    """Return an integer from text.
 
     Raises:
-        ValueError: if it is none, or negative or not below a limit.
+        ValueError: if it is not an integer from 0 to below the limit.
     """
     if not 0 < len(text) <= 20 or not 0 <= int(text) < below:
-        raise ValueError(f"{text[:40]!r} is no number from 0 to {below - 1}")
+        raise ValueError(f"{text[:40]!r} is not a number from 0 to {below - 1}")
     return int(text)

@@ -1,4 +1,4 @@
-"""COLMAP sparse models with EQUIRECTANGULAR cameras: written through pycolmap, read by `colmap_files`."""
+"""COLMAP sparse models with EQUIRECTANGULAR cameras: written through pycolmap, read by `model_reader`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.geometry import Rigid3, pixel_from_ray, ray_from_pixel
-from pano_mvs.io.colmap.files import (
+from pano_mvs.io.colmap.model_reader import (
     ModelCamera,
     ModelImage,
     ModelPoints3D,
@@ -35,17 +35,17 @@ def write_colmap_model(
 ) -> None:
     """Write poses, tracks and points as one COLMAP model: cameras, images, points3D, rigs and frames.
 
-    One EQUIRECTANGULAR camera for each distinct picture size, each its own trivial rig; the key points of an image
-    are its track observations, in pixels of the size given. The same poses give the same bytes.
+    Each distinct image size has one EQUIRECTANGULAR camera in a trivial rig. The key points of an image are its track
+    observations, in pixels of the given size. The same poses give the same bytes.
 
     Args:
-        folder: where the files go; made if it is not there.
-        poses: what to write. Errors become pixels at the equator (w / 2π per radian).
-        sizes_hw: (height, width) of each picture, by the name of the image.
-        form: "bin" (COLMAP's usual), "txt", or "both"; COLMAP reads the binary files if it finds both.
+        folder: the folder of the files, which is created if necessary.
+        poses: the poses. Errors are converted to pixels at the equator (w / 2π per radian).
+        sizes_hw: (height, width) of each image by name.
+        form: "bin" (COLMAP's default), "txt", or "both", of which COLMAP reads the binary files.
 
     Raises:
-        UsageError: if the size of an image is not given.
+        UsageError: if the size of an image is missing.
     """
     import pycolmap
 
@@ -71,13 +71,13 @@ def write_colmap_model(
 def read_colmap_model(folder: Path) -> Poses:
     """Return the registered images, points and tracks of a COLMAP model of panoramas, in its own world and unit.
 
-    Of SphereSfM's models, whose cameras are SPHERE, the poses alone are read.
+    From SphereSfM's models, whose cameras are SPHERE, only the poses are read.
 
     Args:
-        folder: holds cameras, images and points3D as .bin or .txt; images come in the natural order of their names.
+        folder: contains cameras, images and points3D as .bin or .txt. Images are sorted in the natural order of names.
 
     Raises:
-        InputError: if the model cannot be read, has a camera that is no EQUIRECTANGULAR, or registers no image.
+        InputError: if the model cannot be read, has a camera that is not EQUIRECTANGULAR, or registers no image.
     """
     if is_colmap_model(folder) and has_sphere_cameras(folder):
         return read_sphere_model(folder)
@@ -106,7 +106,7 @@ def read_colmap_model(folder: Path) -> Poses:
                 f"{image.where}: its camera {image.camera_id} is not in {files[0].name}. Do the files belong together?"
             )
     points = read_points(files[2])
-    tracks = [_observations(image, cameras[image.camera_id], points, files[2]) for image in images]
+    tracks = [_observations(image, cameras[image.camera_id], points, path=files[2]) for image in images]
     width_by_id = {image_id: cameras[image.camera_id].size_hw[1] for image_id, image in by_id.items()}
     return Poses(
         names=tuple(image.name for image in images),
@@ -138,7 +138,7 @@ def _add_cameras(model: Any, sizes_hw: list[tuple[int, int]]) -> dict[tuple[int,
     for height, width in sizes_hw:
         if (height, width) not in ids:
             ids[height, width] = len(ids) + 1
-            # Without its params an EQUIRECTANGULAR camera takes the process down when it is used.
+            # An EQUIRECTANGULAR camera without params aborts the process when it is used.
             camera = pycolmap.Camera(model="EQUIRECTANGULAR", width=width, height=height, params=[width, height])
             camera.camera_id = ids[height, width]
             model.add_camera_with_trivial_rig(camera)
@@ -148,17 +148,17 @@ def _add_cameras(model: Any, sizes_hw: list[tuple[int, int]]) -> dict[tuple[int,
 def _pose(image: ModelImage) -> Rigid3:
     pose = image.cam_from_world()
     if np.abs(image.quat_wxyz).max() > 2 or abs(np.linalg.norm(image.quat_wxyz) - 1) > _MAX_QUAT_ERROR:
-        raise InputError(f"{image.where}: its quaternion has not length 1. Write the model anew")
+        raise InputError(f"{image.where}: the length of its quaternion is not 1. Write the model again")
     return pose
 
 
 def _observations(
-    image: ModelImage, camera: ModelCamera, points: ModelPoints3D, path: Path
+    image: ModelImage, camera: ModelCamera, points: ModelPoints3D, *, path: Path
 ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """Return the points that an image observes, and the bearings of the observations.
 
     Raises:
-        InputError: if there is no such point.
+        InputError: if a point does not exist.
     """
     observed = image.point_ids >= 0
     ids = image.point_ids[observed]
@@ -173,10 +173,10 @@ def _observations(
 
 
 def _errors_rad(points: ModelPoints3D, width_by_id: Mapping[int, int], path: Path) -> NDArray[np.float32]:
-    """Return the errors of points as angles, by the mean width of the images that observe each; 0 where not known.
+    """Return the errors of points as angles, by the mean width of the images that observe each; 0 if unknown.
 
     Raises:
-        InputError: if a track names an image that there is not.
+        InputError: if an image of a track does not exist.
     """
     observers, which = np.unique(points.track_image_ids, return_inverse=True)
     unknown = next((image_id for image_id in observers.tolist() if image_id not in width_by_id), None)

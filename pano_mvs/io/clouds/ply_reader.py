@@ -115,21 +115,20 @@ def open_ply_points(path: Path) -> PlyPoints:
     try:
         with path.open("rb") as stream:
             head, mark, rest = stream.read(_MAX_HEADER_BYTES).partition(_MARK)
-        size = path.stat().st_size
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}). Check that it exists and may be read") from error
     if not mark:
         raise InputError(f"{path}: not a PLY file: it has no end_header line")
     layout = _layout(head.decode("ascii", "replace").splitlines(), path)
     offset = len(head) + len(mark) + rest.find(b"\n") + 1
-    vertices = _text_vertices(path, offset, layout) if layout.text else _binary_vertices(path, offset, size, layout)
+    vertices = _text_vertices(path, offset, layout) if layout.text else _binary_vertices(path, offset, layout)
     if vertices is None:
         raise InputError(f"{path}: its header states {layout.points} points, but it contains fewer. Write it again")
     return PlyPoints(path, layout.points, {"nx", "ny", "nz"} <= set(layout.vertex.names or ()), vertices)
 
 
-def _binary_vertices(path: Path, offset: int, size: int, layout: _Layout) -> NDArray[np.void] | None:
-    if size - offset < layout.points * layout.vertex.itemsize:
+def _binary_vertices(path: Path, offset: int, layout: _Layout) -> NDArray[np.void] | None:
+    if path.stat().st_size - offset < layout.points * layout.vertex.itemsize:
         return None
     if not layout.points:  # an empty array cannot be mapped
         return np.zeros(0, layout.vertex)
