@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import angle_between
 from pano_mvs.scene import Poses, Views
 from pano_mvs.scene.pose_groups import split_groups
@@ -23,7 +26,14 @@ _BEST_ANGLE_DEG = 12.0
 _SAME_PLACE = 1e-9
 
 
-def select_views(poses: Poses, *, count: int = 4, min_angle_deg: float = 1.0, max_angle_deg: float = 60.0) -> Views:
+@checks_settings
+def select_views(
+    poses: Poses,
+    *,
+    sources: Annotated[int, Setting("maximum number of source images per reference", ge=1)] = 4,
+    min_angle_deg: float = 1.0,
+    max_angle_deg: float = 60.0,
+) -> Views:
     """Select the source images of each registered image, best first.
 
     With tracks, a pair's score is the sum over the points that both see of a weight for the triangulation angle: 0
@@ -33,7 +43,7 @@ def select_views(poses: Poses, *, count: int = 4, min_angle_deg: float = 1.0, ma
 
     Args:
         poses: of all registered images, with or without points.
-        count: maximum number of sources of a reference.
+        sources: maximum number of sources of a reference.
         min_angle_deg: points seen under a smaller angle from the two centres are ignored.
         max_angle_deg: points seen under a larger angle are ignored.
 
@@ -42,16 +52,13 @@ def select_views(poses: Poses, *, count: int = 4, min_angle_deg: float = 1.0, ma
         broken by that order.
 
     Raises:
-        UsageError: if count is not positive or the angles do not form an interval.
+        UsageError: if sources is not positive or the angles do not form an interval.
     """
-    if count < 1 or not 0 <= min_angle_deg < max_angle_deg <= 180:
-        raise UsageError(
-            f"views need count ≥ 1 and 0 ≤ min_angle_deg < max_angle_deg ≤ 180, got {count}, "
-            f"{min_angle_deg} and {max_angle_deg}"
-        )
+    if not 0 <= min_angle_deg < max_angle_deg <= 180:
+        raise UsageError(f"views need 0 ≤ min_angle_deg < max_angle_deg ≤ 180, got {min_angle_deg} and {max_angle_deg}")
     found: dict[str, tuple[str, ...]] = {}
     for group in split_groups(poses):
-        found |= _neighbours(group, count=count, min_angle_deg=min_angle_deg, max_angle_deg=max_angle_deg)
+        found |= _neighbours(group, count=sources, min_angle_deg=min_angle_deg, max_angle_deg=max_angle_deg)
     return Views({name: found[name] for name in poses.names if name in found})
 
 

@@ -20,11 +20,11 @@ from pano_mvs.algorithms.sweep.winner import Winners
 from pano_mvs.algorithms.two_view.verification import verify_pair
 from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError, UsageError
 from pano_mvs.core.named_registry import NamedRegistry
-from pano_mvs.core.settings import setting
+from pano_mvs.core.settings import Setting, checks_settings, setting
 from pano_mvs.engine.stages.context import Context
 from pano_mvs.engine.stages.params import NOT_IN_KEY, InputPath, Params, RegisteredIn, SourcePath
 from pano_mvs.engine.stages.ports import All, Each, Names, Near, One
-from pano_mvs.engine.stages.settings import params_from, settings_from
+from pano_mvs.engine.stages.settings import arguments_from, params_from, settings_from
 from pano_mvs.engine.stages.stage import SourceItem, source, stage
 from pano_mvs.geometry import (
     Rigid3,
@@ -93,6 +93,7 @@ __all__ = [
     "Rigid3",
     "RunStoppedError",
     "Scores",
+    "Setting",
     "Similarity3",
     "SourceItem",
     "SourcePath",
@@ -101,6 +102,8 @@ __all__ = [
     "UsageError",
     "Views",
     "Winners",
+    "arguments_from",
+    "checks_settings",
     "chunks",
     "decode_image",
     "group_file",

@@ -1,4 +1,6 @@
-"""Settings of algorithms, each stated once: name, type, default, bounds and help are those of a dataclass's field.
+"""Settings of algorithms: name, type, default, bounds and help of each are stated once.
+
+They are fields of a dataclass:
 
 @dataclass(frozen=True)
 class SweepSettings:
@@ -7,18 +9,27 @@ class SweepSettings:
     def __post_init__(self) -> None:
         check_settings(self)
 
-`engine.stages.settings.params_from` makes the parameters of a stage from them.
+or keyword-only parameters of a function:
+
+@checks_settings
+def median_range(range_map: RangeMap, *, window: Annotated[int, Setting("side", ge=3, odd=True)] = 5) -> RangeMap:
+
+`engine.stages.settings.params_from` makes the parameters of a stage from either.
 """
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields
-from typing import Any, TypeVar
+from functools import cache, wraps
+from typing import Any, ParamSpec, TypeVar, get_type_hints
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.named_registry import NamedRegistry
 
 Value = TypeVar("Value")
+Arguments = ParamSpec("Arguments")
 _KEY = "pano_mvs.setting"
 
 
@@ -72,17 +83,59 @@ def setting(
     return field(default=default, metadata={_KEY: told})
 
 
-def settings_of(kind: type) -> dict[str, tuple[Setting, Any]]:
-    """Return what is declared of each setting of a dataclass, and its default, by name."""
-    return {one.name: (one.metadata[_KEY], one.default) for one in fields(kind) if _KEY in one.metadata}
+@dataclass(frozen=True, slots=True)
+class Declared:
+    """A setting as a dataclass or a function declares it: its type and default, and what else is known of it."""
+
+    kind: Any
+    default: Any
+    setting: Setting
+
+
+@cache
+def settings_of(source: Callable[..., Any]) -> dict[str, Declared]:
+    """Return the settings that a dataclass or a function declares, by name."""
+    kinds = get_type_hints(source)
+    if isinstance(source, type):
+        found = {one.name: (one.default, one.metadata[_KEY]) for one in fields(source) if _KEY in one.metadata}
+    else:
+        found = dict(_settings_of_function(source))
+    return {name: Declared(kinds[name], *stated) for name, stated in found.items()}
+
+
+def _settings_of_function(function: Callable[..., Any]) -> Iterator[tuple[str, tuple[Any, Setting]]]:
+    parameters = inspect.signature(function).parameters
+    for name, hint in get_type_hints(function, include_extras=True).items():
+        for mark in getattr(hint, "__metadata__", ()):
+            if isinstance(mark, Setting):
+                if parameters[name].kind is not inspect.Parameter.KEYWORD_ONLY:
+                    raise TypeError(f"{function.__qualname__}: the setting {name} must be a keyword-only parameter")
+                yield name, (parameters[name].default, mark)
 
 
 def check_settings(settings: Any) -> None:
     """Raise UsageError if a setting of a dataclass is out of its bounds."""
-    for name, (told, _) in settings_of(type(settings)).items():
-        value = getattr(settings, name)
-        if why := told.problem(value):
-            raise UsageError(f"{name} {why}, got {value}")
+    kind: Callable[..., Any] = type(settings)
+    for name, declared in settings_of(kind).items():
+        _check(name, declared, getattr(settings, name))
+
+
+def checks_settings(function: Callable[Arguments, Value]) -> Callable[Arguments, Value]:
+    """Make a function raise UsageError if a setting among its arguments is out of its bounds."""
+
+    @wraps(function)
+    def checked(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Value:
+        for name, declared in settings_of(function).items():
+            if name in kwargs:
+                _check(name, declared, kwargs[name])
+        return function(*args, **kwargs)
+
+    return checked
+
+
+def _check(name: str, declared: Declared, value: Any) -> None:
+    if why := declared.setting.problem(value):
+        raise UsageError(f"{name} {why}, got {value}")
 
 
 def odd(value: int) -> int:

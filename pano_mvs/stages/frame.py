@@ -14,21 +14,16 @@ from pano_mvs.algorithms.poses.frame.levelling import level_poses
 from pano_mvs.algorithms.poses.frame.metric_scale import scaled_by_baseline, scaled_by_camera_height, scaled_poses
 from pano_mvs.algorithms.poses.frame.vertical import find_vertical
 from pano_mvs.algorithms.poses.unit_translations import unit_translations as without_scale_factors
-from pano_mvs.api import All, Context, InputError, One, Panorama, Params, Poses, stage
+from pano_mvs.api import All, Context, InputError, One, Panorama, Params, Poses, arguments_from, params_from, stage
 from pano_mvs.io.images.names import match_image_names
 from pano_mvs.scene.pose_groups import join_groups, split_groups
 
 _UP_OF_WORLD = np.array([0.0, -1.0, 0.0])
 
 
+@params_from(level_poses)
 class LevelParams(Params):
     """Settings of poses.level."""
-
-    evidence: Literal["auto", "sensors", "structure", "cameras"] = Field(
-        default="auto",
-        description="source of the vertical: sensors (pitch and roll in the metadata), structure (level surfaces among "
-        "the sparse points), or cameras (their up directions); auto uses the first available one",
-    )
 
 
 @stage("poses.level")
@@ -41,7 +36,7 @@ def level(poses: One[Poses], images: All[Panorama], params: LevelParams, ctx: Co
     headings = {name: image.heading_deg for name, image in images.items() if image.heading_deg is not None}
     groups, levelled = split_groups(poses), []
     for number, group in enumerate(groups):
-        level_group, vertical = level_poses(group, _up_in_cam(images), headings, evidence=params.evidence)
+        level_group, vertical = level_poses(group, _up_in_cam(images), headings, **arguments_from(level_poses, params))
         levelled.append(level_group)
         which = f"group {number}: " if len(groups) > 1 else ""
         if not vertical:

@@ -5,16 +5,14 @@ from __future__ import annotations
 from pydantic import Field
 
 from pano_mvs.algorithms.masks.one_color import areas_of_color
-from pano_mvs.api import Context, Each, Panorama, Params, stage
+from pano_mvs.api import Context, Each, Panorama, Params, arguments_from, params_from, stage
 
 
+@params_from(areas_of_color)
 class ColorParams(Params):
     """Settings of mask.color."""
 
     color: str = Field(default="#000000", pattern="^#[0-9a-fA-F]{6}$", description="colour to ignore, as #rrggbb")
-    tolerance: int = Field(default=8, ge=0, le=255, description="maximum difference of a channel, in grey levels")
-    min_area_deg2: float = Field(default=4.0, ge=0, description="minimum size of an area, in square degrees")
-    margin_px: int = Field(default=2, ge=0, le=64, description="width in pixels by which areas are dilated")
 
 
 @stage("mask.color")
@@ -24,9 +22,7 @@ def color(image: Each[Panorama], params: ColorParams, ctx: Context) -> Panorama:
     found = areas_of_color(
         image.load(),
         (red, green, blue),
-        tolerance=params.tolerance,
-        min_area_deg2=params.min_area_deg2,
-        margin_px=params.margin_px,
+        **arguments_from(areas_of_color, params),
     )
     ctx.metric("masked", float(found.mean()))
     return image.with_mask(~found, ctx.scratch)

@@ -25,6 +25,8 @@ from pano_mvs.api import (
     Panorama,
     Params,
     UsageError,
+    arguments_from,
+    params_from,
     stage,
 )
 from pano_mvs.io.images.names import match_image_names
@@ -37,14 +39,9 @@ def exhaustive(images: Names[Features]) -> Pairs:
     return exhaustive_pairs(images)
 
 
+@params_from(loop_closing_pairs)
 class SequentialParams(Params):
     """Settings of pairs.sequential."""
-
-    window: int = Field(default=5, ge=1, description="number of following images to match each image with")
-    loop: bool = Field(default=False, description="the first image follows the last one")
-    loop_closure: int = Field(
-        default=0, ge=0, description="number of similar images beyond the window to match as well; requires global.vlad"
-    )
 
 
 @stage("pairs.sequential")
@@ -55,39 +52,30 @@ def sequential(
 
     With `loop_closure`, also match it with the most similar images beyond the window, where the path returns.
     """
-    if params.loop_closure and descriptors is None:
+    settings = arguments_from(loop_closing_pairs, params)
+    if settings["loop_closure"] and descriptors is None:
         raise UsageError(
             "loop_closure needs global descriptors: add a stage {use: global.vlad} before pairs.sequential"
         )
-    pairs = loop_closing_pairs(
-        images, descriptors or {}, window=params.window, loop=params.loop, loop_closure=params.loop_closure
-    )
+    pairs = loop_closing_pairs(images, descriptors or {}, **settings)
     ctx.metric("pairs", len(pairs.pairs))
     return pairs
 
 
+@params_from(vlad_descriptor)
 class VladParams(Params):
     """Settings of global.vlad."""
-
-    strongest: int = Field(default=4000, ge=8, description="number of the strongest key points in the descriptor")
-    sample: int = Field(
-        default=200,
-        ge=0,
-        le=2000,
-        description="number of key points of the coarsest scales that pairs.retrieval matches with one another",
-    )
 
 
 @stage("global.vlad")
 def vlad(features: Each[Features], params: VladParams) -> GlobalDescriptor:
     """Compute a global descriptor of each panorama, for pairs.retrieval and loop closure."""
-    return vlad_descriptor(features, strongest=params.strongest, sample=params.sample)
+    return vlad_descriptor(features, **arguments_from(vlad_descriptor, params))
 
 
+@params_from(retrieval_pairs)
 class RetrievalParams(Params):
     """Settings of pairs.retrieval."""
-
-    neighbours: int = Field(default=20, ge=1, description="number of most similar panoramas to match each one with")
 
 
 @stage("pairs.retrieval")
@@ -95,16 +83,15 @@ def retrieval(
     images: Names[Features], descriptors: All[GlobalDescriptor], params: RetrievalParams, ctx: Context
 ) -> Pairs:
     """Match each image with the most similar ones; for hundreds of images without order."""
-    pairs = retrieval_pairs(images, descriptors, neighbours=params.neighbours)
+    pairs = retrieval_pairs(images, descriptors, **arguments_from(retrieval_pairs, params))
     ctx.metric("pairs", len(pairs.pairs))
     return pairs
 
 
+@params_from(position_pairs, own_last=True)
 class PositionParams(Params):
     """Settings of pairs.position."""
 
-    neighbours: int = Field(default=10, ge=1, description="number of nearest images to match each image with")
-    window: int = Field(default=3, ge=1, description="for images without position: number of images before and after")
     path: InputPath | None = Field(
         default=None, description="positions from a COLMAP model, poses.json, transforms.json or CSV instead of GPS"
     )
@@ -128,6 +115,6 @@ def position(images: All[Panorama], params: PositionParams, ctx: Context) -> Pai
             else f"{params.path}: none of its images is one of this capture"
         )
     ctx.metric("located", len(positions) / len(images))
-    pairs = position_pairs(tuple(images), positions, neighbours=params.neighbours, window=params.window)
+    pairs = position_pairs(tuple(images), positions, **arguments_from(position_pairs, params))
     ctx.metric("pairs", len(pairs.pairs))
     return pairs

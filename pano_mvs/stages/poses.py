@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -27,6 +26,8 @@ from pano_mvs.api import (
     Poses,
     RunStoppedError,
     TwoView,
+    arguments_from,
+    params_from,
     stage,
 )
 from pano_mvs.core.text import plural
@@ -35,14 +36,10 @@ from pano_mvs.io.poses.files import read_groups, recorded_pictures
 from pano_mvs.scene.pose_groups import split_groups
 
 
+@params_from(solve_scaled_translation, own_last=True)
 class ScaledTranslationParams(Params):
     """Settings of poses.scaled_translation."""
 
-    scale_estimator: Literal["cauchy", "log_median", "kappa"] = Field(
-        default="cauchy", description="estimator of translation scale factors; kappa is the paper's"
-    )
-    kappa: float = Field(default=0.01, gt=0, description="width of the paper's clusters of scale factors")
-    adjust: bool = Field(default=True, description="adjust all cameras and points as the model grows")
     ask_images: bool = Field(
         default=True, description="use the images to decide between poses that the matches support about equally"
     )
@@ -65,21 +62,16 @@ def scaled_translation(
     poses = solve_scaled_translation(
         features,
         matches,
-        scale_estimator=params.scale_estimator,
-        kappa=params.kappa,
-        adjust=params.adjust,
+        **arguments_from(solve_scaled_translation, params),
         load=panorama_loader(images) if params.ask_images else None,
         rng=ctx.rng,
     )
     return checked_poses(poses, ctx)
 
 
+@params_from(verify_poses)
 class VerifyParams(Params):
     """Settings of poses.verify."""
-
-    correct: bool = Field(
-        default=True, description="move or remove cameras that the images contradict; false only reports them"
-    )
 
 
 @stage("poses.verify")
@@ -99,7 +91,7 @@ def verify(
     reported as doubtful. Without features and matches the stage only reports.
     """
     verified = verify_poses(
-        poses, panorama_loader(images), features=features, two_views=matches, correct=params.correct
+        poses, panorama_loader(images), features=features, two_views=matches, **arguments_from(verify_poses, params)
     )
     for name in poses.names:
         if name in verified.names and not np.array_equal(
@@ -119,15 +111,10 @@ def panorama_loader(images: Mapping[str, Panorama]) -> Callable[[str], Picture]:
     return load
 
 
+@params_from(refine_poses, own_last=True)
 class RefineParams(Params):
     """Settings of poses.refine."""
 
-    loss: Literal["cauchy", "huber"] = Field(default="cauchy", description="robust loss of the angular residuals")
-    loss_scale_deg: float = Field(
-        default=0.1, gt=0, description="residual at which an observation starts to lose influence"
-    )
-    max_error_deg: float = Field(default=0.4, gt=0, description="observations with a larger error are dropped")
-    max_iterations: int = Field(default=50, ge=1, description="maximum number of iterations in each round")
     align: bool = Field(default=True, description="refine observations by aligning image patches, and adjust once more")
 
 
@@ -140,10 +127,7 @@ def refine(poses: One[Poses], images: All[Panorama], params: RefineParams, ctx: 
     """
     refined = refine_poses(
         poses,
-        loss=params.loss,
-        loss_scale_deg=params.loss_scale_deg,
-        max_error_deg=params.max_error_deg,
-        max_iterations=params.max_iterations,
+        **arguments_from(refine_poses, params),
         load=panorama_loader(images) if params.align else None,
     )
     largest = split_groups(refined)[0]
@@ -192,11 +176,9 @@ def _require_its_pictures(path: Path, images: Mapping[str, Panorama], ctx: Conte
         ctx.note(f"{name} is not the image whose pose {path.name} records: the files differ")
 
 
+@params_from(triangulate_tracks)
 class TriangulateParams(Params):
     """Settings of poses.triangulate."""
-
-    max_error_deg: float = Field(default=0.4, gt=0, description="observations with a larger error are dropped")
-    min_angle_deg: float = Field(default=1.0, gt=0, description="minimum angle between the rays of a point")
 
 
 @stage("poses.triangulate")
@@ -204,9 +186,7 @@ def triangulate(
     poses: One[Poses], features: All[Features], matches: All[TwoView], params: TriangulateParams, ctx: Context
 ) -> Poses:
     """Triangulate sparse points from known poses, which stay exactly as they are."""
-    points = triangulate_tracks(
-        poses, features, matches, max_error_deg=params.max_error_deg, min_angle_deg=params.min_angle_deg
-    )
+    points = triangulate_tracks(poses, features, matches, **arguments_from(triangulate_tracks, params))
     return checked_poses(points, ctx)
 
 

@@ -10,7 +10,19 @@ from pydantic import Field, model_validator
 from pano_mvs.algorithms.poses.colmap.sift import colmap_sift
 from pano_mvs.algorithms.poses.colmap.solver import extend_with_colmap, solve_colmap
 from pano_mvs.algorithms.poses.extension import extend_poses
-from pano_mvs.api import All, Context, Features, InputPath, Panorama, Params, Poses, TwoView, stage
+from pano_mvs.api import (
+    All,
+    Context,
+    Features,
+    InputPath,
+    Panorama,
+    Params,
+    Poses,
+    TwoView,
+    arguments_from,
+    params_from,
+    stage,
+)
 from pano_mvs.stages.poses import checked_poses, known_poses
 
 
@@ -52,21 +64,18 @@ def colmap_sift_poses(images: All[Panorama], params: ColmapSiftParams, ctx: Cont
     return checked_poses(_mapped(features, matches, params, ctx), ctx)
 
 
+@params_from(extend_poses)
 class ExtendParams(Params):
     """Settings of poses.extend."""
 
     path: InputPath = Field(description="known poses: any input of poses.from_model")
-    max_error_deg: float = Field(default=0.4, gt=0, description="observations with a larger error are dropped")
-    min_angle_deg: float = Field(default=1.0, gt=0, description="minimum angle between the rays of a point")
 
 
 @stage("poses.extend")
 def extend(features: All[Features], matches: All[TwoView], params: ExtendParams, ctx: Context) -> Poses:
     """Register new images with known cameras, whose poses stay exactly as they are; also gives sparse points."""
     known = known_poses(params.path, tuple(features))
-    poses = extend_poses(
-        known, features, matches, max_error_deg=params.max_error_deg, min_angle_deg=params.min_angle_deg
-    )
+    poses = extend_poses(known, features, matches, **arguments_from(extend_poses, params))
     return checked_poses(poses, ctx, remedy=f"{params.path} must contain poses of at least two images of the capture")
 
 

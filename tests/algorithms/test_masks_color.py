@@ -64,7 +64,7 @@ def test_areas_are_of_the_sphere_not_of_the_grid(room: np.ndarray) -> None:
 
 
 def test_numbers_that_make_no_sense_are_refused(room: np.ndarray) -> None:
-    with pytest.raises(UsageError, match="must not be negative"):
+    with pytest.raises(UsageError, match="tolerance must be at least 0"):
         areas_of_color(room, (0, 0, 0), tolerance=-1)
     with pytest.raises(UsageError, match="must be \\(H, W, 3\\) uint8"):
         areas_of_color(room[..., 0], (0, 0, 0))

@@ -256,9 +256,9 @@ def test_no_rounds_only_lay_planes_and_no_source_in_sight_changes_little(views: 
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"window": 4}, "window odd"),
-        ({"rounds": -1}, "rounds must not be negative"),
-        ({"noise": 0}, "the others positive"),
+        ({"window": 4}, "window must be odd"),
+        ({"rounds": -1}, "rounds must be at least 0"),
+        ({"noise": 0}, "noise must be positive"),
         ({"source_masks": [None]}, "one pose"),
         ({"source_masks": [None, np.ones((3, 4), np.bool_)]}, "source 1: its mask"),
     ],
@@ -281,7 +281,7 @@ def test_impossible_pictures_are_named(views: Views, swept: RangeMap) -> None:
         refine_range(swept, pictures[0][:80], pictures[1:], poses[1:])
     with pytest.raises(UsageError, match=r"source 0: refinement needs \(H, W, 3\) uint8"):
         refine_range(swept, pictures[0], [pictures[1][..., 0]], poses[1:2])
-    with pytest.raises(UsageError, match="another place"):
+    with pytest.raises(UsageError, match="same place"):
         refine_range(swept, pictures[0], pictures[1:2], [Rigid3.identity()])
 
 

@@ -46,12 +46,12 @@ def _wall(count: int, distance: float, seed: int = 0) -> NDArray[np.float64]:
 
 
 def test_without_points_the_nearest_come_first() -> None:
-    views = select_views(_poses([(k, 0, 0) for k in (0, 1, 2.1, 3.3, 4.6)]), count=2)
+    views = select_views(_poses([(k, 0, 0) for k in (0, 1, 2.1, 3.3, 4.6)]), sources=2)
     assert views.neighbours == {"a": ("b", "c"), "b": ("a", "c"), "c": ("b", "d"), "d": ("c", "e"), "e": ("d", "c")}
 
 
 def test_without_points_a_neighbour_at_nearly_the_same_place_comes_last() -> None:
-    views = select_views(_poses([(0, 0, 0), (0.01, 0, 0), (1, 0, 0), (2, 0, 0), (3, 0, 0)]), count=4)
+    views = select_views(_poses([(0, 0, 0), (0.01, 0, 0), (1, 0, 0), (2, 0, 0), (3, 0, 0)]), sources=4)
     assert views.neighbours["a"] == ("c", "d", "e", "b")
 
 
@@ -104,7 +104,13 @@ def test_the_order_of_the_tracks_does_not_matter() -> None:
     assert select_views(poses).neighbours == select_views(shuffled).neighbours
 
 
-@pytest.mark.parametrize("options", [{"count": 0}, {"min_angle_deg": 30.0, "max_angle_deg": 20.0}])
-def test_options_that_cannot_work_are_refused(options: dict[str, Any]) -> None:
-    with pytest.raises(UsageError, match="count ≥ 1"):
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        ({"sources": 0}, "sources must be at least 1"),
+        ({"min_angle_deg": 30.0, "max_angle_deg": 20.0}, "min_angle_deg < max_angle_deg"),
+    ],
+)
+def test_options_that_cannot_work_are_refused(options: dict[str, Any], why: str) -> None:
+    with pytest.raises(UsageError, match=why):
         select_views(_poses([(0, 0, 0)]), **options)

@@ -55,7 +55,9 @@ def write_workspace(
         deliver(cuts[name], out, stems[name])
         samples[name] = surface(image=image, range_map=ranges[name], params=SurfaceParams(), ctx=ctx)
     ctx = context(scratch / "model")
-    found = tracked(poses=poses, samples=samples, ranges=ranges, params=TrackedParams(count=points), ctx=ctx)
+    found = tracked(
+        poses=poses, samples=samples, ranges=ranges, params=TrackedParams.model_validate({"count": points}), ctx=ctx
+    )
     names: Names[Panorama] = Names(panoramas)
     model = colmap_dense(poses=poses, faces=cuts, images=names, points=found, params=DenseParams(), ctx=ctx)
     deliver(model, out, "")

@@ -218,7 +218,11 @@ def test_seeds_are_points_with_tracks_in_the_panoramas(capture: Capture, tmp_pat
         for name in NAMES
     }
     points = tracked(
-        poses=capture.poses, samples=samples, ranges=capture.ranges, params=TrackedParams(count=4000), ctx=ctx
+        poses=capture.poses,
+        samples=samples,
+        ranges=capture.ranges,
+        params=TrackedParams.model_validate({"count": 4000}),
+        ctx=ctx,
     )
     seeds = colmap_dense_init(
         poses=capture.poses, points=points, images=capture.images, params=DenseInitParams(format="both"), ctx=ctx
@@ -246,7 +250,12 @@ def test_seeds_are_points_with_tracks_in_the_panoramas(capture: Capture, tmp_pat
 def test_too_few_points_are_told(capture: Capture, tmp_path: Path) -> None:
     ctx = context(tmp_path / "scratch")
     name = NAMES[0]
-    few = surface(image=capture.images[name], range_map=capture.ranges[name], params=SurfaceParams(count=100), ctx=ctx)
+    few = surface(
+        image=capture.images[name],
+        range_map=capture.ranges[name],
+        params=SurfaceParams.model_validate({"count": 100}),
+        ctx=ctx,
+    )
     points = tracked(poses=capture.poses, samples={name: few}, ranges=capture.ranges, params=TrackedParams(), ctx=ctx)
     assert 50 < len(points) <= 100
     assert f"{len(points)} points where 100000 were asked for" in ctx.notes[0]

@@ -198,7 +198,7 @@ def test_known_poses_are_those_of_the_largest_room_and_say_where_the_others_are(
 
 
 def _tracked(rooms: Rooms, ctx: Context, count: int = 100) -> TrackedPoints:
-    params = TrackedParams(count=count, min_confidence=1)
+    params = TrackedParams.model_validate({"count": count, "min_confidence": 1})
     return tracked(poses=rooms.poses, samples=rooms.samples, ranges=rooms.ranges, params=params, ctx=ctx)
 
 
@@ -303,7 +303,9 @@ def _truth_of_rooms(tiny: TinyCapture, folder: Path) -> Path:
 
 
 def test_each_room_is_levelled_on_its_own(rooms: Rooms, ctx: Context) -> None:
-    levelled = level(poses=rooms.poses, images=rooms.images, params=LevelParams(evidence="sensors"), ctx=ctx)
+    levelled = level(
+        poses=rooms.poses, images=rooms.images, params=LevelParams.model_validate({"evidence": "sensors"}), ctx=ctx
+    )
     levelled.check()
     for number, group in enumerate(split_groups(levelled)):
         np.testing.assert_array_equal(group.translations[0], 0)

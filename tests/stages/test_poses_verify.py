@@ -45,7 +45,7 @@ def verified(
         images=tiny.each(Panorama),
         features=tiny.each(Features) if matched else None,
         matches=tiny.each(TwoView) if matched else None,
-        params=VerifyParams(correct=correct),
+        params=VerifyParams.model_validate({"correct": correct}),
         ctx=ctx,
     )
 

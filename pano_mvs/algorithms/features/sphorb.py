@@ -10,15 +10,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from typing import Annotated
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.features.geodesic import NEIGHBOURS, GeodesicGrid, hexagon_ring, plane_from_lattice
-from pano_mvs.algorithms.features.selection import distinct_keypoints, spread_keypoints
+from pano_mvs.algorithms.features.selection import MaxKeypoints, distinct_keypoints, spread_keypoints
 from pano_mvs.algorithms.features.smoothing import smooth_panorama
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import pixel_from_ray
 from pano_mvs.scene import Features
 
@@ -49,12 +51,13 @@ class _Corners:
         return _Corners(self.faces[keep], self.places_uv[keep], self.bearings[keep], self.responses[keep])
 
 
+@checks_settings
 def extract_sphorb(
     image: NDArray[np.uint8],
     mask: NDArray[np.bool_],
     *,
-    max_keypoints: int = 10_000,
-    fast_threshold: int = 5,
+    max_keypoints: MaxKeypoints = 10_000,
+    fast_threshold: Annotated[int, Setting("lower values find more key points on plain walls", ge=1, le=254)] = 5,
     levels: int = 7,
 ) -> Features:
     """Extract the SPHORB key points of a panorama.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.icosahedron import beyond_face_rad, tangent_tiles
 from pano_mvs.algorithms.faces.sampling import sample_view
-from pano_mvs.algorithms.features.selection import distinct_keypoints, spread_keypoints
+from pano_mvs.algorithms.features.selection import MaxKeypoints, distinct_keypoints, spread_keypoints
 from pano_mvs.algorithms.features.tile_sampling import owned_pixels, sample_tile
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import PinholeView, pixel_from_ray
 from pano_mvs.scene import Features
 
@@ -46,13 +47,14 @@ class _Found:
 _Detector = Callable[[NDArray[np.uint8], NDArray[np.uint8]], _Found]
 
 
+@checks_settings
 def extract_sift(
     image: NDArray[np.uint8],
     mask: NDArray[np.bool_],
     *,
-    max_keypoints: int = 8000,
-    contrast_threshold: float = 0.004,
-    root: bool = True,
+    max_keypoints: MaxKeypoints = 8000,
+    contrast_threshold: Annotated[float, Setting("lower values find more key points on plain walls", ge=0)] = 0.004,
+    root: Annotated[bool, Setting("use RootSIFT descriptors")] = True,
 ) -> Features:
     """Extract the SIFT key points of a panorama (Lowe 2004, on the tangent tiles of an icosahedron).
 
@@ -84,11 +86,12 @@ def extract_sift(
     return _extract(image, mask, detect, max_keypoints=max_keypoints, metric="l2", clearance=_SIFT_CLEARANCE)
 
 
+@checks_settings
 def extract_orb(
     image: NDArray[np.uint8],
     mask: NDArray[np.bool_],
     *,
-    max_keypoints: int = 8000,
+    max_keypoints: MaxKeypoints = 8000,
     fast_threshold: int = 7,
 ) -> Features:
     """Extract the ORB key points of a panorama (Rublee et al. 2011, on the tangent tiles of an icosahedron).

@@ -17,7 +17,7 @@ Sᵀ, which is not diagonal but sparse: four vertices by four, summed over the p
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -28,8 +28,10 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.filters.confidence import confidence_weight
 from pano_mvs.algorithms.filters.holes import large_holes
 from pano_mvs.algorithms.filters.replacement import with_ranges
+from pano_mvs.algorithms.filters.settings import Domain, MaxHoleDeg
 from pano_mvs.algorithms.filters.sphere_cells import SphereCells, sphere_cells
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE
 
@@ -42,7 +44,6 @@ _BISTOCHASTIC_ITERATIONS = 10
 # a value.
 _PRIOR_WEIGHT = 1e-4
 _TOLERANCE = 1e-4
-_SMALLEST_BIN = 2.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,19 +73,22 @@ class BilateralSystem:
     m: FloatArray
 
 
+@checks_settings
 def fast_bilateral_solver(
     range_map: RangeMap,
     guide: NDArray[np.uint8],
     *,
-    sigma_spatial: float = 8.0,
-    sigma_luma: float = 8.0,
-    sigma_chroma: float = 8.0,
-    smoothness: float = 1.0,
+    sigma_spatial: Annotated[float, Setting("size of spatial cells, in pixels at the equator", ge=1)] = 8.0,
+    sigma_luma: Annotated[float, Setting("size of luma bins, in grey levels", ge=2.1)] = 8.0,
+    sigma_chroma: Annotated[float, Setting("size of chroma bins, in grey levels", ge=2.1)] = 8.0,
+    smoothness: Annotated[float, Setting("λ: weight of smoothness relative to a pixel of full confidence", ge=0)] = 1.0,
     iterations: int = 60,
-    domain: Literal["range", "inverse"] = "inverse",
-    fill: bool = True,
-    max_hole_deg: float = 20.0,
-    keep_confidence: int = CONSISTENT_CONFIDENCE[0],
+    domain: Domain = "inverse",
+    fill: Annotated[bool, Setting("fill pixels without a range (confidence 1–63)")] = True,
+    max_hole_deg: MaxHoleDeg = 20.0,
+    keep_confidence: Annotated[
+        int, Setting("pixels with at least this confidence keep their range; 256: smooth all", ge=1, le=256)
+    ] = CONSISTENT_CONFIDENCE[0],
 ) -> RangeMap:
     """Smooth a range map within the surfaces of the panorama, and fill invalid pixels.
 
@@ -115,11 +119,8 @@ def fast_bilateral_solver(
         raise UsageError(
             f"the guide must be ({height}, {width}, 3) uint8 like the range map, got {guide.shape} {guide.dtype}"
         )
-    if min(sigma_luma, sigma_chroma) < _SMALLEST_BIN or sigma_spatial < 1 or smoothness < 0 or iterations < 0:
-        raise UsageError(
-            f"sigma_luma and sigma_chroma must be at least {_SMALLEST_BIN}, sigma_spatial at least 1, "
-            f"smoothness and iterations not negative"
-        )
+    if iterations < 0:
+        raise UsageError(f"iterations must not be negative, got {iterations}")
     valid = range_map.valid
     if not valid.any():
         return range_map

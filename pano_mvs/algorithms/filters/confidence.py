@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.replacement import with_ranges
-from pano_mvs.core.errors import UsageError
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, WEAK_CONFIDENCE
 
@@ -28,7 +30,14 @@ def confidence_weight(confidence: NDArray[np.uint8]) -> NDArray[np.float64]:
     return weight
 
 
-def require_confidence(range_map: RangeMap, *, min_confidence: int = CONSISTENT_CONFIDENCE[0]) -> RangeMap:
+@checks_settings
+def require_confidence(
+    range_map: RangeMap,
+    *,
+    min_confidence: Annotated[
+        int, Setting("minimum confidence; 128: confirmed pixels", ge=1, le=255)
+    ] = CONSISTENT_CONFIDENCE[0],
+) -> RangeMap:
     """Return a range map with only the pixels of at least this confidence.
 
     Args:
@@ -36,10 +45,8 @@ def require_confidence(range_map: RangeMap, *, min_confidence: int = CONSISTENT_
         min_confidence: 128 keeps pixels that other views confirm, 64 all pixels that were seen.
 
     Raises:
-        UsageError: if min_confidence is not 1 to 255.
+        UsageError: if min_confidence is out of bounds.
     """
-    if not 1 <= min_confidence <= CONSISTENT_CONFIDENCE[1]:
-        raise UsageError(f"min_confidence must be 1 to 255, got {min_confidence}")
     kept = range_map.confidence >= min_confidence
     ranges: NDArray[np.float32] = np.where(kept, range_map.range, np.float32(np.nan))
     return with_ranges(range_map, ranges, np.where(kept, range_map.confidence, np.uint8(0)))

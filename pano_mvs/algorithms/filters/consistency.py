@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.filters.view_doubts import Agreement
 from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, pad_panorama, pixel_solid_angle, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, WEAK_CONFIDENCE
@@ -32,47 +34,36 @@ def check_consistency(
     reference_pose: Rigid3,
     sources: Sequence[RangeMap],
     source_poses: Sequence[Rigid3],
-    *,
-    max_relative_error: float = 0.02,
-    max_reprojection_px: float = 1.0,
-    min_support: float = 0.85,
-    min_motion_px: float = 0.05,
-    min_views: int = 1,
-    remove_inconsistent: bool = False,
-    min_contradictions: int = 2,
+    **settings: Any,
 ) -> RangeMap:
     """Set the confidence of a range map by the sources that confirm it.
 
-    See `checked_with_agreement`, which also returns the agreement of the sources with the view as a whole.
+    See `checked_with_agreement`, which has the same settings and also returns the agreement of the sources with the
+    view as a whole.
     """
-    return checked_with_agreement(
-        reference,
-        reference_pose,
-        sources,
-        source_poses,
-        max_relative_error=max_relative_error,
-        max_reprojection_px=max_reprojection_px,
-        min_support=min_support,
-        min_motion_px=min_motion_px,
-        min_views=min_views,
-        remove_inconsistent=remove_inconsistent,
-        min_contradictions=min_contradictions,
-    )[0]
+    return checked_with_agreement(reference, reference_pose, sources, source_poses, **settings)[0]
 
 
+@checks_settings
 def checked_with_agreement(
     reference: RangeMap,
     reference_pose: Rigid3,
     sources: Sequence[RangeMap],
     source_poses: Sequence[Rigid3],
     *,
-    max_relative_error: float,
-    max_reprojection_px: float,
-    min_support: float,
-    min_motion_px: float,
-    min_views: int,
-    remove_inconsistent: bool,
-    min_contradictions: int,
+    max_relative_error: Annotated[float, Setting("maximum relative difference of ranges that agree", gt=0)] = 0.02,
+    max_reprojection_px: Annotated[float, Setting("maximum forward-backward reprojection error", gt=0)] = 1.0,
+    min_support: Annotated[
+        float, Setting("minimum sum over sources of (1 - (error / max_reprojection_px)²)² for a pixel", ge=0)
+    ] = 0.85,
+    min_motion_px: Annotated[
+        float, Setting("minimum motion of a pixel in the sources if its range changes by max_relative_error", ge=0)
+    ] = 0.05,
+    min_views: Annotated[int, Setting("minimum number of sources that confirm a pixel", ge=1)] = 1,
+    remove_inconsistent: Annotated[
+        bool, Setting("remove pixels that no source confirms and several contradict")
+    ] = False,
+    min_contradictions: Annotated[int, Setting("number of contradicting sources for removal", ge=1)] = 2,
 ) -> tuple[RangeMap, Agreement]:
     """Set the confidence of a range map by the sources that confirm it, and summarise their agreement.
 
@@ -113,12 +104,10 @@ def checked_with_agreement(
         The checked range map, and the agreement of the sources with the view as a whole.
 
     Raises:
-        UsageError: if sources and poses differ in number, or a limit is not positive.
+        UsageError: if sources and poses differ in number, or a setting is out of bounds.
     """
     if len(sources) != len(source_poses):
         raise UsageError(f"{len(sources)} source range maps but {len(source_poses)} poses: give one pose per source")
-    if not (max_relative_error > 0 and max_reprojection_px > 0 and min_views >= 1 and min_contradictions >= 1):
-        raise UsageError("the limits of the consistency check must be positive")
     px_per_rad = reference.range.shape[1] / (2 * np.pi)
     limits = np.array([max_relative_error, max_reprojection_px / px_per_rad, _MAX_SURFACE_STEP])
     comparison = _compare_with_sources(reference, reference_pose, sources, source_poses, limits)

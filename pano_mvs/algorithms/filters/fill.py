@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 
 from pano_mvs.algorithms.filters.holes import large_holes
 from pano_mvs.algorithms.filters.replacement import with_ranges
+from pano_mvs.algorithms.filters.settings import MaxHoleDeg
 from pano_mvs.algorithms.filters.sphere_steps import columns_per_step
-from pano_mvs.core.errors import UsageError
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE
 
@@ -15,12 +18,15 @@ from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE
 _MAX_RATIO = 1.25
 
 
+@checks_settings
 def fill_from_neighbours(
     range_map: RangeMap,
     *,
-    max_distance_px: int = 48,
-    min_confidence: int = CONSISTENT_CONFIDENCE[0],
-    max_hole_deg: float = 20.0,
+    max_distance_px: Annotated[int, Setting("search distance, in pixels at the equator", ge=1)] = 48,
+    min_confidence: Annotated[
+        int, Setting("minimum confidence of pixels to fill from", ge=1, le=255)
+    ] = CONSISTENT_CONFIDENCE[0],
+    max_hole_deg: MaxHoleDeg = 20.0,
 ) -> RangeMap:
     """Fill invalid pixels with the range of the background surface.
 
@@ -42,11 +48,9 @@ def fill_from_neighbours(
         The range map; filled pixels have a confidence from 63, next to a reliable pixel, down to 1.
 
     Raises:
-        UsageError: if max_distance_px is not positive.
+        UsageError: if a setting is out of bounds.
     """
     height, width = range_map.range.shape
-    if max_distance_px < 1:
-        raise UsageError(f"max_distance_px must be positive, got {max_distance_px}")
     from pano_mvs.algorithms.filters.kernels_fill import fill_holes  # compiles on import
 
     wanted = ~range_map.valid & ~large_holes(range_map.valid, max_hole_deg)

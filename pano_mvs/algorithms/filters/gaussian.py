@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import cv2
 import numpy as np
 
 from pano_mvs.algorithms.filters.replacement import with_ranges
-from pano_mvs.core.errors import UsageError
+from pano_mvs.algorithms.filters.settings import Window
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import pad_panorama
 from pano_mvs.scene import RangeMap
 
 
-def gaussian_range(range_map: RangeMap, *, window: int = 5, sigma_px: float = 1.1) -> RangeMap:
+@checks_settings
+def gaussian_range(
+    range_map: RangeMap,
+    *,
+    window: Window = 5,
+    sigma_px: Annotated[float, Setting("standard deviation in pixels (the paper: 1.1)", gt=0)] = 1.1,
+) -> RangeMap:
     """Smooth a range map by a Gaussian over its valid pixels (normalised convolution).
 
     r'(u) = Σ g(u − v) r(v) / Σ g(u − v), both sums over the valid v in the window (Knutsson and Westin, "Normalized and
@@ -24,10 +33,8 @@ def gaussian_range(range_map: RangeMap, *, window: int = 5, sigma_px: float = 1.
         sigma_px: standard deviation of the Gaussian in pixels.
 
     Raises:
-        UsageError: if the window is even or not positive, or sigma_px is not positive.
+        UsageError: if a setting is out of bounds.
     """
-    if window < 1 or window % 2 == 0 or not sigma_px > 0:
-        raise UsageError(f"a Gaussian needs an odd window and a positive sigma_px, got {window} and {sigma_px}")
     pad = window // 2
     padded = pad_panorama(range_map.range, pad).astype(np.float64)
     valid = np.isfinite(padded)

@@ -7,15 +7,17 @@ borders.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.confidence import confidence_weight
 from pano_mvs.algorithms.filters.replacement import with_ranges
+from pano_mvs.algorithms.filters.settings import Domain
 from pano_mvs.algorithms.filters.sphere_box import box_spread, box_sum
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import FILLED_CONFIDENCE
 
@@ -25,14 +27,15 @@ FloatArray = NDArray[np.float64]
 _MIN_SUPPORT = 1e-6
 
 
+@checks_settings
 def guided_range(
     range_map: RangeMap,
     guide: NDArray[np.uint8],
     *,
-    radius: int = 4,
-    epsilon: float = 4.0,
-    domain: Literal["range", "inverse"] = "inverse",
-    fill: bool = False,
+    radius: Annotated[int, Setting("radius of the windows, in pixels at the equator", ge=1)] = 4,
+    epsilon: Annotated[float, Setting("contrast in grey levels above which edges are preserved", gt=0)] = 4.0,
+    domain: Domain = "inverse",
+    fill: Annotated[bool, Setting("fill pixels near valid ones (confidence 1–63)")] = False,
 ) -> RangeMap:
     """Smooth a range map within the surfaces of the panorama by the guided filter.
 
@@ -50,15 +53,15 @@ def guided_range(
             invalid.
 
     Raises:
-        UsageError: if guide and range map differ in size, the radius is out of range, or epsilon is not positive.
+        UsageError: if guide and range map differ in size, or a setting is out of bounds.
     """
     height, width = range_map.range.shape
     if guide.shape != (height, width, 3) or guide.dtype != np.uint8:
         raise UsageError(
             f"the guide must be ({height}, {width}, 3) uint8 like the range map, got {guide.shape} {guide.dtype}"
         )
-    if not 1 <= radius < height // 2 or not epsilon > 0:
-        raise UsageError(f"a guided filter needs 1 ≤ radius < H / 2 and a positive epsilon, got {radius}, {epsilon}")
+    if radius >= height // 2:
+        raise UsageError(f"radius must be less than half the height, {height // 2}, got {radius}")
     valid = range_map.valid
     if not valid.any():
         return range_map

@@ -8,7 +8,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.replacement import with_ranges
-from pano_mvs.core.errors import UsageError
+from pano_mvs.algorithms.filters.settings import Window
+from pano_mvs.core.settings import checks_settings
 from pano_mvs.geometry import pad_panorama
 from pano_mvs.scene import RangeMap
 
@@ -16,7 +17,8 @@ from pano_mvs.scene import RangeMap
 _OPENCV_WINDOWS = (3, 5)
 
 
-def median_range(range_map: RangeMap, *, window: int = 5) -> RangeMap:
+@checks_settings
+def median_range(range_map: RangeMap, *, window: Window = 5) -> RangeMap:
     """Replace each valid range by the median of the valid ranges around it.
 
     Invalid pixels are ignored and stay invalid; the confidence does not change. Of an even number of ranges, the nearer
@@ -27,9 +29,8 @@ def median_range(range_map: RangeMap, *, window: int = 5) -> RangeMap:
         window: odd width and height of the square window in pixels.
 
     Raises:
-        UsageError: if the window is even, not positive, or wider than the panorama.
+        UsageError: if the window is out of bounds or wider than the panorama.
     """
-    _check_window(window)
     padded = pad_panorama(range_map.range, window // 2)
     if window in _OPENCV_WINDOWS:
         filtered = _median_of_dense(padded, window)
@@ -41,11 +42,6 @@ def median_range(range_map: RangeMap, *, window: int = 5) -> RangeMap:
             filtered[row] = _median_of_windows(windows)
     filtered[~range_map.valid] = np.nan
     return with_ranges(range_map, filtered)
-
-
-def _check_window(window: int) -> None:
-    if window < 1 or window % 2 == 0:
-        raise UsageError(f"a window must have an odd, positive width in pixels, got {window}")
 
 
 def _median_of_dense(padded: NDArray[np.float32], window: int) -> NDArray[np.float32]:

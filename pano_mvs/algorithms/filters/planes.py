@@ -7,13 +7,17 @@ reliable ranges in and around each connected, uniformly coloured part of the pan
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.holes import large_holes
 from pano_mvs.algorithms.filters.replacement import with_ranges
+from pano_mvs.algorithms.filters.settings import MaxHoleDeg
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import pad_panorama, pixel_solid_angle, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE
@@ -33,17 +37,20 @@ _STEPS_BEYOND = 0.8, 1.3
 _SAME_SURFACE = 3.0
 
 
+@checks_settings
 def lay_planes(
     range_map: RangeMap,
     guide: NDArray[np.uint8],
     *,
     rng: np.random.Generator,
-    contrast: float = 8.0,
-    min_area_deg2: float = 75.0,
-    max_relative_error: float = 0.02,
-    min_share: float = 0.25,
-    min_confidence: int = CONSISTENT_CONFIDENCE[0],
-    max_hole_deg: float = 20.0,
+    contrast: Annotated[float, Setting("maximum contrast around a pixel of a plain surface, grey levels", gt=0)] = 8.0,
+    min_area_deg2: Annotated[float, Setting("minimum area of a surface, in square degrees", gt=0)] = 75.0,
+    max_relative_error: Annotated[float, Setting("maximum relative error of a pixel on the plane", gt=0)] = 0.02,
+    min_share: Annotated[float, Setting("minimum share of reliable pixels on the plane", gt=0, le=1)] = 0.25,
+    min_confidence: Annotated[
+        int, Setting("minimum confidence of reliable pixels", ge=1, le=255)
+    ] = CONSISTENT_CONFIDENCE[0],
+    max_hole_deg: MaxHoleDeg = 20.0,
 ) -> RangeMap:
     """Fit planes to the ranges of uniformly coloured surfaces.
 
@@ -67,15 +74,13 @@ def lay_planes(
         max_hole_deg: holes that contain a larger disc stay invalid (`large_holes`): a sky is not a wall.
 
     Raises:
-        UsageError: if guide and range map differ in size, or a limit is not positive.
+        UsageError: if guide and range map differ in size, or a setting is out of bounds.
     """
     height, width = range_map.range.shape
     if guide.shape != (height, width, 3) or guide.dtype != np.uint8:
         raise UsageError(
             f"the guide must be ({height}, {width}, 3) uint8 like the range map, got {guide.shape} {guide.dtype}"
         )
-    if not (contrast > 0 and min_area_deg2 > 0 and max_relative_error > 0 and 0 < min_share <= 1):
-        raise UsageError("contrast, min_area_deg2 and max_relative_error must be positive, min_share in (0, 1]")
     labels, bare = plain_surfaces(guide, contrast)
     area = np.broadcast_to(pixel_solid_angle((height, width))[:, None], (height, width))
     trusted = range_map.valid & (range_map.confidence >= min_confidence)

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.replacement import with_ranges
-from pano_mvs.core.errors import UsageError
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import pixel_solid_angle
 from pano_mvs.scene import RangeMap
 
 
-def remove_speckles(range_map: RangeMap, *, max_size_px: float = 60.0, max_relative_step: float = 0.03) -> RangeMap:
+@checks_settings
+def remove_speckles(
+    range_map: RangeMap,
+    *,
+    max_size_px: Annotated[float, Setting("remove smaller surfaces; area in pixels at the equator", gt=0)] = 60.0,
+    max_relative_step: Annotated[float, Setting("maximum relative step between pixels of one surface", gt=0)] = 0.03,
+) -> RangeMap:
     """Remove connected surfaces up to a given solid angle.
 
     Adjacent pixels (across the seam and the poles) belong to one surface if their ranges differ by at most
@@ -23,10 +31,8 @@ def remove_speckles(range_map: RangeMap, *, max_size_px: float = 60.0, max_relat
         max_relative_step: largest step within a surface, relative to the nearer range.
 
     Raises:
-        UsageError: if a limit is negative.
+        UsageError: if a limit is out of bounds.
     """
-    if max_size_px < 0 or max_relative_step < 0:
-        raise UsageError(f"limits must not be negative, got {max_size_px} and {max_relative_step}")
     from pano_mvs.algorithms.filters.kernels_components import label_surfaces  # compiles on import
 
     height, width = range_map.range.shape

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import pad_panorama, pixel_solid_angle
 
 Mask = NDArray[np.bool_]
 
 
+@checks_settings
 def areas_of_color(
     picture: NDArray[np.uint8],
     color_rgb: tuple[int, int, int],
     *,
-    tolerance: int = 8,
-    min_area_deg2: float = 4.0,
-    margin_px: int = 2,
+    tolerance: Annotated[int, Setting("maximum difference of a channel, in grey levels", ge=0, le=255)] = 8,
+    min_area_deg2: Annotated[float, Setting("minimum size of an area, in square degrees", ge=0)] = 4.0,
+    margin_px: Annotated[int, Setting("width in pixels by which areas are dilated", ge=0, le=64)] = 2,
 ) -> Mask:
     """Return the pixels, (H, W), of large connected areas of one colour, across the seam and the poles.
 
@@ -30,12 +34,10 @@ def areas_of_color(
         margin_px: width in pixels by which areas are dilated, to include their blurred edges.
 
     Raises:
-        UsageError: if the image is not an (H, W, 3) uint8 array, or a number is negative.
+        UsageError: if the image is not an (H, W, 3) uint8 array, or a setting is out of bounds.
     """
     if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
         raise UsageError(f"an image must be (H, W, 3) uint8, got {picture.shape} {picture.dtype}")
-    if min(tolerance, min_area_deg2, margin_px) < 0:
-        raise UsageError(f"numbers must not be negative, got {tolerance}, {min_area_deg2}, {margin_px}")
     from pano_mvs.algorithms.filters.kernels_components import label_surfaces  # compiles on import
 
     alike = np.asarray((np.abs(picture.astype(np.int16) - np.array(color_rgb, np.int16)) <= tolerance).all(axis=-1))

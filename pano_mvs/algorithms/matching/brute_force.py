@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -9,10 +11,18 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.matching.nearest_two import nearest_two
 from pano_mvs.algorithms.matching.whole_numbers import fits_whole_numbers, nearest_two_whole
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features
 
 
-def match_features(first: Features, second: Features, *, ratio: float = 0.8, mutual: bool = True) -> NDArray[np.int32]:
+@checks_settings
+def match_features(
+    first: Features,
+    second: Features,
+    *,
+    ratio: Annotated[float, Setting("maximum ratio of best to second-best distance", gt=0, le=1)] = 0.8,
+    mutual: Annotated[bool, Setting("keep only matches that are each other's best")] = True,
+) -> NDArray[np.int32]:
     """Match the key points of two images by their descriptors.
 
     A match is kept if its distance is below `ratio` times that of the second nearest (Lowe 2004, section 7.1).
@@ -34,8 +44,6 @@ def match_features(first: Features, second: Features, *, ratio: float = 0.8, mut
             f"descriptors of different kinds cannot be compared: {first.metric} with {first.descriptors.shape[1]} and "
             f"{second.metric} with {second.descriptors.shape[1]} components. Use the same feature stage for all images"
         )
-    if not 0 < ratio <= 1:
-        raise UsageError(f"the ratio of the ratio test must be in (0, 1], got {ratio}")
     if len(first) == 0 or len(second) < 2:
         return np.zeros((0, 2), np.int32)
     match_descriptors = _match_l2 if first.metric == "l2" else _match_hamming

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,14 +13,19 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from pano_mvs.algorithms.matching.pairs import sequential_pairs
 from pano_mvs.algorithms.matching.shortlist import sample_matches
 from pano_mvs.algorithms.poses.frame.geodesy import local_from_lla
-from pano_mvs.core.errors import UsageError
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import GlobalDescriptor, Pairs
 
 FloatArray = NDArray[np.float64]
 
 
+@checks_settings
 def position_pairs(
-    names: Sequence[str], positions: Mapping[str, FloatArray], *, neighbours: int = 10, window: int = 3
+    names: Sequence[str],
+    positions: Mapping[str, FloatArray],
+    *,
+    neighbours: Annotated[int, Setting("number of nearest images to match each image with", ge=1)] = 10,
+    window: Annotated[int, Setting("for images without position: number of images before and after", ge=1)] = 3,
 ) -> Pairs:
     """Pair every image with its nearest ones, so that all images are connected.
 
@@ -36,7 +42,6 @@ def position_pairs(
     Raises:
         UsageError: if a number of neighbours is less than 1.
     """
-    _require_positive(neighbours=neighbours, window=window)
     known = np.array([idx for idx, name in enumerate(names) if name in positions], np.intp)
     places = np.array([positions[names[idx]] for idx in known], np.float64)
     found = (
@@ -52,8 +57,12 @@ def position_pairs(
     return _named(names, beside | {(a, b) for a, b in found.tolist()})
 
 
+@checks_settings
 def retrieval_pairs(
-    names: Sequence[str], descriptors: Mapping[str, GlobalDescriptor], *, neighbours: int = 20
+    names: Sequence[str],
+    descriptors: Mapping[str, GlobalDescriptor],
+    *,
+    neighbours: Annotated[int, Setting("number of most similar panoramas to match each one with", ge=1)] = 20,
 ) -> Pairs:
     """Pair every image with the most similar ones, so that all images are connected.
 
@@ -70,7 +79,6 @@ def retrieval_pairs(
     Raises:
         UsageError: if the number of neighbours is less than 1.
     """
-    _require_positive(neighbours=neighbours)
     known = [name for name in names if name in descriptors]
     if len(known) < 2:
         return Pairs(())
@@ -78,13 +86,16 @@ def retrieval_pairs(
     return _named(known, {(a, b) for a, b in nearest_links(apart, neighbours).tolist()})
 
 
+@checks_settings
 def loop_closing_pairs(
     names: Sequence[str],
     descriptors: Mapping[str, GlobalDescriptor],
     *,
-    window: int = 5,
-    loop: bool = False,
-    loop_closure: int = 0,
+    window: Annotated[int, Setting("number of following images to match each image with", ge=1)] = 5,
+    loop: Annotated[bool, Setting("the first image follows the last one")] = False,
+    loop_closure: Annotated[
+        int, Setting("number of similar images beyond the window to match as well; requires global.vlad", ge=0)
+    ] = 0,
 ) -> Pairs:
     """Return the sequential pairs and, for every image, pairs with the most similar images outside its window.
 
@@ -177,9 +188,3 @@ def _dissimilarities(names: Sequence[str], descriptors: Mapping[str, GlobalDescr
 
 def _named(names: Sequence[str], links: set[tuple[int, int]]) -> Pairs:
     return Pairs(tuple((names[first], names[second]) for first, second in sorted(links)))
-
-
-def _require_positive(**numbers: int) -> None:
-    for name, number in numbers.items():
-        if number < 1:
-            raise UsageError(f"{name} must be at least 1, got {number}")

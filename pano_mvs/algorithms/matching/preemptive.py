@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Annotated
 
 from pano_mvs.algorithms.matching.brute_force import match_features
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.core.text import plural
 from pano_mvs.scene import Features
 
@@ -12,7 +14,16 @@ _RATIO = 0.8
 _MIN_SHARE, _MIN_MATCHES = 0.02, 4
 
 
-def hopeless_reason(first: Features, second: Features, *, preemptive: int = 0) -> str:
+@checks_settings
+def hopeless_reason(
+    first: Features,
+    second: Features,
+    *,
+    preemptive: Annotated[
+        int,
+        Setting("skip a pair if hardly any of this many strongest key points match (for example 400); 0: never", ge=0),
+    ] = 0,
+) -> str:
     """Return why a pair is not worth matching, by its strongest key points alone; "" if it may be.
 
     Wu, "Towards Linear-time Incremental Structure from Motion", 2013, section 3: most pairs of a large set have no

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import hadamard
 
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, GlobalDescriptor
 
 FloatArray = NDArray[np.float64]
@@ -16,7 +19,18 @@ _LENGTH = 1024.0
 _CODEBOOK_SEED = 20261121  # arbitrary but fixed, so that images can be compared
 
 
-def vlad_descriptor(features: Features, *, strongest: int = 4000, sample: int = 200) -> GlobalDescriptor:
+@checks_settings
+def vlad_descriptor(
+    features: Features,
+    *,
+    strongest: Annotated[int, Setting("number of the strongest key points in the descriptor", ge=8)] = 4000,
+    sample: Annotated[
+        int,
+        Setting(
+            "number of key points of the coarsest scales that pairs.retrieval matches with one another", ge=0, le=2000
+        ),
+    ] = 200,
+) -> GlobalDescriptor:
     """Compute the VLAD vector of a panorama, and the descriptors of its largest key points.
 
     Jégou et al., "Aggregating local descriptors into a compact image representation", 2010, with the signed square root

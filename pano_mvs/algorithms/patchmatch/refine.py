@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import ceil
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ from pano_mvs.algorithms.sweep.preparation import voting_pixels
 from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
 from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, pad_panorama, ray_grid
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import WEAK_CONFIDENCE
@@ -50,18 +52,27 @@ _SMALLEST_SIDE = 16
 _SOURCE_REACH = 3.0
 
 
+@checks_settings
 def refine_range(
     range_map: RangeMap,
     reference: Picture,
     sources: Sequence[Picture],
     source_from_reference: Sequence[Rigid3],
     *,
-    rounds: int = 4,
-    window: int = 5,
-    prior_px: float = 0.6,
-    prior_slope: float = 0.1,
-    noise: float = 0.4,
-    sigma_color: float = 25.0,
+    rounds: Annotated[int, Setting("number of rounds of fitting and matching planes", ge=0, le=32)] = 4,
+    window: Annotated[
+        int, Setting("samples along each side of the window, two pixels apart, odd", ge=3, le=15, odd=True)
+    ] = 5,
+    prior_px: Annotated[
+        float, Setting("standard deviation of the prior of a plane's range, in pixels of parallax", gt=0)
+    ] = 0.6,
+    prior_slope: Annotated[
+        float, Setting("standard deviation of the prior of its slope, in pixels of parallax per pixel", gt=0)
+    ] = 0.1,
+    noise: Annotated[float, Setting("minimum standard deviation of image noise, in grey levels", gt=0)] = 0.4,
+    sigma_color: Annotated[
+        float, Setting("contrast to the window's centre, in grey levels, at which a sample has half weight", gt=0)
+    ] = 25.0,
     source_masks: Sequence[Mask | None] | None = None,
 ) -> RangeMap:
     """Refine ranges between the depth hypotheses, and estimate normals.
@@ -87,11 +98,6 @@ def refine_range(
         UsageError: if shapes do not match or a parameter is out of bounds.
     """
     _check(range_map, reference, sources, source_from_reference, source_masks)
-    if rounds < 0 or window < 3 or window % 2 == 0 or min(prior_px, prior_slope, noise, sigma_color) <= 0:
-        raise UsageError(
-            f"rounds must not be negative, window odd and at least 3, the others positive, got {rounds}, "
-            f"{window}, {prior_px}, {prior_slope}, {noise}, {sigma_color}"
-        )
     import numba  # slow to import
 
     from pano_mvs.algorithms.patchmatch import kernels_planes, kernels_refine  # compile on import

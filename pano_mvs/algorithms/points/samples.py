@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import pixel_from_ray, ray_from_pixel, spiral_rays
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.surface_samples import SurfaceSamples
 
 
+@checks_settings
 def sample_surface(
     image: NDArray[np.uint8],
     valid: NDArray[np.bool_],
     range_map: RangeMap,
     *,
-    count: int = 80_000,
-    min_confidence: int = 128,
+    count: Annotated[int, Setting("number of evenly spread directions to sample in each view", ge=1)] = 80_000,
+    min_confidence: Annotated[int, Setting("minimum confidence of ranges (128: consistent)", ge=1, le=255)] = 128,
 ) -> SurfaceSamples:
     """Return points of the surfaces that a view sees, one for each of `count` evenly spread directions.
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pano_mvs.algorithms.points.selection import spread_points
-from pano_mvs.core.errors import UsageError
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import Poses, RangeMap
 from pano_mvs.scene.pose_groups import split_groups
@@ -52,17 +53,18 @@ class _Sightings:
     errors_rad: FloatArray
 
 
+@checks_settings
 def track_points(
     samples: Mapping[str, SurfaceSamples],
     poses: Poses,
     load_range: Callable[[str], RangeMap],
     *,
     rng: np.random.Generator,
-    count: int = 100_000,
-    min_views: int = 2,
-    neighbours: int = 16,
-    max_relative_error: float = 0.02,
-    min_confidence: int = 64,
+    count: Annotated[int, Setting("number of points of all views together", ge=1)] = 100_000,
+    min_views: Annotated[int, Setting("minimum number of views that see a point", ge=1)] = 2,
+    neighbours: Annotated[int, Setting("number of nearest views to test for each point", ge=1)] = 16,
+    max_relative_error: Annotated[float, Setting("maximum relative difference of ranges that agree", gt=0)] = 0.02,
+    min_confidence: Annotated[int, Setting("minimum confidence of ranges that see a point", ge=1, le=255)] = 64,
 ) -> TrackedPoints:
     """Select evenly distributed points of range maps, each with the views that see it.
 
@@ -84,10 +86,8 @@ def track_points(
         min_confidence: minimum confidence of a view's range.
 
     Raises:
-        UsageError: if a number is not positive.
+        UsageError: if a setting is out of bounds.
     """
-    if count < 1 or min_views < 1 or neighbours < 1 or not max_relative_error > 0:
-        raise UsageError("count, min_views, neighbours and max_relative_error must be positive")
     groups = split_groups(poses)
     views = [sum(name in samples for name in group.names) for group in groups]
     found = []

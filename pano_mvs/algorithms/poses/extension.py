@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Annotated
 
 import numpy as np
 
@@ -11,19 +12,21 @@ from pano_mvs.algorithms.poses.placement.reasons import why_no_pair
 from pano_mvs.algorithms.poses.placement.registration import GrowingModel
 from pano_mvs.algorithms.poses.placement.resection import refine_resection
 from pano_mvs.algorithms.poses.placement.view_graph import consistent_edges
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Poses, TwoView
 
 _ROUNDS = 3
 _RESECTION_SCALE_RAD = float(np.deg2rad(0.1))
 
 
+@checks_settings
 def extend_poses(
     known: Poses,
     features: Mapping[str, Features],
     two_views: Mapping[tuple[str, str], TwoView],
     *,
-    max_error_deg: float = 0.4,
-    min_angle_deg: float = 1.0,
+    max_error_deg: Annotated[float, Setting("observations with a larger error are dropped", gt=0)] = 0.4,
+    min_angle_deg: Annotated[float, Setting("minimum angle between the rays of a point", gt=0)] = 1.0,
 ) -> Poses:
     """Register new images with known cameras; the known poses stay exactly as they are.
 

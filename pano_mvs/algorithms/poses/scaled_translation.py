@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Annotated
 
 import numpy as np
 
@@ -15,17 +16,21 @@ from pano_mvs.algorithms.poses.placement.view_graph import connected_groups
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
 from pano_mvs.algorithms.poses.verification.pair_weights import weighed_by_images
 from pano_mvs.algorithms.poses.verification.verify_poses import poses_of, with_arbitration
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import join_groups
 
 
+@checks_settings
 def solve_scaled_translation(
     features: Mapping[str, Features],
     two_views: Mapping[tuple[str, str], TwoView],
     *,
-    scale_estimator: ScaleEstimator = "cauchy",
-    kappa: float = 0.01,
-    adjust: bool = True,
+    scale_estimator: Annotated[
+        ScaleEstimator, Setting("estimator of translation scale factors; kappa is the paper's")
+    ] = "cauchy",
+    kappa: Annotated[float, Setting("width of the paper's clusters of scale factors", gt=0)] = 0.01,
+    adjust: Annotated[bool, Setting("adjust all cameras and points as the model grows")] = True,
     load: Callable[[str], Picture] | None = None,
     rng: np.random.Generator,
 ) -> Poses:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from pano_mvs.algorithms.two_view.significance import (
     independent_count,
     log10_false_alarms,
 )
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import Rigid3, angle_between
 from pano_mvs.scene import Features, TwoView
@@ -31,18 +33,23 @@ _MIN_PARALLAX = 4.0  # in units of the threshold
 _MIN_WITH_PARALLAX = 12
 
 
+@checks_settings
 def verify_pair(
     first: Features,
     second: Features,
     matches_idx: NDArray[np.int32],
     *,
     rng: np.random.Generator,
-    threshold_deg: float = 0.2,
-    min_inliers: int = 20,
-    solver: Solver = "five_point",
-    refine: bool = True,
+    threshold_deg: Annotated[float, Setting("maximum angular Sampson error of an inlier", gt=0, le=10)] = 0.2,
+    min_inliers: Annotated[int, Setting("minimum number of inliers of a pair", ge=8)] = 20,
+    solver: Annotated[
+        Solver, Setting("minimal solver; eight_point is the paper's, and unreliable on planar scenes")
+    ] = "five_point",
+    refine: Annotated[bool, Setting("false keeps the best minimal hypothesis unrefined, as in the paper")] = True,
     max_iterations: int = 15_000,
-    max_alternatives: int = 4,
+    max_alternatives: Annotated[
+        int, Setting("maximum number of runner-up geometries of a pair, for repeated structure; requires refine", ge=0)
+    ] = 4,
 ) -> TwoView:
     """Estimate the two-view geometry of two images: their relative pose and its inliers.
 

@@ -33,6 +33,7 @@ _PURE_DECORATORS = frozenset(
         "final",
         "unique",
         "params_from",
+        "checks_settings",
     }
 )
 """These do not register anything; other decorators might."""

@@ -192,5 +192,5 @@ def test_any_number_of_threads_gives_the_same_bytes(true_maps: list[RangeMap]) -
 def test_impossible_calls_are_named(true_maps: list[RangeMap]) -> None:
     with pytest.raises(UsageError, match="one pose per source"):
         check_consistency(true_maps[0], POSES[0], true_maps[1:], POSES[2:])
-    with pytest.raises(UsageError, match="must be positive"):
+    with pytest.raises(UsageError, match="min_views must be at least 1"):
         checked(true_maps, min_views=0)

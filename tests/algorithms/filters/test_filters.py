@@ -59,7 +59,7 @@ def test_a_sphere_around_the_camera_stays_as_it_is(name: str) -> None:
     np.testing.assert_array_equal(filtered.confidence, range_map.confidence)
 
 
-@pytest.mark.parametrize("window", [1, 3, 5, 7])
+@pytest.mark.parametrize("window", [3, 5, 7])
 @pytest.mark.parametrize("holes", [0.0, 0.2, 0.9])
 def test_median_equals_the_sorted_window(window: int, holes: float) -> None:
     range_map = random_map(np.random.default_rng(window), SIZE, holes)
@@ -159,9 +159,9 @@ def test_fill_does_not_trust_weak_pixels() -> None:
     ("call", "words"),
     [
         (lambda m: median_range(m, window=4), "odd"),
-        (lambda m: gaussian_range(m, window=2), "odd window"),
-        (lambda m: gaussian_range(m, sigma_px=0), "positive sigma_px"),
-        (lambda m: remove_speckles(m, max_size_px=-1), "must not be negative"),
+        (lambda m: gaussian_range(m, window=2), "odd"),
+        (lambda m: gaussian_range(m, sigma_px=0), "sigma_px must be positive"),
+        (lambda m: remove_speckles(m, max_size_px=-1), "max_size_px must be positive"),
         (lambda m: fill_from_neighbours(m, max_distance_px=0), "max_distance_px"),
     ],
 )

@@ -132,7 +132,7 @@ def test_bad_settings_are_refused(white: Wall) -> None:
     harms = {"contrast": 0.0, "min_share": 1.5, "max_relative_error": 0.0, "min_area_deg2": -1.0}
     for name, value in harms.items():
         harm: dict[str, Any] = {name: value}
-        with pytest.raises(UsageError, match="must be positive"):
+        with pytest.raises(UsageError, match=f"{name} must be"):
             lay_planes(found, image, rng=rng(), **harm)
     with pytest.raises(UsageError, match="guide must be"):
         lay_planes(found, image[::2], rng=rng())

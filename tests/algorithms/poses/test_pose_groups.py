@@ -86,7 +86,7 @@ def test_a_step_on_groups_is_the_step_on_each(step: Callable[[Poses], Poses]) ->
 
 
 def test_sources_are_of_the_references_own_group() -> None:
-    views = select_views(_joined(), count=4)
+    views = select_views(_joined(), sources=4)
     assert list(views.neighbours) == list(_ORDER)
     for reference, sources in views.neighbours.items():
         assert sorted(sources) == sorted(name for name in _ORDER if name[0] == reference[0] and name != reference)

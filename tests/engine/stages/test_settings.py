@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import pytest
 from pydantic import Field, ValidationError
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.named_registry import NamedRegistry
-from pano_mvs.core.settings import check_settings, setting
+from pano_mvs.core.settings import Setting, check_settings, checks_settings, setting, settings_of
 from pano_mvs.engine.stages.params import Params
-from pano_mvs.engine.stages.settings import params_from, settings_from
+from pano_mvs.engine.stages.settings import arguments_from, params_from, settings_from
 
 ANIMALS = NamedRegistry("animal", {"cat": 1, "dog": 2})
 
@@ -43,6 +43,20 @@ def test_the_parameters_have_the_settings_with_their_defaults() -> None:
     assert (ZooParams.__name__, ZooParams.__doc__) == ("ZooParams", "Settings of a zoo.")
 
 
+@params_from(ZooSettings, own_last=True)
+class OwnLastParams(Params):
+    """Settings of a zoo."""
+
+    place: str = Field(default="here", description="where")
+
+
+def test_fields_of_the_class_come_first_or_last() -> None:
+    settings = list(settings_of(ZooSettings))
+    assert list(ZooParams.model_fields) == ["place", *settings]
+    assert list(OwnLastParams.model_fields) == [*settings, "place"]
+    assert OwnLastParams.model_validate({"count": 4, "place": "there"}).place == "there"
+
+
 def test_the_schema_has_bounds_and_help() -> None:
     fields = ZooParams.model_json_schema()["properties"]
     stated = {"default": 3, "description": "how many", "minimum": 1, "maximum": 9}
@@ -66,3 +80,52 @@ def test_values_out_of_bounds_are_refused_by_both(changes: dict[str, Any], why: 
         ZooSettings(**changes)
     with pytest.raises(ValidationError, match=next(iter(changes))):
         ZooParams.model_validate(changes)
+
+
+@checks_settings
+def feed(
+    animal: str,
+    *,
+    pieces: Annotated[int, Setting("how many", ge=1, odd=True)] = 3,
+    sauce: Annotated[str, Setting("which", registry=ANIMALS)] = "cat",
+    hour: int = 12,
+) -> str:
+    """Return what was done."""
+    return f"{animal}: {pieces} with {sauce} at {hour}"
+
+
+@params_from(ZooSettings, feed)
+class FeedParams(Params):
+    """Settings of feeding."""
+
+
+def test_the_settings_of_a_function_are_its_annotated_parameters() -> None:
+    assert list(settings_of(feed)) == ["pieces", "sauce"]
+    params = FeedParams.model_validate({"pieces": 5, "count": 4})
+    assert feed("cow", **arguments_from(feed, params)) == "cow: 5 with cat at 12"
+    assert settings_from(ZooSettings, params).count == 4
+    stated = {"default": 3, "description": "how many", "minimum": 1, "title": "Pieces", "type": "integer"}
+    assert FeedParams.model_json_schema()["properties"]["pieces"] == stated
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"pieces": -1}, "pieces must be at least 1, got -1"),
+        ({"pieces": 2}, "pieces must be odd"),
+        ({"sauce": "cow"}, "there is no animal 'cow'"),
+    ],
+)
+def test_a_function_and_its_stage_refuse_values_out_of_bounds(changes: dict[str, Any], why: str) -> None:
+    with pytest.raises(UsageError, match=why):
+        feed("cow", **changes)
+    with pytest.raises(ValidationError, match=next(iter(changes))):
+        FeedParams.model_validate(changes)
+
+
+def test_a_setting_must_be_a_keyword() -> None:
+    def eat(pieces: Annotated[int, Setting("how many", ge=1)] = 3) -> int:
+        return pieces
+
+    with pytest.raises(TypeError, match="pieces must be a keyword-only parameter"):
+        settings_of(eat)

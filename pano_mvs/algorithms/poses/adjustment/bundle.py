@@ -16,7 +16,7 @@ from pano_mvs.geometry import rotation_from_rotvec
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int32]
-Loss: TypeAlias = Literal["huber", "cauchy"]
+Loss: TypeAlias = Literal["cauchy", "huber"]
 
 _MIN_DAMPING, _MAX_DAMPING = 1e-9, 1e6
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from pano_mvs.algorithms.poses.adjustment.patch_alignment import Picture, align_
 from pano_mvs.algorithms.poses.adjustment.points import triangulate_observations
 from pano_mvs.algorithms.poses.adjustment.uncertainty import camera_deviations
 from pano_mvs.algorithms.poses.frame.gauge import first_neighbour, in_gauge_of
-from pano_mvs.core.errors import UsageError
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Poses
 from pano_mvs.scene.pose_groups import per_group
 
@@ -28,13 +29,14 @@ _MIN_ANGLE_RAD = float(np.deg2rad(1.0))
 _USUAL_SIGMA_RAD = float(np.deg2rad(0.07))
 
 
+@checks_settings
 def refine_poses(
     poses: Poses,
     *,
-    loss: Loss = "cauchy",
-    loss_scale_deg: float = 0.1,
-    max_iterations: int = 50,
-    max_error_deg: float = 0.4,
+    loss: Annotated[Loss, Setting("robust loss of the angular residuals")] = "cauchy",
+    loss_scale_deg: Annotated[float, Setting("residual at which an observation starts to lose influence", gt=0)] = 0.1,
+    max_error_deg: Annotated[float, Setting("observations with a larger error are dropped", gt=0)] = 0.4,
+    max_iterations: Annotated[int, Setting("maximum number of iterations in each round", ge=1)] = 50,
     load: Callable[[str], Picture] | None = None,
 ) -> Poses:
     """Refine poses and points by minimising the robust sum of squared angles between observed and predicted rays.
@@ -59,13 +61,8 @@ def refine_poses(
         load: returns the panorama and the mask of an image by its name; None keeps the observations as they are.
 
     Raises:
-        UsageError: if a limit is not positive.
+        UsageError: if a setting is out of bounds.
     """
-    if min(loss_scale_deg, max_iterations, max_error_deg) <= 0:
-        raise UsageError(
-            "loss_scale_deg, max_iterations and max_error_deg must be positive, got "
-            f"{loss_scale_deg}, {max_iterations} and {max_error_deg}"
-        )
     refined = partial(
         _refined,
         loss=loss,

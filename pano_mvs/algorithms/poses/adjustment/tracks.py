@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from pano_mvs.algorithms.poses.adjustment.points import triangulate_observations
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import per_group
 
@@ -83,13 +85,14 @@ def build_tracks(features: Mapping[str, Features], two_views: TwoViews) -> Track
     )
 
 
+@checks_settings
 def triangulate_tracks(
     poses: Poses,
     features: Mapping[str, Features],
     two_views: TwoViews,
     *,
-    max_error_deg: float = 0.4,
-    min_angle_deg: float = 1.0,
+    max_error_deg: Annotated[float, Setting("observations with a larger error are dropped", gt=0)] = 0.4,
+    min_angle_deg: Annotated[float, Setting("minimum angle between the rays of a point", gt=0)] = 1.0,
 ) -> Poses:
     """Return the same poses with points triangulated from the verified matches; the poses stay exactly as they are.
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses
 from pano_mvs.algorithms.poses.frame.vertical import Evidence, Vertical, find_vertical
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import Similarity3, rotation_from_rotvec, rotation_from_two_vectors
 from pano_mvs.scene import Poses
@@ -21,12 +23,19 @@ _MIN_HEADINGS = 2
 _MAX_HEADING_DISAGREEMENT_DEG = 15.0
 
 
+@checks_settings
 def level_poses(
     poses: Poses,
     up_in_cam: Mapping[str, Sequence[float]] | None = None,
     heading_deg: Mapping[str, float] | None = None,
     *,
-    evidence: Evidence = "auto",
+    evidence: Annotated[
+        Evidence,
+        Setting(
+            "source of the vertical: sensors (pitch and roll in the metadata), structure (level surfaces among "
+            "the sparse points), or cameras (their up directions); auto uses the first available one"
+        ),
+    ] = "auto",
 ) -> tuple[Poses, Vertical]:
     """Return the same scene in a level world: origin at the first camera, y down along gravity, unit unchanged.
 

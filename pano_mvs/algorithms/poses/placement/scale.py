@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import UsageError
 
 FloatArray = NDArray[np.float64]
-ScaleEstimator: TypeAlias = Literal["kappa", "log_median", "cauchy"]
+ScaleEstimator: TypeAlias = Literal["cauchy", "log_median", "kappa"]
 
 _CAUCHY_STEPS, _CONVERGED = 20, 1e-7
 

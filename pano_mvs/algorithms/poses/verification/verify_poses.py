@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Annotated
 
 import numpy as np
 
@@ -11,19 +12,23 @@ from pano_mvs.algorithms.poses.adjustment.tracks import poses_with_points
 from pano_mvs.algorithms.poses.placement.placed_model import Pairs, PlacedModel, pairs_of
 from pano_mvs.algorithms.poses.verification.arbitration import Arbitration, arbitrate
 from pano_mvs.algorithms.poses.verification.confirmation import Confirmation, Picture
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features, Poses, TwoView
 from pano_mvs.scene.pose_groups import join_groups, split_groups
 
 _MAX_ERROR_DEG, _MIN_ANGLE_DEG = 0.4, 1.0
 
 
+@checks_settings
 def verify_poses(
     poses: Poses,
     load: Callable[[str], Picture],
     *,
     features: Mapping[str, Features] | None = None,
     two_views: Mapping[tuple[str, str], TwoView] | None = None,
-    correct: bool = True,
+    correct: Annotated[
+        bool, Setting("move or remove cameras that the images contradict; false only reports them")
+    ] = True,
 ) -> Poses:
     """Check poses against the images: confirmed and expected shares, doubts, corrections.
 
