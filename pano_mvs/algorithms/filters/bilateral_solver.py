@@ -29,7 +29,7 @@ from pano_mvs.algorithms.filters.confidence import confidence_weight
 from pano_mvs.algorithms.filters.holes import large_holes
 from pano_mvs.algorithms.filters.replacement import with_ranges
 from pano_mvs.algorithms.filters.settings import Domain, MaxHoleDeg
-from pano_mvs.algorithms.filters.sphere_cells import SphereCells, sphere_cells
+from pano_mvs.algorithms.filters.sphere.cells import SphereCells, sphere_cells
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import RangeMap

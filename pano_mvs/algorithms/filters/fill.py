@@ -9,7 +9,7 @@ import numpy as np
 from pano_mvs.algorithms.filters.holes import large_holes
 from pano_mvs.algorithms.filters.replacement import with_ranges
 from pano_mvs.algorithms.filters.settings import MaxHoleDeg
-from pano_mvs.algorithms.filters.sphere_steps import columns_per_step
+from pano_mvs.algorithms.filters.sphere.steps import columns_per_step
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE

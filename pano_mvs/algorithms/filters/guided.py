@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.filters.confidence import confidence_weight
 from pano_mvs.algorithms.filters.replacement import with_ranges
 from pano_mvs.algorithms.filters.settings import Domain
-from pano_mvs.algorithms.filters.sphere_box import box_spread, box_sum
+from pano_mvs.algorithms.filters.sphere.box import box_spread, box_sum
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import RangeMap

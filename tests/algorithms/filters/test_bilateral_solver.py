@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.filters.bilateral_solver import fast_bilateral_solver, solve_bilateral
 from pano_mvs.algorithms.filters.confidence import confidence_weight
 from pano_mvs.algorithms.filters.kernels_bilateral import COLOR_BINS
-from pano_mvs.algorithms.filters.sphere_cells import sphere_cells
+from pano_mvs.algorithms.filters.sphere.cells import sphere_cells
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, angle_between, ray_grid
 from pano_mvs.scene import RangeMap

@@ -14,7 +14,7 @@ from pano_mvs.algorithms.filters.fill import fill_from_neighbours
 from pano_mvs.algorithms.filters.gaussian import gaussian_range
 from pano_mvs.algorithms.filters.median import median_range
 from pano_mvs.algorithms.filters.speckle import remove_speckles
-from pano_mvs.algorithms.filters.sphere_steps import columns_per_step
+from pano_mvs.algorithms.filters.sphere.steps import columns_per_step
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import pixel_solid_angle
 from pano_mvs.scene import RangeMap

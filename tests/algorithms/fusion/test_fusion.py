@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from pano_mvs.algorithms.filters.sphere_steps import columns_per_step
+from pano_mvs.algorithms.filters.sphere.steps import columns_per_step
 from pano_mvs.algorithms.fusion import voxels
 from pano_mvs.algorithms.fusion.normals import normals_from_range
 from pano_mvs.algorithms.fusion.settings import FusionSettings

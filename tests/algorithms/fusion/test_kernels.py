@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.sphere_steps import columns_per_step
+from pano_mvs.algorithms.filters.sphere.steps import columns_per_step
 from pano_mvs.algorithms.fusion.kernels_support import find_supported
 from pano_mvs.algorithms.fusion.kernels_vote import vote
 from pano_mvs.geometry import Rigid3, ray_grid, rotation_from_rotvec

@@ -20,8 +20,8 @@ from pano_mvs.algorithms.filters.guided import guided_range, guided_values
 from pano_mvs.algorithms.filters.holes import large_holes
 from pano_mvs.algorithms.filters.median import median_range
 from pano_mvs.algorithms.filters.speckle import remove_speckles
-from pano_mvs.algorithms.filters.sphere_box import box_spread, box_sum
-from pano_mvs.algorithms.filters.sphere_steps import columns_per_step
+from pano_mvs.algorithms.filters.sphere.box import box_spread, box_sum
+from pano_mvs.algorithms.filters.sphere.steps import columns_per_step
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap

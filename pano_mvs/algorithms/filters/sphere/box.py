@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.sphere_steps import columns_per_step
+from pano_mvs.algorithms.filters.sphere.steps import columns_per_step
 from pano_mvs.geometry import pad_panorama
 
 FloatArray = NDArray[np.float64]

@@ -1,0 +1,1 @@
+"""Windows, grid cells and steps that have the same extent everywhere on the sphere."""
