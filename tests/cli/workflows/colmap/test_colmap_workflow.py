@@ -113,4 +113,4 @@ def test_the_global_mapper_holds_nothing_fixed(pano_mvs: Command, rendered: Path
     path = workflow(tmp_path, rendered, f"{MATCHED}  poses: {{use: poses.colmap, mapper: global, fixed: {known}}}")
     result = pano_mvs("run", path, "--out", "o", "--cache", cache)
     assert result.code == 2
-    assert "take mapper: incremental" in result.flat
+    assert "use mapper: incremental" in result.flat
