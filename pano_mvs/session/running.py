@@ -34,6 +34,8 @@ from pano_mvs.session.settings import overrides_from_settings
 
 MIN_FREE_VARIABLE = "PANO_MVS_MIN_FREE"
 
+_MAX_REPAIRS = 3  # more damage than that comes from the disk
+
 
 @dataclass(frozen=True, slots=True)
 class Execution:
@@ -185,6 +187,7 @@ def _run_locked(session: Session, store: Store, executor: Executor, *, progress:
 def _execute(run: Run, started: datetime, clock: float) -> tuple[RunSummary, StoredValues]:
     """Compute, then write the summary and the report; a damaged file that only the report meets is computed again."""
     earlier = earlier_files(run.out)
+    repairs = 0
     while True:
         try:
             run.execute(earlier_files=earlier)
@@ -194,6 +197,9 @@ def _execute(run: Run, started: datetime, clock: float) -> tuple[RunSummary, Sto
         try:
             return write_outputs(run, started=started, clock=clock)
         except DamagedBlobError as error:  # it has been removed, so another round computes it
+            repairs += 1
+            if repairs > _MAX_REPAIRS:
+                raise
             run.observer.warn(str(error))
 
 

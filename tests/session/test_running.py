@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 import pano_mvs
+from pano_mvs.engine.cache.blobs import DamagedBlobError
 from pano_mvs.session.progress import (
     Event,
     RunFinished,
@@ -127,3 +128,16 @@ def test_an_error_of_the_callback_ends_the_run_and_what_was_computed_is_kept(toy
 def test_the_output_of_a_folder_without_a_run_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(pano_mvs.InputError, match="Give the output folder of a run"):
         pano_mvs.load(tmp_path)
+
+
+def test_a_disk_that_damages_results_again_and_again_ends_the_run(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+
+    def find_damage(run: object, **_: object) -> None:
+        calls.append(run)
+        raise DamagedBlobError("blob 7 is damaged")
+
+    monkeypatch.setattr("pano_mvs.session.running.write_outputs", find_damage)
+    with pytest.raises(DamagedBlobError, match="blob 7"):
+        run_toy(toy)
+    assert len(calls) == 4
