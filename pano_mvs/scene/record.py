@@ -138,7 +138,7 @@ class Record:
     def from_parts(cls, parts: Parts) -> Self:
         """Return the record from the result of `to_parts`."""
         values: dict[str, Any] = {}
-        fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+        fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]  # every kind is a dataclass
         for name, part in parts.items():
             if name == "meta":
                 assert isinstance(part, dict)

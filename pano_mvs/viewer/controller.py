@@ -115,7 +115,7 @@ class Tour:
 
     def begin(self, **settings: str | bool) -> None:
         """Begin with other than the usual settings: fields of `TourState` by name."""
-        self.state = replace(self.state, **settings)  # type: ignore[arg-type]
+        self.state = replace(self.state, **settings)  # type: ignore[arg-type]  # names of fields
 
     def step_into(self, camera_idx: int) -> None:
         """Go to a camera, looking on in the same direction: its panorama is all around."""
@@ -212,7 +212,7 @@ class Tour:
         self.state = replace(self.state, viewpoint=viewpoint, inside=None, outside=None, message="")
 
     def _toggle(self, name: str) -> None:
-        self.state = replace(self.state, **{name: not getattr(self.state, name)})  # type: ignore[arg-type]
+        self.state = replace(self.state, **{name: not getattr(self.state, name)})  # type: ignore[arg-type]  # names of fields
         if name == "measuring":
             message = "measuring: click two points" if self.state.measuring else ""
             self.state = replace(self.state, picked=(), message=message)
