@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 
 import pytest
 
@@ -75,8 +76,11 @@ SOURCE = "  i: {use: toy.source, path: capture}\n"
 SCALED = SOURCE + "  s: {use: toy.scale}\n"
 
 
+Wire = Callable[[str], Graph]
+
+
 @pytest.fixture
-def wired(toy: Toy):  # type: ignore[no-untyped-def]
+def wired(toy: Toy) -> Wire:
     """Returns the graph of the stages in a text."""
     toy.edit("plug.py", lambda text: text + MORE)
 
@@ -121,7 +125,7 @@ def test_every_port_is_fed_and_every_stage_has_its_axis(toy: Toy) -> None:
     assert str(edge.port) == "around: Near[Number]"
 
 
-def test_stages_run_in_the_order_of_the_file_but_for_what_feeds_them(wired) -> None:  # type: ignore[no-untyped-def]
+def test_stages_run_in_the_order_of_the_file_except_for_what_feeds_them(wired: Wire) -> None:
     graph = wired(
         "  z: {use: toy.scale, in: {x: y}}\n" + SOURCE + "  c: {use: toy.total, in: {xs: i}}\n"
         "  b: {use: toy.scale, in: {x: i}}\n  y: {use: toy.scale, in: {x: b}}\n  a: {use: toy.total, in: {xs: i}}\n"
@@ -137,14 +141,14 @@ def test_a_part_of_a_graph_is_what_its_ends_need(toy: Toy) -> None:
     assert toy.session().graph.limited_to(["pairs"], {}).order == ("images", "scaled", "pairs")
 
 
-def test_a_port_that_may_stay_unconnected_does(wired) -> None:  # type: ignore[no-untyped-def]
+def test_a_port_that_may_stay_unconnected_does(wired: Wire) -> None:
     assert producers(wired(SOURCE + "  p: {use: toy.plus}\n"), "p") == {"x": ("i", False)}
     fed = wired(SOURCE + "  t: {use: toy.total}\n  p: {use: toy.plus}\n")
     assert producers(fed, "p") == {"x": ("i", False), "total": ("t", False)}
     assert fed.axes["p"] is Axis.IMAGE
 
 
-def test_the_units_of_a_stage_are_those_of_its_finest_input(wired) -> None:  # type: ignore[no-untyped-def]
+def test_the_units_of_a_stage_are_those_of_its_finest_input(wired: Wire) -> None:
     head = SOURCE + "  s: {use: toy.scale}\n"
     pairs = wired(head + "  p: {use: toy.pairs}\n  d: {use: toy.difference}\n  c: {use: toy.change}\n")
     assert (pairs.axes["d"], pairs.axes["c"]) == (Axis.PAIR, Axis.PAIR)
@@ -155,20 +159,20 @@ def test_the_units_of_a_stage_are_those_of_its_finest_input(wired) -> None:  # t
     assert producers(exploded, "b") == {"x": ("h", True)}
 
 
-def test_a_whole_collection_feeds_a_port_that_wants_it_whole(wired) -> None:  # type: ignore[no-untyped-def]
+def test_a_whole_collection_feeds_a_port_that_wants_it_whole(wired: Wire) -> None:
     text = SOURCE + "  h: {use: toy.shifted}\n  d: {use: toy.total, in: {xs: h}}\n"
     assert producers(wired(text), "d") == {"xs": ("h", True)}
     text += "  p: {use: toy.pairs, in: {names: h}}\n  e: {use: toy.difference, in: {ends: i}}\n"
     assert producers(wired(text + "  w: {use: toy.write, in: {differences: e}}\n"), "w")["shifted"] == ("h", False)
 
 
-def test_files_of_any_axis_feed_a_port_for_one(wired) -> None:  # type: ignore[no-untyped-def]
+def test_files_of_any_axis_feed_a_port_for_one(wired: Wire) -> None:
     means = "  v: {use: toy.views}\n  m: {use: toy.mean, in: {own: s, around: s}}\n"
     graph = wired(SCALED + means + "  w: {use: toy.write_each}\n  a: {use: toy.after}\n")
     assert producers(graph, "a") == {"files": ("w", False)}
 
 
-def test_the_nearest_of_several_is_taken_if_it_depends_on_the_others(wired) -> None:  # type: ignore[no-untyped-def]
+def test_the_nearest_of_several_is_taken_if_it_depends_on_the_others(wired: Wire) -> None:
     """Also where it depends on them through stages in between."""
     graph = wired(
         SOURCE + "  a: {use: toy.scale}\n  h: {use: toy.shifted, in: {xs: a}}\n"
@@ -213,13 +217,13 @@ def test_the_nearest_of_several_is_taken_if_it_depends_on_the_others(wired) -> N
         ),
     ],
 )
-def test_mistakes_name_the_stage_and_the_remedy(wired, stages: str, message: str) -> None:  # type: ignore[no-untyped-def]
+def test_mistakes_name_the_stage_and_the_remedy(wired: Wire, stages: str, message: str) -> None:
     with pytest.raises(WorkflowError, match=re.escape(message)) as caught:
         wired(stages)
     assert all(re.match(r".*wf\.yaml:[0-9]+:[0-9]+: ", one) for one in caught.value.problems)
 
 
-def test_a_mistake_is_reported_where_it_is_in_the_file(wired) -> None:  # type: ignore[no-untyped-def]
+def test_a_mistake_is_reported_where_it_is_in_the_file(wired: Wire) -> None:
     with pytest.raises(WorkflowError) as caught:
         wired(SOURCE + "  s: {use: toy.scale, in: {y: i, x: j}}\n  p: {use: toy.difference, in: {ends: s}}\n")
     places = [re.sub(r".*wf\.yaml:", "", one).split(": ")[0] for one in caught.value.problems]
