@@ -79,8 +79,8 @@ def setting(
     registry: NamedRegistry[Any] | None = None,
 ) -> Value:
     """Declare a field of a dataclass as a setting; see `Setting`."""
-    told = Setting(doc=doc, ge=ge, gt=gt, le=le, odd=odd, registry=registry)
-    return field(default=default, metadata={_KEY: told})
+    declared = Setting(doc=doc, ge=ge, gt=gt, le=le, odd=odd, registry=registry)
+    return field(default=default, metadata={_KEY: declared})
 
 
 @dataclass(frozen=True, slots=True)
