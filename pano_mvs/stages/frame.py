@@ -12,7 +12,7 @@ from pydantic import ConfigDict, Field, model_validator
 from pano_mvs.algorithms.poses.frame.georeference import fit_gps, georeferenced_poses, scaled_by_gps
 from pano_mvs.algorithms.poses.frame.levelling import level_poses
 from pano_mvs.algorithms.poses.frame.metric_scale import scaled_by_baseline, scaled_by_camera_height, scaled_poses
-from pano_mvs.algorithms.poses.frame.vertical import find_vertical
+from pano_mvs.algorithms.poses.frame.vertical import Evidence, find_vertical
 from pano_mvs.algorithms.poses.unit_translations import unit_translations as without_scale_factors
 from pano_mvs.api import All, Context, InputError, One, Panorama, Params, Poses, arguments_from, params_from, stage
 from pano_mvs.io.images.names import match_image_names
@@ -75,7 +75,7 @@ class ScaleParams(Params):
     gps_noise_m: float = Field(
         default=3.0, gt=0, description="standard deviation of GPS positions along an axis, in metres"
     )
-    vertical: Literal["auto", "sensors", "structure", "cameras", "world"] = Field(
+    vertical: Literal[Evidence, "world"] = Field(
         default="auto",
         description="vertical for gps and camera_height_m, as in poses.level; world: the world's y axis",
     )
@@ -210,9 +210,7 @@ def _by_gps(poses: Poses, images: All[Panorama], params: ScaleParams, ctx: Conte
     return georeferenced_poses(poses, fit) if params.align == "gps" else scaled_by_gps(poses, fit)
 
 
-def _up(
-    poses: Poses, images: All[Panorama], evidence: Literal["auto", "sensors", "structure", "cameras", "world"]
-) -> NDArray[np.float64]:
+def _up(poses: Poses, images: All[Panorama], evidence: Literal[Evidence, "world"]) -> NDArray[np.float64]:
     if evidence == "world":
         return _UP_OF_WORLD
     vertical = find_vertical(poses, _up_in_cam(images), evidence=evidence)

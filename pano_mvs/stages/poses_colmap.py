@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal
 
 from pydantic import Field, model_validator
 
@@ -26,20 +25,17 @@ from pano_mvs.api import (
 from pano_mvs.stages.poses import checked_poses, known_poses
 
 
+@params_from(solve_colmap, own_last=True)
 class ColmapParams(Params):
     """Settings of poses.colmap."""
 
-    mapper: Literal["incremental", "global"] = Field(default="incremental", description="COLMAP's mapper")
-    cameras: Literal["sphere", "faces"] = Field(
-        default="sphere", description="EQUIRECTANGULAR cameras, or a rig of six pinhole faces for each panorama"
-    )
     fixed: InputPath | None = Field(
         default=None, description="known poses to keep fixed (any input of poses.from_model); incremental mapper only"
     )
 
     @model_validator(mode="after")
     def _fixed_needs_incremental(self) -> ColmapParams:
-        if self.fixed is not None and self.mapper == "global":
+        if self.fixed is not None and arguments_from(solve_colmap, self)["mapper"] == "global":
             raise ValueError("COLMAP's global mapper moves all cameras: use mapper: incremental to keep some fixed")
         return self
 
@@ -50,17 +46,16 @@ def colmap_poses(features: All[Features], matches: All[TwoView], params: ColmapP
     return checked_poses(_mapped(features, matches, params, ctx), ctx)
 
 
+@params_from(colmap_sift)
 class ColmapSiftParams(ColmapParams):
     """Settings of poses.colmap_sift."""
-
-    max_keypoints: int = Field(default=8192, ge=8, description="maximum number per image")
 
 
 @stage("poses.colmap_sift")
 def colmap_sift_poses(images: All[Panorama], params: ColmapSiftParams, ctx: Context) -> Poses:
     """Solve poses by COLMAP alone: its planar SIFT, exhaustive matching, and mapper. Masks are respected."""
     pictures = ((name, image.load(), image.load_mask()) for name, image in images.items())
-    features, matches = colmap_sift(pictures, max_keypoints=params.max_keypoints, rng=ctx.rng, scratch=ctx.scratch)
+    features, matches = colmap_sift(pictures, **arguments_from(colmap_sift, params), rng=ctx.rng, scratch=ctx.scratch)
     return checked_poses(_mapped(features, matches, params, ctx), ctx)
 
 
@@ -84,8 +79,8 @@ def _mapped(
 ) -> Poses:
     """Run COLMAP's mapper from scratch, or from fixed known poses."""
     if params.fixed is None:
-        return solve_colmap(
-            features, matches, mapper=params.mapper, cameras=params.cameras, rng=ctx.rng, scratch=ctx.scratch
-        )
+        settings = arguments_from(solve_colmap, params)
+        return solve_colmap(features, matches, **settings, rng=ctx.rng, scratch=ctx.scratch)
     known = known_poses(params.fixed, tuple(features))
-    return extend_with_colmap(known, features, matches, cameras=params.cameras, rng=ctx.rng, scratch=ctx.scratch)
+    settings = arguments_from(extend_with_colmap, params)
+    return extend_with_colmap(known, features, matches, **settings, rng=ctx.rng, scratch=ctx.scratch)

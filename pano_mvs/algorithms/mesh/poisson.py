@@ -41,7 +41,7 @@ def poisson_depth(points: NDArray[np.float32], spacing: float) -> int:
     return int(np.clip(np.ceil(np.log2(cells)), _SHALLOWEST, _DEEPEST))
 
 
-def solve_poisson(cloud_file: Path, folder: Path, *, depth: int, point_weight: float = 1.0) -> Path:
+def solve_poisson(cloud_file: Path, folder: Path, *, depth: int, point_weight: float) -> Path:
     """Compute a closed surface through oriented points, with their colours, as a PLY file of triangles.
 
     Args:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import UsageError
+from pano_mvs.core.settings import check_settings, setting
 from pano_mvs.scene import PointCloud
 
 CHUNK_POINTS = 1 << 18
@@ -33,19 +34,18 @@ _FULL_ENOUGH = 0.93
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Criteria for the points of a cloud.
+    """Criteria for the points of a cloud; `max_points` enlarges the voxels as necessary."""
 
-    Attributes:
-        min_confidence: the smallest confidence.
-        min_views: the smallest number of views that agree on a point.
-        voxel: edge of the voxels in scene units, of which each keeps one point; 0: no voxels.
-        max_points: the largest number of points, which enlarges the voxels as necessary; 0: no limit.
-    """
+    min_confidence: int = setting(0, ge=0, le=255, doc="minimum confidence of a point")
+    min_views: int = setting(0, ge=0, le=255, doc="minimum number of views that agree on a point")
+    voxel: float = setting(
+        0.0, ge=0, doc="keep the best point of each voxel with this edge, in scene units; 0: keep all"
+    )
+    max_points: int = setting(0, ge=0, doc="thin evenly to at most this number of points; 0: no limit")
 
-    min_confidence: int = 0
-    min_views: int = 0
-    voxel: float = 0.0
-    max_points: int = 0
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        check_settings(self)
 
 
 class SelectedPoints:

@@ -11,7 +11,19 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from pano_mvs.algorithms.fusion.normals import normals_from_range
-from pano_mvs.api import Context, Each, Files, One, Panorama, Params, PointCloud, RangeMap, stage
+from pano_mvs.api import (
+    Context,
+    Each,
+    Files,
+    One,
+    Panorama,
+    Params,
+    PointCloud,
+    RangeMap,
+    params_from,
+    settings_from,
+    stage,
+)
 from pano_mvs.io.clouds.ply_writer import write_ply
 from pano_mvs.io.clouds.thinning import Selection, select_points
 from pano_mvs.io.images import exr
@@ -26,18 +38,13 @@ from pano_mvs.io.ranges.files import (
 from pano_mvs.scene.files import group_file
 
 
+@params_from(Selection)
 class PlyParams(Params):
     """Settings of export.ply."""
 
     quality: bool = Field(
         default=False, description="add the number of agreeing views and the confidence to each point"
     )
-    min_confidence: int = Field(default=0, ge=0, le=255, description="minimum confidence of a point")
-    min_views: int = Field(default=0, ge=0, le=255, description="minimum number of views that agree on a point")
-    voxel: float = Field(
-        default=0.0, ge=0, description="keep the best point of each voxel with this edge, in scene units; 0: keep all"
-    )
-    max_points: int = Field(default=0, ge=0, description="thin evenly to at most this number of points; 0: no limit")
 
 
 @stage("export.ply")
@@ -47,7 +54,7 @@ def ply(cloud: One[PointCloud], params: PlyParams, ctx: Context) -> Files:
     The cloud is thinned and written in chunks: memory does not grow with its size. Further groups of poses, each in its
     own frame, are cloud_1.ply, cloud_2.ply …; each file is thinned on its own.
     """
-    selection = Selection(params.min_confidence, params.min_views, params.voxel, params.max_points)
+    selection = settings_from(Selection, params)
     files, points = {}, 0
     for number, group in enumerate(cloud.groups()):
         name = group_file("cloud.ply", number)

@@ -17,7 +17,9 @@ from pano_mvs.api import (
     Poses,
     UsageError,
     group_file,
+    params_from,
     select_points,
+    settings_from,
     split_groups,
     stage,
 )
@@ -28,19 +30,12 @@ from pano_mvs_las.las_file import write_las
 from pano_mvs_las.placement import Placement, placement_of
 
 
+@params_from(PointSelection)
 class CloudParams(Params):
     """Settings of both exports."""
 
     epsg: int | None = Field(
         default=None, ge=0, description="map to place the cloud on, if GPS placed the cameras; null: UTM; 0: none"
-    )
-    min_confidence: int = Field(default=0, ge=0, le=255, description="points below are left out")
-    min_views: int = Field(default=0, ge=0, le=255, description="points on which fewer views agree are left out")
-    voxel: float = Field(
-        default=0.0, ge=0, description="keep the best point of each voxel of this edge, scene units; 0: keep all"
-    )
-    max_points: int = Field(
-        default=0, ge=0, description="thin evenly to this number of points or a little fewer; 0: no limit"
     )
 
 
@@ -83,7 +78,7 @@ def _prepared(
     cloud: PointCloud, poses: Poses, params: CloudParams, ctx: Context
 ) -> Iterator[tuple[int, PointCloud, KeptPoints | None, Placement]]:
     """Yield the number and the cloud of each group that has points, which of them are written, and where."""
-    selection = PointSelection(params.min_confidence, params.min_views, params.voxel, params.max_points)
+    selection = settings_from(PointSelection, params)
     total = 0
     for number, (group, own) in enumerate(zip(cloud.groups(), split_groups(poses), strict=False)):
         kept = select_points(group, selection, ctx.scratch)

@@ -133,7 +133,7 @@ def test_a_solver_that_crashes_is_an_error_of_ours(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(poisson, "_SOLVE", "import os, signal; os.kill(os.getpid(), signal.SIGKILL)")
     write_ply(tmp_path / "cloud.ply", room_cloud(200))
     with pytest.raises(InputError, match=r"the Poisson solver ended with code -9 at depth 6: try another `depth`"):
-        solve_poisson(tmp_path / "cloud.ply", tmp_path, depth=6)
+        solve_poisson(tmp_path / "cloud.ply", tmp_path, depth=6, point_weight=1.0)
 
 
 def test_the_depth_follows_the_spacing() -> None:

@@ -121,13 +121,23 @@ def test_colmap_leaves_known_ones_alone_where_nothing_fits(capture: Capture, tmp
     truth, features, two_views = capture
     (tmp_path / "one").mkdir()
     one = extend_with_colmap(
-        known_of(truth, ["0.jpg"]), features, two_views, rng=np.random.default_rng(0), scratch=tmp_path / "one"
+        known_of(truth, ["0.jpg"]),
+        features,
+        two_views,
+        cameras="sphere",
+        rng=np.random.default_rng(0),
+        scratch=tmp_path / "one",
     )
     assert one.names == ("0.jpg",)
     assert set(one.rejected.values()) == {"the known images give no point that it could see"}
     views = {pair: TwoView.failed("a blurred picture") if "5.jpg" in pair else view for pair, view in two_views.items()}
     poses = extend_with_colmap(
-        known_of(truth, list(truth)[:4]), features, views, rng=np.random.default_rng(0), scratch=tmp_path
+        known_of(truth, list(truth)[:4]),
+        features,
+        views,
+        cameras="sphere",
+        rng=np.random.default_rng(0),
+        scratch=tmp_path,
     )
     assert poses.names == tuple(truth)[:5]
     assert list(poses.rejected) == ["5.jpg"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pano_mvs.algorithms.poses.colmap.mapping import quiet_colmap
 from pano_mvs.algorithms.two_view.essential import sampson_angles
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import Rigid3, ray_from_pixel, skew
 from pano_mvs.scene import Features, TwoView
 
@@ -20,10 +21,11 @@ _THREADS = 1
 _SIFT_PATCH_SCALES = 12.0  # SIFT describes 4 × 4 bins of three scales each
 
 
+@checks_settings
 def colmap_sift(
     pictures: Iterable[tuple[str, NDArray[np.uint8], NDArray[np.bool_]]],
     *,
-    max_keypoints: int = 8192,
+    max_keypoints: Annotated[int, Setting("maximum number per image", ge=8)] = 8192,
     rng: np.random.Generator,
     scratch: Path,
 ) -> tuple[dict[str, Features], dict[tuple[str, str], TwoView]]:

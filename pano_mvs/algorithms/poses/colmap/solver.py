@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
@@ -18,19 +19,21 @@ from pano_mvs.algorithms.poses.colmap.mapping import (
 )
 from pano_mvs.algorithms.poses.frame.gauge import moved_poses, normalised_poses
 from pano_mvs.algorithms.poses.placement.reasons import best_pair, why_no_pair
+from pano_mvs.core.settings import Setting
 from pano_mvs.geometry import Similarity3
 from pano_mvs.scene import Features, Poses
 from pano_mvs.scene.pose_groups import join_groups, with_cameras
 
 _SEED_LIMIT = 2**31 - 1
+_CAMERAS = Setting("EQUIRECTANGULAR cameras, or a rig of six pinhole faces for each panorama")
 
 
 def solve_colmap(
     features: Mapping[str, Features],
     two_views: TwoViews,
     *,
-    mapper: Mapper = "incremental",
-    cameras: Cameras = "sphere",
+    mapper: Annotated[Mapper, Setting("COLMAP's mapper")] = "incremental",
+    cameras: Annotated[Cameras, _CAMERAS] = "sphere",
     rng: np.random.Generator,
     scratch: Path,
 ) -> Poses:
@@ -84,7 +87,7 @@ def extend_with_colmap(
     features: Mapping[str, Features],
     two_views: TwoViews,
     *,
-    cameras: Cameras = "sphere",
+    cameras: Annotated[Cameras, _CAMERAS],
     rng: np.random.Generator,
     scratch: Path,
 ) -> Poses:

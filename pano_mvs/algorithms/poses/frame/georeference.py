@@ -68,7 +68,7 @@ def fit_gps(
     positions_lla: Mapping[str, Sequence[float]],
     up_in_world: FloatArray,
     *,
-    gps_noise_m: float = 3.0,
+    gps_noise_m: float,
     rng: np.random.Generator,
 ) -> GpsFit:
     """Fit camera centres to GPS positions by scale, heading and shift, given the vertical.

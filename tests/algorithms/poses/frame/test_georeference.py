@@ -19,6 +19,7 @@ from tests.algorithms.poses.synthetic_capture import random_rotation
 
 UP = np.array([0.0, -1.0, 0.0])
 HOME = np.array([47.5, 8.25, 410.0])
+NOISE_M = 3.0
 
 
 def street(rng: np.random.Generator, count: int, *, step_m: float = 8.0, bend_deg: float = 4.0) -> Poses:
@@ -77,7 +78,7 @@ def test_fit_recovers_scale_and_heading_despite_wrong_positions(seed: int) -> No
         known[name] = (known[name][0] + rng.normal() / 500, known[name][1] + rng.normal() / 500, 0.0)
     turn = random_rotation(rng)
     solved = moved_poses(true, Similarity3(0.2, turn, rng.normal(size=3)))
-    fit = fit_gps(solved, known, turn @ UP, rng=rng)
+    fit = fit_gps(solved, known, turn @ UP, gps_noise_m=NOISE_M, rng=rng)
     assert fit
     assert 18 <= fit.used <= 21
     scaled = scaled_by_gps(solved, fit)
@@ -118,17 +119,17 @@ def test_many_positions_are_fitted_by_a_draw_of_pairs() -> None:
     true = street(rng, 200, bend_deg=1.0)
     known = positions(true, rng, 2.0)
     known |= dict.fromkeys(true.names[::5], (47.6, 8.3, 0.0))
-    fit = fit_gps(true, known, UP, rng=np.random.default_rng(0))
+    fit = fit_gps(true, known, UP, gps_noise_m=NOISE_M, rng=np.random.default_rng(0))
     assert fit.local_from_world.scale == pytest.approx(1, abs=0.005)
     assert fit.used == pytest.approx(160, abs=4)
-    again = fit_gps(true, known, UP, rng=np.random.default_rng(0))
+    again = fit_gps(true, known, UP, gps_noise_m=NOISE_M, rng=np.random.default_rng(0))
     assert again.local_from_world.scale == fit.local_from_world.scale
 
 
 def test_a_room_is_too_small_for_gps() -> None:
     rng = np.random.default_rng(3)
     true = street(rng, 6, step_m=0.7)
-    fit = fit_gps(true, positions(true, rng, 2.0), UP, rng=rng)
+    fit = fit_gps(true, positions(true, rng, 2.0), UP, gps_noise_m=NOISE_M, rng=rng)
     assert not fit
     assert "too close for GPS that is good to" in fit.reason
     assert fit_gps(true, positions(true, rng, 0.01), UP, gps_noise_m=0.01, rng=rng)
@@ -138,7 +139,7 @@ def test_positions_that_have_nothing_to_do_with_the_poses_are_refused() -> None:
     rng = np.random.default_rng(4)
     true = street(rng, 12)
     shuffled = dict(zip(true.names, rng.permutation(list(positions(true, rng, 0.1).values())), strict=True))
-    assert "GPS positions fit the camera poses" in fit_gps(true, shuffled, UP, rng=rng).reason
+    assert "GPS positions fit the camera poses" in fit_gps(true, shuffled, UP, gps_noise_m=NOISE_M, rng=rng).reason
 
 
 @pytest.mark.parametrize("same", ["poses", "positions"])
@@ -150,7 +151,7 @@ def test_one_place_is_no_scale(same: str) -> None:
         true = replace(true, translations=np.zeros((5, 3)))
     else:
         known = dict.fromkeys(true.names, tuple(HOME))
-    fit = fit_gps(true, known, UP, rng=rng)
+    fit = fit_gps(true, known, UP, gps_noise_m=NOISE_M, rng=rng)
     assert not fit
     assert fit.reason
 
@@ -159,7 +160,10 @@ def test_two_positions_are_too_few() -> None:
     rng = np.random.default_rng(6)
     true = street(rng, 5)
     known = dict(list(positions(true, rng, 0.0).items())[:2])
-    assert "2 of 5 registered panoramas have a GPS position; 3" in fit_gps(true, known, UP, rng=rng).reason
+    assert (
+        "2 of 5 registered panoramas have a GPS position; 3"
+        in fit_gps(true, known, UP, gps_noise_m=NOISE_M, rng=rng).reason
+    )
 
 
 @pytest.mark.parametrize("home", [HOME, np.array([-33.9, -70.65, -12.3]), np.array([0.0000001, 179.9, 0.0])])
