@@ -147,7 +147,7 @@ def test_points_that_are_not_wanted_are_left_out_in_any_cut(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: Any, params: type[CloudParams]
 ) -> None:
     cloud = a_cloud()
-    wanted = params(min_views=4, min_confidence=60, voxel=3.0)
+    wanted = params.model_validate({"min_views": 4, "min_confidence": 60, "voxel": 3.0})
     whole = written(stage, tmp_path / "a", cloud, the_poses(), wanted)
     count = len(laspy.read(whole)) if stage is las else len(e57_points(whole)["cartesianX"])
     assert cloud.confidence is not None
@@ -160,4 +160,4 @@ def test_points_that_are_not_wanted_are_left_out_in_any_cut(
     else:
         np.testing.assert_array_equal(e57_points(again)["cartesianX"], e57_points(whole)["cartesianX"])
     with pytest.raises(InputError, match="no points that could be written"):
-        written(stage, tmp_path / "c", cloud, the_poses(), params(min_views=99))
+        written(stage, tmp_path / "c", cloud, the_poses(), params.model_validate({"min_views": 99}))
