@@ -7,7 +7,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections import Counter
 from pathlib import Path
@@ -21,48 +20,15 @@ from pano_mvs.cli.run.estimate import Estimate, duration
 from pano_mvs.cli.run.progress import ProgressBars
 from pano_mvs.core.processes import start_of
 from pano_mvs.session.progress import RunStarted, StageStarted, UnitFinished
-from tests.engine.conftest import Toy, toy  # noqa: F401 (a fixture)
-from tests.engine.running.test_resume import deliverables, finished_records
-from tests.processes import heed_interrupts
+from tests.engine.conftest import Toy, finished_records, start, toy, wait_for_records  # noqa: F401 (a fixture)
+from tests.engine.running.test_resume import deliverables
 
 ON_POSIX = pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
-
-
-def start(toy: Toy, *options: str, sleep_s: float = 0.0) -> subprocess.Popen[str]:  # noqa: F811
-    command = [
-        sys.executable,
-        "-m",
-        "pano_mvs",
-        "run",
-        str(toy.folder / "wf.yaml"),
-        "--cache",
-        str(toy.folder / "cache"),
-        "--out",
-        str(toy.folder / "out"),
-        *options,
-    ]
-    return subprocess.Popen(
-        command,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"TOY_SLEEP_S": str(sleep_s)},
-        cwd=toy.folder,
-        preexec_fn=heed_interrupts,
-    )
 
 
 def finish(process: subprocess.Popen[str]) -> tuple[int, str, str]:
     out, err = process.communicate(timeout=120)
     return process.returncode, out, err
-
-
-def wait_for(process: subprocess.Popen[str], toy: Toy, records: int) -> None:  # noqa: F811
-    deadline = time.monotonic() + 60
-    while finished_records(toy) < records:
-        assert process.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
 
 
 def events_of(text: str) -> list[dict[str, Any]]:
@@ -118,7 +84,7 @@ def test_events_of_a_run_that_cannot_begin_end_as_well(toy: Toy) -> None:  # noq
 )
 def test_interrupt_lets_units_finish_and_says_how_to_go_on(toy: Toy, number: str) -> None:  # noqa: F811
     process = start(toy, "--executor", "processes", "--workers", "2", sleep_s=1.0)
-    wait_for(process, toy, 18)  # the means have begun
+    wait_for_records(toy, process, 18)  # the means have begun
     process.send_signal(signal.Signals[number])
     code, out, err = finish(process)
     assert code == 130
@@ -163,7 +129,7 @@ def test_a_terminal_that_closes_interrupts_once() -> None:
 def test_a_second_run_into_a_folder_is_refused_until_the_first_has_ended(toy: Toy) -> None:  # noqa: F811
     """The second computed beside the first, and whichever came last said that all was well."""
     first = start(toy, "--workers", "2", sleep_s=600)
-    wait_for(first, toy, 6)
+    wait_for_records(toy, first, 6)
     earlier = {path.name for path in (toy.folder / "cache" / "tmp").iterdir()}
     code, out, err = finish(start(toy, "--json"))
     assert code == 4
@@ -326,7 +292,7 @@ def test_a_plugin_that_exits_in_this_process_is_an_error(toy: Toy, place: str, h
 @pytest.mark.slow
 def test_an_interrupt_lets_a_single_worker_finish_its_unit(toy: Toy) -> None:  # noqa: F811
     process = start(toy, "--workers", "1", sleep_s=1.0)
-    wait_for(process, toy, 18)
+    wait_for_records(toy, process, 18)
     process.send_signal(signal.SIGTERM)
     code, out, _ = finish(process)
     assert code == 130

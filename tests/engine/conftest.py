@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,6 +16,7 @@ from pano_mvs.engine.running.events import RunResult
 from pano_mvs.engine.running.run import Run
 from pano_mvs.session.session import Session, open_session
 from tests.engine.toy import HELPER, PLUGIN, WORKFLOW
+from tests.processes import heed_interrupts
 
 
 @dataclass
@@ -52,6 +55,34 @@ class Toy:
     def deliverables(self) -> dict[str, bytes]:
         out = self.folder / "out"
         return {p.relative_to(out).as_posix(): p.read_bytes() for p in sorted(out.rglob("*")) if p.is_file()}
+
+
+def start(toy: Toy, *options: str, sleep_s: float = 0.0) -> subprocess.Popen[str]:
+    """Start `pano-mvs run` on a toy capture; each of its units takes `sleep_s`."""
+    folder = toy.folder
+    command = [sys.executable, "-m", "pano_mvs", "run", str(folder / "wf.yaml"), "--cache", str(folder / "cache")]
+    return subprocess.Popen(
+        [*command, "--out", str(folder / "out"), *options],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"TOY_SLEEP_S": str(sleep_s)},
+        cwd=folder,
+        preexec_fn=heed_interrupts,
+    )
+
+
+def finished_records(toy: Toy) -> int:
+    return len(list((toy.folder / "cache" / "records").rglob("*.json")))
+
+
+def wait_for_records(toy: Toy, process: subprocess.Popen[str], count: int) -> None:
+    """Wait until a run has stored a number of results."""
+    deadline = time.monotonic() + 60
+    while finished_records(toy) < count:
+        assert process.poll() is None, process.stderr.read() if process.stderr else ""
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
 
 
 def settle(path: Path) -> None:

@@ -25,6 +25,21 @@ def _cubic(t: float, weights: FloatArray) -> None:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
+def _sample(image: NDArray[np.float32], column: float, row: float, across: FloatArray, down: FloatArray) -> float:
+    """Return the value at a position, in rows and columns of the array; overwrites the weights `across` and `down`."""
+    left, top = int(np.floor(column)), int(np.floor(row))
+    _cubic(column - left, across)
+    _cubic(row - top, down)
+    value = 0.0
+    for v in range(4):
+        line = 0.0
+        for u in range(4):
+            line += across[u] * image[top - 1 + v, left - 1 + u]
+        value += down[v] * line
+    return value
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def sample_patches(
     padded: NDArray[np.float32],
     pad_px: int,
@@ -50,17 +65,7 @@ def sample_patches(
                 y = middles[m, 1] + a * first_axes[m, 1] + b * second_axes[m, 1]
                 z = middles[m, 2] + a * first_axes[m, 2] + b * second_axes[m, 2]
                 x_px, y_px = pixel_from_ray(x, y, z, height, width)
-                column, row = x_px - 0.5 + pad_px, y_px - 0.5 + pad_px
-                left, top = int(np.floor(column)), int(np.floor(row))
-                _cubic(column - left, across)
-                _cubic(row - top, down)
-                value = 0.0
-                for v in range(4):
-                    line = 0.0
-                    for u in range(4):
-                        line += across[u] * padded[top - 1 + v, left - 1 + u]
-                    value += down[v] * line
-                patches[m, j, i] = value
+                patches[m, j, i] = _sample(padded, x_px - 0.5 + pad_px, y_px - 0.5 + pad_px, across, down)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -122,15 +127,7 @@ def _warped(patch: NDArray[np.float32], warp: FloatArray, size: int, margin: int
             left, top = int(np.floor(column)), int(np.floor(row))
             if left < 1 or top < 1 or left + 2 >= outer or top + 2 >= outer:
                 return False
-            _cubic(column - left, across)
-            _cubic(row - top, down)
-            value = 0.0
-            for v in range(4):
-                line = 0.0
-                for u in range(4):
-                    line += across[u] * patch[top - 1 + v, left - 1 + u]
-                value += down[v] * line
-            values[j * size + i] = value
+            values[j * size + i] = _sample(patch, column, row, across, down)
     return True
 
 
