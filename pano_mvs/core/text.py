@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 
 MAX_CHARACTERS = 2000
 """Maximum length of a message."""
@@ -30,6 +31,16 @@ def plural(count: int, one: str, many: str = "") -> str:
     ['0 files are left', '1 file is left', '2 files are left']
     """
     return one if count == 1 else many or f"{one}s"
+
+
+def shortened_list(names: Iterable[str], count: int = 3) -> str:
+    """Return the first names as text, with the total if there are more.
+
+    >>> shortened_list("abcde")
+    'a, b, c … (5 in all)'
+    """
+    listed = list(names)
+    return ", ".join(listed[:count]) + (f" … ({len(listed)} in all)" if len(listed) > count else "")
 
 
 def without_controls(text: str) -> str:

@@ -12,12 +12,12 @@ from pano_mvs.core.paths import is_file, is_folder
 from pano_mvs.evaluation.capture import score_capture
 from pano_mvs.evaluation.clouds.evaluate import CLOUD_FILE, MODEL_FOLDER, CloudEvaluation, evaluate_cloud
 from pano_mvs.evaluation.inputs.cameras import camera_groups, read_cameras
-from pano_mvs.evaluation.inputs.names import match_images
 from pano_mvs.evaluation.inputs.range_files import find_ranges
 from pano_mvs.evaluation.inputs.truth import find_true_ranges
 from pano_mvs.evaluation.ranges.evaluate import DepthEvaluation, evaluate_depth
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.colmap.model_writer import is_colmap_model
+from pano_mvs.io.images.names import pair_image_names
 from pano_mvs.scene import Scores
 
 _RANGES = "range"
@@ -85,7 +85,7 @@ def _poses(out: Path, truth: Path) -> Scores:
     for number, cameras in enumerate(camera_groups(out / "colmap")):
         estimated |= cameras
         groups |= dict.fromkeys(cameras, number)
-    ours = {known_name: name for name, known_name in match_images(estimated, known).items()}
+    ours = {known_name: name for name, known_name in pair_image_names(estimated, known).items()}
     if not ours:
         raise _NotComparedError(f"the truth knows none of its images ({', '.join(list(estimated)[:3])})")
     # An image of the truth that the run did not register keeps the truth's name, and counts as not registered.
@@ -104,7 +104,7 @@ def _ranges(out: Path, truth: Path) -> DepthEvaluation:
         true = find_true_ranges(truth)
     except InputError as error:
         raise _NotComparedError(f"the truth has none ({error})") from error
-    if not match_images(estimates, true):
+    if not pair_image_names(estimates, true):
         raise _NotComparedError(f"the truth knows none of their images ({', '.join(list(estimates)[:3])})")
     return evaluate_depth(out, truth)
 
@@ -115,7 +115,7 @@ def _cloud(out: Path, truth: Path) -> CloudEvaluation:
     if not is_colmap_model(out / MODEL_FOLDER):
         raise _NotComparedError(f"there is no {MODEL_FOLDER} that defines its frame")
     try:
-        if not match_images(read_cameras(truth)[0], find_true_ranges(truth)):
+        if not pair_image_names(read_cameras(truth)[0], find_true_ranges(truth)):
             raise _NotComparedError("the truth has no ranges of an image whose pose it knows")
     except InputError as error:
         raise _NotComparedError(f"the truth has no ranges with poses ({error})") from error

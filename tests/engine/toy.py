@@ -1,16 +1,12 @@
 """A toy capture: numbers in text files, doubled, compared in pairs, summed, written. Exercises every cardinality."""
 
-PLUGIN = '''
-"""A toy pipeline."""
-import os
-import time
+NUMBERS = """
 from dataclasses import dataclass
 from typing import ClassVar
 from pano_mvs.api import (
-    All, Axis, Context, Each, Files, Names, Near, One, Pairs, Params, Record, SourceItem, SourcePath, Views,
-    source, stage,
+    All, Axis, Context, Each, FilePart, Files, InputPath, Names, Near, One, Pairs, Params, Record, SourceItem,
+    SourcePath, Views, source, stage,
 )
-from helper import double
 
 
 class SourceParams(Params):
@@ -22,6 +18,22 @@ class Number(Record):
     axis: ClassVar[Axis | None] = Axis.IMAGE
     value: float
 
+
+def list_items(params):
+    for path in sorted(params.path.glob("*.txt")):
+        yield SourceItem(path.name, {"text": path})
+"""
+"""The beginning of a plugin that reads numbers from text files."""
+
+PLUGIN = (
+    f'''
+"""A toy pipeline."""
+import os
+import time
+from helper import double
+{NUMBERS}
+'''
+    + '''
 
 @dataclass(frozen=True, eq=False)
 class Difference(Record):
@@ -43,11 +55,6 @@ class Shifted(Record):
 
     def explode(self):
         return {name: Number(value) for name, value in self.values.items()}
-
-
-def list_items(params):
-    for path in sorted(params.path.glob("*.txt")):
-        yield SourceItem(path.name, {"text": path})
 
 
 @source("toy.source", list_items=list_items)
@@ -118,6 +125,7 @@ def write(differences: All[Difference], shifted: One[Shifted], ctx: Context) -> 
     path.write_text(f"{pairs} {shifted.values} {ctx.rng.random()}")
     return Files({"all.txt": path})
 '''
+)
 
 HELPER = """
 def double(x):

@@ -12,10 +12,9 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.evaluation.inputs.names import match_images
 from pano_mvs.evaluation.inputs.range_files import RangeFile, find_ranges
 from pano_mvs.evaluation.inputs.truth import find_true_ranges
-from pano_mvs.io.images.names import without_extension
+from pano_mvs.io.images.names import pair_image_names, without_extension
 from pano_mvs.io.ranges.files import write_confidence_png, write_range_tiff
 from tests.stored import write_npz
 
@@ -120,7 +119,7 @@ def test_truth_is_found_with_poses_and_without(tmp_path: Path) -> None:
 def test_pictures_are_matched_by_their_paths_without_extension(
     ours: Sequence[str], theirs: Sequence[str], expected: dict[str, str]
 ) -> None:
-    assert match_images(ours, theirs) == expected
+    assert pair_image_names(ours, theirs) == expected
 
 
 def test_only_extensions_of_pictures_are_dropped() -> None:

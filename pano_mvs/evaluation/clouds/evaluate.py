@@ -28,13 +28,13 @@ from pano_mvs.evaluation.clouds.true_surface import (
     view_points,
 )
 from pano_mvs.evaluation.inputs.cameras import Cameras, camera_groups, length_unit, read_cameras
-from pano_mvs.evaluation.inputs.names import match_images
 from pano_mvs.evaluation.inputs.sources import as_path, source_name
 from pano_mvs.evaluation.inputs.truth import find_true_ranges
 from pano_mvs.evaluation.poses.alignment import align_centers
 from pano_mvs.evaluation.tables import Summary, TextTable, finite_or_none
 from pano_mvs.geometry import Rigid3, Similarity3
 from pano_mvs.io.clouds.ply_reader import open_ply_points
+from pano_mvs.io.images.names import pair_image_names
 from pano_mvs.scene import PointCloud
 from pano_mvs.scene.up_direction import WORLD_UP, mean_up_direction
 
@@ -232,7 +232,7 @@ def _true_cameras(truth: CloudInput, true_poses: Cameras | None) -> tuple[Mappin
 def _alignment(model: Cameras, known: Mapping[str, Rigid3]) -> tuple[Similarity3, list[str]]:
     """Return truth from model by the camera centres, and the truth's names of the model's cameras."""
     estimated = camera_groups(model)[0]
-    ours = match_images(known, estimated)
+    ours = pair_image_names(known, estimated)
     try:
         aligned = align_centers({true: estimated[name] for true, name in ours.items()}, known)
     except UsageError as error:
@@ -254,7 +254,7 @@ def _compared(
         surface = surface_of_cloud(some, voxel_size=voxel_size)
         return CloudTruth(reference.chunks, surface, {}, 0, length_unit(metric=False), cameras, up)
     files = find_true_ranges(truth)
-    names = match_images(known, files)
+    names = pair_image_names(known, files)
     views = {name: TrueView(pose, files[names[name]].read()) for name, pose in known.items() if name in names}
     chosen = {name: views[name] for name in used if name in views}
     if not chosen:

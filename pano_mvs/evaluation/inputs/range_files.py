@@ -13,12 +13,14 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.paths import below, is_file, is_folder
-from pano_mvs.evaluation.inputs.names import RANGE_SUFFIXES
 from pano_mvs.io.images.exr import read_exr
 from pano_mvs.io.ranges.files import read_confidence_png
 from pano_mvs.io.ranges.npy import keys_of_npz, read_npy, read_npz
 from pano_mvs.scene import RangeMap
 from pano_mvs.scene.image_files.decoding import decode_picture
+
+RANGE_SUFFIXES = (".tiff", ".tif", ".exr", ".npy", ".npz", ".png")
+"""Extensions of range map files. If an image has several, the first of these extensions wins."""
 
 # Channels of an EXR file that may hold the ranges, most likely first.
 _EXR_CHANNELS = ("range", "depth", "distance", "Z", "Depth.Z", "V", "Y", "R")

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, UsageError
-from pano_mvs.core.text import plural
+from pano_mvs.core.text import plural, shortened_list
 from pano_mvs.evaluation.inputs.cameras import Cameras, camera_groups, length_unit, read_cameras
-from pano_mvs.evaluation.inputs.names import match_images, shortened_list
 from pano_mvs.evaluation.inputs.sources import as_path, source_name
 from pano_mvs.evaluation.poses.errors import CenterErrors, PoseErrors, center_errors, relative_pose_errors
 from pano_mvs.evaluation.tables import Summary, TextTable, finite_or_none
 from pano_mvs.geometry import Rigid3
+from pano_mvs.io.images.names import pair_image_names
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +123,7 @@ def evaluate_poses(model: Cameras | str, truth: Cameras | str) -> PoseEvaluation
     Args:
         model: estimated poses: a file or folder that `read_poses` reads, `Poses`, or cam_from_world by image name. Of
             several groups of cameras the largest is compared.
-        truth: the true poses, in any of these forms. Images are paired by name (see `match_images`).
+        truth: the true poses, in any of these forms. Images are paired by name (see `pair_image_names`).
 
     Raises:
         InputError: if a file cannot be read, or the two have fewer than two images in common.
@@ -141,7 +141,7 @@ def evaluate_poses(model: Cameras | str, truth: Cameras | str) -> PoseEvaluation
     target: Cameras = as_path(truth)
     estimated, *others = camera_groups(source)
     known, metric = read_cameras(target)
-    ours = {name: match for match, name in match_images(estimated, known).items()}
+    ours = {name: match for match, name in pair_image_names(estimated, known).items()}
     if len(ours) < 2:
         raise InputError(
             f"{source_name(source)} and {source_name(target)} have {len(ours) or 'no'} {plural(len(ours), 'image')} in "

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.paths import is_file
 from pano_mvs.evaluation.drawing import INK, WIDTH, Picture, put_text, strip, write_stack
-from pano_mvs.evaluation.inputs.names import match_images
 from pano_mvs.evaluation.ranges.evaluate import DepthEvaluation
 from pano_mvs.evaluation.ranges.pairs import RangePairs
 from pano_mvs.io.images.captures import PICTURE_SUFFIXES, describe_picture, list_pictures
+from pano_mvs.io.images.names import pair_image_names
 from pano_mvs.io.images.preview import color_mapped, range_limits, scale_ticks
 from pano_mvs.scene import FilePart, Panorama
 
@@ -137,7 +137,7 @@ def _panoramas(images: Path | None, pairs: RangePairs) -> Mapping[str, Path]:
     """Return the panorama of each view that has one."""
     if images is not None:
         files = {path.relative_to(images).as_posix(): path for path in list_pictures(images)}
-        return {name: files[other] for name, other in match_images(pairs.truths, files).items()}
+        return {name: files[other] for name, other in pair_image_names(pairs.truths, files).items()}
     if pairs.truth_path is None:
         return {}
     places = {

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.core.paths import is_folder
-from pano_mvs.evaluation.inputs.names import match_images, shortened_list
+from pano_mvs.core.text import shortened_list
 from pano_mvs.evaluation.inputs.range_files import RangeMaps, StoredRange, find_ranges
 from pano_mvs.evaluation.inputs.sources import source_name
 from pano_mvs.evaluation.inputs.truth import find_true_ranges
 from pano_mvs.evaluation.ranges.resize import resized_labels, resized_range
 from pano_mvs.io.images.mask_files import find_mask
-from pano_mvs.io.images.names import without_extension
+from pano_mvs.io.images.names import pair_image_names, without_extension
 from pano_mvs.scene.masking import decode_mask, placed_mask
 
 
@@ -131,7 +131,7 @@ def pair_ranges(source: RangeMaps, truth: RangeMaps, *, unit: float, truth_unit:
         InputError: if either side has no range maps, they have no image in common, or no mask is of any of them.
     """
     estimates, truths = find_ranges(source, unit=unit), find_true_ranges(truth, unit=truth_unit)
-    matched = match_images(estimates, truths)
+    matched = pair_image_names(estimates, truths)
     if not matched:
         raise InputError(
             f"{source_name(source)} and {source_name(truth)} have no image in common: the one has "

@@ -11,10 +11,10 @@ import numpy as np
 
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.evaluation.inputs.cameras import Cameras, camera_groups, read_cameras
-from pano_mvs.evaluation.inputs.names import match_images
 from pano_mvs.evaluation.inputs.range_files import RangeMaps
 from pano_mvs.evaluation.poses.alignment import align_centers
 from pano_mvs.geometry import Rigid3
+from pano_mvs.io.images.names import pair_image_names
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class FoundScale:
     def of_views(self, names: Iterable[str]) -> dict[str, float]:
         """Return the factor of each view that has one."""
         listed = list(names)
-        groups = match_images(listed, self.others)
+        groups = pair_image_names(listed, self.others)
         factors = {name: self.others[groups[name]] if name in groups else self.value for name in listed}
         return {name: factor for name, factor in factors.items() if np.isfinite(factor)}
 
@@ -77,7 +77,7 @@ def find_scale(
         if given:
             raise
         return FoundScale(1.0, f"the poses determine no scale, so both are taken to have one unit ({error})")
-    reason = f"from the centres of {len(match_images(groups[0], true))} cameras, never from the ranges"
+    reason = f"from the centres of {len(pair_image_names(groups[0], true))} cameras, never from the ranges"
     others: dict[str, float] = {}
     for number, cameras in enumerate(groups[1:], start=1):
         try:
@@ -99,5 +99,5 @@ def _poses_in(ranges: RangeMaps, poses: Cameras | None) -> Cameras:
 
 
 def _scale(cameras: Mapping[str, Rigid3], true: Mapping[str, Rigid3]) -> float:
-    matched = match_images(cameras, true)
+    matched = pair_image_names(cameras, true)
     return align_centers(cameras, {name: true[other] for name, other in matched.items()}).scale

@@ -12,8 +12,7 @@ import numpy as np
 
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.files import write_text
-from pano_mvs.core.text import plural
-from pano_mvs.evaluation.inputs.names import shortened_list
+from pano_mvs.core.text import plural, shortened_list
 from pano_mvs.evaluation.ranges.errors import DELTAS
 from pano_mvs.evaluation.ranges.evaluate import DepthEvaluation
 from pano_mvs.evaluation.ranges.view_scores import BASELINES, PROTOCOLS, ViewScores

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from itertools import takewhile
 from pathlib import PurePosixPath
 
 from pano_mvs.io.images.captures import PICTURE_SUFFIXES
 
 _SEPARATOR = "|"  # between the two names of a pair
-_EXTENSIONS = PICTURE_SUFFIXES | {".exr", ".npy", ".npz"}
+_EXTENSIONS = PICTURE_SUFFIXES | {".bmp", ".dng", ".exr", ".insp", ".npy", ".npz"}
 
 
 def match_image_names(wanted: Iterable[str], available: Iterable[str]) -> dict[str, str]:
-    """Return, for each wanted image name that has exactly one counterpart, that counterpart.
+    """Return, for each wanted image name that has one closest counterpart, that counterpart.
 
-    The first rule that finds candidates decides: equal names; names of which one is the other with further folders in
-    front; names that are equal without folders; names that are equal without folders and extensions. A name is left
-    out if that rule finds several candidates.
+    Counterparts have the same last part, ignoring case and image extensions. Of several, the closest is the one that
+    shares most trailing folders, then the one that is the wanted name with folders in front or without some, then the
+    one with the same extension. A name is left out if two are equally close. Several names may have one counterpart;
+    see `pair_image_names`.
 
     Args:
         wanted: names relative to a capture, such as "a/001.jpg".
@@ -25,24 +27,31 @@ def match_image_names(wanted: Iterable[str], available: Iterable[str]) -> dict[s
     Returns:
         Wanted name to available name.
     """
-    candidates = list(available)
-    cleaned = {name: _clean(name) for name in candidates}
-    matched: dict[str, str] = {}
-    for name in wanted:
-        parts = _clean(name)
-        rules = (
-            lambda other, parts=parts: other == parts,
-            lambda other, parts=parts: _ends_with(other, parts) or _ends_with(parts, other),
-            lambda other, parts=parts: other[-1:] == parts[-1:],
-            lambda other, parts=parts: _stem(other) == _stem(parts),
-        )
-        for rule in rules:
-            found = [candidate for candidate in candidates if rule(cleaned[candidate])]
-            if found:
-                if len(found) == 1:
-                    matched[name] = found[0]
-                break
-    return matched
+    found = {}
+    for ours, theirs in _with_same_last_part(wanted, available):
+        found |= {name: other for name in ours if (other := _closest(name, theirs))}
+    return found
+
+
+def pair_image_names(names: Iterable[str], available: Iterable[str]) -> dict[str, str]:
+    """Pair image names one to one: those that are the closest to each other, as in `match_image_names`.
+
+    Args:
+        names: image names, such as "a/001".
+        available: names of the other side, such as "images/a/001.jpg".
+
+    Returns:
+        Name to available name.
+
+    Example:
+        >>> pair_image_names(["a/1", "b/1"], ["images/b/1.jpg", "images/a/1.jpg"])
+        {'a/1': 'images/a/1.jpg', 'b/1': 'images/b/1.jpg'}
+    """
+    paired = {}
+    for ours, theirs in _with_same_last_part(names, available):
+        closest = {name: _closest(name, theirs) for name in ours}
+        paired |= {name: other for name, other in closest.items() if other and _closest(other, ours) == name}
+    return paired
 
 
 def without_extension(name: str) -> str:
@@ -65,13 +74,30 @@ def printable_name(name: str) -> tuple[str, str]:
     return shown, f"{shown}: a file name with {what} cannot be used; rename it"
 
 
-def _clean(name: str) -> tuple[str, ...]:
-    return tuple(part for part in PurePosixPath(name.replace("\\", "/")).parts if part != ".")
+def _with_same_last_part(names: Iterable[str], others: Iterable[str]) -> Iterable[tuple[list[str], list[str]]]:
+    """Return the names of both sides in groups with the same last part."""
+    groups: dict[str, tuple[list[str], list[str]]] = {}
+    for side, all_names in enumerate((names, others)):
+        for name in all_names:
+            groups.setdefault(_parts(without_extension(name))[-1].casefold(), ([], []))[side].append(name)
+    return groups.values()
 
 
-def _ends_with(longer: tuple[str, ...], shorter: tuple[str, ...]) -> bool:
-    return bool(shorter) and longer[-len(shorter) :] == shorter
+def _closest(name: str, others: Sequence[str]) -> str:
+    """Return the closest of several names with the same last part; "" if there is none, or two are equally close."""
+    ranked = sorted(((_closeness(name, other), other) for other in others), reverse=True)
+    tied = len(ranked) > 1 and ranked[0][0] == ranked[1][0]
+    return ranked[0][1] if ranked and not tied else ""
 
 
-def _stem(parts: tuple[str, ...]) -> str:
-    return PurePosixPath(parts[-1]).stem.casefold() if parts else ""
+def _closeness(name: str, other: str) -> tuple[bool, int, bool, bool]:
+    """Return how close two names are: equal; equal trailing parts; one ends with the other; same extension."""
+    ours, theirs = _parts(name), _parts(other)
+    plain, other_plain = _parts(without_extension(name)), _parts(without_extension(other))
+    pairs = zip(reversed(plain), reversed(other_plain), strict=False)
+    common = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
+    return ours == theirs, common, common == min(len(plain), len(other_plain)), ours[-1] == theirs[-1]
+
+
+def _parts(name: str) -> tuple[str, ...]:
+    return tuple(part for part in PurePosixPath(name.replace("\\", "/")).parts if part != ".") or ("",)

@@ -21,19 +21,11 @@ from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.running.events import RunResult, SilentObserver
 from pano_mvs.engine.running.run import Run
 from tests.engine.conftest import Toy, settle
+from tests.engine.toy import NUMBERS
 
-PLUGIN = '''
-from dataclasses import dataclass
-from typing import ClassVar
-from pano_mvs.api import (
-    All, Axis, Context, Each, FilePart, Files, InputPath, One, Params, Record, SourceItem, SourcePath, source, stage,
-)
-
-
-class SourceParams(Params):
-    path: SourcePath
-
-
+PLUGIN = (
+    NUMBERS
+    + '''
 @dataclass(frozen=True, eq=False)
 class Text(Record):
     """A text, by reference to its file."""
@@ -42,19 +34,8 @@ class Text(Record):
 
 
 @dataclass(frozen=True, eq=False)
-class Number(Record):
-    axis: ClassVar[Axis | None] = Axis.IMAGE
-    value: float
-
-
-@dataclass(frozen=True, eq=False)
 class Total(Record):
     value: float
-
-
-def list_items(params):
-    for path in sorted(params.path.glob("*.txt")):
-        yield SourceItem(path.name, {"text": path})
 
 
 @source("toy.source", list_items=list_items)
@@ -97,6 +78,7 @@ def add(total: One[Total], params: AddParams) -> Total:
     """Add what a file of the settings says."""
     return Total(total.value + float(params.file.read_text()))
 '''
+)
 
 WORKFLOW = """\
 pano_mvs: 1
