@@ -22,6 +22,12 @@ def test_no_library_is_imported_before_it_is_needed(module: str) -> None:
     assert done.stdout.split() == []
 
 
+def test_a_plugin_does_not_wait_for_the_libraries_of_solvers() -> None:
+    code = "import sys, pano_mvs.api; print(*({'numba', 'pycolmap', 'pyvista', 'scipy'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
 def test_all_names_are_there_and_type_checkers_see_the_same() -> None:
     tree = ast.parse(Path(pano_mvs.__file__).read_text(encoding="utf-8"))
     (block,) = [node for node in tree.body if isinstance(node, ast.If)]

@@ -40,6 +40,17 @@ class RunEvaluation:
     cloud: CloudEvaluation | None
     not_compared: Mapping[str, str]
 
+    def __repr__(self) -> str:
+        """Return the main figures, one line for each result."""
+        lines = [repr(result) for result in (self.depth, self.cloud) if result is not None]
+        if self.poses is not None:
+            scores = self.poses.poses
+            median = scores.get("median_pair_error_deg", float("nan"))  # missing if no pair could be measured
+            images = f"{scores['registered']} of {scores['of']} images"
+            lines.insert(0, f"poses: {images} registered, median error of a pair {median:.3g}°")
+        lines += [f"{result} not compared: {reason}" for result, reason in self.not_compared.items()]
+        return "\n  ".join(["RunEvaluation(", *lines]) + ")"
+
 
 class _NotComparedError(Exception):
     """A result has no counterpart in the truth; the text is the reason."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 FloatArray = NDArray[np.float64]
 
@@ -21,22 +20,30 @@ def skew(vectors: ArrayLike) -> FloatArray:
 
 def rotation_from_rotvec(rotvec: ArrayLike) -> FloatArray:
     """Return the rotation matrix of a rotation vector (axis times angle in radians); (3,) to (3, 3), or batched."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
     return np.asarray(Rotation.from_rotvec(np.asarray(rotvec, dtype=np.float64)).as_matrix())
 
 
 def rotvec_from_rotation(rotation: ArrayLike) -> FloatArray:
     """Return the rotation vector (axis times angle in [0, π]) of a rotation matrix; (3, 3) to (3,), or batched."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
     return np.asarray(Rotation.from_matrix(np.asarray(rotation, dtype=np.float64)).as_rotvec())
 
 
 def rotation_from_quat_wxyz(quat_wxyz: ArrayLike) -> FloatArray:
     """Return the rotation matrix of a quaternion (w, x, y, z) of any length but zero; (..., 4) to (..., 3, 3)."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
     quat = np.asarray(quat_wxyz, dtype=np.float64)
     return np.asarray(Rotation.from_quat(np.roll(quat, -1, axis=-1)).as_matrix())
 
 
 def quat_wxyz_from_rotation(rotation: ArrayLike) -> FloatArray:
     """Return the unit quaternion (w, x, y, z) with w ≥ 0 of a rotation matrix; (..., 3, 3) to (..., 4)."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
     quat_xyzw = Rotation.from_matrix(np.asarray(rotation, dtype=np.float64)).as_quat(canonical=True)
     return np.roll(np.asarray(quat_xyzw), 1, axis=-1)
 

@@ -10,7 +10,8 @@ import pytest
 
 import pano_mvs.evaluation
 from pano_mvs.core.errors import UsageError
-from pano_mvs.evaluation import evaluate_cloud, evaluate_depth, evaluate_poses
+from pano_mvs.evaluation import RunEvaluation, evaluate_cloud, evaluate_depth, evaluate_poses
+from pano_mvs.evaluation.capture import score_capture
 from pano_mvs.evaluation.tables import TextTable
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.clouds.ply_writer import write_ply
@@ -64,6 +65,24 @@ def test_clouds_in_memory_score_like_those_in_files(tmp_path: Path) -> None:
     assert scores[0][1].accuracy < scores[0][0].accuracy == 1
     with pytest.raises(UsageError, match=r"of shape \(N, 3\)"):
         evaluate_cloud(np.ones((4, 2)), points)
+
+
+def test_evaluations_print_their_main_figures_only() -> None:
+    truth = {name: np.full((8, 16), 2, np.float32) for name in "ab"}
+    depth = evaluate_depth({name: 1.1 * ranges for name, ranges in truth.items()}, truth)
+    points = np.random.default_rng(0).uniform(0, 1, (200, 3)).astype(np.float32)
+    cloud = evaluate_cloud(points, points, thresholds=(0.06,))
+    assert repr(evaluate_poses(POSES, POSES)) == "PoseEvaluation(3 of 3 images registered, median error of a pair 0°)"
+    assert repr(depth) == "DepthEvaluation(2 views, mean w_mae 0.2, w_abs_rel 0.1, completeness 1)"
+    assert repr(cloud) == "CloudEvaluation(200 points, F-score 1.000 within 0.06 units of the truth)"
+    run = RunEvaluation(score_capture(POSES, POSES), depth, cloud, {})
+    assert repr(run).splitlines() == [
+        "RunEvaluation(",
+        "  poses: 3 of 3 images registered, median error of a pair 0°",
+        f"  {depth!r}",
+        f"  {cloud!r})",
+    ]
+    assert repr(RunEvaluation(None, None, cloud, {"poses": "no"})).endswith("\n  poses not compared: no)")
 
 
 def test_a_table_is_readable_text() -> None:

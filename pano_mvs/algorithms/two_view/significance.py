@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln
 
 from pano_mvs.geometry import Rigid3
 
@@ -87,4 +86,6 @@ def _cells(bearings: FloatArray, cell_rad: float) -> int:
 
 
 def _log_binomial(n: int, k: int) -> float:
+    from scipy.special import gammaln  # slow to import
+
     return float(gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1))

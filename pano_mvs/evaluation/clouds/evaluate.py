@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -90,12 +90,17 @@ class CloudEvaluation:
     source: str
     truth: str
     scores: tuple[CloudScore, ...]
-    cloud: PointSource = field(repr=False)
+    cloud: PointSource
     is_aligned: bool
-    compared: CloudTruth = field(repr=False)
-    distances: CloudDistances = field(repr=False)
+    compared: CloudTruth
+    distances: CloudDistances
     limits: tuple[float, ...]
     farthest: float
+
+    def __repr__(self) -> str:
+        """Return the main figures in a line."""
+        scores = (f"{score.f_score:.3f} within {score.threshold:g} {self.compared.unit}" for score in self.scores)
+        return f"CloudEvaluation({self.cloud.count} points, F-score {', '.join(scores)})"
 
     def to_json(self) -> dict[str, object]:
         """Return all figures as JSON values; None stands for a distance beyond those measured."""

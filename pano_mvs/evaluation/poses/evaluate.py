@@ -44,6 +44,11 @@ class PoseEvaluation:
     without_truth: tuple[str, ...] = ()
     other_groups: tuple[int, ...] = ()
 
+    def __repr__(self) -> str:
+        """Return the main figures in a line."""
+        images = f"{self.pairs.registered} of {self.pairs.expected} images"
+        return f"PoseEvaluation({images} registered, median error of a pair {self.pairs.median_pair_deg:.3g}°)"
+
     def to_json(self) -> dict[str, object]:
         """Return all figures as JSON values; None stands for what cannot be determined."""
         some, all_pairs = self.registered_pairs, self.pairs

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -42,8 +42,13 @@ class DepthEvaluation:
     settings: ScoreSettings
     scale: FoundScale
     views: Mapping[str, ViewScores]
-    pairs: RangePairs = field(repr=False)
+    pairs: RangePairs
     sizes: Mapping[Sizes, int]
+
+    def __repr__(self) -> str:
+        """Return the main figures in a line."""
+        scores = (f"{name} {self.mean[name]:.3g}" for name in ("w_mae", "w_abs_rel", "completeness"))
+        return f"DepthEvaluation({len(self.views)} views, mean {', '.join(scores)})"
 
     @cached_property
     def mean(self) -> Mapping[str, float]:
