@@ -12,6 +12,7 @@ from pano_mvs.core.errors import StoreError
 from pano_mvs.engine.cache.store import Store
 from pano_mvs.engine.planning.plan import StagePlan, make_plan
 from pano_mvs.engine.planning.run_options import RunOptions
+from pano_mvs.session.python_errors import names_arguments
 from pano_mvs.session.session import Session, check_output, open_session
 from pano_mvs.session.settings import overrides_from_settings
 
@@ -45,6 +46,7 @@ class RunPlan:
         return any(plan.may_run or plan.open for plan in self.stages)
 
 
+@names_arguments
 def plan(
     workflow: str | Path,
     images: str | Path | None = None,

@@ -29,6 +29,7 @@ from pano_mvs.session.outputs import (
     write_outputs_after_error,
 )
 from pano_mvs.session.progress import EventObserver, Progress, RunFinished, RunStarted, ignore
+from pano_mvs.session.python_errors import names_arguments
 from pano_mvs.session.session import Session, check_output, open_session
 from pano_mvs.session.settings import overrides_from_settings
 
@@ -59,6 +60,7 @@ class Execution:
     durable: bool = False
 
 
+@names_arguments
 def run(
     workflow: str | Path,
     images: str | Path | None = None,

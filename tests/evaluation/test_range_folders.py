@@ -151,7 +151,7 @@ class TestFaults:
         with pytest.raises(InputError, match=r"a\.png: holds \(4, 8, 3\) uint8, not a map of ranges"):
             find_ranges(tmp_path)["a"].read()
         cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 8), np.uint8))
-        with pytest.raises(InputError, match="16-bit PNG with --unit"):
+        with pytest.raises(InputError, match="16-bit PNG, and give its unit"):
             find_ranges(tmp_path)["a"].read()
 
     def test_pickles_are_refused(self, tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from pano_mvs.session.progress import (
     UnitFailed,
     UnitFinished,
 )
+from pano_mvs.session.python_errors import arguments_from_options
 from pano_mvs.session.settings import overrides_from_settings
 from tests.engine.conftest import Toy
 
@@ -141,3 +142,22 @@ def test_a_disk_that_damages_results_again_and_again_ends_the_run(toy: Toy, monk
     with pytest.raises(DamagedBlobError, match="blob 7"):
         run_toy(toy)
     assert len(calls) == 4
+
+
+def test_errors_name_arguments_and_not_options(toy: Toy) -> None:
+    with pytest.raises(pano_mvs.InputError, match=r"^images=.*absent: there is no such folder"):
+        run_toy(toy, images=toy.folder / "absent")
+    for call in (pano_mvs.run, pano_mvs.plan):
+        with pytest.raises(pano_mvs.WorkflowError, match=r"^settings\['scald.by'\]=4: no stage 'scald'") as caught:
+            call(toy.folder / "wf.yaml", settings={"scald.by": 4})
+        assert caught.value.problems == str(caught.value).splitlines()
+    with pytest.raises(pano_mvs.UsageError, match=r"^executor=serial runs one unit .* use executor=processes$"):
+        run_toy(toy, workers=3)
+    (toy.folder / "file").touch()
+    with pytest.raises(pano_mvs.UsageError, match="Choose another folder with out=DIR"):
+        run_toy(toy, out=toy.folder / "file")
+
+
+def test_only_options_become_arguments() -> None:
+    message = "a--images b: --json, /x/--out y (--min-free) --workers --cache"
+    assert arguments_from_options(message) == "a--images b: --json, /x/--out y ($PANO_MVS_MIN_FREE) workers cache"

@@ -131,8 +131,8 @@ class CloudEvaluation:
         lines: list[str | TextTable] = [f"{self.cloud.count} {plural(self.cloud.count, 'point')} against {against}"]
         if not compared.used and not self.is_aligned:
             lines.append(
-                "both clouds are taken to lie in one frame; if they do not, give --true-poses, those in the frame of "
-                "the reference cloud"
+                "both clouds are taken to lie in one frame; if they do not, give the true poses, in the frame of the "
+                "reference cloud"
             )
         rows = tuple(
             (f"{score.threshold:g}", *(f"{100 * x:.2f}" for x in (score.accuracy, score.completeness, score.f_score)))
@@ -192,7 +192,7 @@ def evaluate_cloud(
     if model is not None and (known or given is not None):
         if not known:
             raise InputError(
-                f"{source_name(target)}: a reference cloud has no cameras: give --true-poses to bring the cloud of "
+                f"{source_name(target)}: a reference cloud has no cameras: give the true poses to bring the cloud of "
                 f"{source_name(model)} into its frame"
             )
         truth_from_cloud, used = _alignment(model, known)

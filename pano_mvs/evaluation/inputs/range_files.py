@@ -60,7 +60,7 @@ class RangeFile:
             name = f"{self.path}: {self.key}" if self.key else f"{self.path}:"
             raise InputError(
                 f"{name} holds {array.shape} {array.dtype}, not a map of ranges (height, width) in floats or 16-bit "
-                "steps. Write ranges as float TIFF, EXR or NPY, or as 16-bit PNG with --unit"
+                "steps. Write ranges as float TIFF, EXR or NPY, or as 16-bit PNG, and give its unit"
             )
         return _positive_or_nan(array, self.unit)
 

@@ -158,7 +158,7 @@ def evaluate_depth(
         maps = pairs.read(name)
         if settings.min_confidence and maps.confidence is None:
             raise InputError(
-                f"{pairs.estimates[name]}: no confidence/{name}.png beside it, so --min-confidence cannot be applied. "
+                f"{pairs.estimates[name]}: no confidence/{name}.png beside it, so a minimum confidence cannot apply. "
                 "Omit it, or give the output folder of a run"
             )
         views[name] = score_view(

@@ -57,7 +57,7 @@ class ViewMasks:
         if self.folder is None:
             return
         if not is_folder(self.folder):
-            raise InputError(f"{self.folder}: masks must be a folder. Give one mask for all images as --mask")
+            raise InputError(f"{self.folder}: masks must be a folder. Give one mask for all images as `mask`")
         if len(self.missing(names)) == len(names):
             raise InputError(
                 f"{self.folder}: no mask in it belongs to a view. The mask of {names[0]} must be named like the image "

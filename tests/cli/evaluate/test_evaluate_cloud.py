@@ -71,7 +71,7 @@ def test_the_truth_is_perfect_in_its_own_frame_and_in_any_other(
     assert [score["f_score"] for score in against["scores"]] == pytest.approx([1, 1], abs=1e-3)
     failed = pano_mvs("evaluate", "cloud", *arguments, "--truth", tmp_path / "a.ply")
     assert failed.code == 2
-    assert "give --true-poses" in failed.flat
+    assert "give the true poses" in failed.flat
 
 
 def test_truth_may_be_range_maps_in_files_beside_the_poses(
@@ -142,7 +142,7 @@ def test_the_cloud_of_a_run_lies_in_the_frame_of_a_reference_without_poses(
     assert "both clouds are taken to lie in one frame" in plain.flat
     assert "100.00" in plain.text
     named = pano_mvs("evaluate", "cloud", tmp_path, "--truth", own, "--poses", model)
-    assert (named.code, "give --true-poses" in named.flat) == (2, True)
+    assert (named.code, "give the true poses" in named.flat) == (2, True)
 
 
 def test_up_is_where_the_cameras_have_it(tmp_path: Path, folder: Path, surface: np.ndarray) -> None:

@@ -211,7 +211,7 @@ def test_masks_and_confidence_leave_out_what_they_say(
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--min-confidence", "128"), "so --min-confidence cannot be applied"),
+        (("--min-confidence", "128"), "so a minimum confidence cannot apply"),
         (("--scale", "big"), "'big' is no scale"),
         (("--bad", "often"), "no limit for bad pixels"),
         (("--unit", "0"), "unit must be a positive number"),
