@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import import_module
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 COPIED = ("pano_mvs", "tests", "docs", "workflows", "plugins", "pyproject.toml", "README.md", "CONTRIBUTING.md")
 NOT_COPIED = shutil.ignore_patterns("__pycache__", ".git", ".hypothesis")
 SECONDS = 10.0
+_LATER = count(int(time.time()) + 2, 2)  # times of files, each after the last
 LOG = "mutation.log"
 MEMORY_BYTES = 12 << 30
 CRASHED = 99
@@ -111,9 +113,8 @@ def outcome_of(tree: Path, mutant: Mutant, baseline: Baseline) -> str:
 
 def _write(path: Path, data: bytes) -> None:
     """Write a module so that no compiled file of another text is taken for it."""
-    _write.clock = getattr(_write, "clock", int(time.time())) + 2  # type: ignore[attr-defined]
     path.write_bytes(data)
-    os.utime(path, (_write.clock, _write.clock))  # type: ignore[attr-defined]
+    os.utime(path, (later := next(_LATER), later))
 
 
 def _in_child(tree: Path, work: Callable[[], int], limit_s: float) -> int | None:

@@ -24,7 +24,7 @@ from pano_mvs.engine.cache.blobs import BlobRef, DamagedBlobError
 from pano_mvs.engine.cache.disk_guard import DiskGuard
 from pano_mvs.engine.cache.stat_cache import StatCache
 from pano_mvs.engine.cache.store import MIN_FREE_BYTES, ItemRef, Store, UnitRecord, record_from_bytes
-from pano_mvs.scene import FilePart, Record
+from pano_mvs.scene import FilePart, Part, Record
 from tests.engine.conftest import settle
 
 KEY = "ab" * 16
@@ -254,27 +254,27 @@ def test_a_users_file_is_found_where_it_was_said_to_be(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("part", [{"a": 1}, np.arange(5), "file"])
-def test_what_is_stored_already_is_marked_as_used_and_not_written_again(tmp_path: Path, part: object) -> None:
+def test_what_is_stored_already_is_marked_as_used_and_not_written_again(tmp_path: Path, part: Part | str) -> None:
     """A collection takes what has not been used for a while."""
     if isinstance(part, str):
         (tmp_path / "a.txt").write_bytes(b"abc")
         part = FilePart(tmp_path / "a.txt")
-    ref = Store(tmp_path / "store").blobs.put(part)  # type: ignore[arg-type]
+    ref = Store(tmp_path / "store").blobs.put(part)
     path = Store(tmp_path / "store").blobs.path(ref)
     os.utime(path, (1000, 1000))
     before = path.stat().st_ino
-    assert Store(tmp_path / "store").blobs.put(part) == ref  # type: ignore[arg-type]
+    assert Store(tmp_path / "store").blobs.put(part) == ref
     assert path.stat().st_ino == before
     assert path.stat().st_mtime > 1000
 
 
 @pytest.mark.parametrize("part", [{"a": 1}, np.arange(5)])
-def test_what_is_damaged_is_written_again(tmp_path: Path, part: object) -> None:
-    ref = Store(tmp_path).blobs.put(part)  # type: ignore[arg-type]
+def test_what_is_damaged_is_written_again(tmp_path: Path, part: Part) -> None:
+    ref = Store(tmp_path).blobs.put(part)
     path = Store(tmp_path).blobs.path(ref)
     data = path.read_bytes()
     path.write_bytes(data[:-1] + b"?")
-    assert Store(tmp_path).blobs.put(part) == ref  # type: ignore[arg-type]
+    assert Store(tmp_path).blobs.put(part) == ref
     assert path.read_bytes() == data
 
 
@@ -500,8 +500,9 @@ def test_with_durable_every_blob_and_record_is_flushed(tmp_path: Path, monkeypat
     store.put(record_of(store))
     assert flushed == []
     durable = Store(tmp_path / "durable", durable=True)
-    for number, part in enumerate(({"a": 1}, np.arange(3)), 1):
-        durable.blobs.put(part)  # type: ignore[arg-type]
+    parts: tuple[Part, ...] = {"a": 1}, np.arange(3)
+    for number, part in enumerate(parts, 1):
+        durable.blobs.put(part)
         assert len(flushed) >= number
     before = len(flushed)
     durable.put(record_of(store))

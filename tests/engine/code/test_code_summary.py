@@ -290,11 +290,11 @@ def test_text_that_is_no_python_is_refused(text: str, error: type[Exception]) ->
         summarize_module(text, "m")
 
 
-def graph_of(folder: Path, files: dict[str, str], **options: object) -> CodeGraph:
+def graph_of(folder: Path, files: dict[str, str], **options: list[str]) -> CodeGraph:
     for name, text in files.items():
         (folder / "pack" / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / "pack" / name).write_text(text)
-    return CodeGraph(Sources({"pack": folder / "pack"}), **options)  # type: ignore[arg-type]
+    return CodeGraph(Sources({"pack": folder / "pack"}), **options)
 
 
 def reached(folder: Path, files: dict[str, str], *paths: str) -> tuple[set[str], set[str]]:

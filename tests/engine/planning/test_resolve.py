@@ -17,7 +17,7 @@ from pano_mvs.engine.planning.resolve import KEY_SCHEMA, resolve, resolve_source
 from pano_mvs.engine.planning.units import PENDING, WHOLE, Resolution, StageState, Unit
 from pano_mvs.engine.stages.stage import SourceItem
 from pano_mvs.engine.stages.stage_code import reach_of_function, stage_code
-from pano_mvs.scene import Axis, Pairs, Views
+from pano_mvs.scene import Axis, Pairs, Record, Views
 from tests.engine.conftest import Toy
 from tests.engine.workflows.test_wiring import MORE
 
@@ -271,11 +271,12 @@ def test_a_stage_of_a_module_without_source_counts_by_its_version(toy: Toy, monk
     entry = toy.session().workflow.stages["scaled"]
     monkeypatch.setitem(sys.modules, "compiled_stages", ModuleType("compiled_stages"))
 
-    def function() -> None: ...
+    def function() -> Record:
+        raise NotImplementedError
 
     function.__module__ = "compiled_stages"
     function.__qualname__ = "function"
-    code = stage_code(replace(entry.spec, function=function, code_digest=""), entry.params)  # type: ignore[arg-type]
+    code = stage_code(replace(entry.spec, function=function, code_digest=""), entry.params)
     assert (code.digest, code.libraries) == ("", {"compiled_stages": "not installed"})
 
 
@@ -305,11 +306,12 @@ def test_a_plugin_that_is_a_package_uses_no_library_of_its_own_name(toy: Toy, mo
     module.__file__ = str(toy.folder / "mine" / "__init__.py")
     monkeypatch.setitem(sys.modules, "mine", module)
 
-    def function() -> None: ...
+    def function() -> Record:
+        raise NotImplementedError
 
     function.__module__ = "mine"
     entry = toy.session().workflow.stages["scaled"]
-    spec = replace(entry.spec, function=function, code_digest="one")  # type: ignore[arg-type]
+    spec = replace(entry.spec, function=function, code_digest="one")
     code = stage_code(spec, entry.params)
     assert code.libraries.keys() == {"numpy"}
     assert stage_code(spec.with_code("other"), entry.params).digest != code.digest

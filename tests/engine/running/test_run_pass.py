@@ -217,7 +217,9 @@ def test_whatever_is_computed_or_refused_is_heard_of_as_begun_and_ended(toy: Toy
     assert sorted(heard.started) == sorted(name for name, _ in heard.finished if name not in blocked)
 
 
-def test_units_wait_for_memory_and_nothing_overtakes_them(toy: Toy, shelf: Shelf) -> None:
+def test_units_wait_for_memory_and_nothing_overtakes_them(
+    toy: Toy, shelf: Shelf, monkeypatch: pytest.MonkeyPatch
+) -> None:
     shelf.memory_bytes = 3_000_000
     shelf.latest_first = False
     together: list[int] = []
@@ -227,7 +229,7 @@ def test_units_wait_for_memory_and_nothing_overtakes_them(toy: Toy, shelf: Shelf
         submit(job)
         together.append(len([one for one in shelf._jobs if one.unit.entry.name == "scaled"]))
 
-    shelf.submit = counted  # type: ignore[method-assign]
+    monkeypatch.setattr(shelf, "submit", counted)
     assert run_with(toy, shelf, "scaled.memory=2MB").exit_code == 0
     assert max(together) == 1
     assert [one for one in shelf.submitted if one.startswith("scaled")] == [f"scaled:{n}.txt" for n in range(1, 6)]
@@ -278,7 +280,7 @@ def test_of_units_that_deliver_one_file_the_first_of_the_capture_stays(toy: Toy,
     assert summary(cached)["each"] == (0, 1, 4, 0)
 
 
-def test_a_damaged_input_is_left_for_the_next_pass(toy: Toy, shelf: Shelf) -> None:
+def test_a_damaged_input_is_left_for_the_next_pass(toy: Toy, shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
     shelf.answers["scaled:4.txt"] = JobOutcome("damaged", cause="a blob is damaged")
     wait = shelf.wait
 
@@ -288,7 +290,7 @@ def test_a_damaged_input_is_left_for_the_next_pass(toy: Toy, shelf: Shelf) -> No
             shelf.answers.clear()
         return found
 
-    shelf.wait = once  # type: ignore[method-assign]
+    monkeypatch.setattr(shelf, "wait", once)
     result = run_with(toy, shelf)
     assert (result.exit_code, result.warnings) == (0, ["a blob is damaged"])
     assert summary(result)["scaled"] == (5, 0, 0, 0)  # what the first pass computed does not count as found
