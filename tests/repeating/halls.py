@@ -7,10 +7,11 @@ from typing import Literal, Unpack
 import numpy as np
 
 from pano_mvs.testing.paint import OAK, WHITE
-from pano_mvs.testing.repeating.drawings import Drawing
-from pano_mvs.testing.repeating.fittings import Site, Wall
-from pano_mvs.testing.repeating.prints import Print
-from pano_mvs.testing.repeating.visits import (
+from pano_mvs.testing.scenes import Scene
+from tests.repeating.drawings import Drawing
+from tests.repeating.fittings import Site, Wall
+from tests.repeating.prints import Print
+from tests.repeating.visits import (
     SAND,
     STONES,
     Tiles,
@@ -22,8 +23,7 @@ from pano_mvs.testing.repeating.visits import (
     unique_rng,
     wall_print,
 )
-from pano_mvs.testing.repeating.walks import Ground, Rect
-from pano_mvs.testing.scenes import Scene
+from tests.repeating.walks import Ground, Rect
 
 
 def tiled_hall(

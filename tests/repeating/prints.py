@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.testing.paint import WHITE
-from pano_mvs.testing.repeating.drawings import Drawing, Image, pyramid
 from pano_mvs.testing.surfaces import FloatArray, Vector
+from tests.repeating.drawings import Drawing, Image, pyramid
 
 _ROW = 1024
 # Side of a print of the wear, and scale of its second layer: together they do not repeat within a hall.

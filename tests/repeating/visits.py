@@ -8,13 +8,13 @@ import numpy as np
 
 from pano_mvs.geometry import Rigid3, rotation_from_quat_wxyz, rotation_from_rotvec
 from pano_mvs.testing.paint import Colors
-from pano_mvs.testing.repeating.drawings import Drawing, Kind
-from pano_mvs.testing.repeating.fittings import Site
-from pano_mvs.testing.repeating.prints import Print
-from pano_mvs.testing.repeating.walks import Ground, Layout, Rect, stands
 from pano_mvs.testing.room import Room
 from pano_mvs.testing.scenes import Scene
 from pano_mvs.testing.surfaces import FloatArray, Vector
+from tests.repeating.drawings import Drawing, Kind
+from tests.repeating.fittings import Site
+from tests.repeating.prints import Print
+from tests.repeating.walks import Ground, Layout, Rect, stands
 
 Tiles = Literal["marble", "checker", "motif"]
 

@@ -8,8 +8,10 @@ from typing import Unpack
 import numpy as np
 
 from pano_mvs.testing.paint import BLUE, BRICK, OAK, RED, STEEL, STONE, WHITE
-from pano_mvs.testing.repeating.fittings import Site, Wall
-from pano_mvs.testing.repeating.visits import (
+from pano_mvs.testing.scenes import Scene
+from pano_mvs.testing.surfaces import FloatArray
+from tests.repeating.fittings import Site, Wall
+from tests.repeating.visits import (
     PLASTER,
     SAND,
     STONES,
@@ -22,9 +24,7 @@ from pano_mvs.testing.repeating.visits import (
     unique_rng,
     wall_print,
 )
-from pano_mvs.testing.repeating.walks import Ground, Rect
-from pano_mvs.testing.scenes import Scene
-from pano_mvs.testing.surfaces import FloatArray
+from tests.repeating.walks import Ground, Rect
 
 
 def facade_row(

@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from pano_mvs.testing.repeating.halls import colonnade, tiled_hall
-from pano_mvs.testing.repeating.rows import doors, facade_row, stairs
-from pano_mvs.testing.repeating.twin_rooms import twin_rooms
-from pano_mvs.testing.repeating.visits import TILES, Visit
-from pano_mvs.testing.repeating.walks import LAYOUTS
 from pano_mvs.testing.scenes import Scene
+from tests.repeating.halls import colonnade, tiled_hall
+from tests.repeating.rows import doors, facade_row, stairs
+from tests.repeating.twin_rooms import twin_rooms
+from tests.repeating.visits import TILES, Visit
+from tests.repeating.walks import LAYOUTS
 
 __all__ = [
     "REPEATS",

@@ -8,10 +8,10 @@ from typing import TypeAlias
 import numpy as np
 
 from pano_mvs.testing.paint import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, WHITE, Colors, Pattern, Texture
-from pano_mvs.testing.repeating.drawings import Drawing, Kind
-from pano_mvs.testing.repeating.prints import Print
-from pano_mvs.testing.repeating.walks import Rect
 from pano_mvs.testing.surfaces import Ball, Bounded, Cuboid, FloatArray, Quad, Rod, Surface, Vector
+from tests.repeating.drawings import Drawing, Kind
+from tests.repeating.prints import Print
+from tests.repeating.walks import Rect
 
 Painted: TypeAlias = tuple[Surface, Texture | Pattern]
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pano_mvs.testing.repeating.fittings import Painted, Wall, corners, vector
-from pano_mvs.testing.repeating.prints import Print
-from pano_mvs.testing.repeating.walks import Rect
 from pano_mvs.testing.surfaces import Ball, Bounded, Cuboid, FloatArray, Quad, Rod, Surface, Vector
+from tests.repeating.fittings import Painted, Wall, corners, vector
+from tests.repeating.prints import Print
+from tests.repeating.walks import Rect
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,0 @@
-"""Synthetic places with repeated structure."""

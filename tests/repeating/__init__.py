@@ -1,0 +1,1 @@
+"""Synthetic places with repeated structure, for tests and benchmarks of pose solvers."""
