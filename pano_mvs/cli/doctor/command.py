@@ -50,7 +50,7 @@ def all_findings(cache: Path | None = None, out: Path | None = None) -> Iterator
         out: the folder of the results, with the same default.
     """
     from pano_mvs.cli.doctor.libraries import library_findings
-    from pano_mvs.cli.doctor.machine import folder_findings, kernel_cache_finding, machine_findings
+    from pano_mvs.cli.doctor.machine import folder_finding, kernel_cache_finding, machine_findings
     from pano_mvs.cli.doctor.packages import package_findings
     from pano_mvs.cli.doctor.plugins import plugin_findings
     from pano_mvs.engine.stages.registry import Registry
@@ -62,8 +62,8 @@ def all_findings(cache: Path | None = None, out: Path | None = None) -> Iterator
     yield from machine_findings()
     yield kernel_cache_finding()
     variable = os.environ.get(CACHE_VARIABLE)
-    yield from folder_findings("cache", cache or Path(variable or ".pano-mvs"), "--cache DIR")
-    yield from folder_findings("results", out or Path("out"), "--out DIR")
+    yield folder_finding("cache", cache or Path(variable or ".pano-mvs"), "--cache DIR")
+    yield folder_finding("results", out or Path("out"), "--out DIR")
     yield from plugin_findings(Registry.installed(), presets_folder())
 
 

@@ -6,7 +6,7 @@ import importlib.util
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple, TypeAlias
@@ -46,14 +46,10 @@ print(json.dumps({"version": pycolmap.__version__}))
 _OPENCV = """
 import json
 import cv2, numpy
-image = numpy.full((32, 64, 3), 100, numpy.uint8)
-missing = []
-for suffix, kind in ((".jpg", numpy.uint8), (".png", numpy.uint8), (".tiff", numpy.float32), (".webp", numpy.uint8)):
-    good, data = cv2.imencode(suffix, image.astype(kind))
-    if not good or cv2.imdecode(data, cv2.IMREAD_UNCHANGED) is None:
-        missing.append(suffix.lstrip("."))
+good, data = cv2.imencode(".jpg", numpy.full((32, 64, 3), 100, numpy.uint8))
+assert good and cv2.imdecode(data, cv2.IMREAD_UNCHANGED) is not None
 backends = [cv2.videoio_registry.getBackendName(number) for number in cv2.videoio_registry.getBackends()]
-print(json.dumps({"version": cv2.__version__, "missing": missing, "video": "FFMPEG" in backends,
+print(json.dumps({"version": cv2.__version__, "video": "FFMPEG" in backends,
                   "avif": bool(cv2.haveImageWriter("a.avif"))}))
 """
 
@@ -99,83 +95,62 @@ def run_probe(code: str, *, timeout_s: float = TIMEOUT_S) -> Answer:
     return (done.stderr.strip().splitlines() or [f"ended with code {done.returncode}"])[-1]
 
 
-def library_findings(
-    probe: Callable[[str], Answer] | None = None, *, has_torch_plugin: bool | None = None
-) -> Iterator[Finding]:
-    """Yield how the compiled libraries work.
-
-    Args:
-        probe: runs the code of a probe; `run_probe` by default.
-        has_torch_plugin: whether the sweep on PyTorch is installed; looked up by default.
-    """
-    if has_torch_plugin is None:
-        has_torch_plugin = importlib.util.find_spec("pano_mvs_torch") is not None
+def library_findings() -> Iterator[Finding]:
+    """Yield how the compiled libraries work."""
+    has_torch_plugin = importlib.util.find_spec("pano_mvs_torch") is not None
     libraries = [library for library in _LIBRARIES if library.name != "torch" or has_torch_plugin]
     with ThreadPoolExecutor(2) as pool:
-        answers = list(pool.map(probe or run_probe, (library.code for library in libraries)))
+        answers = list(pool.map(run_probe, (library.code for library in libraries)))
     for library, answer in zip(libraries, answers, strict=True):
-        if isinstance(answer, str):
-            yield _finding(library.name, library.state_if_broken, f"{answer}{library.consequence}", library.remedy)
-        else:
-            yield from library.findings(answer)
+        yield from findings_of(library, answer)
     if not has_torch_plugin:
         detail = "the sweep on PyTorch (for graphics cards) is not installed; it is optional"
         yield _finding("torch", "note", detail, "pip install ./plugins/pano_mvs_torch in a checkout")
 
 
-def _of_numba(answer: Mapping[str, Any]) -> Iterator[Finding]:
-    if answer["disabled"]:
+def findings_of(library: Library, answer: Answer) -> Iterator[Finding]:
+    """Yield what the answer of a probe means."""
+    if isinstance(answer, str):
+        yield _finding(library.name, library.state_if_broken, f"{answer}{library.consequence}", library.remedy)
+        return
+    if library.name == "numba" and answer["disabled"]:
         yield _finding("numba", "warning", "compiles nothing: hundreds of times slower", "unset NUMBA_DISABLE_JIT")
-    else:
-        yield _finding("numba", "ok", f"{answer['version']}, compiles")
-
-
-def _of_pycolmap(answer: Mapping[str, Any]) -> Iterator[Finding]:
-    yield _finding("pycolmap", "ok", f"{answer['version']}, has EQUIRECTANGULAR cameras")
-
-
-def _of_opencv(answer: Mapping[str, Any]) -> Iterator[Finding]:
-    reinstall = f"{_REINSTALL} opencv-python-headless"
-    if answer["missing"]:
-        yield _finding("OpenCV", "failed", f"{answer['version']} lacks {', '.join(answer['missing'])}", reinstall)
-    else:
-        video, avif = ("yes" if answer[what] else "no" for what in ("video", "avif"))
-        yield _finding("OpenCV", "ok", f"{answer['version']}: JPEG, PNG, TIFF, WebP; AVIF: {avif}, video: {video}")
-    if not answer["video"]:
-        yield _finding("OpenCV video", "warning", "reads no videos (no FFmpeg)", reinstall)
-    if not answer["avif"]:
+        return
+    if library.name == "torch":
+        yield _of_torch(answer)
+        return
+    yield _finding(library.name, "ok", f"{answer['version']}, {library.success}")
+    if not answer.get("video", True):
+        yield _finding("OpenCV video", "warning", "reads no videos (no FFmpeg)", library.remedy)
+    if not answer.get("avif", True):
         yield _finding("OpenCV AVIF", "note", "reads no AVIF images", "pip install -U opencv-python-headless")
 
 
-def _of_pyvista(answer: Mapping[str, Any]) -> Iterator[Finding]:
-    yield _finding("PyVista", "ok", f"{answer['version']}, renders without a screen")
-
-
-def _of_torch(answer: Mapping[str, Any]) -> Iterator[Finding]:
+def _of_torch(answer: Mapping[str, Any]) -> Finding:
     if answer["devices"]:
-        yield _finding("torch", "ok", f"{answer['version']}: {'; '.join(answer['devices'])}")
-        return
+        return _finding("torch", "ok", f"{answer['version']}: {'; '.join(answer['devices'])}")
     build = "built without CUDA" if answer["built_for"] is None else f"built for CUDA {answer['built_for']}"
     detail = f"{answer['version']}, {build}, finds no graphics card: backend torch uses the CPU"
-    yield _finding("torch", "note", detail, "install the card's driver and a build of torch with CUDA")
+    return _finding("torch", "note", detail, "install the card's driver and a build of torch with CUDA")
 
 
-class _Library(NamedTuple):
-    """A library, the code that tries it, how to read its answer, and what a failure means."""
+class Library(NamedTuple):
+    """A library, the code that tries it, what works if it succeeds, and what a failure means."""
 
     name: str
     code: str
-    findings: Callable[[Mapping[str, Any]], Iterator[Finding]]
+    success: str
     state_if_broken: State
     remedy: str
     consequence: str = ""
 
 
 _OPENGL = "install the system's OpenGL libraries (Debian, Ubuntu: apt install libgl1 libegl1), or pip install -U vtk"
+_NO_PICTURES = ": there are no pictures of clouds; all else works"
 _LIBRARIES = (
-    _Library("numba", _NUMBA, _of_numba, "failed", f"{_REINSTALL} numba llvmlite"),
-    _Library("pycolmap", _PYCOLMAP, _of_pycolmap, "failed", f"{_REINSTALL} pycolmap"),
-    _Library("OpenCV", _OPENCV, _of_opencv, "failed", f"{_REINSTALL} opencv-python-headless"),
-    _Library("PyVista", _PYVISTA, _of_pyvista, "warning", _OPENGL, ": there are no pictures of clouds; all else works"),
-    _Library("torch", _TORCH, _of_torch, "warning", "reinstall torch, or sweep with `backend: numba`"),
+    Library("numba", _NUMBA, "compiles", "failed", f"{_REINSTALL} numba llvmlite"),
+    Library("pycolmap", _PYCOLMAP, "has EQUIRECTANGULAR cameras", "failed", f"{_REINSTALL} pycolmap"),
+    Library("OpenCV", _OPENCV, "reads images", "failed", f"{_REINSTALL} opencv-python-headless"),
+    Library("PyVista", _PYVISTA, "renders without a screen", "warning", _OPENGL, _NO_PICTURES),
+    Library("torch", _TORCH, "", "warning", "reinstall torch, or sweep with `backend: numba`"),
 )

@@ -9,7 +9,7 @@ from functools import partial
 from importlib.metadata import PackageNotFoundError, requires, version
 from typing import NamedTuple, TypeAlias
 
-from pano_mvs.cli.doctor.finding import Finding
+from pano_mvs.cli.doctor.finding import Finding, State
 
 VersionOf: TypeAlias = Callable[[str], str | None]
 
@@ -50,7 +50,11 @@ def package_findings(
         return
     needed = [_parsed(text) for text in (requires(_DISTRIBUTION) or [] if requirements is None else requirements)]
     parsed = [requirement for requirement in needed if requirement is not None]
-    yield from (_required(requirement, version_of) for requirement in parsed if not requirement.extra)
+    for requirement in parsed:
+        if not requirement.extra:
+            state, detail = _state([requirement], version_of)
+            remedy = "" if state == "ok" else f"pip install -U {requirement.name}"
+            yield _finding(requirement.name, "ok" if state == "ok" else "failed", detail, remedy)
     opencv = [name for name in _OPENCV if version_of(name)]
     if len(opencv) > 1:
         detail = f"installed more than once ({', '.join(opencv)}): the packages overwrite each other's files"
@@ -58,7 +62,10 @@ def package_findings(
         yield _finding("OpenCV", "warning", detail, remedy)
     for extra in dict.fromkeys(requirement.extra for requirement in parsed):
         if extra and extra not in _EXTRAS_FOR_DEVELOPERS:
-            yield _extra(extra, [requirement for requirement in parsed if requirement.extra == extra], version_of)
+            state, detail = _state([requirement for requirement in parsed if requirement.extra == extra], version_of)
+            detail = f"{detail}; for {_USES.get(extra, extra)}" if state == "note" else detail
+            remedy = "" if state == "ok" else f"pip install -U 'pano-mvs[{extra}]'"
+            yield _finding(f"extra {extra}", "warning" if state == "failed" else state, detail, remedy)
 
 
 def is_older(found: str, minimum: str) -> bool:
@@ -82,28 +89,15 @@ def _parsed(text: str) -> _Requirement | None:
     return _Requirement(name[0], minimum[1] if minimum else "", extra[1] if extra else "")
 
 
-def _required(requirement: _Requirement, version_of: VersionOf) -> Finding:
-    name, minimum, _ = requirement
-    found = version_of(name)
-    wanted = f"{name}>={minimum}" if minimum else name
-    other = next((other for other in _OPENCV if version_of(other)), None) if name in _OPENCV else None
-    if found is None and other is not None:
-        return _finding(name, "ok", f"{other} {version_of(other)} in its place")
-    if found is None:
-        return _finding(name, "failed", "is not installed", f"pip install '{wanted}'")
-    if is_older(found, minimum):
-        return _finding(name, "failed", f"{found}; {minimum} or newer is needed", f"pip install -U '{wanted}'")
-    return _finding(name, "ok", found)
-
-
-def _extra(extra: str, needed: Sequence[_Requirement], version_of: VersionOf) -> Finding:
-    what, remedy = f"extra {extra}", f"pip install 'pano-mvs[{extra}]'"
+def _state(needed: Sequence[_Requirement], version_of: VersionOf) -> tuple[State, str]:
+    """Return the state of required packages: ok with their versions, or what is missing or too old."""
     versions = []
     for name, minimum, _ in needed:
-        found = version_of(name)
+        used = next((other for other in (name, *_OPENCV) if version_of(other)), name) if name in _OPENCV else name
+        found = version_of(used)
         if found is None:
-            return _finding(what, "note", f"not installed; for {_USES.get(extra, extra)}", remedy)
+            return "note", f"{name} is not installed"
         if is_older(found, minimum):
-            return _finding(what, "warning", f"{name} {found}; {minimum} or newer is needed", remedy)
-        versions.append(f"{name} {found}")
-    return _finding(what, "ok", ", ".join(versions))
+            return "failed", f"{used} {found}; {minimum} or newer is needed"
+        versions.append(f"{used} {found}")
+    return "ok", ", ".join(versions)
