@@ -72,7 +72,7 @@ def test_packages_are_held_against_the_metadata() -> None:
 
     found = by_what(package_findings(NEEDS, {"opencv-python": "5.0", "opencv-python-headless": "5.0"}.get))
     assert found["opencv-python-headless"].state == "ok"
-    assert found["numba"].detail == "numba is not installed"
+    assert found["numba"].detail == "is not installed"
     assert found["OpenCV"].state == "warning"
     assert "more than once" in found["OpenCV"].detail
 

@@ -51,10 +51,11 @@ def package_findings(
     needed = [_parsed(text) for text in (requires(_DISTRIBUTION) or [] if requirements is None else requirements)]
     parsed = [requirement for requirement in needed if requirement is not None]
     for requirement in parsed:
+        name = requirement.name
         if not requirement.extra:
             state, detail = _state([requirement], version_of)
-            remedy = "" if state == "ok" else f"pip install -U {requirement.name}"
-            yield _finding(requirement.name, "ok" if state == "ok" else "failed", detail, remedy)
+            remedy = "" if state == "ok" else f"pip install -U {name}"
+            yield _finding(name, "ok" if state == "ok" else "failed", detail.removeprefix(f"{name} "), remedy)
     opencv = [name for name in _OPENCV if version_of(name)]
     if len(opencv) > 1:
         detail = f"installed more than once ({', '.join(opencv)}): the packages overwrite each other's files"

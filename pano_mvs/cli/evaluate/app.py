@@ -9,6 +9,26 @@ import typer
 
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.default_command import RunByDefault
+from pano_mvs.cli.evaluate.depth_options import (
+    AlignOption,
+    BadOption,
+    BaselineOption,
+    CsvOption,
+    ErrorLimitOption,
+    EstimatesArgument,
+    ImagesOption,
+    MaskOption,
+    MasksOption,
+    MinConfidenceOption,
+    OutOption,
+    PeakOption,
+    PosesOption,
+    ScaleOption,
+    TruePosesOption,
+    TruthOption,
+    TruthUnitOption,
+    UnitOption,
+)
 from pano_mvs.cli.exit_codes import guarded
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.text import plural
@@ -19,7 +39,6 @@ evaluate_app = typer.Typer(
     no_args_is_help=True,
 )
 
-_FILES = "a folder of range maps (.tiff, .exr, .npy, .npz, 16-bit .png; paired by path), or an .npz file"
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 
@@ -98,55 +117,24 @@ def cloud(
 @evaluate_app.command("depth")
 @guarded
 def depth(
-    source: Annotated[Path, typer.Argument(help=f"The output folder of a run, {_FILES}.")],
-    truth: Annotated[Path, typer.Option("--truth", help="Folder with poses.json and depth.npz, or any of these.")],
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", help="Folder for pictures of the errors, scores.json and scores.csv."),
-    ] = None,
-    align: Annotated[
-        Literal["none", "median", "lsq"], typer.Option("--align", help="Fit each view to the truth by a factor.")
-    ] = "none",
-    scale: Annotated[
-        str, typer.Option("--scale", help="Factor to the truth's unit; auto: from the camera centres, if known.")
-    ] = "auto",
-    unit: Annotated[float, typer.Option("--unit", help="Unit of the files' numbers; 0.001 for mm.")] = 1.0,
-    truth_unit: Annotated[float, typer.Option("--truth-unit", help="Unit of the truth's numbers.")] = 1.0,
-    peak: Annotated[float, typer.Option("--peak", help="The range that MSE and PSNR count as 1.")] = 10.0,
-    bad: Annotated[
-        list[str], typer.Option("--bad", help="An error above which a pixel is bad: 5%, or 0.1; may be repeated.")
-    ] = ["5%"],  # noqa: B006  # typer reads it and never changes it
-    min_confidence: Annotated[
-        int,
-        typer.Option(
-            "--min-confidence",
-            min=0,
-            max=255,
-            help="Ranges of lower confidence count as missing; 64: seen, 128: consistent with other views.",
-        ),
-    ] = 0,
-    masks: Annotated[
-        Path | None, typer.Option("--masks", help="Folder of masks <image name>.png; pixels where it is 0 are ignored.")
-    ] = None,
-    mask: Annotated[
-        Path | None, typer.Option("--mask", help="Evaluate only pixels inside this mask (applied to every view).")
-    ] = None,
-    images: Annotated[
-        Path | None, typer.Option("--images", help="Folder of the panoramas, for the pictures of the errors.")
-    ] = None,
-    error_limit: Annotated[
-        float, typer.Option("--error-limit", help="Relative error at which the colours of the pictures end.")
-    ] = 0.1,
-    baseline: Annotated[
-        Literal["best", "median", "mean"], typer.Option("--baseline", help="Which constant is shown beside each score.")
-    ] = "best",
-    poses: Annotated[
-        Path | None, typer.Option("--poses", help="The estimated poses, for the scale; default: the output folder's.")
-    ] = None,
-    true_poses: Annotated[
-        Path | None, typer.Option("--true-poses", help="The true poses, for the scale; default: the truth folder's.")
-    ] = None,
-    csv: Annotated[Path | None, typer.Option("--csv", help="Write one row for each view.")] = None,
+    source: EstimatesArgument,
+    truth: TruthOption,
+    out: OutOption = None,
+    align: AlignOption = "none",
+    scale: ScaleOption = "auto",
+    unit: UnitOption = 1.0,
+    truth_unit: TruthUnitOption = 1.0,
+    peak: PeakOption = 10.0,
+    bad: BadOption = ["5%"],  # noqa: B006  # typer reads it and never changes it
+    min_confidence: MinConfidenceOption = 0,
+    masks: MasksOption = None,
+    mask: MaskOption = None,
+    images: ImagesOption = None,
+    error_limit: ErrorLimitOption = 0.1,
+    baseline: BaselineOption = "best",
+    poses: PosesOption = None,
+    true_poses: TruePosesOption = None,
+    csv: CsvOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Compare range maps with the truth: MSE, PSNR, MAE, RMSE, AbsRel, δ, bad pixels, completeness, AUSE."""
