@@ -8,8 +8,7 @@
     ├── PluginError (ImportError)          exit 2: a plugin that failed to import or to register
     ├── ContractError (TypeError)          exit 1: a stage returned something it had not declared
     ├── StoreError (OSError)               exit 4: the cache or the output folder cannot be written
-    ├── RunStoppedError (RuntimeError)     exit 4: a quality threshold or a stage stopped the run
-    └── StageFailedError (RuntimeError)    exit 3: a stage's own code failed on a unit
+    └── RunStoppedError (RuntimeError)     exit 4: a quality threshold or a stage stopped the run
 
 A message says what is wrong, with which item, where, and what to do about it. Expected degeneracy
 (too few matches, pure rotation) is not an error: functions return a falsy value with the reason.
@@ -78,9 +77,3 @@ class RunStoppedError(PanoMvsError, RuntimeError):
     """The run stops here, such as at a quality threshold; what was computed stays in the cache."""
 
     exit_code = 4
-
-
-class StageFailedError(PanoMvsError, RuntimeError):
-    """A stage's own code failed on a unit; the cause is chained."""
-
-    exit_code = 3

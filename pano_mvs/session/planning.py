@@ -70,11 +70,11 @@ def plan(
         InputError: if the images cannot be listed.
     """
     session = open_session(
-        str(workflow),
+        workflow,
         overrides=overrides_from_settings(settings or {}),
-        images=Path(images) if images is not None else None,
-        cache=Path(cache) if cache is not None else None,
-        out=Path(out) if out is not None else None,
+        images=images,
+        cache=cache,
+        out=out,
         run_options=RunOptions(tuple(until), tuple(only), tuple(refresh)),
     )
     check_output(session)

@@ -112,11 +112,11 @@ def run(
     """
     run_options = RunOptions(tuple(until), tuple(only), tuple(refresh), accept_code=False, keep_going=keep_going)
     session = open_session(
-        str(workflow),
+        workflow,
         overrides=overrides_from_settings(settings or {}),
-        images=Path(images) if images is not None else None,
-        cache=Path(cache) if cache is not None else None,
-        out=Path(out) if out is not None else None,
+        images=images,
+        cache=cache,
+        out=out,
         run_options=run_options,
     )
     return run_session(session, Execution(executor, workers or 0), progress or ignore)

@@ -38,12 +38,12 @@ def presets_folder() -> Path:
 
 
 def open_session(
-    name: str,
+    name: str | Path,
     *,
     overrides: Sequence[str] = (),
-    images: Path | None = None,
-    cache: Path | None = None,
-    out: Path | None = None,
+    images: str | Path | None = None,
+    cache: str | Path | None = None,
+    out: str | Path | None = None,
     run_options: RunOptions = DEFAULT_OPTIONS,
 ) -> Session:
     """Find, validate and wire a workflow.
@@ -57,7 +57,8 @@ def open_session(
         InputError: if the folder of images is not there.
         UsageError: if a stage reads the folder of the cache.
     """
-    path, is_preset = find_workflow(name, presets_folder())
+    path, is_preset = find_workflow(str(name), presets_folder())
+    images = None if images is None else Path(images)
     if images is not None and not is_folder(images):
         if exists(images):
             raise InputError(f"--images {images}: this is a file; give the folder with the pictures")
@@ -75,8 +76,8 @@ def open_session(
     graph = wire(workflow)
     variable = os.environ.get(CACHE_VARIABLE)
     beside = resolved(Path()) if is_preset else path.parent
-    root = cache or (Path(variable) if variable else beside / ".pano-mvs")
-    session = Session(workflow, graph, registry, root, out or Path("out") / workflow.name, run_options)
+    root = Path(cache or variable or beside / ".pano-mvs")
+    session = Session(workflow, graph, registry, root, Path(out or Path("out") / workflow.name), run_options)
     if name := _reader_of(root, session):
         option = "--cache" if cache or not variable else f"${CACHE_VARIABLE}"
         raise UsageError(

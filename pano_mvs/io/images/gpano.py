@@ -9,11 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from xml.etree import ElementTree
-
-from pano_mvs.io.images.containers import read_container
-from pano_mvs.scene import FilePart
 
 _NAMESPACE = "{http://ns.google.com/photos/1.0/panorama/}"
 _WRAPPED, _BARE = (b"<x:xmpmeta", b"</x:xmpmeta>"), (b"<rdf:RDF", b"</rdf:RDF>")
@@ -52,16 +48,6 @@ class GPano:
             return None
         pitch, roll = math.radians(self.pitch_deg), math.radians(self.roll_deg)
         return -math.sin(roll), -math.cos(pitch) * math.cos(roll), math.sin(pitch) * math.cos(roll)
-
-
-def read_gpano(path: Path) -> GPano | None:
-    """Return the GPano metadata of an image file, or None without valid metadata.
-
-    Raises:
-        InputError: if the file cannot be read.
-    """
-    data = FilePart(path).read_bytes()
-    return find_gpano(read_container(data).xmp, data)[0]
 
 
 def find_gpano(chunks: Iterable[bytes], data: bytes = b"") -> tuple[GPano | None, tuple[str, ...]]:

@@ -27,7 +27,7 @@ def match_image_names(wanted: Iterable[str], available: Iterable[str]) -> dict[s
     Returns:
         Wanted name to available name.
     """
-    found = {}
+    found: dict[str, str] = {}
     for ours, theirs in _with_same_last_part(wanted, available):
         found |= {name: other for name in ours if (other := _closest(name, theirs))}
     return found
@@ -47,7 +47,7 @@ def pair_image_names(names: Iterable[str], available: Iterable[str]) -> dict[str
         >>> pair_image_names(["a/1", "b/1"], ["images/b/1.jpg", "images/a/1.jpg"])
         {'a/1': 'images/a/1.jpg', 'b/1': 'images/b/1.jpg'}
     """
-    paired = {}
+    paired: dict[str, str] = {}
     for ours, theirs in _with_same_last_part(names, available):
         closest = {name: _closest(name, theirs) for name in ours}
         paired |= {name: other for name, other in closest.items() if other and _closest(other, ours) == name}

@@ -42,11 +42,6 @@ class VideoInfo:
     frames_per_s: float
     is_turned: bool
 
-    @property
-    def duration_s(self) -> float:
-        """Duration of the video."""
-        return self.frames / self.frames_per_s
-
 
 def list_videos(path: Path, notes: list[str] | None = None) -> list[Path]:
     """Return a video, or all videos in a folder and its subfolders in natural order.

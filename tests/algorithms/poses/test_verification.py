@@ -274,4 +274,3 @@ def test_judging_changes_nothing(matches: Matches) -> None:
     assert set(found.doubts) == {2}
     assert not found.moved
     assert found.shares[2] == min(found.shares.values())
-    assert found.mean_share() == pytest.approx(np.mean(list(found.shares.values())))

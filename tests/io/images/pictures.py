@@ -14,6 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from pano_mvs.io.images.containers import read_container
+from pano_mvs.io.images.gpano import GPano, find_gpano
+
 GPANO = "http://ns.google.com/photos/1.0/panorama/"
 RDF = "http://www.w3.org/1999/02/22-rdf-syntax-ns#"
 
@@ -139,3 +142,8 @@ def sound_files(size_hw: tuple[int, int], packet: bytes) -> list[bytes]:
         by_pillow(size_hw, "TIFF", tiffinfo={700: packet}),
         by_pillow(size_hw, "TIFF", tiffinfo={700: packet}, big_tiff=True),
     ]
+
+
+def gpano_of(path: Path) -> GPano | None:
+    data = path.read_bytes()
+    return find_gpano(read_container(data).xmp, data)[0]

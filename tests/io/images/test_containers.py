@@ -17,12 +17,13 @@ from PIL import Image
 
 from pano_mvs.io.images.captures import describe_picture
 from pano_mvs.io.images.containers import read_container
-from pano_mvs.io.images.gpano import GPano, read_gpano
+from pano_mvs.io.images.gpano import GPano
 from tests.io.images.pictures import (
     app1,
     by_pillow,
     exif,
     full_sphere,
+    gpano_of,
     picture,
     png_chunk,
     sound_files,
@@ -54,7 +55,7 @@ def test_every_container_keeps_both_kinds(tmp_path: Path, idx: int) -> None:
     (tmp_path / "a").write_bytes(data)
     assert read_container(data).size_hw == SIZE
     assert len(read_container(data).xmp) == 1
-    assert read_gpano(tmp_path / "a") == EXPECTED
+    assert gpano_of(tmp_path / "a") == EXPECTED
     if idx < 2:  # Pillow writes no GPS directory into a TIFF's own
         assert describe_picture(tmp_path / "a").position_lla == POSITION
 
@@ -90,12 +91,12 @@ def test_an_extended_packet_is_joined_from_its_pieces(tmp_path: Path) -> None:
     extended = b"".join(app1(b"http://ns.adobe.com/xmp/extension/\0" + piece) for piece in pieces)
     main = b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><other/></x:xmpmeta>'
     path = write_jpeg(tmp_path / "a.jpg", SIZE, main, segments=extended)
-    assert read_gpano(path) == EXPECTED
+    assert gpano_of(path) == EXPECTED
 
 
 def test_packets_behind_the_end_of_a_jpeg_are_found(tmp_path: Path) -> None:
     path = write_jpeg(tmp_path / "a.jpg", SIZE, behind=bytes(100_000) + PACKET)
-    assert read_gpano(path) == EXPECTED
+    assert gpano_of(path) == EXPECTED
 
 
 @pytest.mark.parametrize("form", ["jpeg", "png", "tiff"])

@@ -9,11 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pano_mvs.core.errors import InputError
 from pano_mvs.geometry import rotation_from_rotvec
 from pano_mvs.io.images.containers import read_container
-from pano_mvs.io.images.gpano import GPano, find_gpano, read_gpano
-from tests.io.images.pictures import full_sphere, sound_files, write_jpeg, write_png, xmp
+from pano_mvs.io.images.gpano import GPano, find_gpano
+from tests.io.images.pictures import full_sphere, gpano_of, sound_files, write_jpeg, write_png, xmp
 
 FIELDS = full_sphere(32, 64, PoseHeadingDegrees="180.0", PosePitchDegrees="1.4", PoseRollDegrees="-2.5")
 SOUND = sound_files((32, 64), xmp(FIELDS))
@@ -24,17 +23,17 @@ EXPECTED = GPano("equirectangular", (32, 64), (0, 0, 64, 32), 180.0, 1.4, -2.5)
 @pytest.mark.parametrize("wrapped", [True, False])
 def test_elements_and_attributes_are_read_from_a_jpeg(tmp_path: Path, form: str, wrapped: bool) -> None:
     path = write_jpeg(tmp_path / "a.jpg", (32, 64), xmp(FIELDS, form=form, wrapped=wrapped))
-    assert read_gpano(path) == EXPECTED
+    assert gpano_of(path) == EXPECTED
 
 
 @pytest.mark.parametrize("compressed", [True, False])
 def test_they_are_read_from_a_png(tmp_path: Path, compressed: bool) -> None:
     path = write_png(tmp_path / "a.png", (32, 64), xmp(FIELDS), compressed=compressed)
-    assert read_gpano(path) == EXPECTED
+    assert gpano_of(path) == EXPECTED
 
 
 def test_a_picture_without_them_has_none(tmp_path: Path) -> None:
-    assert read_gpano(write_jpeg(tmp_path / "a.jpg", (32, 64))) is None
+    assert gpano_of(write_jpeg(tmp_path / "a.jpg", (32, 64))) is None
     assert find_gpano((), write_png(tmp_path / "a.png", (32, 64)).read_bytes()) == (None, ())
     other = b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><a b="c"/></x:xmpmeta>'
     assert find_gpano([other]) == (None, ())
@@ -95,8 +94,3 @@ def test_up_is_a_unit_vector_turned_by_roll_and_pitch(pitch_deg: float, roll_deg
 def test_a_level_camera_has_up_at_its_zenith() -> None:
     assert GPano(pitch_deg=0.0, roll_deg=0.0).up_in_cam == pytest.approx((0, -1, 0))
     assert GPano(pitch_deg=3.0).up_in_cam is None
-
-
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"gone\.jpg: cannot be read"):
-        read_gpano(tmp_path / "gone.jpg")

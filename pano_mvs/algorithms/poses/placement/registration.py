@@ -156,10 +156,6 @@ class GrowingModel:
         known = np.isfinite(points[:, 0])
         return points[known], self.tracks.bearings[observations[known]]
 
-    def known_count(self, image: int) -> int:
-        """Return the number of triangulated points in an image's tracks."""
-        return int(np.isfinite(self._points[self.tracks.track_idx[self._track_of_image[image]], 0]).sum())
-
     def attach_all(self, images: Iterable[int], *, after_each: Callable[[], None] = lambda: None) -> dict[int, str]:
         """Attach images, the one with most known points first; return the reasons for those that cannot be attached."""
         left = list(images)

@@ -76,11 +76,6 @@ class Arbitration:
     removed: dict[int, str] = field(default_factory=dict)
     asked: bool = True
 
-    def mean_share(self) -> float:
-        """Return the mean confirmed share of the images that can be judged; NaN if there is none."""
-        known = [share for share in self.shares.values() if np.isfinite(share)]
-        return float(np.mean(known)) if known else float("nan")
-
 
 def arbitrate(
     model: PlacedModel, confirmation: Confirmation, *, fixed: Collection[int] = (), remove: bool = True
