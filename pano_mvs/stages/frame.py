@@ -109,14 +109,16 @@ def scale(poses: One[Poses], images: All[Panorama], params: ScaleParams, ctx: Co
         ends, metres = _ends(images, params.baseline), params.baseline.metres
         chosen = _holding(ends, groups)
         whole = poses if chosen is None else groups[chosen]
-        return _scaled(poses, groups, [chosen or 0], lambda _: scaled_by_baseline(whole, *ends, metres=metres), ctx)
+        return _scaled(
+            poses, groups, [chosen or 0], scaled=lambda _: scaled_by_baseline(whole, *ends, metres=metres), ctx=ctx
+        )
     if params.factor is not None:
         origin, factor = f"the given factor {params.factor:g}", params.factor
-        return _scaled(poses, groups, [0], lambda group: scaled_poses(group, factor, origin=origin), ctx)
+        return _scaled(poses, groups, [0], scaled=lambda group: scaled_poses(group, factor, origin=origin), ctx=ctx)
     every = list(range(len(groups)))
     if params.camera_height_m is not None:
-        return _scaled(poses, groups, every, lambda group: _by_camera_height(group, images, params), ctx)
-    return _scaled(poses, groups, every, lambda group: _by_gps(group, images, params, ctx), ctx)
+        return _scaled(poses, groups, every, scaled=lambda group: _by_camera_height(group, images, params), ctx=ctx)
+    return _scaled(poses, groups, every, scaled=lambda group: _by_gps(group, images, params, ctx=ctx), ctx=ctx)
 
 
 class UnitTranslationsParams(Params):
@@ -132,7 +134,7 @@ def unit_translations(poses: One[Poses], params: UnitTranslationsParams) -> Pose
 
 
 def _scaled(
-    poses: Poses, groups: list[Poses], chosen: list[int], scaled: Callable[[Poses], Poses], ctx: Context
+    poses: Poses, groups: list[Poses], chosen: list[int], *, scaled: Callable[[Poses], Poses], ctx: Context
 ) -> Poses:
     """Return all groups, with the chosen ones scaled if possible.
 
@@ -195,7 +197,7 @@ def _ends(images: All[Panorama], baseline: BaselineParams) -> tuple[str, str]:
     return known[wanted[0]], known[wanted[1]]
 
 
-def _by_gps(poses: Poses, images: All[Panorama], params: ScaleParams, ctx: Context) -> Poses:
+def _by_gps(poses: Poses, images: All[Panorama], params: ScaleParams, *, ctx: Context) -> Poses:
     positions = {name: image.position_lla for name, image in images.items() if image.position_lla is not None}
     up = _up(poses, images, params.vertical)
     fit = fit_gps(poses, positions, up, gps_noise_m=params.gps_noise_m, rng=ctx.rng)

@@ -43,7 +43,7 @@ class ColmapParams(Params):
 @stage("poses.colmap")
 def colmap_poses(features: All[Features], matches: All[TwoView], params: ColmapParams, ctx: Context) -> Poses:
     """Solve poses by COLMAP's incremental or global mapper, from our key points and verified matches."""
-    return checked_poses(_mapped(features, matches, params, ctx), ctx)
+    return checked_poses(_mapped(features, matches, params, ctx=ctx), ctx)
 
 
 @params_from(colmap_sift)
@@ -56,7 +56,7 @@ def colmap_sift_poses(images: All[Panorama], params: ColmapSiftParams, ctx: Cont
     """Solve poses by COLMAP alone: its planar SIFT, exhaustive matching, and mapper. Masks are respected."""
     pictures = ((name, image.load(), image.load_mask()) for name, image in images.items())
     features, matches = colmap_sift(pictures, **arguments_from(colmap_sift, params), rng=ctx.rng, scratch=ctx.scratch)
-    return checked_poses(_mapped(features, matches, params, ctx), ctx)
+    return checked_poses(_mapped(features, matches, params, ctx=ctx), ctx)
 
 
 @params_from(extend_poses)
@@ -75,7 +75,7 @@ def extend(features: All[Features], matches: All[TwoView], params: ExtendParams,
 
 
 def _mapped(
-    features: Mapping[str, Features], matches: Mapping[tuple[str, str], TwoView], params: ColmapParams, ctx: Context
+    features: Mapping[str, Features], matches: Mapping[tuple[str, str], TwoView], params: ColmapParams, *, ctx: Context
 ) -> Poses:
     """Run COLMAP's mapper from scratch, or from fixed known poses."""
     if params.fixed is None:

@@ -91,7 +91,7 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
         ctx.note(f"{item.name}: {warning}")
     for trait in info.traits:
         ctx.note(f"some images have {trait}")
-    _check_pixels(path, data, info, params.max_pixels)
+    _check_pixels(path, data, info, max_pixels=params.max_pixels)
     del data
     panorama = Panorama(
         image=image,
@@ -112,7 +112,7 @@ def folder(item: SourceItem, params: FolderParams, ctx: Context) -> Panorama:
     return panorama
 
 
-def _check_pixels(path: Path, data: bytes, info: PictureInfo, max_pixels: int) -> None:
+def _check_pixels(path: Path, data: bytes, info: PictureInfo, *, max_pixels: int) -> None:
     """Decode the whole image once, so that a damaged file is reported here and not in the middle of a sweep."""
     picture = decode_image(path, data, max_pixels=max_pixels)
     height, width = picture.shape[:2]

@@ -99,7 +99,7 @@ def video(item: SourceItem, params: VideoParams, ctx: Context) -> Panorama:
     info = describe_video(path)
     if info.is_turned:
         ctx.note(f"{path.name} has a rotation in its metadata, which was ignored: frames are used as stored")
-    time_s, quality, frame = _best_frame(path, _time_from_name(item.name), params, info, threads=ctx.threads)
+    time_s, quality, frame = _best_frame(path, _time_from_name(item.name), params, info=info, threads=ctx.threads)
     if is_dual_fisheye(frame):
         raise InputError(_dual_fisheye(path))
     ctx.metric("time_s", time_s)
@@ -167,7 +167,7 @@ def _steps(info: VideoInfo, params: VideoParams) -> list[float]:
 
 
 def _best_frame(
-    path: Path, time_s: float, params: VideoParams, info: VideoInfo, *, threads: int
+    path: Path, time_s: float, params: VideoParams, *, info: VideoInfo, threads: int
 ) -> tuple[float, float, NDArray[np.uint8]]:
     """Return the time, the sharpness and the image (BGR) of the frame to use around a time.
 

@@ -97,7 +97,7 @@ def extract_sphorb(
             for g, c in zip(grids, chosen, strict=True)
         ]
     )
-    return _record(image, chosen, np.concatenate(described), sizes)
+    return _record(image, chosen, np.concatenate(described), sizes_rad=sizes)
 
 
 def grid_pyramid(width: int, levels: int) -> list[GeodesicGrid]:
@@ -176,7 +176,7 @@ def _describe(pictures: NDArray[np.uint8], grid: GeodesicGrid, corners: _Corners
 
 
 def _record(
-    image: NDArray[np.uint8], chosen: list[_Corners], descriptors: NDArray[np.uint8], sizes_rad: NDArray[np.float32]
+    image: NDArray[np.uint8], chosen: list[_Corners], descriptors: NDArray[np.uint8], *, sizes_rad: NDArray[np.float32]
 ) -> Features:
     height, width = image.shape[:2]
     bearings = np.concatenate([c.bearings for c in chosen])

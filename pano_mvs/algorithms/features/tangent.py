@@ -142,7 +142,8 @@ def _extract(
     tiles = tangent_tiles(size_hw)
     detected = [detect(sample_tile(gray, idx), owned_pixels(size_hw, idx)) for idx in range(len(tiles))]
     found = [
-        _owned(_unmasked(f, valid, t, clearance), t, i) for i, (f, t) in enumerate(zip(detected, tiles, strict=True))
+        _owned(_unmasked(f, valid, t, clearance=clearance), t, i)
+        for i, (f, t) in enumerate(zip(detected, tiles, strict=True))
     ]
     bearings = np.concatenate([t.bearings_from_pixels(f.pixels_px) for t, f in zip(tiles, found, strict=True)])
     sizes = np.concatenate([_angular_sizes(t, f) for t, f in zip(tiles, found, strict=True)])
@@ -165,7 +166,7 @@ def _extract(
     )
 
 
-def _unmasked(found: _Found, valid: NDArray[np.uint8], tile: PinholeView, clearance: float) -> _Found:
+def _unmasked(found: _Found, valid: NDArray[np.uint8], tile: PinholeView, *, clearance: float) -> _Found:
     """Drop key points that are masked, or closer to the mask than `clearance` sizes; `valid` is 255 or 0."""
     if valid.all() or not len(found.scores):
         return found

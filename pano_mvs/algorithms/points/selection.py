@@ -21,7 +21,7 @@ _MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9, 0xD
 
 
 def spread_points(
-    points: NDArray[np.float64], spacing: NDArray[np.float64], count: int, rng: np.random.Generator
+    points: NDArray[np.float64], spacing: NDArray[np.float64], count: int, *, rng: np.random.Generator
 ) -> NDArray[np.intp]:
     """Select `count` points whose distances to their neighbours are proportional to `spacing`.
 
@@ -47,12 +47,12 @@ def spread_points(
         raise UsageError("spread_points needs points (M, 3), as many positive spacings, and a positive count")
     kept = _one_per_voxel(points, spacing, int(np.ceil(_CHOICE * count)))
     if len(kept) > count:
-        kept = kept[_discs(points[kept], spacing[kept], count, rng)]
+        kept = kept[_discs(points[kept], spacing[kept], count, rng=rng)]
     dropped = rng.permutation(len(kept))[count:]
     return np.sort(np.delete(kept, dropped))
 
 
-def _widest(low: float, high: float, wanted: int, left: Callable[[float], int]) -> float:
+def _widest(low: float, high: float, wanted: int, *, left: Callable[[float], int]) -> float:
     """Return the largest width between two limits, to about 2 %, that leaves enough points; `left` is decreasing."""
     for _ in range(_STEPS):
         middle = float(np.sqrt(low * high))
@@ -72,12 +72,12 @@ def _one_per_voxel(points: NDArray[np.float64], spacing: NDArray[np.float64], wa
     levels = np.rint(_LEVELS_PER_OCTAVE * np.log2(spacing / spacing.min()))
     edges = np.exp2(levels / _LEVELS_PER_OCTAVE)
     extent = max(float(np.ptp(points, axis=0).max()), 1e-9)
-    width = _widest(1e-7 * extent, 2 * extent, wanted, lambda width: _occupied(points, edges * width, levels))
+    width = _widest(1e-7 * extent, 2 * extent, wanted, left=lambda width: _occupied(points, edges * width, levels))
     return _nearest_to_centers(points, edges * width, levels)
 
 
 def _discs(
-    points: NDArray[np.float64], spacing: NDArray[np.float64], wanted: int, rng: np.random.Generator
+    points: NDArray[np.float64], spacing: NDArray[np.float64], wanted: int, *, rng: np.random.Generator
 ) -> NDArray[np.intp]:
     """Return points of which no two are closer than the smaller of their discs' radii."""
     order = rng.permutation(len(points))
@@ -94,7 +94,7 @@ def _discs(
         return _undisturbed(first[close], second[close], len(points))
 
     low = max(float(width.min()), 1e-12)
-    return left(_widest(0.5 * low, 2 * float(width.max()), wanted, lambda radius: len(left(radius))))
+    return left(_widest(0.5 * low, 2 * float(width.max()), wanted, left=lambda radius: len(left(radius))))
 
 
 def _undisturbed(later: NDArray[np.intp], earlier: NDArray[np.intp], total: int) -> NDArray[np.intp]:

@@ -151,7 +151,7 @@ def _track_group(
     centers = poses.centers[pose_idx]
     tree = cKDTree(centers)
     spacing = np.maximum(np.asarray(tree.query(candidates.points)[0]), 1e-9) ** _SPACING_POWER
-    few = spread_points(candidates.points, spacing, int(np.ceil(_SURPLUS * count)), rng)
+    few = spread_points(candidates.points, spacing, int(np.ceil(_SURPLUS * count)), rng=rng)
     chosen, spacing = candidates[few], spacing[few]
     asked = _asked(tree, chosen, min(neighbours, len(names)))
     limits = np.array([max_relative_error, _MAX_SURFACE_STEP, float(min_confidence)])
@@ -161,7 +161,7 @@ def _track_group(
     ]
     sightings = _joined(found)
     kept = np.flatnonzero(np.bincount(sightings.point_idx, minlength=len(few)) >= min_views)
-    return _tracked(names, chosen, sightings, kept[spread_points(chosen.points[kept], spacing[kept], count, rng)])
+    return _tracked(names, chosen, sightings, kept[spread_points(chosen.points[kept], spacing[kept], count, rng=rng)])
 
 
 def _candidates(

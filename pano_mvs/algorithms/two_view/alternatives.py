@@ -118,10 +118,10 @@ class _Search:
         order = self.rng.permutation(len(self.first))
         p, q = self.first[order], self.second[order]
         poses = [best]
-        for essential in least_essentials(twins, p, q, 2 * self.threshold_rad, count=_PEAKS):
+        for essential in least_essentials(twins, p, q, threshold_rad=2 * self.threshold_rad, count=_PEAKS):
             rough = facing_pose(essential, p, q, 2 * self.threshold_rad)
             if _differ(rough, best):
-                poses.append(self._settled(rough, p, q, (2.0, 1.0)))
+                poses.append(self._settled(rough, p, q, widths=(2.0, 1.0)))
         costs = facing_costs(poses, self.first, self.second, self.threshold_rad)
         return poses[int(np.argmin(costs))], twins
 
@@ -134,8 +134,8 @@ class _Search:
             return None
         p, q = self.first[rest], self.second[rest]
         rough = [
-            self._settled(pose, p, q, (3.0, 2.0))
-            for pose in self._candidates(known, pool, p, q)
+            self._settled(pose, p, q, widths=(3.0, 2.0))
+            for pose in self._candidates(known, pool, p=p, q=q)
             if agreement(pose, p, q, 3 * self.threshold_rad)[1].sum() >= needed
         ]
         support = [int(agreement(pose, p, q, 1.5 * self.threshold_rad)[1].sum()) for pose in rough]
@@ -145,14 +145,16 @@ class _Search:
                 break
             if all(_differ(rough[idx], other) for other in chosen):
                 chosen.append(rough[idx])
-        found = [self.geometry(self._settled(pose, self.first, self.second, (1.5, 1.0))) for pose in chosen]
+        found = [self.geometry(self._settled(pose, self.first, self.second, widths=(1.5, 1.0))) for pose in chosen]
         found.sort(key=lambda geometry: -int((geometry.agreeing & searched).sum()))
         for geometry in found:
-            if _is_other(geometry, known, searched) and self._significant(geometry, known, searched, needed):
+            if _is_other(geometry, known, searched) and self._significant(geometry, known, searched, needed=needed):
                 return geometry
         return None
 
-    def _candidates(self, known: Sequence[_Geometry], pool: FloatArray, p: FloatArray, q: FloatArray) -> list[Rigid3]:
+    def _candidates(
+        self, known: Sequence[_Geometry], pool: FloatArray, *, p: FloatArray, q: FloatArray
+    ) -> list[Rigid3]:
         """Return poses that some of the unexplained matches, p and q, support.
 
         There are two kinds: the known rotations with directions from pairs of these matches, and the essential matrices
@@ -163,10 +165,10 @@ class _Search:
         for rotation in _distinct_rotations(known):
             directions, costs = direction_candidates(rotation, p, q, rng=self.rng, threshold_rad=wide_rad)
             found += [Rigid3(rotation, direction) for direction in _peaks(directions, costs)]
-        finalists = least_essentials(pool, p, q, wide_rad, count=_PEAKS)
+        finalists = least_essentials(pool, p, q, threshold_rad=wide_rad, count=_PEAKS)
         return found + [facing_pose(essential, p, q, wide_rad) for essential in finalists]
 
-    def _settled(self, pose: Rigid3, p: FloatArray, q: FloatArray, widths: Sequence[float]) -> Rigid3:
+    def _settled(self, pose: Rigid3, p: FloatArray, q: FloatArray, *, widths: Sequence[float]) -> Rigid3:
         """Refine on the matches within successively narrower bands, in units of the threshold."""
         for widen in widths:
             near = agreement(pose, p, q, widen * self.threshold_rad)[1]
@@ -176,7 +178,9 @@ class _Search:
             pose = refine_relative_pose(pose, p[near], q[near], scale_rad=scale_rad, max_iterations=6)
         return pose
 
-    def _significant(self, geometry: _Geometry, known: Sequence[_Geometry], searched: BoolArray, needed: float) -> bool:
+    def _significant(
+        self, geometry: _Geometry, known: Sequence[_Geometry], searched: BoolArray, *, needed: float
+    ) -> bool:
         own = geometry.agreeing & searched
         own_p, own_q = self.first[own], self.second[own]
         witnesses = independent_count(own_p, own_q) if own.any() else 0

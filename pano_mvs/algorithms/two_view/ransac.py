@@ -105,7 +105,7 @@ def estimate_two_view(
     pose: Rigid3 | None = leaders[0]
     if refine:
         pose = best_redirected(leaders, first, second, rng=rng, threshold_rad=threshold_rad)
-        pose = _refined(pose, first, second, threshold_rad)
+        pose = _refined(pose, first, second, threshold_rad=threshold_rad)
     if pose is None:
         return _none(len(first), "no relative pose is supported by eight matches")
     residuals, inliers = agreement(pose, first, second, threshold_rad)
@@ -116,7 +116,7 @@ def _none(count: int, reason: str) -> RelativePose:
     return RelativePose(Rigid3.identity(), np.zeros(count, np.bool_), np.full(count, np.pi / 2), 0, reason)
 
 
-def _refined(pose: Rigid3, first: FloatArray, second: FloatArray, threshold_rad: float) -> Rigid3 | None:
+def _refined(pose: Rigid3, first: FloatArray, second: FloatArray, *, threshold_rad: float) -> Rigid3 | None:
     """Minimise the angular error over the matches around the inliers; None if fewer than eight are left."""
     for _ in range(3):
         residuals, near = agreement(pose, first, second, 2 * threshold_rad)
@@ -172,7 +172,7 @@ class _Search:
             hypotheses,
             self.first[screened],
             self.second[screened],
-            self.threshold_rad,
+            threshold_rad=self.threshold_rad,
             # The cost without cheirality is a lower bound of the cost.
             limit=worst if len(self.first) <= _SCREEN else np.inf,
             sigmas=_LAG_SIGMAS if self.optimise else np.inf,

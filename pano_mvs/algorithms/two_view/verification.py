@@ -84,13 +84,13 @@ def verify_pair(
         p, q, rng=rng, threshold_rad=threshold_rad, solver=solver, refine=refine, max_iterations=max_iterations
     )
     if turned.sum() >= max(min_inliers, _ROTATION_SHARE * pose.inliers.sum()):
-        return _from_one_place(matches_idx, rotation, turned, angle_between(p @ rotation.T, q))
+        return _from_one_place(matches_idx, rotation, turned, angles=angle_between(p @ rotation.T, q))
     kept = pose.inliers
     witnesses = independent_count(p[kept], q[kept]) if kept.any() else 0
     if not pose or witnesses < min_inliers:
         few = f"{_agreeing(witnesses, count)} on a relative pose, {min_inliers} needed"
         return TwoView.failed(pose.reason or few, candidates=count)
-    reason = _why_chance(pose, p, q, witnesses, rng=rng, threshold_rad=threshold_rad, solver=solver)
+    reason = _why_chance(pose, p, q, witnesses=witnesses, rng=rng, threshold_rad=threshold_rad, solver=solver)
     if reason:
         return TwoView.failed(reason, candidates=count)
     pair = _Pair(matches_idx, p, q, threshold_rad)
@@ -146,7 +146,7 @@ class _Pair:
 
 
 def _from_one_place(
-    matches_idx: NDArray[np.int32], rotation: FloatArray, turned: NDArray[np.bool_], angles: FloatArray
+    matches_idx: NDArray[np.int32], rotation: FloatArray, turned: NDArray[np.bool_], *, angles: FloatArray
 ) -> TwoView:
     return TwoView(
         matches_idx=matches_idx[turned],
@@ -164,8 +164,8 @@ def _why_chance(
     pose: RelativePose,
     p: FloatArray,
     q: FloatArray,
-    witnesses: int,
     *,
+    witnesses: int,
     rng: np.random.Generator,
     threshold_rad: float,
     solver: Solver,

@@ -39,7 +39,7 @@ def colmap(poses: One[Poses], images: All[Panorama], params: ModelParams, ctx: C
 
     Further groups of poses, each in its own frame, are the models sparse/1, sparse/2 …
     """
-    return _sparse_models(poses, images, params.format, ctx, "colmap/sparse")
+    return _sparse_models(poses, images, params.format, ctx=ctx, target="colmap/sparse")
 
 
 class MasksParams(Params):
@@ -151,7 +151,7 @@ def colmap_dense(
     seen = write_rig_model(folder, largest, cuts, form=params.format)
     files = sparse_targets(children(folder)) | write_stereo_configs(ctx.scratch, seen)
     for number, group in enumerate(others, start=1):
-        files |= _other_model(group, number, _cuts(group.names, faces, item_stems(images)), params.format, ctx)
+        files |= _other_model(group, number, _cuts(group.names, faces, item_stems(images)), form=params.format, ctx=ctx)
     _warn_about_spaces(seen, params.format, ctx)
     blind = sum(not count for count in seen.values())
     ctx.metric("faces_without_points", blind)
@@ -180,7 +180,7 @@ def colmap_dense_init(
     """
     joined = points.joined_to(poses, keep_points=params.keep_sfm)
     ctx.metric("points", len(joined.points_in_world))
-    return _sparse_models(joined, images, params.format, ctx, "colmap_dense_init/sparse")
+    return _sparse_models(joined, images, params.format, ctx=ctx, target="colmap_dense_init/sparse")
 
 
 def _warn_about_spaces(names: Iterable[str], form: ModelForm, ctx: Context) -> None:
@@ -192,7 +192,9 @@ def _warn_about_spaces(names: Iterable[str], form: ModelForm, ctx: Context) -> N
         )
 
 
-def _sparse_models(poses: Poses, images: Mapping[str, Panorama], form: ModelForm, ctx: Context, target: str) -> Files:
+def _sparse_models(
+    poses: Poses, images: Mapping[str, Panorama], form: ModelForm, *, ctx: Context, target: str
+) -> Files:
     """Write a model for each group of poses into the folders 0, 1 … of the target."""
     files: dict[str, Path] = {}
     for number, group in enumerate(split_groups(poses)):
@@ -205,7 +207,7 @@ def _sparse_models(poses: Poses, images: Mapping[str, Panorama], form: ModelForm
 
 
 def _other_model(
-    group: Poses, number: int, cuts: Mapping[str, CutPanorama], form: ModelForm, ctx: Context
+    group: Poses, number: int, cuts: Mapping[str, CutPanorama], *, form: ModelForm, ctx: Context
 ) -> dict[str, Path]:
     """Write the model of a group other than the workspace's, and return the targets of its files."""
     shown = ", ".join(group.names[:3]) + (f" … ({len(group.names)} images)" if len(group.names) > 3 else "")

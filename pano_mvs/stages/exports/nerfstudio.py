@@ -87,9 +87,9 @@ def nerfstudio_frames(
         ranges = np.where(kept, range_map.range, np.float32(np.nan))
     made = _FrameFiles(params, ctx)
     if "equirectangular" in params.variants:
-        _add_panorama(made, image, valid, ranges)
+        _add_panorama(made, image, valid, ranges=ranges)
     if "faces" in params.variants:
-        _add_faces(made, image, valid, ranges)
+        _add_faces(made, image, valid, ranges=ranges)
     share = made.beyond / made.depths if made.depths else 0.0
     ctx.metric("beyond_depth", share)
     if share > _MUCH:
@@ -138,7 +138,7 @@ def nerfstudio(
     clouds = [] if cloud is None else cloud.groups()
     for number, group in enumerate(groups):
         own = clouds[number] if number < len(clouds) else None
-        files |= _write_group(number, group, loaded, own, params, ctx)
+        files |= _write_group(number, group, loaded, cloud=own, params=params, ctx=ctx)
     if len(groups) > 1:
         ctx.note(
             f"the poses are in {len(groups)} groups, each in its own frame: transforms.json lists the largest group, "
@@ -151,6 +151,7 @@ def _write_group(
     number: int,
     poses: Poses,
     frames: Mapping[str, NerfstudioFrames],
+    *,
     cloud: PointCloud | None,
     params: NerfstudioParams,
     ctx: Context,
@@ -163,7 +164,7 @@ def _write_group(
     files: dict[str, Path] = {}
     scratch = ctx.scratch / str(number)
     scratch.mkdir()
-    seed = _write_seed(poses, cloud, params, ctx, scratch)
+    seed = _write_seed(poses, cloud, params, ctx=ctx, scratch=scratch)
     seed_name, transforms = group_file("seed.ply", number), group_file("transforms.json", number)
     for variant in sorted({frame.variant for each in loaded.values() for frame in each.frames}):
         listed = [
@@ -225,7 +226,7 @@ class _FrameFiles:
 
 
 def _add_panorama(
-    made: _FrameFiles, image: Panorama, valid: NDArray[np.bool_], ranges: NDArray[np.float32] | None
+    made: _FrameFiles, image: Panorama, valid: NDArray[np.bool_], *, ranges: NDArray[np.float32] | None
 ) -> None:
     folder, name = "nerfstudio/equirectangular", "{name}"
     height, width = image.size_hw
@@ -243,7 +244,7 @@ def _add_panorama(
 
 
 def _add_faces(
-    made: _FrameFiles, image: Panorama, valid: NDArray[np.bool_], ranges: NDArray[np.float32] | None
+    made: _FrameFiles, image: Panorama, valid: NDArray[np.bool_], *, ranges: NDArray[np.float32] | None
 ) -> None:
     folder, params = "nerfstudio/faces", made.params
     panorama = image.load()
@@ -262,7 +263,7 @@ def _add_faces(
 
 
 def _write_seed(
-    poses: Poses, cloud: PointCloud | None, params: NerfstudioParams, ctx: Context, scratch: Path
+    poses: Poses, cloud: PointCloud | None, params: NerfstudioParams, *, ctx: Context, scratch: Path
 ) -> Path | None:
     """Write the initial points; return None if there are none."""
     if cloud is None or not len(cloud):

@@ -84,7 +84,7 @@ def test_points_are_spread_like_discs(seed: int) -> None:
     """On a plane sampled ever more densely to one side."""
     rng = np.random.default_rng(seed)
     points = np.column_stack([rng.random((30_000, 2)) ** (3, 1), np.zeros(30_000)])
-    kept = spread_points(points, np.ones(len(points)), 1500, rng)
+    kept = spread_points(points, np.ones(len(points)), 1500, rng=rng)
     assert len(kept) == len(set(kept.tolist())) == 1500
     assert (np.diff(kept) > 0).all()
     assert unevenness(points[kept]) < 0.2
@@ -96,7 +96,7 @@ def test_distances_go_with_the_spacing() -> None:
     rng = np.random.default_rng(5)
     points = np.column_stack([rng.random((40_000, 2)), np.zeros(40_000)])
     spacing = np.where(points[:, 0] < 0.5, 1.0, 3.0)
-    kept = spread_points(points, spacing, 1000, rng)
+    kept = spread_points(points, spacing, 1000, rng=rng)
     dense, sparse = points[kept[spacing[kept] == 1]], points[kept[spacing[kept] == 3]]
     assert len(dense) / len(sparse) == pytest.approx(9, rel=0.25)
 
@@ -104,17 +104,17 @@ def test_distances_go_with_the_spacing() -> None:
 @pytest.mark.parametrize("total", [0, 1, 2, 7, 40])
 def test_no_more_points_than_there_are(total: int) -> None:
     points = np.random.default_rng(0).random((total, 3))
-    assert spread_points(points, np.ones(total), 40, np.random.default_rng(0)).tolist() == list(range(total))
+    assert spread_points(points, np.ones(total), 40, rng=np.random.default_rng(0)).tolist() == list(range(total))
 
 
 def test_points_in_one_place_are_one() -> None:
     points = np.zeros((100, 3))
-    assert 1 <= len(spread_points(points, np.ones(100), 5, np.random.default_rng(0))) <= 5
+    assert 1 <= len(spread_points(points, np.ones(100), 5, rng=np.random.default_rng(0))) <= 5
 
 
 def test_wrong_spacings_are_refused() -> None:
     with pytest.raises(UsageError, match="positive spacings"):
-        spread_points(np.zeros((3, 3)), np.array([1.0, 0.0, 1.0]), 2, np.random.default_rng(0))
+        spread_points(np.zeros((3, 3)), np.array([1.0, 0.0, 1.0]), 2, rng=np.random.default_rng(0))
 
 
 def test_points_are_on_the_walls_even_and_seen_where_the_tracks_say(room: Room) -> None:

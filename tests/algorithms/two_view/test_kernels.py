@@ -99,10 +99,10 @@ def test_ranking_kernel_keeps_the_order_of_plain_costs() -> None:
     expected = essentials[np.argsort(costs)[:5]]
     order = rng.permutation(len(p))
     for sigmas in (3.0, np.inf):
-        found = least_essentials(essentials, p[order], q[order], THRESHOLD_RAD, sigmas=sigmas, count=5)
+        found = least_essentials(essentials, p[order], q[order], threshold_rad=THRESHOLD_RAD, sigmas=sigmas, count=5)
         np.testing.assert_array_equal(found, expected)
     limit = np.sort(costs)[:3].mean()
-    few = least_essentials(essentials, p, q, THRESHOLD_RAD, limit=limit, sigmas=np.inf, count=5)
+    few = least_essentials(essentials, p, q, threshold_rad=THRESHOLD_RAD, limit=limit, sigmas=np.inf, count=5)
     np.testing.assert_array_equal(few, expected[: int((costs < limit).sum())])
 
 

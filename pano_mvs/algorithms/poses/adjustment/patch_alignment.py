@@ -66,7 +66,7 @@ def _aligned(poses: Poses, load: Callable[[str], Picture]) -> Poses:
     chosen = _longest_tracks(poses.track_point_idx, _MAX_PER_IMAGE * len(poses.names))
     sigmas_rad = np.where(chosen, _NOT_ALIGNED, _NOT_TRIED) * step_rad
     for block in _blocks(sightings.reference_idx, poses.track_image_idx, chosen):
-        _align_block(poses, sightings, block, load, step_rad, bearings, sigmas_rad)
+        _align_block(poses, sightings, block, load=load, step_rad=step_rad, bearings=bearings, sigmas_rad=sigmas_rad)
     return replace(poses, track_bearings=bearings, track_sigmas_rad=sigmas_rad.astype(np.float32))
 
 
@@ -104,7 +104,7 @@ def _sightings(poses: Poses, step_rad: float) -> _Sightings:
     towards = poses.points_in_world[point_idx] - poses.centers[image_idx]
     ranges = np.maximum(np.linalg.norm(towards, axis=1), 1e-12)
     rays = towards / ranges[:, None]
-    reference_of_point = _references(point_idx, rays, ranges, len(poses.points_in_world))
+    reference_of_point = _references(point_idx, rays, ranges, count=len(poses.points_in_world))
     reference_idx = reference_of_point[point_idx]
     steps = (step_rad * ranges[reference_idx])[:, None, None]
     axes = poses.rotations[image_idx] @ (steps * tangent_basis(rays[reference_idx]))
@@ -117,7 +117,7 @@ def _sightings(poses: Poses, step_rad: float) -> _Sightings:
     )
 
 
-def _references(point_idx: NDArray[np.int32], rays: FloatArray, ranges: FloatArray, count: int) -> NDArray[np.intp]:
+def _references(point_idx: NDArray[np.int32], rays: FloatArray, ranges: FloatArray, *, count: int) -> NDArray[np.intp]:
     """Return the reference observation of every point, (count,): the ray nearest to the mean, the nearer of two."""
     total = np.stack([np.bincount(point_idx, column, count) for column in rays.T], axis=1)
     mean = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
@@ -147,6 +147,7 @@ def _align_block(
     poses: Poses,
     sightings: _Sightings,
     block: NDArray[np.intp],
+    *,
     load: Callable[[str], Picture],
     step_rad: float,
     bearings: FloatArray,
@@ -158,7 +159,7 @@ def _align_block(
     targets = block[sightings.reference_idx[block] != block]
     references = sightings.reference_idx[targets]
     shifts, correlations, deviations = aligned_shifts(
-        _patches(poses, sightings, block, load), place[references], place[targets]
+        _patches(poses, sightings, block, load=load), place[references], place[targets]
     )
     zoom = sightings.zoom[targets]
     moved = np.linalg.norm(shifts, axis=1) * zoom
@@ -177,7 +178,7 @@ def _align_block(
 
 
 def _patches(
-    poses: Poses, sightings: _Sightings, block: NDArray[np.intp], load: Callable[[str], Picture]
+    poses: Poses, sightings: _Sightings, block: NDArray[np.intp], *, load: Callable[[str], Picture]
 ) -> NDArray[np.float32]:
     """Return the patches of observations with their margins, (M, n, n) grey levels, loading one image at a time."""
     # Importing numba takes most of a second, so import it only where it is used.

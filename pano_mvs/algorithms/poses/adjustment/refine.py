@@ -128,7 +128,7 @@ def _fitting(bundle: Bundle, colors: NDArray[np.uint8], *, max_error_rad: float)
         max_error_rad=max_error_rad,
         min_angle_rad=_MIN_ANGLE_RAD,
     )
-    return _selected(replace(bundle, points=found.points_in_world), colors, found.used, found.valid)
+    return _selected(replace(bundle, points=found.points_in_world), colors, found.used, valid=found.valid)
 
 
 def _without_outliers(
@@ -137,11 +137,11 @@ def _without_outliers(
     """Drop observations with large errors, then points with fewer than two observations."""
     used = bundle.errors_rad() <= max_error_rad
     valid = np.bincount(bundle.point_idx[used], minlength=len(bundle.points)) >= 2
-    return _selected(bundle, colors, used & valid[bundle.point_idx], valid)
+    return _selected(bundle, colors, used & valid[bundle.point_idx], valid=valid)
 
 
 def _selected(
-    bundle: Bundle, colors: NDArray[np.uint8], used: NDArray[np.bool_], valid: NDArray[np.bool_]
+    bundle: Bundle, colors: NDArray[np.uint8], used: NDArray[np.bool_], *, valid: NDArray[np.bool_]
 ) -> tuple[Bundle, NDArray[np.uint8]]:
     selected = replace(
         bundle,

@@ -41,7 +41,7 @@ def camera_deviations(bundle: Bundle, *, loss: Loss, scale_rad: float, neighbour
     errors = ordered.errors_rad()
     system = reduced_cameras(ordered, weights, damping=0.0)
     band, _ = held(system.band, system.gradient, int(place[0]))
-    _hold_length(band, ordered.centers, int(place[0]), int(place[neighbour]))
+    _hold_length(band, ordered.centers, int(place[0]), neighbour=int(place[neighbour]))
     unseen = system.diagonal.reshape(-1, 6)[:, 0] == 0
     band[np.repeat(unseen, 6), 0] = 1.0
     redundancy = 2 * len(errors) - 6 * len(bundle.centers) - 3 * len(bundle.points) + 7
@@ -56,7 +56,7 @@ def camera_deviations(bundle: Bundle, *, loss: Loss, scale_rad: float, neighbour
     return deviations[place, 1], deviations[place, 0]
 
 
-def _hold_length(band: FloatArray, centers: FloatArray, first: int, neighbour: int) -> None:
+def _hold_length(band: FloatArray, centers: FloatArray, first: int, *, neighbour: int) -> None:
     """Constrain the system so that the distance between two cameras does not change."""
     along = centers[neighbour] - centers[first]
     along /= np.linalg.norm(along)

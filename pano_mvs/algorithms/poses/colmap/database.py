@@ -61,7 +61,7 @@ def write_database(
             images: dict[int, DatabaseImage] = {}
             for idx, (name, found) in enumerate(features.items()):
                 images |= write(database, sensors, idx, name, found)
-            _write_pairs(database, tuple(features), two_views, images)
+            _write_pairs(database, tuple(features), two_views, images=images)
     finally:
         database.close()
     return images
@@ -76,7 +76,7 @@ def _write_sphere(database: Any, sensors: dict[Any, Any], idx: int, name: str, f
         camera = pycolmap.Camera(model="EQUIRECTANGULAR", width=width, height=height, params=[width, height])
         sensors[found.size_hw] = _write_rig(database, [camera], np.eye(3)[None])
     rig_id, camera_ids = sensors[found.size_hw]
-    (image_id,) = _write_frame(database, rig_id, camera_ids, [name])
+    (image_id,) = _write_frame(database, rig_id, camera_ids, names=[name])
     database.write_keypoints(image_id, pixel_from_ray(found.bearings, found.size_hw).astype(np.float32))
     return {image_id: DatabaseImage(idx, np.arange(len(found), dtype=np.int32), np.eye(3))}
 
@@ -95,7 +95,7 @@ def _write_faces(database: Any, sensors: dict[Any, Any], idx: int, name: str, fo
             camera.has_prior_focal_length = True
         sensors[found.size_hw] = _write_rig(database, faces, CUBE_ROTATIONS)
     rig_id, camera_ids = sensors[found.size_hw]
-    image_ids = _write_frame(database, rig_id, camera_ids, [f"{face}/{name}" for face in CUBE_NAMES])
+    image_ids = _write_frame(database, rig_id, camera_ids, names=[f"{face}/{name}" for face in CUBE_NAMES])
     face_of_keypoint = face_of_bearing(found.bearings)
     written = {}
     for face_idx, image_id in enumerate(image_ids):
@@ -119,7 +119,7 @@ def _write_rig(database: Any, cameras: list[Any], face_from_panorama: FloatArray
     return database.write_rig(rig), camera_ids
 
 
-def _write_frame(database: Any, rig_id: int, camera_ids: list[int], names: list[str]) -> list[int]:
+def _write_frame(database: Any, rig_id: int, camera_ids: list[int], *, names: list[str]) -> list[int]:
     """Write the images of one panorama, and the frame that joins them; return the image ids."""
     import pycolmap
 
@@ -141,7 +141,7 @@ def _camera_sensor(camera_id: int) -> Any:
 
 
 def _write_pairs(
-    database: Any, names: tuple[str, ...], two_views: TwoViews, images: Mapping[int, DatabaseImage]
+    database: Any, names: tuple[str, ...], two_views: TwoViews, *, images: Mapping[int, DatabaseImage]
 ) -> None:
     """Write matches and geometry of every pair of images with common matches."""
     position = {name: idx for idx, name in enumerate(names)}

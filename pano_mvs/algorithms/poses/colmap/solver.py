@@ -117,7 +117,7 @@ def extend_with_colmap(
                 scratch / "database.db",
                 scratch / "models",
                 fixed,
-                images,
+                images=images,
                 cameras=cameras,
                 seed=seed,
                 width_px=_width_px(features),

@@ -99,17 +99,17 @@ def fit_gps(
     levelling = rotation_from_two_vectors(up_in_world, _UP)
     level = poses.centers[[idx for idx, _ in located]] @ levelling.T
     source, target = level[:, 0] + 1j * level[:, 2], local[:, 0] + 1j * local[:, 2]
-    factor, shift = _fit_plane(source, target, gps_noise_m, rng)
+    factor, shift = _fit_plane(source, target, gps_noise_m, rng=rng)
     residuals_m = np.abs(factor * source + shift - target)
     agree = residuals_m < _OUTLIER_SIGMAS * gps_noise_m * np.sqrt(2)
     fit = replace(
         unknown,
-        local_from_world=_similarity(factor, shift, levelling, level[agree], local[agree]),
+        local_from_world=_similarity(factor, shift, levelling, level=level[agree], local=local[agree]),
         origin_lla=origin_lla,
         used=int(agree.sum()),
         residual_m=float(np.median(residuals_m)),
     )
-    return _judged(fit, factor, source[agree], residuals_m[agree], gps_noise_m)
+    return _judged(fit, factor, source[agree], residuals_m=residuals_m[agree], gps_noise_m=gps_noise_m)
 
 
 def scaled_by_gps(poses: Poses, fit: GpsFit) -> Poses:
@@ -155,7 +155,9 @@ def origin_of_frame(frame: str) -> tuple[float, float, float] | None:
     return None if found is None else (float(found[1]), float(found[2]), float(found[3]))
 
 
-def _judged(fit: GpsFit, factor: complex, source: ComplexArray, residuals_m: FloatArray, gps_noise_m: float) -> GpsFit:
+def _judged(
+    fit: GpsFit, factor: complex, source: ComplexArray, *, residuals_m: FloatArray, gps_noise_m: float
+) -> GpsFit:
     """Return the fit with its uncertainty, rejected if it is not reliable."""
     if fit.used < max(_MIN_POSITIONS, fit.of / 2):
         return replace(
@@ -179,7 +181,7 @@ def _judged(fit: GpsFit, factor: complex, source: ComplexArray, residuals_m: Flo
 
 
 def _fit_plane(
-    source: ComplexArray, target: ComplexArray, noise_m: float, rng: np.random.Generator
+    source: ComplexArray, target: ComplexArray, noise_m: float, *, rng: np.random.Generator
 ) -> tuple[complex, complex]:
     """Return a and b of target ≈ a source + b, robust to outliers."""
     first, second = _pairs(len(source), rng)
@@ -217,7 +219,7 @@ def _pairs(count: int, rng: np.random.Generator) -> tuple[NDArray[np.int64], NDA
 
 
 def _similarity(
-    factor: complex, shift: complex, levelling: FloatArray, level: FloatArray, local: FloatArray
+    factor: complex, shift: complex, levelling: FloatArray, *, level: FloatArray, local: FloatArray
 ) -> Similarity3:
     """Return local_from_world of a fit on the ground; the height is the median over the positions used."""
     scale = abs(factor)
