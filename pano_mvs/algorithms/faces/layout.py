@@ -10,12 +10,13 @@ camera model is enough for a rig.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.faces.icosahedron import face_centers
-from pano_mvs.core.errors import UsageError
+from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.geometry import PinholeView, spiral_rays
 from pano_mvs.scene.face_files import FaceLayout
 
@@ -37,7 +38,7 @@ CUBE_ROTATIONS: FloatArray = np.array(
 )
 CUBE_NAMES = ("front", "right", "back", "left", "up", "down")
 _OCTAGON_NAMES = ("front", "front-right", "right", "back-right", "back", "back-left", "left", "front-left")
-_MIN_FOV_DEG, _MAX_FOV_DEG, _MIN_SIZE_PX = 30.0, 150.0, 4
+_MIN_SIZE_PX = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,8 +54,15 @@ class Face:
     view: PinholeView
 
 
+@checks_settings
 def panorama_faces(
-    size_hw: tuple[int, int], *, layout: FaceLayout = "cube", fov_deg: float = 96.0, size_px: int | None = None
+    size_hw: tuple[int, int],
+    *,
+    layout: Annotated[FaceLayout, Setting("cube: 6 faces, octagon: 10, icosahedron: 20")] = "cube",
+    fov_deg: Annotated[float, Setting("field of view of a face; faces overlap above 90", ge=30, le=150)] = 96.0,
+    size_px: Annotated[
+        int | None, Setting("width of a face; null: the resolution of the panorama", ge=_MIN_SIZE_PX, le=16384)
+    ] = None,
 ) -> tuple[Face, ...]:
     """Return the faces of a panorama.
 
@@ -65,17 +73,13 @@ def panorama_faces(
     Args:
         size_hw: (height, width) of the full sphere.
         layout: name of the layout.
-        fov_deg: horizontal and vertical field of view, from 30 to 150.
+        fov_deg: horizontal and vertical field of view.
         size_px: width and height of a face; None: `default_face_size`.
 
     Raises:
         UsageError: if the field of view or the size is out of bounds.
     """
-    if not _MIN_FOV_DEG <= fov_deg <= _MAX_FOV_DEG:
-        raise UsageError(f"the field of view of a face must be from 30 to 150 degrees, got {fov_deg}")
     size = default_face_size(size_hw, fov_deg=fov_deg) if size_px is None else size_px
-    if size < _MIN_SIZE_PX:
-        raise UsageError(f"a face must be {_MIN_SIZE_PX} pixels wide or more, got {size}")
     focal_px = size / (2 * np.tan(np.radians(fov_deg) / 2))
     center = np.array([size / 2, size / 2])
     return tuple(
@@ -84,7 +88,7 @@ def panorama_faces(
     )
 
 
-def default_face_size(size_hw: tuple[int, int], *, fov_deg: float = 96.0) -> int:
+def default_face_size(size_hw: tuple[int, int], *, fov_deg: float) -> int:
     """Return the width at which the centre of a face has the resolution of the equator: (w / π) tan(fov / 2).
 
     Rounded up to an even number of pixels; the resolution increases towards the edges of a face.

@@ -11,7 +11,22 @@ from pydantic import Field
 
 from pano_mvs.algorithms.faces.layout import Face, covers_sphere, default_face_size, panorama_faces
 from pano_mvs.algorithms.faces.render import colmap_depth_view, face_source, render_face
-from pano_mvs.api import All, Context, Each, Files, Names, One, Panorama, Params, Poses, RangeMap, UsageError, stage
+from pano_mvs.api import (
+    All,
+    Context,
+    Each,
+    Files,
+    Names,
+    One,
+    Panorama,
+    Params,
+    Poses,
+    RangeMap,
+    UsageError,
+    arguments_from,
+    params_from,
+    stage,
+)
 from pano_mvs.core.paths import children
 from pano_mvs.core.text import plural
 from pano_mvs.geometry import PinholeView
@@ -20,7 +35,7 @@ from pano_mvs.io.colmap.model_writer import write_colmap_model
 from pano_mvs.io.colmap.points import ModelForm
 from pano_mvs.io.colmap.rig import CutPanorama, write_rig_model
 from pano_mvs.io.colmap.workspace import WORKSPACE, face_image_name, sparse_targets, write_face, write_stereo_configs
-from pano_mvs.scene.face_files import FaceFiles, FaceLayout
+from pano_mvs.scene.face_files import FaceFiles
 from pano_mvs.scene.files import item_stems
 from pano_mvs.scene.image_files.image_file import write_png
 from pano_mvs.scene.pose_groups import split_groups
@@ -66,14 +81,10 @@ def colmap_masks(image: Each[Panorama], params: MasksParams, ctx: Context) -> Fi
     return Files(files)
 
 
+@params_from(panorama_faces, own_last=True)
 class FacesParams(Params):
     """Settings of export.colmap_faces."""
 
-    layout: FaceLayout = Field(default="cube", description="cube: 6 faces, octagon: 10, icosahedron: 20")
-    fov_deg: float = Field(default=96.0, ge=30, le=150, description="field of view of a face; faces overlap above 90")
-    size_px: int | None = Field(
-        default=None, ge=4, le=16384, description="width of a face; null: the resolution of the panorama"
-    )
     min_confidence: int = Field(default=64, ge=1, le=255, description="minimum confidence of depths (64: seen)")
     image_format: Literal["jpg", "png"] = Field(
         default="jpg", description="format of the faces' images (JPEG: quality 95)"
@@ -83,7 +94,8 @@ class FacesParams(Params):
 def faces_memory_bytes(params: FacesParams, inputs: Mapping[str, Any]) -> int:
     """Return the memory for the faces of one panorama: normals of the whole panorama, and one face at a time."""
     height, width = inputs["image"].size_hw
-    size = params.size_px or default_face_size((height, width), fov_deg=params.fov_deg)
+    cut = arguments_from(panorama_faces, params)
+    size = cut["size_px"] or default_face_size((height, width), fov_deg=cut["fov_deg"])
     return int(200_000_000 + 70 * height * width + 60 * size**2)
 
 
@@ -97,10 +109,11 @@ def colmap_faces(image: Each[Panorama], range_map: Each[RangeMap], params: Faces
     source = face_source(
         picture, image.load_mask(), range_map, min_confidence=params.min_confidence, threads=ctx.threads
     )
-    faces = panorama_faces(image.size_hw, layout=params.layout, fov_deg=params.fov_deg, size_px=params.size_px)
+    cut = arguments_from(panorama_faces, params)
+    faces = panorama_faces(image.size_hw, **cut)
     if not covers_sphere(faces):
         ctx.note(
-            f"{params.layout} faces of {params.fov_deg:g}° do not cover the sphere: some directions are in no face"
+            f"{cut['layout']} faces of {cut['fov_deg']:g}° do not cover the sphere: some directions are in no face"
         )
     suffix, depths = f".{params.image_format}", []
     files: dict[str, Path] = {}
@@ -117,7 +130,7 @@ def colmap_faces(image: Each[Panorama], range_map: Each[RangeMap], params: Faces
         )
         depths.append(np.isfinite(seen.z_depth).mean())
     ctx.metric("share_with_depth", float(np.mean(depths)))
-    return FaceFiles(files, params.layout, params.fov_deg, faces[0].view.size_hw[0], suffix)
+    return FaceFiles(files, cut["layout"], cut["fov_deg"], faces[0].view.size_hw[0], suffix)
 
 
 class DenseParams(Params):

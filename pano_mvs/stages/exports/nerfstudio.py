@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from pano_mvs.algorithms.faces.layout import FaceLayout, panorama_faces
+from pano_mvs.algorithms.faces.layout import panorama_faces
 from pano_mvs.algorithms.faces.pictures import face_image, face_mask
 from pano_mvs.algorithms.faces.ranges import face_z_depth
 from pano_mvs.api import (
@@ -27,6 +27,8 @@ from pano_mvs.api import (
     PointCloud,
     Poses,
     RangeMap,
+    arguments_from,
+    params_from,
     stage,
     write_png,
 )
@@ -44,17 +46,18 @@ _NO_TURN = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 _MUCH = 0.01
 
 
-class NerfstudioFramesParams(Params):
-    """Settings of export.nerfstudio_frames."""
+@params_from(panorama_faces)
+class _CutParams(Params):
+    """How panoramas are cut into faces."""
 
     variants: tuple[Variant, ...] = Field(
         default=("equirectangular", "faces"), min_length=1, description="whole panoramas, pinhole faces, or both"
     )
-    layout: FaceLayout = Field(default="cube", description="cube: 6 faces, octagon: 10, icosahedron: 20")
-    fov_deg: float = Field(default=96.0, ge=30, le=150, description="field of view of a face; faces overlap above 90")
-    size_px: int | None = Field(
-        default=None, ge=4, le=16384, description="width of a face; null: the resolution of the panorama"
-    )
+
+
+class NerfstudioFramesParams(_CutParams):
+    """Settings of export.nerfstudio_frames."""
+
     image_format: Literal["jpg", "png"] = Field(
         default="jpg", description="format of images that are not copied unchanged"
     )
@@ -67,7 +70,7 @@ class NerfstudioFramesParams(Params):
 def frames_memory_bytes(params: NerfstudioFramesParams, inputs: Mapping[str, Any]) -> int:
     """Return the memory for one panorama: 40 bytes a pixel, measured at 4096 and 8192 columns, and one face."""
     height, width = inputs["image"].size_hw
-    return int(40 * (height * width + (params.size_px or 0) ** 2))
+    return int(40 * (height * width + (arguments_from(panorama_faces, params)["size_px"] or 0) ** 2))
 
 
 @stage("export.nerfstudio_frames", memory=frames_memory_bytes)
@@ -248,7 +251,7 @@ def _add_faces(
 ) -> None:
     folder, params = "nerfstudio/faces", made.params
     panorama = image.load()
-    for face in panorama_faces(image.size_hw, layout=params.layout, fov_deg=params.fov_deg, size_px=params.size_px):
+    for face in panorama_faces(image.size_hw, **arguments_from(panorama_faces, params)):
         view, name = face.view, f"{{name}}.{face.name}"
         picture = f"images/{name}.{params.image_format}"
         write_picture(made.write(f"{folder}/{picture}", f".{params.image_format}"), face_image(panorama, view))
