@@ -19,8 +19,8 @@ from pano_mvs import __version__
 from pano_mvs.cli.cache.app import cache_app
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.doctor.command import doctor
+from pano_mvs.cli.error_messages import guarded
 from pano_mvs.cli.evaluate.app import evaluate_app
-from pano_mvs.cli.exit_codes import guarded
 from pano_mvs.cli.options import (
     AcceptOption,
     CacheOption,

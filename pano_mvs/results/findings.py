@@ -10,28 +10,24 @@ from pano_mvs.core.text import plural
 from pano_mvs.results.figures import figure, median, share, significant
 from pano_mvs.results.records import Finding, PoseGroup, PosesSummary
 from pano_mvs.results.summary import RunSummary
+from pano_mvs.results.thresholds import (
+    FAIR_COMPLETE,
+    FAIR_CONSISTENT,
+    FAIR_REGISTERED,
+    FAIR_RESIDUAL_PX,
+    FAIR_UNDOUBTED,
+    GOOD_COMPLETE,
+    GOOD_CONSISTENT,
+    GOOD_REGISTERED,
+    GOOD_RESIDUAL_PX,
+    mood_of,
+)
 
-GOOD_REGISTERED, FAIR_REGISTERED = 0.95, 0.5
-# Residuals are compared with a pixel of the panorama: what is measured to within one is measured well.
-GOOD_RESIDUAL_PX, FAIR_RESIDUAL_PX = 1.0, 2.0
-# A sky takes up to half of the sphere, so it is not for much less that a result is bad.
-GOOD_COMPLETE, FAIR_COMPLETE = 0.8, 0.35
-# Plain walls are confirmed by nobody: a third of a furnished room is as much as can be had.
-GOOD_CONSISTENT, FAIR_CONSISTENT = 0.3, 0.12
 _FEW_LINKS = 2
 _SHOWN_GROUPS = 5
 _SHOWN_DOUBTS = 5
-# A model more than half of whose cameras are doubtful is not to be relied on.
-FAIR_UNDOUBTED = 0.5
 _NAMES_AND_FIGURES = re.compile(r"\d+([.,]\d+)?|'[^']*'")
 _ENDINGS = re.compile(r"\b(is|are)\b|(?<=\w)e?s\b")  # by which one and several differ
-
-
-def mood_of(value: float, good: float, fair: float) -> str:
-    """Return "good", "fair" or "bad": limits that fall from good to fair are lower ones, else upper ones."""
-    if good > fair:
-        return "good" if value >= good else "fair" if value >= fair else "bad"
-    return "good" if value <= good else "fair" if value <= fair else "bad"
 
 
 def findings(summary: RunSummary, *, residual_px: float | None = None) -> tuple[Finding, ...]:
@@ -64,12 +60,12 @@ def _stopped(summary: RunSummary) -> list[Finding]:
         return [
             Finding(
                 "fair",
-                "The run was interrupted: what is shown is what it had finished.",
+                "The run was interrupted. This report shows what it had finished.",
                 "Run the same command again; what is finished is not computed again.",
             )
         ]
     stopped = stopped if stopped.endswith((".", "!", "?")) else f"{stopped}."
-    return [Finding("bad", f"The run stopped early: {stopped}", "Mend this and run the same command again.")]
+    return [Finding("bad", f"The run stopped early: {stopped}", "Correct this and run the same command again.")]
 
 
 def _failures(summary: RunSummary) -> list[Finding]:

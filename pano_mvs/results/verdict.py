@@ -6,7 +6,11 @@ from collections.abc import Collection
 
 from pano_mvs.core.text import plural
 from pano_mvs.results.figures import degrees, figure, median, share, significant
-from pano_mvs.results.findings import (
+from pano_mvs.results.findings import compares_views, doubt_mood, findings
+from pano_mvs.results.records import Tile, Verdict
+from pano_mvs.results.residuals import Residuals
+from pano_mvs.results.summary import RunSummary
+from pano_mvs.results.thresholds import (
     FAIR_COMPLETE,
     FAIR_CONSISTENT,
     FAIR_REGISTERED,
@@ -15,14 +19,8 @@ from pano_mvs.results.findings import (
     GOOD_CONSISTENT,
     GOOD_REGISTERED,
     GOOD_RESIDUAL_PX,
-    compares_views,
-    doubt_mood,
-    findings,
     mood_of,
 )
-from pano_mvs.results.records import Tile, Verdict
-from pano_mvs.results.residuals import Residuals
-from pano_mvs.results.summary import RunSummary
 
 _SOME_FAILED, _INTERRUPTED = 3, 130
 _OUTCOMES = {

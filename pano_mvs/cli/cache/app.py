@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from pano_mvs.cli.console import Console
-from pano_mvs.cli.exit_codes import guarded
+from pano_mvs.cli.error_messages import guarded
 from pano_mvs.cli.options import CacheOption
 
 cache_app = typer.Typer(

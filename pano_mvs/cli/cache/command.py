@@ -37,7 +37,7 @@ def open_cache(cache: Path | None) -> Store:
     root = cache or (Path(variable) if variable else Path(".pano-mvs"))
     if not is_file(root / "layout.json"):
         if is_denied(root / "layout.json"):
-            raise UsageError(f"{root}: you may not look into this folder (permission denied). Mend its permissions")
+            raise UsageError(f"{root}: this folder cannot be listed (permission denied). Correct its permissions")
         raise UsageError(
             f"{root} is no cache of pano-mvs; name one with --cache DIR (it lies beside the workflow file "
             "as .pano-mvs, or where you ran a preset by its name)"

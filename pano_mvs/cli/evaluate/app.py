@@ -9,7 +9,7 @@ import typer
 
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.default_command import RunByDefault
-from pano_mvs.cli.exit_codes import guarded
+from pano_mvs.cli.error_messages import guarded
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.text import plural
 

@@ -9,7 +9,7 @@ import typer
 
 from pano_mvs.cli.completion import complete_plugin_kind, complete_stage_kind
 from pano_mvs.cli.console import Console
-from pano_mvs.cli.exit_codes import guarded
+from pano_mvs.cli.error_messages import guarded
 
 plugin_app = typer.Typer(help="Write plugins.", no_args_is_help=True)
 stage_app = typer.Typer(help="Look at one stage.", no_args_is_help=True)

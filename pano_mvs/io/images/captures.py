@@ -163,7 +163,7 @@ def files_below(folder: Path, notes: list[str]) -> Iterator[Path]:
     def fail(error: OSError) -> None:
         problem = f"{error.filename}: cannot be listed ({error.strerror})"
         if Path(error.filename) == folder:
-            raise InputError(f"{problem}. Mend its permissions or give another folder")
+            raise InputError(f"{problem}. Correct its permissions or choose another folder")
         notes.append(f"{problem}; what it holds is left out")
 
     seen: set[Path] = set()
