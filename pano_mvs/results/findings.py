@@ -61,7 +61,7 @@ def _stopped(summary: RunSummary) -> list[Finding]:
             Finding(
                 "fair",
                 "The run was interrupted. This report shows what it had finished.",
-                "Run the same command again; what is finished is not computed again.",
+                "Run the same command again to continue.",
             )
         ]
     stopped = stopped if stopped.endswith((".", "!", "?")) else f"{stopped}."
@@ -76,7 +76,9 @@ def _failures(summary: RunSummary) -> list[Finding]:
     where = ", ".join(f"{count} in {stage}" for stage, count in stages.most_common(3))
     more = f"; {_units(len(blocked))} could not run because of {plural(len(failures), 'it', 'them')}" if blocked else ""
     verb = plural(len(failures), "unit of work failed", "units of work failed")
-    return [Finding("fair", f"{figure(len(failures))} {verb} ({where}){more}.", "Each is listed with its cause.")]
+    return [
+        Finding("fair", f"{figure(len(failures))} {verb} ({where}){more}.", "The report lists each with its cause.")
+    ]
 
 
 def _registration(summary: RunSummary) -> list[Finding]:
@@ -95,7 +97,7 @@ def _registration(summary: RunSummary) -> list[Finding]:
         Finding(
             mood,
             text,
-            "Take more pictures between those, 0.5–1 m apart indoors, each seeing much of what the next one sees.",
+            "Take more panoramas between these, 0.5–1 m apart indoors, so that consecutive ones overlap well.",
         )
     ]
 
@@ -119,7 +121,7 @@ def _doubts(summary: RunSummary) -> list[Finding]:
         Finding(
             mood,
             f"{count}: {'; '.join(reasons[:_SHOWN_DOUBTS])}{more}.",
-            f"Take panoramas between {them} neighbours, with things in view that occur only once, or leave "
+            f"Take panoramas between {them} neighbours that show something unique, or leave "
             f"{plural(len(reasons), 'it', 'these images')} out.",
         )
     ]
@@ -158,9 +160,9 @@ def pictures_between(groups: Sequence[PoseGroup]) -> str:
             )
             found.append(f"{pair.first} and {pair.second} ({known})")
     if not found:
-        return "Take pictures between the groups, 0.5–1 m apart, and compare them with both."
+        return "Take panoramas between the groups, 0.5–1 m apart, so that they overlap both."
     more = " …" if len(found) > _SHOWN_GROUPS else ""
-    return f"To join them take pictures between {'; between '.join(found[:_SHOWN_GROUPS])}{more}."
+    return f"To connect them, take panoramas between {'; between '.join(found[:_SHOWN_GROUPS])}{more}."
 
 
 def _commonest(reasons: Sequence[str]) -> str:
@@ -186,8 +188,8 @@ def _graph(summary: RunSummary) -> list[Finding]:
     return [
         Finding(
             mood,
-            f"{len(loose)} {sharing} a verified geometry with one other alone ({shown}): unless their "
-            "poses were given, nothing confirms them.",
+            f"{len(loose)} {sharing} a verified geometry with only one other camera ({shown}): unless their "
+            "poses come from a file, nothing confirms them.",
         )
     ]
 
@@ -195,13 +197,13 @@ def _graph(summary: RunSummary) -> list[Finding]:
 def _residual(residual_px: float | None) -> list[Finding]:
     if residual_px is None or (mood := mood_of(residual_px, GOOD_RESIDUAL_PX, FAIR_RESIDUAL_PX)) == "good":
         return []
-    text = f"The points miss the pictures by {significant(residual_px)} pixels in the median: the poses are not sharp."
+    text = f"The median reprojection residual is {significant(residual_px)} pixels: the poses are imprecise."
     return [
         Finding(
             mood,
             text,
-            "Check that the pictures are sharp, unstitched seams aside, and not edited one by one; "
-            "put poses.refine behind the solver if it is not there.",
+            "Check that the images are sharp, well stitched, and not edited individually; "
+            "add poses.refine after the solver if it is missing.",
         )
     ]
 
@@ -221,15 +223,15 @@ def _views(summary: RunSummary) -> list[Finding]:
             Finding(
                 mood,
                 f"Half of the views have a range for less than {share(complete)} of their pixels.",
-                "Sky and masks have none; elsewhere look at the views in the report.",
+                "Sky and masked areas have none; for other areas, look at the views in the report.",
             )
         )
     if consistent is not None and not compares_views(summary):
         found.append(
             Finding(
                 "",
-                "No stage compared the views with each other, so nothing is known of their agreement.",
-                "filters.consistency does it.",
+                "No stage compared the views with each other, so it is unknown whether they agree.",
+                "Add filters.consistency.",
             )
         )
     elif consistent is not None and (mood := mood_of(consistent, GOOD_CONSISTENT, FAIR_CONSISTENT)) != "good":
@@ -237,7 +239,7 @@ def _views(summary: RunSummary) -> list[Finding]:
             Finding(
                 mood,
                 f"Other views confirm only {share(consistent)} of the pixels in the median view.",
-                "Plain walls cannot be confirmed; if textured ones are not either, the cameras are too "
+                "Plain walls cannot be confirmed. If textured surfaces are not confirmed either, the cameras are too "
                 "far apart or the poses are wrong.",
             )
         )
@@ -250,7 +252,7 @@ def _cloud(summary: RunSummary) -> list[Finding]:
             Finding(
                 "bad",
                 "The cloud has no points: no two views agree on any surface.",
-                "Look at the ranges in the report; if they are right, the poses are wrong.",
+                "Look at the range maps in the report: if they look right, the poses are wrong.",
             )
         ]
     return []
@@ -264,8 +266,8 @@ def _baseline(summary: RunSummary) -> list[Finding]:
         ours = median([view.get("psnr_db") for view in views])
         constant = median([view.get("best_constant_psnr_db", view.get("constant_psnr_db")) for view in views])
         if ours is not None and constant is not None and ours <= constant:
-            text = f"Against the truth ({stage}), one constant range for all pixels does as well"
-            found.append(Finding("bad", f"{text}: {ours:z.1f} dB to {constant:z.1f} dB."))
+            text = f"Compared with the ground truth ({stage}), a single constant range scores at least as well"
+            found.append(Finding("bad", f"{text}: {constant:z.1f} dB, against {ours:z.1f} dB."))
     return found
 
 

@@ -28,7 +28,7 @@ _OUTCOMES = {
     1: ("bad", "Stopped by an internal error"),
     2: ("bad", "Stopped: the workflow or an input cannot be used"),
     _SOME_FAILED: ("fair", "Finished, with failed items"),
-    4: ("bad", "Stopped by a quality threshold or a guard"),
+    4: ("bad", "Stopped by a quality threshold or a safety check"),
     _INTERRUPTED: ("fair", "Interrupted"),
 }
 _JUDGEMENTS = {
@@ -78,13 +78,13 @@ def _worst(moods: Collection[str]) -> str:
 def _sentence(summary: RunSummary) -> str:
     run, cached, failed = (sum(getattr(s, key) for s in summary.stages) for key in ("run", "cached", "failed"))
     if not run + cached + failed:
-        return "No unit of work was due."
+        return "There was nothing to compute."
     parts = [f"{figure(run)} computed", f"{figure(cached)} taken from the cache"]
     if failed:
         parts.append(f"{figure(failed)} failed")
     if not run and not failed:
         units = plural(cached, "the one unit of work was", f"all {figure(cached)} units of work were")
-        return f"Nothing had changed: {units} taken from the cache."
+        return f"Nothing has changed: {units} taken from the cache."
     total = run + cached + failed
     return f"{figure(total)} {plural(total, 'unit of work', 'units of work')}: {', '.join(parts)}."
 
@@ -135,9 +135,9 @@ def _accuracy(summary: RunSummary) -> list[Tile]:
     tiles = []
     error_deg = median([scores.poses.get("median_pair_error_deg")])
     if error_deg is not None:
-        tiles.append(Tile(degrees(error_deg), "median pose error against the truth"))
+        tiles.append(Tile(degrees(error_deg), "median pose error against the ground truth"))
     errors = [view.get("median_relative_error") for view in scores.views.values()]
     relative = median(errors)
     if relative is not None:
-        tiles.append(Tile(f"{significant(100 * relative)} %", "median range error against the truth"))
+        tiles.append(Tile(f"{significant(100 * relative)} %", "median range error against the ground truth"))
     return tiles

@@ -40,7 +40,7 @@ def test_views_are_shown_with_panorama_range_and_confidence(
     assert_sound(page)
     for name in tiny.names:
         words = [attrs["alt"] for attrs in page.all("img") if str(attrs["alt"]).startswith(f"{name}:")]
-        assert [word.split()[-1] for word in words] == ["panorama", "blue", "class"]
+        assert [word.split()[-1] for word in words] == ["panorama", "(far)", "pixel"]
     assert page.all("img", alt="The cloud: From above")
     assert "From inside, where" in page.words
     assert "only 7 of 31 matches agree" in page.words

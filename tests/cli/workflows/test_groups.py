@@ -123,7 +123,7 @@ def test_both_rooms_are_delivered(pano_mvs: Command, rooms: Path) -> None:
     assert (first in LARGE, second in SMALL) == (True, True)
     assert "2 groups of panoramas share no reliable connection: each has its own frame and scale" in result.flat
     assert f"between {first} and {second}" in result.flat
-    assert f"To join them take pictures between {first} and {second}" in (out / "report.html").read_text()
+    assert f"To connect them, take panoramas between {first} and {second}" in (out / "report.html").read_text()
     _check_models(out, rooms)
     _check_ranges(out, rooms)
     _check_clouds(out, rooms)
@@ -189,7 +189,7 @@ def test_the_terminal_says_what_the_report_finds_of_groups(capsys: pytest.Captur
     print_summary(_output({"poses": poses}), Console(width=200))
     printed = capsys.readouterr().out
     assert "Usable, with doubts: see below.\ndoubtful: 2 groups of panoramas share no reliable connection" in printed
-    assert "To join them take pictures between b and x (31 candidates)." in printed
+    assert "To connect them, take panoramas between b and x (31 candidates)." in printed
     print_summary(_output({"poses": poses | {"groups": groups[:1]}}), Console(width=200))
     assert "reliable connection" not in capsys.readouterr().out
 
