@@ -107,7 +107,7 @@ def _tour(scene: ShownScene, options: ViewOptions, size_wh: tuple[int, int]) -> 
 
 def _surface(wanted: str, scene: ShownScene) -> str:
     if wanted not in ("cloud", "mesh", "both"):
-        raise UsageError(f"--show {wanted}: there are cloud, mesh and both")
+        raise UsageError(f"--show {wanted}: must be cloud, mesh or both")
     missing = {"cloud": scene.cloud is None, "mesh": scene.mesh is None}
     absent = [name for name in ("cloud", "mesh") if wanted in (name, "both") and missing[name]]
     if absent:
@@ -125,7 +125,7 @@ def mesh_points(path: Path) -> NDArray[np.float32]:
 
     points = read_ply_points(path)
     if not len(points):
-        raise InputError(f"{path}: a mesh without corners. Write it again")
+        raise InputError(f"{path}: the mesh has no vertices. Export it again")
     return points
 
 
@@ -138,7 +138,7 @@ def _size_wh(text: str) -> tuple[int, int]:
 
 def _check_screenshot(path: Path) -> None:
     if path.suffix.lower() not in _SUFFIXES:
-        raise UsageError(f"--screenshot {path}: pictures are {', '.join(_SUFFIXES)}")
+        raise UsageError(f"--screenshot {path}: images must end in {', '.join(_SUFFIXES)}")
 
 
 def _write(path: Path, picture: NDArray[np.uint8]) -> None:

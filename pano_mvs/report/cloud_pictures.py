@@ -87,7 +87,7 @@ def cloud_pictures(
         note = "; ".join(
             [
                 *filter(None, [note]),
-                "shown is group 0 of the poses, the largest; the clouds of the others "
+                "this is group 0 of the poses, the largest; the clouds of the others "
                 "are cloud_1.ply … (pano-mvs view OUT --group 1)",
             ]
         )
@@ -119,7 +119,7 @@ def _drawn(
         images = _drawn_apart(arrays, seen_from, command)
         if images:
             return images, ""
-    note = "" if software else "PyVista could not draw here (no graphics driver), so these are plainer pictures"
+    note = "" if software else "PyVista could not render (no graphics driver), so these images are simpler"
     return [draw_cloud(*arrays, view, size_hw=_SIZE_HW) for view in seen_from], note
 
 

@@ -26,7 +26,7 @@ _WORDS = {
 }
 _CONSTANTS = "best_constant_", "constant_"
 _BRACKETS = (
-    "In brackets: what one constant range for all pixels scores, the constant that is best for the very score "
+    "In brackets: the score of a single constant range, the best one for each score "
     "(in runs of earlier versions the median of the true ranges)."
 )
 _MIN_SHOWN = 0.0001

@@ -63,10 +63,10 @@ class StoredValues:
         own = str(resolved(out))
         entry = next((run for run in store.runs.entries() if run.out == own and not run.pinned), None)
         if entry is None:
-            return StoredValues(notes=[f"the cache {store.root} knows no run into {out}, so pictures are missing"])
+            return StoredValues(notes=[f"the cache {store.root} contains no run into {out}, so images are missing"])
         stages = {role: stage for role, stage in summary.results.items() if role in ROLES}
         if not stages:
-            note = "run.json is of an earlier version and names no results: run again to see pictures"
+            note = "run.json was written by an earlier version and lists no results: run again to see images"
             return StoredValues(notes=[note])
         refs = {role: _Recorded(store, entry.keys.get(stage, {})) for role, stage in stages.items()}
         _find_images(store, summary, refs.get("images", {}))

@@ -132,13 +132,13 @@ class RunSummary(Entry):
         except OSError as error:
             raise InputError(f"{path} cannot be read ({error.strerror}). Give the output folder of a run") from error
         except (ValueError, RecursionError) as error:
-            raise InputError(f"{path} is no run.json ({error}). Run the workflow again to replace it") from error
+            raise InputError(f"{path} is not a valid run.json ({error}). Run the workflow again") from error
         if not isinstance(value, Mapping) or not isinstance(value.get("stages"), list):
-            raise InputError(f"{path} is no run.json. Run the workflow again to replace it")
+            raise InputError(f"{path} is not a run.json. Run the workflow again")
         try:
             return RunSummary.from_json(value)
         except InputError as error:
-            raise InputError(f"{path} is no run.json ({error}). Run the workflow again to replace it") from error
+            raise InputError(f"{path} is not a valid run.json ({error}). Run the workflow again") from error
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of run.json, as values that `json.dumps` takes."""

@@ -158,8 +158,8 @@ class Panorama(Record):
         else:
             of = f"{width}×{height} px" if crop == sphere else f"a part of {crop[2]}×{crop[3]} px of {width}×{height}"
             raise InputError(
-                f"{what} has {size[1]}×{size[0]} px, which is the shape neither of the full sphere nor of the picture "
-                f"({self.image.path.name}, {of}). Draw it over the picture itself; its resolution does not matter"
+                f"{what} has {size[1]}×{size[0]} px, which is the shape neither of the full sphere nor of the image "
+                f"({self.image.path.name}, {of}). Draw it over the image itself; its resolution does not matter"
             )
         return placed_mask(mask, self.size_hw, of=covered, whole_hw=self.source_size_hw)
 

@@ -73,7 +73,7 @@ def write_outputs_after_error(run: Run, error: BaseException, *, started: dateti
     try:
         write_outputs(run, started=started, clock=clock)
     except (PanoMvsError, OSError) as second:
-        error.add_note(f"Nor could the report be written: {second}")
+        error.add_note(f"The report could not be written either: {second}")
 
 
 def _reason(error: BaseException) -> str:

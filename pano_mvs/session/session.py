@@ -60,9 +60,9 @@ def open_session(
     path, is_preset = find_workflow(name, presets_folder())
     if images is not None and not is_folder(images):
         if exists(images):
-            raise InputError(f"--images {images}: this is a file; give the folder with the pictures")
+            raise InputError(f"--images {images}: this is a file; give the folder that contains the images")
         raise InputError(
-            f"--images {images}: there is no such folder that you may look at ({problem_of(images)})"
+            f"--images {images}: no readable folder with this name ({problem_of(images)})"
             if is_denied(images)
             else f"--images {images}: there is no such folder"
         )
@@ -80,7 +80,7 @@ def open_session(
     if name := _reader_of(root, session):
         option = "--cache" if cache or not variable else f"${CACHE_VARIABLE}"
         raise UsageError(
-            f"{option} {root}: stage {name!r} reads this very folder, and the cache's files would lie "
+            f"{option} {root}: stage {name!r} reads this folder, and the cache's files would be "
             "among its own. Choose another folder"
         )
     return session
@@ -93,7 +93,7 @@ def check_output(session: Session) -> None:
         UsageError: if a stage reads it.
     """
     if name := _reader_of(session.out, session):
-        raise UsageError(f"--out {session.out}: stage {name!r} reads this very folder. Choose another folder")
+        raise UsageError(f"--out {session.out}: stage {name!r} reads this folder. Choose another folder")
 
 
 def _reader_of(folder: Path, session: Session) -> str:

@@ -242,7 +242,7 @@ class Tour:
     def _pick(self, start: FloatArray, direction: FloatArray) -> None:
         points = self.cloud.points if self.cloud is not None else self.corners
         if points is None:
-            self.state = replace(self.state, message="there is no cloud to measure in")
+            self.state = replace(self.state, message="there is no cloud to measure")
             return
         height = self.state.viewpoint.height
         normals = None if self.state.backs or self.cloud is None else self.cloud.normals

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from pano_mvs.core.errors import UsageError
 
 _DRAWING_LIBRARIES = ("libEGL.so.1", "libOSMesa.so.8", "libOSMesa.so")
-_REMEDY = "Give --screenshot FILE to draw a picture without a window"
+_REMEDY = "Use --screenshot FILE to write an image without a window"
 
 
 def require_display(environment: Mapping[str, str] = os.environ, platform: str = sys.platform) -> None:
@@ -30,7 +30,7 @@ def require_display(environment: Mapping[str, str] = os.environ, platform: str =
 def require_window(window_class: str) -> None:
     """Raise UsageError if VTK fell back to drawing without a window, because the display does not answer."""
     if window_class in ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow"):
-        raise UsageError(f"the display {os.environ.get('DISPLAY', '')} does not answer. {_REMEDY}")
+        raise UsageError(f"the display {os.environ.get('DISPLAY', '')} does not respond. {_REMEDY}")
 
 
 def require_drawing(
@@ -50,7 +50,7 @@ def require_drawing(
         return
     if not any((loads or _loads)(name) for name in _DRAWING_LIBRARIES):
         raise UsageError(
-            "pictures cannot be drawn here: neither EGL nor OSMesa is installed. Install one: for Debian "
+            "images cannot be rendered: neither EGL nor OSMesa is installed. Install one: for Debian "
             "and Ubuntu `apt install libegl1 libgl1-mesa-dri`"
         )
 

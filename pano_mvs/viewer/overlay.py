@@ -18,7 +18,7 @@ _KEYS = (
     ("m", "measure: click two points"),
     ("c", "colours of the cloud"),
     ("s", "cloud, mesh, or both"),
-    ("x", "what turns its back to you"),
+    ("x", "what faces away from you"),
     ("b", "cloud within the panorama"),
     ("d", "all points"),
     ("l, k", "names, cameras"),

@@ -131,7 +131,7 @@ def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> Sho
 def _scene_of_ply(path: Path) -> ShownScene:
     cloud, mesh = (None, path) if has_faces(path) else (open_ply_points(path), None)
     if cloud is not None and not cloud.count:
-        raise InputError(f"{path}: holds no points, so there is nothing to show. Look at what wrote it")
+        raise InputError(f"{path}: contains no points, so there is nothing to show. Check the program that wrote it")
     return ShownScene(path.name, cloud, mesh, (), "scene units", *_frame(()))
 
 
@@ -143,7 +143,7 @@ def _group_of(run: RunSummary, group: int, path: Path, notes: list[str]) -> Pose
     if len(groups) > 1:
         sizes = [f"{number} ({len(poses.registered)} images)" for number, poses in enumerate(groups)]
         notes.append(
-            f"shown is group {group} of {len(groups)}, each with a frame and a scale of its own; --group N "
+            f"this is group {group} of {len(groups)}, each with its own frame and scale; --group N "
             f"shows another: {', '.join(sizes[:group] + sizes[group + 1 :])}"
         )
     return groups[group]
@@ -155,9 +155,9 @@ def _cloud(path: Path | None, name: str, notes: list[str]) -> PlyPoints | None:
     if cloud is not None and cloud.count:
         return cloud
     if cloud is None:
-        notes.append(f"no {name}: the workflow has no export.ply, or the run did not get there")
+        notes.append(f"no {name}: the workflow has no export.ply, or the run did not reach it")
     else:
-        notes.append(f"{name} holds no points: report.html shows why")
+        notes.append(f"{name} contains no points: report.html shows why")
     return None
 
 
@@ -196,7 +196,7 @@ def _cameras(
 ) -> tuple[ShownCamera, ...]:
     model = folder / model_name
     if not is_folder(model):
-        notes.append(f"no {model_name}: the workflow has no export.colmap, or the run did not get there; no cameras")
+        notes.append(f"no {model_name}: the workflow has no export.colmap, or the run did not reach it; no cameras")
         return ()
     poses = read_poses(model)
     source = images or run.source_folder

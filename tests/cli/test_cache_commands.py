@@ -411,7 +411,7 @@ def test_folder_that_is_no_cache_is_refused_and_left_as_it_is(tmp_path: Path) ->
     for command in (["du"], ["ls"], ["verify"], ["gc"], ["pin", "a", "b"], ["unpin", "a"]):
         result = CliRunner().invoke(app, ["cache", *command, "--cache", str(tmp_path)])
         assert result.exit_code == 2
-        assert "is no cache of pano-mvs" in " ".join(result.output.split())
+        assert "is not a cache of pano-mvs" in " ".join(result.output.split())
     assert not list(tmp_path.iterdir())
 
 

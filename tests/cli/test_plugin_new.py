@@ -94,7 +94,7 @@ def test_the_command_writes_both_files_and_overwrites_none(pano_mvs: Command) ->
 @pytest.mark.parametrize(
     ("kind", "name", "what"),
     [
-        ("filters", "mine", "no kind of plugin 'filters'; there are source, mask"),
+        ("filters", "mine", "unknown kind of plugin 'filters'; known kinds: source, mask"),
         ("filter", "../mine", "cannot be called '../mine'"),
         ("filter", "Mine", "cannot be called 'Mine'"),
         ("filter", "class", "cannot be called 'class'"),

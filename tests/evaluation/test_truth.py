@@ -120,7 +120,7 @@ def test_the_same_file_gives_known_poses(capture: Path) -> None:
         (lambda data: data.update(views=3), "key 'views' must be a list"),
         (lambda data: data.update(views=[]), "holds no poses"),
         (lambda data: data["views"].insert(1, 5), r"views\[1\]: expected an object, got int"),
-        (lambda data: data["views"][1].pop("image"), r"views\[1\]: key 'image' must be the picture's name"),
+        (lambda data: data["views"][1].pop("image"), r"views\[1\]: key 'image' must be the name of the image"),
         (lambda data: data["views"][1].update(R=[[1, 0], [0, 1]]), r"views\[1\]: key 'R' must hold 3 × 3 numbers"),
         (lambda data: data["views"][2].update(t=["a", 0, 0]), r"views\[2\]: key 't' must hold 3 numbers"),
         (lambda data: data["views"][0].update(R=[[2, 0, 0], [0, 1, 0], [0, 0, 1]]), r"views\[0\] .*not orthonormal"),

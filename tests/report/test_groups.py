@@ -157,7 +157,7 @@ def test_the_cloud_of_the_largest_group_is_shown_alone(rooms: tuple[dict[str, An
     """The other one is a thousand units away here: with it nothing would be seen of either."""
     _, results = rooms
     shown = cloud_pictures(results, EarlierPage(), up=np.array([0.0, -1.0, 0.0]))
-    assert "shown is group 0" in shown.note
+    assert "this is group 0" in shown.note
     assert results.cloud is not None
     alone = with_values(results, cloud=results.cloud.groups()[0])
     for (_, picture), (_, expected) in zip(

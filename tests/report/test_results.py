@@ -127,7 +127,7 @@ def test_a_folder_and_its_cache_give_the_page_of_the_run(
     assert panorama.load().shape == (32, 64, 3)
     assert again.notes == []
     elsewhere = StoredValues.of_folder(out_dir / "other", RunSummary.from_json(summary), store)
-    assert "knows no run" in elsewhere.notes[0]
+    assert "contains no run" in elsewhere.notes[0]
     assert "earlier version" in StoredValues.of_folder(out_dir, RunSummary(), store).notes[0]
 
 
@@ -155,7 +155,7 @@ def test_where_there_is_no_graphics_driver_plainer_pictures_are_drawn(
     monkeypatch.setenv(RENDERER_VARIABLE, "")
     made = cloud_pictures(results, EarlierPage(), up=UP, command=drawing(tmp_path, body))
     assert len(made.shown) == 3
-    assert "PyVista could not draw here" in made.note
+    assert "PyVista could not render" in made.note
 
 
 def test_a_missing_interpreter_is_no_reason_to_fail(

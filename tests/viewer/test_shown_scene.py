@@ -212,7 +212,7 @@ def test_one_group_is_shown_at_a_time_and_the_others_are_named(tmp_path: Path) -
         scene = open_scene(out, group=group)
         assert scene.cloud is not None
         assert (len(scene.cameras), scene.cloud.count, scene.unit) == (cameras, points, unit)
-        assert f"shown is group {group} of 2" in scene.notes[0]
+        assert f"this is group {group} of 2" in scene.notes[0]
         assert told in scene.notes[0]
     with pytest.raises(UsageError, match=r"--group 2: .* has 2 groups, numbered from 0"):
         open_scene(out, group=2)

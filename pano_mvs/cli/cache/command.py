@@ -39,7 +39,7 @@ def open_cache(cache: Path | None) -> Store:
         if is_denied(root / "layout.json"):
             raise UsageError(f"{root}: this folder cannot be listed (permission denied). Correct its permissions")
         raise UsageError(
-            f"{root} is no cache of pano-mvs; name one with --cache DIR (it lies beside the workflow file "
+            f"{root} is not a cache of pano-mvs; specify one with --cache DIR (it lies beside the workflow file "
             "as .pano-mvs, or where you ran a preset by its name)"
         )
     return Store(root)
@@ -150,5 +150,5 @@ def seconds_from_text(text: str) -> float:
     """
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([smhdw])", text.strip())
     if match is None:
-        raise UsageError(f"{text!r} is no time: write a number and s, m, h, d or w, such as 30d")
+        raise UsageError(f"{text!r} is not a duration: write a number and s, m, h, d or w, such as 30d")
     return float(match[1]) * _UNITS_S[match[2]]

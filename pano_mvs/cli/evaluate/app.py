@@ -197,5 +197,5 @@ def _scale(text: str) -> float | Literal["auto"]:
         return float(text)
     except ValueError as error:
         raise UsageError(
-            f"'{text}' is no scale: give a positive number, or auto to find it from the camera centres"
+            f"'{text}' is not a scale: give a positive number, or auto to estimate it from the camera centres"
         ) from error

@@ -80,7 +80,9 @@ def open_run(target: str, *, overrides: Sequence[str], images: Path | None, cach
     summary = RunSummary.read(out)
     workflow = Path(summary.workflow.path)
     if not is_file(workflow):
-        raise InputError(f"{out}: its workflow {workflow} is gone. Give another: pano-mvs inspect WORKFLOW IMAGE X Y")
+        raise InputError(
+            f"{out}: its workflow {workflow} is missing. Specify another: pano-mvs inspect WORKFLOW IMAGE X Y"
+        )
     # A relative folder was meant from where the run was started; what it was is in the settings.
     folder = next((stage.params.get("path") for stage in summary.stages if stage.name == "images"), None)
     given = [
@@ -109,7 +111,7 @@ class _Found:
 
 def _inspection(session: Session, wanted: PixelWanted) -> Inspection:
     if not (math.isfinite(wanted.x) and math.isfinite(wanted.y)):
-        raise UsageError(f"({wanted.x}, {wanted.y}) is no pixel: give its column and its row as numbers")
+        raise UsageError(f"({wanted.x}, {wanted.y}) is not a pixel: give its column and row as numbers")
     sweep = _sweep_stage(session, wanted.stage)
     store = Store(session.store_root, for_reading=True)
     found = _Found()
@@ -128,7 +130,7 @@ def _sweep_stage(session: Session, name: str) -> str:
     if not sweeps:
         raise UsageError("this workflow has no depth.sweep: only sweeps have cost curves")
     if name and name not in sweeps:
-        raise UsageError(f"{name!r} is no depth.sweep of this workflow; its sweeps: {', '.join(sweeps)}")
+        raise UsageError(f"{name!r} is not a depth.sweep stage of this workflow, which has: {', '.join(sweeps)}")
     return name or sweeps[0]
 
 
@@ -141,7 +143,7 @@ def _image(wanted: str, names: Sequence[str]) -> str:
         return fitting[0]
     shown = fitting or list(names)
     raise UsageError(
-        f"{len(fitting) or 'no'} images are called {wanted!r}; there are: {', '.join(shown[:_SHOWN])}"
+        f"{len(fitting) or 'no'} images match {wanted!r}; there are: {', '.join(shown[:_SHOWN])}"
         f"{' …' if len(shown) > _SHOWN else ''}"
     )
 
@@ -186,7 +188,7 @@ def _write_plot(path: Path, found: Inspection) -> None:
     from pano_mvs.viewer.inspect.curve_picture import write_curve_picture
 
     if path.suffix.lower() != ".png":
-        raise UsageError(f"--plot {path}: the plot is a PNG, call it so")
+        raise UsageError(f"--plot {path}: the plot is a PNG image, so the file name must end in .png")
     try:
         write_curve_picture(path, found)
     except OSError as error:

@@ -72,11 +72,11 @@ def rendered(kind: str, name: str) -> tuple[str, str]:
         UsageError: if there is no such kind, or the name cannot be that of a Python file.
     """
     if kind not in KINDS:
-        raise UsageError(f"there is no kind of plugin {kind!r}; there are {', '.join(KINDS)}")
+        raise UsageError(f"unknown kind of plugin {kind!r}; known kinds: {', '.join(KINDS)}")
     if not _NAME.fullmatch(name) or keyword.iskeyword(name):
         raise UsageError(f"a plugin cannot be called {name!r}: use small letters, digits and '_', a letter first")
     if name in sys.stdlib_module_names or name in packages_distributions():
-        raise UsageError(f"a plugin cannot be called {name!r}: its file would hide the Python package of that name")
+        raise UsageError(f"a plugin cannot be called {name!r}: its file would hide the Python package with that name")
     environment = Environment(
         loader=PackageLoader("pano_mvs.cli.plugins", "templates"),
         undefined=StrictUndefined,
@@ -107,7 +107,7 @@ def write_plugin(kind: str, name: str, folder: Path, console: Console) -> None:
     paths = folder / f"{name}.py", folder / f"test_{name}.py"
     for path in paths:
         if exists(path):
-            raise UsageError(f"{path} is there already; nothing was written. Take another name, or another --dir")
+            raise UsageError(f"{path} already exists; nothing was written. Choose another name or another --dir")
     for path, text in zip(paths, (plugin, test), strict=True):
         write_text(path, text)
     console.print(f"wrote {escape(str(paths[0]))} and its test", highlight=False, soft_wrap=True)

@@ -95,7 +95,7 @@ def _poses_in(ranges: RangeMaps, poses: Cameras | None) -> Cameras:
         return poses
     if isinstance(ranges, Path):
         return ranges
-    raise InputError("range maps in memory hold no poses")
+    raise InputError("range maps in memory have no poses")
 
 
 def _scale(cameras: Mapping[str, Rigid3], true: Mapping[str, Rigid3]) -> float:

@@ -45,7 +45,7 @@ def depth_summary(evaluation: DepthEvaluation, *, baseline: str = "best") -> Sum
         UsageError: if the baseline is unknown.
     """
     if baseline not in BASELINES:
-        raise UsageError(f"'{baseline}' is no baseline: choose one of {', '.join(BASELINES)}")
+        raise UsageError(f"'{baseline}' is not a baseline: choose one of {', '.join(BASELINES)}")
     views = evaluation.views
     text: list[str | TextTable] = [*_conditions(evaluation, baseline), _mean_table(evaluation, baseline)]
     if len(views) > 1:

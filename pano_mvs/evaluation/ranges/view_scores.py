@@ -138,7 +138,7 @@ def _confident(pixels: ScoredPixels, least: int) -> ScoredPixels:
     if least <= 0:
         return pixels
     if pixels.confidence is None:
-        raise UsageError("a least confidence is set, but there is no confidence")
+        raise UsageError("a minimum confidence is set, but there is no confidence map")
     return replace(pixels, found=np.where(pixels.confidence >= least, pixels.found, np.nan))
 
 

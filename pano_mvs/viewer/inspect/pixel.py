@@ -213,13 +213,13 @@ def _curve_notes(
     name = unit.entry.name
     if record is None:
         notes.append(
-            f"{name} of {unit.item} is not in the cache as it would be computed now (other settings, pictures or "
-            "version): the curve was computed for this alone"
+            f"{name} of {unit.item} is not in the cache for the current settings, images and "
+            "version: only the cost curve was computed"
         )
     if settings.levels > 1:
         notes.append(
-            f"{name} goes from coarse to fine (levels: {settings.levels}) and tries a few ranges around a "
-            "guide; the curve tries all"
+            f"{name} goes from coarse to fine (levels: {settings.levels}) and tests a few ranges around a "
+            "guide; the curve tests all"
         )
     stored = next((found for found in stages if found.stage == name), None)
     if stored is not None and not _alike(stored.range, curve):

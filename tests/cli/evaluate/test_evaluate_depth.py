@@ -212,8 +212,8 @@ def test_masks_and_confidence_leave_out_what_they_say(
     ("arguments", "words"),
     [
         (("--min-confidence", "128"), "so --min-confidence cannot be applied"),
-        (("--scale", "big"), "'big' is no scale"),
-        (("--bad", "often"), "no limit for bad pixels"),
+        (("--scale", "big"), "'big' is not a scale"),
+        (("--bad", "often"), "not a limit for bad pixels"),
         (("--unit", "0"), "unit must be a positive number"),
         (("--peak", "0"), "peak must be a positive length"),
         (("--masks", "none"), "masks must be a folder"),
@@ -238,7 +238,7 @@ def test_strangers_are_named_with_what_either_has(pano_mvs: Command, output: Pat
     np.savez(tmp_path / "other.npz", zebra=np.ones((4, 8), np.float32))
     result = pano_mvs("evaluate", "depth", output, "--truth", tmp_path / "other.npz")
     assert result.code == 2
-    assert "no image in common: the one has 000, 001, 002, the other zebra" in result.flat
+    assert "no image in common: the first has 000, 001, 002, the other zebra" in result.flat
     write_npz(tmp_path / "shape.npz", {"001": np.ones((30, 50), np.float32)})
     result = pano_mvs("evaluate", "depth", output, "--truth", tmp_path / "shape.npz")
     assert result.code == 2

@@ -164,7 +164,7 @@ def _check_clouds(out: Path, rooms: Path) -> None:
         assert scene.cloud.count == len(cloud)
         assert [camera.name for camera in scene.cameras] == [list(LARGE), list(SMALL)][number]
         assert scene.unit == ("scene units", "m")[number]
-        assert f"shown is group {number} of 2" in scene.notes[0]
+        assert f"this is group {number} of 2" in scene.notes[0]
 
 
 def _check_evaluation(pano_mvs: Command, out: Path, rooms: Path) -> None:
