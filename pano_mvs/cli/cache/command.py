@@ -92,7 +92,7 @@ def verify_cache(store: Store, console: Console, *, drop_unproven: bool = False)
     if not damage.removed and not damage.incomplete and not damage.unproven:
         return 0
     if damage.removed or damage.incomplete or drop_unproven:
-        console.print("the same run computes what is missing again")
+        console.print("the next run computes the missing results again")
     return _FAILED_ITEMS
 
 
@@ -104,7 +104,7 @@ def collect_cache(store: Store, console: Console, *, delete: bool, unused: str, 
         console.print(f"run of {escape(entry.workflow)} into {escape(entry.out)}, ended {entry.when}", highlight=False)
     console.print(_told(found, delete=delete), highlight=False)
     if not delete and (found.records or found.blobs or found.runs):
-        console.print("nothing was deleted; --delete does it")
+        console.print("nothing was deleted; use --delete to delete these results")
 
 
 def _told(found: GarbageCollection, *, delete: bool) -> str:
@@ -114,7 +114,7 @@ def _told(found: GarbageCollection, *, delete: bool) -> str:
 
 
 def pin_run(store: Store, console: Console, run: str, name: str) -> None:
-    """Keep what a run used whatever runs after it."""
+    """Protect the results of a run from garbage collection."""
     pin = store.runs.pin(run, name)
     console.print(
         f"{escape(pin.name)}: {pin.units} {plural(pin.units, 'unit')} of {escape(pin.workflow)} "
@@ -124,12 +124,12 @@ def pin_run(store: Store, console: Console, run: str, name: str) -> None:
 
 
 def unpin_run(store: Store, console: Console, name: str) -> None:
-    """Give up a pin."""
+    """Remove a pin."""
     pins = {entry.name: entry for entry in store.runs.entries() if entry.pinned}
     if name not in pins:
         raise UsageError(f"there is no pin {name!r}; there are: {', '.join(sorted(pins)) or 'none'}")
     store.runs.forget(pins[name])
-    console.print(f"{escape(name)} is no pin any more", highlight=False)
+    console.print(f"{escape(name)} is no longer pinned", highlight=False)
 
 
 def size_text(size_bytes: int) -> str:

@@ -87,15 +87,15 @@ def run_probe(code: str, *, timeout_s: float = TIMEOUT_S) -> Answer:
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)  # noqa: S603
     except subprocess.TimeoutExpired:
-        return f"gave no answer within {timeout_s:.0f} s"
+        return f"did not respond within {timeout_s:.0f} s"
     except OSError as error:
-        return f"could not be tried: {error}"
+        return f"could not be checked: {error}"
     lines = done.stdout.strip().splitlines()
     if done.returncode == 0 and lines:
         answer: dict[str, Any] = json.loads(lines[-1])
         return answer
     if done.returncode < 0:
-        return f"the process died of signal {-done.returncode}"
+        return f"the process was killed by signal {-done.returncode}"
     return (done.stderr.strip().splitlines() or [f"ended with code {done.returncode}"])[-1]
 
 
@@ -125,7 +125,9 @@ def library_findings(
 
 def _of_numba(answer: Mapping[str, Any]) -> Iterator[Finding]:
     if answer["disabled"]:
-        yield _finding("numba", "warning", "compiles nothing: hundreds of times slower", "unset NUMBA_DISABLE_JIT")
+        yield _finding(
+            "numba", "warning", "compilation is disabled: hundreds of times slower", "unset NUMBA_DISABLE_JIT"
+        )
     else:
         yield _finding("numba", "ok", f"{answer['version']}, compiles")
 
@@ -176,6 +178,8 @@ _LIBRARIES = (
     _Library("numba", _NUMBA, _of_numba, "failed", f"{_REINSTALL} numba llvmlite"),
     _Library("pycolmap", _PYCOLMAP, _of_pycolmap, "failed", f"{_REINSTALL} pycolmap"),
     _Library("OpenCV", _OPENCV, _of_opencv, "failed", f"{_REINSTALL} opencv-python-headless"),
-    _Library("PyVista", _PYVISTA, _of_pyvista, "warning", _OPENGL, ": there are no pictures of clouds; all else works"),
+    _Library(
+        "PyVista", _PYVISTA, _of_pyvista, "warning", _OPENGL, ": clouds cannot be rendered; everything else works"
+    ),
     _Library("torch", _TORCH, _of_torch, "warning", "reinstall torch, or sweep with `backend: numba`"),
 )

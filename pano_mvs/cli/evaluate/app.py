@@ -20,16 +20,16 @@ evaluate_app = typer.Typer(
 )
 
 _FILES = "a folder of range maps (.tiff, .exr, .npy, .npz, 16-bit .png; paired by path), or an .npz file"
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
 @evaluate_app.command("run")
 @guarded
 def run(
     out: Annotated[Path, typer.Argument(help="The output folder of a run.")],
-    truth: Annotated[Path, typer.Option("--truth", help="Folder with poses.json and depth.npz, or one of these.")],
+    truth: Annotated[Path, typer.Option("--truth", help="Folder with poses.json and depth.npz, or one of them.")],
 ) -> None:
-    """Compare a run's poses, range maps and cloud with the truth, as far as both exist."""
+    """Compare the poses, range maps and cloud of a run with ground truth, as far as available."""
     from pano_mvs.cli.evaluate.printing import print_run
     from pano_mvs.evaluation import evaluate_run
 
@@ -39,11 +39,11 @@ def run(
 @evaluate_app.command("poses")
 @guarded
 def poses(
-    model: Annotated[Path, typer.Argument(help="COLMAP model, poses.json, transforms.json, CSV, or a run's output.")],
-    truth: Annotated[Path, typer.Option("--truth", help="The true poses, in any of these formats.")],
+    model: Annotated[Path, typer.Argument(help="COLMAP model, poses.json, transforms.json, CSV, or output folder.")],
+    truth: Annotated[Path, typer.Option("--truth", help="True poses, in any of these formats.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Compare the poses in any file with the truth, whatever their frames and units."""
+    """Compare poses with ground truth, regardless of their frames and units."""
     from pano_mvs.cli.evaluate.printing import print_json, print_summary
     from pano_mvs.evaluation import evaluate_poses
 
@@ -58,27 +58,27 @@ def poses(
 @guarded
 def cloud(
     cloud: Annotated[Path, typer.Argument(help="A PLY file, or the output folder of a run.")],
-    truth: Annotated[Path, typer.Option("--truth", help="Folder with poses and range maps, or a reference PLY.")],
+    truth: Annotated[Path, typer.Option("--truth", help="Folder with true poses and range maps, or a PLY file.")],
     poses: Annotated[
         Path | None,
-        typer.Option("--poses", help="The poses with which it was made; without, a PLY lies in the truth's frame."),
+        typer.Option("--poses", help="Poses of a PLY file; default: it is in the frame of the ground truth."),
     ] = None,
     true_poses: Annotated[
-        Path | None, typer.Option("--true-poses", help="The true poses in the frame of a reference PLY.")
+        Path | None, typer.Option("--true-poses", help="True poses in the frame of a reference PLY.")
     ] = None,
     thresholds: Annotated[
-        list[float], typer.Option("--threshold", help="A tolerance in the truth's unit; may be given repeatedly.")
+        list[float], typer.Option("--threshold", help="Tolerance in the unit of the ground truth; can be repeated.")
     ] = [0.05, 0.02],  # noqa: B006  # typer reads it and never changes it
     out: Annotated[
         Path | None,
-        typer.Option("--out", help="Folder for the cloud and the surface coloured by their errors, and pictures."),
+        typer.Option("--out", help="Folder for images, and for cloud and surface coloured by error."),
     ] = None,
     picture: Annotated[
-        Path | None, typer.Option("--picture", help="A PNG to write that shows the errors in the views and from above.")
+        Path | None, typer.Option("--picture", help="PNG file to write, with the errors in the views and from above.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare a cloud with the true surface: accuracy, completeness, F-score."""
+    """Compare a cloud with ground truth: accuracy, completeness, F-score."""
     from pano_mvs.cli.evaluate.printing import print_json, print_line, print_summary
     from pano_mvs.evaluation import evaluate_cloud, write_error_clouds, write_overview
 
@@ -92,7 +92,7 @@ def cloud(
         return
     print_summary(evaluation.summary(), Console())
     if out is not None:
-        print_line(f"accuracy.ply, completeness.ply and pictures of the errors are in {out}", Console())
+        print_line(f"accuracy.ply, completeness.ply and images of the errors are in {out}", Console())
 
 
 @evaluate_app.command("depth")
@@ -102,19 +102,19 @@ def depth(
     truth: Annotated[Path, typer.Option("--truth", help="Folder with poses.json and depth.npz, or any of these.")],
     out: Annotated[
         Path | None,
-        typer.Option("--out", help="Folder for pictures of the errors, scores.json and scores.csv."),
+        typer.Option("--out", help="Folder for images of the errors, scores.json and scores.csv."),
     ] = None,
     align: Annotated[
-        Literal["none", "median", "lsq"], typer.Option("--align", help="Fit each view to the truth by a factor.")
+        Literal["none", "median", "lsq"], typer.Option("--align", help="Fit each view to its truth by one factor.")
     ] = "none",
     scale: Annotated[
-        str, typer.Option("--scale", help="Factor to the truth's unit; auto: from the camera centres, if known.")
+        str, typer.Option("--scale", help="Factor to the unit of the ground truth; auto: from the camera centres.")
     ] = "auto",
-    unit: Annotated[float, typer.Option("--unit", help="Unit of the files' numbers; 0.001 for mm.")] = 1.0,
-    truth_unit: Annotated[float, typer.Option("--truth-unit", help="Unit of the truth's numbers.")] = 1.0,
-    peak: Annotated[float, typer.Option("--peak", help="The range that MSE and PSNR count as 1.")] = 10.0,
+    unit: Annotated[float, typer.Option("--unit", help="Unit of the estimated ranges; 0.001 for mm.")] = 1.0,
+    truth_unit: Annotated[float, typer.Option("--truth-unit", help="Unit of the true ranges.")] = 1.0,
+    peak: Annotated[float, typer.Option("--peak", help="Peak of MSE and PSNR, a range.")] = 10.0,
     bad: Annotated[
-        list[str], typer.Option("--bad", help="An error above which a pixel is bad: 5%, or 0.1; may be repeated.")
+        list[str], typer.Option("--bad", help="Error above which a pixel is bad, such as 5% or 0.1; can be repeated.")
     ] = ["5%"],  # noqa: B006  # typer reads it and never changes it
     min_confidence: Annotated[
         int,
@@ -122,34 +122,34 @@ def depth(
             "--min-confidence",
             min=0,
             max=255,
-            help="Ranges of lower confidence count as missing; 64: seen, 128: consistent with other views.",
+            help="Ranges of lower confidence count as missing; 64: seen, 128: consistent.",
         ),
     ] = 0,
     masks: Annotated[
-        Path | None, typer.Option("--masks", help="Folder of masks <image name>.png; pixels where it is 0 are ignored.")
+        Path | None, typer.Option("--masks", help="Folder of masks <image name>.png; 0 is ignored.")
     ] = None,
     mask: Annotated[
-        Path | None, typer.Option("--mask", help="Evaluate only pixels inside this mask (applied to every view).")
+        Path | None, typer.Option("--mask", help="Mask for all views; pixels with value 0 are ignored.")
     ] = None,
     images: Annotated[
-        Path | None, typer.Option("--images", help="Folder of the panoramas, for the pictures of the errors.")
+        Path | None, typer.Option("--images", help="Folder of the panoramas, for the images of the errors.")
     ] = None,
     error_limit: Annotated[
-        float, typer.Option("--error-limit", help="Relative error at which the colours of the pictures end.")
+        float, typer.Option("--error-limit", help="Relative error at the end of the colour scale.")
     ] = 0.1,
     baseline: Annotated[
-        Literal["best", "median", "mean"], typer.Option("--baseline", help="Which constant is shown beside each score.")
+        Literal["best", "median", "mean"], typer.Option("--baseline", help="Constant range to compare with.")
     ] = "best",
     poses: Annotated[
-        Path | None, typer.Option("--poses", help="The estimated poses, for the scale; default: the output folder's.")
+        Path | None, typer.Option("--poses", help="Estimated poses, for the scale; default: of the output folder.")
     ] = None,
     true_poses: Annotated[
-        Path | None, typer.Option("--true-poses", help="The true poses, for the scale; default: the truth folder's.")
+        Path | None, typer.Option("--true-poses", help="True poses, for the scale; default: those of the ground truth.")
     ] = None,
-    csv: Annotated[Path | None, typer.Option("--csv", help="Write one row for each view.")] = None,
+    csv: Annotated[Path | None, typer.Option("--csv", help="CSV file to write, with one row per view.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare range maps with the truth: MSE, PSNR, MAE, RMSE, AbsRel, δ, bad pixels, completeness, AUSE."""
+    """Compare range maps with ground truth: MSE, PSNR, MAE, RMSE, AbsRel, δ, bad pixels, completeness, AUSE."""
     from pano_mvs.cli.evaluate.printing import print_json, print_line, print_summary
     from pano_mvs.evaluation import (
         BadLimit,
@@ -186,7 +186,7 @@ def depth(
     if out is not None:
         count = len(evaluation.views)
         print_line(
-            f"{count} {plural(count, 'picture')} of the errors, scores.json and scores.csv are in {out}", Console()
+            f"{count} {plural(count, 'image')} of the errors, scores.json and scores.csv are in {out}", Console()
         )
 
 

@@ -35,7 +35,7 @@ def print_summary(output: RunOutput, console: Console) -> None:
         console.print(f"note: {escape(note)}", highlight=False, soft_wrap=True)
     if summary.left_over:
         count = len(summary.left_over)
-        text = f"{count} {plural(count, 'file')} of an earlier run, which this one did not write,"
+        text = f"{count} {plural(count, 'file')} of an earlier run, which this run did not write,"
         console.print(f"{text} {plural(count, 'is', 'are')} still there", highlight=False)
     _print_verdict(output.verdict, console)
     look = f", or look around with pano-mvs view {escape(shlex.quote(out))}" if is_to_see(summary.files) else ""
@@ -54,7 +54,7 @@ def _print_failures(summary: RunSummary, console: Console) -> None:
         text = f"{one_line(failure.label)}: {failure.cause} — {failure.consequence}"
         console.print(f"[red]failed:[/] {escape(text)}", highlight=False, soft_wrap=True)
         if failure.log:
-            console.print(f"  what it printed is in {escape(failure.log)}", highlight=False, soft_wrap=True)
+            console.print(f"  log: {escape(failure.log)}", highlight=False, soft_wrap=True)
     if len(causes) > _SHOWN_FAILURES:
         console.print(f"… and {len(causes) - _SHOWN_FAILURES} more, all in run.json", highlight=False)
     for image, rejected in summary.rejected.items():

@@ -126,7 +126,7 @@ class CloudEvaluation:
         lines: list[str | TextTable] = [f"{self.cloud.count} {plural(self.cloud.count, 'point')} against {against}"]
         if not compared.used and not self.is_aligned:
             lines.append(
-                "both clouds are taken to lie in one frame; if they do not, give --true-poses, those in the frame of "
+                "both clouds are assumed to be in the same frame; otherwise, give --true-poses in the frame of "
                 "the reference cloud"
             )
         rows = tuple(

@@ -70,13 +70,15 @@ def find_scale(
     except InputError as error:
         if given:
             raise
-        return FoundScale(1.0, f"no poses on both sides, so both are taken to have one unit ({error})")
+        return FoundScale(
+            1.0, f"poses are missing on at least one side, so both are assumed to have the same unit ({error})"
+        )
     try:
         value = _scale(groups[0], true)
     except UsageError as error:
         if given:
             raise
-        return FoundScale(1.0, f"the poses determine no scale, so both are taken to have one unit ({error})")
+        return FoundScale(1.0, f"the poses determine no scale, so both are assumed to have the same unit ({error})")
     reason = f"from the centres of {len(match_images(groups[0], true))} cameras, never from the ranges"
     others: dict[str, float] = {}
     for number, cameras in enumerate(groups[1:], start=1):

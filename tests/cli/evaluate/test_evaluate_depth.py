@@ -91,11 +91,11 @@ def test_the_table_tells_how_it_was_judged_and_what_constants_score(
     plain = pano_mvs("evaluate", "depth", output, "--truth", truth)
     assert plain.code == 0
     assert "estimates × 2.5: from the centres of 4 cameras" in plain.flat
-    assert "ranges are not fitted to the truth (--align none)" in plain.flat
+    assert "ranges are not fitted to the ground truth (--align none)" in plain.flat
     assert plain.text.count("constant") >= 4
     assert "no estimate of images/003.png" in plain.flat
     fitted = pano_mvs("evaluate", "depth", output, "--truth", truth, "--align", "median", "--baseline", "mean")
-    assert "RANGES ARE FITTED TO THE TRUTH" in fitted.flat
+    assert "RANGES ARE FITTED TO THE GROUND TRUTH" in fitted.flat
     assert "0.90909 to 0.90909" in fitted.flat
     assert "the mean of the view's true ranges" in fitted.flat
 
@@ -276,7 +276,7 @@ class TestRun:
         assert result.code == 0, result.text
         assert "poses: not compared, there is no colmap/sparse/0" in result.flat
         assert "PSNR" in result.text
-        assert "both are taken to have one unit" in result.flat
+        assert "both are assumed to have the same unit" in result.flat
 
     def test_poses_alone(self, pano_mvs: Command, output: Path, truth: Path, tmp_path: Path) -> None:
         shutil.rmtree(output / "range")

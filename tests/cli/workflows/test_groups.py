@@ -174,7 +174,7 @@ def _check_evaluation(pano_mvs: Command, out: Path, rooms: Path) -> None:
     told = pano_mvs("evaluate", "run", out, "--truth", rooms / "capture" / "truth")
     assert told.code == 0, told.text
     assert "5 of 5 registered (3 in one frame), median pair error" in told.flat
-    assert "the poses are in 2 groups, each with a frame and a scale of its own" in told.flat
+    assert "the poses are in 2 groups, each with its own frame and scale" in told.flat
     depth = pano_mvs("evaluate", "depth", out, "--truth", rooms / "capture" / "truth", "--json")
     views = json.loads(depth.text)["views"]
     assert views["a0"]["scale"] == pytest.approx(2.0, rel=0.02)
