@@ -1,4 +1,4 @@
-"""What a person should know of a run before anything else: what is wrong or doubtful, and what to do about it."""
+"""Findings of a run, for the report and the terminal: what is wrong or doubtful, and what to do about it."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def _named(group: PoseGroup) -> str:
 
 
 def pictures_between(groups: Sequence[PoseGroup]) -> str:
-    """Return which images to take so that the smaller groups join the largest one, the first of two or more."""
+    """Return between which images to take more, to connect smaller groups to the largest one, which is the first."""
     found = []
     for pair in (group.nearest_pair for group in groups[1:]):
         if pair:
@@ -166,7 +166,7 @@ def pictures_between(groups: Sequence[PoseGroup]) -> str:
 
 
 def _commonest(reasons: Sequence[str]) -> str:
-    """Return the reason that is given most often, whatever the figures and names in it, and how often it is."""
+    """Return the most frequent reason, ignoring figures and names in it, and its frequency."""
     kinds = [_ENDINGS.sub("", _NAMES_AND_FIGURES.sub("…", reason)) for reason in reasons]
     ((kind, count),) = Counter(kinds).most_common(1)
     example = reasons[kinds.index(kind)]
@@ -209,7 +209,7 @@ def _residual(residual_px: float | None) -> list[Finding]:
 
 
 def compares_views(summary: RunSummary) -> bool:
-    """Return whether any stage compared the views: where none did, no pixel is confirmed, and that says nothing."""
+    """Return whether any stage compared the views; otherwise, no pixel can be confirmed."""
     compared = any("consistency" in stage.use for stage in summary.stages)
     return compared or any(view.consistent for view in summary.views)
 
@@ -259,7 +259,7 @@ def _cloud(summary: RunSummary) -> list[Finding]:
 
 
 def _baseline(summary: RunSummary) -> list[Finding]:
-    """Return whether a constant range would have scored as well."""
+    """Return a finding for each branch that scores no better than a constant range."""
     found = []
     for stage, scores in summary.scores_by_stage.items():
         views = scores.views.values()

@@ -1,4 +1,4 @@
-"""What a reader wants to know first: did it work, for how much of the capture, and how well."""
+"""The verdict of a run: how it ended, whether the result is reliable, and its main figures."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _JUDGEMENTS = {
 
 
 def verdict(summary: RunSummary, *, residuals: Residuals | None = None, image_width: int | None = None) -> Verdict:
-    """Return the verdict on a run; figures that are not known are left out.
+    """Return the verdict on a run; unknown figures are left out.
 
     Args:
         summary: of the run.
@@ -130,7 +130,7 @@ def _cloud(summary: RunSummary) -> list[Tile]:
 
 
 def _accuracy(summary: RunSummary) -> list[Tile]:
-    """Return how far the result is from the truth, where that is known."""
+    """Return the errors against ground truth, if known."""
     scores = summary.scores
     tiles = []
     error_deg = median([scores.poses.get("median_pair_error_deg")])

@@ -1,4 +1,4 @@
-"""What every command that takes a workflow needs: the workflow wired, its store, its output folder."""
+"""A session: a wired workflow with its cache and its output folder, as needed by most commands."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def open_session(
     Raises:
         UsageError: if there is no such workflow.
         WorkflowError: with every mistake in it.
-        InputError: if the folder of images is not there.
+        InputError: if the folder of images does not exist.
         UsageError: if a stage reads the folder of the cache.
     """
     path, is_preset = find_workflow(name, presets_folder())
@@ -87,7 +87,7 @@ def open_session(
 
 
 def check_output(session: Session) -> None:
-    """Refuse an output folder that is itself read from.
+    """Refuse an output folder from which a stage reads.
 
     Raises:
         UsageError: if a stage reads it.

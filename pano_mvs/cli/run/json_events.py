@@ -14,7 +14,7 @@ Every object has `event` and `time` (seconds since 1970). The events, in the ord
                     report) and doubts (image to reason)
 
 `item` is empty where a stage has one unit only. Stages overlap. If a damaged part of the store is found, the run starts
-over: `stage_started` comes again for every stage, and what was counted before does not count. `run_finished` is always
+over: `stage_started` comes again for every stage, and earlier counts no longer apply. `run_finished` is always
 the last line, also of a run that is interrupted (130) or ends in an error (then `stopped` says which), unless the
 process is killed. Fields may be added to a schema; none changes its meaning.
 """
