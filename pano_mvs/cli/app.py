@@ -1,6 +1,6 @@
-"""The command line: options in, the engine's or a library's function called, exit codes out.
+"""The command line: parse options, call the function that does the work, return its exit code.
 
-0 ok · 1 internal error · 2 usage or validation · 3 finished with failed items · 4 stopped by a threshold or a guard ·
+0 ok · 1 internal error · 2 usage or validation · 3 finished with failed items · 4 stopped by a threshold or a check ·
 130 interrupted.
 """
 

@@ -1,4 +1,4 @@
-"""Look at a run: a window, or a picture of what it would show."""
+"""View a run in a window, or write an image of it."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ _QUALITY = 90
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """How to look.
+    """Options of `pano-mvs view`.
 
     Attributes:
         images: folder of the panoramas; None: where the run read them.
-        screenshot: a picture to write instead of opening a window.
+        screenshot: image file to write instead of opening a window.
         view: "overview", "top", "front" or "inside:NAME".
         color: of the cloud, see `COLORINGS`.
-        surface: "cloud", "mesh" or "both"; empty for the cloud where there is one.
+        surface: "cloud", "mesh" or "both"; empty for the cloud if it exists.
         points: maximum number of points to draw; 0: all.
         size: WIDTHxHEIGHT of the window in pixels.
         labels: whether cameras are named.
         blended: whether the cloud is shown within a panorama.
-        backs: whether points and triangles are shown that turn their back to the eye.
-        group: which group of poses to show; 0 is the largest.
+        backs: whether points and triangles that face away from the viewer are shown.
+        group: group of poses to show; 0 is the largest.
     """
 
     images: Path | None = None
@@ -56,12 +56,12 @@ class ViewOptions:
 
 
 def view_scene(path: Path, options: ViewOptions, console: Console) -> None:
-    """Open a window on an output folder or a PLY file, or write a picture of it.
+    """View an output folder or a PLY file in a window, or write an image of it.
 
     Raises:
         InputError: if there is nothing to show, or a file is damaged.
-        UsageError: if an option cannot be, or there is no display.
-        StoreError: if the picture cannot be written.
+        UsageError: if an option is invalid, or there is no display.
+        StoreError: if the image cannot be written.
     """
     size_wh = _size_wh(options.size)
     if options.screenshot is None:
@@ -116,7 +116,7 @@ def _surface(wanted: str, scene: ShownScene) -> str:
 
 
 def mesh_points(path: Path) -> NDArray[np.float32]:
-    """Return the corners of a mesh, (N, 3) float32.
+    """Return the vertices of a mesh, (N, 3) float32.
 
     Raises:
         InputError: if it cannot be read.

@@ -1,4 +1,4 @@
-"""Points as VTK draws them: those that turn their back to the eye are left out, so that one sees into rooms."""
+"""VTK actor of a cloud that hides points facing away from the viewer, so that rooms can be seen from outside."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ class CloudActor:
         self.show_backs(wanted=False)
 
     def color(self, coloring: Coloring) -> None:
-        """Give the points other colours."""
+        """Set the colours of the points."""
         self._data["rgb"] = coloring.colors_rgb
         self._data.Modified()
 
     def show_backs(self, *, wanted: bool) -> None:
-        """Draw points that turn their back to the eye, or leave them out; those without normals are always drawn."""
+        """Show or hide points that face away from the viewer; points without normals are always shown."""
         shader = self.actor.GetShaderProperty()
         shader.ClearAllVertexShaderReplacements()
         if self._has_normals:
@@ -65,5 +65,5 @@ class CloudActor:
                 shader.AddVertexShaderReplacement(_MOVE, True, _MOVED, False)
 
     def size(self, pixels: float) -> None:
-        """Draw points so large."""
+        """Set the size of the points."""
         self.actor.GetProperty().SetPointSize(pixels)

@@ -1,4 +1,4 @@
-"""Whether there is a display, and whether pictures can be drawn without one."""
+"""Check for a display, and for a library that renders without one."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def require_display(environment: Mapping[str, str] = os.environ, platform: str =
 
 
 def require_window(window_class: str) -> None:
-    """Raise UsageError if VTK fell back to drawing without a window, because the display does not answer."""
+    """Raise UsageError if VTK fell back to off-screen rendering, because the display does not respond."""
     if window_class in ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow"):
         raise UsageError(f"the display {os.environ.get('DISPLAY', '')} does not respond. {_REMEDY}")
 
@@ -39,7 +39,7 @@ def require_drawing(
     *,
     loads: Callable[[str], bool] | None = None,
 ) -> None:
-    """Raise UsageError if there is neither a display nor a library that draws without one; VTK would crash.
+    """Raise UsageError if there is neither a display nor a library for off-screen rendering; VTK would crash.
 
     Args:
         environment: the process's.
@@ -64,7 +64,7 @@ def _loads(name: str) -> bool:
 
 
 def quiet_vtk() -> None:
-    """Keep VTK from printing that it found no X server before it draws without one."""
+    """Suppress VTK's message about a missing X server before off-screen rendering."""
     from vtkmodules.vtkCommonCore import vtkLogger
 
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)

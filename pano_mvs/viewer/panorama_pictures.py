@@ -1,4 +1,4 @@
-"""The pictures on the spheres, no larger than they are shown."""
+"""Images for the spheres of cameras, at the size at which they are shown."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ _SKY, _GROUND = (150, 160, 175), (90, 95, 105)
 
 
 def sphere_picture(camera: ShownCamera, width: int) -> NDArray[np.uint8]:
-    """Return a camera's panorama, (H, W, 3) RGB, at most `width` wide; of a small one the preview will do.
+    """Return a camera's panorama, (H, W, 3) RGB, at most `width` wide; for small sizes, from the preview.
 
-    A damaged or missing picture is a plain one: the rest can be looked at all the same.
+    A damaged or missing image is replaced by a uniform one, so that the rest can be viewed.
     """
     files = (camera.preview, camera.picture) if width <= SMALL_WIDTH else (camera.picture, camera.preview)
     for path in files:

@@ -205,7 +205,7 @@ def test_folders_that_are_no_output_are_refused(run: Path, tmp_path: Path) -> No
     summary = json.loads((moved / "run.json").read_text())
     summary["workflow"]["path"] = "/nowhere/wf.yaml"
     (moved / "run.json").write_text(json.dumps(summary))
-    assert "its workflow /nowhere/wf.yaml is gone" in call("inspect", moved, "000.png", 1, 1).flat
+    assert "its workflow /nowhere/wf.yaml is missing" in call("inspect", moved, "000.png", 1, 1).flat
 
 
 def test_the_pictures_of_the_run_are_found_from_anywhere(

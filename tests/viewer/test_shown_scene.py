@@ -92,11 +92,11 @@ def test_a_cloud_without_points_is_as_none(tmp_path: Path) -> None:
     write_ply(out / "cloud.ply", PointCloud(none, none, np.zeros((0, 3), np.uint8), np.zeros(0, np.uint8)))
     scene = open_scene(out)
     assert (scene.cloud, len(scene.cameras)) == (None, 2)
-    assert "cloud.ply holds no points" in scene.notes[-1]
-    with pytest.raises(InputError, match="holds no points"):
+    assert "cloud.ply contains no points" in scene.notes[-1]
+    with pytest.raises(InputError, match="contains no points"):
         open_scene(out / "cloud.ply")
     shutil.rmtree(out / "colmap")
-    with pytest.raises(InputError, match=r"holds no cloud\.ply with points"):
+    with pytest.raises(InputError, match=r"contains no cloud\.ply with points"):
         open_scene(out)
 
 

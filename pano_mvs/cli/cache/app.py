@@ -1,4 +1,4 @@
-"""`pano-mvs cache …`: the typer side of cache_command."""
+"""Options of `pano-mvs cache`; `command` does the work."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The commands that look after a cache: its size, its content, its integrity, and what can be deleted."""
+"""The cache commands: size, content, integrity, and results that can be deleted."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _UNPROVEN = (
 
 
 def open_cache(cache: Path | None) -> Store:
-    """Open the cache that is asked for: `--cache`, $PANO_MVS_CACHE, or `.pano-mvs` in the current folder.
+    """Open the cache given by `--cache`, $PANO_MVS_CACHE, or `.pano-mvs` in the current folder.
 
     Raises:
         UsageError: if there is none.
@@ -46,7 +46,7 @@ def open_cache(cache: Path | None) -> Store:
 
 
 def show_usage(store: Store, console: Console) -> None:
-    """Print how much of the cache each stage takes."""
+    """Print the disk space used by each stage."""
     table = Table("stage", "units", "size", "computed in")
     for usage in usage_of(store):
         table.add_row(usage.stage, str(usage.units), size_text(usage.size_bytes), f"{usage.seconds:.0f} s")
@@ -97,7 +97,7 @@ def verify_cache(store: Store, console: Console, *, drop_unproven: bool = False)
 
 
 def collect_cache(store: Store, console: Console, *, delete: bool, unused: str, older_than: str) -> None:
-    """Print what nothing needs any more; remove it if asked."""
+    """Print the results that nothing needs any more; delete them on request."""
     forget_after_s = seconds_from_text(older_than) if older_than else None
     found = collect(store, unused_s=seconds_from_text(unused), forget_after_s=forget_after_s, delete=delete)
     for entry in found.runs:
@@ -133,7 +133,7 @@ def unpin_run(store: Store, console: Console, name: str) -> None:
 
 
 def size_text(size_bytes: int) -> str:
-    """Return a size as people read it, such as 1.3 GB."""
+    """Return a size as text, such as 1.3 GB."""
     size = float(size_bytes)
     for unit in ("B", "kB", "MB", "GB"):
         if size < 1000:

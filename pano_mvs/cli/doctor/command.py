@@ -1,4 +1,4 @@
-"""`pano-mvs doctor`: run all checks, print the findings, and return by the exit code whether a run can work."""
+"""`pano-mvs doctor`: run all checks, print the findings, and set the exit code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Try the compiled libraries, each in a process of its own: a crash of one does not end the others or the doctor."""
+"""Check the compiled libraries, each in a separate process, so that a crash does not end the other checks."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ print(json.dumps({"version": torch.__version__, "devices": names, "built_for": t
 
 
 def run_probe(code: str, *, timeout_s: float = TIMEOUT_S) -> Answer:
-    """Run code, whose last printed line is a JSON object, in a process of its own."""
+    """Run code in a separate process and return the JSON object that it prints last."""
     command = [sys.executable, "-P", "-c", code]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)  # noqa: S603
@@ -102,7 +102,7 @@ def run_probe(code: str, *, timeout_s: float = TIMEOUT_S) -> Answer:
 def library_findings(
     probe: Callable[[str], Answer] | None = None, *, has_torch_plugin: bool | None = None
 ) -> Iterator[Finding]:
-    """Yield how the compiled libraries work.
+    """Yield the state of the compiled libraries.
 
     Args:
         probe: runs the code of a probe; `run_probe` by default.
@@ -163,7 +163,7 @@ def _of_torch(answer: Mapping[str, Any]) -> Iterator[Finding]:
 
 
 class _Library(NamedTuple):
-    """A library, the code that tries it, how to read its answer, and what a failure means."""
+    """A library, the code that checks it, a function that interprets its output, and the meaning of a failure."""
 
     name: str
     code: str

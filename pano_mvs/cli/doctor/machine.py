@@ -31,7 +31,7 @@ def machine_findings(
     processors: int | None = None,
     memory_bytes: int | None = None,
 ) -> Iterator[Finding]:
-    """Yield the processors, the memory, and the environment variables that limit a run or that nothing reads.
+    """Yield findings on processors, memory, and environment variables that limit a run or are unknown.
 
     Args:
         environment: the environment variables.

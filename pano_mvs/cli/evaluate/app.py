@@ -1,4 +1,4 @@
-"""The commands `pano-mvs evaluate …`."""
+"""Options of the commands `pano-mvs evaluate`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Print all that is known of one pixel of a run, with its cost curve."""
+"""Print the analysis of one pixel of a run, with its cost curve."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ _SHOWN = 6
 
 @dataclass(frozen=True)
 class PixelWanted:
-    """What is to be inspected.
+    """The pixel to inspect.
 
     Attributes:
-        image: name of the image, or an end of it that fits one alone.
-        x: column of the pixel from the left edge, in pixels of the swept size; its fraction is dropped.
-        y: row from the upper edge, likewise.
+        image: name of the image, or a unique part of it.
+        x: column of the pixel from the left, at the resolution of the sweep; fractions are dropped.
+        y: row of the pixel from the top.
         stage: name of the sweep in the workflow; empty for the first.
         truth: folder with poses.json and depth.npz; None for the workflow's own.
     """
@@ -50,11 +50,11 @@ class PixelWanted:
 
 
 def inspect(session: Session, wanted: PixelWanted, console: Console, *, plot: Path | None, as_json: bool) -> None:
-    """Print what is known of a pixel.
+    """Print the analysis of a pixel.
 
     Raises:
         UsageError: if there is no such sweep, image or pixel.
-        InputError: if what the sweep reads is not computed yet.
+        InputError: if an input of the sweep is not computed yet.
         StoreError: if the plot cannot be written.
     """
     found = _inspection(session, wanted)
@@ -69,10 +69,10 @@ def inspect(session: Session, wanted: PixelWanted, console: Console, *, plot: Pa
 
 
 def open_run(target: str, *, overrides: Sequence[str], images: Path | None, cache: Path | None) -> Session:
-    """Open a workflow, or that of an output folder with the settings, the pictures and the cache of its run.
+    """Open a workflow, or that of an output folder with the settings, images and cache of its run.
 
     Raises:
-        InputError: if the folder has no run.json, or its workflow is gone.
+        InputError: if the folder has no run.json, or its workflow file is missing.
     """
     out = Path(target)
     if not is_folder(out):
@@ -96,13 +96,13 @@ def open_run(target: str, *, overrides: Sequence[str], images: Path | None, cach
 
 @dataclass
 class _Found:
-    """What a plan shows of an image."""
+    """The units of an image in a plan."""
 
     images: list[str] = field(default_factory=list)
     units: dict[str, dict[str, UnitFound]] = field(default_factory=dict)
 
     def look(self, unit: Unit, record: UnitRecord | None, _reason: str) -> None:
-        """Take note of a unit."""
+        """Add a unit."""
         if unit.source is not None:
             self.images.append(unit.item)
         if issubclass(unit.entry.spec.output, RangeMap):
@@ -173,9 +173,9 @@ def _run_command(session: Session, unit: str) -> str:
 
 
 def _truth_of(session: Session, image: str) -> Path | None:
-    """Return the truth that the workflow itself compares with, if it does and knows the image.
+    """Return the ground truth of the workflow, if it has one for the image.
 
-    A preset's truth is of its sample: of other pictures it says nothing.
+    The ground truth of a preset only applies to its sample images.
     """
     for entry in session.workflow.stages.values():
         folder = getattr(entry.params, "truth", None)

@@ -1,4 +1,4 @@
-"""`pano-mvs plugins`, `plugin new` and `stage show`: the typer side of show and plugin_new."""
+"""Options of `pano-mvs plugins`, `plugin new` and `stage show`; `show` and `new` do the work."""
 
 from __future__ import annotations
 

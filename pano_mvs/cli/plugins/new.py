@@ -27,7 +27,7 @@ class PluginKind:
 
     Attributes:
         prefix: of the stage's name; empty for a part of the sweep.
-        what: what it does, in words.
+        what: its purpose.
         use: how a workflow uses it, with `{name}` for its name.
         contract_tests: the function of `pano_mvs.testing.conformance` that returns its contract tests.
     """
@@ -100,10 +100,10 @@ def rendered(kind: str, name: str) -> tuple[str, str]:
 
 
 def write_plugin(kind: str, name: str, folder: Path, console: Console) -> None:
-    """Write a new plugin and its test into a folder, and say how it is used.
+    """Write a new plugin and its test into a folder, and print how to use it.
 
     Raises:
-        UsageError: if a file of that name is there already, or as of `rendered`.
+        UsageError: if a file with that name exists, or as for `rendered`.
     """
     plugin, test = rendered(kind, name)
     paths = folder / f"{name}.py", folder / f"test_{name}.py"
@@ -120,7 +120,7 @@ def write_plugin(kind: str, name: str, folder: Path, console: Console) -> None:
 
 
 def show_kinds(console: Console) -> None:
-    """List the kinds of plugins there are."""
+    """List the kinds of plugins."""
     table = Table("kind", "purpose", "in a workflow")
     for name, kind in KINDS.items():
         table.add_row(name, kind.what, escape(kind.use.format(name="mine")))

@@ -20,7 +20,7 @@ _SHOWN_FAILURES = 20
 
 
 def print_summary(output: RunOutput, console: Console) -> None:
-    """Print where the results are and how good they are known to be."""
+    """Print the summary of a run: counts, failures, scores, the verdict, and where the results are."""
     summary, out = output.summary, str(output.out)
     units = summary.units
     failed = f", {units.failed} failed" if units.failed else ""
@@ -72,7 +72,7 @@ def _print_poses(summary: RunSummary, console: Console) -> None:
 
 
 def _print_verdict(verdict: Verdict, console: Console) -> None:
-    """Print whether the result can be relied on, as the report says it, and what is wrong or doubtful."""
+    """Print the verdict of the report and its findings."""
     if verdict.judgement:
         console.print(f"[{_COLORS[verdict.mood]}]{escape(verdict.judgement)}[/]", highlight=False, soft_wrap=True)
     for finding in verdict.findings:
@@ -108,7 +108,7 @@ def print_scores(scores: ScoresSummary, console: Console) -> None:
 
 
 def _print_comparison(all_scores: Mapping[str, ScoresSummary], console: Console) -> None:
-    """Print, where several branches are scored, the medians over their views side by side."""
+    """Print the medians over views of several scored branches side by side."""
     if len(all_scores) < 2:
         return
     table = Table("median over views", *_SHOWN_SCORES.values(), caption=_IN_BRACKETS)

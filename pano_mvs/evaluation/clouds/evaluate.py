@@ -258,6 +258,6 @@ def _compared(
     views = {name: TrueView(pose, files[names[name]].read()) for name, pose in known.items() if name in names}
     chosen = {name: views[name] for name in used if name in views}
     if not chosen:
-        raise InputError(f"{truth}: holds no range map of a camera that was used ({', '.join(used[:3]) or 'none'})")
+        raise InputError(f"{truth}: contains no range map of a camera that was used ({', '.join(used[:3]) or 'none'})")
     surface = surface_of_views(list(chosen.values()))
     return CloudTruth(lambda: map(view_points, views.values()), surface, chosen, len(views), unit, cameras, up)
