@@ -1,4 +1,4 @@
-"""Between which ranges to sweep, found by looking: small sweeps of the reference and its sources that must agree."""
+"""Estimate the near and far limits of a sweep from small sweeps of the reference and its sources that must agree."""
 
 from __future__ import annotations
 

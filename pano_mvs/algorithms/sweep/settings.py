@@ -1,4 +1,4 @@
-"""The settings of a sphere sweep, and what follows from them."""
+"""The settings of a sphere sweep."""
 
 from __future__ import annotations
 

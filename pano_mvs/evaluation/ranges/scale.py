@@ -1,4 +1,4 @@
-"""The factor from the estimates' unit of length to the truth's."""
+"""The factor from the unit of the estimates to that of the ground truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pictures of a capture: which files, in which order, and whether each is a panorama."""
+"""The images of a capture: their files, their order, and whether each is a panorama."""
 
 from __future__ import annotations
 
