@@ -114,11 +114,11 @@ def test_libraries_that_work_are_ok() -> None:
     [
         ({"numba": "ImportError: llvmlite"}, "numba", "failed", "llvmlite"),
         ({"numba": {"version": "1", "disabled": True}}, "numba", "warning", "unset NUMBA_DISABLE_JIT"),
-        ({"pycolmap": "the process was killed by signal 6"}, "pycolmap", "failed", "killed by signal 6"),
+        ({"pycolmap": "the process died of signal 6"}, "pycolmap", "failed", "died of signal 6"),
         ({"cv2": {**GOOD["cv2"], "missing": ["tiff"]}}, "OpenCV", "failed", "lacks tiff"),
         ({"cv2": {**GOOD["cv2"], "video": False}}, "OpenCV video", "warning", "reads no videos"),
         ({"cv2": {**GOOD["cv2"], "avif": False}}, "OpenCV AVIF", "note", "reads no AVIF"),
-        ({"pyvista": "did not respond within 180 s"}, "PyVista", "warning", "libgl1"),
+        ({"pyvista": "gave no answer within 180 s"}, "PyVista", "warning", "libgl1"),
         ({"torch": {"version": "5", "devices": [], "built_for": None}}, "torch", "note", "built without CUDA"),
         ({"torch": "ImportError: libcuda"}, "torch", "warning", "backend: numba"),
     ],
@@ -133,9 +133,9 @@ def test_a_library_that_does_not_work_is_told_with_the_remedy(
 
 def test_a_probe_that_dies_or_hangs_ends_nothing_else() -> None:
     assert run_probe("print('noise'); print('{\"a\": 1}')") == {"a": 1}
-    assert run_probe("import os; os.abort()") == "the process was killed by signal 6"
+    assert run_probe("import os; os.abort()") == "the process died of signal 6"
     assert run_probe("raise ValueError('broken')") == "ValueError: broken"
-    assert run_probe("import time; time.sleep(60)", timeout_s=0.3) == "did not respond within 0 s"
+    assert run_probe("import time; time.sleep(60)", timeout_s=0.3) == "gave no answer within 0 s"
 
 
 def test_the_machine_and_slips_in_the_environment() -> None:
@@ -224,7 +224,7 @@ def test_the_command_shows_the_remedies_and_ends_with_2_if_a_run_cannot_work(
     assert result.code == 0, result.text
     assert "a run can work; 1 warning" in result.flat
     assert "warning: PyVista: install the system's OpenGL libraries" in result.flat
-    answers["pycolmap"] = "the process was killed by signal 11"
+    answers["pycolmap"] = "the process died of signal 11"
     result = pano_mvs("doctor", "--json")
     assert result.code == 2
     said = json.loads(result.text)
@@ -233,7 +233,7 @@ def test_the_command_shows_the_remedies_and_ends_with_2_if_a_run_cannot_work(
         "group": "libraries",
         "what": "pycolmap",
         "state": "failed",
-        "detail": "the process was killed by signal 11",
+        "detail": "the process died of signal 11",
         "remedy": "pip install --force-reinstall --no-deps pycolmap",
     } in said["findings"]
     assert not Path("c").exists()

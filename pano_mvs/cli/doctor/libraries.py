@@ -1,4 +1,4 @@
-"""Check the compiled libraries, each in a separate process, so that a crash does not end the other checks."""
+"""Try the compiled libraries, each in a process of its own: a crash of one does not end the others or the doctor."""
 
 from __future__ import annotations
 
@@ -82,27 +82,27 @@ print(json.dumps({"version": torch.__version__, "devices": names, "built_for": t
 
 
 def run_probe(code: str, *, timeout_s: float = TIMEOUT_S) -> Answer:
-    """Run code in a separate process and return the JSON object that it prints last."""
+    """Run code, whose last printed line is a JSON object, in a process of its own."""
     command = [sys.executable, "-P", "-c", code]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)  # noqa: S603
     except subprocess.TimeoutExpired:
-        return f"did not respond within {timeout_s:.0f} s"
+        return f"gave no answer within {timeout_s:.0f} s"
     except OSError as error:
-        return f"could not be checked: {error}"
+        return f"could not be tried: {error}"
     lines = done.stdout.strip().splitlines()
     if done.returncode == 0 and lines:
         answer: dict[str, Any] = json.loads(lines[-1])
         return answer
     if done.returncode < 0:
-        return f"the process was killed by signal {-done.returncode}"
+        return f"the process died of signal {-done.returncode}"
     return (done.stderr.strip().splitlines() or [f"ended with code {done.returncode}"])[-1]
 
 
 def library_findings(
     probe: Callable[[str], Answer] | None = None, *, has_torch_plugin: bool | None = None
 ) -> Iterator[Finding]:
-    """Yield the state of the compiled libraries.
+    """Yield how the compiled libraries work.
 
     Args:
         probe: runs the code of a probe; `run_probe` by default.
@@ -125,9 +125,7 @@ def library_findings(
 
 def _of_numba(answer: Mapping[str, Any]) -> Iterator[Finding]:
     if answer["disabled"]:
-        yield _finding(
-            "numba", "warning", "compilation is disabled: hundreds of times slower", "unset NUMBA_DISABLE_JIT"
-        )
+        yield _finding("numba", "warning", "compiles nothing: hundreds of times slower", "unset NUMBA_DISABLE_JIT")
     else:
         yield _finding("numba", "ok", f"{answer['version']}, compiles")
 
@@ -163,7 +161,7 @@ def _of_torch(answer: Mapping[str, Any]) -> Iterator[Finding]:
 
 
 class _Library(NamedTuple):
-    """A library, the code that checks it, a function that interprets its output, and the meaning of a failure."""
+    """A library, the code that tries it, how to read its answer, and what a failure means."""
 
     name: str
     code: str
@@ -178,8 +176,6 @@ _LIBRARIES = (
     _Library("numba", _NUMBA, _of_numba, "failed", f"{_REINSTALL} numba llvmlite"),
     _Library("pycolmap", _PYCOLMAP, _of_pycolmap, "failed", f"{_REINSTALL} pycolmap"),
     _Library("OpenCV", _OPENCV, _of_opencv, "failed", f"{_REINSTALL} opencv-python-headless"),
-    _Library(
-        "PyVista", _PYVISTA, _of_pyvista, "warning", _OPENGL, ": clouds cannot be rendered; everything else works"
-    ),
+    _Library("PyVista", _PYVISTA, _of_pyvista, "warning", _OPENGL, ": there are no pictures of clouds; all else works"),
     _Library("torch", _TORCH, _of_torch, "warning", "reinstall torch, or sweep with `backend: numba`"),
 )

@@ -31,7 +31,7 @@ def machine_findings(
     processors: int | None = None,
     memory_bytes: int | None = None,
 ) -> Iterator[Finding]:
-    """Yield findings on processors, memory, and environment variables that limit a run or are unknown.
+    """Yield the processors, the memory, and the environment variables that limit a run or that nothing reads.
 
     Args:
         environment: the environment variables.
@@ -60,7 +60,7 @@ def machine_findings(
         if name.startswith(("PANO_MVS", "PANOMVS")) and name not in KNOWN_VARIABLES:
             close = get_close_matches(name, KNOWN_VARIABLES, n=1, cutoff=0.6)
             remedy = f"did you mean {close[0]}?" if close else f"unset it; known are {', '.join(KNOWN_VARIABLES)}"
-            yield _finding(name, "warning", "is set, but unknown", remedy)
+            yield _finding(name, "warning", "is set, but nothing reads it", remedy)
 
 
 def kernel_cache_finding(package: Path = PACKAGE, environment: Mapping[str, str] = os.environ) -> Finding:
