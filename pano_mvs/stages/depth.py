@@ -73,8 +73,8 @@ def sweep(
 ) -> RangeMap:
     """Sphere sweep: select, for each pixel of the reference, the depth hypothesis at which the sources match best.
 
-    Without `near` and `far` the limits come from small sweeps of the reference and its first sources, from what they
-    agree on.
+    Without `near` and `far`, the limits are estimated from small sweeps of the reference and its first sources that
+    must agree with each other.
     """
     require_one_group(pose, source_poses)
     pictures = [ref.load(), *(source.load() for source in sources)]
