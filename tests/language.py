@@ -36,6 +36,10 @@ WORDS = {
     "come along": (r"(?:comes?|came|coming) along", "included, shipped"),
     "virtual range": (r"virtual ranges?", "depth hypothesis"),
     "is none": (r"(?<!there\s)(?:is|are) (?-i:none)", "there is no …, returns None"),
+    "is no": (
+        r"(?<!there\s)(?:is|are) no (?!longer|more|other|less|larger|smaller|better|worse|fewer|wider)[a-z]+",
+        "is not a …",
+    ),
     "of ours": (r"of ours", "in pano_mvs, our"),
     "of one name": (r"of one name", "with the same name"),
     "anew": (r"anew", "again"),

@@ -68,7 +68,7 @@ def sweep_range(
         `has_match`).
 
     Raises:
-        UsageError: if shapes, types or numbers do not fit together, or near and far are no limits.
+        UsageError: if shapes, types or numbers do not fit together, or near and far are not valid limits.
     """
     settings = settings or SweepSettings()
     compute = backend_for(backend, settings).find_winners

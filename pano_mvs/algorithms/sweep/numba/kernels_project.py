@@ -22,7 +22,7 @@ EVERY = 8
 
 _BLOCK = 16
 _MAX_THIRD_PX = _F(1)
-# Eight rows of a lower picture are no small step on the sphere: all its positions are exact.
+# In a lower picture, eight rows are a large step on the sphere, so all positions are exact.
 _LOWEST_PICTURE = 128
 
 
