@@ -312,7 +312,7 @@ def main() -> None:
     """Run the command line."""
     bound_environment(os.environ, available_threads())  # before a command loads the libraries
     output = protect_standard_streams()
-    faulthandler.enable(os.dup(2))  # a stage that runs in this process may turn descriptor 2
+    faulthandler.enable(os.dup(2))  # a stage in this process may redirect descriptor 2
     turn_exits_into_errors()
     try:
         app()

@@ -96,7 +96,7 @@ def _stages(ctx: typer.Context) -> Mapping[str, StageEntry]:
     from pano_mvs.engine.workflows.workflow import find_workflow, load_workflow
     from pano_mvs.session.session import presets_folder
 
-    # click leaves arguments where they are once it has met an option that still lacks its value.
+    # After an option without its value, click does not process further arguments.
     named = ctx.params.get("workflow") or next((word for word in ctx.args if not word.startswith("-")), None)
     if not isinstance(named, str):
         return {}

@@ -12,7 +12,7 @@ class RunByDefault(TyperGroup):
 
     default: ClassVar[str] = "run"
 
-    # The context is click's, which versions of typer bring under different names.
+    # The context is click's, whose module differs between versions of typer.
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Insert the default command if the arguments name none, except when they ask for help."""
         if args and args[0] not in self.commands and args[0] not in ctx.help_option_names:

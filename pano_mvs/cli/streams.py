@@ -87,7 +87,9 @@ class _LenientRaw(io.RawIOBase):
         if self._state.reader_left or self._state.failure:
             return size
         try:
-            while (written := self._raw.write(data)) is None:  # somebody made the terminal or the pipe non-blocking
+            while (
+                written := self._raw.write(data)
+            ) is None:  # another process made the terminal or the pipe non-blocking
                 select.select([], [self._raw], [])
         except OSError as error:
             if self._is_closed(error):

@@ -71,7 +71,7 @@ def view_scene(path: Path, options: ViewOptions, console: Console) -> None:
         require_drawing()
     scene = open_scene(path, images=options.images, group=options.group)
     tour = _tour(scene, options, size_wh)
-    from pano_mvs.viewer.window import SceneWindow  # on use: pyvista is slow to import
+    from pano_mvs.viewer.window import SceneWindow  # imported on use, because pyvista is slow to import
 
     if options.screenshot is not None:
         quiet_vtk()
@@ -91,13 +91,13 @@ def view_scene(path: Path, options: ViewOptions, console: Console) -> None:
 def _tour(scene: ShownScene, options: ViewOptions, size_wh: tuple[int, int]) -> Tour:
     cloud = drawn_cloud(scene.cloud, budget=options.points) if scene.cloud is not None else None
     if cloud is not None:
-        color_cloud(cloud, options.color, up=scene.up, unit=scene.unit)  # refuses what it cannot do
+        color_cloud(cloud, options.color, up=scene.up, unit=scene.unit)  # raises if the colouring is not available
     points = cloud.points if cloud is not None else np.zeros((0, 3), np.float32)
     corners = mesh_points(scene.mesh) if cloud is None and scene.mesh is not None else None
     box = box_of(points if corners is None else corners, scene.centers)
     tour = Tour(scene, cloud, box, aspect=size_wh[0] / size_wh[1], corners=corners)
     tour.see(options.view)
-    # Ours face the side that was seen; how anybody's lone mesh is wound is not known.
+    # Our meshes face the observed side; the orientation of other meshes is unknown.
     backs = options.backs or (cloud is None and not scene.cameras)
     tour.begin(coloring=options.color, labels=options.labels, blended=options.blended, backs=backs)
     if options.surface:

@@ -158,7 +158,7 @@ def _chosen(
             why = reasons.get((link.first, link.second), "")
             text = f"{labels[a]} – {labels[b]}: {words}{why and f'; {why}'}"
             found.append(_Joined(a, b, link.inliers, link.candidates or 0, text))
-    # Of rejected ones those that came nearest, with most candidates.
+    # Of the rejected links, those with the most candidates.
     found.sort(key=lambda link: (link.inliers, -link.candidates))
     split = sum(not link.inliers for link in found)
     return found[:split][:_MAX_REJECTED] + found[split:][-_MAX_LINKS:]

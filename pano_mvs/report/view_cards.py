@@ -30,7 +30,7 @@ MAX_BYTES = 80_000
 _TICKS_APART = 0.09
 _DECODERS = 2  # a large panorama takes 100 MB while it is decoded
 _PARTS = ("panorama", "range", "confidence")
-# Confidence in colours that are apart for colour-blind eyes and in grey: low and high end of each class.
+# Colours of the low and high end of each class, distinguishable for colour-blind readers and in grey.
 _CLASSES = (
     (FILLED_CONFIDENCE, (150, 95, 160), (196, 140, 204)),
     (WEAK_CONFIDENCE, (200, 130, 20), (245, 180, 60)),
@@ -143,7 +143,7 @@ def _new_card(results: StoredValues, kept: EarlierPage, name: str, out_dir: Path
         fits = mask is not None and mask.shape == range_map.range.shape
         shares = shares_of(range_map.confidence, mask if fits else None)
         ticks = _ticks(near, far)
-    if stem and len(pictures) == len(_PARTS):  # what is missing may be back for the next page
+    if stem and len(pictures) == len(_PARTS):  # a missing image may be available for the next page
         kept.keep(stem, {"ticks": ticks, "shares": fact_of(shares) if shares else None})
     panels = preview_panels(out_dir, preview) if len(pictures) < len(_PARTS) else ()
     for part, panel in zip(_PARTS, panels, strict=False):

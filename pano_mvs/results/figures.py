@@ -8,9 +8,9 @@ from typing import Any
 
 from pano_mvs.results.records import ScoresSummary
 
-# What a person looks at first; other scores follow as they come.
+# The scores to show first; others follow in their stored order.
 _FIRST = ("psnr_db", "w_mae", "w_delta_105", "median_relative_error", "completeness")
-# The figures of the scores, in words; others are spelt out from their names.
+# Labels of scores; those of others are derived from their names.
 _WORDS = {
     "psnr_db": "PSNR dB",
     "mae": "mean error",

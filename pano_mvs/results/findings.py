@@ -27,7 +27,7 @@ _FEW_LINKS = 2
 _SHOWN_GROUPS = 5
 _SHOWN_DOUBTS = 5
 _NAMES_AND_FIGURES = re.compile(r"\d+([.,]\d+)?|'[^']*'")
-_ENDINGS = re.compile(r"\b(is|are)\b|(?<=\w)e?s\b")  # by which one and several differ
+_ENDINGS = re.compile(r"\b(is|are)\b|(?<=\w)e?s\b")  # endings that differ between singular and plural
 
 
 def findings(summary: RunSummary, *, residual_px: float | None = None) -> tuple[Finding, ...]:

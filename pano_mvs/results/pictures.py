@@ -78,6 +78,6 @@ def preview_panels(out_dir: Path, relative: str, *, small: bool = False) -> tupl
         return ()
     rgb: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
     height = rgb.shape[1] // 2
-    # Between them is a white line; below is the scale.
+    # They are separated by a white line; the scale is below.
     start = height if small else height + _LINE_PX
     return rgb[:height], rgb[start : start + height]

@@ -64,7 +64,7 @@ def histogram(values_deg: Sequence[float] | FloatArray) -> Histogram | None:
     if not len(values):
         return None
     median, p95, p98 = (float(value) for value in np.quantile(values, [0.5, 0.95, 0.98]))
-    upper = _round_up(max(1.01 * p98, 1e-6))  # so that the last column is for what is larger alone
+    upper = _round_up(max(1.01 * p98, 1e-6))  # so that only larger values are in the last column
     counts = np.bincount((values / upper * _BINS).astype(np.int64).clip(0, _BINS - 1), minlength=_BINS)
     return Histogram(tuple(map(int, counts)), upper, median, p95, len(values))
 

@@ -132,7 +132,9 @@ class Panorama(Record):
             further if further.shape == self.size_hw else self._placed(further, "a stage's mask")
         )
         if self.crop_ltwh is not None and same_shape(self.size_hw, (self.crop_ltwh[3], self.crop_ltwh[2])):
-            height, width = whole = self.source_size_hw  # at working resolution it would be taken for the crop's
+            height, width = whole = (
+                self.source_size_hw
+            )  # at working resolution, its size could be confused with that of the crop
             keep = placed_mask(keep, whole, of=(0, 0, width, height), whole_hw=whole)
         path = folder / f"{self.image.path.stem}.mask.png"
         write_png(path, np.where(keep, np.uint8(255), np.uint8(0)))

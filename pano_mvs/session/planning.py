@@ -60,7 +60,7 @@ def plan(
 
     >>> import pano_mvs
     >>> plan = pano_mvs.plan("quickstart", out="out", settings={"depth.planes": 192})
-    >>> list(plan["depth"].run)  # after the run of `pano_mvs.run`'s example, which had other planes
+    >>> list(plan["depth"].run)  # after the example of `pano_mvs.run`, which has other planes
     ['000.png', '001.png', '002.png', '003.png']
 
     Raises:

@@ -34,7 +34,7 @@ from pano_mvs.session.settings import overrides_from_settings
 
 MIN_FREE_VARIABLE = "PANO_MVS_MIN_FREE"
 
-_MAX_REPAIRS = 3  # more damage than that comes from the disk
+_MAX_REPAIRS = 3  # more damage than this suggests a failing disk
 
 
 @dataclass(frozen=True, slots=True)

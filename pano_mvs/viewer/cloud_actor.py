@@ -8,13 +8,13 @@ import numpy as np
 
 from pano_mvs.viewer.cloud_colors import Coloring, DrawnCloud
 
-# The points' normals go to the graphics processor along with their places.
+# The normals of the points are passed to the graphics processor with their positions.
 _DECLARE, _MOVE = "//VTK::PositionVC::Dec", "//VTK::PositionVC::Impl"
 _DECLARED = f"""{_DECLARE}
 in vec3 facingMC;
 """
-# A point that turns its back is moved out of the picture. The eye is where the line of sight through the middle comes
-# from; in parallel projection it lies at infinity, and w vanishes.
+# A point that faces away is moved out of the image. The eye is the origin of the central line of sight;
+# in parallel projection it is at infinity, and w is 0.
 _MOVED = f"""{_MOVE}
 vec4 eyeMC = inverse(MCDCMatrix) * vec4(0.0, 0.0, -1.0, 0.0);
 vec3 seenMC = vertexMC.xyz * eyeMC.w - eyeMC.xyz;

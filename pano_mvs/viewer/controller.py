@@ -92,7 +92,7 @@ class Tour:
 
     def from_outside(self, name: str) -> Viewpoint:
         """Return the view called "overview", "top" or "front"."""
-        # Perspective leaves room around what it fits; a plan or an elevation has to fit the ends of the cloud itself.
+        # Perspective leaves a margin; a plan or an elevation has to include the ends of the cloud.
         box = self.box if name == "overview" else self._outer_box
         return outside_view(name, box, self.scene.up, self.scene.ahead, aspect=self.aspect)
 
@@ -123,7 +123,7 @@ class Tour:
         center = self.centers[camera_idx]
         forward = self.scene.ahead if state.viewpoint.height else state.viewpoint.axes[2]
         if abs(float(forward @ self.scene.up)) > 0.7 and state.inside is None:
-            forward = self.scene.ahead  # from high above one does not want to look at the floor
+            forward = self.scene.ahead  # from above, do not look at the floor
         self.state = replace(
             state,
             inside=camera_idx,

@@ -8,7 +8,7 @@ from typing import Any
 from pano_mvs.viewer.controller import Tour
 from pano_mvs.viewer.viewpoint import Viewpoint
 
-# A press and a release this close together are a click.
+# A press and a release within this distance are a click.
 _CLICK_PX = 4
 _LEFT, _RIGHT = "LeftButton", "RightButton"
 

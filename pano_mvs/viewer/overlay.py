@@ -25,7 +25,7 @@ _KEYS = (
     ("h, q", "this help, quit"),
 )
 _HELP = "\n".join(f" {keys:<18} {what} " for keys, what in _KEYS)
-# In shares of the window, from the lower left corner, and which edges of the text lie there.
+# Position as a share of the window from the lower left corner, and the edges of the text that are placed there.
 _PLACES = {
     "upper_left": (0.008, 0.988, "left", "top"),
     "lower_right": (0.992, 0.012, "right", "bottom"),

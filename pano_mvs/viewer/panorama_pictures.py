@@ -14,7 +14,7 @@ from pano_mvs.scene.image_files.image_file import decode_image
 from pano_mvs.viewer.shown_scene import ShownCamera
 
 SMALL_WIDTH, LARGE_WIDTH = 512, 4096
-# What is shown where there is no picture: a plain ball, lighter above, so that one sees which way is up.
+# Shown without an image: a uniform ball, lighter at the top, which shows the up direction.
 _SKY, _GROUND = (150, 160, 175), (90, 95, 105)
 
 

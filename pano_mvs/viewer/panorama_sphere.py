@@ -42,7 +42,7 @@ def panorama_sphere(cam_from_world: Rigid3, radius: float, *, rows: int = 48) ->
     vertices = cam_from_world.inverse().apply(rays * radius)
     first = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).reshape(-1)
     corners = np.stack([first, first + 1, first + columns + 2, first + columns + 1], axis=-1)
-    # Towards the inside a quadrilateral's corners run from left to right, then down: clockwise.
+    # Seen from inside, the corners of a quadrilateral run clockwise: from left to right, then down.
     triangles = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
     texture_uv = np.stack([x / columns, 1 - y / rows], axis=-1).reshape(-1, 2).astype(np.float32)
     return SphereMesh(vertices, triangles, texture_uv)

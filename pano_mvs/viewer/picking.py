@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-# Rays and points this much apart meet: half the width of a finger's click at a usual field of view.
+# A ray hits a point within this angle: half the width of a click at a usual field of view.
 _REACH_RAD = np.deg2rad(0.4)
 
 
@@ -56,7 +56,7 @@ def point_under(
     if not len(candidates):
         return None
     first = float(along[candidates].min())
-    # Of the foremost surface, what lies closest to the ray.
+    # Of the foremost surface, the point closest to the ray.
     foremost = candidates[along[candidates] <= first * (1 + 4 * np.tan(_REACH_RAD))]
     return int(foremost[np.argmin(aside[foremost])])
 

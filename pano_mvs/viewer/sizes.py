@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-# A sphere is this share of the way to the next camera, within these shares of the scene.
+# Radius of a sphere as a share of the distance to the next camera, within these shares of the scene.
 _RADIUS_SHARE, _RADIUS_LIMITS = 0.18, (0.008, 0.025)
 _CROWDED_SHARE = 0.4
 _BOX_SHARES, _OUTER_SHARES = (0.01, 0.99), (0.0005, 0.9995)

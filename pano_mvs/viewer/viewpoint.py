@@ -11,11 +11,11 @@ FloatArray = NDArray[np.float64]
 
 OUTSIDE_ANGLE_DEG, INSIDE_ANGLE_DEG = 45.0, 80.0
 _MIN_ANGLE_DEG, _MAX_ANGLE_DEG = 15.0, 110.0
-# One does not look straight up or down: there the direction up has no meaning.
+# Limit of the elevation: straight up and down, the up direction is undefined.
 _STEEPEST_DEG = 89.0
-# The scene fills the window up to this share.
+# Share of the window that the scene fills.
 _FILLED = 0.94
-# Height of a plan or an elevation in halves of the scene: below it there is room for the bar of known length.
+# Height of a plan or an elevation in halves of the scene, with space for the scale bar below.
 _PARALLEL_ROOM = 2.25
 
 
@@ -58,7 +58,7 @@ class Viewpoint:
         """
         width, height = size_wh
         right, down, forward = self.axes
-        # In halves of the height, from the middle.
+        # In halves of the height, from the centre.
         across, below = (2 * x - width) / height, (2 * y - height) / height
         if self.height:
             return self.eye + self.height / 2 * (across * right + below * down), forward

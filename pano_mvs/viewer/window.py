@@ -28,7 +28,7 @@ _RIM_OUTSIDE, _RIM_INSIDE = 1.1, 1.03
 _MAX_LABELS = 300
 _SURROUND_SHARE = 2.0
 _FONT_SHARE = 1 / 72
-# Upper right, as least and greatest x and y: the bar lies at the lower edge, texts in other corners.
+# Upper right corner, as minimum and maximum x and y: the scale bar is at the lower edge, texts are in other corners.
 _TRIAD = (0.8, 0.8, 1.0, 1.0)
 
 

@@ -83,7 +83,7 @@ def open_run(target: str, *, overrides: Sequence[str], images: Path | None, cach
         raise InputError(
             f"{out}: its workflow {workflow} is missing. Specify another: pano-mvs inspect WORKFLOW IMAGE X Y"
         )
-    # A relative folder was meant from where the run was started; what it was is in the settings.
+    # A relative folder is relative to where the run was started; the settings contain the absolute path.
     folder = next((stage.params.get("path") for stage in summary.stages if stage.name == "images"), None)
     given = [
         f"images.path={json.dumps(folder)}" if one.startswith("images.path=") and folder else one
@@ -167,7 +167,7 @@ def _run_command(session: Session, unit: str) -> str:
     for override in session.workflow.overrides:
         setting, _, _ = override.partition("=")
         path = getattr(session.workflow.stages["images"].params, "path", None) if setting == "images.path" else None
-        # The workflow writes --images as a setting, but as it was typed, which need not be YAML.
+        # --images is stored as a setting, but in its original form, which may not be valid YAML.
         words += ["--images", str(path)] if isinstance(path, Path) and is_folder(path) else ["--set", override]
     return shlex.join(words)
 

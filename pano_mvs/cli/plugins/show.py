@@ -96,7 +96,7 @@ def _registry(workflow: str | None, files: Sequence[Path]) -> tuple[Registry, Wo
         return registry, None
     try:
         load_workflow(find_workflow(workflow, presets_folder())[0], registry, presets=presets_folder())
-    except WorkflowError as error:  # what its plugins define can be shown all the same
+    except WorkflowError as error:  # the plugins can be shown nevertheless
         return registry, error
     return registry, None
 

@@ -12,7 +12,7 @@ from pano_mvs.algorithms.sweep.cost_curve import CostCurve
 _ROWS = 8
 _MARGIN = 6
 _LABEL_STEP = 16
-# Eighths of a character, in terminals that have them, and whole ones in others.
+# Eighths of a character if the terminal supports them, otherwise whole characters.
 _EIGHTHS, _WHOLE = " ▁▂▃▄▅▆▇█", " #"
 _SIGNS = {"winner": "▲", "next valley": "△", "truth": "◆"}
 _PLAIN_SIGNS = {"winner": "^", "next valley": "o", "truth": "T"}
