@@ -62,7 +62,7 @@ def open_session(
         if exists(images):
             raise InputError(f"--images {images}: this is a file; give the folder that contains the images")
         raise InputError(
-            f"--images {images}: no readable folder with this name ({problem_of(images)})"
+            f"--images {images}: cannot be read ({problem_of(images)})"
             if is_denied(images)
             else f"--images {images}: there is no such folder"
         )

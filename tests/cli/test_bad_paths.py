@@ -61,7 +61,7 @@ def test_what_is_wrong_with_a_path_is_said(pano_mvs: Command) -> None:
     Path("locked").chmod(0)
     with permissions_hold():
         assert (
-            "--images locked/in: no readable folder with this name (Permission denied)"
+            "--images locked/in: cannot be read (Permission denied)"
             in pano_mvs("run", "quickstart", "--images", "locked/in").flat
         )
         assert (

@@ -48,7 +48,7 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
     ("arguments", "message"),
     [
         ((), "no display"),
-        (("--screenshot", "a.bmp"), "pictures are .png"),
+        (("--screenshot", "a.bmp"), "images must end in .png"),
         (("--screenshot", "a.png", "--size", "big"), "give the width and the height"),
         (("--screenshot", "a.png", "--view", "inside:roof"), "no camera 'roof'; there are: lobby/000.png"),
         (("--screenshot", "a.png", "--view", "below"), "there are overview, top, front and inside:NAME"),

@@ -147,7 +147,7 @@ def test_foreign_folders_are_compared_in_their_units(pano_mvs: Command, truth: P
     arguments = ("evaluate", "depth", tmp_path / "png", "--truth", tmp_path / "true.npz")
     report = told(pano_mvs(*arguments, "--unit", "0.001", "--json"))
     assert report["scale"] == 1
-    assert "one unit" in report["scale_reason"]
+    assert "the same unit" in report["scale_reason"]
     assert report["mean"]["w_delta_105"] > 0.8
     text = pano_mvs(*arguments, "--unit", "0.001").flat
     assert f"{SIZE_HW[1] // 2}×{SIZE_HW[0] // 2}, their truth {SIZE_HW[1]}×{SIZE_HW[0]}" in text
