@@ -64,7 +64,6 @@ def share_run(
     """Write a page with the cloud, the cameras and the panoramas of a run; of several groups the largest is shown.
 
     >>> import pano_mvs
-    >>> from pano_mvs.share import share_run
     >>> shared = share_run(pano_mvs.load("out"), Path("page"))
     >>> shared.page.name, shared.panoramas
     ('index.html', 4)
