@@ -269,6 +269,30 @@ def view_results(
     view_scene(out, options, Console())
 
 
+@app.command()
+@guarded
+def share(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="The output folder of a run.")],
+    to: Annotated[Path, typer.Option("--to", metavar="DIR", help="Folder to write the page to.")],
+    title: Annotated[str, typer.Option("--title", help="Heading; default: the name of OUT.", show_default=False)] = "",
+    points: Annotated[
+        int, typer.Option("--points", min=0, help="Maximum number of points of the cloud; 0: all.")
+    ] = 5_000_000,
+    width: Annotated[int, typer.Option("--width", min=1024, help="Maximum width of the panoramas in pixels.")] = 4096,
+    quality: Annotated[int, typer.Option("--quality", min=1, max=100, help="JPEG quality of the panoramas.")] = 85,
+    images: Annotated[
+        Path | None, typer.Option("--images", help="Folder of the panoramas, if they were moved.")
+    ] = None,
+    cache: CacheOption = None,
+) -> None:
+    """Write a page to send: cloud, cameras and panoramas, for any browser, without a network."""
+    from pano_mvs.cli.share_command import share_output
+    from pano_mvs.share import ShareOptions
+
+    options = ShareOptions(title, points, width, quality)
+    share_output(out, to, options, images=images, cache=cache, console=Console())
+
+
 @app.command("inspect")
 @guarded
 def inspect_pixel(
