@@ -35,7 +35,11 @@ WORDS = {
     "but for": (r"but for", "except"),
     "come along": (r"(?:comes?|came|coming) along", "included, shipped"),
     "virtual range": (r"virtual ranges?", "depth hypothesis"),
-    "is none": (r"(?<!there\s)(?:is|are) none", "there is no …, returns None"),
+    "is none": (r"(?<!there\s)(?:is|are) (?-i:none)", "there is no …, returns None"),
+    "is no": (
+        r"(?<!there\s)(?:is|are) no (?!longer|more|other|less|larger|smaller|better|worse|fewer|wider)[a-z]+",
+        "is not a …",
+    ),
     "of ours": (r"of ours", "in pano_mvs, our"),
     "of one name": (r"of one name", "with the same name"),
     "anew": (r"anew", "again"),
@@ -61,6 +65,8 @@ _ANY = re.compile(
 )
 _FENCE = re.compile(r"^( *)(```|~~~).*?^ *\2 *$", re.DOTALL | re.MULTILINE)
 _NOT_PROSE = re.compile(r"<!--.*?-->|\$\$.*?\$\$|``.*?``|`[^`]*`|\]\([^)]*\)", re.DOTALL)
+_ENTRY = re.compile(r"^ +\w+: ", re.MULTILINE)
+"""Name of a parameter or an attribute in a docstring, which is not prose."""
 _STRING = re.compile(r"^[a-zA-Z]*('''|\"\"\"|'|\")(.*)\1$", re.DOTALL)
 
 
@@ -117,8 +123,8 @@ def places_in_module(path: Path) -> list[Place]:
 def prose_of(source: str) -> Iterator[tuple[str, int]]:
     """Yield comments and strings of a Python source with the line on which each begins.
 
-    Consecutive lines of comments are joined. Code in backticks, braces of f-strings, and strings without a space (keys
-    and names) are left out.
+    Consecutive lines of comments are joined. Code in backticks, braces of f-strings, names of parameters in
+    docstrings, and strings without a space (keys and names) are left out.
     """
     comment: list[str] = []
     began = last = 0
@@ -133,7 +139,7 @@ def prose_of(source: str) -> Iterator[tuple[str, int]]:
             last = token.start[0]
         elif token.type == tokenize.STRING or tokenize.tok_name[token.type] == "FSTRING_MIDDLE":
             found = _STRING.match(token.string)
-            text = re.sub(r"\{[^{}]*\}", " _ ", _blank(_NOT_PROSE, found[2] if found else token.string))
+            text = re.sub(r"\{[^{}]*\}", " _ ", _blank(_ENTRY, _blank(_NOT_PROSE, found[2] if found else token.string)))
             if " " in text.strip():
                 yield text, token.start[0]
     if comment:

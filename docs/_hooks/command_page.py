@@ -24,7 +24,7 @@ def command_page() -> str:
 
 
 def commands(command: Any, path: str) -> list[tuple[str, Any]]:
-    """Return all commands below one that are no mere groups, each with the words that call it."""
+    """Return all commands below one that are not groups, each with the words that call it."""
     inner = getattr(command, "commands", None)
     if not inner:
         return [(path, command)]

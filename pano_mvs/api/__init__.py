@@ -1,4 +1,4 @@
-"""Everything that a plugin needs of pano_mvs; `pano_mvs.api.sweep` adds what backends of the sweep are made of.
+"""Everything that plugins import from pano_mvs; backends of the sweep also import `pano_mvs.api.sweep`.
 
 from pano_mvs.api import Context, Each, Near, Panorama, Params, Pose, RangeMap, stage
 

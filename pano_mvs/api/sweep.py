@@ -1,4 +1,4 @@
-"""What backends of the sweep are made of, beside `pano_mvs.api`: the readable backend, and the parts that it shares.
+"""Building blocks for backends of the sweep: the readable backend and its parts.
 
 A backend takes a `SweepInput` and returns `Winners`. `find_winners` is the readable backend in numpy; the other names
 are its parts: weights of the sources, penalties between depth hypotheses, windows and constants of the costs.

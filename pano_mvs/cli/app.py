@@ -1,6 +1,6 @@
-"""The command line: options in, the engine's or a library's function called, exit codes out.
+"""The command line: parse options, call the function that does the work, return its exit code.
 
-0 ok · 1 internal error · 2 usage or validation · 3 finished with failed items · 4 stopped by a threshold or a guard ·
+0 ok · 1 internal error · 2 usage or validation · 3 finished with failed items · 4 stopped by a threshold or a check ·
 130 interrupted.
 """
 
@@ -19,8 +19,8 @@ from pano_mvs import __version__
 from pano_mvs.cli.cache.app import cache_app
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.doctor.command import doctor
+from pano_mvs.cli.error_messages import guarded
 from pano_mvs.cli.evaluate.app import evaluate_app
-from pano_mvs.cli.exit_codes import guarded
 from pano_mvs.cli.options import (
     AcceptOption,
     CacheOption,
@@ -80,36 +80,34 @@ def run(
         str,
         typer.Option(
             "--executor",
-            help="processes (the default), dask, or serial: one unit "
-            "after another in this process, for a debugger; a crash ends the run.",
+            help="How units are computed: processes, dask, or serial (one unit "
+            "at a time in this process, for debugging). Default: processes.",
             show_default=False,
         ),
     ] = "",
     workers: Annotated[
         int,
-        typer.Option(
-            "--workers", min=0, help="Units at a time, each in a process of its own; 0: as many as there are cores for."
-        ),
+        typer.Option("--workers", min=0, help="Number of worker processes; 0: one per core, if memory permits."),
     ] = 0,
     threads: Annotated[
-        int, typer.Option("--threads-per-worker", min=0, help="Threads of each; 0: an equal share of the cores.")
+        int, typer.Option("--threads-per-worker", min=0, help="Threads per worker; 0: an equal share of the cores.")
     ] = 0,
     scheduler: Annotated[
         str,
         typer.Option(
             "--scheduler",
             metavar="ADDRESS",
-            help="An existing dask scheduler, such as tcp://host:8786, whose workers see the cache.",
+            help="Use this dask scheduler, such as tcp://host:8786; its workers must share the cache.",
             show_default=False,
         ),
     ] = "",
-    as_json: Annotated[bool, typer.Option("--json", help="Print events, one JSON object in a line.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print events instead, one JSON object per line.")] = False,
     until: UntilOption = None,
     only: OnlyOption = None,
     refresh: RefreshOption = None,
     accept_code: AcceptOption = False,
     keep_going: Annotated[
-        bool, typer.Option("-k", "--keep-going", help="Go on after failures even where a stage says on_error: stop.")
+        bool, typer.Option("-k", "--keep-going", help="Continue after failures even if a stage has on_error: stop.")
     ] = False,
     min_free: MinFreeOption = "",
     durable: DurableOption = False,
@@ -145,12 +143,12 @@ def plan(
         typer.Option(
             "--explain",
             metavar="STAGE:ITEM",
-            help="All about one unit: what it reads, what it is made of, where its result is.",
+            help="Describe one unit: its inputs, its cache key, and where its result is stored.",
             show_default=False,
         ),
     ] = "",
 ) -> None:
-    """Show what a run would do, what is cached, and why the rest is not; nothing is written into --out."""
+    """Show what a run would compute, and why; nothing is written to the output folder."""
     from pano_mvs.cli.plan.command import show_plan
     from pano_mvs.cli.plan.explain import explain_unit
     from pano_mvs.engine.planning.run_options import RunOptions
@@ -170,7 +168,7 @@ def plan(
 @app.command()
 @guarded
 def check(workflow: WorkflowArgument, images: ImagesOption = None, overrides: SetOption = None) -> None:
-    """Show every mistake in a workflow at once, with its line and column."""
+    """Check a workflow and report every mistake with its line and column."""
     from pano_mvs.session.session import open_session
 
     session = open_session(workflow, overrides=overrides or [], images=images)
@@ -183,11 +181,13 @@ def check(workflow: WorkflowArgument, images: ImagesOption = None, overrides: Se
 def schema(
     workflow: Annotated[
         str | None,
-        typer.Argument(metavar="[WORKFLOW]", help="With its plugins, and the stages of what it extends."),
+        typer.Argument(
+            metavar="[WORKFLOW]", help="Include the plugins of this workflow and the stages that it inherits."
+        ),
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="A file; else the standard output.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="File to write; default: standard output.")] = None,
 ) -> None:
-    """Write the JSON Schema of workflows, with which an editor completes and checks them."""
+    """Write the JSON Schema of workflows, for completion and validation in editors."""
     from pano_mvs.cli.schema_command import show_schema
 
     show_schema(workflow, out)
@@ -208,7 +208,7 @@ def status(
 @app.command()
 @guarded
 def report(out: Annotated[Path, typer.Argument(help="The output folder of a run.")], cache: CacheOption = None) -> None:
-    """Write report.html again from run.json and the cache; nothing is computed."""
+    """Rewrite report.html from run.json and the cache, without computing anything."""
     from pano_mvs.cli.report_command import rewrite_report
 
     rewrite_report(out, cache, Console())
@@ -225,17 +225,19 @@ def view_results(
     screenshot: Annotated[
         Path | None,
         typer.Option(
-            "--screenshot", metavar="FILE", help="Write a picture instead of opening a window; needs no display."
+            "--screenshot", metavar="FILE", help="Write an image instead of opening a window; works without a display."
         ),
     ] = None,
-    view: Annotated[str, typer.Option("--view", help="overview, top, front or inside:NAME of an image.")] = "overview",
-    color: Annotated[str, typer.Option("--color", help="rgb, confidence, views, normals or height.")] = "rgb",
+    view: Annotated[
+        str, typer.Option("--view", help="Initial view: overview, top, front or inside:IMAGE.")
+    ] = "overview",
+    color: Annotated[str, typer.Option("--color", help="Colours: rgb, confidence, views, normals or height.")] = "rgb",
     surface: Annotated[
         str,
         typer.Option(
             "--show",
             metavar="cloud|mesh|both",
-            help="What to show; default: the cloud, if there is one.",
+            help="What to show; default: the cloud if it exists.",
             show_default=False,
         ),
     ] = "",
@@ -249,22 +251,46 @@ def view_results(
         Path | None, typer.Option("--images", help="Folder of the panoramas, if they were moved.")
     ] = None,
     labels: Annotated[bool, typer.Option("--labels", help="Show the names of the cameras.")] = False,
-    blended: Annotated[bool, typer.Option("--blend", help="Show the cloud within a panorama.")] = False,
+    blended: Annotated[bool, typer.Option("--blend", help="Overlay the cloud on the panoramas.")] = False,
     backs: Annotated[bool, typer.Option("--backs", help="Also show points that face away from the viewer.")] = False,
     group: Annotated[
         int,
         typer.Option(
             "--group",
             min=0,
-            help="Group of panoramas to show if no reliable pair connects all of them; 0 is the largest.",
+            help="Group to show if the panoramas form several groups; 0 is the largest.",
         ),
     ] = 0,
 ) -> None:
-    """Look at cloud, mesh and cameras, and step inside the panoramas."""
+    """View the cloud, the mesh and the cameras, and step inside the panoramas."""
     from pano_mvs.cli.view_command import ViewOptions, view_scene
 
     options = ViewOptions(images, screenshot, view, color, surface, points, size, labels, blended, backs, group)
     view_scene(out, options, Console())
+
+
+@app.command()
+@guarded
+def share(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="The output folder of a run.")],
+    to: Annotated[Path, typer.Option("--to", metavar="DIR", help="Folder to write the page to.")],
+    title: Annotated[str, typer.Option("--title", help="Heading; default: the name of OUT.", show_default=False)] = "",
+    points: Annotated[
+        int, typer.Option("--points", min=0, help="Maximum number of points of the cloud; 0: all.")
+    ] = 5_000_000,
+    width: Annotated[int, typer.Option("--width", min=1024, help="Maximum width of the panoramas in pixels.")] = 4096,
+    quality: Annotated[int, typer.Option("--quality", min=1, max=100, help="JPEG quality of the panoramas.")] = 85,
+    images: Annotated[
+        Path | None, typer.Option("--images", help="Folder of the panoramas, if they were moved.")
+    ] = None,
+    cache: CacheOption = None,
+) -> None:
+    """Write a page to send: cloud, cameras and panoramas, for any browser, without a network."""
+    from pano_mvs.cli.share_command import share_output
+    from pano_mvs.share import ShareOptions
+
+    options = ShareOptions(title, points, width, quality)
+    share_output(out, to, options, images=images, cache=cache, console=Console())
 
 
 @app.command("inspect")
@@ -276,12 +302,14 @@ def inspect_pixel(
             metavar="WORKFLOW|OUT", help="A workflow file, the name of a preset, or the output folder of a run."
         ),
     ],
-    image: Annotated[str, typer.Argument(help="Name of the image, or a part of the name that only one image has.")],
+    image: Annotated[str, typer.Argument(help="Name of the image, or a unique part of it.")],
     x: Annotated[
         float,
-        typer.Argument(help="Column of the pixel from the left edge, at the size of the sweep; fractions are dropped."),
+        typer.Argument(
+            help="Column of the pixel, from the left, at the resolution of the sweep; fractions are dropped."
+        ),
     ],
-    y: Annotated[float, typer.Argument(help="Row of the pixel from the upper edge.")],
+    y: Annotated[float, typer.Argument(help="Row of the pixel, from the top.")],
     stage: Annotated[
         str, typer.Option("--stage", help="Sweep stage to inspect; default: the first.", show_default=False)
     ] = "",
@@ -290,14 +318,14 @@ def inspect_pixel(
     cache: CacheOption = None,
     truth: Annotated[
         Path | None,
-        typer.Option("--truth", help="Folder with poses.json and depth.npz; default: the one that the workflow names."),
+        typer.Option("--truth", help="Folder with poses.json and depth.npz; default: that of the workflow."),
     ] = None,
     plot: Annotated[
         Path | None, typer.Option("--plot", metavar="FILE.png", help="Write a plot of the cost curve to this file.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Show one pixel: its ray, its range after each stage, what its neighbours see, and its cost at every depth."""
+    """Analyse one pixel: its ray, its range after each stage, and its cost for every depth hypothesis."""
     from pano_mvs.cli.inspect.command import PixelWanted, inspect, open_run
 
     session = open_run(target, overrides=overrides or [], images=images, cache=cache)
@@ -308,7 +336,7 @@ def main() -> None:
     """Run the command line."""
     bound_environment(os.environ, available_threads())  # before a command loads the libraries
     output = protect_standard_streams()
-    faulthandler.enable(os.dup(2))  # a stage that runs in this process may turn descriptor 2
+    faulthandler.enable(os.dup(2))  # a stage in this process may redirect descriptor 2
     turn_exits_into_errors()
     try:
         app()

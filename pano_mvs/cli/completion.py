@@ -1,6 +1,6 @@
-"""What a shell offers when the tab key is pressed: presets and workflow files, stages, settings and their values.
+"""Shell completion of presets and workflow files, stages, settings and their values.
 
-A shell is to stay silent whatever is wrong with a workflow or a plugin: `pano-mvs check` is for that.
+Completion ignores mistakes in workflows and plugins, which `pano-mvs check` reports.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Offer = tuple[str, str]
 
 
 def _silent(complete: Callable[..., Iterator[Offer]]) -> Callable[..., list[Offer]]:
-    """Return a completer that keeps to what begins with what is there, and offers nothing where something is wrong."""
+    """Return a completer that filters by the typed prefix, and returns nothing if an error occurs."""
 
     def offers(ctx: typer.Context, incomplete: str) -> list[Offer]:
         known = {"ctx": ctx, "incomplete": incomplete}
@@ -63,14 +63,14 @@ def complete_stage_kind() -> Iterator[Offer]:
 
 @_silent
 def complete_stage(ctx: typer.Context) -> Iterator[Offer]:
-    """Offer the stages of the workflow that the command line names."""
+    """Offer the stages of the workflow on the command line."""
     for name, entry in _stages(ctx).items():
         yield name, entry.spec.name
 
 
 @_silent
 def complete_setting(ctx: typer.Context, incomplete: str) -> Iterator[Offer]:
-    """Offer STAGE.PARAM= of the workflow that the command line names, and behind the sign what a setting may be."""
+    """Offer STAGE.PARAM= for the workflow on the command line, and after the sign the values of the setting."""
     target, equals, _ = incomplete.partition("=")
     for name, entry in _stages(ctx).items():
         schema = entry.spec.params_type.model_json_schema(by_alias=True) if entry.spec.params_type.model_fields else {}
@@ -96,7 +96,7 @@ def _stages(ctx: typer.Context) -> Mapping[str, StageEntry]:
     from pano_mvs.engine.workflows.workflow import find_workflow, load_workflow
     from pano_mvs.session.session import presets_folder
 
-    # click leaves arguments where they are once it has met an option that still lacks its value.
+    # After an option without its value, click does not process further arguments.
     named = ctx.params.get("workflow") or next((word for word in ctx.args if not word.startswith("-")), None)
     if not isinstance(named, str):
         return {}
@@ -105,7 +105,7 @@ def _stages(ctx: typer.Context) -> Mapping[str, StageEntry]:
 
 
 def _values(field: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what a setting may be, where that is a choice."""
+    """Yield the values of a setting with a fixed set of choices."""
     if field.get("type") == "boolean":
         yield from ("true", "false")
     for option in (field, *field.get("anyOf", ())):

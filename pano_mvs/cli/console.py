@@ -1,4 +1,4 @@
-"""The console of all commands: nothing that files, plugins or exceptions say can steer the terminal or flood it."""
+"""The console of all commands, which protects the terminal from control characters and overlong lines."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _MAX_LINE = 10_000
 
 
 class Console(rich.console.Console):
-    """A console that spells control characters out, and cuts lines that nobody would read."""
+    """A console that escapes control characters and cuts overlong lines."""
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
-        """Render an object; colours and cursor movements are the console's own and stay."""
+        """Render an object; only the console's own colours and cursor movements remain."""
         for segment in super().render(renderable, options):
             if segment.control:
                 yield segment

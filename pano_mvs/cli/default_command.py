@@ -1,4 +1,4 @@
-"""A group of commands one of which may be left out when it is called."""
+"""A group of commands with a default command."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ class RunByDefault(TyperGroup):
 
     default: ClassVar[str] = "run"
 
-    # The context is click's, which versions of typer bring under different names.
+    # The context is click's, whose module differs between versions of typer.
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Put the default command in front of arguments that name none; asking for help names none either."""
+        """Insert the default command if the arguments name none, except when they ask for help."""
         if args and args[0] not in self.commands and args[0] not in ctx.help_option_names:
             args = [self.default, *args]
         return super().parse_args(ctx, args)

@@ -12,16 +12,16 @@ from pano_mvs.cli.completion import complete_setting, complete_stage, complete_w
 WorkflowArgument = Annotated[
     str,
     typer.Argument(
-        metavar="WORKFLOW", help="A workflow file, or the name of a preset.", autocompletion=complete_workflow
+        metavar="WORKFLOW", help="A workflow file or the name of a preset.", autocompletion=complete_workflow
     ),
 ]
 ImagesOption = Annotated[
-    Path | None, typer.Option("--images", help="Folder of panoramas; default: the one that the workflow names.")
+    Path | None, typer.Option("--images", help="Folder of panoramas; default: that of the workflow.")
 ]
 SetOption = Annotated[
     list[str] | None,
     typer.Option(
-        "--set", metavar="STAGE.PARAM=VALUE", help="Change a setting; may be repeated.", autocompletion=complete_setting
+        "--set", metavar="STAGE.PARAM=VALUE", help="Change a setting; can be repeated.", autocompletion=complete_setting
     ),
 ]
 CacheOption = Annotated[
@@ -49,7 +49,7 @@ RefreshOption = Annotated[
     typer.Option(
         "--refresh",
         metavar="STAGE[:ITEM]",
-        help="Compute this stage or unit again even if it is cached.",
+        help="Recompute this stage or unit even if it is cached.",
         autocompletion=complete_stage,
     ),
 ]
@@ -58,13 +58,13 @@ MinFreeOption = Annotated[
     typer.Option(
         "--min-free",
         metavar="SIZE",
-        help="Start no unit if less space than this is free on the disk of the cache, such as 5GB; default: 200MB.",
+        help="Stop if less disk space than this is free for the cache, such as 5GB; default: 200MB.",
         show_default=False,
     ),
 ]
 DurableOption = Annotated[
     bool,
-    typer.Option("--durable", help="Flush each result to the disk before going on, for machines that may lose power."),
+    typer.Option("--durable", help="Flush each result to disk, for machines that may lose power."),
 ]
 AcceptOption = Annotated[
     bool, typer.Option("--accept-code", help="Reuse results that were computed before code or libraries changed.")

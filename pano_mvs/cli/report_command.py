@@ -1,4 +1,4 @@
-"""Write the report of a run again from what the run left."""
+"""Rewrite the report of a run from its run.json and the cache."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def rewrite_report(out: Path, cache: Path | None, console: Console) -> None:
     The cache is `cache`, else $PANO_MVS_CACHE, else the one that run.json names.
 
     Raises:
-        InputError: if there is no run.json, or no cache: a page without pictures would replace one that has them.
+        InputError: if there is no run.json or no cache, since a page without images would replace one with images.
         StoreError: if the cache's list of runs is damaged, or a run is writing into the folder.
     """
     summary = RunSummary.read(out)

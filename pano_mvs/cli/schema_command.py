@@ -1,4 +1,4 @@
-"""`pano-mvs schema`: what an editor needs to complete workflows."""
+"""`pano-mvs schema`: write the JSON Schema of workflows for editors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def show_schema(workflow: str | None, out: Path | None) -> None:
     """Write the schema of workflows to a file or to the standard output.
 
     Args:
-        workflow: a workflow whose plugins count too, and whose inherited stages are known by name.
+        workflow: a workflow whose plugins and inherited stages are included.
         out: the file; None for the standard output.
 
     Raises:

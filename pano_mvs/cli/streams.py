@@ -1,4 +1,4 @@
-"""Standard streams whose reader may leave: a closed pipe or a full disk ends the printing, not the command."""
+"""Standard streams that tolerate a closed pipe or a full disk, which end the output but not the command."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _READER_LEFT = {errno.EPIPE, errno.ECONNRESET, getattr(errno, "ESHUTDOWN", errno
 
 
 class StreamState:
-    """Whether what is written to a stream still arrives.
+    """Whether a stream can still be written.
 
     Attributes:
         reader_left: whether the other end of the pipe, or the terminal, was closed.
@@ -37,7 +37,7 @@ class StreamState:
         self.reader_may_leave = False
 
     def exit_code(self, code: int) -> int:
-        """Return the exit code of a command that would end with `code`; a standard output that failed is reported."""
+        """Return the exit code of a command that would end with `code`, reporting a failed standard output."""
         if self.failure:
             text = f"the standard output cannot be written: {self.failure}. The command went on without it"
             Console(stderr=True).print(f"[red]error:[/] {text}", highlight=False, soft_wrap=True)
@@ -46,10 +46,10 @@ class StreamState:
 
 
 class LenientStream(io.TextIOWrapper):
-    """A text stream that drops what is written after the first write that failed.
+    """A text stream that drops all output after the first failed write.
 
     Attributes:
-        state: whether what is written arrives.
+        state: whether it can still be written.
     """
 
     def __init__(
@@ -87,7 +87,9 @@ class _LenientRaw(io.RawIOBase):
         if self._state.reader_left or self._state.failure:
             return size
         try:
-            while (written := self._raw.write(data)) is None:  # somebody made the terminal or the pipe non-blocking
+            while (
+                written := self._raw.write(data)
+            ) is None:  # another process made the terminal or the pipe non-blocking
                 select.select([], [self._raw], [])
         except OSError as error:
             if self._is_closed(error):
@@ -98,7 +100,7 @@ class _LenientRaw(io.RawIOBase):
         return written
 
     def _is_closed(self, error: OSError) -> bool:
-        """Return whether nobody reads any more: a pipe was closed, a terminal hung up."""
+        """Return whether the reader has gone: a closed pipe or terminal."""
         hung_up = self._is_terminal and error.errno == errno.EIO
         return error.errno in _READER_LEFT or hung_up or (os.name == "nt" and error.errno == errno.EINVAL)
 
@@ -106,8 +108,8 @@ class _LenientRaw(io.RawIOBase):
 def protect_standard_streams() -> StreamState:
     """Make the standard output and error streams lenient; return the state of the output.
 
-    A descriptor that was closed when the command started leads nowhere from now on. Otherwise the next file that is
-    opened would get its number, and everything that is printed.
+    A descriptor that was closed when the command started is redirected to the null device. Otherwise the next opened
+    file would get its number, and would receive the output.
     """
     for descriptor in range(3):
         try:
@@ -119,7 +121,7 @@ def protect_standard_streams() -> StreamState:
 
 
 def _lenient(stream: TextIO | None, descriptor: int) -> TextIO:
-    """Return a lenient stream in place of a standard one; one that is no file is returned as it is."""
+    """Return a lenient stream for a standard one; a stream that is not a file is returned unchanged."""
     if stream is None:  # its descriptor was closed
         return LenientStream(io.FileIO(descriptor, "w", closefd=False), "utf-8", StreamState())
     raw = getattr(stream, "buffer", None)
@@ -131,10 +133,10 @@ def _lenient(stream: TextIO | None, descriptor: int) -> TextIO:
 
 
 def apart(stream: TextIO) -> TextIO:
-    """Return a stream to where another one leads now, wherever its descriptor is turned to later.
+    """Return a stream to the current target of another one, unaffected by later redirections of its descriptor.
 
-    It is lenient, and its reader may leave. If the other stream is lenient, both share their state. A stream without
-    descriptor, such as a test's, is returned as it is: nobody turns it.
+    It is lenient, and its reader may exit. If the other stream is lenient, both share their state. A stream without
+    descriptor, such as that of a test, is returned unchanged.
     """
     try:
         stream.flush()

@@ -1,4 +1,4 @@
-"""Look at a run: a window, or a picture of what it would show."""
+"""View a run in a window, or write an image of it."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ _QUALITY = 90
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """How to look.
+    """Options of `pano-mvs view`.
 
     Attributes:
         images: folder of the panoramas; None: where the run read them.
-        screenshot: a picture to write instead of opening a window.
+        screenshot: image file to write instead of opening a window.
         view: "overview", "top", "front" or "inside:NAME".
         color: of the cloud, see `COLORINGS`.
-        surface: "cloud", "mesh" or "both"; empty for the cloud where there is one.
+        surface: "cloud", "mesh" or "both"; empty for the cloud if it exists.
         points: maximum number of points to draw; 0: all.
         size: WIDTHxHEIGHT of the window in pixels.
         labels: whether cameras are named.
         blended: whether the cloud is shown within a panorama.
-        backs: whether points and triangles are shown that turn their back to the eye.
-        group: which group of poses to show; 0 is the largest.
+        backs: whether points and triangles that face away from the viewer are shown.
+        group: group of poses to show; 0 is the largest.
     """
 
     images: Path | None = None
@@ -56,12 +56,12 @@ class ViewOptions:
 
 
 def view_scene(path: Path, options: ViewOptions, console: Console) -> None:
-    """Open a window on an output folder or a PLY file, or write a picture of it.
+    """View an output folder or a PLY file in a window, or write an image of it.
 
     Raises:
         InputError: if there is nothing to show, or a file is damaged.
-        UsageError: if an option cannot be, or there is no display.
-        StoreError: if the picture cannot be written.
+        UsageError: if an option is invalid, or there is no display.
+        StoreError: if the image cannot be written.
     """
     size_wh = _size_wh(options.size)
     if options.screenshot is None:
@@ -71,7 +71,7 @@ def view_scene(path: Path, options: ViewOptions, console: Console) -> None:
         require_drawing()
     scene = open_scene(path, images=options.images, group=options.group)
     tour = _tour(scene, options, size_wh)
-    from pano_mvs.viewer.window import SceneWindow  # on use: pyvista is slow to import
+    from pano_mvs.viewer.window import SceneWindow  # imported on use, because pyvista is slow to import
 
     if options.screenshot is not None:
         quiet_vtk()
@@ -91,13 +91,13 @@ def view_scene(path: Path, options: ViewOptions, console: Console) -> None:
 def _tour(scene: ShownScene, options: ViewOptions, size_wh: tuple[int, int]) -> Tour:
     cloud = drawn_cloud(scene.cloud, budget=options.points) if scene.cloud is not None else None
     if cloud is not None:
-        color_cloud(cloud, options.color, up=scene.up, unit=scene.unit)  # refuses what it cannot do
+        color_cloud(cloud, options.color, up=scene.up, unit=scene.unit)  # raises if the colouring is not available
     points = cloud.points if cloud is not None else np.zeros((0, 3), np.float32)
     corners = mesh_points(scene.mesh) if cloud is None and scene.mesh is not None else None
     box = box_of(points if corners is None else corners, scene.centers)
     tour = Tour(scene, cloud, box, aspect=size_wh[0] / size_wh[1], corners=corners)
     tour.see(options.view)
-    # Ours face the side that was seen; how anybody's lone mesh is wound is not known.
+    # Our meshes face the observed side; the orientation of other meshes is unknown.
     backs = options.backs or (cloud is None and not scene.cameras)
     tour.begin(coloring=options.color, labels=options.labels, blended=options.blended, backs=backs)
     if options.surface:
@@ -107,7 +107,7 @@ def _tour(scene: ShownScene, options: ViewOptions, size_wh: tuple[int, int]) -> 
 
 def _surface(wanted: str, scene: ShownScene) -> str:
     if wanted not in ("cloud", "mesh", "both"):
-        raise UsageError(f"--show {wanted}: there are cloud, mesh and both")
+        raise UsageError(f"--show {wanted}: must be cloud, mesh or both")
     missing = {"cloud": scene.cloud is None, "mesh": scene.mesh is None}
     absent = [name for name in ("cloud", "mesh") if wanted in (name, "both") and missing[name]]
     if absent:
@@ -116,7 +116,7 @@ def _surface(wanted: str, scene: ShownScene) -> str:
 
 
 def mesh_points(path: Path) -> NDArray[np.float32]:
-    """Return the corners of a mesh, (N, 3) float32.
+    """Return the vertices of a mesh, (N, 3) float32.
 
     Raises:
         InputError: if it cannot be read.
@@ -125,7 +125,7 @@ def mesh_points(path: Path) -> NDArray[np.float32]:
 
     points = read_ply_points(path)
     if not len(points):
-        raise InputError(f"{path}: a mesh without corners. Write it again")
+        raise InputError(f"{path}: the mesh has no vertices. Export it again")
     return points
 
 
@@ -138,7 +138,7 @@ def _size_wh(text: str) -> tuple[int, int]:
 
 def _check_screenshot(path: Path) -> None:
     if path.suffix.lower() not in _SUFFIXES:
-        raise UsageError(f"--screenshot {path}: pictures are {', '.join(_SUFFIXES)}")
+        raise UsageError(f"--screenshot {path}: images must end in {', '.join(_SUFFIXES)}")
 
 
 def _write(path: Path, picture: NDArray[np.uint8]) -> None:

@@ -1,4 +1,4 @@
-"""Process the rows of an image in bands, on threads."""
+"""Process the rows of an image in bands, in threads."""
 
 from __future__ import annotations
 

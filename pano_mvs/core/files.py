@@ -54,7 +54,7 @@ def set_aside(path: Path) -> Path:
     try:
         return path.rename(free)
     except OSError as error:
-        raise StoreError(f"{path} is in the way and cannot be renamed ({error.strerror}). Move it away") from error
+        raise StoreError(f"{path} exists and cannot be renamed ({error.strerror}). Move it elsewhere") from error
 
 
 def temporary_prefix() -> str:

@@ -85,7 +85,7 @@ def _own_temporary_folder() -> Path:
         info = folder.lstat()
         if stat.S_ISDIR(info.st_mode) and info.st_uid == os.getuid() and not info.st_mode & 0o077:
             return folder
-    raise OSError(errno.EACCES, "you have no writable folder for caches")
+    raise OSError(errno.EACCES, "there is no writable folder for caches")
 
 
 def _can_be_made(folder: Path) -> bool:

@@ -1,1 +1,1 @@
-"""Run workflows: from their files over plans to cached results. The engine knows no stage by name."""
+"""Run workflows, from files and plans to cached results. The engine does not know any stage by name."""

@@ -54,7 +54,7 @@ def score_capture(
         groups: group number of each estimated pose, if the groups have different worlds; None: all share one.
     """
     if len(true_poses) < 2:
-        return Scores({}, {}, ("no ground truth is known for these images",))
+        return Scores({}, {}, ("there is no ground truth for these images",))
     group_of = groups or {}
     notes: list[str] = []
     errors = relative_pose_errors(estimated_poses, true_poses, groups=groups)
@@ -62,8 +62,8 @@ def score_capture(
     if len(numbers := set(group_of.values())) > 1:
         poses["registered_in_one_frame"] = errors.in_one_frame
         notes.append(
-            f"the poses are in {len(numbers)} groups, each with a frame and a scale of its own: pairs across groups "
-            "cannot be measured and count as not registered; each group is aligned with the truth on its own"
+            f"the poses are in {len(numbers)} groups, each with its own frame and scale: pairs across groups "
+            "cannot be measured and count as not registered; each group is aligned separately"
         )
     scales, refused = _scales(estimated_poses, true_poses, group_of)
     if not scales:

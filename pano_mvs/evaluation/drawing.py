@@ -1,4 +1,4 @@
-"""Strips of text and files of pictures with which errors are shown."""
+"""Drawing helpers for error images: strips of text, and image files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Results as text for people: lines and tables, independent of how they are displayed."""
+"""Results as text: lines and tables, independent of how they are displayed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pure mathematics on the sphere, and the conventions of the whole product, stated once.
+"""Mathematics on the sphere, and the conventions of the whole product.
 
 Frames
     Camera frame: x right, y DOWN, z forward, right-handed (COLMAP's). A transform is named

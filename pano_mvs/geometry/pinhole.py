@@ -1,4 +1,4 @@
-"""A pinhole picture that shares its centre with a panorama."""
+"""A pinhole view that shares its centre with a panorama."""
 
 from __future__ import annotations
 

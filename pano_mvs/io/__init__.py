@@ -1,1 +1,1 @@
-"""Files of other people: readers and writers."""
+"""Readers and writers of file formats."""

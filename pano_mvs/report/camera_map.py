@@ -1,4 +1,4 @@
-"""Where the cameras stand, seen from above and from the side, with the links of the match graph."""
+"""Draw the cameras from above and from the side, with the links of the match graph."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Link:
     Attributes:
         ends: x1, y1, x2, y2.
         strength: from 0 to 1, by its inliers.
-        text: what it says when pointed at.
+        text: the tooltip.
         rejected: whether no common geometry was found.
     """
 
@@ -47,13 +47,13 @@ class CameraMap:
     """One drawing, in the units of an SVG view box.
 
     Attributes:
-        title: from where the cameras are seen.
-        text: the same for people who do not see it.
+        title: the caption, which names the direction of view.
+        text: description for screen readers.
         size_wh: of the view box.
-        links: rejected ones first, then the others, strong ones last and so on top.
-        cameras: (x, y, name, where its label goes: x and y, or None).
-        doubtful: (x, y, name, reason) of cameras whose poses are doubtful; they are drawn over the others.
-        dots: an SVG path of cameras that are too many to be named.
+        links: in drawing order: rejected links, then weak ones, then strong ones.
+        cameras: (x, y, name, position of the label or None).
+        doubtful: (x, y, name, reason) of cameras whose poses are doubtful; drawn above the others.
+        dots: an SVG path of the cameras if there are too many to name.
         bar: (x, y, length, text) of the scale bar.
         north: whether north is upwards.
     """
@@ -80,11 +80,11 @@ class CameraMap:
 
 
 def camera_maps(poses: PosesSummary, reasons: Mapping[tuple[str, str], str] | None = None) -> tuple[CameraMap, ...]:
-    """Return the cameras from above and from the side; none where no centre is known.
+    """Return the cameras from above and from the side; nothing if no centre is known.
 
     Args:
         poses: of one group of cameras.
-        reasons: why pairs have no common geometry, where that is known.
+        reasons: why pairs have no common geometry, if known.
     """
     names = list(poses.registered)
     centers = np.array(poses.centers, dtype=np.float64).reshape(-1, 3)
@@ -112,10 +112,10 @@ def camera_maps(poses: PosesSummary, reasons: Mapping[tuple[str, str], str] | No
 
 
 def up_of(poses: PosesSummary) -> FloatArray:
-    """Return the direction up in the world, unit (3,).
+    """Return the up direction in the world, a unit vector (3,).
 
-    That is −y where the frame says so; else the mean of the cameras' own, `up`, since they are mostly held upright;
-    else −y, the first camera's.
+    It is −y if the frame states so, otherwise the mean `up` of the cameras, which are mostly held upright,
+    otherwise −y, that of the first camera.
     """
     up = np.array(poses.up or (0, -1, 0), np.float64)
     usable = np.isfinite(up).all() and np.linalg.norm(up) > 1e-6
@@ -125,14 +125,14 @@ def up_of(poses: PosesSummary) -> FloatArray:
 
 
 def short_names(names: Sequence[str]) -> list[str]:
-    """Return names without folder and extension, where that leaves them distinct."""
+    """Return names without folder and extension if they stay distinct."""
     short = [PurePosixPath(name).stem for name in names]
     return short if len(set(short)) == len(short) else list(names)
 
 
 @dataclass(frozen=True)
 class _Joined:
-    """A link before it is drawn: the positions of two cameras, the inliers, and words."""
+    """A link to draw: the positions of two cameras, the number of inliers, and the tooltip."""
 
     first: int
     second: int
@@ -144,7 +144,7 @@ class _Joined:
 def _chosen(
     links: Sequence[PairLink], names: list[str], labels: list[str], reasons: Mapping[tuple[str, str], str]
 ) -> list[_Joined]:
-    """Return the links between registered cameras: some rejected ones, then the strongest, weak ones first."""
+    """Return links between registered cameras: some rejected ones, then the strongest, in ascending order."""
     position = {name: idx for idx, name in enumerate(names)}
     found: list[_Joined] = []
     for link in links:
@@ -158,7 +158,7 @@ def _chosen(
             why = reasons.get((link.first, link.second), "")
             text = f"{labels[a]} – {labels[b]}: {words}{why and f'; {why}'}"
             found.append(_Joined(a, b, link.inliers, link.candidates or 0, text))
-    # Of rejected ones those that came nearest, with most candidates.
+    # Of the rejected links, those with the most candidates.
     found.sort(key=lambda link: (link.inliers, -link.candidates))
     split = sum(not link.inliers for link in found)
     return found[:split][:_MAX_REJECTED] + found[split:][-_MAX_LINKS:]
@@ -179,7 +179,7 @@ def _drawn(
     tallest: int,
     north: bool,
 ) -> CameraMap:
-    """Return the drawing of cameras at (N, 2), x to the right and y down, some of them doubtful."""
+    """Return the drawing of cameras at positions (N, 2), with x to the right and y down."""
     low, high = flat.min(axis=0), flat.max(axis=0)
     extent = np.maximum(high - low, 1e-9 + 0.02 * float((high - low).max()))
     if not (high - low).any():
@@ -207,9 +207,9 @@ def _drawn(
 
 
 def _label_spots(placed: FloatArray, labels: list[str]) -> list[tuple[float, float] | None]:
-    """Return where each label begins: beside its camera, where no other is; none where there is no such place.
+    """Return the position of each label beside its camera, or None if no position is free.
 
-    Where there are too many cameras none has a label.
+    If there are too many cameras, there are no labels.
     """
     if len(labels) > _MAX_LABELS:
         return [None] * len(labels)
@@ -226,7 +226,7 @@ def _label_spots(placed: FloatArray, labels: list[str]) -> list[tuple[float, flo
 
 
 def _fits(spot: tuple[float, float], wide: float, taken: list[tuple[float, float, float]]) -> bool:
-    """Return whether a label is within the map and covers none that is there."""
+    """Return whether a label is within the map and overlaps no other label."""
     left, y = spot
     if left < 2 or left + wide > _WIDTH - 2:
         return False
@@ -234,6 +234,6 @@ def _fits(spot: tuple[float, float], wide: float, taken: list[tuple[float, float
 
 
 def _round_length(longest: float) -> float:
-    """Return the greatest of 1, 2, 5 × 10ⁿ that is not longer."""
+    """Return the largest length of the form 1, 2 or 5 × 10ⁿ that is not longer."""
     power = 10.0 ** np.floor(np.log10(longest))
     return float(next(step * power for step in (5, 2, 1) if step * power <= longest * (1 + 1e-9)))

@@ -1,4 +1,4 @@
-"""Pictures of the fused cloud from three places: by PyVista, or without it where there is no graphics driver."""
+"""Images of the fused cloud from three viewpoints, by PyVista or, without a graphics driver, by our own renderer."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ class CloudPictures:
     """The pictures of a cloud.
 
     Attributes:
-        shown: (what is seen, picture); none where there is no cloud.
-        note: how they were made, where that needs saying.
+        shown: (title, image); empty if there is no cloud.
+        note: remark on how they were rendered, or "".
     """
 
     shown: tuple[tuple[str, Picture], ...] = ()
@@ -53,15 +53,15 @@ class CloudPictures:
 def cloud_pictures(
     results: StoredValues, kept: EarlierPage, *, up: NDArray[np.float64], command: Sequence[str] = _COMMAND
 ) -> CloudPictures:
-    """Return pictures of the cloud: those of an earlier page, if they are of the same cloud, else new ones.
+    """Return images of the cloud, reusing those of an earlier page if they show the same cloud.
 
-    Of several groups of poses the largest is shown.
+    If there are several groups of poses, the largest is shown.
 
     Args:
         results: with the cloud and the poses.
         kept: the earlier page's.
         up: (3,) unit vector away from the ground, in the world.
-        command: what draws; it is given a folder.
+        command: the rendering command, which receives a folder as argument.
     """
     digest = results.digest("cloud")
     if not digest:
@@ -87,7 +87,7 @@ def cloud_pictures(
         note = "; ".join(
             [
                 *filter(None, [note]),
-                "shown is group 0 of the poses, the largest; the clouds of the others "
+                "this is group 0 of the poses, the largest; the clouds of the others "
                 "are cloud_1.ply … (pano-mvs view OUT --group 1)",
             ]
         )
@@ -103,7 +103,7 @@ def cloud_pictures(
 
 
 def _thinned(cloud: PointCloud) -> Arrays:
-    """Return every n-th point of a cloud, so that no more are drawn than a picture can show."""
+    """Return every n-th point of a cloud, to limit the number of drawn points."""
     step = -(-len(cloud) // _MAX_POINTS)
     return (
         np.ascontiguousarray(cloud.points_in_world[::step]),
@@ -119,12 +119,12 @@ def _drawn(
         images = _drawn_apart(arrays, seen_from, command)
         if images:
             return images, ""
-    note = "" if software else "PyVista could not draw here (no graphics driver), so these are plainer pictures"
+    note = "" if software else "PyVista could not render (no graphics driver), so these images are simpler"
     return [draw_cloud(*arrays, view, size_hw=_SIZE_HW) for view in seen_from], note
 
 
 def _drawn_apart(arrays: Arrays, seen_from: Sequence[Viewpoint], command: Sequence[str]) -> list[NDArray[np.uint8]]:
-    """Return the pictures of another process; none if it fails, crashes or takes too long."""
+    """Return images rendered in another process; nothing if it fails, crashes or takes too long."""
     with TemporaryDirectory(prefix="pano-mvs-report-") as name:
         folder = Path(name)
         write_scene(folder, arrays, seen_from, size_hw=_SIZE_HW)

@@ -1,6 +1,6 @@
-"""Draw a cloud with PyVista, in a process of its own: a graphics driver that crashes takes no run with it.
+"""Render a cloud with PyVista in a separate process, so that a crashing graphics driver does not end the run.
 
-`python -m pano_mvs.report.cloud_renderer FOLDER` reads what `write_scene` wrote there and writes the pictures.
+`python -m pano_mvs.report.cloud_renderer FOLDER` reads the files of `write_scene` and writes the images.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def write_scene(
     *,
     size_hw: tuple[int, int],
 ) -> None:
-    """Write what is to be drawn.
+    """Write the scene to render.
 
     Args:
         folder: an empty folder.
@@ -51,7 +51,7 @@ def write_scene(
 
 
 def read_pictures(folder: Path, count: int, *, size_hw: tuple[int, int]) -> list[NDArray[np.uint8]]:
-    """Return the pictures that were drawn; none if one is missing, empty or of another size."""
+    """Return the rendered images; nothing if one is missing, empty or of another size."""
     found: list[NDArray[np.uint8]] = []
     for number in range(count):
         try:
@@ -65,7 +65,7 @@ def read_pictures(folder: Path, count: int, *, size_hw: tuple[int, int]) -> list
 
 
 def draw(folder: Path) -> None:
-    """Draw what `write_scene` wrote."""
+    """Render the scene that `write_scene` wrote."""
     import pyvista
 
     scene = json.loads((folder / "scene.json").read_bytes())

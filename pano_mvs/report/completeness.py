@@ -22,7 +22,7 @@ class Shares:
         weak: seen, but not confirmed (64–127).
         filled: interpolated, not seen (1–63).
         invalid: no range.
-        masked: not to be looked at, by a mask.
+        masked: excluded by a mask.
     """
 
     consistent: float
@@ -33,21 +33,21 @@ class Shares:
 
     @property
     def complete(self) -> float:
-        """The share of what is not masked that has a range; 0 if all is masked."""
+        """The share of the unmasked sphere that has a range; 0 if all is masked."""
         return (self.consistent + self.weak + self.filled) / max(1e-9, 1 - self.masked)
 
     @property
     def confirmed(self) -> float:
-        """The share of what is not masked on which other views agree."""
+        """The share of the unmasked sphere on which other views agree."""
         return self.consistent / max(1e-9, 1 - self.masked)
 
 
 def shares_of(confidence: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None) -> Shares:
-    """Return the shares of a view by the solid angle of its pixels; of large maps every n-th row and column counts.
+    """Return the shares of a view by the solid angle of its pixels, sampling every n-th row and column of large maps.
 
     Args:
         confidence: (H, W) uint8 as of range maps.
-        mask: (H, W) bool, False is masked; None where no mask is known.
+        mask: (H, W) bool, False is masked; None if unknown.
     """
     step = max(1, confidence.shape[0] // _ROWS)
     sampled = np.asarray(confidence[step // 2 :: step, step // 2 :: step])
@@ -63,7 +63,7 @@ def shares_of(confidence: NDArray[np.uint8], mask: NDArray[np.bool_] | None = No
 
 
 def shares_from_fact(fact: Any) -> Shares | None:
-    """Return the shares that `fact_of` gave; None if the value is not from it."""
+    """Return shares from the JSON value of `fact_of`; None for other values."""
     valid = isinstance(fact, list) and len(fact) == 5 and all(isinstance(value, int | float) for value in fact)
     return Shares(*map(float, fact)) if valid else None
 

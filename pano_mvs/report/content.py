@@ -1,4 +1,4 @@
-"""Everything that the page shows of a run's results, gathered from the summary, the store and an earlier page."""
+"""The content of the page, gathered from the summary, the cache and an earlier page."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pano_mvs.report.camera_map import CameraMap, camera_maps, up_of
 from pano_mvs.report.cloud_pictures import CloudPictures, cloud_pictures
 from pano_mvs.report.completeness import Shares
 from pano_mvs.report.earlier_page import EarlierPage
-from pano_mvs.report.panoramas import Row, panorama_rows
+from pano_mvs.report.panorama_table import Row, panorama_rows
 from pano_mvs.report.thumbnails import measured_shares, thumbnails
 from pano_mvs.report.view_cards import ViewCard, chosen_views, view_cards
 from pano_mvs.results.figures import score_tables, side_by_side
@@ -27,7 +27,7 @@ _MAX_REASONS = 300
 
 @dataclass(frozen=True)
 class Content:
-    """What the page shows.
+    """The content of the page.
 
     Attributes:
         verdict: the head of the page.
@@ -35,7 +35,7 @@ class Content:
         maps: the cameras of each group, from above and from the side.
         metric: images whose ranges are in metres.
         rejected_pairs: (first, second, candidates or None, reason) of pairs without a common geometry.
-        pairs: number of pairs that were looked at.
+        pairs: number of compared pairs.
         cloud: pictures of the cloud.
         cards: views shown in full.
         total_views: number of views.
@@ -44,10 +44,10 @@ class Content:
         mean_shares: of the sphere, over all measured views.
         residuals: of the points.
         pair_residuals: medians of the pairs' residuals.
-        scores: (stage, tables) of each branch that has some.
+        scores: (stage, tables) of each branch with scores.
         comparison: the medians of several branches side by side.
         notes: what could not be shown.
-        facts: figures that the next page may use again.
+        facts: figures that the next page may reuse.
     """
 
     verdict: Verdict
@@ -71,13 +71,13 @@ class Content:
 
 
 def gather(out_dir: Path, summary: RunSummary, values: StoredValues, *, earlier: EarlierPage) -> Content:
-    """Return what the page shows; what is missing or damaged is left out and named in the notes.
+    """Return the content of the page; missing or damaged values are left out and named in the notes.
 
     Args:
         out_dir: the output folder.
         summary: of the run.
-        values: that the run made.
-        earlier: the earlier page, whose pictures and figures are used again.
+        values: the values of the run.
+        earlier: the earlier page, whose images and figures are reused.
     """
     poses, views = summary.poses, summary.views
     groups = poses.by_group()
@@ -115,7 +115,7 @@ def gather(out_dir: Path, summary: RunSummary, values: StoredValues, *, earlier:
 
 
 def _rejected_pairs(links: Sequence[PairLink], values: StoredValues) -> tuple[tuple[str, str, int | None, str], ...]:
-    """Return the pairs without inliers, those with most candidates first, and why, of the first 300."""
+    """Return the pairs without inliers, those with the most candidates first, with reasons for the first 300."""
     rejected = sorted((link for link in links if not link.inliers), key=lambda link: -(link.candidates or 0))
     return tuple(
         (
@@ -129,7 +129,7 @@ def _rejected_pairs(links: Sequence[PairLink], values: StoredValues) -> tuple[tu
 
 
 def _judged(view: ViewSummary, shares: Mapping[str, Shares]) -> ViewSummary:
-    """Return a view with its shares of the unmasked sphere, if they were measured, in place of its pixels'."""
+    """Return a view with its shares of the unmasked sphere, if measured, instead of its shares of pixels."""
     own = shares.get(view.name)
     if own is None:
         return view

@@ -1,6 +1,6 @@
-"""What an earlier page holds, so that a run that computed nothing draws nothing again.
+"""Reuse the images and figures of an earlier page whose inputs are the same.
 
-Each picture bears a key: the digest of what it was made of. A page that was edited, or of another version, just has
+Each image has a key: the digest of its inputs. A page that was edited, or written by another version, just has
 fewer of them.
 """
 
@@ -23,7 +23,7 @@ _MAX_BYTES = 100_000_000
 
 
 class EarlierPage:
-    """The pictures and the figures of an earlier page, by key, and those that the next one is to keep."""
+    """Images and figures of an earlier page by key, and those that the next page keeps."""
 
     def __init__(self, pictures: Mapping[str, Picture] | None = None, facts: Mapping[str, Any] | None = None) -> None:
         self._pictures = dict(pictures or {})
@@ -32,7 +32,7 @@ class EarlierPage:
 
     @staticmethod
     def of_file(path: Path) -> EarlierPage:
-        """Return the pictures and figures of a page; none if there is no page, or it is from another program."""
+        """Return the images and figures of a page; nothing if there is no page, or another program wrote it."""
         try:
             text = path.read_text(encoding="utf-8") if path.stat().st_size <= _MAX_BYTES else ""
         except (OSError, UnicodeDecodeError):
@@ -43,11 +43,11 @@ class EarlierPage:
         return EarlierPage(pictures, _facts(text))
 
     def picture(self, key: str) -> Picture | None:
-        """Return a picture, None if it was not kept."""
+        """Return an image, or None if it was not kept."""
         return self._pictures.get(key)
 
     def fact(self, key: str) -> Any:
-        """Return figures, None if they were not kept; what is asked for is kept on."""
+        """Return figures and keep them for the next page; None if they were not kept."""
         if key in self._facts:
             self.facts[key] = self._facts[key]
         return self._facts.get(key)

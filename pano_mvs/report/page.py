@@ -30,10 +30,10 @@ def write_report(out_dir: Path, summary: RunSummary, values: StoredValues | None
     """Write `report.html` and return the verdict that it shows; `gather_report` and `write_page` in one step.
 
     Args:
-        out_dir: the output folder; previews are looked up below it, and the pictures of the page that is there are
-            used again if they are of the same values.
+        out_dir: the output folder; previews are read from it, and the images of an existing page are
+            reused if they show the same values.
         summary: of the run.
-        values: that the run made; None if only the summary is known.
+        values: the values of the run; None if only the summary is known.
 
     Raises:
         StoreError: if the page cannot be written.
@@ -44,7 +44,7 @@ def write_report(out_dir: Path, summary: RunSummary, values: StoredValues | None
 
 
 def gather_report(out_dir: Path, summary: RunSummary, values: StoredValues | None = None) -> Content:
-    """Return everything that the page shows; arguments as of `write_report`."""
+    """Return the content of the page; arguments as for `write_report`."""
     earlier = EarlierPage.of_file(out_dir / "report.html")
     return gather(out_dir, summary, values or StoredValues(), earlier=earlier)
 

@@ -1,4 +1,4 @@
-"""Small pictures of very many views, from the previews in the output folder, and their shares of the sphere."""
+"""Small images of many views, from the previews in the output folder, and their shares of the sphere."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _VERSION = 1
 def thumbnails(
     out_dir: Path, views: Sequence[ViewSummary], results: StoredValues, kept: EarlierPage
 ) -> dict[str, Picture]:
-    """Return image name to a small picture of its preview, of at most 1,000 views, evenly apart."""
+    """Return small images of at most 1,000 evenly spaced views, by name."""
     chosen = [views[idx] for idx in _evenly(len(views), MAX_THUMBNAILS)]
     with ThreadPoolExecutor(_THREADS) as pool:
         found = pool.map(lambda view: _thumbnail(out_dir, view, results, kept), chosen)
@@ -34,7 +34,7 @@ def thumbnails(
 
 
 def measured_shares(views: Sequence[ViewSummary], results: StoredValues, kept: EarlierPage) -> dict[str, Shares]:
-    """Return image name to its shares of the sphere, of at most 1,000 views, evenly apart; masks are not looked at."""
+    """Return the shares of the sphere of at most 1,000 evenly spaced views, by name, without considering masks."""
     found: dict[str, Shares] = {}
     for idx in _evenly(len(views), MAX_MEASURED):
         name = views[idx].name

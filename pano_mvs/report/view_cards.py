@@ -1,4 +1,4 @@
-"""The views that the page shows in full: panorama, range and confidence, one over the other."""
+"""The views that the page shows in full: panorama, range and confidence, stacked."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MAX_BYTES = 80_000
 _TICKS_APART = 0.09
 _DECODERS = 2  # a large panorama takes 100 MB while it is decoded
 _PARTS = ("panorama", "range", "confidence")
-# Confidence in colours that are apart for colour-blind eyes and in grey: low and high end of each class.
+# Colours of the low and high end of each class, distinguishable for colour-blind readers and in grey.
 _CLASSES = (
     (FILLED_CONFIDENCE, (150, 95, 160), (196, 140, 204)),
     (WEAK_CONFIDENCE, (200, 130, 20), (245, 180, 60)),
@@ -45,9 +45,9 @@ class ViewCard:
 
     Attributes:
         name: of the image.
-        pictures: what is shown → its picture: of `panorama`, `range`, `confidence` those that could be had.
+        pictures: the available images among `panorama`, `range` and `confidence`.
         shares: of the sphere, or None.
-        ticks: (share of the scale from near to far, range) of the colours of the range map.
+        ticks: (position on the colour scale from 0 to 1, range).
     """
 
     name: str
@@ -57,9 +57,9 @@ class ViewCard:
 
 
 def chosen_views(views: Sequence[ViewSummary], most: int = MAX_CARDS, *, always: Collection[str] = ()) -> list[int]:
-    """Return the positions of the views to show in full: all; of many, the least complete third and others evenly.
+    """Return the positions of the views to show in full: all, or the least complete third and evenly spaced others.
 
-    The views named in `always` come first in that third, as far as there is room.
+    The views in `always` come first in that third, as far as there is room.
     """
     everything = list(range(len(views)))
     if len(views) <= most:
@@ -73,10 +73,10 @@ def chosen_views(views: Sequence[ViewSummary], most: int = MAX_CARDS, *, always:
 def view_cards(
     out_dir: Path, views: Sequence[ViewSummary], results: StoredValues, kept: EarlierPage
 ) -> tuple[ViewCard, ...]:
-    """Return the cards of views; what an earlier page shows of the same values is taken from there.
+    """Return the cards of views, reusing images of an earlier page that show the same values.
 
     Args:
-        out_dir: the output folder, for previews that stand in for what is not in the store.
+        out_dir: the output folder, whose previews replace values that are not in the cache.
         views: of the run.
         results: the values.
         kept: the earlier page's.
@@ -91,7 +91,7 @@ def view_cards(
 
 
 def confidence_colors(confidence: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return confidence (H, W) in colours (H, W, 3) RGB: by class, brighter with more of it; invalid is grey."""
+    """Return RGB colours (H, W, 3) of confidences (H, W): a hue per class, brighter if higher; invalid is grey."""
     table = np.empty((256, 3), np.uint8)
     table[0] = _INVALID
     for (low, high), dark, bright in _CLASSES:
@@ -101,7 +101,7 @@ def confidence_colors(confidence: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def key_of(results: StoredValues, name: str, what: str, version: int) -> str:
-    """Return the key of something that is made from a view's panorama and range map; "" if it has no range map."""
+    """Return the key of an image derived from a view's panorama and range map; "" if it has no range map."""
     digest = results.digest("ranges", name)
     return f"{digest[:24]}.{results.digest('images', name)[:16]}.{what}{version}" if digest else ""
 
@@ -143,7 +143,7 @@ def _new_card(results: StoredValues, kept: EarlierPage, name: str, out_dir: Path
         fits = mask is not None and mask.shape == range_map.range.shape
         shares = shares_of(range_map.confidence, mask if fits else None)
         ticks = _ticks(near, far)
-    if stem and len(pictures) == len(_PARTS):  # what is missing may be back for the next page
+    if stem and len(pictures) == len(_PARTS):  # a missing image may be available for the next page
         kept.keep(stem, {"ticks": ticks, "shares": fact_of(shares) if shares else None})
     panels = preview_panels(out_dir, preview) if len(pictures) < len(_PARTS) else ()
     for part, panel in zip(_PARTS, panels, strict=False):
@@ -152,7 +152,7 @@ def _new_card(results: StoredValues, kept: EarlierPage, name: str, out_dir: Path
 
 
 def _ticks(near: float, far: float) -> tuple[tuple[float, float], ...]:
-    """Return where on the scale of a range map which ranges are written, so that no two overlap."""
+    """Return the ticks of the scale of a range map, spaced so that no two labels overlap."""
     found: list[tuple[float, float]] = []
     for value in scale_ticks(near, far):
         at = round(float(np.log(value / near) / np.log(far / near)), 4)
@@ -166,7 +166,7 @@ def _part(image: NDArray[np.uint8], stem: str, part: str) -> Picture:
 
 
 def _shrunk(array: NDArray[Any]) -> NDArray[Any]:
-    """Return a map at the size at which it is shown, no value of which is a mixture of others."""
+    """Return a map at its displayed size, without mixing values."""
     if array.shape[1] <= WIDTH:
         return np.ascontiguousarray(array)
     size = WIDTH, round(array.shape[0] * WIDTH / array.shape[1])

@@ -1,1 +1,1 @@
-"""What a run made: its summary (run.json), its values on demand, and a verdict on them."""
+"""The output of a run: its summary (run.json), its values, loaded on access, and the verdict."""

@@ -8,9 +8,9 @@ from typing import Any
 
 from pano_mvs.results.records import ScoresSummary
 
-# What a person looks at first; other scores follow as they come.
+# The scores to show first; others follow in their stored order.
 _FIRST = ("psnr_db", "w_mae", "w_delta_105", "median_relative_error", "completeness")
-# The figures of the scores, in words; others are spelt out from their names.
+# Labels of scores; those of others are derived from their names.
 _WORDS = {
     "psnr_db": "PSNR dB",
     "mae": "mean error",
@@ -26,7 +26,7 @@ _WORDS = {
 }
 _CONSTANTS = "best_constant_", "constant_"
 _BRACKETS = (
-    "In brackets: what one constant range for all pixels scores, the constant that is best for the very score "
+    "In brackets: the score of a single constant range, the best one for each score "
     "(in runs of earlier versions the median of the true ranges)."
 )
 _MIN_SHOWN = 0.0001
@@ -71,7 +71,7 @@ def significant(value: float, digits: int = 2) -> str:
 
 
 def figure(value: Any) -> str:
-    """Return a value with four significant digits, thousands apart."""
+    """Return a value with four significant digits and thousands separators."""
     if isinstance(value, bool) or value is None:
         return {True: "yes", False: "no", None: "–"}[value]
     if isinstance(value, int):
@@ -98,9 +98,9 @@ def words(name: str) -> str:
 
 
 def score_tables(scores: ScoresSummary) -> dict[str, Any]:
-    """Return the scores of the poses as rows, and those of the views as a table with one column for each metric.
+    """Return the scores of the poses as rows, and those of the views as a table with one column per metric.
 
-    What a constant range map scores (`best_constant_…`, or in older runs `constant_…`) stands in brackets beside.
+    The score of a constant range map (`best_constant_…`, in older runs `constant_…`) is added in brackets.
     """
     views = scores.views
     known = [metric for metric in _metrics(views) if not metric.startswith(_CONSTANTS)]
@@ -116,10 +116,10 @@ def score_tables(scores: ScoresSummary) -> dict[str, Any]:
 
 
 def side_by_side(tables: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[str, Any]:
-    """Return the medians of several branches as one table with a row for each; none where there is but one.
+    """Return a table with the medians of each branch in a row; empty if there is only one branch.
 
     Args:
-        tables: (name of a branch, what `score_tables` gave for it).
+        tables: (name of a branch, result of `score_tables`).
     """
     scored = [(name, table) for name, table in tables if table["views"]]
     if len(scored) < 2:
@@ -137,14 +137,14 @@ def _metrics(views: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 
 def _beside_constant(values: Mapping[str, Any], metric: str) -> str:
-    """Return a score, and in brackets what a constant scores where that is known."""
+    """Return a score, followed by that of a constant in brackets if known."""
     found = figure(values.get(metric))
     constant = next((values[prefix + metric] for prefix in _CONSTANTS if values.get(prefix + metric) is not None), None)
     return found if constant is None else f"{found} ({figure(constant)})"
 
 
 def median(values: list[Any]) -> float | None:
-    """Return the median of those values that are finite numbers, or None."""
+    """Return the median of the finite values, or None."""
     numbers = sorted(float(value) for value in values if _is_number(value))
     if not numbers:
         return None

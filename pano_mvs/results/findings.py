@@ -1,4 +1,4 @@
-"""What a person should know of a run before anything else: what is wrong or doubtful, and what to do about it."""
+"""Findings of a run, for the report and the terminal: what is wrong or doubtful, and what to do about it."""
 
 from __future__ import annotations
 
@@ -10,28 +10,24 @@ from pano_mvs.core.text import plural
 from pano_mvs.results.figures import figure, median, share, significant
 from pano_mvs.results.records import Finding, PoseGroup, PosesSummary
 from pano_mvs.results.summary import RunSummary
+from pano_mvs.results.thresholds import (
+    FAIR_COMPLETE,
+    FAIR_CONSISTENT,
+    FAIR_REGISTERED,
+    FAIR_RESIDUAL_PX,
+    FAIR_UNDOUBTED,
+    GOOD_COMPLETE,
+    GOOD_CONSISTENT,
+    GOOD_REGISTERED,
+    GOOD_RESIDUAL_PX,
+    mood_of,
+)
 
-GOOD_REGISTERED, FAIR_REGISTERED = 0.95, 0.5
-# Residuals are compared with a pixel of the panorama: what is measured to within one is measured well.
-GOOD_RESIDUAL_PX, FAIR_RESIDUAL_PX = 1.0, 2.0
-# A sky takes up to half of the sphere, so it is not for much less that a result is bad.
-GOOD_COMPLETE, FAIR_COMPLETE = 0.8, 0.35
-# Plain walls are confirmed by nobody: a third of a furnished room is as much as can be had.
-GOOD_CONSISTENT, FAIR_CONSISTENT = 0.3, 0.12
 _FEW_LINKS = 2
 _SHOWN_GROUPS = 5
 _SHOWN_DOUBTS = 5
-# A model more than half of whose cameras are doubtful is not to be relied on.
-FAIR_UNDOUBTED = 0.5
 _NAMES_AND_FIGURES = re.compile(r"\d+([.,]\d+)?|'[^']*'")
-_ENDINGS = re.compile(r"\b(is|are)\b|(?<=\w)e?s\b")  # by which one and several differ
-
-
-def mood_of(value: float, good: float, fair: float) -> str:
-    """Return "good", "fair" or "bad": limits that fall from good to fair are lower ones, else upper ones."""
-    if good > fair:
-        return "good" if value >= good else "fair" if value >= fair else "bad"
-    return "good" if value <= good else "fair" if value <= fair else "bad"
+_ENDINGS = re.compile(r"\b(is|are)\b|(?<=\w)e?s\b")  # endings that differ between singular and plural
 
 
 def findings(summary: RunSummary, *, residual_px: float | None = None) -> tuple[Finding, ...]:
@@ -64,12 +60,12 @@ def _stopped(summary: RunSummary) -> list[Finding]:
         return [
             Finding(
                 "fair",
-                "The run was interrupted: what is shown is what it had finished.",
-                "Run the same command again; what is finished is not computed again.",
+                "The run was interrupted. This report shows what it had finished.",
+                "Run the same command again to continue.",
             )
         ]
     stopped = stopped if stopped.endswith((".", "!", "?")) else f"{stopped}."
-    return [Finding("bad", f"The run stopped early: {stopped}", "Mend this and run the same command again.")]
+    return [Finding("bad", f"The run stopped early: {stopped}", "Correct this and run the same command again.")]
 
 
 def _failures(summary: RunSummary) -> list[Finding]:
@@ -80,7 +76,9 @@ def _failures(summary: RunSummary) -> list[Finding]:
     where = ", ".join(f"{count} in {stage}" for stage, count in stages.most_common(3))
     more = f"; {_units(len(blocked))} could not run because of {plural(len(failures), 'it', 'them')}" if blocked else ""
     verb = plural(len(failures), "unit of work failed", "units of work failed")
-    return [Finding("fair", f"{figure(len(failures))} {verb} ({where}){more}.", "Each is listed with its cause.")]
+    return [
+        Finding("fair", f"{figure(len(failures))} {verb} ({where}){more}.", "The report lists each with its cause.")
+    ]
 
 
 def _registration(summary: RunSummary) -> list[Finding]:
@@ -99,7 +97,7 @@ def _registration(summary: RunSummary) -> list[Finding]:
         Finding(
             mood,
             text,
-            "Take more pictures between those, 0.5–1 m apart indoors, each seeing much of what the next one sees.",
+            "Take more panoramas between these, 0.5–1 m apart indoors, so that consecutive ones overlap well.",
         )
     ]
 
@@ -123,7 +121,7 @@ def _doubts(summary: RunSummary) -> list[Finding]:
         Finding(
             mood,
             f"{count}: {'; '.join(reasons[:_SHOWN_DOUBTS])}{more}.",
-            f"Take panoramas between {them} neighbours, with things in view that occur only once, or leave "
+            f"Take panoramas between {them} neighbours that show something unique, or leave "
             f"{plural(len(reasons), 'it', 'these images')} out.",
         )
     ]
@@ -150,7 +148,7 @@ def _named(group: PoseGroup) -> str:
 
 
 def pictures_between(groups: Sequence[PoseGroup]) -> str:
-    """Return which images to take so that the smaller groups join the largest one, the first of two or more."""
+    """Return between which images to take more, to connect smaller groups to the largest one, which is the first."""
     found = []
     for pair in (group.nearest_pair for group in groups[1:]):
         if pair:
@@ -162,13 +160,13 @@ def pictures_between(groups: Sequence[PoseGroup]) -> str:
             )
             found.append(f"{pair.first} and {pair.second} ({known})")
     if not found:
-        return "Take pictures between the groups, 0.5–1 m apart, and compare them with both."
+        return "Take panoramas between the groups, 0.5–1 m apart, so that they overlap both."
     more = " …" if len(found) > _SHOWN_GROUPS else ""
-    return f"To join them take pictures between {'; between '.join(found[:_SHOWN_GROUPS])}{more}."
+    return f"To connect them, take panoramas between {'; between '.join(found[:_SHOWN_GROUPS])}{more}."
 
 
 def _commonest(reasons: Sequence[str]) -> str:
-    """Return the reason that is given most often, whatever the figures and names in it, and how often it is."""
+    """Return the most frequent reason, ignoring figures and names in it, and its frequency."""
     kinds = [_ENDINGS.sub("", _NAMES_AND_FIGURES.sub("…", reason)) for reason in reasons]
     ((kind, count),) = Counter(kinds).most_common(1)
     example = reasons[kinds.index(kind)]
@@ -190,8 +188,8 @@ def _graph(summary: RunSummary) -> list[Finding]:
     return [
         Finding(
             mood,
-            f"{len(loose)} {sharing} a verified geometry with one other alone ({shown}): unless their "
-            "poses were given, nothing confirms them.",
+            f"{len(loose)} {sharing} a verified geometry with only one other camera ({shown}): unless their "
+            "poses come from a file, nothing confirms them.",
         )
     ]
 
@@ -199,19 +197,19 @@ def _graph(summary: RunSummary) -> list[Finding]:
 def _residual(residual_px: float | None) -> list[Finding]:
     if residual_px is None or (mood := mood_of(residual_px, GOOD_RESIDUAL_PX, FAIR_RESIDUAL_PX)) == "good":
         return []
-    text = f"The points miss the pictures by {significant(residual_px)} pixels in the median: the poses are not sharp."
+    text = f"The median reprojection residual is {significant(residual_px)} pixels: the poses are imprecise."
     return [
         Finding(
             mood,
             text,
-            "Check that the pictures are sharp, unstitched seams aside, and not edited one by one; "
-            "put poses.refine behind the solver if it is not there.",
+            "Check that the images are sharp, well stitched, and not edited individually; "
+            "add poses.refine after the solver if it is missing.",
         )
     ]
 
 
 def compares_views(summary: RunSummary) -> bool:
-    """Return whether any stage compared the views: where none did, no pixel is confirmed, and that says nothing."""
+    """Return whether any stage compared the views; otherwise, no pixel can be confirmed."""
     compared = any("consistency" in stage.use for stage in summary.stages)
     return compared or any(view.consistent for view in summary.views)
 
@@ -225,15 +223,15 @@ def _views(summary: RunSummary) -> list[Finding]:
             Finding(
                 mood,
                 f"Half of the views have a range for less than {share(complete)} of their pixels.",
-                "Sky and masks have none; elsewhere look at the views in the report.",
+                "Sky and masked areas have none; for other areas, look at the views in the report.",
             )
         )
     if consistent is not None and not compares_views(summary):
         found.append(
             Finding(
                 "",
-                "No stage compared the views with each other, so nothing is known of their agreement.",
-                "filters.consistency does it.",
+                "No stage compared the views with each other, so it is unknown whether they agree.",
+                "Add filters.consistency.",
             )
         )
     elif consistent is not None and (mood := mood_of(consistent, GOOD_CONSISTENT, FAIR_CONSISTENT)) != "good":
@@ -241,7 +239,7 @@ def _views(summary: RunSummary) -> list[Finding]:
             Finding(
                 mood,
                 f"Other views confirm only {share(consistent)} of the pixels in the median view.",
-                "Plain walls cannot be confirmed; if textured ones are not either, the cameras are too "
+                "Plain walls cannot be confirmed. If textured surfaces are not confirmed either, the cameras are too "
                 "far apart or the poses are wrong.",
             )
         )
@@ -254,22 +252,22 @@ def _cloud(summary: RunSummary) -> list[Finding]:
             Finding(
                 "bad",
                 "The cloud has no points: no two views agree on any surface.",
-                "Look at the ranges in the report; if they are right, the poses are wrong.",
+                "Look at the range maps in the report: if they look right, the poses are wrong.",
             )
         ]
     return []
 
 
 def _baseline(summary: RunSummary) -> list[Finding]:
-    """Return whether a constant range would have scored as well."""
+    """Return a finding for each branch that scores no better than a constant range."""
     found = []
     for stage, scores in summary.scores_by_stage.items():
         views = scores.views.values()
         ours = median([view.get("psnr_db") for view in views])
         constant = median([view.get("best_constant_psnr_db", view.get("constant_psnr_db")) for view in views])
         if ours is not None and constant is not None and ours <= constant:
-            text = f"Against the truth ({stage}), one constant range for all pixels does as well"
-            found.append(Finding("bad", f"{text}: {ours:z.1f} dB to {constant:z.1f} dB."))
+            text = f"Compared with the ground truth ({stage}), a single constant range scores at least as well"
+            found.append(Finding("bad", f"{text}: {constant:z.1f} dB, against {ours:z.1f} dB."))
     return found
 
 

@@ -19,7 +19,7 @@ _COLORS = {"good": "#1a7f37", "fair": "#9a6700", "bad": "#cf222e", "": "inherit"
 
 
 def run_html(run: RunOutput) -> str:
-    """Return the verdict, pictures of some views, and a table of the stages; without references to other files."""
+    """Return the verdict, images of some views, and a table of the stages, as self-contained HTML."""
     verdict = run.verdict
     title = f"<b>{_text(run.summary.workflow.name or 'pano-mvs')}</b>: {_text(verdict.outcome)}."
     judgement = f'<b style="color:{_COLORS[verdict.mood]}">{_text(verdict.judgement)}</b>'

@@ -1,4 +1,4 @@
-"""Pictures that are embedded in a page: JPEG with a limited size, as data URIs."""
+"""Images embedded in a page: JPEG files of limited size, as data URIs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Picture:
     Attributes:
         uri: `data:image/jpeg;base64,…`.
         size_hw: (height, width) in pixels.
-        key: under which a later page finds it again; "" if it never does.
+        key: by which a later page can reuse it; "" if it cannot.
     """
 
     uri: str
@@ -33,12 +33,12 @@ class Picture:
 
 
 def picture(image: NDArray[np.uint8], *, width: int, most_bytes: int, key: str = "") -> Picture:
-    """Return an image as JPEG: first with a lower quality, then smaller, until it takes no more than its share.
+    """Return an image as JPEG, reducing its quality and then its size until it fits into `most_bytes`.
 
     Args:
         image: (H, W, 3) uint8 RGB.
         width: in pixels, at most.
-        most_bytes: of the JPEG, before it is written as text.
+        most_bytes: of the JPEG, before base64 encoding.
         key: see `Picture`.
     """
     shown = resized(image, width)
@@ -67,7 +67,7 @@ def preview_panels(out_dir: Path, relative: str, *, small: bool = False) -> tupl
     Args:
         out_dir: the output folder, outside of which nothing is read.
         relative: the preview's path below it.
-        small: an eighth of the size, which is decoded sooner.
+        small: decode at an eighth of the size, which is faster.
     """
     path = resolved(out_dir / relative)
     if not relative or not path.is_relative_to(resolved(out_dir)) or not is_file(path):
@@ -78,6 +78,6 @@ def preview_panels(out_dir: Path, relative: str, *, small: bool = False) -> tupl
         return ()
     rgb: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
     height = rgb.shape[1] // 2
-    # Between them is a white line; below is the scale.
+    # They are separated by a white line; the scale is below.
     start = height if small else height + _LINE_PX
     return rgb[:height], rgb[start : start + height]

@@ -1,4 +1,4 @@
-"""The parts of run.json as frozen records; `pano_mvs.results.summary` has the whole.
+"""The parts of run.json as frozen records; `pano_mvs.results.summary` combines them.
 
 Every field has a default, so that a file of an earlier version, or one that was shortened by hand, can be read.
 """
@@ -311,12 +311,12 @@ class Tile:
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that the user should know of a run.
+    """A finding about a run.
 
     Attributes:
-        mood: "bad" or "fair"; "" for a mere note.
+        mood: "bad" or "fair"; "" for a note.
         text: what it is.
-        remedy: what to do about it; "" if nothing.
+        remedy: what to do about it, or "".
     """
 
     mood: str
@@ -326,12 +326,12 @@ class Finding:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether the result of a run can be relied on.
+    """Whether the result of a run is reliable.
 
     Attributes:
         mood: "good", "fair" or "bad".
         outcome: how the run ended.
-        judgement: whether the result can be relied on, in a sentence; empty if there is nothing to judge.
+        judgement: whether the result is reliable, in a sentence; empty if there is nothing to judge.
         sentence: what was done, in one sentence.
         tiles: the headline figures.
         findings: what is wrong or doubtful, the worst first.

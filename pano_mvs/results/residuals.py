@@ -1,4 +1,4 @@
-"""How far points lie from where they were seen, in degrees: over all, and view by view."""
+"""Reprojection residuals of the points in degrees, over all views and for each view."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ _BINS = 30
 
 @dataclass(frozen=True)
 class Histogram:
-    """Counts over equally wide bins, the last of which takes all that is larger.
+    """Counts over bins of equal width, the last of which includes all larger values.
 
     Attributes:
         counts: of each bin.
-        upper_deg: where the last bin would end if it took no more than the others.
+        upper_deg: nominal end of the last bin.
         median_deg: of all values.
         p95_deg: 95 % are smaller.
         total: number of values.
@@ -49,7 +49,7 @@ class Residuals:
     Attributes:
         overall: of all observations.
         views: image name to (median, 95 % quantile) in degrees and the number of observations.
-        sampled: whether only some of the observations were looked at, evenly apart.
+        sampled: whether only evenly spaced observations were used.
     """
 
     overall: Histogram
@@ -58,13 +58,13 @@ class Residuals:
 
 
 def histogram(values_deg: Sequence[float] | FloatArray) -> Histogram | None:
-    """Return the histogram of values, None if there are none; values that are no numbers do not count."""
+    """Return the histogram of the finite values, or None if there are none."""
     values = np.asarray(values_deg, np.float64)
     values = values[np.isfinite(values)]
     if not len(values):
         return None
     median, p95, p98 = (float(value) for value in np.quantile(values, [0.5, 0.95, 0.98]))
-    upper = _round_up(max(1.01 * p98, 1e-6))  # so that the last column is for what is larger alone
+    upper = _round_up(max(1.01 * p98, 1e-6))  # so that only larger values are in the last column
     counts = np.bincount((values / upper * _BINS).astype(np.int64).clip(0, _BINS - 1), minlength=_BINS)
     return Histogram(tuple(map(int, counts)), upper, median, p95, len(values))
 
@@ -72,7 +72,7 @@ def histogram(values_deg: Sequence[float] | FloatArray) -> Histogram | None:
 def reprojection_residuals(poses: Poses) -> Residuals | None:
     """Return the angles between the rays of all tracks and those to their points; None if there are no tracks.
 
-    Of more than two million observations, that many, evenly apart, are looked at.
+    At most two million evenly spaced observations are used.
     """
     total = len(poses.track_point_idx)
     if not total:
@@ -95,7 +95,7 @@ def reprojection_residuals(poses: Poses) -> Residuals | None:
 
 
 def _residuals_deg(poses: Poses, step: int) -> FloatArray:
-    """Return the residual of every step-th observation, in blocks: each needs a rotation of its own."""
+    """Return the residual of every step-th observation, computed in blocks to limit memory."""
     point_idx, image_idx = poses.track_point_idx[::step], poses.track_image_idx[::step]
     bearings = poses.track_bearings[::step]
     found = np.empty(len(point_idx))

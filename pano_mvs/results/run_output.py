@@ -1,4 +1,4 @@
-"""The output of a run as Python objects, which are loaded when they are asked for."""
+"""The output of a run as Python objects, which are loaded on first access."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from pano_mvs.scene.pose_groups import join_groups
 
 
 class RunOutput:
-    """What a run made: a summary, and the poses, range maps and cloud on demand.
+    """The output of a run: its summary, and poses, range maps and cloud, loaded on access.
 
-    Values come from the cache of the run. Where that is gone they come from the files in the output folder, if the
-    workflow exports them. None stands for a value that the run does not have.
+    Values are loaded from the cache of the run or, if it was deleted, from the files in the output folder, if the
+    workflow exports them. Values that the run did not produce are None.
 
     Attributes:
         out: the output folder.
@@ -47,7 +47,7 @@ class RunOutput:
 
     @cached_property
     def verdict(self) -> Verdict:
-        """Whether the result can be relied on."""
+        """Whether the result is reliable, with the findings of the report."""
         return self.summary.verdict or verdict(self.summary)
 
     @property
@@ -91,14 +91,14 @@ class RunOutput:
 
 
 class Views(Mapping[str, "RunView"]):
-    """The views of a run, by the names of their images. A view loads its arrays when they are asked for."""
+    """The views of a run, by the names of their images. Their arrays are loaded on access."""
 
     def __init__(self, run: RunOutput) -> None:
         self._run = run
         self._summaries = {view.name: view for view in run.summary.views}
 
     def __getitem__(self, name: str) -> RunView:
-        """Return the view of an image; a new one each time, so that arrays are freed with it."""
+        """Return the view of an image, a new object each time, so that its arrays are freed with it."""
         return RunView(self._run, self._summaries[name])
 
     def __iter__(self) -> Iterator[str]:
@@ -120,7 +120,7 @@ class RunView:
 
     Attributes:
         name: of the image.
-        summary: what run.json says of the view.
+        summary: the entry of the view in run.json.
     """
 
     def __init__(self, run: RunOutput, summary: ViewSummary) -> None:
@@ -134,7 +134,7 @@ class RunView:
 
     @cached_property
     def range_map(self) -> NDArray[np.float32] | None:
-        """Distances along the rays of the pixels, (H, W) float32 in scene units; NaN where there is none."""
+        """Distances along the rays of the pixels, (H, W) float32 in scene units; NaN is invalid."""
         if self._record is not None:
             return self._record.range
         path = self._exported("range", ".tiff")
@@ -142,7 +142,7 @@ class RunView:
 
     @cached_property
     def confidence(self) -> NDArray[np.uint8] | None:
-        """Confidence of the ranges, (H, W) uint8: 0 none, 1–63 interpolated, 64–127 weak, 128–255 confirmed."""
+        """Confidence of the ranges, (H, W) uint8: 0 invalid, 1–63 filled, 64–127 weak, 128–255 confirmed."""
         if self._record is not None:
             return self._record.confidence
         path = self._exported("confidence", ".png")

@@ -1,4 +1,4 @@
-"""The values that a run left in the cache. Nothing is computed again; what is gone is missing."""
+"""The values of a run in the cache. Nothing is recomputed; deleted values are missing."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class StoredValues:
     """The values of one run.
 
     Attributes:
-        store: the cache; None if it is not known or gone.
+        store: the cache; None if it is unknown or was deleted.
         refs: role to item to the stored value; see `ROLES`. The only item of a role such as `poses` is called "".
-        notes: what could not be read, and why; grows with each value that is asked for.
+        notes: values that could not be read, with the reason; grows as values are loaded.
     """
 
     store: Store | None = None
@@ -39,7 +39,7 @@ class StoredValues:
 
     @staticmethod
     def of_run(run: Run, stages: Mapping[str, str]) -> StoredValues:
-        """Return what a run in this process made.
+        """Return the values of a run in this process.
 
         Args:
             run: the run, finished or not.
@@ -50,7 +50,7 @@ class StoredValues:
 
     @staticmethod
     def of_folder(out: Path, summary: RunSummary, store: Store) -> StoredValues:
-        """Return what the latest run into a folder made, by the cache's list of runs.
+        """Return the values of the latest run into a folder, using the list of runs in the cache.
 
         Args:
             out: the output folder.
@@ -63,10 +63,10 @@ class StoredValues:
         own = str(resolved(out))
         entry = next((run for run in store.runs.entries() if run.out == own and not run.pinned), None)
         if entry is None:
-            return StoredValues(notes=[f"the cache {store.root} knows no run into {out}, so pictures are missing"])
+            return StoredValues(notes=[f"the cache {store.root} contains no run into {out}, so images are missing"])
         stages = {role: stage for role, stage in summary.results.items() if role in ROLES}
         if not stages:
-            note = "run.json is of an earlier version and names no results: run again to see pictures"
+            note = "run.json was written by an earlier version and lists no results: run again to see images"
             return StoredValues(notes=[note])
         refs = {role: _Recorded(store, entry.keys.get(stage, {})) for role, stage in stages.items()}
         _find_images(store, summary, refs.get("images", {}))
@@ -74,7 +74,7 @@ class StoredValues:
 
     @property
     def poses(self) -> Poses | None:
-        """The poses that the ranges were made with."""
+        """The poses with which the ranges were computed."""
         return self._load("poses", "", Poses)
 
     @property
@@ -83,7 +83,7 @@ class StoredValues:
         return self._load("cloud", "", PointCloud)
 
     def panorama(self, name: str) -> Panorama | None:
-        """Return a panorama, whose picture is decoded on demand."""
+        """Return a panorama, whose pixels are decoded on access."""
         return self._load("images", name, Panorama)
 
     def range_map(self, name: str) -> RangeMap | None:
@@ -96,12 +96,12 @@ class StoredValues:
         return part if isinstance(part, np.ndarray) else None
 
     def pair_reason(self, name: str) -> str:
-        """Return why a pair has no general geometry, "" if that is not known."""
+        """Return why a pair has no two-view geometry, or "" if unknown."""
         meta = self._part("pairs", name, "meta")
         return str(meta.get("reason", "")) if isinstance(meta, dict) else ""
 
     def digest(self, role: str, name: str = "") -> str:
-        """Return the digest of a value, "" if there is none."""
+        """Return the digest of a value, or "" if there is none."""
         ref = self.refs.get(role, {}).get(name)
         return ref.digest if ref is not None else ""
 
@@ -128,7 +128,7 @@ class StoredValues:
 
 
 class _Recorded(Mapping[str, ItemRef]):
-    """Item to its stored value, whose record is read when it is asked for: the page shows few of many pairs."""
+    """Item to its stored value, whose record is read on access, because the page shows only few of many pairs."""
 
     def __init__(self, store: Store, keys: Mapping[str, str]) -> None:
         self._store = store

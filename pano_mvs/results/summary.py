@@ -1,4 +1,4 @@
-"""The summary of a run, which is what run.json holds."""
+"""The summary of a run, which is the content of run.json."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class RunSummary(Entry):
         executor: its name, number of workers, and threads of each.
         seconds: that the run took; None if it is not known.
         exit_code: 0 finished; 1 internal error; 2 unusable workflow or input; 3 finished with failed or doubtful items;
-            4 stopped by a quality threshold or a guard; 130 interrupted.
+            4 stopped by a quality threshold or a safety check; 130 interrupted.
         stopped: why the run ended early; empty if it did not.
         units: number of units, by outcome.
         stages: those that began, in the order of the workflow.
@@ -65,14 +65,14 @@ class RunSummary(Entry):
         results: role (`images`, `pairs`, `poses`, `ranges`, `cloud`) to the stage that made the final values.
         poses: the cameras.
         scores: of the first stage that compares with the ground truth.
-        all_scores: stage to scores, if several branches were compared.
+        all_scores: scores by stage, if several branches were compared.
         views: the final range maps.
         cloud: the fused cloud.
         workflow_text: the workflow as it was read.
         versions: library to version.
         files: file in the output folder to its digest.
-        left_over: files of earlier runs that this one did not write and that are still there, likewise.
-        verdict: whether the result can be relied on; None if the run ended before it could be judged.
+        left_over: existing files of earlier runs that this run did not write, with their digests.
+        verdict: whether the result is reliable; None if the run ended before it could be judged.
     """
 
     schema_version: int = Field(default=SCHEMA, alias="schema")
@@ -107,7 +107,7 @@ class RunSummary(Entry):
 
     @staticmethod
     def from_json(value: object) -> RunSummary:
-        """Return the summary that `to_json` gave; fields that are missing or null have their defaults.
+        """Return the summary from the value of `to_json`; missing or null fields have their defaults.
 
         Raises:
             InputError: if it is not the content of a run.json.
@@ -132,13 +132,13 @@ class RunSummary(Entry):
         except OSError as error:
             raise InputError(f"{path} cannot be read ({error.strerror}). Give the output folder of a run") from error
         except (ValueError, RecursionError) as error:
-            raise InputError(f"{path} is no run.json ({error}). Run the workflow again to replace it") from error
+            raise InputError(f"{path} is not a valid run.json ({error}). Run the workflow again") from error
         if not isinstance(value, Mapping) or not isinstance(value.get("stages"), list):
-            raise InputError(f"{path} is no run.json. Run the workflow again to replace it")
+            raise InputError(f"{path} is not a run.json. Run the workflow again")
         try:
             return RunSummary.from_json(value)
         except InputError as error:
-            raise InputError(f"{path} is no run.json ({error}). Run the workflow again to replace it") from error
+            raise InputError(f"{path} is not a valid run.json ({error}). Run the workflow again") from error
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of run.json, as values that `json.dumps` takes."""
@@ -162,7 +162,7 @@ class RunSummary(Entry):
 
     @property
     def scores_by_stage(self) -> Mapping[str, ScoresSummary]:
-        """The scores of every branch that has some, by the stage that scored it."""
+        """The scores of each branch, by the stage that computed them."""
         return self.all_scores or ({"scores": self.scores} if self.scores else {})
 
     @property

@@ -1,4 +1,4 @@
-"""What a reader wants to know first: did it work, for how much of the capture, and how well."""
+"""The verdict of a run: how it ended, whether the result is reliable, and its main figures."""
 
 from __future__ import annotations
 
@@ -6,7 +6,11 @@ from collections.abc import Collection
 
 from pano_mvs.core.text import plural
 from pano_mvs.results.figures import degrees, figure, median, share, significant
-from pano_mvs.results.findings import (
+from pano_mvs.results.findings import compares_views, doubt_mood, findings
+from pano_mvs.results.records import Tile, Verdict
+from pano_mvs.results.residuals import Residuals
+from pano_mvs.results.summary import RunSummary
+from pano_mvs.results.thresholds import (
     FAIR_COMPLETE,
     FAIR_CONSISTENT,
     FAIR_REGISTERED,
@@ -15,14 +19,8 @@ from pano_mvs.results.findings import (
     GOOD_CONSISTENT,
     GOOD_REGISTERED,
     GOOD_RESIDUAL_PX,
-    compares_views,
-    doubt_mood,
-    findings,
     mood_of,
 )
-from pano_mvs.results.records import Tile, Verdict
-from pano_mvs.results.residuals import Residuals
-from pano_mvs.results.summary import RunSummary
 
 _SOME_FAILED, _INTERRUPTED = 3, 130
 _OUTCOMES = {
@@ -30,7 +28,7 @@ _OUTCOMES = {
     1: ("bad", "Stopped by an internal error"),
     2: ("bad", "Stopped: the workflow or an input cannot be used"),
     _SOME_FAILED: ("fair", "Finished, with failed items"),
-    4: ("bad", "Stopped by a quality threshold or a guard"),
+    4: ("bad", "Stopped by a quality threshold or a safety check"),
     _INTERRUPTED: ("fair", "Interrupted"),
 }
 _JUDGEMENTS = {
@@ -42,7 +40,7 @@ _JUDGEMENTS = {
 
 
 def verdict(summary: RunSummary, *, residuals: Residuals | None = None, image_width: int | None = None) -> Verdict:
-    """Return the verdict on a run; figures that are not known are left out.
+    """Return the verdict on a run; unknown figures are left out.
 
     Args:
         summary: of the run.
@@ -80,13 +78,13 @@ def _worst(moods: Collection[str]) -> str:
 def _sentence(summary: RunSummary) -> str:
     run, cached, failed = (sum(getattr(s, key) for s in summary.stages) for key in ("run", "cached", "failed"))
     if not run + cached + failed:
-        return "No unit of work was due."
+        return "There was nothing to compute."
     parts = [f"{figure(run)} computed", f"{figure(cached)} taken from the cache"]
     if failed:
         parts.append(f"{figure(failed)} failed")
     if not run and not failed:
         units = plural(cached, "the one unit of work was", f"all {figure(cached)} units of work were")
-        return f"Nothing had changed: {units} taken from the cache."
+        return f"Nothing has changed: {units} taken from the cache."
     total = run + cached + failed
     return f"{figure(total)} {plural(total, 'unit of work', 'units of work')}: {', '.join(parts)}."
 
@@ -132,14 +130,14 @@ def _cloud(summary: RunSummary) -> list[Tile]:
 
 
 def _accuracy(summary: RunSummary) -> list[Tile]:
-    """Return how far the result is from the truth, where that is known."""
+    """Return the errors against ground truth, if known."""
     scores = summary.scores
     tiles = []
     error_deg = median([scores.poses.get("median_pair_error_deg")])
     if error_deg is not None:
-        tiles.append(Tile(degrees(error_deg), "median pose error against the truth"))
+        tiles.append(Tile(degrees(error_deg), "median pose error against the ground truth"))
     errors = [view.get("median_relative_error") for view in scores.views.values()]
     relative = median(errors)
     if relative is not None:
-        tiles.append(Tile(f"{significant(100 * relative)} %", "median range error against the truth"))
+        tiles.append(Tile(f"{significant(100 * relative)} %", "median range error against the ground truth"))
     return tiles

@@ -41,7 +41,7 @@ def decode_mask(path: Path, data: bytes | None = None) -> Mask:
         data = FilePart(path).read_bytes()
     picture = decode_picture(data, path, cv2.IMREAD_UNCHANGED)
     if picture is None:
-        raise InputError(f"{path}: the mask is not a picture that can be decoded ({len(data)} bytes). Save it as PNG")
+        raise InputError(f"{path}: the mask is not an image that can be decoded ({len(data)} bytes). Save it as PNG")
     channels = np.atleast_3d(picture)
     has_alpha = channels.shape[2] in (2, 4)
     colors = channels[..., :-1] if has_alpha else channels

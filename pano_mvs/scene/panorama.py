@@ -132,7 +132,9 @@ class Panorama(Record):
             further if further.shape == self.size_hw else self._placed(further, "a stage's mask")
         )
         if self.crop_ltwh is not None and same_shape(self.size_hw, (self.crop_ltwh[3], self.crop_ltwh[2])):
-            height, width = whole = self.source_size_hw  # at working resolution it would be taken for the crop's
+            height, width = whole = (
+                self.source_size_hw
+            )  # at working resolution, its size could be confused with that of the crop
             keep = placed_mask(keep, whole, of=(0, 0, width, height), whole_hw=whole)
         path = folder / f"{self.image.path.stem}.mask.png"
         write_png(path, np.where(keep, np.uint8(255), np.uint8(0)))
@@ -158,8 +160,8 @@ class Panorama(Record):
         else:
             of = f"{width}×{height} px" if crop == sphere else f"a part of {crop[2]}×{crop[3]} px of {width}×{height}"
             raise InputError(
-                f"{what} has {size[1]}×{size[0]} px, which is the shape neither of the full sphere nor of the picture "
-                f"({self.image.path.name}, {of}). Draw it over the picture itself; its resolution does not matter"
+                f"{what} has {size[1]}×{size[0]} px, which is the shape neither of the full sphere nor of the image "
+                f"({self.image.path.name}, {of}). Draw it over the image itself; its resolution does not matter"
             )
         return placed_mask(mask, self.size_hw, of=covered, whole_hw=self.source_size_hw)
 

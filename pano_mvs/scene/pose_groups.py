@@ -13,7 +13,7 @@ from pano_mvs.core.errors import UsageError
 from pano_mvs.scene.poses import Pose, Poses
 
 _PER_CAMERA = ("center_stds", "rotation_stds_rad", "confirmed_shares", "expected_shares")
-ALONE = "no other picture shares its frame, so that its position is meaningless"
+ALONE = "no other image shares its frame, so its position is meaningless"
 
 
 def split_groups(poses: Poses) -> list[Poses]:

@@ -33,7 +33,7 @@ class Pose(Record):
         require(self.group >= 0, self, "the number of the group is negative")
         rotation = self.cam_from_world.rotation
         require(bool(np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)), self, "the rotation is not orthonormal")
-        require(bool(np.linalg.det(rotation) > 0), self, "the rotation mirrors (its determinant is negative)")
+        require(bool(np.linalg.det(rotation) > 0), self, "the rotation is a reflection (its determinant is negative)")
         require(bool(np.isfinite(self.cam_from_world.translation).all()), self, "the translation is not finite")
 
     def to_parts(self) -> Parts:

@@ -75,7 +75,7 @@ Parts: TypeAlias = Mapping[str, Part]
 
 def vanished_text(path: Path) -> str:
     """Return the message about a user's file that can no longer be read after the run listed it."""
-    return f"{path} vanished during the run, or may not be read any more; put it back, or run again without it"
+    return f"{path} was removed during the run, or is no longer readable; restore it, or run again without it"
 
 
 class Record:

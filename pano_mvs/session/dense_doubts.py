@@ -1,4 +1,4 @@
-"""Judge the poses of a finished run by its dense results, whichever stages made them."""
+"""Judge the poses of a finished run by its range maps, whichever stages computed them."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ _FIGURES = tuple(Agreement.__dataclass_fields__)
 
 
 def add_dense_doubts(run: Run) -> None:
-    """Add to a run's result the views that the others contradict; a run with any ends with exit code 3.
+    """Mark views that other views contradict as doubtful, so that the run ends with exit code 3.
 
-    What counts are the figures of `Agreement` that the last stage of the range maps reports which has them;
+    The figures of `Agreement` are used from the last stage of the range maps that reports them;
     filters.consistency does. Cameras that are doubted already keep their reason.
     """
     poses = latest(run, Poses)

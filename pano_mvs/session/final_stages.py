@@ -1,4 +1,4 @@
-"""Which stages of a run made its final values: the last of the stages that make a kind of value one from the other."""
+"""Find the stages that produced the final values of a run: the last of a chain of stages of the same kind."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _Kind = TypeVar("_Kind", bound=Record)
 
 
 def chain_of(workflow: Workflow, graph: Graph, kind: type[Record]) -> list[str]:
-    """Return the stages that make a kind of value one from the other, beginning with the first of the workflow.
+    """Return the chain of stages that produce a kind of value from one another, starting with the first.
 
     A stage that does not depend on the first, such as a second sweep beside it, is on another branch and not included.
     """
@@ -39,7 +39,7 @@ def chain_of(workflow: Workflow, graph: Graph, kind: type[Record]) -> list[str]:
 
 
 def latest(run: Run, kind: type[_Kind]) -> _Kind | None:
-    """Return the value of a kind that the last stage of the first chain made in this run; None if none did."""
+    """Return the value of a kind from the last stage of the first chain that produced one, or None."""
     for name in reversed(chain_of(run.workflow, run.graph, kind)):
         value = run.load(name, kind)
         if isinstance(value, kind):

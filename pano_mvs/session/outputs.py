@@ -1,4 +1,4 @@
-"""What a run writes about itself into its output folder, however it ended: run.json and the report."""
+"""Write run.json and the report of a run into its output folder, however it ended."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def set_aside_foreign_files(out: Path) -> None:
 
 
 def earlier_files(out: Path) -> dict[str, str]:
-    """Return file to digest of what an earlier run wrote into a folder; empty if that is not known."""
+    """Return the files that an earlier run wrote into a folder, with their digests; empty if unknown."""
     try:
         last = json.loads((out / RUN_JSON).read_bytes())
         files = {**last["files"], **last.get("left_over", {})}
@@ -73,7 +73,7 @@ def write_outputs_after_error(run: Run, error: BaseException, *, started: dateti
     try:
         write_outputs(run, started=started, clock=clock)
     except (PanoMvsError, OSError) as second:
-        error.add_note(f"Nor could the report be written: {second}")
+        error.add_note(f"The report could not be written either: {second}")
 
 
 def _reason(error: BaseException) -> str:

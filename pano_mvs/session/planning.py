@@ -1,4 +1,4 @@
-"""What a run would compute, without computing it."""
+"""Plan a run: what it would compute, without computing it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pano_mvs.session.settings import overrides_from_settings
 
 @dataclass(frozen=True, slots=True)
 class RunPlan:
-    """What a run would do.
+    """What a run would compute.
 
     Attributes:
         stages: in the order of the workflow.
@@ -42,7 +42,7 @@ class RunPlan:
 
     @property
     def may_follow(self) -> bool:
-        """Whether more units may have to be computed, depending on the results of those."""
+        """Whether more units may have to be computed, depending on their results."""
         return any(plan.may_run or plan.open for plan in self.stages)
 
 
@@ -62,7 +62,7 @@ def plan(
 
     >>> import pano_mvs
     >>> plan = pano_mvs.plan("quickstart", out="out", settings={"depth.planes": 192})
-    >>> list(plan["depth"].run)  # after the run of `pano_mvs.run`'s example, which had other planes
+    >>> list(plan["depth"].run)  # after the example of `pano_mvs.run`, which has other planes
     ['000.png', '001.png', '002.png', '003.png']
 
     Raises:
@@ -94,7 +94,7 @@ def plan_session(session: Session) -> RunPlan:
 
 @contextmanager
 def without_collector() -> Iterator[None]:
-    """Suspend Python's garbage collector: a plan creates a million objects that all stay, and no cycles."""
+    """Suspend Python's garbage collector, since a plan creates many objects that stay, and no cycles."""
     was_on = gc.isenabled()
     gc.disable()
     try:

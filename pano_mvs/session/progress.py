@@ -1,8 +1,8 @@
-"""What a run reports while it goes on, as typed events for a callback.
+"""Events of a run, as typed records for a callback.
 
 A run reports `RunStarted`, then events of its stages and units, then `RunFinished`, which is always the last. Stages
-overlap. If a damaged file is found in the cache, the run starts over: `StageStarted` comes again for every stage, and
-what was counted before does not count.
+overlap. If a damaged file is found in the cache, the run starts over: `StageStarted` is repeated for every stage, and
+earlier counts no longer apply.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ class RunFinished:
         blocked: units that did not run because an input failed.
         seconds: that the run took.
         out: the output folder.
-        verdict: on the result; None if the run broke off.
+        verdict: on the result; None if the run was aborted.
         doubts: doubtful image to the reason.
     """
 

@@ -1,4 +1,4 @@
-"""Run a workflow: from a session to the results in the output folder. The module reads in the order of a run."""
+"""Run a workflow: from a session to the results in the output folder, in the order of a run."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from pano_mvs.session.settings import overrides_from_settings
 
 MIN_FREE_VARIABLE = "PANO_MVS_MIN_FREE"
 
-_MAX_REPAIRS = 3  # more damage than that comes from the disk
+_MAX_REPAIRS = 3  # more damage than this suggests a failing disk
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ class Execution:
         scheduler: address of a dask scheduler.
         min_free: free space on the cache's disk below which no unit is started, such as `5GB`; empty for the value
             of $PANO_MVS_MIN_FREE, or else 200 MB.
-        durable: whether to flush every result to the disk before going on.
+        durable: whether to flush every result to disk.
     """
 
     executor: str = ""
@@ -76,7 +76,7 @@ def run(
     keep_going: bool = False,
     progress: Progress | None = None,
 ) -> RunOutput:
-    """Run a workflow and return its results; what is in the cache is not computed again.
+    """Run a workflow and return its output; cached results are reused.
 
     Units that fail do not raise an error: they are in `summary.failures`, and `summary.ok` is False. The same holds
     for a quality threshold that stops the run (`summary.stopped`).
@@ -92,17 +92,17 @@ def run(
 
     Args:
         workflow: name of a preset, or a workflow file.
-        images: folder of panoramas; None for the one that the workflow names.
+        images: folder of panoramas; None for that of the workflow.
         out: output folder; None for out/<name of the workflow> in the current folder.
-        settings: `STAGE.PARAM` to its value: a Python value, or a string as `--set` takes it.
+        settings: `STAGE.PARAM` to a Python value, or to a string in the syntax of `--set`.
         cache: folder of the cache; None for $PANO_MVS_CACHE, or else `.pano-mvs` beside the workflow file (in the
             current folder if the workflow is a preset).
-        executor: `processes` (the default), `serial` (in this process, for a debugger) or `dask`.
+        executor: `processes` (the default), `serial` (in this process, for debugging) or `dask`.
         workers: number of units at a time; None for one per core, if memory permits.
-        until: stages at which to end.
-        only: units, as `STAGE:ITEM`, to which the run is confined, with all that they need.
-        refresh: stages or units to compute again though they are cached.
-        keep_going: go on after failures even if a stage has `on_error: stop`.
+        until: run only these stages and those that they need.
+        only: run only these units, as `STAGE:ITEM`, and those that they need.
+        refresh: stages or units to recompute even if they are cached.
+        keep_going: continue after failures even if a stage has `on_error: stop`.
         progress: called with each event of `pano_mvs.session.progress`; an exception that it raises ends the run.
 
     Raises:
@@ -142,7 +142,7 @@ def run_session(session: Session, execution: Execution = Execution(), progress: 
 
 
 def _run_and_report(session: Session, store: Store, executor: Executor, *, progress: Progress) -> RunOutput:
-    """Run between the first and the last event."""
+    """Run, and report the first and the last event."""
     clock = time.perf_counter()
     progress(
         RunStarted(
@@ -187,7 +187,7 @@ def _run_locked(session: Session, store: Store, executor: Executor, *, progress:
 
 
 def _execute(run: Run, started: datetime, clock: float) -> tuple[RunSummary, StoredValues]:
-    """Compute, then write the summary and the report; a damaged file that only the report meets is computed again."""
+    """Compute, then write summary and report; recompute damaged results that only the report reads."""
     earlier = earlier_files(run.out)
     repairs = 0
     while True:

@@ -1,4 +1,4 @@
-"""What every command that takes a workflow needs: the workflow wired, its store, its output folder."""
+"""A session: a wired workflow with its cache and its output folder, as needed by most commands."""
 
 from __future__ import annotations
 
@@ -54,16 +54,16 @@ def open_session(
     Raises:
         UsageError: if there is no such workflow.
         WorkflowError: with every mistake in it.
-        InputError: if the folder of images is not there.
+        InputError: if the folder of images does not exist.
         UsageError: if a stage reads the folder of the cache.
     """
     path, is_preset = find_workflow(str(name), presets_folder())
     images = None if images is None else Path(images)
     if images is not None and not is_folder(images):
         if exists(images):
-            raise InputError(f"--images {images}: this is a file; give the folder with the pictures")
+            raise InputError(f"--images {images}: this is a file; give the folder that contains the images")
         raise InputError(
-            f"--images {images}: there is no such folder that you may look at ({problem_of(images)})"
+            f"--images {images}: cannot be read ({problem_of(images)})"
             if is_denied(images)
             else f"--images {images}: there is no such folder"
         )
@@ -81,20 +81,20 @@ def open_session(
     if name := _reader_of(root, session):
         option = "--cache" if cache or not variable else f"${CACHE_VARIABLE}"
         raise UsageError(
-            f"{option} {root}: stage {name!r} reads this very folder, and the cache's files would lie "
+            f"{option} {root}: stage {name!r} reads this folder, and the cache's files would be "
             "among its own. Choose another folder"
         )
     return session
 
 
 def check_output(session: Session) -> None:
-    """Refuse an output folder that is itself read from.
+    """Refuse an output folder from which a stage reads.
 
     Raises:
         UsageError: if a stage reads it.
     """
     if name := _reader_of(session.out, session):
-        raise UsageError(f"--out {session.out}: stage {name!r} reads this very folder. Choose another folder")
+        raise UsageError(f"--out {session.out}: stage {name!r} reads this folder. Choose another folder")
 
 
 def _reader_of(folder: Path, session: Session) -> str:

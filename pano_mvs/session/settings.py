@@ -1,4 +1,4 @@
-"""Settings as Python values, in the form in which `--set` takes them."""
+"""Convert settings from Python values to the syntax of `--set`."""
 
 from __future__ import annotations
 

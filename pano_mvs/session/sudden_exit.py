@@ -1,4 +1,4 @@
-"""Exits that the code of a plugin asks for: `sys.exit` and `os._exit` must not end a run silently."""
+"""Handle `sys.exit` and `os._exit` in the code of plugins, which must not end a run silently."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import NoReturn
 
 
 class SuddenExit(SystemExit):
-    """Raised in place of a call of os._exit, which would have ended this process without a message."""
+    """Raised instead of calling os._exit, which would end this process without a message."""
 
 
 def exit_text(end: SystemExit) -> str:

@@ -1,4 +1,4 @@
-"""The summary of a run from what the engine knows of it."""
+"""Create the summary of a run from the result of the engine."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ def _poses(run: Run, blocked: tuple[BlockedUnit, ...]) -> PosesSummary:
 
 
 def _confirmed(poses: Poses) -> dict[str, tuple[float | None, float | None]]:
-    """Return image to its confirmed and its expected share, None for one that is not known."""
+    """Return the confirmed and the expected share of each image; None if unknown."""
     if poses.confirmed_shares is None or poses.expected_shares is None:
         return {}
     columns = zip(poses.names, poses.confirmed_shares.tolist(), poses.expected_shares.tolist(), strict=True)
@@ -180,7 +180,7 @@ def _rounded_share(share: float) -> float | None:
 
 
 def nearest_pair(largest: Sequence[str], other: Sequence[str], links: Sequence[PairLink]) -> NearestPair | None:
-    """Return the pair that comes closest to joining two groups: that with most matches, or else most candidates.
+    """Return the pair that comes closest to connecting two groups: that with the most matches, then candidates.
 
     Args:
         largest: images of the largest group.
@@ -224,7 +224,7 @@ def _up(poses: Poses) -> Direction | None:
 
 
 def _scores(run: Run) -> dict[str, ScoresSummary]:
-    """Return stage to its scores, for each branch that has some."""
+    """Return the scores of each branch, by stage."""
     found = {}
     for name in run.graph.order:
         if issubclass(run.workflow.stages[name].spec.output, Scores):
@@ -261,7 +261,7 @@ def _cloud(run: Run) -> CloudSummary:
 
 
 def _machine() -> dict[str, Any]:
-    """Return what a run's times depend on."""
+    """Return the properties of the machine on which run times depend."""
     found: dict[str, Any] = {"processor": platform.machine(), "cores": available_threads()}
     with suppress(AttributeError, ValueError, OSError):  # not on every system
         found["memory_gb"] = round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1)

@@ -36,15 +36,15 @@ class SweepParams(Params):
     """Settings of depth.sweep."""
 
     backend: Annotated[str, RegisteredIn(SWEEP_BACKENDS)] = Field(
-        default="numba", description="numpy is the slow, readable reference; opencv; a plugin's"
+        default="numba", description="numba, opencv, numpy (slow reference), or that of a plugin"
     )
     device: Annotated[str, NOT_IN_KEY] = Field(
-        default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="where a backend that can choose computes"
+        default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="device, for backends that have a choice"
     )
     near: float | None = Field(
-        default=None, gt=0, description="nearest depth hypothesis, scene units; else found by small sweeps"
+        default=None, gt=0, description="nearest depth hypothesis, scene units; null: estimated by small sweeps"
     )
-    far: float | None = Field(default=None, gt=0, description="farthest depth hypothesis, likewise")
+    far: float | None = Field(default=None, gt=0, description="farthest depth hypothesis; null: estimated")
 
     @model_validator(mode="after")
     def _fit_together(self) -> SweepParams:
@@ -71,10 +71,10 @@ def sweep(
     params: SweepParams,
     ctx: Context,
 ) -> RangeMap:
-    """The sphere sweep: at each depth hypothesis, look the sources up where the reference's rays would end.
+    """Sphere sweep: select, for each pixel of the reference, the depth hypothesis at which the sources match best.
 
-    Without `near` and `far` the limits come from small sweeps of the reference and its first sources, from what they
-    agree on.
+    Without `near` and `far`, the limits are estimated from small sweeps of the reference and its first sources that
+    must agree with each other.
     """
     require_one_group(pose, source_poses)
     pictures = [ref.load(), *(source.load() for source in sources)]

@@ -132,7 +132,7 @@ class FillParams(Params):
 
 @stage("filters.fill", memory=bytes_per_pixel(96))
 def fill(range_map: Each[RangeMap], image: Each[Panorama], params: FillParams, ctx: Context) -> RangeMap:
-    """Fill holes with the range of the background surface, from reliable pixels only (confidence 1–63).
+    """Fill holes with the range of the background surface, from reliable pixels (filled pixels: confidence 1–63).
 
     Masked pixels get no range.
     """

@@ -35,7 +35,7 @@ from pano_mvs.io.poses.files import read_poses
 
 @stage("pairs.exhaustive")
 def exhaustive(images: Names[Features]) -> Pairs:
-    """Match every image with every other one; for up to a few hundred images."""
+    """Match every image with every other one; for up to about 60 images."""
     return exhaustive_pairs(images)
 
 

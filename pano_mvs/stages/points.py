@@ -5,7 +5,6 @@ from __future__ import annotations
 from pano_mvs.algorithms.points.samples import sample_surface
 from pano_mvs.algorithms.points.tracking import track_points
 from pano_mvs.api import All, Context, Each, One, Panorama, Params, Poses, RangeMap, arguments_from, params_from, stage
-from pano_mvs.core.text import plural
 from pano_mvs.scene.surface_samples import SurfaceSamples
 from pano_mvs.scene.tracked_points import TrackedPoints
 
@@ -41,8 +40,7 @@ def tracked(
     ctx.metric("views_per_point", len(points.track_point_idx) / max(len(points), 1))
     if len(points) < settings["count"]:
         ctx.note(
-            f"{len(points)} {plural(len(points), 'point')} where {settings['count']} were asked for: the range maps "
-            "have no more that are sure enough; raise points.surface's count or lower its "
-            "min_confidence"
+            f"only {len(points)} of {settings['count']} points: the range maps contain no more reliable ones. Raise "
+            "`count` of points.surface, or lower its `min_confidence`"
         )
     return points

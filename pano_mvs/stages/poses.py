@@ -239,7 +239,7 @@ def known_poses(path: Path, images: tuple[str, ...]) -> Poses:
     }
     centers = np.array([pose.center for pose in poses.values()])
     if len(centers) > 1 and np.ptp(centers, axis=0).max() <= 1e-9 * max(1.0, float(np.abs(centers).max())):
-        raise InputError(f"{path}: all {len(centers)} cameras stand in one place; depth needs different places")
+        raise InputError(f"{path}: all {len(centers)} cameras are in the same place; depth needs different places")
     rejected = {
         name: f"{path.name} has one pose, {known[name]!r}, that matches several images"
         if name in known

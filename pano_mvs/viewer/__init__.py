@@ -1,1 +1,1 @@
-"""What a run made, looked at: the window of `pano-mvs view`, and one pixel of a sweep for `pano-mvs inspect`."""
+"""Display results: the window of `pano-mvs view`, and the analysis of a pixel for `pano-mvs inspect`."""

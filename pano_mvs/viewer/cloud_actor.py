@@ -1,4 +1,4 @@
-"""Points as VTK draws them: those that turn their back to the eye are left out, so that one sees into rooms."""
+"""VTK actor of a cloud that hides points facing away from the viewer, so that rooms can be seen from outside."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import numpy as np
 
 from pano_mvs.viewer.cloud_colors import Coloring, DrawnCloud
 
-# The points' normals go to the graphics processor along with their places.
+# The normals of the points are passed to the graphics processor with their positions.
 _DECLARE, _MOVE = "//VTK::PositionVC::Dec", "//VTK::PositionVC::Impl"
 _DECLARED = f"""{_DECLARE}
 in vec3 facingMC;
 """
-# A point that turns its back is moved out of the picture. The eye is where the line of sight through the middle comes
-# from; in parallel projection it lies at infinity, and w vanishes.
+# A point that faces away is moved out of the image. The eye is the origin of the central line of sight;
+# in parallel projection it is at infinity, and w is 0.
 _MOVED = f"""{_MOVE}
 vec4 eyeMC = inverse(MCDCMatrix) * vec4(0.0, 0.0, -1.0, 0.0);
 vec3 seenMC = vertexMC.xyz * eyeMC.w - eyeMC.xyz;
@@ -51,12 +51,12 @@ class CloudActor:
         self.show_backs(wanted=False)
 
     def color(self, coloring: Coloring) -> None:
-        """Give the points other colours."""
+        """Set the colours of the points."""
         self._data["rgb"] = coloring.colors_rgb
         self._data.Modified()
 
     def show_backs(self, *, wanted: bool) -> None:
-        """Draw points that turn their back to the eye, or leave them out; those without normals are always drawn."""
+        """Show or hide points that face away from the viewer; points without normals are always shown."""
         shader = self.actor.GetShaderProperty()
         shader.ClearAllVertexShaderReplacements()
         if self._has_normals:
@@ -65,5 +65,5 @@ class CloudActor:
                 shader.AddVertexShaderReplacement(_MOVE, True, _MOVED, False)
 
     def size(self, pixels: float) -> None:
-        """Draw points so large."""
+        """Set the size of the points."""
         self.actor.GetProperty().SetPointSize(pixels)

@@ -1,4 +1,4 @@
-"""A cloud as it is drawn: as many points as a display needs, in the colours that were asked for."""
+"""Select the points of a cloud to draw, and colour them."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class DrawnCloud:
     Attributes:
         points: (N, 3) float32 in the world.
         normals: (N, 3) float32, or None if the file has none.
-        vertices: (N,) all that the file says of them.
-        total: how many points the file holds.
+        vertices: (N,) all properties in the file.
+        total: number of points in the file.
     """
 
     points: NDArray[np.float32]
@@ -37,7 +37,7 @@ class DrawnCloud:
 
     @property
     def colorings(self) -> tuple[str, ...]:
-        """By what these points can be coloured."""
+        """Available colourings of these points."""
         known = self.vertices.dtype.names or ()
         return tuple(name for name in COLORINGS if set(_NEEDED[name]) <= set(known))
 
@@ -48,7 +48,7 @@ class Coloring:
 
     Attributes:
         colors_rgb: (N, 3) uint8.
-        legend: what they mean, in words.
+        legend: description of the colours.
     """
 
     colors_rgb: NDArray[np.uint8]
@@ -56,10 +56,10 @@ class Coloring:
 
 
 def drawn_cloud(cloud: PlyPoints, *, budget: int = POINT_BUDGET) -> DrawnCloud:
-    """Return at most `budget` points of a cloud, 0 for all; read from the disk are no more than these.
+    """Return at most `budget` points of a cloud, 0 for all; only these are read from disk.
 
-    Of each stretch of the file one point is taken, at a place drawn at random: regular steps would leave patterns,
-    since neighbours in the file are neighbours in a picture. The same file gives the same points.
+    One point is drawn at random from each section of the file. Regular steps would leave patterns,
+    since neighbours in the file are neighbours in an image. The same file gives the same points.
     """
     count = len(cloud.vertices)
     chosen: NDArray[np.intp] | slice = slice(None)
@@ -86,7 +86,7 @@ def color_cloud(cloud: DrawnCloud, by: str, *, up: NDArray[np.float64], unit: st
         unit: of lengths.
 
     Raises:
-        UsageError: if the file does not hold what they need.
+        UsageError: if the file lacks the required properties.
     """
     if by not in cloud.colorings:
         raise UsageError(

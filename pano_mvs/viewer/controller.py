@@ -1,4 +1,4 @@
-"""What the viewer does when somebody clicks, drags or presses a key; it knows no window, and is tested without one."""
+"""Actions of the viewer on clicks, drags and keys, independent of any window and tested without one."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ _PARALLEL_REACH = 0.006
 
 @dataclass(frozen=True, eq=False)
 class TourState:
-    """What the window shows.
+    """State of the viewer.
 
     Attributes:
-        viewpoint: from where.
+        viewpoint: position and direction of view.
         surface: "cloud", "mesh" or "both".
-        coloring: of the cloud.
-        inside: index of the camera whose panorama is all around, or None.
-        outside: where to come back to from inside.
+        coloring: name of the cloud's colouring.
+        inside: index of the camera whose panorama surrounds the viewer, or None.
+        outside: viewpoint to return to from inside.
         measuring: whether clicks pick points.
         picked: none, one or two points (3,) in the world.
         hovered: index of the camera under the pointer, or None.
         labels: whether all cameras are named.
         cameras: whether cameras are shown.
         blended: whether the cloud is shown inside a panorama.
-        backs: whether points, and triangles, that turn their back to the eye are shown; not showing them opens rooms
-            to the eye.
+        backs: whether points and triangles that face away from the viewer are shown; hiding them opens rooms
+            to view.
         all_points: whether all points of the file are drawn.
         help: whether the keys are listed.
-        message: the latest news.
+        message: the latest message.
     """
 
     viewpoint: Viewpoint
@@ -64,15 +64,15 @@ class TourState:
 
 @dataclass(eq=False)
 class Tour:
-    """A scene, and how it is looked at.
+    """A scene and the state of its viewer.
 
     Attributes:
         scene: cloud, mesh and cameras.
         cloud: the points that are drawn, or None.
-        box: (2, 3) in which nearly all lies.
+        box: (2, 3) that contains nearly everything.
         aspect: width of the window as a multiple of its height.
-        corners: (N, 3) of a mesh, to measure between where there is no cloud; None if there is no mesh.
-        state: what is shown now.
+        corners: (N, 3) of the mesh, to measure distances if there is no cloud; None if there is no mesh.
+        state: current state.
     """
 
     scene: ShownScene
@@ -83,7 +83,7 @@ class Tour:
     state: TourState = field(init=False)
 
     def __post_init__(self) -> None:
-        """Begin with the overview."""
+        """Start with the overview."""
         self.centers = self.scene.centers
         self.radius = sphere_radius(self.centers, self.box)
         points = self.corners if self.cloud is None else self.cloud.points
@@ -92,7 +92,7 @@ class Tour:
 
     def from_outside(self, name: str) -> Viewpoint:
         """Return the view called "overview", "top" or "front"."""
-        # Perspective leaves room around what it fits; a plan or an elevation has to fit the ends of the cloud itself.
+        # Perspective leaves a margin; a plan or an elevation has to include the ends of the cloud.
         box = self.box if name == "overview" else self._outer_box
         return outside_view(name, box, self.scene.up, self.scene.ahead, aspect=self.aspect)
 
@@ -114,16 +114,16 @@ class Tour:
             raise UsageError(f"there is no view {view!r}; there are overview, top, front and inside:NAME")
 
     def begin(self, **settings: str | bool) -> None:
-        """Begin with other than the usual settings: fields of `TourState` by name."""
+        """Set initial values of fields of `TourState`."""
         self.state = replace(self.state, **settings)  # type: ignore[arg-type]  # names of fields
 
     def step_into(self, camera_idx: int) -> None:
-        """Go to a camera, looking on in the same direction: its panorama is all around."""
+        """Step inside the panorama of a camera, keeping the direction of view."""
         state = self.state
         center = self.centers[camera_idx]
         forward = self.scene.ahead if state.viewpoint.height else state.viewpoint.axes[2]
         if abs(float(forward @ self.scene.up)) > 0.7 and state.inside is None:
-            forward = self.scene.ahead  # from high above one does not want to look at the floor
+            forward = self.scene.ahead  # from above, do not look at the floor
         self.state = replace(
             state,
             inside=camera_idx,
@@ -134,7 +134,7 @@ class Tour:
         )
 
     def step_out(self) -> None:
-        """Go back to where one stepped in from; elsewhere, give up measuring."""
+        """Return to the previous outside view; outside, cancel measuring."""
         state = self.state
         if state.inside is None or state.outside is None:
             self.state = replace(state, measuring=False, picked=(), message="")
@@ -142,7 +142,7 @@ class Tour:
         self.state = replace(state, inside=None, outside=None, viewpoint=state.outside, message="")
 
     def click(self, x: float, y: float, size_wh: tuple[int, int]) -> None:
-        """Do what a click at a place in the window asks for: pick a point, step into a camera, or read a pixel."""
+        """Handle a click: pick a point, step into a camera, or read a pixel."""
         start, direction = self.state.viewpoint.ray(x, y, size_wh)
         if self.state.measuring:
             self._pick(start, direction)
@@ -155,7 +155,7 @@ class Tour:
             self.state = replace(self.state, message=said)
 
     def hover(self, x: float, y: float, size_wh: tuple[int, int]) -> bool:
-        """Note which camera is under the pointer, and return whether that is another one than before."""
+        """Set the camera under the pointer, and return whether it changed."""
         before = self.state.hovered
         self.state = replace(self.state, hovered=self._camera_at(*self.state.viewpoint.ray(x, y, size_wh)))
         return self.state.hovered != before
@@ -166,23 +166,23 @@ class Tour:
         self.state = replace(self.state, viewpoint=viewpoint)
 
     def zoom(self, steps: float) -> None:
-        """See less, or more for negative steps, of what is around."""
+        """Decrease the viewing angle, or increase it for negative steps."""
         self.state = replace(self.state, viewpoint=self.state.viewpoint.zoomed(steps))
 
     def key(self, name: str) -> bool:
-        """Do what a key asks for, and return whether it asks for anything."""
+        """Handle a key, and return whether it has a function."""
         action = self._keys.get(name)
         if action is not None:
             action()
         return action is not None
 
     def moved_to(self, viewpoint: Viewpoint) -> None:
-        """Note where the window's own mouse handling went."""
+        """Set the viewpoint to that of the window, which its own mouse handling may have moved."""
         self.state = replace(self.state, viewpoint=viewpoint)
 
     @property
     def distance(self) -> float | None:
-        """Between the two picked points in scene units, or None."""
+        """Distance of the two picked points in scene units, or None."""
         if len(self.state.picked) < 2:
             return None
         return float(np.linalg.norm(self.state.picked[1] - self.state.picked[0]))
@@ -242,7 +242,7 @@ class Tour:
     def _pick(self, start: FloatArray, direction: FloatArray) -> None:
         points = self.cloud.points if self.cloud is not None else self.corners
         if points is None:
-            self.state = replace(self.state, message="there is no cloud to measure in")
+            self.state = replace(self.state, message="there is no cloud to measure")
             return
         height = self.state.viewpoint.height
         normals = None if self.state.backs or self.cloud is None else self.cloud.normals

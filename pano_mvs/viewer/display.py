@@ -1,4 +1,4 @@
-"""Whether there is a display, and whether pictures can be drawn without one."""
+"""Check for a display, and for a library that renders without one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from pano_mvs.core.errors import UsageError
 
 _DRAWING_LIBRARIES = ("libEGL.so.1", "libOSMesa.so.8", "libOSMesa.so")
-_REMEDY = "Give --screenshot FILE to draw a picture without a window"
+_REMEDY = "Use --screenshot FILE to write an image without a window"
 
 
 def require_display(environment: Mapping[str, str] = os.environ, platform: str = sys.platform) -> None:
@@ -28,9 +28,9 @@ def require_display(environment: Mapping[str, str] = os.environ, platform: str =
 
 
 def require_window(window_class: str) -> None:
-    """Raise UsageError if VTK fell back to drawing without a window, because the display does not answer."""
+    """Raise UsageError if VTK fell back to off-screen rendering, because the display does not respond."""
     if window_class in ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow"):
-        raise UsageError(f"the display {os.environ.get('DISPLAY', '')} does not answer. {_REMEDY}")
+        raise UsageError(f"the display {os.environ.get('DISPLAY', '')} does not respond. {_REMEDY}")
 
 
 def require_drawing(
@@ -39,7 +39,7 @@ def require_drawing(
     *,
     loads: Callable[[str], bool] | None = None,
 ) -> None:
-    """Raise UsageError if there is neither a display nor a library that draws without one; VTK would crash.
+    """Raise UsageError if there is neither a display nor a library for off-screen rendering; VTK would crash.
 
     Args:
         environment: the process's.
@@ -50,7 +50,7 @@ def require_drawing(
         return
     if not any((loads or _loads)(name) for name in _DRAWING_LIBRARIES):
         raise UsageError(
-            "pictures cannot be drawn here: neither EGL nor OSMesa is installed. Install one: for Debian "
+            "images cannot be rendered: neither EGL nor OSMesa is installed. Install one: for Debian "
             "and Ubuntu `apt install libegl1 libgl1-mesa-dri`"
         )
 
@@ -64,7 +64,7 @@ def _loads(name: str) -> bool:
 
 
 def quiet_vtk() -> None:
-    """Keep VTK from printing that it found no X server before it draws without one."""
+    """Suppress VTK's message about a missing X server before off-screen rendering."""
     from vtkmodules.vtkCommonCore import vtkLogger
 
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)

@@ -1,4 +1,4 @@
-"""From the mouse and the keyboard of a window to what the tour does."""
+"""Connect mouse and keyboard events of a window to the actions of the viewer."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 from pano_mvs.viewer.controller import Tour
 from pano_mvs.viewer.viewpoint import Viewpoint
 
-# A press and a release this close together are a click.
+# A press and a release within this distance are a click.
 _CLICK_PX = 4
 _LEFT, _RIGHT = "LeftButton", "RightButton"
 
@@ -16,7 +16,7 @@ _LEFT, _RIGHT = "LeftButton", "RightButton"
 class Hands:
     """Handles the events of one interactor.
 
-    From outside, VTK's trackball turns and moves the camera; inside a panorama, dragging looks around.
+    Outside, VTK's trackball rotates and moves the camera; inside a panorama, dragging changes the direction of view.
     """
 
     def __init__(self, tour: Tour, *, seen_from: Callable[[], Viewpoint], update: Callable[[], None]) -> None:
@@ -25,7 +25,7 @@ class Hands:
         Args:
             tour: receives the actions of the user.
             seen_from: returns where the window's camera is now.
-            update: shows the tour's state in the window.
+            update: updates the window to the tour's state.
         """
         self._tour, self._seen_from, self._update = tour, seen_from, update
         self._pressed: dict[str, tuple[int, int]] = {}
@@ -34,7 +34,7 @@ class Hands:
         self._style: Any = None
 
     def attach(self, interactor: Any) -> Any:
-        """Take the events of a VTK interactor, and return the style that was made for it."""
+        """Handle the events of a VTK interactor, and return its new style."""
         from vtkmodules.vtkInteractionStyle import vtkInteractorStyleTrackballCamera
 
         self._interactor, self._style = interactor, vtkInteractorStyleTrackballCamera()
@@ -59,7 +59,7 @@ class Hands:
         return max(1, width), max(1, height)
 
     def _place(self) -> tuple[int, int]:
-        """Return where the pointer is, from the upper left corner; VTK counts from the lower one."""
+        """Return the position of the pointer from the upper left corner; VTK counts from the lower left."""
         x, y = self._interactor.GetEventPosition()
         return x, self._size_wh[1] - 1 - y
 

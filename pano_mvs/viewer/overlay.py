@@ -1,4 +1,4 @@
-"""Letters over the picture: corners, names beside what they name, the keys."""
+"""Text over the scene: messages in the corners, labels of cameras, and the help."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ _KEYS = (
     ("m", "measure: click two points"),
     ("c", "colours of the cloud"),
     ("s", "cloud, mesh, or both"),
-    ("x", "what turns its back to you"),
+    ("x", "what faces away from you"),
     ("b", "cloud within the panorama"),
     ("d", "all points"),
     ("l, k", "names, cameras"),
     ("h, q", "this help, quit"),
 )
 _HELP = "\n".join(f" {keys:<18} {what} " for keys, what in _KEYS)
-# In shares of the window, from the lower left corner, and which edges of the text lie there.
+# Position as a share of the window from the lower left corner, and the edges of the text that are placed there.
 _PLACES = {
     "upper_left": (0.008, 0.988, "left", "top"),
     "lower_right": (0.992, 0.012, "right", "bottom"),
@@ -34,7 +34,7 @@ _PLACES = {
 
 
 class Overlay:
-    """Writes on a plotter; what is written under a name takes the place of what was there."""
+    """Writes text on a plotter, replacing earlier text with the same name."""
 
     def __init__(self, plotter: Any, font: int, *, ink: str, paper: str) -> None:
         self._plotter, self._font, self._ink, self._paper = plotter, font, ink, paper
@@ -64,7 +64,7 @@ class Overlay:
         )
 
     def help(self, *, wanted: bool) -> None:
-        """Show the keys, or take them away."""
+        """Show or hide the help."""
         self._panel(_HELP if wanted else "", "help", font="courier", size=0.7)
 
     def _panel(self, text: str, name: str, *, font: str, size: float) -> None:

@@ -1,4 +1,4 @@
-"""The pictures on the spheres, no larger than they are shown."""
+"""Images for the spheres of cameras, at the size at which they are shown."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from pano_mvs.scene.image_files.image_file import decode_image
 from pano_mvs.viewer.shown_scene import ShownCamera
 
 SMALL_WIDTH, LARGE_WIDTH = 512, 4096
-# What is shown where there is no picture: a plain ball, lighter above, so that one sees which way is up.
+# Shown without an image: a uniform ball, lighter at the top, which shows the up direction.
 _SKY, _GROUND = (150, 160, 175), (90, 95, 105)
 
 
 def sphere_picture(camera: ShownCamera, width: int) -> NDArray[np.uint8]:
-    """Return a camera's panorama, (H, W, 3) RGB, at most `width` wide; of a small one the preview will do.
+    """Return a camera's panorama, (H, W, 3) RGB, at most `width` wide; for small sizes, from the preview.
 
-    A damaged or missing picture is a plain one: the rest can be looked at all the same.
+    A damaged or missing image is replaced by a uniform one, so that the rest can be viewed.
     """
     files = (camera.preview, camera.picture) if width <= SMALL_WIDTH else (camera.picture, camera.preview)
     for path in files:

@@ -1,4 +1,4 @@
-"""A panorama on a sphere: from within as the camera saw it, and from outside too."""
+"""A sphere textured with a panorama, for views from inside and from outside."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from pano_mvs.geometry import Rigid3, ray_from_pixel
 
 @dataclass(frozen=True, eq=False)
 class SphereMesh:
-    """Triangles of a sphere with places in a picture.
+    """Triangles of a sphere with texture coordinates.
 
     Attributes:
         vertices: (V, 3) float64 in the world.
-        triangles: (T, 3) int64; seen from inside, their corners run clockwise.
-        texture_uv: (V, 2) float32, u to the right, v upwards from the picture's lower edge.
+        triangles: (T, 3) int64; clockwise as seen from inside.
+        texture_uv: (V, 2) float32, u to the right, v upwards from the lower edge of the image.
     """
 
     vertices: NDArray[np.float64]
@@ -28,8 +28,8 @@ class SphereMesh:
 def panorama_sphere(cam_from_world: Rigid3, radius: float, *, rows: int = 48) -> SphereMesh:
     """Return a sphere around a camera that shows each pixel of its panorama along that pixel's ray.
 
-    Drawn without the triangles that face the eye, it shows from outside what one would see through it, as a crystal
-    ball does: the far side, from within. Neither way is writing mirrored.
+    Drawn without the triangles that face the viewer, it shows from outside what lies behind it, like a crystal
+    ball. In neither case is text mirrored.
 
     Args:
         cam_from_world: pose.
@@ -42,7 +42,7 @@ def panorama_sphere(cam_from_world: Rigid3, radius: float, *, rows: int = 48) ->
     vertices = cam_from_world.inverse().apply(rays * radius)
     first = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).reshape(-1)
     corners = np.stack([first, first + 1, first + columns + 2, first + columns + 1], axis=-1)
-    # Towards the inside a quadrilateral's corners run from left to right, then down: clockwise.
+    # Seen from inside, the corners of a quadrilateral run clockwise: from left to right, then down.
     triangles = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
     texture_uv = np.stack([x / columns, 1 - y / rows], axis=-1).reshape(-1, 2).astype(np.float32)
     return SphereMesh(vertices, triangles, texture_uv)

@@ -1,4 +1,4 @@
-"""What lies under the pointer: a camera, or a point of the cloud."""
+"""Find the camera or the point of the cloud under the pointer."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-# Rays and points this much apart meet: half the width of a finger's click at a usual field of view.
+# A ray hits a point within this angle: half the width of a click at a usual field of view.
 _REACH_RAD = np.deg2rad(0.4)
 
 
 def camera_under(start: FloatArray, direction: FloatArray, centers: FloatArray, radius: float) -> int | None:
-    """Return the nearest camera whose sphere a ray meets, or None.
+    """Return the nearest camera whose sphere a ray intersects, or None.
 
     Args:
-        start: (3,) where the ray begins.
+        start: (3,) origin of the ray.
         direction: (3,) unit.
         centers: (N, 3) of the spheres.
         radius: of each of them.
@@ -39,11 +39,11 @@ def point_under(
     """Return the nearest point close to a ray, or None.
 
     Args:
-        start: (3,) where the ray begins.
+        start: (3,) origin of the ray.
         direction: (3,) unit.
         points: (N, 3).
-        normals: (N, 3); points that turn their back are passed over, as they are not drawn. None: none is.
-        parallel_reach: how far from the ray a point may lie, scene units; 0: that grows with the distance.
+        normals: (N, 3); points that face away are ignored, since they are not drawn. None: use all points.
+        parallel_reach: maximum distance from the ray, scene units; 0: it grows with the distance from the viewer.
     """
     if not len(points):
         return None
@@ -56,7 +56,7 @@ def point_under(
     if not len(candidates):
         return None
     first = float(along[candidates].min())
-    # Of the foremost surface, what lies closest to the ray.
+    # Of the foremost surface, the point closest to the ray.
     foremost = candidates[along[candidates] <= first * (1 + 4 * np.tan(_REACH_RAD))]
     return int(foremost[np.argmin(aside[foremost])])
 
@@ -64,7 +64,7 @@ def point_under(
 def _along_and_aside(
     start: FloatArray, direction: FloatArray, points: NDArray[np.floating]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return how far along a ray each point lies, and how far from it, (N,) each."""
+    """Return the distance of each point along a ray and from it, (N,) each."""
     offsets = np.asarray(points, np.float64) - start
     along = offsets @ direction
     aside = np.sqrt(np.maximum(np.einsum("ni,ni->n", offsets, offsets) - along**2, 0))

@@ -1,4 +1,4 @@
-"""What a run found along one ray of one camera."""
+"""Describe the pixel of a camera in a direction."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from pano_mvs.viewer.sizes import length_text
 
 
 def pixel_readout(camera: ShownCamera, direction_in_world: NDArray[np.float64], unit: str) -> str:
-    """Return the pixel in which a camera sees a direction (3,), with its range and confidence, in words.
+    """Return the pixel of a camera in a direction (3,), with its range and confidence, as text.
 
-    The pixel is that of the range map, as `pano-mvs inspect` takes it; without one, angles are all there is to say.
+    The pixel is that of the range map, as used by `pano-mvs inspect`; without a range map, only angles are returned.
     """
     ray = camera.cam_from_world.rotation @ direction_in_world
     azimuth, elevation = np.rad2deg([np.arctan2(ray[0], ray[2]), np.arcsin(np.clip(-ray[1], -1, 1))])

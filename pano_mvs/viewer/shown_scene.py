@@ -1,4 +1,4 @@
-"""What the viewer shows of an output folder or of a single PLY file."""
+"""Load the scene of an output folder or of a single PLY file for the viewer."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class ShownCamera:
     Attributes:
         name: of its image.
         cam_from_world: its pose.
-        picture: its panorama, or None where no file is there.
-        preview: a small picture whose upper half is the panorama, or None.
+        picture: its panorama, or None if the file is missing.
+        preview: a small image whose upper half is the panorama, or None.
         range_file: its ranges as float32 TIFF, or None.
         confidence_file: its confidences as PNG, or None.
         doubtful: whether the run found its pose doubtful.
@@ -52,13 +52,13 @@ class ShownCamera:
 
     @property
     def label(self) -> str:
-        """What is written beside the camera."""
+        """Label of the camera."""
         return f"{self.name} (doubtful)" if self.doubtful else self.name
 
 
 @dataclass(frozen=True, eq=False)
 class ShownScene:
-    """What is there.
+    """The scene to show.
 
     Attributes:
         name: of the folder or file.
@@ -66,8 +66,8 @@ class ShownScene:
         mesh: a PLY file with faces, or None.
         cameras: in the order of the capture.
         unit: of lengths: "m" or "scene units".
-        up: (3,) unit, upright in the world.
-        ahead: (3,) unit across `up`: where the first camera looks.
+        up: (3,) unit vector, up in the world.
+        ahead: (3,) unit vector orthogonal to `up`: the viewing direction of the first camera.
         notes: what is missing, and why.
     """
 
@@ -82,7 +82,7 @@ class ShownScene:
 
     @property
     def centers(self) -> FloatArray:
-        """Of the cameras, (N, 3)."""
+        """Centres of the cameras, (N, 3)."""
         return np.array([camera.cam_from_world.center for camera in self.cameras]).reshape(-1, 3)
 
 
@@ -92,7 +92,7 @@ def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> Sho
     Args:
         path: the output folder of a run, or a PLY file, a cloud or a mesh.
         images: folder of the panoramas; None: where the run read them, else the previews that it wrote.
-        group: which group of poses to show, since each has a frame of its own; 0 is the largest.
+        group: group of poses to show, since each has its own frame; 0 is the largest.
 
     Raises:
         InputError: if there is nothing to show, or a file is damaged.
@@ -114,7 +114,7 @@ def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> Sho
     cloud = _cloud(_written(path, run, cloud_name), cloud_name, notes)
     if cloud is None and mesh_file is None and not cameras:
         raise InputError(
-            f"{path}: holds no {cloud_name} with points, no {mesh_name} and no {model}. Give the output "
+            f"{path}: contains no {cloud_name} with points, no {mesh_name} and no {model}. Give the output "
             "folder of a run; its report.html shows what happened"
         )
     return ShownScene(
@@ -131,7 +131,7 @@ def open_scene(path: Path, *, images: Path | None = None, group: int = 0) -> Sho
 def _scene_of_ply(path: Path) -> ShownScene:
     cloud, mesh = (None, path) if has_faces(path) else (open_ply_points(path), None)
     if cloud is not None and not cloud.count:
-        raise InputError(f"{path}: holds no points, so there is nothing to show. Look at what wrote it")
+        raise InputError(f"{path}: contains no points, so there is nothing to show. Check the program that wrote it")
     return ShownScene(path.name, cloud, mesh, (), "scene units", *_frame(()))
 
 
@@ -143,31 +143,31 @@ def _group_of(run: RunSummary, group: int, path: Path, notes: list[str]) -> Pose
     if len(groups) > 1:
         sizes = [f"{number} ({len(poses.registered)} images)" for number, poses in enumerate(groups)]
         notes.append(
-            f"shown is group {group} of {len(groups)}, each with a frame and a scale of its own; --group N "
+            f"this is group {group} of {len(groups)}, each with its own frame and scale; --group N "
             f"shows another: {', '.join(sizes[:group] + sizes[group + 1 :])}"
         )
     return groups[group]
 
 
 def _cloud(path: Path | None, name: str, notes: list[str]) -> PlyPoints | None:
-    """Return the vertices of a cloud; None, with a note, if there is no file or it holds no points."""
+    """Return the vertices of a cloud; None, with a note, if the file is missing or contains no points."""
     cloud = None if path is None else open_ply_points(path)
     if cloud is not None and cloud.count:
         return cloud
     if cloud is None:
-        notes.append(f"no {name}: the workflow has no export.ply, or the run did not get there")
+        notes.append(f"no {name}: the workflow has no export.ply, or the run did not reach it")
     else:
-        notes.append(f"{name} holds no points: report.html shows why")
+        notes.append(f"{name} contains no points: report.html shows why")
     return None
 
 
 def is_to_see(files: Iterable[str]) -> bool:
-    """Return whether among a run's files, by their paths in its folder, is one that `open_scene` shows."""
+    """Return whether `open_scene` can show any of a run's files, given by their paths in its folder."""
     return any(PurePosixPath(name).name in (_CLOUD, _MESH) or name.startswith(f"{_MODELS}/0/") for name in files)
 
 
 def has_faces(path: Path) -> bool:
-    """Return whether a PLY file holds faces."""
+    """Return whether a PLY file contains faces."""
     try:
         with path.open("rb") as stream:
             head = stream.read(_HEAD_BYTES)
@@ -178,7 +178,7 @@ def has_faces(path: Path) -> bool:
 
 
 def _summary(folder: Path) -> RunSummary:
-    """Return what run.json says; an empty summary if there is none that can be read: the files are enough."""
+    """Return the summary in run.json, or an empty one if it cannot be read, since the files suffice."""
     try:
         return RunSummary.read(folder)
     except InputError:
@@ -186,7 +186,7 @@ def _summary(folder: Path) -> RunSummary:
 
 
 def _written(folder: Path, run: RunSummary, name: str) -> Path | None:
-    """Return the file of that name in the folder, or the first that the run wrote below it."""
+    """Return the file with this name in the folder, or the first one that the run wrote below it."""
     names = [name, *(written for written in run.files if PurePosixPath(written).name == name)]
     return next((folder / found for found in names if is_file(folder / found)), None)
 
@@ -196,7 +196,7 @@ def _cameras(
 ) -> tuple[ShownCamera, ...]:
     model = folder / model_name
     if not is_folder(model):
-        notes.append(f"no {model_name}: the workflow has no export.colmap, or the run did not get there; no cameras")
+        notes.append(f"no {model_name}: the workflow has no export.colmap, or the run did not reach it; no cameras")
         return ()
     poses = read_poses(model)
     source = images or run.source_folder
@@ -223,13 +223,13 @@ def _cameras(
 
 
 def _map_of(folder: Path, kind: str, name: str, suffix: str) -> Path | None:
-    """Return the file of an image in range/ or confidence/, called with its extension where need be, else without."""
+    """Return the file of an image in range/ or confidence/, named with or without the image's extension."""
     candidates = (folder / kind / f"{name}{suffix}", folder / kind / PurePosixPath(name).with_suffix(suffix))
     return next((path for path in candidates if is_file(path)), None)
 
 
 def _frame(cameras: tuple[ShownCamera, ...]) -> tuple[FloatArray, FloatArray]:
-    """Return the directions up and ahead: those of the cameras where they agree, else −y and z."""
+    """Return the directions up and ahead: those of the cameras if they agree, else −y and z."""
     common_up = mean_up_direction([camera.cam_from_world.rotation for camera in cameras])
     up = np.array(WORLD_UP) if common_up is None else common_up
     ahead = cameras[0].cam_from_world.rotation[2] if cameras else np.array([0.0, 0.0, 1.0])

@@ -1,4 +1,4 @@
-"""How large things are in the scene, and how lengths are written."""
+"""Sizes of objects in the scene, and lengths as text."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-# A sphere is this share of the way to the next camera, within these shares of the scene.
+# Radius of a sphere as a share of the distance to the next camera, within these shares of the scene.
 _RADIUS_SHARE, _RADIUS_LIMITS = 0.18, (0.008, 0.025)
 _CROWDED_SHARE = 0.4
 _BOX_SHARES, _OUTER_SHARES = (0.01, 0.99), (0.0005, 0.9995)
 
 
 def sphere_radius(centers: FloatArray, box: FloatArray) -> float:
-    """Return how large the spheres of cameras are, so that they neither touch nor vanish; scene units."""
+    """Return the radius of the spheres of cameras, at which they neither touch nor vanish; scene units."""
     size = float(np.linalg.norm(box[1] - box[0])) or 1.0
     least, most = (share * size for share in _RADIUS_LIMITS)
     if len(centers) < 2:
@@ -44,8 +44,8 @@ def box_of(points: NDArray[np.floating], centers: FloatArray) -> FloatArray:
 def outer_box(points: NDArray[np.floating], box: FloatArray) -> FloatArray:
     """Return a box, (2, 3), in which the thinly sampled ends of a cloud (N, 3) lie too.
 
-    Points grow sparse with the distance from the cameras, so that a small share of them may be half a corridor. What
-    is farther off than half the longest side of the scene's box is taken for stray all the same.
+    Points become sparse with the distance from the cameras, so a small share of them may be half a corridor. Points
+    farther away than half the longest side of the scene's box are treated as outliers.
     """
     if not len(points):
         return box
@@ -55,18 +55,18 @@ def outer_box(points: NDArray[np.floating], box: FloatArray) -> FloatArray:
 
 
 def length_text(length: float, unit: str) -> str:
-    """Return a length as people read it, with its unit."""
+    """Return a length with its unit, as text."""
     if unit != "m":
         return f"{length:.4g} {unit}"
     return f"{length:.3f} m" if length >= 1 else f"{100 * length:.1f} cm"
 
 
 def bar_text(length: float, unit: str) -> str:
-    """Return a round length with its unit."""
+    """Return a round length with its unit, as text."""
     return f"{length:g} {unit.removesuffix('s') if length == 1 else unit}"
 
 
 def bar_length(extent: float) -> float:
-    """Return the longest of 1, 2, 5 × 10ⁿ that is no longer than a quarter of an extent."""
+    """Return the largest length of the form 1, 2 or 5 × 10ⁿ that is at most a quarter of an extent."""
     power = 10.0 ** np.floor(np.log10(extent / 4))
     return float(next(step * power for step in (5, 2, 1) if step * power <= extent / 4 * (1 + 1e-9)))

@@ -1,4 +1,4 @@
-"""Spheres with panoramas on them, as VTK draws them."""
+"""VTK actors of spheres with panoramas."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def sphere_actor(picture: NDArray[np.uint8], cam_from_world: Rigid3, radius: flo
         picture: the panorama.
         cam_from_world: pose.
         radius: in scene units.
-        surrounds: whether the eye is inside; else the half towards the eye is left out, see `panorama_sphere`.
+        surrounds: whether the viewer is inside; otherwise the near half is left out, see `panorama_sphere`.
     """
     import pyvista
 
@@ -37,9 +37,9 @@ def sphere_actor(picture: NDArray[np.uint8], cam_from_world: Rigid3, radius: flo
 
 
 def rims_actor(centers: NDArray[np.float64], radius: float, color: str) -> Any:
-    """Return the actor of rims around spheres, (N, 3), by which they stand out from what is behind them.
+    """Return the actor of rims around spheres, (N, 3), which separate them from the background.
 
-    Of larger spheres, of that radius, the far half is drawn: what of them looks out behind the spheres is their rim.
+    The far half of larger spheres of this radius is drawn; the part that extends beyond the spheres is the rim.
     """
     import pyvista
 

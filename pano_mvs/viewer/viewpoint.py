@@ -1,4 +1,4 @@
-"""From where the scene is looked at, and which ray a place in the window is."""
+"""Viewpoints of the scene, and the rays of pixels in the window."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ FloatArray = NDArray[np.float64]
 
 OUTSIDE_ANGLE_DEG, INSIDE_ANGLE_DEG = 45.0, 80.0
 _MIN_ANGLE_DEG, _MAX_ANGLE_DEG = 15.0, 110.0
-# One does not look straight up or down: there the direction up has no meaning.
+# Limit of the elevation: straight up and down, the up direction is undefined.
 _STEEPEST_DEG = 89.0
-# The scene fills the window up to this share.
+# Share of the window that the scene fills.
 _FILLED = 0.94
-# Height of a plan or an elevation in halves of the scene: below it there is room for the bar of known length.
+# Height of a plan or an elevation in halves of the scene, with space for the scale bar below.
 _PARALLEL_ROOM = 2.25
 
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """Where the eye is and what it sees.
+    """Position and direction of view.
 
     Attributes:
         eye: (3,) in the world.
-        target: (3,) what is in the middle of the window.
-        up: (3,) unit direction that is upright in the window.
+        target: (3,) point in the centre of the window.
+        up: (3,) unit vector, up in the window.
         angle_deg: vertical field of view.
-        height: of what is seen in parallel projection, scene units; 0 for perspective.
+        height: visible height in parallel projection, scene units; 0 for perspective.
     """
 
     eye: FloatArray
@@ -39,7 +39,7 @@ class Viewpoint:
 
     @property
     def axes(self) -> FloatArray:
-        """The directions right, down and forward of the window in the world, (3, 3), one in each row."""
+        """The directions right, down and forward of the window in the world, (3, 3), one per row."""
         forward = self.target - self.eye
         forward = forward / np.linalg.norm(forward)
         right = np.cross(forward, self.up)
@@ -49,7 +49,7 @@ class Viewpoint:
         return np.stack([right, np.cross(forward, right), forward])
 
     def ray(self, x: float, y: float, size_wh: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-        """Return where the ray of a place in the window begins, and its unit direction.
+        """Return the origin and the unit direction of the ray of a position in the window.
 
         Args:
             x: from the left edge in pixels.
@@ -58,7 +58,7 @@ class Viewpoint:
         """
         width, height = size_wh
         right, down, forward = self.axes
-        # In halves of the height, from the middle.
+        # In halves of the height, from the centre.
         across, below = (2 * x - width) / height, (2 * y - height) / height
         if self.height:
             return self.eye + self.height / 2 * (across * right + below * down), forward
@@ -67,9 +67,9 @@ class Viewpoint:
         return self.eye, direction / np.linalg.norm(direction)
 
     def turned(self, dx_px: float, dy_px: float, *, window_height: int) -> Viewpoint:
-        """Return the view from the same place after the picture was dragged by this number of pixels, right and down.
+        """Return the view from the same position after dragging by this number of pixels to the right and down.
 
-        What was under the pointer stays under it, near the middle of the window.
+        Near the centre of the window, the point under the pointer stays there.
         """
         rad_per_px = np.deg2rad(self.angle_deg) / window_height
         _, _, forward = self.axes
@@ -87,7 +87,7 @@ class Viewpoint:
         return replace(self, target=target)
 
     def zoomed(self, steps: float) -> Viewpoint:
-        """Return the view with a smaller angle for positive steps, within reason."""
+        """Return the view with a smaller angle for positive steps, within limits."""
         angle = float(np.clip(self.angle_deg * 0.9**steps, _MIN_ANGLE_DEG, _MAX_ANGLE_DEG))
         return replace(self, angle_deg=angle)
 
@@ -99,13 +99,13 @@ def looking_along(eye: ArrayLike, direction: ArrayLike, up: ArrayLike) -> Viewpo
 
 
 def outside_view(name: str, box: FloatArray, up: FloatArray, ahead: FloatArray, *, aspect: float) -> Viewpoint:
-    """Return a view from outside of all that lies in a box.
+    """Return a view of a box from outside.
 
     Args:
         name: "overview", from above at an angle; "top", a plan; "front", an elevation, along `ahead`.
-        box: (2, 3) least and greatest coordinates.
+        box: (2, 3) minimum and maximum coordinates.
         up: (3,) unit.
-        ahead: (3,) unit, across `up`: what is upwards in the plan, and farthest in the others.
+        ahead: (3,) unit vector orthogonal to `up`: up in the plan, away from the viewer in the others.
         aspect: width of the window as a multiple of its height.
     """
     middle, right = box.mean(axis=0), np.cross(ahead, up)
@@ -123,7 +123,7 @@ def outside_view(name: str, box: FloatArray, up: FloatArray, ahead: FloatArray, 
 
 
 def _distance(corners: FloatArray, aspect: float) -> float:
-    """Return from how far away all corners, (N, 3) right, down and forward of the middle, are in the window."""
+    """Return the distance from which all corners, (N, 3) relative to the centre, are visible in the window."""
     reach = np.tan(np.deg2rad(OUTSIDE_ANGLE_DEG) / 2) * _FILLED
     needed = np.maximum(np.abs(corners[:, 0]) / aspect, np.abs(corners[:, 1])) / reach - corners[:, 2]
     return float(needed.max())

@@ -1,4 +1,4 @@
-"""The window: PyVista shows what the tour says."""
+"""The window of the viewer, drawn by PyVista from the state of the tour."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _RIM_OUTSIDE, _RIM_INSIDE = 1.1, 1.03
 _MAX_LABELS = 300
 _SURROUND_SHARE = 2.0
 _FONT_SHARE = 1 / 72
-# Upper right, as least and greatest x and y: the bar lies at the lower edge, texts in other corners.
+# Upper right corner, as minimum and maximum x and y: the scale bar is at the lower edge, texts are in other corners.
 _TRIAD = (0.8, 0.8, 1.0, 1.0)
 
 
@@ -73,16 +73,16 @@ class SceneWindow:
         self.plotter.close()
 
     def picture(self) -> NDArray[np.uint8]:
-        """Return what the window shows, (H, W, 3) RGB."""
+        """Return an image of the window, (H, W, 3) RGB."""
         image = self.plotter.screenshot(return_img=True)
         return np.asarray(image, np.uint8)[..., :3]
 
     def close(self) -> None:
-        """Give the window's memory back."""
+        """Free the memory of the window."""
         self.plotter.close()
 
     def seen_from(self) -> Viewpoint:
-        """Return where the window's camera is; the trackball may have moved it."""
+        """Return the viewpoint of the window's camera, which the trackball may have moved."""
         camera = self.plotter.camera
         parallel = bool(camera.parallel_projection)
         return replace(
@@ -143,7 +143,7 @@ class SceneWindow:
             )
 
     def _add_bar(self) -> None:
-        """Lay a line of known length along the lower front edge of the scene."""
+        """Add a scale bar along the lower front edge of the scene."""
         scene, box = self.tour.scene, self.tour.box
         right = np.cross(scene.ahead, scene.up)
         corners = np.array(np.meshgrid(*box.T)).reshape(3, -1).T
@@ -158,7 +158,7 @@ class SceneWindow:
         self._overlay.label(ends[1:] + 0.02 * extent * right, [bar_text(length, scene.unit)], "bar label")
 
     def _reload_points(self, state: TourState) -> None:
-        """Read all points of the file, or as many as a display needs."""
+        """Read all points of the file, or a sample for display."""
         cloud = self.tour.cloud
         wanted = 0 if state.all_points else self._budget
         if cloud is None or self.tour.scene.cloud is None or (not wanted and len(cloud.points) == cloud.total):
@@ -191,14 +191,14 @@ class SceneWindow:
             self._cloud.size(self._point_size(state))
 
     def _point_size(self, state: TourState) -> float:
-        """Return points large enough for surfaces to close, in pixels."""
+        """Return the size of points in pixels at which surfaces appear closed."""
         count = max(1, len(self.tour.cloud.points) if self.tour.cloud is not None else 1)
         width, height = self.plotter.window_size
         share = 2.0 if state.inside is not None else 1.6
         return float(np.clip(share * np.sqrt(width * height / count), 1.5, 6.0))
 
     def _surround(self, camera_idx: int | None) -> None:
-        """Lay the panorama of a camera all around, or take it away."""
+        """Show the panorama of a camera around the viewer, or remove it."""
         if self._surroundings is not None:
             self.plotter.remove_actor(self._surroundings, render=False)
             self._surroundings = None
@@ -240,7 +240,7 @@ class SceneWindow:
         return np.argsort(np.linalg.norm(self.tour.centers - eye, axis=1), kind="stable")[:count]
 
     def _texture_nearest(self, eye: NDArray[np.float64]) -> None:
-        """Make the nearest cameras spheres with pictures, and forget those of others."""
+        """Draw the nearest cameras as textured spheres, and remove the textures of others."""
         wanted = {int(idx) for idx in self._nearest(eye, TEXTURED)}
         for idx in [idx for idx in self._spheres if idx not in wanted]:
             self.plotter.remove_actor(self._spheres.pop(idx), render=False)
@@ -252,7 +252,7 @@ class SceneWindow:
         self._mark(wanted)
 
     def _mark(self, textured: set[int]) -> None:
-        """Give the spheres rims, and all other cameras dots."""
+        """Draw rims around the spheres, and dots for all other cameras."""
         tour = self.tour
         self.plotter.remove_actor("rims", render=False)
         self.plotter.remove_actor("dots", render=False)
@@ -308,6 +308,6 @@ class SceneWindow:
 
 
 def _looks_elsewhere(before: TourState, state: TourState) -> bool:
-    """Return whether nothing but the viewpoint is another one."""
+    """Return whether only the viewpoint has changed."""
     names = (field.name for field in fields(TourState) if field.name != "viewpoint")
     return all(getattr(before, name) is getattr(state, name) for name in names)

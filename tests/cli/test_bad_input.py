@@ -38,7 +38,7 @@ def test_empty_folder(pano_mvs: Command, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     result = pano_mvs("run", "quickstart", "--images", tmp_path / "empty")
     assert result.code == 2
-    assert "no pictures here" in result.flat
+    assert "no images here" in result.flat
 
 
 def test_folder_that_is_not_there(pano_mvs: Command) -> None:
@@ -51,7 +51,7 @@ def test_file_instead_of_a_folder(pano_mvs: Command, tmp_path: Path) -> None:
     (tmp_path / "hall.jpg").touch()
     result = pano_mvs("run", "quickstart", "--images", tmp_path / "hall.jpg")
     assert result.code == 2
-    assert "this is a file; give the folder with the pictures" in result.flat
+    assert "this is a file; give the folder that contains the images" in result.flat
 
 
 def test_one_image(pano_mvs: Command, capture: Path) -> None:
@@ -150,7 +150,7 @@ def test_pictures_of_two_places_make_no_false_model(pano_mvs: Command, capture: 
 def test_output_folder_that_is_the_capture(pano_mvs: Command, short: Path, capture: Path) -> None:
     result = pano_mvs("run", short, "--out", capture / "images")
     assert result.code == 2
-    assert "reads this very folder" in result.flat
+    assert "reads this folder" in result.flat
 
 
 def test_outputs_of_an_interrupted_run_are_no_pictures(pano_mvs: Command, capture: Path) -> None:
@@ -216,7 +216,7 @@ def test_status_of_a_strange_run_json(pano_mvs: Command, short: Path) -> None:
         Path("out/run.json").write_text(text)
         result = pano_mvs("status", short, "--out", "out")
         assert result.code == 0, result.text
-        assert "Run the workflow again to replace it" in result.flat
+        assert "Run the workflow again" in result.flat
 
 
 def test_pictures_without_a_mask_are_told_in_each_run_and_only_there(

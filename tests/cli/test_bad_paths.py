@@ -61,7 +61,7 @@ def test_what_is_wrong_with_a_path_is_said(pano_mvs: Command) -> None:
     Path("locked").chmod(0)
     with permissions_hold():
         assert (
-            "--images locked/in: there is no such folder that you may look at (Permission denied)"
+            "--images locked/in: cannot be read (Permission denied)"
             in pano_mvs("run", "quickstart", "--images", "locked/in").flat
         )
         assert (
@@ -90,7 +90,7 @@ def test_cache_that_is_the_folder_of_the_images_is_refused(
     for command in ("run", "plan", "status"):
         result = pano_mvs(command, alone, "--cache", capture / "images")
         assert result.code == 2
-        assert "stage 'images' reads this very folder" in result.flat
+        assert "stage 'images' reads this folder" in result.flat
     monkeypatch.setenv("PANO_MVS_CACHE", str(capture / "images" / ".." / "images"))
     result = pano_mvs("run", alone)
     assert (result.code, "$PANO_MVS_CACHE" in result.flat) == (2, True)
@@ -115,7 +115,7 @@ def test_subfolder_that_cannot_be_listed_is_a_note(pano_mvs: Command, alone: Pat
     assert run_json(Path("out"))["stages"][0]["units"] == 4
     notes = [note for note in run_json(Path("out"))["notes"] if "lost+found" in note]
     assert notes == [
-        f"{capture / 'images' / 'lost+found'}: cannot be listed (Permission denied); what it holds is left out"
+        f"{capture / 'images' / 'lost+found'}: cannot be listed (Permission denied); its contents are skipped"
     ]
 
 

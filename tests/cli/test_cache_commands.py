@@ -154,7 +154,7 @@ def test_verification_removes_what_is_damaged_and_says_what_is_missing(toy: Toy,
     assert f"removed, damaged: {record}" in said
     assert "incomplete: " in said
     assert "2 damaged" in said
-    assert "the same run computes what is missing again" in said
+    assert "the next run computes the missing results again" in said
     assert not record.exists()
     assert not blob.exists()
     toy.run()
@@ -168,10 +168,12 @@ def test_collection_tells_first_and_deletes_when_asked(toy: Toy, cache: Cache) -
     code, said = cache("gc", "--unused", "0s")
     assert code == 0
     assert "would delete: 2" in said
-    assert "nothing was deleted; --delete does it" in said
+    assert "nothing was deleted; use --delete to delete these results" in said
     assert files_of(toy.folder / "cache") == before
     code, again = cache("gc", "--unused", "0s", "--delete")
-    assert again == said.replace("would delete", "deleted").replace(" nothing was deleted; --delete does it", "")
+    assert again == said.replace("would delete", "deleted").replace(
+        " nothing was deleted; use --delete to delete these results", ""
+    )
     assert len(files_of(toy.folder / "cache")) < len(before)
     assert "0 units, 0 blobs" in cache("gc", "--unused", "0s")[1]
     assert "(nothing to compute)" in run(toy, "out")[1]
@@ -411,7 +413,7 @@ def test_folder_that_is_no_cache_is_refused_and_left_as_it_is(tmp_path: Path) ->
     for command in (["du"], ["ls"], ["verify"], ["gc"], ["pin", "a", "b"], ["unpin", "a"]):
         result = CliRunner().invoke(app, ["cache", *command, "--cache", str(tmp_path)])
         assert result.exit_code == 2
-        assert "is no cache of pano-mvs" in " ".join(result.output.split())
+        assert "is not a cache of pano-mvs" in " ".join(result.output.split())
     assert not list(tmp_path.iterdir())
 
 

@@ -47,4 +47,4 @@ def test_plan_takes_the_out_of_a_run_and_writes_nothing_there(toy: Toy) -> None:
     assert not (toy.folder / "new").exists()
     refused = CliRunner().invoke(app, [*command, str(toy.folder / "capture")])
     assert refused.exit_code == 2, "as a run would be"
-    assert "reads this very folder" in " ".join(refused.output.split())
+    assert "reads this folder" in " ".join(refused.output.split())

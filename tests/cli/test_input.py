@@ -42,7 +42,7 @@ def test_pictures_of_every_kind_are_one_capture(pano_mvs: Command, tmp_path: Pat
     result = pano_mvs("run", tmp_path / "look.yaml", "--out", "out")
     assert result.code == 0, result.text
     assert run_json(Path("out"))["stages"][0]["run"] == 8
-    assert "EXIF orientation that turns or mirrors them, which was ignored" in result.flat
+    assert "EXIF orientation that rotates or mirrors them, which was ignored" in result.flat
 
 
 def test_two_fisheyes_among_panoramas_are_told(pano_mvs: Command, tmp_path: Path) -> None:

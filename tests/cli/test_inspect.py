@@ -130,7 +130,7 @@ def test_a_masked_pixel_has_a_curve_and_no_range(run: Path) -> None:
 
 def test_a_sweep_from_coarse_to_fine_says_that_it_tried_less(run: Path) -> None:
     found = inspected(run / "out", "000.png", 40, 28, "--set", "depth.levels=2")
-    assert any("tries a few ranges around a guide" in note for note in found["notes"])
+    assert any("tests a few ranges around a guide" in note for note in found["notes"])
 
 
 def test_people_see_tables_a_plot_and_a_picture(run: Path, tmp_path: Path) -> None:
@@ -156,11 +156,11 @@ def test_people_see_tables_a_plot_and_a_picture(run: Path, tmp_path: Path) -> No
     ("arguments", "message"),
     [
         (("000.png", 500, 3), "there is no pixel (500, 3); x is 0 to 127"),
-        (("000.png", "nan", 3), "(nan, 3.0) is no pixel"),
-        (("000.png", 5, "inf"), "(5.0, inf) is no pixel"),
-        (("0", 5, 3), "3 images are called '0'"),
-        (("lobby.jpg", 5, 3), "no images are called 'lobby.jpg'; there are: 000.png"),
-        (("000.png", 5, 3, "--stage", "checked"), "its sweeps: depth, boxed"),
+        (("000.png", "nan", 3), "(nan, 3.0) is not a pixel"),
+        (("000.png", 5, "inf"), "(5.0, inf) is not a pixel"),
+        (("0", 5, 3), "3 images match '0'"),
+        (("lobby.jpg", 5, 3), "no images match 'lobby.jpg'; there are: 000.png"),
+        (("000.png", 5, 3, "--stage", "checked"), "which has: depth, boxed"),
         (("000.png", 5, 3, "--plot", "curve.pdf"), "the plot is a PNG"),
         (("000.png", 5, 3, "--set", "images.nadir_deg=30"), "run the workflow with these settings first"),
     ],
@@ -205,7 +205,7 @@ def test_folders_that_are_no_output_are_refused(run: Path, tmp_path: Path) -> No
     summary = json.loads((moved / "run.json").read_text())
     summary["workflow"]["path"] = "/nowhere/wf.yaml"
     (moved / "run.json").write_text(json.dumps(summary))
-    assert "its workflow /nowhere/wf.yaml is gone" in call("inspect", moved, "000.png", 1, 1).flat
+    assert "its workflow /nowhere/wf.yaml is missing" in call("inspect", moved, "000.png", 1, 1).flat
 
 
 def test_the_pictures_of_the_run_are_found_from_anywhere(

@@ -87,14 +87,14 @@ def test_the_command_writes_both_files_and_overwrites_none(pano_mvs: Command) ->
     Path("plugins/here/mine.py").unlink()
     result = pano_mvs("plugin", "new", "filter", "mine", "--dir", "plugins/here")
     assert result.code == 2
-    assert "test_mine.py is there already" in result.flat
+    assert "test_mine.py already exists" in result.flat
     assert not Path("plugins/here/mine.py").exists()
 
 
 @pytest.mark.parametrize(
     ("kind", "name", "what"),
     [
-        ("filters", "mine", "no kind of plugin 'filters'; there are source, mask"),
+        ("filters", "mine", "unknown kind of plugin 'filters'; known kinds: source, mask"),
         ("filter", "../mine", "cannot be called '../mine'"),
         ("filter", "Mine", "cannot be called 'Mine'"),
         ("filter", "class", "cannot be called 'class'"),

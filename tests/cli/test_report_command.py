@@ -53,7 +53,7 @@ def test_a_run_its_repetition_and_the_command_show_the_same(pano_mvs: Command, t
         assert sum(str(alt).startswith(f"{name}:") for alt in pictures(first)) == 3
     assert len(pictures(first)) == 9 + 3, "of the cloud from three places"
     assert "metres, as the file has it" in first.words
-    assert "Against the truth" in first.words
+    assert "Comparison with ground truth" in first.words
     summary = run_json(out)
     assert set(summary["results"]) == {"images", "pairs", "poses", "ranges", "cloud"}
     assert summary["machine"]["cores"] >= 1
@@ -65,7 +65,7 @@ def test_a_run_its_repetition_and_the_command_show_the_same(pano_mvs: Command, t
 
     assert pano_mvs("run", *command).code == 0
     again = page_in(out)
-    assert "Nothing had changed" in again.words
+    assert "Nothing has changed" in again.words
     assert pictures(again) == pictures(first)
 
     shutil.rmtree("cache")
@@ -97,7 +97,7 @@ def test_an_interrupted_run_has_a_report(pano_mvs: Command, toy: Toy) -> None:  
     assert (summary["exit_code"], summary["stopped"]) == (130, "interrupted")
     page = page_in(toy.folder / "out")
     assert "Interrupted" in page.words
-    assert "what is finished is not computed again" in page.words
+    assert "Run the same command again to continue" in page.words
 
 
 def test_a_run_that_a_gate_stops_says_why_at_once(pano_mvs: Command, toy: Toy) -> None:  # noqa: F811

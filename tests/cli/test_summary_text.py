@@ -34,7 +34,7 @@ def test_one_of_anything_is_not_named_as_several(tmp_path: Path) -> None:
     print_summary(RunOutput(tmp_path, summary, StoredValues(), written=("b",)), Console(file=stream, width=200))
     for words in (
         "1 unit computed, 0 cached",
-        "1 file of an earlier run, which this one did not write, is still",
+        "1 file of an earlier run, which this run did not write, is still",
         "1 point; scale",
         "(1 file, 1 written now)",
     ):

@@ -48,13 +48,13 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
     ("arguments", "message"),
     [
         ((), "no display"),
-        (("--screenshot", "a.bmp"), "pictures are .png"),
+        (("--screenshot", "a.bmp"), "images must end in .png"),
         (("--screenshot", "a.png", "--size", "big"), "give the width and the height"),
         (("--screenshot", "a.png", "--view", "inside:roof"), "no camera 'roof'; there are: lobby/000.png"),
         (("--screenshot", "a.png", "--view", "below"), "there are overview, top, front and inside:NAME"),
         (("--screenshot", "a.png", "--color", "views"), "quality: true"),
         (("--screenshot", "a.png", "--show", "both"), "there is no mesh.ply"),
-        (("--screenshot", "a.png", "--show", "all"), "there are cloud, mesh and both"),
+        (("--screenshot", "a.png", "--show", "all"), "must be cloud, mesh or both"),
     ],
 )
 def test_mistakes_are_told_with_a_remedy(out: Path, arguments: tuple[str, ...], message: str) -> None:

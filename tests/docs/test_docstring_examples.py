@@ -12,7 +12,12 @@ import pano_mvs
 
 PACKAGE = Path(pano_mvs.__file__).parent
 # Each runs the sample, or needs what the one before has left.
-COMPUTING = ("pano_mvs.session.running", "pano_mvs.session.planning", "pano_mvs.results.run_output")
+COMPUTING = (
+    "pano_mvs.session.running",
+    "pano_mvs.session.planning",
+    "pano_mvs.results.run_output",
+    "pano_mvs.share.share",
+)
 
 
 def modules() -> list[str]:

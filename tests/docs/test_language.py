@@ -47,6 +47,9 @@ def test_of_a_workflow_comments_count(tmp_path: Path, monkeypatch: pytest.Monkey
         ("x = f'{told} is a sound name'\n", ["sound"]),
         ("x = {'gate': 1}\ny = '`gate` is a key'\n", []),
         ("# the law of sines tells them apart\n", []),
+        ('"""Gates.\n\n    Args:\n        gate: of laws.\n"""\n', ["law", "gate"]),
+        ('"""Return None if it is None or is none."""\n', ["is none"]),
+        ('"""It is no mask if there is no pixel, and is no longer one."""\n', ["is no"]),
     ],
 )
 def test_comments_and_strings_of_a_module_count(

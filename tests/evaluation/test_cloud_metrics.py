@@ -77,7 +77,7 @@ class TestSurface:
         np.testing.assert_array_equal(surface_of_cloud(points, voxel_size=1.0).area, [0.5, 0.5, 1])
 
     def test_no_view_is_named(self) -> None:
-        with pytest.raises(UsageError, match="no view with truth"):
+        with pytest.raises(UsageError, match="no view has ground truth"):
             surface_of_views([])
 
 

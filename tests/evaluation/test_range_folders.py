@@ -97,7 +97,7 @@ def test_truth_is_found_with_poses_and_without(tmp_path: Path) -> None:
     assert list(found) == ["images/z.png"]
     np.testing.assert_array_equal(found["images/z.png"].read(), 2 * RANGES)
     np.savez(tmp_path / "depth.npz", nothing=RANGES)
-    with pytest.raises(InputError, match="no array named like an image"):
+    with pytest.raises(InputError, match="no array named after an image"):
         find_true_ranges(tmp_path)
     (tmp_path / "poses.json").unlink()
     assert list(find_true_ranges(tmp_path)) == ["nothing"]
@@ -164,5 +164,5 @@ class TestFaults:
         with pytest.raises(InputError, match="holds 2 arrays"):
             RangeFile(tmp_path / "a.npz").read()
         np.savez(tmp_path / "b.npz")
-        with pytest.raises(InputError, match="holds no arrays"):
+        with pytest.raises(InputError, match="contains no arrays"):
             find_ranges(tmp_path / "b.npz")

@@ -107,7 +107,7 @@ class TestDefinitions:
 
     @pytest.mark.parametrize("text", ["", "5 percent", "0", "-1%", "nan", "inf"])
     def test_limits_that_are_none_are_told(self, text: str) -> None:
-        with pytest.raises(UsageError, match="is no limit for bad pixels"):
+        with pytest.raises(UsageError, match="is not a limit for bad pixels"):
             BadLimit.from_text(text)
 
     def test_limits_are_named_by_what_they_are(self) -> None:

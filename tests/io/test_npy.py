@@ -32,7 +32,7 @@ def test_arrays_come_back(tmp_path: Path, order: Literal["C", "F"], dtype: str) 
 @pytest.mark.parametrize(
     ("start", "what"),
     [
-        (header("(1000000000000,)"), "states 4000000000000 bytes, there are"),
+        (header("(1000000000000,)"), "states 4000000000000 bytes, but there are"),
         (header("(4611686018427387904, 4)"), "states"),
         (header("(-1, 5)"), "states the shape"),
         (header("(5,)", "'|O'"), "Python objects"),

@@ -74,7 +74,7 @@ def test_its_pixels_are_ours(tmp_path: Path) -> None:
         (reconstruction(cameras={"v2": {"projection_type": "perspective"}}), "shot '1.jpg'.*perspective, expected"),
         (reconstruction(cameras={}), "projection_type is None"),
         (reconstruction(cameras=[]), "must be objects"),
-        (reconstruction(shots={}), "holds no poses"),
+        (reconstruction(shots={}), "contains no poses"),
         (reconstruction(shots={"a": 1}), "shot 'a': expected an object"),
         (reconstruction(shots={"a": {"camera": "v2", "rotation": [0, 0]}}), "key 'rotation' must hold 3 numbers"),
         (

@@ -57,7 +57,7 @@ def test_a_name_with_a_comma_may_be_quoted(tmp_path: Path) -> None:
     [
         ([], ":1: the first line must be name,tx"),
         (["image,x,y,z"], ":1: the first line must be name,tx"),
-        ([HEADER], ": holds no poses"),
+        ([HEADER], ": contains no poses"),
         ([HEADER, "", "a,1,2,3"], ":3: expected a name and 7 numbers .* got 4 cells"),
         ([HEADER, "a,1,2,3,1,0,0,zero"], ":2: could not convert"),
         ([HEADER, "# x", "a,1,2,3,0,0,0,0"], ":3: the pose of a .* quaternion of length 0"),

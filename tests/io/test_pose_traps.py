@@ -35,7 +35,7 @@ SHOT = {"camera": "c", "rotation": [0, 0, 0], "translation": [0, 0, 0]}
         ("poses.json", views(metric="false"), "must be true or false"),
         ("transforms.json", frames([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 2, 3, 1]]), "transposed"),
         ("transforms.json", frames([[1, 0, 0, 10**400], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), "4 × 4 numbers"),
-        ("transforms.json", frames([[1, 0, 0, 1e308], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), "no place on Earth"),
+        ("transforms.json", frames([[1, 0, 0, 1e308], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), "not a valid pos"),
         ("reconstruction.json", shots(shots=3), "must be objects by name"),
         ("reconstruction.json", shots(shots={"a.png": {**SHOT, "camera": ["c"]}}), "projection_type is None"),
     ],

@@ -114,7 +114,7 @@ def test_a_score_stands_beside_what_a_constant_scores() -> None:
     assert tables["columns"] == ["psnr_db", "ause"]
     assert tables["views"] == [("a", ["30 (19)", "0.02"]), ("b", ["20 (10)", "–"]), ("c", ["–", "–"])]
     assert tables["median"] == ["25 (19)", "0.02"]
-    assert "best for the very score" in tables["notes"][0]
+    assert "best one for each score" in tables["notes"][0]
     assert tables["notes"][1:] == ["a note"]
     assert score_tables(ScoresSummary(views={"a": {"psnr_db": 1.0}})) == {
         "poses": [],

@@ -99,7 +99,7 @@ def test_groups_are_a_doubt_and_the_pictures_to_take_are_named(rooms: tuple[dict
     told = next(finding for finding in found.findings if "groups of panoramas" in finding.text)
     assert (told.mood, told.remedy) == (
         "fair",
-        "To join them take pictures between 001.png and 002.png (31 candidates).",
+        "To connect them, take panoramas between 001.png and 002.png (31 candidates).",
     )
     assert "group 1 has 2 (002.png, 003.png)" in told.text
 
@@ -114,7 +114,7 @@ def test_one_group_is_no_finding(rooms: tuple[dict[str, Any], StoredValues]) -> 
 
 def test_of_groups_that_were_never_compared_nothing_is_guessed() -> None:
     text = pictures_between([PoseGroup(images=("a",)), PoseGroup(images=("x",))])
-    assert text.startswith("Take pictures between the groups")
+    assert text.startswith("Take panoramas between the groups")
 
 
 def test_of_many_groups_a_few_are_named() -> None:
@@ -145,7 +145,7 @@ def test_the_page_draws_each_group_apart_and_says_its_frame(
     assert "the annexe's" in text
     assert [text.count(f"{name} group {number}") for name, number in (("001.png", 0), ("002.png", 1))] == [1, 1]
     assert "metres, by GPS" in text
-    assert "each has its own frame and unit of length" in text
+    assert "Each group has its own frame and unit of length" in text
     assert sum(tag == "svg" and "cameras from" in str(values.get("aria-label")) for tag, values in page.elements) == 4
     labels = [
         str(values["aria-label"]) for _, values in page.elements if "Colours of the" in str(values.get("aria-label"))
@@ -157,7 +157,7 @@ def test_the_cloud_of_the_largest_group_is_shown_alone(rooms: tuple[dict[str, An
     """The other one is a thousand units away here: with it nothing would be seen of either."""
     _, results = rooms
     shown = cloud_pictures(results, EarlierPage(), up=np.array([0.0, -1.0, 0.0]))
-    assert "shown is group 0" in shown.note
+    assert "this is group 0" in shown.note
     assert results.cloud is not None
     alone = with_values(results, cloud=results.cloud.groups()[0])
     for (_, picture), (_, expected) in zip(

@@ -287,4 +287,4 @@ def test_scores_of_all_branches_are_told_apart(out_dir: Path) -> None:
 
 
 def test_where_nothing_failed_nothing_is_said_of_failures(out_dir: Path) -> None:
-    assert "What failed" not in reported(out_dir, SUMMARY | {"failures": []}).words
+    assert "Failures" not in reported(out_dir, SUMMARY | {"failures": []}).words

@@ -40,7 +40,7 @@ def test_views_are_shown_with_panorama_range_and_confidence(
     assert_sound(page)
     for name in tiny.names:
         words = [attrs["alt"] for attrs in page.all("img") if str(attrs["alt"]).startswith(f"{name}:")]
-        assert [word.split()[-1] for word in words] == ["panorama", "blue", "class"]
+        assert [word.split()[-1] for word in words] == ["panorama", "(far)", "pixel"]
     assert page.all("img", alt="The cloud: From above")
     assert "From inside, where" in page.words
     assert "only 7 of 31 matches agree" in page.words
@@ -127,7 +127,7 @@ def test_a_folder_and_its_cache_give_the_page_of_the_run(
     assert panorama.load().shape == (32, 64, 3)
     assert again.notes == []
     elsewhere = StoredValues.of_folder(out_dir / "other", RunSummary.from_json(summary), store)
-    assert "knows no run" in elsewhere.notes[0]
+    assert "contains no run" in elsewhere.notes[0]
     assert "earlier version" in StoredValues.of_folder(out_dir, RunSummary(), store).notes[0]
 
 
@@ -155,7 +155,7 @@ def test_where_there_is_no_graphics_driver_plainer_pictures_are_drawn(
     monkeypatch.setenv(RENDERER_VARIABLE, "")
     made = cloud_pictures(results, EarlierPage(), up=UP, command=drawing(tmp_path, body))
     assert len(made.shown) == 3
-    assert "PyVista could not draw here" in made.note
+    assert "PyVista could not render" in made.note
 
 
 def test_a_missing_interpreter_is_no_reason_to_fail(

@@ -64,7 +64,7 @@ def doubting(count: int) -> dict[str, Any]:
         ({"views": [{"completeness": 0.2, "consistent": 0.5}]}, "bad", "less than 20 %"),
         ({"views": [{"completeness": 1.0, "consistent": 0.05}]}, "bad", "confirm only 5"),
         ({"cloud": {"points": 0}}, "bad", "The cloud has no points"),
-        ({"scores": {"views": {"1": {"psnr_db": 17.0, "constant_psnr_db": 18.0}}}}, "bad", "17.0 dB to 18.0 dB"),
+        ({"scores": {"views": {"1": {"psnr_db": 17.0, "constant_psnr_db": 18.0}}}}, "bad", "18.0 dB, against 17.0 dB"),
         (
             {"all_scores": {"a": GOOD["scores"], "b": {"views": {"1": {"psnr_db": 9.0, "constant_psnr_db": 18.0}}}}},
             "bad",
@@ -77,7 +77,7 @@ def doubting(count: int) -> dict[str, Any]:
         (
             {"poses": POSES | {"links": [[NAMES[0], name, 90] for name in NAMES[1:]]}},
             "fair",
-            "9 cameras share a verified geometry with one other alone",
+            "9 cameras share a verified geometry with only one other camera",
         ),
         ({"exit_code": 3, "poses": doubting(1)}, "fair", "1 camera is doubtful: 0.png (confirmed 1 %)."),
         ({"poses": doubting(5)}, "fair", "5 cameras are doubtful: 0.png (confirmed 1 %); 1.png"),
@@ -109,7 +109,7 @@ def test_where_no_stage_compares_the_views_nothing_is_held_against_them() -> Non
     views = [{"name": name, "completeness": 0.99, "consistent": 0.0} for name in NAMES]
     found = judged(GOOD | {"views": views})
     assert found.mood == "good"
-    assert "nothing is known of their agreement" in found.findings[0].text
+    assert "it is unknown whether they agree" in found.findings[0].text
     assert not any("agree" in tile.label for tile in found.tiles)
     checked = [{"name": "checked", "use": "filters.consistency", "run": 10}]
     assert judged(GOOD | {"views": views, "stages": checked}).mood == "bad", "it compared, and nothing agrees"
@@ -183,7 +183,7 @@ def test_where_nothing_is_known_nothing_is_judged() -> None:
 
 def test_a_run_that_computed_nothing_says_so() -> None:
     stages = [{"name": "depth", "cached": 7}, {"name": "ply", "cached": 1}]
-    assert "Nothing had changed: all 8 units" in judged({"stages": stages}).sentence
+    assert "Nothing has changed: all 8 units" in judged({"stages": stages}).sentence
 
 
 def test_doubts_of_a_run_without_poses_are_findings_too() -> None:

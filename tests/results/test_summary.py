@@ -110,7 +110,7 @@ def test_what_is_no_summary_is_an_error_that_names_the_place(value: object, plac
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"stages": 3}', '{"stages": [], "units": []}'])
 def test_a_damaged_file_is_an_error_with_a_remedy(tmp_path: Path, text: str) -> None:
     (tmp_path / "run.json").write_text(text)
-    with pytest.raises(InputError, match=r"is no run\.json.*Run the workflow again"):
+    with pytest.raises(InputError, match=r"is not a .*run\.json.*Run the workflow again"):
         RunSummary.read(tmp_path)
 
 

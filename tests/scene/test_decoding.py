@@ -65,7 +65,7 @@ def test_a_header_is_believed_as_far_as_the_file_can_hold_it(tmp_path: Path, rea
 def test_opencvs_own_limit_is_reported_in_our_words(tmp_path: Path) -> None:
     """It showed as "(-215:Assertion failed) pixels <= CV_IO_MAX_IMAGE_PIXELS"."""
     data = png_of(40_000, 30_000, more=bytes(130_000))
-    with pytest.raises(InputError, match=r"a\.png: .*40000×30000 px \(1200 megapixels\) is more than OpenCV decodes"):
+    with pytest.raises(InputError, match=r"a\.png: .*40000×30000 px \(1200 megapixels\) is larger than OpenCV decodes"):
         decode_picture(data, tmp_path / "a.png", cv2.IMREAD_COLOR, max_pixels=1 << 40)
 
 
@@ -91,7 +91,7 @@ def test_what_opencv_does_not_take_is_reported_with_its_limits(
 ) -> None:
     monkeypatch.setattr(cv2, "imdecode", refuse)
     data = png_of(width, height, more=bytes(width * height // 10_000))
-    said = r"is more than OpenCV decodes, 1074 megapixels and 1048576 px" if is_limit else r"not a picture that can be"
+    said = r"is larger than OpenCV decodes, 1074 megapixels and 1048576 px" if is_limit else r"not an image that can be"
     with pytest.raises(InputError, match=said):
         decode_picture(data, tmp_path / "a.png", cv2.IMREAD_COLOR, max_pixels=1 << 40)
 
@@ -100,9 +100,9 @@ def test_a_small_picture_that_opencv_refuses_is_none_that_can_be_decoded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cv2, "imdecode", refuse)
-    with pytest.raises(InputError, match=r"a\.png: not a picture that can be decoded \(its header states 256×128 px\)"):
+    with pytest.raises(InputError, match=r"a\.png: not an image that can be decoded \(its header states 256×128 px\)"):
         decode_picture(encoded(".png"), tmp_path / "a.png", cv2.IMREAD_COLOR)
-    with pytest.raises(InputError, match=r"a: not a picture that can be decoded\. Copy it again"):
+    with pytest.raises(InputError, match=r"a: not an image that can be decoded\. Copy it again"):
         decode_picture(b"something else", tmp_path / "a", cv2.IMREAD_COLOR)
 
 
@@ -166,5 +166,5 @@ def test_want_of_memory_is_the_pictures_failure(tmp_path: Path, monkeypatch: pyt
         raise MemoryError
 
     monkeypatch.setattr(cv2, "imdecode", fail)
-    with pytest.raises(InputError, match=r"a\.png: there is not enough memory to decode a picture of 256×128 px"):
+    with pytest.raises(InputError, match=r"a\.png: there is not enough memory to decode an image of 256×128 px"):
         decode_picture(encoded(".png"), tmp_path / "a.png", cv2.IMREAD_COLOR)

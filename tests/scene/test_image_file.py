@@ -71,7 +71,7 @@ def test_eight_bits_written_as_sixteen_come_back(tmp_path: Path, factor: int, su
 
 def test_a_float_picture_is_refused_with_the_remedy(tmp_path: Path) -> None:
     (tmp_path / "a.tif").write_bytes(bytes(cv2.imencode(".tif", np.zeros((8, 16, 3), np.float32))[1]))
-    with pytest.raises(InputError, match=r"a\.tif: float32 pictures are not supported\. Convert it to 8 or 16 bits"):
+    with pytest.raises(InputError, match=r"a\.tif: float32 images are not supported\. Convert it to 8 or 16 bits"):
         decode_image(tmp_path / "a.tif")
     (tmp_path / "b.tif").write_bytes(by_pillow(SIZE, "TIFF", mode="F"))
     with pytest.raises(InputError, match=r"b\.tif: .*convert it to JPEG, or to PNG or TIFF of 8 or 16 bits"):
@@ -100,7 +100,7 @@ def test_what_cameras_append_to_a_jpeg_is_not_taken_for_its_end(tmp_path: Path) 
 
 def test_avif_that_opencv_does_not_read_says_so(tmp_path: Path) -> None:
     (tmp_path / "a.avif").write_bytes(saved("AVIF")[:200])
-    with pytest.raises(InputError, match=r"a\.avif: this OpenCV .* reads no AVIF pictures, or it is damaged"):
+    with pytest.raises(InputError, match=r"a\.avif: this OpenCV .* cannot read AVIF images, or the file is damaged"):
         decode_image(tmp_path / "a.avif")
 
 
@@ -108,7 +108,7 @@ def test_avif_that_opencv_does_not_read_says_so(tmp_path: Path) -> None:
 def test_what_is_cut_short_is_refused(tmp_path: Path, kind: str) -> None:
     data = heic(SMOOTH) if kind == "HEIC" else saved(kind)
     (tmp_path / "a.X").write_bytes(data[: len(data) // 2])
-    with pytest.raises(InputError, match=r"a\.X: not a .*picture that can be decoded"):
+    with pytest.raises(InputError, match=r"a\.X: not an? .*image that can be decoded"):
         decode_image(tmp_path / "a.X")
 
 

@@ -276,7 +276,7 @@ def test_a_pose_keeps_all_its_digits(group: int) -> None:
     [
         (np.eye(3), np.zeros(3), -1, "negative"),
         (np.eye(3) * 1.0001, np.zeros(3), 0, "orthonormal"),
-        (np.diag([1.0, 1.0, -1.0]), np.zeros(3), 0, "mirrors"),
+        (np.diag([1.0, 1.0, -1.0]), np.zeros(3), 0, "reflection"),
         (np.eye(3), np.array([0, np.nan, 0]), 0, "not finite"),
     ],
 )

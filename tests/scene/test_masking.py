@@ -85,7 +85,7 @@ def test_a_mask_that_cannot_be_read_is_named(tmp_path: Path) -> None:
         decode_mask(tmp_path / "gone.png")
     for data in (b"", b"no picture"):
         (tmp_path / "bad.png").write_bytes(data)
-        with pytest.raises(InputError, match=r"bad\.png: the mask is not a picture .* Save it as PNG"):
+        with pytest.raises(InputError, match=r"bad\.png: the mask is not an image .* Save it as PNG"):
             decode_mask(tmp_path / "bad.png")
 
 

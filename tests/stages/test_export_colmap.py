@@ -260,7 +260,7 @@ def test_too_few_points_are_told(capture: Capture, tmp_path: Path) -> None:
     )
     points = tracked(poses=capture.poses, samples={name: few}, ranges=capture.ranges, params=TrackedParams(), ctx=ctx)
     assert 50 < len(points) <= 100
-    assert f"{len(points)} points where 100000 were asked for" in ctx.notes[0]
+    assert f"only {len(points)} of 100000 points" in ctx.notes[0]
 
 
 @pytest.mark.parametrize("source_hw", [(256, 512), (600, 1200), (128, 256)])

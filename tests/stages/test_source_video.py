@@ -167,8 +167,8 @@ def fisheyes(number: int) -> Picture:
 @pytest.mark.parametrize(
     ("name", "picture", "what"),
     [
-        ("square.avi", lambda number: counted(number, (128, 128)), "128×128 px are no equirectangular frames"),
-        ("flat.avi", lambda number: counted(number, (72, 128)), "128×72 px are no equirectangular frames"),
+        ("square.avi", lambda number: counted(number, (128, 128)), "128×128 px frames are not equirectangular"),
+        ("flat.avi", lambda number: counted(number, (72, 128)), "128×72 px frames are not equirectangular"),
         ("two.avi", fisheyes, "two fisheye images side by side"),
     ],
 )

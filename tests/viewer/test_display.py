@@ -15,7 +15,7 @@ def test_without_a_display_the_remedy_is_named() -> None:
 
 
 def test_a_display_that_does_not_answer_is_told_from_one_that_does() -> None:
-    with pytest.raises(UsageError, match="does not answer"):
+    with pytest.raises(UsageError, match="does not respond"):
         require_window("vtkEGLRenderWindow")
     require_window("vtkXOpenGLRenderWindow")
 

@@ -92,11 +92,11 @@ def test_a_cloud_without_points_is_as_none(tmp_path: Path) -> None:
     write_ply(out / "cloud.ply", PointCloud(none, none, np.zeros((0, 3), np.uint8), np.zeros(0, np.uint8)))
     scene = open_scene(out)
     assert (scene.cloud, len(scene.cameras)) == (None, 2)
-    assert "cloud.ply holds no points" in scene.notes[-1]
-    with pytest.raises(InputError, match="holds no points"):
+    assert "cloud.ply contains no points" in scene.notes[-1]
+    with pytest.raises(InputError, match="contains no points"):
         open_scene(out / "cloud.ply")
     shutil.rmtree(out / "colmap")
-    with pytest.raises(InputError, match=r"holds no cloud\.ply with points"):
+    with pytest.raises(InputError, match=r"contains no cloud\.ply with points"):
         open_scene(out)
 
 
@@ -212,7 +212,7 @@ def test_one_group_is_shown_at_a_time_and_the_others_are_named(tmp_path: Path) -
         scene = open_scene(out, group=group)
         assert scene.cloud is not None
         assert (len(scene.cameras), scene.cloud.count, scene.unit) == (cameras, points, unit)
-        assert f"shown is group {group} of 2" in scene.notes[0]
+        assert f"this is group {group} of 2" in scene.notes[0]
         assert told in scene.notes[0]
     with pytest.raises(UsageError, match=r"--group 2: .* has 2 groups, numbered from 0"):
         open_scene(out, group=2)

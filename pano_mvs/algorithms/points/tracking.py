@@ -235,7 +235,7 @@ def _tracked(names: list[str], chosen: _Candidates, sightings: _Sightings, kept:
     total = len(chosen.points)
     number = np.full(total, -1, np.int32)
     number[kept] = np.arange(len(kept), dtype=np.int32)
-    # The view that a point comes from determines its position: its zero error is no evidence.
+    # The view that a point comes from determines its position: its zero error proves nothing.
     others = sightings.view_idx != chosen.home_idx[sightings.point_idx]
     errors = np.bincount(sightings.point_idx[others], sightings.errors_rad[others], minlength=total)
     confirming = np.bincount(sightings.point_idx[others], minlength=total)

@@ -1,1 +1,1 @@
-"""Images of clouds, rendered with numpy alone."""
+"""Images of clouds, rendered with numpy."""

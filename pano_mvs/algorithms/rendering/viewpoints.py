@@ -1,4 +1,4 @@
-"""Viewpoints for pictures of a cloud: from above, from outside at an angle, and from the place of a camera."""
+"""Viewpoints for images of a cloud: from above, from outside at an angle, and from the position of a camera."""
 
 from __future__ import annotations
 

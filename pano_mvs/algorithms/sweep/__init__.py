@@ -1,1 +1,1 @@
-"""The sphere sweep: range by testing virtual depths."""
+"""The sphere sweep: find ranges by testing depth hypotheses."""

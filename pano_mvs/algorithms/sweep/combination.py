@@ -1,4 +1,4 @@
-"""How much each source has to say about each pixel."""
+"""Combine the costs of the sources at each pixel: all, the best ones, or weighted by parallax."""
 
 from __future__ import annotations
 

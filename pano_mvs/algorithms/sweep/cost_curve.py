@@ -74,7 +74,7 @@ def cost_curve(work: SweepInput, *, column: int, row: int, masked: bool = False)
         masked: whether the reference is masked there.
 
     Raises:
-        UsageError: if the picture has no such pixel.
+        UsageError: if the image has no such pixel.
     """
     height, width = work.reference.shape[:2]
     if not (0 <= column < width and 0 <= row < height):

@@ -1,4 +1,4 @@
-"""Match the exposure of source pictures to the reference, from what both see."""
+"""Match the exposure of source images to the reference, from the surfaces that both see."""
 
 from __future__ import annotations
 

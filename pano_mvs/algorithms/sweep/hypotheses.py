@@ -1,4 +1,4 @@
-"""The depth hypotheses of a sweep: the ranges that it tries, called virtual depths in the paper."""
+"""The depth hypotheses of a sweep: the ranges that it tests."""
 
 from __future__ import annotations
 

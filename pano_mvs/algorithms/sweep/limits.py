@@ -1,4 +1,4 @@
-"""Between which ranges to sweep, found by looking: small sweeps of the reference and its sources that must agree."""
+"""Estimate the near and far limits of a sweep from small sweeps of the reference and its sources that must agree."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def _baselines(idx: int, poses: Sequence[Rigid3]) -> list[float]:
 
 
 def reduced_panorama(picture: NDArray[np.uint8], width_px: int) -> NDArray[np.uint8]:
-    """Return a panorama (H, W, 3) at `width_px` columns; one that is no larger is returned as it is."""
+    """Return a panorama (H, W, 3) at `width_px` columns; a smaller one is returned unchanged."""
     if picture.shape[1] <= width_px:
         return picture
     small: NDArray[np.uint8] = cv2.resize(picture, (width_px, width_px // 2), interpolation=cv2.INTER_AREA)

@@ -1,4 +1,4 @@
-"""Where nothing was found: the sky, and bare surfaces of which every range says the same."""
+"""Detect pixels without a match: the sky, and surfaces without texture, where all ranges cost about the same."""
 
 from __future__ import annotations
 

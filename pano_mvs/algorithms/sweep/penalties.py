@@ -1,4 +1,4 @@
-"""What semi-global matching pays for a step, and how its paths run on a sphere; the same for every backend."""
+"""Penalties of semi-global matching, and its paths on the sphere, for all backends."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The costs of some pixels at all depth hypotheses, without those of all other pixels."""
+"""Compute the costs of selected pixels at all depth hypotheses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From pictures to what is compared: filtered, matched in exposure, grey for census and correlation."""
+"""Prepare images for a sweep: filter them, match their exposure, convert them to grey for census and correlation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The settings of a sphere sweep, and what follows from them."""
+"""The settings of a sphere sweep."""
 
 from __future__ import annotations
 
@@ -32,60 +32,58 @@ class SweepSettings:
 
     planes: int = setting(128, ge=3, le=4096, doc="number of depth hypotheses")
     spacing: Literal["inverse", "log", "uniform"] = setting(
-        "inverse", doc="depth hypotheses: even in 1/range, log range, or range (the paper)"
+        "inverse", doc="spacing of the depth hypotheses: even in 1/range, log range, or range (the paper)"
     )
     cost: str = setting(
         "census",
         registry=SWEEP_COSTS,
-        doc="census, census_gradient (with grey levels and their gradients), zncc (correlation), sad (the "
-        "paper's sum of absolute differences), sad_gradient (colours with their gradients), or a plugin's",
+        doc="census, census_gradient (also grey levels and their gradients), zncc (correlation), sad (the "
+        "paper's sum of absolute differences), sad_gradient (also gradients of colours), or a plugin's cost",
     )
-    window: int = setting(7, ge=1, le=15, odd=True, doc="side of the cost's window in pixels, odd")
+    window: int = setting(7, ge=1, le=15, odd=True, doc="side of the window of the cost in pixels, odd")
     spherical_window: bool = setting(True, doc="widen windows towards the poles so that they keep their solid angle")
     combination: Literal["sum", "best_half", "best_k", "parallax_weighted"] = setting(
         "best_half",
-        doc="over sources: all (the paper), the better half or the best few, which copes with occlusion, or "
-        "the better half by the parallax that each of them sees",
+        doc="sources that count at a pixel: all (the paper), the better half, the `best` ones, or the better "
+        "half weighted by parallax; all but the first cope with occlusion",
     )
-    best: int = setting(2, ge=1, doc="how many sources best_k takes")
-    aggregation: Literal["box", "sgm"] = setting(
-        "sgm", doc="winner takes all after a box (the paper), or semi-global matching"
-    )
+    best: int = setting(2, ge=1, doc="number of sources of best_k")
+    aggregation: Literal["box", "sgm"] = setting("sgm", doc="average over a box (the paper), or semi-global matching")
     support: int = setting(
-        5, ge=1, le=15, odd=True, doc="side of the box over which census costs, and plugins', are averaged, odd"
+        5, ge=1, le=15, odd=True, doc="side of the box over which census costs, and costs of plugins, are averaged, odd"
     )
-    p1: int = setting(80, ge=0, le=4000, doc="SGM's penalty of a step by one plane, for 512 rows")
-    p2: int = setting(1600, ge=0, le=4000, doc="SGM's penalty of a larger step, for 512 rows")
-    p2_contrast: float = setting(15.0, ge=0, doc="grey levels of contrast at which p2 is halved; 0 keeps it")
+    p1: int = setting(80, ge=0, le=4000, doc="SGM's penalty for a step of one plane, for 512 rows")
+    p2: int = setting(1600, ge=0, le=4000, doc="SGM's penalty for a larger step, for 512 rows")
+    p2_contrast: float = setting(15.0, ge=0, doc="contrast in grey levels at which p2 is halved; 0: p2 is constant")
     selection: Literal["winner", "parabola", "vfit"] = setting(
         "vfit", doc="the cheapest plane (the paper), or the minimum of a parabola or a V around it"
     )
     confidence: Literal["peak_ratio", "curvature", "combined"] = setting(
-        "peak_ratio", doc="how much dearer the best rival is, how sharp the minimum is, or both"
+        "peak_ratio", doc="margin to the best other minimum, sharpness of the minimum, or both"
     )
     no_match: Literal["invalid", "keep"] = setting(
         "invalid",
-        doc="bare pixels that run to the nearest or farthest plane, and all (the sky) that run to a farthest "
-        "plane as good as infinitely far: leave `far` to be found outdoors; the paper keeps them",
+        doc="pixels without texture whose winner is the nearest or farthest plane, and all pixels (the sky) "
+        "whose winner is a farthest plane without parallax, for which `far` must be unset; the paper keeps them",
     )
     prefilter_diameter: int = setting(
-        0, ge=0, le=31, doc="bilateral filter of the pictures before the sweep (the paper: 3); 0: no filter"
+        0, ge=0, le=31, doc="diameter of a bilateral filter of the images before the sweep (the paper: 3); 0: none"
     )
-    prefilter_sigma_color: float = setting(25.0, gt=0, doc="its width in grey levels")
-    prefilter_sigma_space_px: float = setting(25.0, gt=0, doc="its width in pixels")
+    prefilter_sigma_color: float = setting(25.0, gt=0, doc="standard deviation of the bilateral filter in grey levels")
+    prefilter_sigma_space_px: float = setting(25.0, gt=0, doc="standard deviation of the bilateral filter in pixels")
     derotate: bool = setting(False, doc="resample each source to the reference's orientation first (the paper)")
-    exposure: bool = setting(True, doc="match the exposure of sources to the reference's where colours are compared")
+    exposure: bool = setting(True, doc="match the exposure of sources to the reference if the cost compares colours")
     levels: int = setting(
         1,
         ge=1,
         le=4,
-        doc="1: every plane everywhere; 2 or 3: a sweep at half or a quarter of the resolution says where to "
-        "look, which is faster",
+        doc="1: test every plane at every pixel; 2 or 3: first sweep at half or a quarter of the resolution to "
+        "restrict the search, which is faster",
     )
     volume_limit_gb: float = setting(
         4.0,
         gt=0,
-        doc="memory (10⁹ bytes) of semi-global matching; larger panoramas are matched in parts that overlap",
+        doc="memory for semi-global matching, in 10⁹ bytes; larger panoramas are matched in overlapping parts",
     )
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-"""The sphere sweep: the range of every pixel of a panorama by testing depth hypotheses, the paper's virtual depths.
+"""The sphere sweep: find the range of every pixel of a panorama by testing depth hypotheses.
 
 For a hypothesis r, a reference pixel u is looked up in source k at F⁻¹(r R F(u) + t), (R, t) = source_from_reference
 and F the ray of a pixel; the range at which reference and sources agree best wins.
@@ -74,7 +74,7 @@ def sweep_range(
         `has_match`).
 
     Raises:
-        UsageError: if shapes, types or numbers do not fit together, or near and far are no limits.
+        UsageError: if shapes, types or numbers do not fit together, or near and far are not valid limits.
     """
     settings = settings or SweepSettings()
     compute = backend_for(backend, settings).find_winners

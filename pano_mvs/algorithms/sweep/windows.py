@@ -1,4 +1,4 @@
-"""Windows on the sphere: how far a window's columns reach in each row."""
+"""Windows on the sphere: their width in columns for each row."""
 
 from __future__ import annotations
 

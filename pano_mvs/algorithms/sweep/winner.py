@@ -1,4 +1,4 @@
-"""From winning planes to ranges with confidence; the same for every backend."""
+"""Convert winning planes to ranges with confidence, for all backends."""
 
 from __future__ import annotations
 

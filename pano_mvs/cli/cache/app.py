@@ -1,4 +1,4 @@
-"""`pano-mvs cache …`: the typer side of cache_command."""
+"""Options of `pano-mvs cache`; `command` does the work."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from typing import Annotated
 import typer
 
 from pano_mvs.cli.console import Console
-from pano_mvs.cli.exit_codes import guarded
+from pano_mvs.cli.error_messages import guarded
 from pano_mvs.cli.options import CacheOption
 
 cache_app = typer.Typer(
-    help="Look after a cache. Nothing is ever deleted unless `gc --delete` is asked for.", no_args_is_help=True
+    help="Inspect and clean the cache. Only `gc --delete` and `verify` delete files.", no_args_is_help=True
 )
 
 
 @cache_app.command("du")
 @guarded
 def usage(cache: CacheOption = None) -> None:
-    """Show how much each stage takes."""
+    """Show the disk space used by each stage."""
     from pano_mvs.cli.cache.command import open_cache, show_usage
 
     show_usage(open_cache(cache), Console())
@@ -38,12 +38,13 @@ def runs(cache: CacheOption = None) -> None:
 def verify(
     cache: CacheOption = None,
     drop_unproven: Annotated[
-        bool, typer.Option("--drop-unproven", help="Remove results of earlier versions that are not proven.")
+        bool,
+        typer.Option("--drop-unproven", help="Remove results of earlier versions that cannot be proven to be correct."),
     ] = False,
 ) -> None:
-    """Check every byte; damaged files are removed, and computed again by the next run.
+    """Check every file and remove damaged ones, which the next run computes again.
 
-    Results of earlier versions that may be of images that changed during a run are listed as not proven.
+    Results of earlier versions are listed as not proven if their images may have changed during the run.
     """
     from pano_mvs.cli.cache.command import open_cache, verify_cache
 
@@ -54,15 +55,16 @@ def verify(
 @guarded
 def collect(
     cache: CacheOption = None,
-    delete: Annotated[bool, typer.Option("--delete", help="Delete it; else it is only shown.")] = False,
+    delete: Annotated[bool, typer.Option("--delete", help="Delete these results; default: only list them.")] = False,
     unused: Annotated[
-        str, typer.Option("--unused", metavar="TIME", help="Keep what was computed within this time.")
+        str, typer.Option("--unused", metavar="TIME", help="Keep results computed within this time.")
     ] = "1d",
     older_than: Annotated[
-        str, typer.Option("--older-than", metavar="TIME", help="Forget runs that ended longer ago, such as 30d.")
+        str,
+        typer.Option("--older-than", metavar="TIME", help="Forget runs that ended longer ago than this, such as 30d."),
     ] = "",
 ) -> None:
-    """Show what no latest run of a workflow into a folder, and no pin, needs."""
+    """List or delete results that no latest run and no pin needs."""
     from pano_mvs.cli.cache.command import collect_cache, open_cache
 
     collect_cache(open_cache(cache), Console(), delete=delete, unused=unused, older_than=older_than)
@@ -71,11 +73,11 @@ def collect(
 @cache_app.command("pin")
 @guarded
 def pin(
-    run: Annotated[str, typer.Argument(help="The beginning of a run's name in `cache ls`, or its output folder.")],
-    name: Annotated[str, typer.Argument(help="A name for the pin.")],
+    run: Annotated[str, typer.Argument(help="The beginning of the run's name in `cache ls`, or its output folder.")],
+    name: Annotated[str, typer.Argument(help="Name of the pin.")],
     cache: CacheOption = None,
 ) -> None:
-    """Keep what a run used, whatever runs after it."""
+    """Protect the results of a run from `gc`."""
     from pano_mvs.cli.cache.command import open_cache, pin_run
 
     pin_run(open_cache(cache), Console(), run, name)
@@ -83,8 +85,8 @@ def pin(
 
 @cache_app.command("unpin")
 @guarded
-def unpin(name: Annotated[str, typer.Argument(help="The pin's name.")], cache: CacheOption = None) -> None:
-    """Give up a pin."""
+def unpin(name: Annotated[str, typer.Argument(help="Name of the pin.")], cache: CacheOption = None) -> None:
+    """Remove a pin."""
     from pano_mvs.cli.cache.command import open_cache, unpin_run
 
     unpin_run(open_cache(cache), Console(), name)

@@ -1,4 +1,4 @@
-"""The commands that look after a cache: its size, its content, its integrity, and what can be deleted."""
+"""The cache commands: size, content, integrity, and results that can be deleted."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _UNPROVEN = (
 
 
 def open_cache(cache: Path | None) -> Store:
-    """Open the cache that is asked for: `--cache`, $PANO_MVS_CACHE, or `.pano-mvs` in the current folder.
+    """Open the cache given by `--cache`, $PANO_MVS_CACHE, or `.pano-mvs` in the current folder.
 
     Raises:
         UsageError: if there is none.
@@ -37,16 +37,16 @@ def open_cache(cache: Path | None) -> Store:
     root = cache or (Path(variable) if variable else Path(".pano-mvs"))
     if not is_file(root / "layout.json"):
         if is_denied(root / "layout.json"):
-            raise UsageError(f"{root}: you may not look into this folder (permission denied). Mend its permissions")
+            raise UsageError(f"{root}: this folder cannot be listed (permission denied). Correct its permissions")
         raise UsageError(
-            f"{root} is no cache of pano-mvs; name one with --cache DIR (it lies beside the workflow file "
+            f"{root} is not a cache of pano-mvs; specify one with --cache DIR (it lies beside the workflow file "
             "as .pano-mvs, or where you ran a preset by its name)"
         )
     return Store(root)
 
 
 def show_usage(store: Store, console: Console) -> None:
-    """Print how much of the cache each stage takes."""
+    """Print the disk space used by each stage."""
     table = Table("stage", "units", "size", "computed in")
     for usage in usage_of(store):
         table.add_row(usage.stage, str(usage.units), size_text(usage.size_bytes), f"{usage.seconds:.0f} s")
@@ -92,19 +92,19 @@ def verify_cache(store: Store, console: Console, *, drop_unproven: bool = False)
     if not damage.removed and not damage.incomplete and not damage.unproven:
         return 0
     if damage.removed or damage.incomplete or drop_unproven:
-        console.print("the same run computes what is missing again")
+        console.print("the next run computes the missing results again")
     return _FAILED_ITEMS
 
 
 def collect_cache(store: Store, console: Console, *, delete: bool, unused: str, older_than: str) -> None:
-    """Print what nothing needs any more; remove it if asked."""
+    """Print the results that nothing needs any more; delete them on request."""
     forget_after_s = seconds_from_text(older_than) if older_than else None
     found = collect(store, unused_s=seconds_from_text(unused), forget_after_s=forget_after_s, delete=delete)
     for entry in found.runs:
         console.print(f"run of {escape(entry.workflow)} into {escape(entry.out)}, ended {entry.when}", highlight=False)
     console.print(_told(found, delete=delete), highlight=False)
     if not delete and (found.records or found.blobs or found.runs):
-        console.print("nothing was deleted; --delete does it")
+        console.print("nothing was deleted; use --delete to delete these results")
 
 
 def _told(found: GarbageCollection, *, delete: bool) -> str:
@@ -114,7 +114,7 @@ def _told(found: GarbageCollection, *, delete: bool) -> str:
 
 
 def pin_run(store: Store, console: Console, run: str, name: str) -> None:
-    """Keep what a run used whatever runs after it."""
+    """Protect the results of a run from garbage collection."""
     pin = store.runs.pin(run, name)
     console.print(
         f"{escape(pin.name)}: {pin.units} {plural(pin.units, 'unit')} of {escape(pin.workflow)} "
@@ -124,16 +124,16 @@ def pin_run(store: Store, console: Console, run: str, name: str) -> None:
 
 
 def unpin_run(store: Store, console: Console, name: str) -> None:
-    """Give up a pin."""
+    """Remove a pin."""
     pins = {entry.name: entry for entry in store.runs.entries() if entry.pinned}
     if name not in pins:
         raise UsageError(f"there is no pin {name!r}; there are: {', '.join(sorted(pins)) or 'none'}")
     store.runs.forget(pins[name])
-    console.print(f"{escape(name)} is no pin any more", highlight=False)
+    console.print(f"{escape(name)} is no longer pinned", highlight=False)
 
 
 def size_text(size_bytes: int) -> str:
-    """Return a size as people read it, such as 1.3 GB."""
+    """Return a size as text, such as 1.3 GB."""
     size = float(size_bytes)
     for unit in ("B", "kB", "MB", "GB"):
         if size < 1000:
@@ -150,5 +150,5 @@ def seconds_from_text(text: str) -> float:
     """
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([smhdw])", text.strip())
     if match is None:
-        raise UsageError(f"{text!r} is no time: write a number and s, m, h, d or w, such as 30d")
+        raise UsageError(f"{text!r} is not a duration: write a number and s, m, h, d or w, such as 30d")
     return float(match[1]) * _UNITS_S[match[2]]

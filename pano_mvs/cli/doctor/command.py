@@ -1,4 +1,4 @@
-"""`pano-mvs doctor`: run all checks, print the findings, and return by the exit code whether a run can work."""
+"""`pano-mvs doctor`: run all checks, print the findings, and set the exit code."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rich.table import Table
 
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.doctor.finding import Finding
-from pano_mvs.cli.exit_codes import guarded
+from pano_mvs.cli.error_messages import guarded
 from pano_mvs.cli.options import CacheOption, OutOption
 from pano_mvs.core.text import plural
 
@@ -28,12 +28,12 @@ _EXIT_FAILED = 2
 def doctor(
     cache: CacheOption = None,
     out: OutOption = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Check the installation, the machine and the folders of a run; exit code 2 if a run cannot work."""
     console = Console()
     if console.is_terminal and not as_json:
-        with console.status("trying the libraries, which takes a few seconds …"):
+        with console.status("checking the libraries, which takes a few seconds …"):
             findings = list(all_findings(cache, out))
     else:
         findings = list(all_findings(cache, out))

@@ -15,7 +15,7 @@ class Finding:
 
     Attributes:
         group: packages, libraries, machine, disk or plugins.
-        what: the thing that was checked.
+        what: the subject of the check.
         state: the verdict.
         detail: what was found.
         remedy: what to do; given with every warning and failure.

@@ -46,7 +46,7 @@ def plugin_findings(
         remedy = f"correct or remove it; `{command}` shows more"
         yield _finding(plugin.origin, "warning", f"failed to load: {plugin.error}", remedy)
     for (kind, name), why in registry.clashes.items():
-        yield _finding(f"{kind} {name}", "warning", why, "nobody can use it before that is resolved")
+        yield _finding(f"{kind} {name}", "warning", why, "it cannot be used until this is resolved")
     for folder in user_plugin_folders(environment):
         files = len(plugin_files_in(folder))
         if is_folder(folder):

@@ -1,4 +1,4 @@
-"""The commands `pano-mvs evaluate …`."""
+"""Options of the commands `pano-mvs evaluate`."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import typer
 
 from pano_mvs.cli.console import Console
 from pano_mvs.cli.default_command import RunByDefault
+from pano_mvs.cli.error_messages import guarded
 from pano_mvs.cli.evaluate.depth_options import (
     AlignOption,
     BadOption,
@@ -29,7 +30,6 @@ from pano_mvs.cli.evaluate.depth_options import (
     TruthUnitOption,
     UnitOption,
 )
-from pano_mvs.cli.exit_codes import guarded
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.text import plural
 
@@ -39,16 +39,16 @@ evaluate_app = typer.Typer(
     no_args_is_help=True,
 )
 
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
 @evaluate_app.command("run")
 @guarded
 def run(
     out: Annotated[Path, typer.Argument(help="The output folder of a run.")],
-    truth: Annotated[Path, typer.Option("--truth", help="Folder with poses.json and depth.npz, or one of these.")],
+    truth: Annotated[Path, typer.Option("--truth", help="Folder with poses.json and depth.npz, or one of them.")],
 ) -> None:
-    """Compare a run's poses, range maps and cloud with the truth, as far as both exist."""
+    """Compare the poses, range maps and cloud of a run with ground truth, as far as available."""
     from pano_mvs.cli.evaluate.printing import print_run
     from pano_mvs.evaluation import evaluate_run
 
@@ -58,11 +58,11 @@ def run(
 @evaluate_app.command("poses")
 @guarded
 def poses(
-    model: Annotated[Path, typer.Argument(help="COLMAP model, poses.json, transforms.json, CSV, or a run's output.")],
-    truth: Annotated[Path, typer.Option("--truth", help="The true poses, in any of these formats.")],
+    model: Annotated[Path, typer.Argument(help="COLMAP model, poses.json, transforms.json, CSV, or output folder.")],
+    truth: Annotated[Path, typer.Option("--truth", help="True poses, in any of these formats.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Compare the poses in any file with the truth, whatever their frames and units."""
+    """Compare poses with ground truth, regardless of their frames and units."""
     from pano_mvs.cli.evaluate.printing import print_json, print_summary
     from pano_mvs.evaluation import evaluate_poses
 
@@ -77,27 +77,27 @@ def poses(
 @guarded
 def cloud(
     cloud: Annotated[Path, typer.Argument(help="A PLY file, or the output folder of a run.")],
-    truth: Annotated[Path, typer.Option("--truth", help="Folder with poses and range maps, or a reference PLY.")],
+    truth: Annotated[Path, typer.Option("--truth", help="Folder with true poses and range maps, or a PLY file.")],
     poses: Annotated[
         Path | None,
-        typer.Option("--poses", help="The poses with which it was made; without, a PLY lies in the truth's frame."),
+        typer.Option("--poses", help="Poses of a PLY file; default: it is in the frame of the ground truth."),
     ] = None,
     true_poses: Annotated[
-        Path | None, typer.Option("--true-poses", help="The true poses in the frame of a reference PLY.")
+        Path | None, typer.Option("--true-poses", help="True poses in the frame of a reference PLY.")
     ] = None,
     thresholds: Annotated[
-        list[float], typer.Option("--threshold", help="A tolerance in the truth's unit; may be given repeatedly.")
+        list[float], typer.Option("--threshold", help="Tolerance in the unit of the ground truth; can be repeated.")
     ] = [0.05, 0.02],  # noqa: B006  # typer reads it and never changes it
     out: Annotated[
         Path | None,
-        typer.Option("--out", help="Folder for the cloud and the surface coloured by their errors, and pictures."),
+        typer.Option("--out", help="Folder for images, and for cloud and surface coloured by error."),
     ] = None,
     picture: Annotated[
-        Path | None, typer.Option("--picture", help="A PNG to write that shows the errors in the views and from above.")
+        Path | None, typer.Option("--picture", help="PNG file to write, with the errors in the views and from above.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare a cloud with the true surface: accuracy, completeness, F-score."""
+    """Compare a cloud with ground truth: accuracy, completeness, F-score."""
     from pano_mvs.cli.evaluate.printing import print_json, print_line, print_summary
     from pano_mvs.evaluation import evaluate_cloud, write_error_clouds, write_overview
 
@@ -111,7 +111,7 @@ def cloud(
         return
     print_summary(evaluation.summary(), Console())
     if out is not None:
-        print_line(f"accuracy.ply, completeness.ply and pictures of the errors are in {out}", Console())
+        print_line(f"accuracy.ply, completeness.ply and images of the errors are in {out}", Console())
 
 
 @evaluate_app.command("depth")
@@ -137,7 +137,7 @@ def depth(
     csv: CsvOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare range maps with the truth: MSE, PSNR, MAE, RMSE, AbsRel, δ, bad pixels, completeness, AUSE."""
+    """Compare range maps with ground truth: MSE, PSNR, MAE, RMSE, AbsRel, δ, bad pixels, completeness, AUSE."""
     from pano_mvs.cli.evaluate.printing import print_json, print_line, print_summary
     from pano_mvs.evaluation import (
         BadLimit,
@@ -174,7 +174,7 @@ def depth(
     if out is not None:
         count = len(evaluation.views)
         print_line(
-            f"{count} {plural(count, 'picture')} of the errors, scores.json and scores.csv are in {out}", Console()
+            f"{count} {plural(count, 'image')} of the errors, scores.json and scores.csv are in {out}", Console()
         )
 
 
@@ -185,5 +185,5 @@ def _scale(text: str) -> float | Literal["auto"]:
         return float(text)
     except ValueError as error:
         raise UsageError(
-            f"'{text}' is no scale: give a positive number, or auto to find it from the camera centres"
+            f"'{text}' is not a scale: give a positive number, or auto to estimate it from the camera centres"
         ) from error

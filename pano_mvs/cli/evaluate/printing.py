@@ -39,7 +39,7 @@ def print_run(evaluation: RunEvaluation, console: Console) -> None:
 
 
 def print_line(text: str, console: Console) -> None:
-    """Print a line as it is, at its full length."""
+    """Print a line without wrapping it."""
     console.print(text, highlight=False, markup=False, soft_wrap=True)
 
 

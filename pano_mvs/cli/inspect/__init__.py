@@ -1,1 +1,1 @@
-"""`pano-mvs inspect`: one pixel of a sweep, printed."""
+"""`pano-mvs inspect`: print the analysis of one pixel."""

@@ -1,4 +1,4 @@
-"""Print all that is known of one pixel of a run, with its cost curve."""
+"""Print the analysis of one pixel of a run, with its cost curve."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ _SHOWN = 6
 
 @dataclass(frozen=True)
 class PixelWanted:
-    """What is to be inspected.
+    """The pixel to inspect.
 
     Attributes:
-        image: name of the image, or an end of it that fits one alone.
-        x: column of the pixel from the left edge, in pixels of the swept size; its fraction is dropped.
-        y: row from the upper edge, likewise.
+        image: name of the image, or a unique part of it.
+        x: column of the pixel from the left, at the resolution of the sweep; fractions are dropped.
+        y: row of the pixel from the top.
         stage: name of the sweep in the workflow; empty for the first.
         truth: folder with poses.json and depth.npz; None for the workflow's own.
     """
@@ -50,11 +50,11 @@ class PixelWanted:
 
 
 def inspect(session: Session, wanted: PixelWanted, console: Console, *, plot: Path | None, as_json: bool) -> None:
-    """Print what is known of a pixel.
+    """Print the analysis of a pixel.
 
     Raises:
         UsageError: if there is no such sweep, image or pixel.
-        InputError: if what the sweep reads is not computed yet.
+        InputError: if an input of the sweep is not computed yet.
         StoreError: if the plot cannot be written.
     """
     found = _inspection(session, wanted)
@@ -69,10 +69,10 @@ def inspect(session: Session, wanted: PixelWanted, console: Console, *, plot: Pa
 
 
 def open_run(target: str, *, overrides: Sequence[str], images: Path | None, cache: Path | None) -> Session:
-    """Open a workflow, or that of an output folder with the settings, the pictures and the cache of its run.
+    """Open a workflow, or that of an output folder with the settings, images and cache of its run.
 
     Raises:
-        InputError: if the folder has no run.json, or its workflow is gone.
+        InputError: if the folder has no run.json, or its workflow file is missing.
     """
     out = Path(target)
     if not is_folder(out):
@@ -80,8 +80,10 @@ def open_run(target: str, *, overrides: Sequence[str], images: Path | None, cach
     summary = RunSummary.read(out)
     workflow = Path(summary.workflow.path)
     if not is_file(workflow):
-        raise InputError(f"{out}: its workflow {workflow} is gone. Give another: pano-mvs inspect WORKFLOW IMAGE X Y")
-    # A relative folder was meant from where the run was started; what it was is in the settings.
+        raise InputError(
+            f"{out}: its workflow {workflow} is missing. Specify another: pano-mvs inspect WORKFLOW IMAGE X Y"
+        )
+    # A relative folder is relative to where the run was started; the settings contain the absolute path.
     folder = next((stage.params.get("path") for stage in summary.stages if stage.name == "images"), None)
     given = [
         f"images.path={json.dumps(folder)}" if one.startswith("images.path=") and folder else one
@@ -94,13 +96,13 @@ def open_run(target: str, *, overrides: Sequence[str], images: Path | None, cach
 
 @dataclass
 class _Found:
-    """What a plan shows of an image."""
+    """The units of an image in a plan."""
 
     images: list[str] = field(default_factory=list)
     units: dict[str, dict[str, UnitFound]] = field(default_factory=dict)
 
     def look(self, unit: Unit, record: UnitRecord | None, _reason: str) -> None:
-        """Take note of a unit."""
+        """Add a unit."""
         if unit.source is not None:
             self.images.append(unit.item)
         if issubclass(unit.entry.spec.output, RangeMap):
@@ -109,7 +111,7 @@ class _Found:
 
 def _inspection(session: Session, wanted: PixelWanted) -> Inspection:
     if not (math.isfinite(wanted.x) and math.isfinite(wanted.y)):
-        raise UsageError(f"({wanted.x}, {wanted.y}) is no pixel: give its column and its row as numbers")
+        raise UsageError(f"({wanted.x}, {wanted.y}) is not a pixel: give its column and row as numbers")
     sweep = _sweep_stage(session, wanted.stage)
     store = Store(session.store_root, for_reading=True)
     found = _Found()
@@ -128,7 +130,7 @@ def _sweep_stage(session: Session, name: str) -> str:
     if not sweeps:
         raise UsageError("this workflow has no depth.sweep: only sweeps have cost curves")
     if name and name not in sweeps:
-        raise UsageError(f"{name!r} is no depth.sweep of this workflow; its sweeps: {', '.join(sweeps)}")
+        raise UsageError(f"{name!r} is not a depth.sweep stage of this workflow, which has: {', '.join(sweeps)}")
     return name or sweeps[0]
 
 
@@ -141,7 +143,7 @@ def _image(wanted: str, names: Sequence[str]) -> str:
         return fitting[0]
     shown = fitting or list(names)
     raise UsageError(
-        f"{len(fitting) or 'no'} images are called {wanted!r}; there are: {', '.join(shown[:_SHOWN])}"
+        f"{len(fitting) or 'no'} images match {wanted!r}; there are: {', '.join(shown[:_SHOWN])}"
         f"{' …' if len(shown) > _SHOWN else ''}"
     )
 
@@ -165,15 +167,15 @@ def _run_command(session: Session, unit: str) -> str:
     for override in session.workflow.overrides:
         setting, _, _ = override.partition("=")
         path = getattr(session.workflow.stages["images"].params, "path", None) if setting == "images.path" else None
-        # The workflow writes --images as a setting, but as it was typed, which need not be YAML.
+        # --images is stored as a setting, but in its original form, which may not be valid YAML.
         words += ["--images", str(path)] if isinstance(path, Path) and is_folder(path) else ["--set", override]
     return shlex.join(words)
 
 
 def _truth_of(session: Session, image: str) -> Path | None:
-    """Return the truth that the workflow itself compares with, if it does and knows the image.
+    """Return the ground truth of the workflow, if it has one for the image.
 
-    A preset's truth is of its sample: of other pictures it says nothing.
+    The ground truth of a preset only applies to its sample images.
     """
     for entry in session.workflow.stages.values():
         folder = getattr(entry.params, "truth", None)
@@ -186,7 +188,7 @@ def _write_plot(path: Path, found: Inspection) -> None:
     from pano_mvs.viewer.inspect.curve_picture import write_curve_picture
 
     if path.suffix.lower() != ".png":
-        raise UsageError(f"--plot {path}: the plot is a PNG, call it so")
+        raise UsageError(f"--plot {path}: the plot is a PNG image, so the file name must end in .png")
     try:
         write_curve_picture(path, found)
     except OSError as error:

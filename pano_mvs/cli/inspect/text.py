@@ -1,4 +1,4 @@
-"""An inspected pixel, for people and for programs."""
+"""The analysis of a pixel as text and as JSON."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _CONFIDENCES = ((0, "no range"), (63, "filled"), (127, "seen but weak"), (255, "
 
 
 def as_json_value(found: Inspection) -> dict[str, Any]:
-    """Return an inspection as plain JSON values; what is not known is null."""
+    """Return an inspection as plain JSON values; unknown values are null."""
     curve = found.curve
     return {
         "image": found.image,
@@ -71,7 +71,7 @@ def _number(value: float) -> float | None:
 
 
 def print_inspection(found: Inspection, console: Console) -> None:
-    """Print an inspection, its curve drawn by characters."""
+    """Print an inspection, with its curve drawn as text."""
 
     def say(text: str) -> None:
         console.print(escape(text), highlight=False, soft_wrap=True)

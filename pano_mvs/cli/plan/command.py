@@ -1,4 +1,4 @@
-"""Show what a run would do, and what the latest one did."""
+"""Show what a run would compute, and what the latest one did."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _SHOWN_REASONS = 5
 
 
 def show_plan(session: Session, console: Console) -> None:
-    """Print per stage how many units are cached, would run, or may run, and why."""
+    """Print the number of cached units per stage, and the units that would or may run, with reasons."""
     run_plan = plan_session(session)
     plans = run_plan.stages
     table = Table("stage", "use", "cached", "run", "may run", "cannot run")
@@ -43,7 +43,7 @@ def show_plan(session: Session, console: Console) -> None:
 
 
 def show_status(session: Session, console: Console) -> None:
-    """Print what the latest run into the output folder said, then what is cached now."""
+    """Print the outcome of the latest run into the output folder, then the state of the cache."""
     if not is_file(session.out / RUN_JSON):
         console.print(f"no finished run in {escape(str(session.out))}", highlight=False)
     else:

@@ -1,4 +1,4 @@
-"""All that is known of one unit: whether it is cached, why not, what it reads, where its result lies."""
+"""Describe one unit: whether and why it would run, its inputs, and where its result is stored."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _SHOWN = 8
 
 
 def explain_unit(session: Session, label: str, console: Console) -> None:
-    """Print all about one unit, `STAGE:ITEM`, or `STAGE` where there is one only.
+    """Print the description of a unit, `STAGE:ITEM`, or `STAGE` if it has only one unit.
 
     Raises:
         UsageError: if there is no such stage or unit.

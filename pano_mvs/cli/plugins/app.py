@@ -1,4 +1,4 @@
-"""`pano-mvs plugins`, `plugin new` and `stage show`: the typer side of show and plugin_new."""
+"""Options of `pano-mvs plugins`, `plugin new` and `stage show`; `show` and `new` do the work."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import typer
 
 from pano_mvs.cli.completion import complete_plugin_kind, complete_stage_kind
 from pano_mvs.cli.console import Console
-from pano_mvs.cli.exit_codes import guarded
+from pano_mvs.cli.error_messages import guarded
 
-plugin_app = typer.Typer(help="Write plugins.", no_args_is_help=True)
-stage_app = typer.Typer(help="Look at one stage.", no_args_is_help=True)
+plugin_app = typer.Typer(help="Create plugins.", no_args_is_help=True)
+stage_app = typer.Typer(help="Describe a stage.", no_args_is_help=True)
 
 WorkflowOption = Annotated[
     str | None,
-    typer.Option("--workflow", help="Also what the plugin files of this workflow define.", show_default=False),
+    typer.Option("--workflow", help="Include the plugins of this workflow.", show_default=False),
 ]
 FileOption = Annotated[
     list[Path] | None,
-    typer.Option("--plugin", metavar="FILE", help="Also what a plugin file defines; may be given repeatedly."),
+    typer.Option("--plugin", metavar="FILE", help="Include this plugin file; can be repeated."),
 ]
 
 
@@ -36,12 +36,12 @@ def plugins(workflow: WorkflowOption = None, files: FileOption = None) -> None:
 @guarded
 def stage_show(
     name: Annotated[
-        str, typer.Argument(help="A stage's name, such as depth.sweep.", autocompletion=complete_stage_kind)
+        str, typer.Argument(help="Name of the stage, such as depth.sweep.", autocompletion=complete_stage_kind)
     ],
     workflow: WorkflowOption = None,
     files: FileOption = None,
 ) -> None:
-    """Show a stage's ports, settings and documentation; of a broken one, why it cannot be loaded."""
+    """Show the ports, settings and documentation of a stage, or why it cannot be loaded."""
     from pano_mvs.cli.plugins.show import show_stage
 
     show_stage(name, Console(), workflow=workflow, files=files or [])
@@ -52,14 +52,12 @@ def stage_show(
 def plugin_new(
     kind: Annotated[
         str,
-        typer.Argument(
-            help="What it is to be; `pano-mvs plugin kinds` lists the kinds.", autocompletion=complete_plugin_kind
-        ),
+        typer.Argument(help="Kind of plugin; `pano-mvs plugin kinds` lists them.", autocompletion=complete_plugin_kind),
     ],
-    name: Annotated[str, typer.Argument(help="A word of small letters, digits and '_'.")],
-    folder: Annotated[Path, typer.Option("--dir", help="Where to write the file and its test.")] = Path(),
+    name: Annotated[str, typer.Argument(help="Name of the plugin: lower-case letters, digits and '_'.")],
+    folder: Annotated[Path, typer.Option("--dir", help="Folder for the file and its test.")] = Path(),
 ) -> None:
-    """Write a working plugin of a kind, NAME.py, and its test, test_NAME.py."""
+    """Write a working plugin, NAME.py, and its test, test_NAME.py."""
     from pano_mvs.cli.plugins.new import write_plugin
 
     write_plugin(kind, name, folder, Console())

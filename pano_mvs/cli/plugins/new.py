@@ -27,7 +27,7 @@ class PluginKind:
 
     Attributes:
         prefix: of the stage's name; empty for a part of the sweep.
-        what: what it does, in words.
+        what: its purpose.
         use: how a workflow uses it, with `{name}` for its name.
         contract_tests: the function of `pano_mvs.testing.conformance` that returns its contract tests.
     """
@@ -42,25 +42,25 @@ KINDS = {
     "source": PluginKind("source", "where panoramas come from", "images: {{use: source.{name}, path: photos}}"),
     "mask": PluginKind("mask", "which pixels every later stage ignores", "masked: {{use: mask.{name}}}"),
     "features": PluginKind("features", "key points as bearings", "features: {{use: features.{name}}}"),
-    "pairs": PluginKind("pairs", "which pictures are matched", "pairs: {{use: pairs.{name}}}"),
-    "matches": PluginKind("matches", "which key points are the same", "matches: {{use: matches.{name}}}"),
-    "poses": PluginKind("poses", "where the pictures were taken", "poses: {{use: poses.{name}}}"),
-    "views": PluginKind("views", "which sources each reference is swept against", "views: {{use: views.{name}}}"),
+    "pairs": PluginKind("pairs", "which images are matched", "pairs: {{use: pairs.{name}}}"),
+    "matches": PluginKind("matches", "matches between key points", "matches: {{use: matches.{name}}}"),
+    "poses": PluginKind("poses", "poses of the cameras", "poses: {{use: poses.{name}}}"),
+    "views": PluginKind("views", "the sources of each reference", "views: {{use: views.{name}}}"),
     "depth": PluginKind("depth", "the range of every pixel", "depth: {{use: depth.{name}}}"),
     "sweep_cost": PluginKind(
         "",
-        "what depth.sweep compares by",
+        "matching cost of depth.sweep",
         "depth: {{use: depth.sweep, backend: numpy, cost: {name}}}",
         "cost_contract_tests",
     ),
     "sweep_backend": PluginKind(
         "",
-        "what computes depth.sweep",
+        "implementation of depth.sweep",
         "depth: {{use: depth.sweep, backend: {name}, cost: sad}}",
         "backend_contract_tests",
     ),
-    "filter": PluginKind("filters", "range map in, range map out", "filtered: {{use: filters.{name}}}"),
-    "fusion": PluginKind("fusion", "from range maps to one cloud", "cloud: {{use: fusion.{name}}}"),
+    "filter": PluginKind("filters", "turns a range map into another", "filtered: {{use: filters.{name}}}"),
+    "fusion": PluginKind("fusion", "merges range maps into a cloud", "cloud: {{use: fusion.{name}}}"),
     "export": PluginKind("export", "files for other programs", "written: {{use: export.{name}}}"),
 }
 
@@ -72,11 +72,13 @@ def rendered(kind: str, name: str) -> tuple[str, str]:
         UsageError: if there is no such kind, or the name cannot be that of a Python file.
     """
     if kind not in KINDS:
-        raise UsageError(f"there is no kind of plugin {kind!r}; there are {', '.join(KINDS)}")
+        raise UsageError(f"unknown kind of plugin {kind!r}; known kinds: {', '.join(KINDS)}")
     if not _NAME.fullmatch(name) or keyword.iskeyword(name):
-        raise UsageError(f"a plugin cannot be called {name!r}: use small letters, digits and '_', a letter first")
+        raise UsageError(
+            f"a plugin cannot be called {name!r}: use lower-case letters, digits and '_', starting with a letter"
+        )
     if name in sys.stdlib_module_names or name in packages_distributions():
-        raise UsageError(f"a plugin cannot be called {name!r}: its file would hide the Python package of that name")
+        raise UsageError(f"a plugin cannot be called {name!r}: its file would hide the Python package with that name")
     environment = Environment(
         loader=PackageLoader("pano_mvs.cli.plugins", "templates"),
         undefined=StrictUndefined,
@@ -98,28 +100,28 @@ def rendered(kind: str, name: str) -> tuple[str, str]:
 
 
 def write_plugin(kind: str, name: str, folder: Path, console: Console) -> None:
-    """Write a new plugin and its test into a folder, and say how it is used.
+    """Write a new plugin and its test into a folder, and print how to use it.
 
     Raises:
-        UsageError: if a file of that name is there already, or as of `rendered`.
+        UsageError: if a file with that name exists, or as for `rendered`.
     """
     plugin, test = rendered(kind, name)
     paths = folder / f"{name}.py", folder / f"test_{name}.py"
     for path in paths:
         if exists(path):
-            raise UsageError(f"{path} is there already; nothing was written. Take another name, or another --dir")
+            raise UsageError(f"{path} already exists; nothing was written. Choose another name or another --dir")
     for path, text in zip(paths, (plugin, test), strict=True):
         write_text(path, text)
     console.print(f"wrote {escape(str(paths[0]))} and its test", highlight=False, soft_wrap=True)
-    console.print("name it in a workflow:", highlight=False)
+    console.print("use it in a workflow:", highlight=False)
     console.print(f"  plugins: [{name}.py]", highlight=False, markup=False)
     console.print(f"  stages:\n    {KINDS[kind].use.format(name=name)}", highlight=False, markup=False)
     console.print(f"test it: pytest {escape(str(paths[1]))}", highlight=False, soft_wrap=True)
 
 
 def show_kinds(console: Console) -> None:
-    """List the kinds of plugins there are."""
-    table = Table("kind", "what it is", "in a workflow")
+    """List the kinds of plugins."""
+    table = Table("kind", "purpose", "in a workflow")
     for name, kind in KINDS.items():
         table.add_row(name, kind.what, escape(kind.use.format(name="mine")))
     console.print(table)

@@ -1,4 +1,4 @@
-"""Show what is registered."""
+"""List plugins and stages, and describe a stage."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def show_stage(name: str, console: Console, *, workflow: str | None = None, file
         name: of the stage.
         console: where to.
         workflow: a workflow whose plugin files may define it.
-        files: more plugin files that may.
+        files: more plugin files that may define it.
 
     Raises:
         UsageError: if there is no such stage; with the traceback, if its plugin is broken.
@@ -88,7 +88,7 @@ def _settings(spec: StageSpec) -> Table:
 
 
 def _registry(workflow: str | None, files: Sequence[Path]) -> tuple[Registry, WorkflowError | None]:
-    """Return what is installed, with the plugins of a workflow and of files, and the mistakes in the workflow."""
+    """Return the registry with the plugins of a workflow and of files, and the mistakes in the workflow."""
     registry = Registry.installed()
     for path in files:
         registry.add_file(path)
@@ -96,7 +96,7 @@ def _registry(workflow: str | None, files: Sequence[Path]) -> tuple[Registry, Wo
         return registry, None
     try:
         load_workflow(find_workflow(workflow, presets_folder())[0], registry, presets=presets_folder())
-    except WorkflowError as error:  # what its plugins define can be shown all the same
+    except WorkflowError as error:  # the plugins can be shown nevertheless
         return registry, error
     return registry, None
 

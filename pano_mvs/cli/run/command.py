@@ -38,9 +38,9 @@ def run_workflow(session: Session, execution: Execution, *, as_json: bool = Fals
 
 @contextmanager
 def interrupted_by_termination() -> Iterator[None]:
-    """Let a request to terminate (SIGTERM) and the end of the terminal (SIGHUP) end a run as an interrupt does.
+    """Treat SIGTERM, and SIGHUP from a closing terminal, as an interrupt.
 
-    A terminal that closes sends SIGHUP more than once: only the first counts. Under nohup it is ignored, as is wanted.
+    A closing terminal sends SIGHUP more than once; only the first counts. Under nohup, SIGHUP stays ignored.
     """
     if threading.current_thread() is not threading.main_thread():
         yield  # signals reach only the main thread

@@ -1,4 +1,4 @@
-"""How long a run will still take, from what its units have taken so far."""
+"""Estimate the remaining time of a run from the times of its finished units."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(slots=True)
 class StageClock:
-    """What is known of one stage's pace; `done` counts units of every outcome, `computed` those that took `seconds`."""
+    """The pace of one stage; `done` counts all finished units, `computed` those that took `seconds`."""
 
     units: int
     done: int = 0
@@ -16,7 +16,7 @@ class StageClock:
 
     @property
     def left_s(self) -> float | None:
-        """What its other units will take, one at a time; None if none has been computed yet."""
+        """Estimated time of its remaining units, one at a time; None if none has been computed yet."""
         if self.done >= self.units:
             return 0.0
         return self.seconds / self.computed * (self.units - self.done) if self.computed else None
@@ -30,11 +30,11 @@ class Estimate:
         self.stages: dict[str, StageClock] = {}
 
     def start(self, name: str, units: int) -> None:
-        """Enter a stage, or enter it again."""
+        """Start the clock of a stage, or restart it."""
         self.stages[name] = StageClock(units)
 
     def count(self, name: str, seconds: float, *, computed: bool) -> None:
-        """Enter a unit that is done."""
+        """Count a finished unit."""
         clock = self.stages[name]
         clock.done += 1
         if computed:
@@ -42,14 +42,14 @@ class Estimate:
             clock.seconds += seconds
 
     def of_stage(self, name: str) -> str:
-        """Return a stage's time left, in words; empty if it is not known or there is none."""
+        """Return the remaining time of a stage as text; empty if unknown or zero."""
         clock = self.stages[name]
         left_s = clock.left_s
         at_a_time = min(self.workers, max(1, clock.units - clock.done))
         return f"{duration(left_s / at_a_time)} left" if left_s else ""
 
     def of_run(self, stages: int) -> str:
-        """Return the time left in a run of this number of stages; a lower bound until all stages are known."""
+        """Return the remaining time of a run as text, a lower bound until all stages have started."""
         known = [clock.left_s for clock in self.stages.values()]
         total = sum(left_s for left_s in known if left_s) / self.workers
         if not total:
@@ -59,7 +59,7 @@ class Estimate:
 
 
 def duration(seconds: float) -> str:
-    """Return a time as people say it."""
+    """Return a duration as text."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     if seconds < 90 * 60:

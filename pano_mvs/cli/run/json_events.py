@@ -1,4 +1,4 @@
-"""What a run does, as a stream of JSON objects, one in a line, for programs.
+"""Print the events of a run as JSON objects, one per line, for programs.
 
 Every object has `event` and `time` (seconds since 1970). The events, in the order in which they can come:
 
@@ -13,10 +13,10 @@ Every object has `event` and `time` (seconds since 1970). The events, in the ord
                     verdict (mood, outcome, judgement, sentence, tiles, findings (mood, text, remedy), as in the
                     report) and doubts (image to reason)
 
-`item` is empty where a stage has one unit only. Stages overlap. If a damaged part of the store is found, the run starts
-over: `stage_started` comes again for every stage, and what was counted before does not count. `run_finished` is always
-the last line, also of a run that is interrupted (130) or ends in an error (then `stopped` says which), unless the
-process is killed. Fields may be added to a schema; none changes its meaning.
+`item` is empty if a stage has a single unit. Stages overlap. If a damaged result is found in the cache, the run starts
+over: `stage_started` is repeated for every stage, and earlier counts no longer apply. `run_finished` is always
+the last line, also after an interrupt (130) or an error (stated in `stopped`), unless the
+process is killed. Later versions may add fields, but will not change the meaning of any.
 """
 
 from __future__ import annotations

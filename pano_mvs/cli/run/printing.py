@@ -20,7 +20,7 @@ _SHOWN_FAILURES = 20
 
 
 def print_summary(output: RunOutput, console: Console) -> None:
-    """Print where the results are and how good they are known to be."""
+    """Print the summary of a run: counts, failures, scores, the verdict, and where the results are."""
     summary, out = output.summary, str(output.out)
     units = summary.units
     failed = f", {units.failed} failed" if units.failed else ""
@@ -35,7 +35,7 @@ def print_summary(output: RunOutput, console: Console) -> None:
         console.print(f"note: {escape(note)}", highlight=False, soft_wrap=True)
     if summary.left_over:
         count = len(summary.left_over)
-        text = f"{count} {plural(count, 'file')} of an earlier run, which this one did not write,"
+        text = f"{count} {plural(count, 'file')} of an earlier run, which this run did not write,"
         console.print(f"{text} {plural(count, 'is', 'are')} still there", highlight=False)
     _print_verdict(output.verdict, console)
     look = f", or look around with pano-mvs view {escape(shlex.quote(out))}" if is_to_see(summary.files) else ""
@@ -54,7 +54,7 @@ def _print_failures(summary: RunSummary, console: Console) -> None:
         text = f"{one_line(failure.label)}: {failure.cause} — {failure.consequence}"
         console.print(f"[red]failed:[/] {escape(text)}", highlight=False, soft_wrap=True)
         if failure.log:
-            console.print(f"  what it printed is in {escape(failure.log)}", highlight=False, soft_wrap=True)
+            console.print(f"  log: {escape(failure.log)}", highlight=False, soft_wrap=True)
     if len(causes) > _SHOWN_FAILURES:
         console.print(f"… and {len(causes) - _SHOWN_FAILURES} more, all in run.json", highlight=False)
     for image, rejected in summary.rejected.items():
@@ -72,7 +72,7 @@ def _print_poses(summary: RunSummary, console: Console) -> None:
 
 
 def _print_verdict(verdict: Verdict, console: Console) -> None:
-    """Print whether the result can be relied on, as the report says it, and what is wrong or doubtful."""
+    """Print the verdict of the report and its findings."""
     if verdict.judgement:
         console.print(f"[{_COLORS[verdict.mood]}]{escape(verdict.judgement)}[/]", highlight=False, soft_wrap=True)
     for finding in verdict.findings:
@@ -108,7 +108,7 @@ def print_scores(scores: ScoresSummary, console: Console) -> None:
 
 
 def _print_comparison(all_scores: Mapping[str, ScoresSummary], console: Console) -> None:
-    """Print, where several branches are scored, the medians over their views side by side."""
+    """Print the medians over views of several scored branches side by side."""
     if len(all_scores) < 2:
         return
     table = Table("median over views", *_SHOWN_SCORES.values(), caption=_IN_BRACKETS)

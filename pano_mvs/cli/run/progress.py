@@ -86,7 +86,7 @@ class ProgressBars:
         )
 
     def _show_failure(self, failure: UnitFailed) -> None:
-        """Print what failed, and the last lines that it printed."""
+        """Print a failure and the last lines of the unit's output."""
         label = f"{failure.stage}:{failure.item}" if failure.item else failure.stage
         self.console.print(f"[red]failed[/] {escape(label)}", highlight=False, soft_wrap=True)
         for line in failure.said[-_SHOWN_LINES:]:

@@ -1,4 +1,4 @@
-"""References to the parts of a stored value, in a fifth of the memory: a run may hold a million of them."""
+"""References to the parts of a stored value in a fifth of the memory, since a run may hold a million of them."""
 
 from __future__ import annotations
 

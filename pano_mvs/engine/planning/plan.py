@@ -1,4 +1,4 @@
-"""What a run would do with each unit: find it in the cache, compute it (and why), or decide later."""
+"""Plan a run: which units are cached, which are computed and why, and which are decided later."""
 
 from __future__ import annotations
 

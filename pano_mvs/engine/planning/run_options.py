@@ -1,4 +1,4 @@
-"""What a user asks of one run beyond the workflow: to run a part of it, or to compute some units again."""
+"""Options of a run beyond the workflow: run a part of it, or recompute some units."""
 
 from __future__ import annotations
 

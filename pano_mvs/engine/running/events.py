@@ -89,7 +89,7 @@ class RunResult:
         written: files that this run wrote into the output folder.
         removed: files of earlier runs that this run deleted.
         published: every file of the results, with its digest.
-        left_over: files of earlier runs, with their digests, that are no part of the results and still exist.
+        left_over: files of earlier runs, with their digests, that are not part of the results and still exist.
         warnings: such as damaged files of the cache that were computed again.
     """
 

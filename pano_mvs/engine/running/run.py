@@ -1,4 +1,4 @@
-"""Run a workflow: the whole flow, from the options of the run to what the next run reads.
+"""Run a workflow: the whole flow, from the options of the run to the records for the next run.
 
 `Run.execute` goes over the workflow in passes. If a pass finds a damaged file in the cache, or an input image that
 changed, a further pass computes what depends on it; otherwise it is the last one. Each pass (`RunPass`) does this:

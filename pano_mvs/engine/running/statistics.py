@@ -1,4 +1,4 @@
-"""Count what each stage of a run did and what failed, and check the thresholds that the workflow sets."""
+"""Count the outcomes of each stage of a run, and check the thresholds of the workflow."""
 
 from __future__ import annotations
 

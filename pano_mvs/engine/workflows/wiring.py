@@ -1,4 +1,4 @@
-"""Connect the ports of a workflow's stages, and report what does not fit before anything runs."""
+"""Connect the ports of a workflow's stages, and report mismatches before anything runs."""
 
 from __future__ import annotations
 

@@ -131,8 +131,8 @@ class CloudEvaluation:
         lines: list[str | TextTable] = [f"{self.cloud.count} {plural(self.cloud.count, 'point')} against {against}"]
         if not compared.used and not self.is_aligned:
             lines.append(
-                "both clouds are taken to lie in one frame; if they do not, give the true poses, in the frame of the "
-                "reference cloud"
+                "both clouds are assumed to be in the same frame; otherwise, give the true poses in the frame of "
+                "the reference cloud"
             )
         rows = tuple(
             (f"{score.threshold:g}", *(f"{100 * x:.2f}" for x in (score.accuracy, score.completeness, score.f_score)))
@@ -263,6 +263,6 @@ def _compared(
     views = {name: TrueView(pose, files[names[name]].read()) for name, pose in known.items() if name in names}
     chosen = {name: views[name] for name in used if name in views}
     if not chosen:
-        raise InputError(f"{truth}: holds no range map of a camera that was used ({', '.join(used[:3]) or 'none'})")
+        raise InputError(f"{truth}: contains no range map of a camera that was used ({', '.join(used[:3]) or 'none'})")
     surface = surface_of_views(list(chosen.values()))
     return CloudTruth(lambda: map(view_points, views.values()), surface, chosen, len(views), unit, cameras, up)

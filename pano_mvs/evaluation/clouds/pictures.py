@@ -1,4 +1,4 @@
-"""Pictures of the errors of a cloud: in the views, from above, from outside and from inside."""
+"""Images of the errors of a cloud: in the views, from above, from outside and from inside."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ def surface_of_views(views: Sequence[TrueView], *, min_views: int = 2, max_sampl
         UsageError: if there are no views, or a range map is not (H, W) with even W.
     """
     if not views:
-        raise UsageError("no view with truth: the surface to be found is not known")
+        raise UsageError("no view has ground truth, so the true surface is unknown")
     pixels = sum(view.range.size for view in views)
     step = max(1, int(np.ceil(np.sqrt(pixels / max_samples))))
     parts = [_samples(idx, views, step=step, min_views=min(min_views, len(views))) for idx in range(len(views))]

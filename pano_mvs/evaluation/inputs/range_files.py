@@ -168,7 +168,7 @@ def _in_memory(name: str, given: RangeMap | NDArray[np.floating], unit: float) -
 def _in_archive(path: Path, unit: float) -> dict[str, StoredRange]:
     keys = keys_of_npz(path)
     if not keys:
-        raise InputError(f"{path}: holds no arrays. Give a file with one range map per image")
+        raise InputError(f"{path}: contains no arrays. Use a file with one range map per image")
     return {key: RangeFile(path, key, unit) for key in keys}
 
 

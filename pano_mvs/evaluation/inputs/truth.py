@@ -110,7 +110,7 @@ def find_true_ranges(truth: RangeMaps, *, unit: float = 1.0) -> dict[str, Stored
     files = {view.name: view.range_file for view in read_truth(truth).views.values()}
     found: dict[str, StoredRange] = {name: replace(file, unit=unit) for name, file in files.items() if file}
     if not found:
-        raise InputError(f"{truth / 'depth.npz'}: holds no array named like an image of poses.json, or like its id")
+        raise InputError(f"{truth / 'depth.npz'}: contains no array named after an image of poses.json, or its id")
     return found
 
 

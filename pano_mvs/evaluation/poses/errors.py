@@ -96,7 +96,7 @@ def relative_pose_errors(
         UsageError: if the truth holds fewer than two images.
     """
     if len(truth) < 2:
-        raise UsageError(f"relative poses need the truth of at least two images, got {len(truth)}")
+        raise UsageError(f"relative poses need the true poses of at least two images, got {len(truth)}")
     position = {name: idx for idx, name in enumerate(truth)}
     worlds: dict[int, list[str]] = {}
     for name in truth:

@@ -116,7 +116,7 @@ class PoseEvaluation:
                 "with a frame of its own, count as not registered"
             )
         if self.without_truth:
-            lines.append(f"no truth for {shortened_list(self.without_truth)}")
+            lines.append(f"no ground truth for {shortened_list(self.without_truth)}")
         over = f"over {len(some.pairs)} {plural(len(some.pairs), 'pair')} of registered images"
         registered = f"{pairs.registered} of {pairs.expected} {plural(pairs.expected, 'image')} registered"
         return (registered, TextTable((over, "median", "mean", "max"), tuple(rows)), *lines)

@@ -1,4 +1,4 @@
-"""Pictures of the errors of range maps: the panorama, the estimate, the truth, and the signed error."""
+"""Error images of range maps: the panorama, the estimate, the ground truth, and the signed error."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ class BadLimit:
         except ValueError:
             value = float("nan")
         if not 0 < value < float("inf"):
-            raise UsageError(f"'{text}' is no limit for bad pixels: write a share as 5%, or a length as 0.1")
+            raise UsageError(f"'{text}' is not a limit for bad pixels: write a share (5%) or a length (0.1)")
         return cls(value, relative)
 
 

@@ -78,7 +78,7 @@ class DepthEvaluation:
         return replace(maps, estimated=(estimated * self.views[name].scale).astype(np.float32))
 
     def to_json(self) -> dict[str, object]:
-        """Return all figures as JSON values; None stands for what is no finite number (the PSNR of no error)."""
+        """Return all figures as JSON values; None stands for values that are not finite (the PSNR of a zero error)."""
         return {
             "source": self.source,
             "truth": self.truth,
@@ -174,6 +174,6 @@ def evaluate_depth(
     if not any(view.pixels for view in views.values()):
         raise InputError(
             f"{source_name(target)}: no pixel of any view has a true range that counts. Check its files and the masks: "
-            "zero, negative, infinite and NaN are no range"
+            "zero, negative, infinite and NaN are invalid"
         )
     return DepthEvaluation(source_name(source), source_name(target), settings, found_scale, views, pairs, sizes)

@@ -134,7 +134,7 @@ def pair_ranges(source: RangeMaps, truth: RangeMaps, *, unit: float, truth_unit:
     matched = pair_image_names(estimates, truths)
     if not matched:
         raise InputError(
-            f"{source_name(source)} and {source_name(truth)} have no image in common: the one has "
+            f"{source_name(source)} and {source_name(truth)} have no image in common: the first has "
             f"{shortened_list(estimates)}, the other {shortened_list(truths)}. Range maps are paired by their paths "
             "without extension"
         )

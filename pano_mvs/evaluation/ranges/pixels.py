@@ -68,7 +68,7 @@ def scored_pixels(
     """Return the pixels with ground truth and their estimates.
 
     Args:
-        estimated: (H, W) ranges in scene units; anything but a positive finite number is no estimate.
+        estimated: (H, W) ranges in scene units; values that are not positive and finite count as missing.
         truth: (H, W) true ranges; pixels with anything but a positive finite one are ignored.
         confidence: (H, W), the larger the more confident.
         scale: factor from scene units to the truth's unit.

@@ -1,4 +1,4 @@
-"""The factor from the estimates' unit of length to the truth's."""
+"""The factor from the unit of the estimates to that of the ground truth."""
 
 from __future__ import annotations
 
@@ -70,13 +70,15 @@ def find_scale(
     except InputError as error:
         if given:
             raise
-        return FoundScale(1.0, f"no poses on both sides, so both are taken to have one unit ({error})")
+        return FoundScale(
+            1.0, f"poses are missing on at least one side, so both are assumed to have the same unit ({error})"
+        )
     try:
         value = _scale(groups[0], true)
     except UsageError as error:
         if given:
             raise
-        return FoundScale(1.0, f"the poses determine no scale, so both are taken to have one unit ({error})")
+        return FoundScale(1.0, f"the poses determine no scale, so both are assumed to have the same unit ({error})")
     reason = f"from the centres of {len(pair_image_names(groups[0], true))} cameras, never from the ranges"
     others: dict[str, float] = {}
     for number, cameras in enumerate(groups[1:], start=1):
@@ -95,7 +97,7 @@ def _poses_in(ranges: RangeMaps, poses: Cameras | None) -> Cameras:
         return poses
     if isinstance(ranges, Path):
         return ranges
-    raise InputError("range maps in memory hold no poses")
+    raise InputError("range maps in memory have no poses")
 
 
 def _scale(cameras: Mapping[str, Rigid3], true: Mapping[str, Rigid3]) -> float:

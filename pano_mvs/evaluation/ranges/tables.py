@@ -27,9 +27,9 @@ _UNSCALED = frozenset({"psnr_db", "rmse", "mae"})  # all other scores are shown 
 _VIEW_SCORES = "psnr_db", "w_mae", "w_delta_105", "completeness", "valid_w_delta_105", "median_relative_error", "ause"
 _MAX_VIEWS = 40
 _BASELINE_WORDS = {
-    "best": "the constant that is best for this score, chosen by the truth",
-    "median": "the median of the view's true ranges everywhere",
-    "mean": "the mean of the view's true ranges everywhere",
+    "best": "the best constant range for each score, chosen with the ground truth",
+    "median": "a constant range, the median of the view's true ranges",
+    "mean": "a constant range, the mean of the view's true ranges",
 }
 
 
@@ -44,7 +44,7 @@ def depth_summary(evaluation: DepthEvaluation, *, baseline: str = "best") -> Sum
         UsageError: if the baseline is unknown.
     """
     if baseline not in BASELINES:
-        raise UsageError(f"'{baseline}' is no baseline: choose one of {', '.join(BASELINES)}")
+        raise UsageError(f"'{baseline}' is not a baseline: choose one of {', '.join(BASELINES)}")
     views = evaluation.views
     text: list[str | TextTable] = [*_conditions(evaluation, baseline), _mean_table(evaluation, baseline)]
     if len(views) > 1:
@@ -100,16 +100,16 @@ def _conditions(evaluation: DepthEvaluation, baseline: str) -> list[str]:
         f"estimates × {scale.value:.6g}: {scale.reason}",
     ]
     if settings.align == "none":
-        lines.append("ranges are not fitted to the truth (--align none)")
+        lines.append("ranges are not fitted to the ground truth (--align none)")
     else:
         scales = scale.of_views(views)
         fitted = [view.scale / scales[name] for name, view in views.items()]
         lines.append(
-            f"RANGES ARE FITTED TO THE TRUTH, each view by a factor of its own (--align {settings.align}): "
+            f"RANGES ARE FITTED TO THE GROUND TRUTH, each view by its own factor (--align {settings.align}): "
             f"{min(fitted):.5g} to {max(fitted):.5g}"
         )
     if settings.min_confidence:
-        lines.append(f"ranges of a confidence below {settings.min_confidence} count as missing")
+        lines.append(f"ranges with a confidence below {settings.min_confidence} count as missing")
     if missing := evaluation.without_mask:
         lines.append(
             f"no mask in --masks for {len(missing)} of {len(views)} {plural(len(views), 'view')}, {missing[0]} first: "

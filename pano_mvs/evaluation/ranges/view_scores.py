@@ -83,7 +83,7 @@ def score_view(
     sparsification_oracle_area and ause, by solid angle, and plain_ause with equal weights.
 
     Args:
-        estimated: (H, W) ranges in scene units; anything but a positive finite number is no estimate.
+        estimated: (H, W) ranges in scene units; values that are not positive and finite count as missing.
         truth: (H, W) true ranges; pixels with anything but a positive finite one are ignored.
         confidence: (H, W), the larger the more confident.
         scale: factor from scene units to the truth's unit.
@@ -138,7 +138,7 @@ def _confident(pixels: ScoredPixels, least: int) -> ScoredPixels:
     if least <= 0:
         return pixels
     if pixels.confidence is None:
-        raise UsageError("a least confidence is set, but there is no confidence")
+        raise UsageError("a minimum confidence is set, but there is no confidence map")
     return replace(pixels, found=np.where(pixels.confidence >= least, pixels.found, np.nan))
 
 

@@ -149,7 +149,7 @@ def read_images(path: Path) -> dict[int, ModelImage]:
         for image_id, image in _binary_images(path) if path.suffix == ".bin" else _text_images(path):
             if image_id in images:
                 raise ValueError(
-                    f"images {images[image_id].name[:80]!r} and {image.name[:80]!r} have one id, {image_id}"
+                    f"images {images[image_id].name[:80]!r} and {image.name[:80]!r} have the same id, {image_id}"
                 )
             images[image_id] = image
         return images

@@ -1,4 +1,4 @@
-"""Poses of SphereSfM's models, which are like COLMAP's but have a camera model of their own.
+"""Poses of SphereSfM's models, which are like COLMAP's but have their own camera model.
 
 SphereSfM, a fork of COLMAP, writes panoramas as camera model SPHERE, number 11 with three parameters (f, cx, cy). In
 COLMAP, number 11 is another model with more parameters, so that pycolmap cannot read the files. The camera frame is

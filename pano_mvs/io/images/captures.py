@@ -1,4 +1,4 @@
-"""The pictures of a capture: which files, in which order, and whether each is a panorama."""
+"""The images of a capture: their files, their order, and whether each is a panorama."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp",
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi"})
 _IGNORED_FOLDERS = frozenset({"masks"})
 _TURNED = (
-    "an EXIF orientation that turns or mirrors them, which was ignored: the pixels of a panorama are taken as "
+    "an EXIF orientation that rotates or mirrors them, which was ignored: the pixels of a panorama are used as "
     "they are stored"
 )
 
@@ -79,14 +79,14 @@ def list_pictures(folder: Path, notes: list[str] | None = None) -> list[Path]:
     pictures = [path for path in files if path.suffix.lower() in PICTURE_SUFFIXES]
     if not pictures and (film := next((path for path in files if path.suffix.lower() in VIDEO_SUFFIXES), None)):
         raise InputError(
-            f"{folder}: no pictures here, but the video {film.name}. Use source.video: "
+            f"{folder}: no images here, but the video {film.name}. Use source.video: "
             "--set images.use=source.video --set pairs.use=pairs.sequential"
         )
     if not pictures:
         kinds = ", ".join(sorted(suffix.lstrip(".") for suffix in PICTURE_SUFFIXES))
         raise InputError(
             "\n  ".join(
-                [f"{folder}: no pictures here. Panoramas may be {kinds}; folders called masks are left out", *notes]
+                [f"{folder}: no images here. Supported formats: {kinds}; folders called masks are skipped", *notes]
             )
         )
     return sorted(pictures, key=lambda path: natural_key(path.relative_to(folder).as_posix()))
@@ -124,7 +124,7 @@ def describe_picture(path: Path, data: bytes | None = None, *, max_pixels: int =
     height, width = int(size[0]), int(size[1])
     if gpano is not None and gpano.projection_type != "equirectangular":
         raise InputError(
-            f"{path}: its metadata say that it is {gpano.projection_type}, not equirectangular. "
+            f"{path}: according to its metadata, it is {gpano.projection_type}, not equirectangular. "
             "Export it as an equirectangular panorama, or remove it"
         )
     sphere, crop = (height, width), None
@@ -163,8 +163,8 @@ def files_below(folder: Path, notes: list[str]) -> Iterator[Path]:
     def fail(error: OSError) -> None:
         problem = f"{error.filename}: cannot be listed ({error.strerror})"
         if Path(error.filename) == folder:
-            raise InputError(f"{problem}. Mend its permissions or give another folder")
-        notes.append(f"{problem}; what it holds is left out")
+            raise InputError(f"{problem}. Correct its permissions or choose another folder")
+        notes.append(f"{problem}; its contents are skipped")
 
     seen: set[Path] = set()
     for root, folders, files in os.walk(folder, followlinks=True, onerror=fail):
@@ -199,7 +199,7 @@ def _placed(
     if (crop_height, crop_width) != size_hw:
         if abs(width * crop_height - height * crop_width) > max(width, height, crop_width, crop_height):
             raise InputError(
-                f"{path}: {width}×{height} px, but its GPano metadata speak of {crop_width}×{crop_height}. It was cut "
+                f"{path}: {width}×{height} px, but its GPano metadata state {crop_width}×{crop_height}. It was cut "
                 "after it was taken: restore the original, or remove the metadata"
             )
         warnings = (

@@ -65,5 +65,5 @@ def read_exr(path: Path) -> dict[str, NDArray[np.float32]]:
             return {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
     except _DAMAGE as error:
         raise InputError(
-            f"{path}: no EXR file that can be read ({str(error) or type(error).__name__}). Write it again"
+            f"{path}: not a readable EXR file ({str(error) or type(error).__name__}). Write it again"
         ) from error

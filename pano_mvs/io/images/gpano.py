@@ -101,7 +101,7 @@ def _fields(packet: bytes) -> dict[str, str]:
     """Return the GPano fields of a packet, from elements and from attributes."""
     upper = packet.upper()
     if b"<!DOCTYPE" in upper or b"<!ENTITY" in upper:
-        raise ValueError("it declares entities")
+        raise ValueError("it declares XML entities")
     fields: dict[str, str] = {}
     for element in ElementTree.fromstring(packet).iter():  # noqa: S314  # no DTD gets this far
         named = [(element.tag, element.text or ""), *element.attrib.items()]

@@ -41,13 +41,13 @@ def require_masks(folder: Path, names: Sequence[str]) -> None:
         InputError: if it does not, or if it is not a folder.
     """
     if not is_folder(folder):
-        raise InputError(f"{folder}: masks must be a folder. Give one mask for all pictures as `mask`")
+        raise InputError(f"{folder}: masks must be a folder. Set one mask for all images with `mask`")
     if any(find_mask(folder, name) for name in names):
         return
     files = [path.relative_to(folder).as_posix() for path in below(folder) if is_file(path)]
     others = f" and {len(files) - 1} more" if len(files) > 1 else ""
     content = f"it holds {files[0]}{others}" if files else "it is empty"
     raise InputError(
-        f"{folder}: no mask in it belongs to a picture of the capture ({content}). The mask of {names[0]} must be "
+        f"{folder}: no mask in it belongs to an image of the capture ({content}). The mask of {names[0]} must be "
         f"called {names[0]}.png, or {without_extension(names[0])}.png"
     )

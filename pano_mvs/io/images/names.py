@@ -70,7 +70,7 @@ def printable_name(name: str) -> tuple[str, str]:
     shown = name.encode(errors="replace").decode()
     if _SEPARATOR not in name and shown == name:
         return name, ""
-    what = repr(_SEPARATOR) if _SEPARATOR in name else "bytes that are no UTF-8"
+    what = repr(_SEPARATOR) if _SEPARATOR in name else "bytes that are not UTF-8"
     return shown, f"{shown}: a file name with {what} cannot be used; rename it"
 
 

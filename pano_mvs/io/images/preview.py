@@ -1,4 +1,4 @@
-"""Pictures for people: a panorama above its colour-mapped range, with a scale bar."""
+"""Preview images: a panorama above its colour-mapped range, with a scale bar."""
 
 from __future__ import annotations
 

@@ -70,7 +70,7 @@ def list_videos(path: Path, notes: list[str] | None = None) -> list[Path]:
         raise InputError(
             f"{path}: {raw[0]} is not stitched; {_UNSTITCHED}"
             if raw
-            else f"{path}: no videos here; they may be {kinds}. For pictures use source.folder"
+            else f"{path}: no videos here; supported formats: {kinds}. For images, use source.folder"
         )
     return sorted(videos, key=lambda file: natural_key(file.relative_to(path).as_posix()))
 
@@ -92,8 +92,8 @@ def describe_video(path: Path) -> VideoInfo:
         )
     if width != 2 * height:
         raise InputError(
-            f"{path}: {width}×{height} px are no equirectangular frames, which are twice as wide as high. If it is "
-            f"straight from the camera (two fisheye images, or cube faces), {_UNSTITCHED}; of a stereo video, export "
+            f"{path}: {width}×{height} px frames are not equirectangular, which are twice as wide as high. If it is "
+            f"unstitched (two fisheye images, or cube faces), {_UNSTITCHED}; of a stereo video, export "
             "one eye"
         )
     return VideoInfo((height, width), int(count), float(rate), is_turned)
@@ -154,7 +154,7 @@ def _seek(capture: cv2.VideoCapture, time_s: float) -> bool:
 @contextmanager
 def _opened(path: Path, threads: int = 1) -> Iterator[cv2.VideoCapture]:
     if not is_file(path):
-        raise InputError(f"{path}: no such video ({problem_of(path) or 'it is no file'})")
+        raise InputError(f"{path}: no such video ({problem_of(path) or 'it is not a file'})")
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, threads])
     try:
         if not capture.isOpened():

@@ -133,19 +133,19 @@ def rigid_from_arrays(rotation: NDArray[np.float64], translation: NDArray[np.flo
     if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
         raise InputError(f"{where}: the pose holds NaN or infinite numbers")
     if np.abs(translation).max() > _MAX_LENGTH:
-        raise InputError(f"{where}: a translation of {np.abs(translation).max():.3g} is no place on Earth")
+        raise InputError(f"{where}: a translation of {np.abs(translation).max():.3g} is not a valid position")
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     if error > _ROTATION_TOLERANCE:
         raise InputError(f"{where}: the rotation is not orthonormal (off by {error:.2g})")
     if np.linalg.det(rotation) < 0:
-        raise InputError(f"{where}: the rotation mirrors (its determinant is −1): the axes are left-handed")
+        raise InputError(f"{where}: the rotation is a reflection (its determinant is −1): the axes are left-handed")
     return Rigid3(rotation if error < 1e-12 else nearest_rotation(rotation), translation)
 
 
 def require_distinct(names: list[str], path: Path) -> None:
     """Raise InputError if an image is listed twice, or if there is no image."""
     if not names:
-        raise InputError(f"{path}: holds no poses")
+        raise InputError(f"{path}: contains no poses")
     seen: set[str] = set()
     for name in names:
         if name in seen:
@@ -167,7 +167,7 @@ def _name(entry: Any, key: str, where: str) -> str:
         raise InputError(f"{where}: expected an object, got {type(entry).__name__}")
     name = entry.get(key)
     if not isinstance(name, str) or not name:
-        raise InputError(f"{where}: key {key!r} must be the picture's name, got {name!r}")
+        raise InputError(f"{where}: key {key!r} must be the name of the image, got {name!r}")
     return name.replace("\\", "/").removeprefix("./")
 
 

@@ -61,7 +61,7 @@ def read_npz(path: Path, key: str, *, what: str = "") -> NDArray[Any]:
                 return _read_array(stream, min(member.file_size, max_bytes))
     except DAMAGE as error:
         raise InputError(
-            f"{path}: {what or f'the array {key}'} cannot be read ({_reason(error)}). Fetch the file again"
+            f"{path}: {what or f'the array {key}'} cannot be read ({_reason(error)}). Copy the file again"
         ) from error
 
 
@@ -75,7 +75,7 @@ def keys_of_npz(path: Path) -> list[str]:
         with zipfile.ZipFile(path) as archive:
             return sorted(name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy"))
     except DAMAGE as error:
-        raise InputError(f"{path}: not a readable .npz file ({_reason(error)}). Fetch it again") from error
+        raise InputError(f"{path}: not a readable .npz file ({_reason(error)}). Copy it again") from error
 
 
 def _read_array(stream: IO[bytes], size_bytes: int) -> NDArray[Any]:
@@ -87,15 +87,15 @@ def _read_array(stream: IO[bytes], size_bytes: int) -> NDArray[Any]:
     """
     version = np.lib.format.read_magic(stream)
     if version not in _HEADERS:
-        raise ValueError(f"version {version} of the format is not read")
+        raise ValueError(f"version {version} of the format is not supported")
     shape, is_fortran, dtype = _HEADERS[version](stream)
     if dtype.hasobject:
-        raise ValueError("it holds Python objects, which are not read")
+        raise ValueError("it contains Python objects, which are not allowed")
     if len(shape) > _MAX_DIMENSIONS or min(shape, default=0) < 0:
         raise ValueError(f"its header states the shape {shape}")
     count = math.prod(shape)
     if count * dtype.itemsize > size_bytes:
-        raise ValueError(f"its header states {count * dtype.itemsize} bytes, there are at most {size_bytes}")
+        raise ValueError(f"its header states {count * dtype.itemsize} bytes, but there are at most {size_bytes}")
     if count > MAX_PIXELS:
         raise ValueError(f"its {count} numbers are more than the limit of {MAX_PIXELS}")
     values = np.frombuffer(_read_exactly(stream, count * dtype.itemsize), dtype)

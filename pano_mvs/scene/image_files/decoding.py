@@ -83,7 +83,7 @@ def decode_picture(data: bytes, path: Path, flags: int, *, max_pixels: int = MAX
         raise InputError(f"{path}: {_why_not(error, size)}") from error
     if warning:
         raise InputError(
-            f"{path}: the JPEG is damaged or its data end early: a part of the picture is missing "
+            f"{path}: the JPEG is damaged or its data end early: a part of the image is missing "
             f"(decoder: {warning}). Copy it again from the camera"
         )
     return image
@@ -168,10 +168,10 @@ def _why_not(error: Exception, size: Size | None) -> str:
     code = error.code if isinstance(error, cv2.error) else _OPENCV_NO_MEMORY
     if code == _OPENCV_ASSERTION and (height * width > _OPENCV_PIXELS or max(height, width) > _OPENCV_SIDE):
         return (
-            f"a picture{of} is more than OpenCV decodes, {_OPENCV_PIXELS / 1e6:.0f} megapixels and "
+            f"an image{of} is larger than OpenCV decodes, {_OPENCV_PIXELS / 1e6:.0f} megapixels and "
             f"{_OPENCV_SIDE} px on a side. Scale it down"
         )
     if code == _OPENCV_NO_MEMORY:
-        return f"there is not enough memory to decode a picture{of}. Close other programs, or scale it down"
+        return f"there is not enough memory to decode an image{of}. Close other programs, or scale it down"
     states = f" (its header states {width}×{height} px)" if size else ""
-    return f"not a picture that can be decoded{states}. Copy it again"
+    return f"not an image that can be decoded{states}. Copy it again"

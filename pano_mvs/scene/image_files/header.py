@@ -27,7 +27,7 @@ _DAMAGE = (struct.error, IndexError, OverflowError)
 
 
 def image_kind(data: bytes) -> ImageKind | None:
-    """Return the kind of an image file by its first bytes, or None if it is none of these kinds."""
+    """Return the kind of an image file by its first bytes, or None for any other file."""
     if data.startswith(JPEG_START):
         return "jpeg"
     if data.startswith(PNG_START):

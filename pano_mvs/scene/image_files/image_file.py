@@ -42,12 +42,12 @@ def decode_image(path: Path, data: bytes | None = None, *, max_pixels: int = MAX
     image = decode_picture(data, path, flags, max_pixels=max_pixels)
     if image is None and data[4:12] in (b"ftypavif", b"ftypavis"):
         raise InputError(
-            f"{path}: this OpenCV ({cv2.__version__}) reads no AVIF pictures, or it is damaged. Install a "
+            f"{path}: this OpenCV ({cv2.__version__}) cannot read AVIF images, or the file is damaged. Install a "
             "newer opencv-python-headless, or convert it to JPEG"
         )
     if image is None:
         raise InputError(
-            f"{path}: not a picture that can be decoded ({len(data)} bytes). Remove it or convert it to "
+            f"{path}: not an image that can be decoded ({len(data)} bytes). Remove it or convert it to "
             f"JPEG, or to PNG or TIFF of 8 or 16 bits"
         )
     del data  # frees memory
@@ -55,7 +55,7 @@ def decode_image(path: Path, data: bytes | None = None, *, max_pixels: int = MAX
         np.right_shift(image, 8, out=image)  # programs write 8 bits v in 16 as 257 v or 256 v; both give v
         return np.asarray(image[..., ::-1].astype(np.uint8, order="C"))
     if image.dtype != np.uint8:
-        raise InputError(f"{path}: {image.dtype} pictures are not supported. Convert it to 8 or 16 bits")
+        raise InputError(f"{path}: {image.dtype} images are not supported. Convert it to 8 or 16 bits")
     rgb: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)  # in place
     return rgb
 
@@ -66,14 +66,14 @@ def _decode_heic(data: bytes, path: Path) -> NDArray[np.uint8]:
         pillow_heif = import_module("pillow_heif")
     except ImportError as error:
         raise InputError(
-            f"{path}: HEIC pictures need an extra: pip install 'pano-mvs[heic]', or convert it to JPEG"
+            f"{path}: HEIC images need an extra: pip install 'pano-mvs[heic]', or convert it to JPEG"
         ) from error
     try:
         picture = pillow_heif.open_heif(data, convert_hdr_to_8bit=True)
         image = np.array(picture, copy=True)  # a view may not outlive the image
     except (ValueError, EOFError, OSError, RuntimeError, SyntaxError) as error:
         raise InputError(
-            f"{path}: not a HEIC picture that can be decoded ({error}). Copy it again, or convert it to JPEG"
+            f"{path}: not a HEIC image that can be decoded ({error}). Copy it again, or convert it to JPEG"
         ) from error
     rgb = image[..., :3] if image.ndim == 3 and image.shape[-1] >= 3 else np.atleast_3d(image)[..., :1].repeat(3, -1)
     return np.ascontiguousarray(rgb, dtype=np.uint8)

@@ -78,7 +78,7 @@ def write_curve_picture(path: Path, inspection: Inspection) -> None:
 
 
 def _set_scales(axes: Axes, ranges: NDArray[np.float64], *, with_labels: bool) -> None:
-    """Set the limits; ticks of the ranges stand where they lie among the hypotheses, which are evenly apart."""
+    """Set the limits and ticks of the axes; hypotheses are evenly spaced."""
     highest = max(float(np.nanmax(line.get_ydata())) for line in axes.lines if np.isfinite(line.get_ydata()).any())
     axes.set(xlim=(0, len(ranges) - 1), ylim=(0, 1.1 * max(highest, 0.02)))
     axes.yaxis.set_major_formatter("{x:.2f}")
@@ -114,7 +114,7 @@ def _add_marks(axes: Axes, inspection: Inspection, costs: NDArray[np.float64]) -
 
 
 def _add_tag(axes: Axes, text: str, place: tuple[float, float], *, color: str, other: float) -> None:
-    """Write below a mark, or above it at the bottom, on the side away from another mark that is near."""
+    """Label a mark on the side away from a nearby mark, below it, or above it at the bottom of the plot."""
     count, highest = axes.get_xlim()[1], axes.get_ylim()[1]
     x, y, other = place[0] / count, place[1] / highest, other / count
     leftwards = x > 0.75 or (x < other < x + 2 * _TAG_WIDTH and x > _TAG_WIDTH)
@@ -131,7 +131,7 @@ def _add_tag(axes: Axes, text: str, place: tuple[float, float], *, color: str, o
 
 
 def _place_of(value: float, ranges: NDArray[np.float64]) -> float:
-    """Return the position of a range among the hypotheses; beyond either end, that end."""
+    """Return the position of a range among the hypotheses, clamped to both ends."""
     return float(np.interp(value, ranges, np.arange(len(ranges))))
 
 
@@ -159,5 +159,5 @@ def _add_legend(figure: Figure, found: Inspection) -> None:
 
 
 def _drawable(text: str) -> str:
-    """Return a text with ? for characters that the font may lack."""
+    """Return a text with ? instead of characters that the font may lack."""
     return "".join(letter if letter.isprintable() and letter <= "ÿ" else "?" for letter in text)

@@ -1,4 +1,4 @@
-"""A cost curve as characters."""
+"""Draw a cost curve with text characters."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from pano_mvs.algorithms.sweep.cost_curve import CostCurve
 _ROWS = 8
 _MARGIN = 6
 _LABEL_STEP = 16
-# Eighths of a character, in terminals that have them, and whole ones in others.
+# Eighths of a character if the terminal supports them, otherwise whole characters.
 _EIGHTHS, _WHOLE = " ▁▂▃▄▅▆▇█", " #"
 _SIGNS = {"winner": "▲", "next valley": "△", "truth": "◆"}
 _PLAIN_SIGNS = {"winner": "^", "next valley": "o", "truth": "T"}
 
 
 def curve_text(curve: CostCurve, *, true_range: float = np.nan, width: int = 100, plain: bool = False) -> list[str]:
-    """Return the lines of a plot: a bar for the cost of each depth hypothesis, low where it matches, near on the left.
+    """Return the lines of a plot with a bar for the cost of each depth hypothesis, near on the left.
 
-    Costs after semi-global matching are drawn below those that it was given. Where there are more ranges than columns,
-    a bar is the cheapest of its ranges.
+    Costs after semi-global matching are drawn below the original costs. If there are more ranges than columns,
+    a bar shows the minimum of several ranges.
 
     Args:
         curve: of a pixel.
-        true_range: marked below; NaN if it is not known.
+        true_range: marked below; NaN if unknown.
         width: characters in a line.
         plain: whether to use ASCII alone.
     """
@@ -76,7 +76,7 @@ def _marks(curve: CostCurve, true_range: float) -> Mapping[str, int]:
 
 
 def _scale(ranges: Sequence[float] | NDArray[np.float64], group: int, bars: int) -> str:
-    """Return the ranges below the bars, as many as find room."""
+    """Return as many range labels below the bars as fit."""
     line = ""
     for bar in range(0, bars, _LABEL_STEP):
         line = line.ljust(bar) + f"{ranges[bar * group]:.3g}"

@@ -1,4 +1,4 @@
-"""All that is known of one pixel: its ray, its range after each stage, what its neighbours see, its cost curve."""
+"""The analysis of one pixel: its ray, its range after each stage, its neighbours, and its cost curve."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pano_mvs.algorithms.sweep.settings import SweepSettings
 
 @dataclass(frozen=True)
 class StageRange:
-    """What one stage made of the pixel.
+    """Range of the pixel after one stage.
 
     Attributes:
         stage: its name in the workflow.
@@ -30,7 +30,7 @@ class StageRange:
 
 @dataclass(frozen=True)
 class SourceSight:
-    """What one neighbour sees where the pixel's surface is.
+    """A neighbour's view of the surface point of the pixel.
 
     Attributes:
         name: of the image.
@@ -39,7 +39,7 @@ class SourceSight:
         pixel_px: (x, y) in the neighbour.
         color_rgb: there.
         masked: whether the neighbour is masked there.
-        cost: of the winning range in this neighbour alone, a share of the worst; NaN if it does not count.
+        cost: of the winning range in this neighbour alone, relative to the worst cost; NaN if it does not count.
     """
 
     name: str
@@ -59,17 +59,17 @@ class Inspection:
         image: its name.
         column: of the pixel, from 0; its centre is at column + ½.
         row: likewise.
-        size_hw: of the picture that was swept.
+        size_hw: of the image at the resolution of the sweep.
         color_rgb: of the pixel.
         ray_in_cam: (3,) unit ray through its centre.
         ray_in_world: (3,) likewise.
         center_in_world: (3,) of the camera, scene units.
-        stages: what each stage that makes ranges made of it, as far as it is stored.
-        sweep: name of the stage whose curve it is.
+        stages: its range after each stage that produces ranges, as far as stored.
+        sweep: name of the stage whose cost curve is shown.
         settings: of that sweep.
         curve: its costs.
         sources: its neighbours.
-        true_range: in scene units; NaN if not known.
+        true_range: in scene units; NaN if unknown.
         notes: further remarks.
     """
 
@@ -91,10 +91,10 @@ class Inspection:
 
     @property
     def azimuth_deg(self) -> float:
-        """Of the ray: 0 ahead, 90 to the right."""
+        """Azimuth of the ray: 0 is ahead, 90 to the right."""
         return float(np.rad2deg(np.arctan2(self.ray_in_cam[0], self.ray_in_cam[2])))
 
     @property
     def elevation_deg(self) -> float:
-        """Of the ray: 90 is up."""
+        """Elevation of the ray: 90 is up."""
         return float(np.rad2deg(np.arcsin(np.clip(-self.ray_in_cam[1], -1, 1))))

@@ -1,4 +1,4 @@
-"""Find out all that is known of one pixel of a sweep."""
+"""Analyse one pixel of a sweep."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ UnitFound = tuple[Unit, UnitRecord | None]
 def inspect_pixel(
     sweep_unit: UnitFound, stages: Sequence[UnitFound], store: Store, *, column: int, row: int, truth: Path | None
 ) -> Inspection:
-    """Return what is known of a pixel.
+    """Return the analysis of a pixel.
 
     Args:
         sweep_unit: the unit of a `depth.sweep` whose curve is wanted, and its record if it was computed.
-        stages: the units of the image that make range maps, with their records.
-        store: where what they read lies.
+        stages: the units that produce range maps of the image, with their records.
+        store: the cache with their inputs.
         column: of the pixel, from 0.
         row: likewise.
         truth: folder with poses.json and depth.npz, or None.
 
     Raises:
-        UsageError: if the picture has no such pixel.
-        InputError: if a file that it reads is gone or damaged.
+        UsageError: if the image has no such pixel.
+        InputError: if an input file is missing or damaged.
     """
     unit, record = sweep_unit
     read = _SweepRead.of(unit, store)
@@ -98,7 +98,7 @@ def inspect_pixel(
 
 @dataclass(frozen=True, eq=False)
 class _SweepRead:
-    """What a unit of a sweep reads."""
+    """The inputs of a sweep's unit."""
 
     reference: Panorama
     sources: tuple[Panorama, ...]
@@ -127,7 +127,7 @@ def _limits(
     read: _SweepRead,
     masks: list[NDArray[np.bool_]],
 ) -> tuple[float, float]:
-    """Return near and far as the stage had them, or as it would find them."""
+    """Return the near and far limits of the stage, estimating them if they are unset."""
     if params.near is not None and params.far is not None:
         return params.near, params.far
     if record is not None and {"near", "far"} <= record.metrics.keys():
@@ -158,7 +158,7 @@ def _sights(
     pictures: list[NDArray[np.uint8]],
     masks: list[NDArray[np.bool_]],
 ) -> tuple[SourceSight, ...]:
-    """Return what each neighbour sees at the winning range."""
+    """Return the view of each neighbour at the winning range."""
     distance = curve.range if np.isfinite(curve.range) else float(curve.ranges[curve.winner])
     sights = []
     for idx, pose in enumerate(read.source_from_reference):
@@ -186,7 +186,7 @@ def _sights(
 def _true_range(
     folder: Path | None, image: str, read: _SweepRead, row: int, column: int
 ) -> tuple[float, tuple[str, ...]]:
-    """Return the true range in scene units, by the scale at which the cameras' centres fit, and why not if not."""
+    """Return the true range in scene units, scaled by the camera centres, or the reason why it is unknown."""
     if folder is None:
         return np.nan, ()
     truth = read_truth(folder)
@@ -213,13 +213,13 @@ def _curve_notes(
     name = unit.entry.name
     if record is None:
         notes.append(
-            f"{name} of {unit.item} is not in the cache as it would be computed now (other settings, pictures or "
-            "version): the curve was computed for this alone"
+            f"{name} of {unit.item} is not in the cache for the current settings, images and "
+            "version: only the cost curve was computed"
         )
     if settings.levels > 1:
         notes.append(
-            f"{name} goes from coarse to fine (levels: {settings.levels}) and tries a few ranges around a "
-            "guide; the curve tries all"
+            f"{name} goes from coarse to fine (levels: {settings.levels}) and tests a few ranges around a "
+            "guide; the curve tests all"
         )
     stored = next((found for found in stages if found.stage == name), None)
     if stored is not None and not _alike(stored.range, curve):
@@ -230,7 +230,7 @@ def _curve_notes(
 
 
 def _alike(stored: float, curve: CostCurve) -> bool:
-    """Return whether a stored range is that of the curve, to half a plane."""
+    """Return whether a stored range agrees with the curve within half a plane."""
     if np.isnan(stored) or np.isnan(curve.range):
         return bool(np.isnan(stored) and np.isnan(curve.range))
     planes = np.arange(len(curve.ranges))

@@ -71,10 +71,10 @@ def placement_of(poses: Poses, epsg: int | None) -> Placement:
     try:
         crs = CRS.from_epsg(_utm_epsg(origin[0], origin[1]) if epsg is None else epsg)
     except CRSError as error:
-        raise UsageError(f"epsg: {epsg} is no coordinate system that PROJ knows") from error
+        raise UsageError(f"epsg: {epsg} is not a coordinate system that PROJ knows") from error
     if not crs.is_projected:
         raise UsageError(
-            f"epsg: {epsg} ({crs.name}) is not projected: its unit is no length. Take a map's, such as "
+            f"epsg: {epsg} ({crs.name}) is not projected: its unit is not a length. Take a map's, such as "
             f"{_utm_epsg(origin[0], origin[1])}"
         )
     return Placement(origin, crs)

@@ -105,7 +105,7 @@ def test_another_map_or_none(tmp_path: Path) -> None:
     none = laspy.read(written(las, tmp_path / "b", cloud, the_poses(HERE), LasParams(epsg=0)))
     assert none.header.parse_crs() is None
     assert np.abs(none.xyz).max() < 21
-    for epsg, what in ((4326, "not projected"), (999999, "no coordinate system that PROJ knows")):
+    for epsg, what in ((4326, "not projected"), (999999, "not a coordinate system that PROJ knows")):
         with pytest.raises(UsageError, match=what):
             written(las, tmp_path / "c", cloud, the_poses(HERE), LasParams(epsg=epsg))
     with pytest.raises(UsageError, match="needs cameras that GPS has placed"):

@@ -139,7 +139,7 @@ def test_the_cloud_of_a_run_lies_in_the_frame_of_a_reference_without_poses(
     model.mkdir(parents=True)
     plain = pano_mvs("evaluate", "cloud", tmp_path, "--truth", own)
     assert plain.code == 0, plain.text
-    assert "both clouds are taken to lie in one frame" in plain.flat
+    assert "both clouds are assumed to be in the same frame" in plain.flat
     assert "100.00" in plain.text
     named = pano_mvs("evaluate", "cloud", tmp_path, "--truth", own, "--poses", model)
     assert (named.code, "give the true poses" in named.flat) == (2, True)

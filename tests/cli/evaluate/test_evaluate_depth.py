@@ -91,11 +91,11 @@ def test_the_table_tells_how_it_was_judged_and_what_constants_score(
     plain = pano_mvs("evaluate", "depth", output, "--truth", truth)
     assert plain.code == 0
     assert "estimates × 2.5: from the centres of 4 cameras" in plain.flat
-    assert "ranges are not fitted to the truth (--align none)" in plain.flat
+    assert "ranges are not fitted to the ground truth (--align none)" in plain.flat
     assert plain.text.count("constant") >= 4
     assert "no estimate of images/003.png" in plain.flat
     fitted = pano_mvs("evaluate", "depth", output, "--truth", truth, "--align", "median", "--baseline", "mean")
-    assert "RANGES ARE FITTED TO THE TRUTH" in fitted.flat
+    assert "RANGES ARE FITTED TO THE GROUND TRUTH" in fitted.flat
     assert "0.90909 to 0.90909" in fitted.flat
     assert "the mean of the view's true ranges" in fitted.flat
 
@@ -147,7 +147,7 @@ def test_foreign_folders_are_compared_in_their_units(pano_mvs: Command, truth: P
     arguments = ("evaluate", "depth", tmp_path / "png", "--truth", tmp_path / "true.npz")
     report = told(pano_mvs(*arguments, "--unit", "0.001", "--json"))
     assert report["scale"] == 1
-    assert "one unit" in report["scale_reason"]
+    assert "the same unit" in report["scale_reason"]
     assert report["mean"]["w_delta_105"] > 0.8
     text = pano_mvs(*arguments, "--unit", "0.001").flat
     assert f"{SIZE_HW[1] // 2}×{SIZE_HW[0] // 2}, their truth {SIZE_HW[1]}×{SIZE_HW[0]}" in text
@@ -212,8 +212,8 @@ def test_masks_and_confidence_leave_out_what_they_say(
     ("arguments", "words"),
     [
         (("--min-confidence", "128"), "so a minimum confidence cannot apply"),
-        (("--scale", "big"), "'big' is no scale"),
-        (("--bad", "often"), "no limit for bad pixels"),
+        (("--scale", "big"), "'big' is not a scale"),
+        (("--bad", "often"), "not a limit for bad pixels"),
         (("--unit", "0"), "unit must be a positive number"),
         (("--peak", "0"), "peak must be a positive length"),
         (("--masks", "none"), "masks must be a folder"),
@@ -238,7 +238,7 @@ def test_strangers_are_named_with_what_either_has(pano_mvs: Command, output: Pat
     np.savez(tmp_path / "other.npz", zebra=np.ones((4, 8), np.float32))
     result = pano_mvs("evaluate", "depth", output, "--truth", tmp_path / "other.npz")
     assert result.code == 2
-    assert "no image in common: the one has 000, 001, 002, the other zebra" in result.flat
+    assert "no image in common: the first has 000, 001, 002, the other zebra" in result.flat
     write_npz(tmp_path / "shape.npz", {"001": np.ones((30, 50), np.float32)})
     result = pano_mvs("evaluate", "depth", output, "--truth", tmp_path / "shape.npz")
     assert result.code == 2
@@ -276,7 +276,7 @@ class TestRun:
         assert result.code == 0, result.text
         assert "poses: not compared, there is no colmap/sparse/0" in result.flat
         assert "PSNR" in result.text
-        assert "both are taken to have one unit" in result.flat
+        assert "both are assumed to have the same unit" in result.flat
 
     def test_poses_alone(self, pano_mvs: Command, output: Path, truth: Path, tmp_path: Path) -> None:
         shutil.rmtree(output / "range")

@@ -63,7 +63,7 @@ def test_the_table_tells_a_turned_camera_and_a_missing_one(
     assert "over 6 pairs of registered images" in text
     assert "AUC over all 10 pairs, %: 30.0 @ 0.1°" in text
     assert "camera centre, units of the truth" in text
-    assert "no truth for more.jpg" in text
+    assert "no ground truth for more.jpg" in text
     told = json.loads(pano_mvs("evaluate", "poses", model, "--truth", known, "--json").text)
     assert told["rotation_deg"]["max"] == pytest.approx(2.0, abs=1e-6)
     assert told["pair_deg_all"]["max"] == 180

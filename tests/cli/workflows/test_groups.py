@@ -123,7 +123,7 @@ def test_both_rooms_are_delivered(pano_mvs: Command, rooms: Path) -> None:
     assert (first in LARGE, second in SMALL) == (True, True)
     assert "2 groups of panoramas share no reliable connection: each has its own frame and scale" in result.flat
     assert f"between {first} and {second}" in result.flat
-    assert f"To join them take pictures between {first} and {second}" in (out / "report.html").read_text()
+    assert f"To connect them, take panoramas between {first} and {second}" in (out / "report.html").read_text()
     _check_models(out, rooms)
     _check_ranges(out, rooms)
     _check_clouds(out, rooms)
@@ -164,7 +164,7 @@ def _check_clouds(out: Path, rooms: Path) -> None:
         assert scene.cloud.count == len(cloud)
         assert [camera.name for camera in scene.cameras] == [list(LARGE), list(SMALL)][number]
         assert scene.unit == ("scene units", "m")[number]
-        assert f"shown is group {number} of 2" in scene.notes[0]
+        assert f"this is group {number} of 2" in scene.notes[0]
 
 
 def _check_evaluation(pano_mvs: Command, out: Path, rooms: Path) -> None:
@@ -174,7 +174,7 @@ def _check_evaluation(pano_mvs: Command, out: Path, rooms: Path) -> None:
     told = pano_mvs("evaluate", "run", out, "--truth", rooms / "capture" / "truth")
     assert told.code == 0, told.text
     assert "5 of 5 registered (3 in one frame), median pair error" in told.flat
-    assert "the poses are in 2 groups, each with a frame and a scale of its own" in told.flat
+    assert "the poses are in 2 groups, each with its own frame and scale" in told.flat
     depth = pano_mvs("evaluate", "depth", out, "--truth", rooms / "capture" / "truth", "--json")
     views = json.loads(depth.text)["views"]
     assert views["a0"]["scale"] == pytest.approx(2.0, rel=0.02)
@@ -189,7 +189,7 @@ def test_the_terminal_says_what_the_report_finds_of_groups(capsys: pytest.Captur
     print_summary(_output({"poses": poses}), Console(width=200))
     printed = capsys.readouterr().out
     assert "Usable, with doubts: see below.\ndoubtful: 2 groups of panoramas share no reliable connection" in printed
-    assert "To join them take pictures between b and x (31 candidates)." in printed
+    assert "To connect them, take panoramas between b and x (31 candidates)." in printed
     print_summary(_output({"poses": poses | {"groups": groups[:1]}}), Console(width=200))
     assert "reliable connection" not in capsys.readouterr().out
 

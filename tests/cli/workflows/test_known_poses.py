@@ -61,7 +61,7 @@ def test_cameras_in_one_place_are_refused(pano_mvs: Command, known: Path, captur
     write(known, capture, ["000.png", "001.png", "002.png"], one_place=True)
     result = pano_mvs("run", known, "--out", "out")
     assert result.code == 2
-    assert "stand in one place" in result.flat
+    assert "are in the same place" in result.flat
     assert Path("out/report.html").exists()
 
 

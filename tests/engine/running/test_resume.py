@@ -39,4 +39,4 @@ def test_interrupt_ends_with_exit_code_130_and_says_how_to_go_on(toy: Toy) -> No
     process.send_signal(signal.SIGINT)
     output = "".join(process.communicate(timeout=60))
     assert process.returncode == 130
-    assert "the same command goes on" in output
+    assert "run the same command again" in output

@@ -83,7 +83,7 @@ def test_a_truncated_file_is_named(tmp_path: Path, keep: int) -> None:
         ("1 0 0 0 0 1 2 3 1 a.jpg", "its quaternion is not a rotation"),
         ("1 1 0 0 0 nan 2 3 1 a.jpg", "NaN or infinite"),
         ("1 one 0 0 0 1 2 3 1 a.jpg", "could not convert"),
-        ("", "holds no poses"),
+        ("", "contains no poses"),
     ],
 )
 def test_a_malformed_text_is_named(tmp_path: Path, line: str, what: str) -> None:

@@ -76,7 +76,7 @@ def test_a_subfolder_that_cannot_be_read_costs_what_it_holds(tmp_path: Path, mod
         assert (found, notes) == (["1.jpg", "lost+found/2.jpg", "z/3.jpg"], [])
     else:
         assert found == ["1.jpg", "z/3.jpg"]
-        assert notes == [f"{tmp_path / 'lost+found'}: cannot be listed (Permission denied); what it holds is left out"]
+        assert notes == [f"{tmp_path / 'lost+found'}: cannot be listed (Permission denied); its contents are skipped"]
 
 
 def test_a_folder_that_cannot_be_read_is_an_error(tmp_path: Path) -> None:
@@ -86,7 +86,7 @@ def test_a_folder_that_cannot_be_read_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "photos").chmod(0o700)
 
 
-@pytest.mark.parametrize(("folder", "what"), [("gone", "no such folder"), ("empty", "no pictures here")])
+@pytest.mark.parametrize(("folder", "what"), [("gone", "no such folder"), ("empty", "no images here")])
 def test_a_folder_without_pictures_is_named(tmp_path: Path, folder: str, what: str) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match=f"{folder}: {what}"):

@@ -349,7 +349,7 @@ def _conclude(
         # Neither images nor pairs alone may be enough to doubt a camera, although both are evidence against it.
         if ratio < (_SUSPICIOUS if explained < _MIN_EXPLAINED_IN_ALL else _DOUBTFUL):
             reasons.append(
-                f"other images confirm {100 * share:.0f} % of its texture, where its neighbours lead to expect "
+                f"other images confirm {100 * share:.0f} % of its texture, but its neighbours suggest "
                 f"{100 * expected:.0f} %"
             )
         contradicted = explained < _MIN_EXPLAINED and not ratio > _CONFIRMED

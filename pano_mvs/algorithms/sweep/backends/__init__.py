@@ -1,1 +1,1 @@
-"""What computes a sweep, chosen by name: numba (the default), numpy (readable), opencv, and plugins' backends."""
+"""Implementations of the sweep, chosen by name: numba (the default), numpy (readable), opencv, and those of plugins."""

@@ -1,4 +1,4 @@
-"""The sweep, compiled: bands of rows in threads, no volume unless semi-global matching needs one.
+"""The compiled sweep: bands of rows in threads, without a cost volume unless semi-global matching needs one.
 
 Memory beyond the pictures and the result: a source's packed copy has 4 bytes a pixel if it is grey, 8 in colour, or 12
 without vector instructions; for "box" about 3 MB a thread at 1,000 columns and 3 sources, whatever the planes and the

@@ -1,4 +1,4 @@
-"""The sweep, readable: the whole volume in memory, exact projection, one statement for each step.
+"""The readable sweep: the whole cost volume in memory, exact projection, one statement per step.
 
 The reference against which compiled backends are held. Memory: about 20 bytes for each pixel and plane.
 """

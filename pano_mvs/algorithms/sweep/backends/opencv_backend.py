@@ -1,4 +1,4 @@
-"""The sweep by OpenCV: whole pictures warped by cv2.remap, windows by cv2.blur, one plane at a time.
+"""The sweep by OpenCV: whole images warped by cv2.remap, windows by cv2.blur, one plane at a time.
 
 cv2.remap rounds positions to 1/32 pixel. Everything else is as in the numpy backend, which also computes the costs for
 which OpenCV has no function. Semi-global matching is the numba backend's, since OpenCV has it for flat pairs alone.

@@ -1,4 +1,4 @@
-"""The backends of a sweep by name, and what each of them can do; plugins add their own.
+"""The backends of a sweep by name, with their capabilities; plugins add their own.
 
 A backend turns a `SweepInput` into `Winners`; all backends return the same ones, except for rounding. `numpy` is the
 readable one against which the others are tested, `numba` the default; `opencv` warps by cv2.remap.

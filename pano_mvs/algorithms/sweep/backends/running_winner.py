@@ -1,4 +1,4 @@
-"""Winner takes all, one plane at a time, so that no volume is needed."""
+"""Winner takes all, one plane at a time, without a cost volume."""
 
 from __future__ import annotations
 

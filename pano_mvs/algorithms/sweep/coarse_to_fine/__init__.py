@@ -1,1 +1,1 @@
-"""The faster sweep: half the resolution guides the full one. Needs numba."""
+"""The coarse-to-fine sweep: a sweep at half the resolution guides the full one. It needs numba."""

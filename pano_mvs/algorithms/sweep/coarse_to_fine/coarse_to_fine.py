@@ -1,4 +1,4 @@
-"""Coarse to fine: a sweep at half the resolution says where to look at the full one.
+"""Coarse to fine: a sweep at half the resolution restricts the search at full resolution.
 
 1. The pictures at half size are swept at half as many planes (itself coarse to fine for more than two levels).
 2. What it found, smoothed within each surface, guides the sweep at full size: every pixel is tried at seven planes

@@ -1,4 +1,4 @@
-"""Compiled: the sweep near surfaces that are known roughly, each pixel at offsets from its own depth hypothesis.
+"""Compiled: the sweep near approximate surfaces, at offsets from each pixel's own depth hypothesis.
 
 The rows are warped as a whole at once, as in the plain sweep, but by a surface instead of by a sphere. Windows then
 lie on the surface, slanted as it is, and few offsets do.

@@ -1,4 +1,4 @@
-"""Compiled: two guiding surfaces for every pixel, where two of them meet."""
+"""Compiled: two guiding surfaces for every pixel near depth edges."""
 
 from __future__ import annotations
 

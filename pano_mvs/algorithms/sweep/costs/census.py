@@ -1,4 +1,4 @@
-"""Census: the Hamming distance of the signs of the differences to the window's centre; exposure makes no difference.
+"""Census: the Hamming distance of the signs of differences to the window's centre; insensitive to exposure.
 
 R. Zabih, J. Woodfill, "Non-parametric local transforms for computing visual correspondence", ECCV 1994.
 """

@@ -1,4 +1,4 @@
-"""What a matching cost is."""
+"""The interface of matching costs."""
 
 from __future__ import annotations
 

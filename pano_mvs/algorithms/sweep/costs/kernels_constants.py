@@ -1,4 +1,4 @@
-"""Numbers that are compiled into the kernels and that others need too. This module does not import numba.
+"""Constants that are compiled into the kernels and used elsewhere, too. This module does not import numba.
 
 The folder of compiled kernels is named by the text of all files `kernels_*.py`; a constant anywhere else could change
 without the kernels being compiled again.

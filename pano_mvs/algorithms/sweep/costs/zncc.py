@@ -1,4 +1,4 @@
-"""1 − zero-mean normalised cross-correlation over the window; exposure makes no difference."""
+"""1 − zero-mean normalised cross-correlation over the window; insensitive to exposure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a sweep's input to the arguments of its kernels."""
+"""Convert the input of a sweep to the arguments of its kernels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Compiled: one cost of a pixel from those of all sources."""
+"""Compiled: combine the costs of all sources at a pixel."""
 
 from __future__ import annotations
 

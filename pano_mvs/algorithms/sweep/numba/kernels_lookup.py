@@ -1,4 +1,4 @@
-"""Compiled: a band of rows of the reference, at one depth hypothesis, looked up in one source."""
+"""Compiled: sample one source for a band of rows of the reference at one depth hypothesis."""
 
 from __future__ import annotations
 

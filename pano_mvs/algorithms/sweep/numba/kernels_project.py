@@ -1,4 +1,4 @@
-"""Compiled: where a band of rows arrives in a source, exactly in every eighth row and by cubics in between.
+"""Compiled: project a band of rows into a source, exactly in every eighth row and by cubic interpolation between.
 
 The exact position costs two arc tangents. Along a column of the reference it is smooth but near the poles of the
 source: there, where four exact rows are bent too much (their third difference is large, and with it the fourth, of
@@ -22,7 +22,7 @@ EVERY = 8
 
 _BLOCK = 16
 _MAX_THIRD_PX = _F(1)
-# Eight rows of a lower picture are no small step on the sphere: all its positions are exact.
+# In a lower picture, eight rows are a large step on the sphere, so all positions are exact.
 _LOWEST_PICTURE = 128
 
 

@@ -1,4 +1,4 @@
-"""Compiled: one row of the reference, at one depth hypothesis, looked up in one source.
+"""Compiled: sample one source for a row of the reference at one depth hypothesis.
 
 Rows are computed in short separate loops (project, gather, blend) over arrays of one row: a loop that both gathers and
 stores cannot be proved free of aliasing, and is then not vectorised. Loop variables are unsigned, since numba checks

@@ -1,4 +1,4 @@
-"""Compiled: winner takes all, some planes at a time, so that no volume is needed."""
+"""Compiled: winner takes all, some planes at a time, without a cost volume."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sources as the compiled sweep reads them: all 2×2 patches laid out so that one load fetches what a sample needs.
+"""Pack the sources for the compiled sweep: all 2×2 patches, laid out so that a bilinear sample needs one load.
 
 Patch (j, i) of a panorama holds the pixels of rows j − 1, j and columns i − 1, i, over the seam and over the poles: no
 sample lies at a border. Values are stored less 128, as signed bytes.

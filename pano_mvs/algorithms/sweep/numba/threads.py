@@ -1,4 +1,4 @@
-"""Run the jobs of a compiled sweep in plain threads.
+"""Run the jobs of a compiled sweep in threads.
 
 The kernels release the GIL and write disjoint parts in a fixed arithmetic order, so the number of threads changes no
 bit. numba's own parallel regions would take several times longer to compile, and their portable threading layer aborts

@@ -1,4 +1,4 @@
-"""From exceptions to messages and exit codes: the only place where that is done."""
+"""Print exceptions as error messages and end with their exit codes, which `core/errors.py` defines for each class."""
 
 from __future__ import annotations
 
@@ -33,7 +33,9 @@ def guarded(command: Command) -> Command:
                 errors.print(f"[red]error:[/] {escape(problem)}", highlight=False, soft_wrap=True)
             raise typer.Exit(error.exit_code) from None
         except KeyboardInterrupt:
-            errors.print("interrupted; what was finished is kept: the same command goes on from here:", highlight=False)
+            errors.print(
+                "interrupted; finished results are kept. To continue, run the same command again:", highlight=False
+            )
             errors.print(f"  {escape(shlex.join(['pano-mvs', *sys.argv[1:]]))}", highlight=False, soft_wrap=True)
             raise typer.Exit(130) from None
         except typer.Exit:
@@ -42,18 +44,18 @@ def guarded(command: Command) -> Command:
             traceback.print_exc()
             errors.print(
                 f"[red]error:[/] the code above called {escape(exit_text(end))}, which a plugin must not do; "
-                "what was finished is kept",
+                "finished results are kept",
                 highlight=False,
                 soft_wrap=True,
             )
             raise typer.Exit(1) from None
         except Exception as error:
-            if isinstance(error, OSError) and error.filename is not None:  # where no better message was foreseen
-                problem = f"{error.filename}: {reason_of(error)}. Mend its permissions, or choose another path"
+            if isinstance(error, OSError) and error.filename is not None:  # no more specific message exists
+                problem = f"{error.filename}: {reason_of(error)}. Correct its permissions, or choose another path"
                 errors.print(f"[red]error:[/] {escape(problem)}", highlight=False, soft_wrap=True)
                 raise typer.Exit(StoreError.exit_code) from None
             traceback.print_exc()
-            errors.print("[red]internal error:[/] this is a bug in pano_mvs; what was finished is kept")
+            errors.print("[red]internal error:[/] this is a bug in pano_mvs; finished results are kept")
             raise typer.Exit(1) from None
 
     return cast(Command, run_guarded)

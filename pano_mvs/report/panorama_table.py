@@ -1,4 +1,4 @@
-"""One row for each panorama of the capture: its state, how much of it is known, how well its pose fits."""
+"""Rows of the report's table of panoramas: state, shares of the sphere, links and residuals."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ class Row:
 
     Attributes:
         name: of the image.
-        registered: whether it has a pose; None if no stage made any.
-        reason: why it was left out, "" if it was not.
-        doubtful: why its pose is doubtful, "" if it is not.
+        registered: whether it has a pose; None if no stage computed poses.
+        reason: why it was left out, or "".
+        doubtful: why its pose is doubtful, or "".
         shares: of the sphere around it, if measured.
         completeness: share of pixels with a range, as its stage reported it, or None.
         consistent: share of pixels on which other views agree, likewise.
-        links: number of pictures with which it has a common geometry.
+        links: number of images with which it has a common geometry.
         residual_deg: median reprojection residual, or None.
         p95_deg: 95 % of its residuals are smaller, or None.
-        thumbnail: its preview, if there is one.
-        group: number of its group, None where there is one group alone.
+        thumbnail: its preview, or None.
+        group: number of its group; None if there is only one group.
     """
 
     name: str
@@ -49,7 +49,7 @@ class Row:
 
     @property
     def doubt(self) -> float:
-        """What rows are sorted by, largest first: panoramas left out, doubtful ones, those of which least is known."""
+        """Sort key, largest first: panoramas left out, doubtful ones, then those with the smallest shares."""
         if self.reason or self.doubtful:
             return 4.0 if self.reason else 3.0
         known = (self.completeness or 0.0) + (self.consistent or 0.0)
@@ -63,7 +63,7 @@ def panorama_rows(
     residuals: Residuals | None,
     thumbnails: Mapping[str, Picture],
 ) -> tuple[Row, ...]:
-    """Return the rows in the order of the capture, those left out behind; not more than 5,000.
+    """Return at most 5,000 rows in the order of the capture, followed by images that were left out.
 
     Args:
         summary: of the run.

@@ -1,0 +1,139 @@
+"use strict";
+// The cloud: an octree of which as much is loaded and drawn as the picture needs.
+
+const POINT_BUDGET = 1_500_000;
+const LOADS_AT_ONCE = 4;
+const MIN_NODE_PIXELS = 110; // a node smaller than this on the screen is left to its parent
+
+const POINT_VERTEX = `
+attribute vec3 color;
+attribute float views;
+uniform float pointSize; uniform float pixelsPerUnit; uniform float cut; uniform bool coverage; uniform bool hideBacks;
+varying vec3 shown;
+void main() {
+  vec4 inWorld = modelMatrix * vec4(position, 1.0);
+  vec4 inView = viewMatrix * inWorld;
+  gl_Position = projectionMatrix * inView;
+  bool turnedAway = hideBacks && dot(normal, inWorld.xyz - cameraPosition) > 0.0;
+  if (inWorld.y > cut || turnedAway) gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
+  bool perspective = projectionMatrix[2][3] != 0.0;
+  gl_PointSize = clamp(pointSize * pixelsPerUnit / (perspective ? -inView.z : 1.0), 1.5, 24.0);
+  float t = clamp((views * 255.0 - 1.0) / 5.0, 0.0, 1.0);
+  vec3 ramp = mix(vec3(0.78, 0.15, 0.29), mix(vec3(0.98, 0.80, 0.30), vec3(0.10, 0.60, 0.45), clamp(t * 2.0 - 1.0, 0.0, 1.0)), clamp(t * 2.0, 0.0, 1.0));
+  shown = coverage ? ramp * (0.45 + 0.55 * dot(color, vec3(0.3, 0.6, 0.1))) : color;
+}`;
+const POINT_FRAGMENT = `
+varying vec3 shown;
+void main() {
+  vec2 fromCenter = gl_PointCoord - 0.5;
+  if (dot(fromCenter, fromCenter) > 0.25) discard;
+  gl_FragColor = vec4(shown, 1.0);
+}`;
+
+class Cloud {
+  constructor(scene, changed) {
+    this.group = new THREE.Group();
+    this.changed = changed;
+    this.loading = 0;
+    this.nodes = new Map();
+    for (const node of scene.nodes) {
+      const box = new THREE.Box3(new THREE.Vector3(...node.lower), new THREE.Vector3(...node.lower).addScalar(node.size));
+      this.nodes.set(node.name, { ...node, box, sphere: box.getBoundingSphere(new THREE.Sphere()), points: null, asked: false });
+    }
+    this.material = new THREE.ShaderMaterial({
+      vertexShader: POINT_VERTEX,
+      fragmentShader: POINT_FRAGMENT,
+      uniforms: {
+        pointSize: { value: this.spacing() }, pixelsPerUnit: { value: 1 }, cut: { value: 1e30 }, coverage: { value: false }, hideBacks: { value: true },
+      },
+    });
+  }
+
+  /** Return a typical distance between points: of the root's, spread over the surfaces of its cube. */
+  spacing() {
+    const total = [...this.nodes.values()].reduce((sum, node) => sum + node.count, 0);
+    const root = this.nodes.get("r");
+    return root ? 1.6 * Math.sqrt((4 * root.size * root.size) / Math.max(1, Math.min(total, POINT_BUDGET))) : 0.01;
+  }
+
+  /** Choose the nodes for a camera: nearest and largest first, until the budget is spent; load what is missing. */
+  update(camera, height) {
+    const perspective = camera.isPerspectiveCamera;
+    const focal = perspective ? height / 2 / Math.tan(THREE.MathUtils.degToRad(camera.fov) / 2) : height * camera.zoom / (camera.top - camera.bottom);
+    this.material.uniforms.pixelsPerUnit.value = focal;
+    const frustum = new THREE.Frustum().setFromProjectionMatrix(
+      new THREE.Matrix4().multiplyMatrices(camera.projectionMatrix, camera.matrixWorldInverse));
+    const pixels = (node) => {
+      const distance = Math.max(camera.position.distanceTo(node.sphere.center) - node.sphere.radius, node.size * 0.1);
+      return (node.size * focal) / (perspective ? distance : 1);
+    };
+    for (const node of this.nodes.values()) if (node.points) node.points.visible = false;
+    const candidates = this.nodes.has("r") ? [this.nodes.get("r")] : [];
+    let left = POINT_BUDGET;
+    while (candidates.length && left > 0) {
+      candidates.sort((a, b) => pixels(a) - pixels(b));
+      const node = candidates.pop();
+      if (node.name !== "r" && (pixels(node) < MIN_NODE_PIXELS || !frustum.intersectsBox(node.box))) continue;
+      left -= node.count;
+      if (node.points) node.points.visible = true;
+      else this.load(node);
+      for (let octant = 0; octant < 8; octant++) {
+        const child = this.nodes.get(node.name + octant);
+        if (child) candidates.push(child);
+      }
+    }
+  }
+
+  load(node) {
+    if (node.asked || this.loading >= LOADS_AT_ONCE) return;
+    node.asked = true;
+    this.loading++;
+    PanoMvs.load(`cloud/${node.name}`).then((text) => {
+      const bytes = bytesOf(text).buffer;
+      const geometry = new THREE.BufferGeometry();
+      geometry.setAttribute("position", new THREE.BufferAttribute(new Uint16Array(bytes, 0, 3 * node.count), 3, true));
+      geometry.setAttribute("color", new THREE.BufferAttribute(new Uint8Array(bytes, 6 * node.count, 3 * node.count), 3, true));
+      geometry.setAttribute("views", new THREE.BufferAttribute(new Uint8Array(bytes, 9 * node.count, node.count), 1, true));
+      geometry.setAttribute("normal", new THREE.BufferAttribute(new Int8Array(bytes, 10 * node.count, 3 * node.count), 3, true));
+      node.points = new THREE.Points(geometry, this.material);
+      node.points.position.set(...node.lower);
+      node.points.scale.setScalar(node.size);
+      node.points.frustumCulled = false; // `update` does that
+      this.group.add(node.points);
+    }).catch(problem).finally(() => {
+      this.loading--;
+      this.changed();
+    });
+  }
+
+  /** Return the point nearest to the eye among those within `slack` pixels of a ray; null if there is none. */
+  pick(raycaster, camera, height, slack = 7) {
+    const { origin, direction } = raycaster.ray;
+    const perspective = camera.isPerspectiveCamera;
+    const pixel = perspective ? (2 * Math.tan(THREE.MathUtils.degToRad(camera.fov) / 2)) / height : (camera.top - camera.bottom) / camera.zoom / height;
+    const cut = this.material.uniforms.cut.value, hideBacks = this.material.uniforms.hideBacks.value;
+    let best = null;
+    let bestAlong = Infinity;
+    for (const node of this.nodes.values()) {
+      if (!node.points || !node.points.visible || raycaster.ray.distanceToPoint(node.sphere.center) > node.sphere.radius * 1.5 + 1e-6 + (perspective ? 0.05 * origin.distanceTo(node.sphere.center) : 0)) continue;
+      const places = node.points.geometry.attributes.position.array, normals = node.points.geometry.attributes.normal.array;
+      const scale = node.size / 65535;
+      const [lx, ly, lz] = node.lower;
+      for (let i = 0; i < places.length; i += 3) {
+        const y = ly + places[i + 1] * scale;
+        if (y > cut) continue;
+        const dx = lx + places[i] * scale - origin.x, dy = y - origin.y, dz = lz + places[i + 2] * scale - origin.z;
+        const along = dx * direction.x + dy * direction.y + dz * direction.z;
+        if (along <= 0 || along >= bestAlong) continue;
+        if (hideBacks && dx * normals[i] + dy * normals[i + 1] + dz * normals[i + 2] > 0) continue;
+        const off = dx * dx + dy * dy + dz * dz - along * along;
+        const reach = slack * pixel * (perspective ? along : 1);
+        if (off < reach * reach) {
+          bestAlong = along;
+          best = new THREE.Vector3(dx, dy, dz).add(origin);
+        }
+      }
+    }
+    return best;
+  }
+}
