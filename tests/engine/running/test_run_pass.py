@@ -339,7 +339,7 @@ def test_results_that_come_after_the_end_of_a_pass_count_as_computed(
     session = toy.session()
     run = Run(session.workflow, session.graph, Store(session.store_root), out=session.out, executor=shelf)
     run.computed.add("z")
-    record, entry = UnitRecord("a", {}, ItemRef("K", "d", {})), session.workflow.stages["scaled"]
+    record, entry = UnitRecord("a", {}, ItemRef("K", "d" * 32, {})), session.workflow.stages["scaled"]
     outcomes = {"a": JobOutcome("done", record), "b": JobOutcome("failed"), "c": JobOutcome("done", record)}
     ended = [FinishedJob(Unit(entry, key, (), {}, key, {}), outcome) for key, outcome in outcomes.items()]
     monkeypatch.setattr(run.dispatcher, "next_finished", lambda: ended.pop(0) if ended else None)
