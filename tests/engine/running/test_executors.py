@@ -13,16 +13,20 @@ from pathlib import Path
 
 import pytest
 
-from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError, UsageError
-from pano_mvs.engine.cache.store import Store
-from pano_mvs.engine.executors import choose, worker_process
+from pano_mvs.core.errors import InputError, PanoMvsError, RunStoppedError, StoreError, UsageError
+from pano_mvs.engine.cache.blobs import BlobRef
+from pano_mvs.engine.cache.store import ItemRef, Store
+from pano_mvs.engine.executors import choose, unit_json, worker_process
 from pano_mvs.engine.executors.choose import make_executor
 from pano_mvs.engine.executors.processes import ProcessExecutor
 from pano_mvs.engine.executors.protocol import Executor, JobOutcome
 from pano_mvs.engine.executors.serial import SerialExecutor
 from pano_mvs.engine.executors.threads import bound_environment, share_cores
+from pano_mvs.engine.executors.unit_json import unit_from_json, unit_to_json, write_large_inputs
+from pano_mvs.engine.planning.units import Unit
 from pano_mvs.engine.running.events import RunResult, SilentObserver
 from pano_mvs.engine.running.run import Run
+from pano_mvs.engine.stages.stage_code import stage_code
 from tests.engine.conftest import Toy, ran
 from tests.engine.running.test_run import ALL_UNITS
 
@@ -137,14 +141,16 @@ def test_unit_starts_before_the_stage_before_it_is_complete(toy: Toy) -> None:
     assert ran(result) == ALL_UNITS
 
 
-def kill_once(toy: Toy, *, when: str = "x.value == 30", how: str = "os.kill(os.getpid(), 9)") -> None:
-    """Let the worker that multiplies a certain number die the first time."""
+def kill_once(
+    toy: Toy, *, when: str = "x.value == 30", how: str = "os.kill(os.getpid(), 9)", of: str = "Multiply."
+) -> None:
+    """Let the worker that multiplies a certain number die the first time; `of` is the docstring of another stage."""
     mark = toy.folder / "died"
     toy.edit(
         "plug.py",
         lambda text: text.replace(
-            '    """Multiply."""',
-            f'''    """Multiply."""
+            f'    """{of}"""',
+            f'''    """{of}"""
     import pathlib
     if {when} and not pathlib.Path({str(mark)!r}).exists():
         pathlib.Path({str(mark)!r}).touch()
@@ -159,6 +165,50 @@ def test_killed_worker_costs_one_try(toy: Toy) -> None:
     result = run_with(toy, two_processes)
     assert result.exit_code == 0
     assert ran(result) == ALL_UNITS
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
+def test_many_inputs_reach_workers_through_a_file(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half a million of them as one message took 3 kB each. The worker dies once, so that they are sent twice."""
+    kill_once(toy, when="len(xs) == 5", of="Less the whole part of the mean.")
+    (toy.folder / "died").touch()
+    serial = run_with(toy, SerialExecutor, name="serial")
+    (toy.folder / "died").unlink()
+    written: list[list[int]] = []
+
+    def write(unit: Unit, store: Store, path: Path) -> None:
+        write_large_inputs(unit, store, path)
+        written.append([len(json.loads(line)["many"]) for line in path.read_text().splitlines()])
+
+    for name, value in {"LARGE_INPUT": 3, "_ITEMS_PER_LINE": 2, "write_large_inputs": write}.items():
+        monkeypatch.setattr(unit_json, name, value)
+    side_by_side = run_with(toy, two_processes, name="processes")
+    assert written == [[2, 2, 1], [2, 2, 1], [2, 2]]
+    assert told(side_by_side) == told(serial)
+    assert keys_and_outputs(toy.folder / "cache-processes") == keys_and_outputs(toy.folder / "cache-serial")
+    assert not list((toy.folder / "cache-processes" / "tmp").iterdir())
+
+
+def test_the_files_of_the_user_among_many_inputs_reach_workers(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    session, store = toy.session(), Store(toy.folder / "cache")
+    entry = session.workflow.stages["shifted"]
+    images = [toy.folder / "capture" / f"{number}.txt" for number in (1, 2, 3)]
+    texts = [BlobRef(store.blobs.register_external(path), 2, ".txt", external=True) for path in images]
+    xs = {path.name: ItemRef("Number", "0" * 32, {"text": text}) for path, text in zip(images, texts, strict=True)}
+    code = stage_code(entry.spec, entry.params)
+    identity = {"code": code.digest, "libraries": dict(code.libraries), "inputs": {"xs": list(xs)}}
+    unit = Unit(entry, "", (), {"xs": xs}, "1" * 32, identity)
+    monkeypatch.setattr(unit_json, "LARGE_INPUT", 1)
+    write_large_inputs(unit, store, toy.folder / "cache" / "tmp" / "x.inputs")
+    message = unit_to_json(unit, store, inputs_file=toy.folder / "cache" / "tmp" / "x.inputs")
+    assert message["external"] == {}
+    other = Store(toy.folder / "cache")
+    received = unit_from_json(json.loads(json.dumps(message)), entry.spec, other)
+    assert (received.inputs, received.identity) == (unit.inputs, unit.identity)
+    assert [other.blobs.path(ref.parts["text"]) for ref in xs.values()] == images
+    (toy.folder / "cache" / "tmp" / "x.inputs").unlink()
+    with pytest.raises(StoreError, match=r"x\.inputs: the inputs of a unit cannot be read \(No such file"):
+        unit_from_json(message, entry.spec, other)
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
