@@ -411,9 +411,6 @@ class RunPass:
 
     def _drop_producers(self, unit: Unit) -> None:
         """Drop the incomplete records that led a unit to a damaged file, so that they are computed again."""
-        for ref in unit.input_blobs():
-            if ref.external:
-                self._store.stat_cache.forget(self._store.blobs.path(ref))
         for producer in self.queue.producers(unit.entry.name):
             for key in self._run.keys.get(producer, {}).values():
                 record = self._store.read_record(key)
