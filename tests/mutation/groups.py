@@ -64,7 +64,7 @@ GROUPS = {
     "run_pass": Group(("pano_mvs/engine/running/run.py",), _TESTS_OF_RUNS, within="RunPass"),
     "run": Group(
         ("pano_mvs/engine/running/run.py",),
-        (*_TESTS_OF_RUNS, *_engine("running/options", "running/set_aside")),
+        (*_TESTS_OF_RUNS, *_engine("running/run_promises", "running/options")),
         within="Run",
     ),
 }

@@ -270,7 +270,7 @@ def test_a_unit_that_has_to_give_way_ends_the_run_if_asked(toy: Toy, shelf: Shel
         (toy.folder / "capture" / f"{number}.txt").unlink()
     toy.edit("plug.py", lambda text: text.replace("mean/{item}.txt", "mean/fixed.txt"))
     result = run_with(toy, shelf, "each.on_error=stop")
-    assert [label for label in shelf.submitted if label.startswith("each")][0] == "each:2.txt"
+    assert next(label for label in shelf.submitted if label.startswith("each")) == "each:2.txt"
     assert (result.exit_code, summary(result)["each"][2]) == (RunStoppedError.exit_code, 1)
     assert "stage 'each' has on_error: stop, and each:2.txt failed: mean/fixed.txt" in result.stopped
 
