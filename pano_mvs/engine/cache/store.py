@@ -22,7 +22,7 @@ from typing import Any
 
 from pano_mvs.core.digest import DIGEST_BYTES, IS_DIGEST, digest_from_bytes, digest_from_value
 from pano_mvs.core.errors import ContractError, StoreError, UsageError
-from pano_mvs.core.files import CACHE_MARK, clear_abandoned, is_older, remove_whole, write_text
+from pano_mvs.core.files import CACHE_MARK, clear_abandoned, is_older, remove_whole, replacing, write_text
 from pano_mvs.core.paths import children, exists, is_link, reason_of
 from pano_mvs.engine.cache.blobs import BlobRef, BlobStore, DamagedBlobError
 from pano_mvs.engine.cache.disk_guard import DiskGuard, is_full_disk
@@ -227,16 +227,21 @@ class Store:
 
     def put(self, record: UnitRecord) -> None:
         """Write a record; its blobs must already exist."""
-        body = json.dumps(record.to_json(), sort_keys=True)
+        body = json.dumps(
+            record.to_json(), sort_keys=True
+        ).encode()  # 50 MB for a stage with all pairs, so avoid copies
         path = self.record_path(record.key)
         if is_link(path.parent):
             raise StoreError(
                 f"{path.parent} is a link, but caches have no links: remove it, or choose another cache "
                 "with --cache DIR"
             )
-        write_text(
-            path, f"{digest_from_bytes(body.encode())}\n{body}", temporary_in=self.blobs.temporary, durable=self.durable
-        )
+        with (
+            replacing(path, temporary_in=self.blobs.temporary, durable=self.durable) as temporary,
+            temporary.open("wb") as stream,
+        ):
+            stream.write(f"{digest_from_bytes(body)}\n".encode())
+            stream.write(body)
 
     def drop(self, key: str) -> None:
         """Remove a record that turned out to be unusable."""
