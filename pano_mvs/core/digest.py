@@ -19,6 +19,8 @@ DIGEST_BYTES = 16
 IS_DIGEST = re.compile(rf"[0-9a-f]{{{2 * DIGEST_BYTES}}}")
 """Matches the digests that the functions below return."""
 
+_MAX_CHUNKS = 10_000
+
 
 def digest_from_value(value: object) -> str:
     """Return the hex digest of a tree of None, bool, int, float, str, bytes, list, tuple and dict.
@@ -26,9 +28,9 @@ def digest_from_value(value: object) -> str:
     Raises:
         UsageError: if the tree holds another type, a NaN or an infinity.
     """
-    chunks: list[bytes] = []
-    _encode(value, chunks)
-    return hashlib.blake2b(b"".join(chunks), digest_size=DIGEST_BYTES).hexdigest()
+    encoder = _Encoder()
+    encoder.add(value)
+    return encoder.digest()
 
 
 def digest_from_bytes(data: bytes | memoryview) -> str:
@@ -50,33 +52,52 @@ def digest_from_stream(stream: IO[bytes]) -> str:
     return hasher.hexdigest()
 
 
-def _encode(value: object, chunks: list[bytes]) -> None:
-    """Append the canonical form. The most frequent type comes first, because a plan encodes 100,000 keys."""
-    if isinstance(value, str):
-        text = value.encode()
-        chunks.append(b"s%d:%b" % (len(text), text))
-        return
-    match value:
-        case bool():
-            chunks.append(b"b1;" if value else b"b0;")
-        case int():
-            chunks.append(b"i%d;" % value)
-        case float():
-            if not math.isfinite(value):
-                raise UsageError(f"{value} cannot be part of a cache key: use None, or a finite number")
-            chunks.append(b"f" + (value + 0.0).hex().encode() + b";")
-        case None:
-            chunks.append(b"n;")
-        case list() | tuple():
-            chunks.append(b"l%d:" % len(value))
-            for item in value:
-                _encode(item, chunks)
-        case dict() | Mapping():
-            chunks.append(b"d%d:" % len(value))
-            for key in sorted(value, key=str):
-                _encode(key, chunks)
-                _encode(value[key], chunks)
-        case bytes():
-            chunks.append(b"y%d:" % len(value) + value)
-        case _:
-            raise UsageError(f"a {type(value).__name__} has no canonical form and cannot be part of a cache key")
+class _Encoder:
+    """Computes the digest of the canonical form, of which only a part is in memory at a time."""
+
+    def __init__(self) -> None:
+        self._hasher = hashlib.blake2b(digest_size=DIGEST_BYTES)
+        self._chunks: list[bytes] = []
+
+    def digest(self) -> str:
+        """Return the hex digest of what was added."""
+        self._flush()
+        return self._hasher.hexdigest()
+
+    def add(self, value: object) -> None:
+        """Append the canonical form. The most frequent type comes first, because a plan encodes 100,000 keys."""
+        chunks = self._chunks
+        if isinstance(value, str):
+            text = value.encode()
+            chunks.append(b"s%d:%b" % (len(text), text))
+            return
+        match value:
+            case bool():
+                chunks.append(b"b1;" if value else b"b0;")
+            case int():
+                chunks.append(b"i%d;" % value)
+            case float():
+                if not math.isfinite(value):
+                    raise UsageError(f"{value} cannot be part of a cache key: use None, or a finite number")
+                chunks.append(b"f" + (value + 0.0).hex().encode() + b";")
+            case None:
+                chunks.append(b"n;")
+            case list() | tuple():
+                chunks.append(b"l%d:" % len(value))
+                for item in value:
+                    self.add(item)
+            case dict() | Mapping():
+                chunks.append(b"d%d:" % len(value))
+                for key in sorted(value, key=str):
+                    self.add(key)
+                    self.add(value[key])
+            case bytes():
+                chunks.append(b"y%d:" % len(value) + value)
+            case _:
+                raise UsageError(f"a {type(value).__name__} has no canonical form and cannot be part of a cache key")
+        if len(chunks) > _MAX_CHUNKS:
+            self._flush()
+
+    def _flush(self) -> None:
+        self._hasher.update(b"".join(self._chunks))
+        self._chunks.clear()

@@ -137,7 +137,6 @@ class _Joined:
     first: int
     second: int
     inliers: int
-    candidates: int
     text: str
 
 
@@ -146,22 +145,29 @@ def _chosen(
 ) -> list[_Joined]:
     """Return links between registered cameras: some rejected ones, then the strongest, in ascending order."""
     position = {name: idx for idx, name in enumerate(names)}
-    found: list[_Joined] = []
-    for link in links:
-        if link.first in position and link.second in position:
-            a, b = position[link.first], position[link.second]
-            of = ""
-            if link.candidates is not None:
-                of = f" of {link.candidates} {plural(link.candidates, 'candidate')}"
-            matches = f"{link.inliers} {plural(link.inliers, 'match', 'matches')}{of}"
-            words = matches if link.inliers else f"rejected{of and f', none{of}'}"
-            why = reasons.get((link.first, link.second), "")
-            text = f"{labels[a]} – {labels[b]}: {words}{why and f'; {why}'}"
-            found.append(_Joined(a, b, link.inliers, link.candidates or 0, text))
+    # There may be half a million of them, so only those that are drawn get words.
+    found = [link for link in links if link.first in position and link.second in position]
     # Of the rejected links, those with the most candidates.
-    found.sort(key=lambda link: (link.inliers, -link.candidates))
+    found.sort(key=lambda link: (link.inliers, -(link.candidates or 0)))
     split = sum(not link.inliers for link in found)
-    return found[:split][:_MAX_REJECTED] + found[split:][-_MAX_LINKS:]
+    chosen = found[:split][:_MAX_REJECTED] + found[split:][-_MAX_LINKS:]
+    return [
+        _Joined(
+            first := position[link.first],
+            second := position[link.second],
+            link.inliers,
+            f"{labels[first]} – {labels[second]}: {_words(link, reasons.get((link.first, link.second), ''))}",
+        )
+        for link in chosen
+    ]
+
+
+def _words(link: PairLink, why: str) -> str:
+    """Return what a link says when pointed at, behind the names of its cameras."""
+    of = "" if link.candidates is None else f" of {link.candidates} {plural(link.candidates, 'candidate')}"
+    matches = f"{link.inliers} {plural(link.inliers, 'match', 'matches')}{of}"
+    words = matches if link.inliers else f"rejected{of and f', none{of}'}"
+    return f"{words}{why and f'; {why}'}"
 
 
 def _measured(length: float, unit: str) -> str:

@@ -36,7 +36,6 @@ from pano_mvs.results.records import (
 )
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene import Axis, PointCloud, Poses, Scores, TwoView
-from pano_mvs.scene.index import pair_from_name
 from pano_mvs.scene.pose_groups import split_groups
 from pano_mvs.scene.up_direction import mean_up_direction
 from pano_mvs.session.final_stages import chain_of, final_stages, latest
@@ -136,7 +135,8 @@ def _poses(run: Run, blocked: tuple[BlockedUnit, ...]) -> PosesSummary:
     links: tuple[PairLink, ...] = ()
     for stage in result.stages:
         if issubclass(run.workflow.stages[stage.name].spec.output, TwoView):
-            links = tuple(_link(pair, metrics) for pair, metrics in stage.unit_metrics.items())
+            images = run.states[stage.name].members
+            links = tuple(_link(images[pair], metrics) for pair, metrics in stage.unit_metrics.items())
     groups = split_groups(poses)
     return PosesSummary(
         registered=tuple(poses.names),
@@ -202,9 +202,9 @@ def nearest_pair(largest: Sequence[str], other: Sequence[str], links: Sequence[P
     return NearestPair(a, b, -matches, -candidates)
 
 
-def _link(pair: str, metrics: Mapping[str, float]) -> PairLink:
+def _link(images: tuple[str, ...], metrics: Mapping[str, float]) -> PairLink:
     candidates, residual_deg = metrics.get("candidates"), metrics.get("residual_deg")
-    first, second = pair_from_name(pair)
+    first, second = images
     return PairLink(
         first,
         second,

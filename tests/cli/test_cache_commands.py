@@ -325,7 +325,10 @@ def test_store_with_a_half_written_entry_of_a_killed_run_can_be_collected(toy: T
 
 
 def test_collection_while_a_run_goes_on_costs_time_at_most(toy: Toy, cache: Cache) -> None:  # noqa: F811
-    """Everything is collected, again and again, while two processes compute; the run heals what it finds gone."""
+    """Everything is collected, again and again, while two processes compute; the run heals what it finds gone.
+
+    It does so three times for each file, and then takes the disk to be damaged, so there are three collections.
+    """
     toy.edit("plug.py", lambda text: text.replace('"""Multiply."""', '"""Multiply."""\n    time.sleep(0.02)'))
     toy.run(cache=toy.folder / "clean")
     clean = deliverables(toy.folder / "out")
@@ -334,14 +337,14 @@ def test_collection_while_a_run_goes_on_costs_time_at_most(toy: Toy, cache: Cach
         target=lambda: results.append(run(toy, "new", "--executor", "processes", "--workers", "2"))
     )
     thread.start()
-    rounds = 0
+    collections = 0
     while thread.is_alive():
-        rounds += 1
-        store = Store(toy.folder / "cache")
-        if rounds < 8:
-            collect(store, unused_s=0.0, forget_after_s=0.0, delete=True)
-        time.sleep(0.2)
+        if collections < 3 and len(list((toy.folder / "cache" / "records").rglob("*.json"))) > 4:
+            collections += 1
+            collect(Store(toy.folder / "cache"), unused_s=0.0, forget_after_s=0.0, delete=True)
+        time.sleep(0.02)
     thread.join()
+    assert collections
     assert results[0][0] == 0, results
     assert deliverables(toy.folder / "new") == clean
 

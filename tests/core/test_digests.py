@@ -107,3 +107,10 @@ def test_bytes_files_and_streams_have_one_digest(tmp_path: Path, size: int) -> N
 @pytest.mark.parametrize("text", ["", "0" * 31, "0" * 33, "G" * 32, "A" * 32, "0" * 32 + "\n"])
 def test_what_is_no_digest_is_not_taken_for_one(text: str) -> None:
     assert not IS_DIGEST.fullmatch(text)
+
+
+def test_a_large_value_has_the_digest_of_its_canonical_form() -> None:
+    """The form is passed on in pieces, so that a list of a million names does not exist a second time as text."""
+    count = 25_000
+    form = b"l%d:" % count + b"".join(b"l2:i%d;s1:a" % number for number in range(count))
+    assert digest_from_value([[number, "a"] for number in range(count)]) == digest_from_bytes(form)

@@ -18,6 +18,9 @@ from pano_mvs.session.session import Session, open_session
 from tests.engine.toy import HELPER, PLUGIN, WORKFLOW
 from tests.processes import heed_interrupts
 
+PATIENCE_S = 300.0
+"""A busy machine takes long to do the quickest thing; what takes longer than this hangs."""
+
 
 @dataclass
 class Toy:
@@ -58,7 +61,7 @@ class Toy:
 
 
 def start(toy: Toy, *options: str, sleep_s: float = 0.0) -> subprocess.Popen[str]:
-    """Start `pano-mvs run` on a toy capture; each of its units takes `sleep_s`."""
+    """Start `pano-mvs run` on a toy capture; each mean takes `sleep_s`."""
     folder = toy.folder
     command = [sys.executable, "-m", "pano_mvs", "run", str(folder / "wf.yaml"), "--cache", str(folder / "cache")]
     return subprocess.Popen(
@@ -78,7 +81,7 @@ def finished_records(toy: Toy) -> int:
 
 def wait_for_records(toy: Toy, process: subprocess.Popen[str], count: int) -> None:
     """Wait until a run has stored a number of results."""
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + PATIENCE_S
     while finished_records(toy) < count:
         assert process.poll() is None, process.stderr.read() if process.stderr else ""
         assert time.monotonic() < deadline

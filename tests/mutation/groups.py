@@ -22,6 +22,15 @@ def _engine(*names: str) -> tuple[str, ...]:
     return tuple(f"tests/engine/{folder}/test_{name}.py" for folder, name in (name.split("/") for name in names))
 
 
+_TESTS_OF_RUNS = _engine(
+    "running/run_pass",
+    "running/run",
+    "running/changed_files",
+    "cache/store",
+    "cache/hostile_store",
+    "cache/stat_cache",
+)
+
 GROUPS = {
     "geometry": Group(("pano_mvs/geometry/*.py",), ("tests/geometry",)),
     "scene": Group(
@@ -52,17 +61,11 @@ GROUPS = {
     "wiring": Group(
         ("pano_mvs/engine/workflows/wiring.py",), _engine("workflows/wiring", "workflows/workflow", "running/run")
     ),
-    "run_pass": Group(
+    "run_pass": Group(("pano_mvs/engine/running/run.py",), _TESTS_OF_RUNS, within="RunPass"),
+    "run": Group(
         ("pano_mvs/engine/running/run.py",),
-        _engine(
-            "running/run_pass",
-            "running/run",
-            "running/changed_files",
-            "cache/store",
-            "cache/hostile_store",
-            "cache/stat_cache",
-        ),
-        within="RunPass",
+        (*_TESTS_OF_RUNS, *_engine("running/run_promises", "running/options")),
+        within="Run",
     ),
 }
 """`__init__.py` is left out: it says what is public, which a test of its own checks."""

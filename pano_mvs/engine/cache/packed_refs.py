@@ -11,10 +11,10 @@ from pano_mvs.engine.cache.blobs import BlobRef
 _SIZE_BYTES = 7  # blobs are smaller than 2⁵⁰ bytes
 _PART_BYTES = DIGEST_BYTES + _SIZE_BYTES
 
-_Form: TypeAlias = "dict[str, tuple[int, str, bool]]"
+Form: TypeAlias = "dict[str, tuple[int, str, bool]]"
 """Name of a part to its position, its suffix, and whether it is external."""
 
-_forms: dict[tuple[tuple[str, str, bool], ...], _Form] = {}
+_forms: dict[tuple[tuple[str, str, bool], ...], Form] = {}
 
 
 class PackedRefs(Mapping[str, BlobRef]):
@@ -31,6 +31,23 @@ class PackedRefs(Mapping[str, BlobRef]):
         self._packed = b"".join(
             bytes.fromhex(ref.digest) + ref.size_bytes.to_bytes(_SIZE_BYTES, "big") for ref in parts.values()
         )
+
+    @staticmethod
+    def from_packed(form: Form, packed: bytes) -> PackedRefs:
+        """Return the references whose `form` and `packed` are known."""
+        parts = PackedRefs.__new__(PackedRefs)
+        parts._form, parts._packed = form, packed
+        return parts
+
+    @property
+    def form(self) -> Form:
+        """What values with the same names and suffixes share."""
+        return self._form
+
+    @property
+    def packed(self) -> bytes:
+        """The digests and sizes."""
+        return self._packed
 
     def __getitem__(self, name: str) -> BlobRef:
         """Return one reference."""

@@ -20,9 +20,9 @@ from pathlib import Path
 from sys import intern
 from typing import Any
 
-from pano_mvs.core.digest import digest_from_bytes, digest_from_value
+from pano_mvs.core.digest import DIGEST_BYTES, IS_DIGEST, digest_from_bytes, digest_from_value
 from pano_mvs.core.errors import ContractError, StoreError, UsageError
-from pano_mvs.core.files import CACHE_MARK, clear_abandoned, is_older, remove_whole, write_text
+from pano_mvs.core.files import CACHE_MARK, clear_abandoned, is_older, remove_whole, replacing, write_text
 from pano_mvs.core.paths import children, exists, is_link, reason_of
 from pano_mvs.engine.cache.blobs import BlobRef, BlobStore, DamagedBlobError
 from pano_mvs.engine.cache.disk_guard import DiskGuard, is_full_disk
@@ -40,13 +40,52 @@ _ABANDONED_AFTER_S = 7 * 24 * 3600.0
 _FOLDERS = ("blobs", "records", "runs", "pins", "tmp")
 
 
-@dataclass(frozen=True, slots=True)
 class ItemRef:
-    """A stored value: its kind, its parts, and the digest that represents it in the keys of other units."""
+    """A stored value: its kind, its parts, and the digest that represents it in the keys of other units.
 
-    kind: str
-    digest: str
-    parts: Mapping[str, BlobRef]
+    It is packed, because a run holds one for each unit.
+    """
+
+    __slots__ = ("_form", "_kind", "_packed")
+
+    def __init__(self, kind: str, digest: str, parts: Mapping[str, BlobRef]) -> None:
+        """Make a reference.
+
+        Raises:
+            ValueError: if the digest is not one.
+        """
+        if not IS_DIGEST.fullmatch(digest):
+            raise ValueError(f"not a digest: {digest!r}")
+        found = parts if isinstance(parts, PackedRefs) else PackedRefs(parts)
+        self._kind, self._form = kind, found.form
+        self._packed = bytes.fromhex(digest) + found.packed
+
+    @property
+    def kind(self) -> str:
+        """The name of its kind."""
+        return self._kind
+
+    @property
+    def digest(self) -> str:
+        """The digest of the value."""
+        return self._packed[:DIGEST_BYTES].hex()
+
+    @property
+    def parts(self) -> PackedRefs:
+        """The parts of the value by name."""
+        return PackedRefs.from_packed(self._form, self._packed[DIGEST_BYTES:])
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether two references are the same in every part."""
+        if not isinstance(other, ItemRef):
+            return NotImplemented
+        return (self._kind, self._packed, self._form) == (other._kind, other._packed, other._form)
+
+    __hash__ = None  # type: ignore[assignment]  # as that of the mapping of its parts
+
+    def __repr__(self) -> str:
+        """Return the reference as a dataclass prints it."""
+        return f"ItemRef(kind={self.kind!r}, digest={self.digest!r}, parts={self.parts!r})"
 
     def to_json(self) -> dict[str, Any]:
         """Return the reference as a JSON value."""
@@ -188,16 +227,21 @@ class Store:
 
     def put(self, record: UnitRecord) -> None:
         """Write a record; its blobs must already exist."""
-        body = json.dumps(record.to_json(), sort_keys=True)
+        body = json.dumps(
+            record.to_json(), sort_keys=True
+        ).encode()  # 50 MB for a stage with all pairs, so avoid copies
         path = self.record_path(record.key)
         if is_link(path.parent):
             raise StoreError(
                 f"{path.parent} is a link, but caches have no links: remove it, or choose another cache "
                 "with --cache DIR"
             )
-        write_text(
-            path, f"{digest_from_bytes(body.encode())}\n{body}", temporary_in=self.blobs.temporary, durable=self.durable
-        )
+        with (
+            replacing(path, temporary_in=self.blobs.temporary, durable=self.durable) as temporary,
+            temporary.open("wb") as stream,
+        ):
+            stream.write(f"{digest_from_bytes(body)}\n".encode())
+            stream.write(body)
 
     def drop(self, key: str) -> None:
         """Remove a record that turned out to be unusable."""
@@ -320,10 +364,10 @@ class Store:
 
 def record_from_bytes(data: bytes) -> UnitRecord | None:
     """Return the record in the bytes of a file, or None if they do not match the digest in the first line."""
-    checksum, _, body = data.partition(b"\n")
+    end = data.find(b"\n")
     try:
-        if checksum.decode() != digest_from_bytes(body):
+        if end < 0 or data[:end].decode() != digest_from_bytes(memoryview(data)[end + 1 :]):
             return None
-        return UnitRecord.from_json(json.loads(body.decode()))
+        return UnitRecord.from_json(json.loads(str(memoryview(data)[end + 1 :], "utf-8")))
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
         return None

@@ -87,7 +87,10 @@ class DaskExecutor:
         text = json.dumps(request)
         if len(text) > _LARGE_BYTES:
             path = job.log.with_suffix(".json").absolute()
-            path.write_text(text, encoding="utf-8")
+            try:
+                path.write_text(text, encoding="utf-8")
+            except OSError as error:
+                raise self._store.cannot_write(error) from error
             self._requests[job.number] = path
             text = str(path)
         self._attempts += 1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -32,6 +32,11 @@ class Job:
     timeout_s: float
     log: Path
     plugins: Mapping[Path, str] = field(default_factory=dict)
+
+    @property
+    def inputs_file(self) -> Path:
+        """File for inputs that are too many for a message to a worker; the dispatcher removes it."""
+        return self.log.with_suffix(".inputs")
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,10 +68,10 @@ class JobOutcome:
     changed: Mapping[str, str] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the outcome as a JSON value."""
+        """Return the outcome as a JSON value, without the identity in its record, which is that of the unit."""
         return {
             "status": self.status,
-            "record": None if self.record is None else self.record.to_json(),
+            "record": None if self.record is None else replace(self.record, identity={}).to_json(),
             "cause": self.cause,
             "trace": self.trace,
             "error": self.error,

@@ -1,12 +1,19 @@
-"""Convert units of work to JSON and back, for workers that share only the cache with the main process."""
+"""Convert units of work to JSON and back, for workers that share only the cache with the main process.
+
+A stage that combines all pairs may have half a million inputs. Such large inputs are written into a file in the cache,
+some in each line, so that neither process holds all of them as text.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from pano_mvs.core.errors import UsageError
+from pano_mvs.core.errors import StoreError, UsageError
+from pano_mvs.core.paths import reason_of
 from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.executors.protocol import Job
 from pano_mvs.engine.planning.units import PENDING, Unit, UnitInput
@@ -17,13 +24,30 @@ from pano_mvs.engine.stages.stage_code import stage_code
 from pano_mvs.engine.workflows.policy import Policy
 from pano_mvs.engine.workflows.workflow import StageEntry
 
-TEXT_VERSION = 2
+TEXT_VERSION = 3
+LARGE_INPUT = 2000
+"""The inputs of an All port are written into a file if they are more than this."""
+
+_ITEMS_PER_LINE = 500
 
 
 def request_to_json(job: Job, store: Store) -> dict[str, Any]:
-    """Return the request to a worker: the unit, and the paths of its plugins, the cache and the log."""
+    """Return the request to a worker: the unit, and the paths of its plugins, the cache and the log.
+
+    Large inputs are written into the job's `inputs_file`.
+
+    Raises:
+        UsageError: if the settings of the stage change when they are written as JSON and read back.
+        StoreError: if the file cannot be written.
+    """
+    large = has_large_inputs(job.unit)
+    if large:
+        try:
+            write_large_inputs(job.unit, store, job.inputs_file)
+        except OSError as error:
+            raise store.cannot_write(error) from error
     return {
-        "unit": unit_to_json(job.unit, store),
+        "unit": unit_to_json(job.unit, store, inputs_file=job.inputs_file if large else None),
         "plugins": {str(path.absolute()): digest for path, digest in job.plugins.items()},
         "store": [str(store.root.absolute()), store.durable, store.min_free_bytes],
         "log": str(job.log.absolute()),
@@ -32,13 +56,47 @@ def request_to_json(job: Job, store: Store) -> dict[str, Any]:
     }
 
 
-def unit_to_json(unit: Unit, store: Store) -> dict[str, Any]:
+def has_large_inputs(unit: Unit) -> bool:
+    """Return whether some inputs of a unit are too many for one message."""
+    return bool(_large_ports(unit))
+
+
+def write_large_inputs(unit: Unit, store: Store, path: Path) -> None:
+    """Write the large inputs of a unit, and the parts of its identity that describe them."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", encoding="utf-8") as stream:
+        for port in _large_ports(unit):
+            value = unit.inputs[port]
+            assert isinstance(value, dict)
+            items = zip(value.items(), unit.identity["inputs"][port], strict=True)
+            while some := list(islice(items, _ITEMS_PER_LINE)):
+                refs = {name: ref for (name, ref), _ in some}
+                line = {
+                    "port": port,
+                    "many": {name: ref.to_json() for name, ref in refs.items()},
+                    "identity": [described for _, described in some],
+                    "external": _external_files(refs.values(), store),
+                }
+                stream.write(json.dumps(line) + "\n")
+
+
+def unit_to_json(unit: Unit, store: Store, *, inputs_file: Path | None = None) -> dict[str, Any]:
     """Return everything beside the cache that a worker needs to compute a unit; paths are absolute.
+
+    Args:
+        unit: the unit.
+        store: the cache.
+        inputs_file: that `write_large_inputs` wrote; None if all inputs are to be in the message.
 
     Raises:
         UsageError: if the settings of the stage change when they are written as JSON and read back.
     """
     spec = unit.entry.spec
+    large = _large_ports(unit) if inputs_file is not None else ()
+    inputs = {port: value for port, value in unit.inputs.items() if port not in large}
+    identity = dict(unit.identity)
+    if large:
+        identity["inputs"] = {name: [] if name in large else part for name, part in identity["inputs"].items()}
     return {
         "text_version": TEXT_VERSION,
         "stage": unit.entry.name,
@@ -48,11 +106,13 @@ def unit_to_json(unit: Unit, store: Store) -> dict[str, Any]:
         "params": params_to_json(unit.entry),
         "item": unit.item,
         "members": list(unit.members),
-        "inputs": {port: _input_to_json(unit, port, value) for port, value in unit.inputs.items()},
-        "external": {ref.digest: str(store.blobs.path(ref).absolute()) for ref in unit.input_blobs() if ref.external},
+        "inputs": {port: _input_to_json(unit, port, value) for port, value in inputs.items()}
+        | {port: {"many": {}} for port in large},
+        "inputs_file": str(inputs_file.absolute()) if large and inputs_file else "",
+        "external": _external_files(_refs(inputs), store),
         "source": None if unit.source is None else _source_to_json(unit.source),
         "key": unit.key,
-        "identity": dict(unit.identity),
+        "identity": identity,
     }
 
 
@@ -61,6 +121,7 @@ def unit_from_json(text: Mapping[str, Any], spec: StageSpec, store: Store) -> Un
 
     Raises:
         UsageError: if another version wrote it, or it is for another version of the stage.
+        StoreError: if the file with its inputs cannot be read.
     """
     found = (text["version"], text["code"], text["text_version"])
     if found != (spec.version, spec.code_digest, TEXT_VERSION):
@@ -69,15 +130,34 @@ def unit_from_json(text: Mapping[str, Any], spec: StageSpec, store: Store) -> Un
         store.blobs.place_external(digest, Path(path))
     params = spec.params_type.model_validate(text["params"])
     require_same_code(spec, params, text["identity"])
+    inputs = {port: _input_from_json(value) for port, value in text["inputs"].items()}
+    if text["inputs_file"]:
+        _read_large_inputs(Path(text["inputs_file"]), inputs, text["identity"], store)
     return Unit(
         entry=StageEntry(text["stage"], spec, params, Policy(use=spec.name), ""),
         item=text["item"],
         members=tuple(text["members"]),
-        inputs={port: _input_from_json(value) for port, value in text["inputs"].items()},
+        inputs=inputs,
         key=text["key"],
         identity=text["identity"],
         source=None if text["source"] is None else _source_from_json(text["source"]),
     )
+
+
+def _read_large_inputs(path: Path, inputs: Mapping[str, UnitInput], identity: Mapping[str, Any], store: Store) -> None:
+    """Add the inputs in a file to those of a unit, and to its identity."""
+    try:
+        with path.open(encoding="utf-8") as stream:
+            for text in stream:
+                line = json.loads(text)
+                found = inputs[line["port"]]
+                assert isinstance(found, dict)
+                found.update((name, ItemRef.from_json(ref)) for name, ref in line["many"].items())
+                identity["inputs"][line["port"]].extend(line["identity"])
+                for digest, external in line["external"].items():
+                    store.blobs.place_external(digest, Path(external))
+    except (OSError, ValueError) as error:
+        raise StoreError(f"{path}: the inputs of a unit cannot be read ({reason_of(error)}). Run again") from error
 
 
 def require_same_code(spec: StageSpec, params: Params, identity: Mapping[str, Any]) -> None:
@@ -132,6 +212,26 @@ def _with_absolute_paths(value: Any, as_json: Any) -> Any:
     if isinstance(as_json, list) and isinstance(value, list | tuple):
         return [_with_absolute_paths(*pair) for pair in zip(value, as_json, strict=True)]
     return as_json
+
+
+def _large_ports(unit: Unit) -> tuple[str, ...]:
+    """Return the All ports with more inputs than one message should have."""
+    many = (port.name for port in unit.entry.spec.ports if port.cardinality is Cardinality.ALL)
+    return tuple(name for name in many if isinstance(found := unit.inputs.get(name), dict) and len(found) > LARGE_INPUT)
+
+
+def _refs(inputs: Mapping[str, UnitInput]) -> Iterator[ItemRef]:
+    for value in inputs.values():
+        if isinstance(value, ItemRef):
+            yield value
+        elif value:
+            yield from value.values()
+
+
+def _external_files(refs: Iterable[ItemRef], store: Store) -> dict[str, str]:
+    """Return digest to path of the parts that are files of the user."""
+    parts = (part for ref in refs for part in ref.parts.values())
+    return {part.digest: str(store.blobs.path(part).absolute()) for part in parts if part.external}
 
 
 def _input_to_json(unit: Unit, port: str, value: UnitInput) -> Any:

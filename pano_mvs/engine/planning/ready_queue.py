@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol, TypeAlias
 
@@ -48,7 +48,7 @@ class _Stage:
     position: int
     edges: Mapping[str, Edge]
     resolver: Resolver
-    rank: dict[str, int] = field(default_factory=dict)
+    rank: dict[str, int] = field(default_factory=dict)  # unit to its position in the capture, while the stage is open
     missing: dict[str, int] = field(default_factory=dict)  # unit to the number of tokens it still waits for
     found: dict[str, Unit] = field(default_factory=dict)  # a source's units
     collections: dict[str, Mapping[str, ItemRef]] = field(default_factory=dict)
@@ -137,7 +137,11 @@ class ReadyQueue:
 
     def position_of(self, stage: str, item: str) -> tuple[int, int]:
         """Return the position of a unit in the workflow and in the capture, for sorting."""
-        return self._stages[stage].position, self._stages[stage].rank.get(item, 0)
+        found = self._stages[stage]
+        if not found.rank:
+            state = self.states[stage]
+            found.rank = _ranks(state.members, state.failed)
+        return found.position, found.rank.get(item, 0)
 
     def _spread(self) -> None:
         """Hand out the new tokens, until no further ones result."""
@@ -171,8 +175,8 @@ class ReadyQueue:
             blocked = stage.resolver.resolution.blocked
             # There may be a million members: a dict is not copied.
             state.members = members if isinstance(members, dict) else dict(members)
-        items = [*state.members, *(item for item in blocked if item not in state.members)]
-        stage.rank = {item: rank for rank, item in enumerate(items)}
+        stage.rank = _ranks(state.members, blocked)
+        items = list(stage.rank)
         stage.unsettled, state.open = len(items), False
         state.pending.update(items)
         self._listener.stage_opened(stage.entry)
@@ -201,8 +205,9 @@ class ReadyQueue:
             heapq.heappush(self._ready, (stage.position, stage.rank[item], stage.entry.name, item))
             return
         stage.missing[item] = len(tokens)
+        waiter = stage.entry.name, item
         for token in tokens:
-            self._waiting.setdefault(token, []).append((stage.entry.name, item))
+            self._waiting.setdefault(token, []).append(waiter)
 
     def _needs(self, stage: _Stage, item: str) -> Iterator[Token]:
         for edge in stage.edges.values():
@@ -243,7 +248,12 @@ class ReadyQueue:
         state.items = {item: state.items[item] for item in stage.rank if item in state.items}
         state.failed = {item: state.failed[item] for item in stage.rank if item in state.failed}
         state.exploded = {key: ref for item in stage.rank for key, ref in stage.collections.get(item, {}).items()}
-        state.pending, stage.missing = set(), {}  # an emptied set or dict would keep its memory
+        state.pending, stage.missing, stage.rank = set(), {}, {}  # emptied ones would keep their memory
         self._listener.stage_complete(stage.entry)
         self._complete.add(name)
         self._work.append((name, None))
+
+
+def _ranks(members: Mapping[str, object], others: Iterable[str]) -> dict[str, int]:
+    """Return unit to its position: the listed units in order, then others that could not even be listed."""
+    return {item: rank for rank, item in enumerate(dict.fromkeys((*members, *others)))}

@@ -122,7 +122,8 @@ class Resolver:
         self.resolution = Resolution()
         self._add(name, members)
         assert not self.resolution.waiting, name
-        return self.resolution.units[0] if self.resolution.units else self.resolution.blocked[name]
+        # The unit is taken out, because that of a stage with All ports is large, and would be kept until the next one.
+        return self.resolution.units.pop() if self.resolution.units else self.resolution.blocked[name]
 
     def unit_names(self) -> Mapping[str, tuple[str, ...]] | None:
         """Return the units of the stage and the images that each concerns, or None if they are not known yet.

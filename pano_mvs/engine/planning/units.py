@@ -15,7 +15,7 @@ from pano_mvs.scene import Axis
 WHOLE = ""
 """The name of the unit of a stage that has only one."""
 
-PENDING = ItemRef("", "", {})
+PENDING = ItemRef("", "0" * 32, {})
 """Placeholder for an item of which only the name is known."""
 
 OF_CODE = frozenset({"code", "libraries"})

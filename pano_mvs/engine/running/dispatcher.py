@@ -18,6 +18,7 @@ from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.executors.capture import tail
 from pano_mvs.engine.executors.execute import arguments_of
 from pano_mvs.engine.executors.protocol import Executor, Job, JobOutcome
+from pano_mvs.engine.executors.unit_json import has_large_inputs
 from pano_mvs.engine.planning.units import PENDING, Unit
 from pano_mvs.scene import Record
 
@@ -126,6 +127,7 @@ class Dispatcher:
                 self._executor.submit(running.job)
                 continue
             del self._running[number]
+            _remove_inputs_file(running.job)
             log, said = self._keep_log(running.job)
             return FinishedJob(running.job.unit, outcome, log, said)
         return None
@@ -136,6 +138,7 @@ class Dispatcher:
         for running in self._running.values():
             with suppress(OSError):
                 running.job.log.unlink(missing_ok=True)
+            _remove_inputs_file(running.job)
         self._running.clear()
 
     def _memory_of(self, unit: Unit) -> int:
@@ -178,6 +181,12 @@ class Dispatcher:
         with suppress(OSError):
             job.log.unlink(missing_ok=True)  # there is no room for it in the output folder
         return None, said
+
+
+def _remove_inputs_file(job: Job) -> None:
+    if has_large_inputs(job.unit):
+        with suppress(OSError):
+            job.inputs_file.unlink(missing_ok=True)
 
 
 def _inputs_of(unit: Unit) -> list[tuple[ItemRef, type[Record]]]:

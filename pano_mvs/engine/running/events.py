@@ -71,7 +71,7 @@ class StageSummary:
     seconds: float = 0.0
     unit_seconds: float = 0.0
     metrics: dict[str, float] = field(default_factory=dict)
-    unit_metrics: dict[str, dict[str, float]] = field(default_factory=dict)
+    unit_metrics: dict[str, Mapping[str, float]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
 

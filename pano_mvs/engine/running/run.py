@@ -101,6 +101,7 @@ class Run:
         self.keys: dict[str, dict[str, str]] = {}
         self.computed: set[str] = set()
         self.refreshed: set[str] = set()
+        self._has_passed = False  # whether the last pass ended without an error
         self._warnings: list[str] = []
         self._last_keys = store.runs.last_keys(workflow.id) if options.accept_code else {}
         self._pass = RunPass(self, self._warnings)
@@ -131,6 +132,7 @@ class Run:
         self._warn_of_timeouts()
         try:
             self._execute_passes()
+            self._has_passed = True
             self._warn_of_unused_refresh()
             if self.result.complete and not self.graph.is_part:
                 self.result.removed = self.publisher.remove_stale(self.publisher.earlier)
@@ -183,7 +185,7 @@ class Run:
 
     def _remember(self) -> None:
         """Store the keys and file digests for the next run; the run does not fail if that is impossible."""
-        finished = self.result.exit_code in {0, 3} and not self.result.stopped and not self.graph.is_part
+        finished = self._has_passed and not self.result.stopped and not self.graph.is_part
         try:
             self.store.runs.remember(
                 self.workflow.id, self.keys, workflow=self.workflow.name, out=self.out, finished=finished
@@ -411,9 +413,6 @@ class RunPass:
 
     def _drop_producers(self, unit: Unit) -> None:
         """Drop the incomplete records that led a unit to a damaged file, so that they are computed again."""
-        for ref in unit.input_blobs():
-            if ref.external:
-                self._store.stat_cache.forget(self._store.blobs.path(ref))
         for producer in self.queue.producers(unit.entry.name):
             for key in self._run.keys.get(producer, {}).values():
                 record = self._store.read_record(key)

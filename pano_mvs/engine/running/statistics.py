@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from array import array
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
@@ -12,6 +14,7 @@ from pano_mvs.core.text import plural
 from pano_mvs.engine.cache.store import UnitRecord
 from pano_mvs.engine.planning.units import StageState
 from pano_mvs.engine.running.events import Failure, Observer, RunResult, StageSummary, UnitStatus, consequence_of
+from pano_mvs.engine.running.packed_figures import PackedFigures
 from pano_mvs.engine.workflows.workflow import StageEntry
 
 _MAX_SHOWN_CAUSES = 10
@@ -23,7 +26,7 @@ class _StageCount:
 
     summary: StageSummary
     began: float = 0.0
-    metrics: dict[str, dict[str, float]] = field(default_factory=dict)
+    metrics: dict[str, Mapping[str, float]] = field(default_factory=dict)
     notes: dict[str, tuple[str, ...]] = field(default_factory=dict)
     rejected: dict[str, dict[str, str]] = field(default_factory=dict)
     doubts: dict[str, dict[str, str]] = field(default_factory=dict)
@@ -101,7 +104,7 @@ class RunStatistics:
         else:
             count.summary.cached += 1
         if record.metrics:
-            count.metrics[item] = dict(record.metrics)
+            count.metrics[item] = PackedFigures(record.metrics)
         if record.notes:
             count.notes[item] = record.notes
         if record.rejected:
@@ -140,9 +143,12 @@ class RunStatistics:
         summary = count.summary
         summary.seconds = time.perf_counter() - count.began
         summary.unit_metrics = {item: count.metrics[item] for item in state.items if item in count.metrics}
-        for name in sorted({name for metrics in summary.unit_metrics.values() for name in metrics}):
-            values = [metrics[name] for metrics in summary.unit_metrics.values() if name in metrics]
-            summary.metrics[name] = sum(values) / len(values)
+        count.metrics = {}  # an emptied dict would keep its memory, that of a million entries
+        values: defaultdict[str, array[float]] = defaultdict(lambda: array("d"))
+        for metrics in summary.unit_metrics.values():
+            for name, value in metrics.items():
+                values[name].append(value)
+        summary.metrics = {name: sum(values[name]) / len(values[name]) for name in sorted(values)}
         source_notes = self._source_notes.get(entry.name, {})
         notes = (note for item in state.items for note in (*source_notes.get(item, ()), *count.notes.get(item, ())))
         summary.notes = list(dict.fromkeys(notes))

@@ -91,7 +91,7 @@ def record_json(**changes: object) -> dict[str, object]:
     value: dict[str, object] = {
         "key": KEY,
         "identity": {},
-        "output": {"kind": "K", "digest": "d", "parts": {}},
+        "output": {"kind": "K", "digest": "d" * 32, "parts": {}},
         "items": {},
         "metrics": {},
         "notes": [],
@@ -127,7 +127,14 @@ def test_only_a_plain_yes_says_that_files_were_checked(checked: object) -> None:
 
 @pytest.mark.parametrize(
     "changes",
-    [{"identity": []}, {"rejected": []}, {"doubts": []}, {"metrics": {"a": float("inf")}}, {"seconds": float("nan")}],
+    [
+        {"identity": []},
+        {"rejected": []},
+        {"doubts": []},
+        {"metrics": {"a": float("inf")}},
+        {"seconds": float("nan")},
+        {"output": {"kind": "K", "digest": "D" * 32, "parts": {}}},
+    ],
 )
 def test_a_record_with_something_else_in_it_is_none(changes: dict[str, object]) -> None:
     assert record_from_bytes(signed(record_json())) is not None
@@ -166,7 +173,7 @@ def test_parts_that_make_no_value_are_removed_and_reported(tmp_path: Path) -> No
     store = Store(tmp_path)
     parts = {name: store.blobs.put(part) for name, part in {"array": np.arange(3), "other": np.arange(4)}.items()}
     with pytest.raises(DamagedBlobError, match=r"is not a part of a Pair; the same command computes it again"):
-        store.load(ItemRef("Pair", "d", parts), Pair)
+        store.load(ItemRef("Pair", "d" * 32, parts), Pair)
     assert not any(store.blobs.exists(ref) for ref in parts.values())
     assert len(store.damaged) == 1
 

@@ -21,9 +21,11 @@ from pano_mvs.scene import Axis, Pairs, Record, Views
 from tests.engine.conftest import Toy
 from tests.engine.workflows.test_wiring import MORE
 
+DIGEST = {name: digest_from_value(name) for name in ("a", "b", "c", "s", "ab")}
+
 
 def ref(name: str) -> ItemRef:
-    return ItemRef("Number", f"digest of {name}", {})
+    return ItemRef("Number", digest_from_value(name), {})
 
 
 def images(*names: str, pending: str = "", failed: str = "") -> StageState:
@@ -100,7 +102,7 @@ def test_names_of_what_will_come_count_and_of_what_failed_do_not(resolved: Resol
 def test_a_gather_waits_for_all_and_does_without_what_failed(resolved: Resolved) -> None:
     units, _ = resolved("shifted", scaled=images("a", "b", "c", failed="b"))
     assert units[WHOLE].inputs == {"xs": {"a": ref("a"), "c": ref("c")}}
-    assert units[WHOLE].identity["inputs"] == {"xs": [[["a"], "digest of a"], [["c"], "digest of c"]]}
+    assert units[WHOLE].identity["inputs"] == {"xs": [[["a"], DIGEST["a"]], [["c"], DIGEST["c"]]]}
     assert resolved("shifted", scaled=images("a", "b", pending="b"))[1].waiting == [WHOLE]
     assert resolved("shifted", scaled=OPEN)[1].waiting == [WHOLE]
     assert resolved("shifted", scaled=images("a", failed="a"))[1].blocked == {WHOLE: "needs scaled, which failed"}
@@ -120,7 +122,7 @@ def test_a_pair_needs_both_ends(resolved: Resolved) -> None:
     ends = unit.inputs["ends"]
     assert isinstance(ends, dict)
     assert list(ends) == ["b", "a"]
-    assert unit.identity["inputs"] == {"ends": ["digest of b", "digest of a"]}
+    assert unit.identity["inputs"] == {"ends": [DIGEST["b"], DIGEST["a"]]}
     assert rest.waiting == ["b | c"]
     assert rest.blocked == {"a | d": "needs scaled:d, which failed"}
     assert list(rest.members) == ["b | a", "b | c", "a | d"]
@@ -132,7 +134,7 @@ def test_a_view_does_with_the_neighbours_that_there_are(resolved: Resolved) -> N
     assert list(units) == ["a"]
     assert units["a"].inputs == {"own": ref("a"), "around": {"b": ref("b")}}
     assert units["a"].members == ("a",)
-    assert units["a"].identity["inputs"] == {"own": "digest of a", "around": ["digest of b"]}
+    assert units["a"].identity["inputs"] == {"own": DIGEST["a"], "around": [DIGEST["b"]]}
     assert rest.waiting == ["d"]
     assert rest.blocked == {
         "b": "needs scaled:c, which failed",
@@ -158,7 +160,7 @@ def test_without_an_index_no_unit_is_known(resolved: Resolved, stage: str) -> No
 def test_a_port_that_is_not_connected_is_given_nothing(resolved: Resolved) -> None:
     units, _ = resolved("plus", scaled=images("a"))
     assert units["a"].inputs == {"x": ref("a"), "total": None}
-    assert units["a"].identity["inputs"] == {"x": "digest of a", "total": None}
+    assert units["a"].identity["inputs"] == {"x": DIGEST["a"], "total": None}
 
 
 def test_items_of_a_collection_are_known_once_it_is_there(resolved: Resolved) -> None:
@@ -191,8 +193,8 @@ def test_a_stage_reads_several_producers(resolved: Resolved) -> None:
     pairs = StageState(Axis.PAIR, {"a | b": ref("ab")}, {}, {"a | b": ("a", "b")})
     units, _ = resolved("all", difference=pairs, shifted=whole(ref("s")))
     assert units[WHOLE].identity["inputs"] == {
-        "differences": [[["a", "b"], "digest of ab"]],
-        "shifted": "digest of s",
+        "differences": [[["a", "b"], DIGEST["ab"]]],
+        "shifted": DIGEST["s"],
     }
     for state, blocked, waiting in (
         (whole(None, failed=True), {WHOLE: "needs shifted, which failed"}, []),
@@ -217,7 +219,7 @@ def test_a_key_is_made_of_the_identity_and_nothing_else(resolved: Resolved) -> N
         "libraries": dict(code.libraries),
         "params": {"by": 3.0},
         "kinds": {"Number": 1},
-        "inputs": {"x": "digest of a"},
+        "inputs": {"x": DIGEST["a"]},
     }
     same = images("c", "a")
     same.items["c"] = ref("a")

@@ -76,7 +76,7 @@ def test_as_many_are_kept_as_are_asked_for(loaded: list[int]) -> None:
 
 
 def ref_of(*sizes: int) -> ItemRef:
-    return ItemRef("kind", "d", {str(n): BlobRef("d", size, ".npy") for n, size in enumerate(sizes)})
+    return ItemRef("kind", "d" * 32, {str(n): BlobRef("d" * 32, size, ".npy") for n, size in enumerate(sizes)})
 
 
 def test_how_many_are_kept_depends_on_open_files_and_on_memory() -> None:

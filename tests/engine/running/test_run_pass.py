@@ -55,9 +55,24 @@ class Shelf(SerialExecutor):
         return self.memory_bytes
 
 
-def run_with(toy: Toy, shelf: Shelf, *overrides: str) -> RunResult:
+class Heard(SilentObserver):
+    """Notes what it hears of units."""
+
+    def __init__(self) -> None:
+        self.started: list[str] = []
+        self.finished: list[tuple[str, str]] = []
+
+    def unit_started(self, name: str, item: str) -> None:
+        self.started.append(f"{name}:{item}")
+
+    def unit_finished(self, name: str, item: str, *, status: UnitStatus, seconds: float) -> None:
+        self.finished.append((f"{name}:{item}", status))
+
+
+def run_with(toy: Toy, shelf: Shelf, *overrides: str, observer: SilentObserver | None = None) -> RunResult:
     session = toy.session(*overrides)
-    return Run(session.workflow, session.graph, Store(session.store_root), out=session.out, executor=shelf).execute()
+    store = Store(session.store_root)
+    return Run(session.workflow, session.graph, store, out=session.out, observer=observer, executor=shelf).execute()
 
 
 @pytest.fixture
@@ -84,9 +99,11 @@ def test_as_many_units_are_out_as_the_executor_takes_and_the_result_is_that_of_o
 
 def test_what_is_in_the_store_is_not_handed_out(toy: Toy, shelf: Shelf) -> None:
     toy.run()
-    result = run_with(toy, shelf)
-    assert shelf.submitted == []
+    heard = Heard()
+    result = run_with(toy, shelf, observer=heard)
+    assert shelf.submitted == heard.started == []
     assert all(counts[0] == 0 and counts[1] > 0 for counts in summary(result).values())
+    assert {status for _, status in heard.finished} == {"cached"}
 
 
 def test_units_of_one_key_are_computed_once(toy: Toy, shelf: Shelf) -> None:
@@ -190,27 +207,11 @@ def test_a_unit_that_needs_more_memory_than_there_is_fails_and_the_others_go_on(
     assert "pairs" not in shelf.submitted
 
 
-class Heard(SilentObserver):
-    """Notes what it hears of units."""
-
-    def __init__(self) -> None:
-        self.started: list[str] = []
-        self.finished: list[tuple[str, str]] = []
-
-    def unit_started(self, name: str, item: str) -> None:
-        self.started.append(f"{name}:{item}")
-
-    def unit_finished(self, name: str, item: str, *, status: UnitStatus, seconds: float) -> None:
-        self.finished.append((f"{name}:{item}", status))
-
-
 @pytest.mark.parametrize("memory", ["1MB", "5MB"])
 def test_whatever_is_computed_or_refused_is_heard_of_as_begun_and_ended(toy: Toy, shelf: Shelf, memory: str) -> None:
     shelf.memory_bytes = 3_000_000
-    session, heard = toy.session(f"pairs.memory={memory}"), Heard()
-    Run(
-        session.workflow, session.graph, Store(session.store_root), out=session.out, executor=shelf, observer=heard
-    ).execute()
+    heard = Heard()
+    run_with(toy, shelf, f"pairs.memory={memory}", observer=heard)
     assert [name for name in heard.started if name.startswith("pairs")] == ["pairs:"]
     assert [one for one in heard.finished if one[0] == "pairs:"] == [("pairs:", "run" if memory == "1MB" else "failed")]
     blocked = {name for name, status in heard.finished if status == "blocked"}
@@ -263,6 +264,17 @@ def test_files_that_give_way_to_those_of_an_earlier_unit_end_the_run_if_asked(to
     assert result.exit_code == RunStoppedError.exit_code
     assert "stage 'each' has on_error: stop" in result.stopped
     assert "mean/fixed.txt" in result.stopped
+
+
+def test_a_unit_that_has_to_give_way_ends_the_run_if_asked(toy: Toy, shelf: Shelf) -> None:
+    """The only other one comes before it in the capture, and delivers later."""
+    for number in (3, 4, 5):
+        (toy.folder / "capture" / f"{number}.txt").unlink()
+    toy.edit("plug.py", lambda text: text.replace("mean/{item}.txt", "mean/fixed.txt"))
+    result = run_with(toy, shelf, "each.on_error=stop")
+    assert next(label for label in shelf.submitted if label.startswith("each")) == "each:2.txt"
+    assert (result.exit_code, summary(result)["each"][2]) == (RunStoppedError.exit_code, 1)
+    assert "stage 'each' has on_error: stop, and each:2.txt failed: mean/fixed.txt" in result.stopped
 
 
 def test_of_units_that_deliver_one_file_the_first_of_the_capture_stays(toy: Toy, shelf: Shelf) -> None:
@@ -341,7 +353,7 @@ def test_results_that_come_after_the_end_of_a_pass_count_as_computed(
     session = toy.session()
     run = Run(session.workflow, session.graph, Store(session.store_root), out=session.out, executor=shelf)
     run.computed.add("z")
-    record, entry = UnitRecord("a", {}, ItemRef("K", "d", {})), session.workflow.stages["scaled"]
+    record, entry = UnitRecord("a", {}, ItemRef("K", "d" * 32, {})), session.workflow.stages["scaled"]
     outcomes = {"a": JobOutcome("done", record), "b": JobOutcome("failed"), "c": JobOutcome("done", record)}
     ended = [FinishedJob(Unit(entry, key, (), {}, key, {}), outcome) for key, outcome in outcomes.items()]
     monkeypatch.setattr(run.dispatcher, "next_finished", lambda: ended.pop(0) if ended else None)
