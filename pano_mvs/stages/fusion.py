@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
+from pano_mvs.algorithms.fusion.fuse import fuse_stream
 from pano_mvs.algorithms.fusion.settings import FusionSettings
 from pano_mvs.algorithms.fusion.view import FusionView
-from pano_mvs.algorithms.fusion.vote import fuse_stream
 from pano_mvs.api import All, Context, Panorama, Params, PointCloud, Pose, RangeMap, params_from, settings_from, stage
 
 

@@ -17,13 +17,13 @@ def footprint(view: NDArray[np.float64], normal: NDArray[np.float32]) -> float:
     return distance**2 / max(float(-view @ normal) / distance, 0.05)
 
 
-def vote(
+def add_source(
     reference: tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float32], NDArray[np.bool_]],
     source_from_reference: Rigid3,
     source: tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]],
     limits: NDArray[np.float64],
 ) -> dict[str, NDArray[Any]]:
-    """Return what `kernels_vote.vote` adds to tallies of zeros."""
+    """Return what `kernels_fuse.add_source` adds to tallies of zeros."""
     ranges, rays, normals, written = reference
     source_ranges, source_confidence, image = source
     max_error, max_angle, max_step, max_ratio, merge_within, least_confidence = limits

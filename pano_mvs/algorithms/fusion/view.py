@@ -34,7 +34,7 @@ class FusionView:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sight:
+class ConfidentView:
     """Data of a view with sufficient confidence, in the memory layout of compiled loops.
 
     Attributes:
@@ -60,7 +60,7 @@ def held_rays(size_hw: tuple[int, int]) -> NDArray[np.float64]:
     return rays
 
 
-def sight_of(view: FusionView, *, min_confidence: int) -> Sight:
+def confident_view(view: FusionView, *, min_confidence: int) -> ConfidentView:
     """Return the data of a view with at least the given confidence and outside of its mask.
 
     Raises:
@@ -78,7 +78,7 @@ def sight_of(view: FusionView, *, min_confidence: int) -> Sight:
             raise UsageError(f"a view's mask must have the size of its range map {ranges.shape}, got {view.mask.shape}")
         good &= view.mask
     given = view.range_map.normals_in_cam
-    return Sight(
+    return ConfidentView(
         view.pose,
         np.where(good, ranges, np.float32(np.nan)),
         np.ascontiguousarray(confidence),
@@ -87,7 +87,7 @@ def sight_of(view: FusionView, *, min_confidence: int) -> Sight:
     )
 
 
-class SightWindow:
+class ViewWindow:
     """Loads views when they are needed and caches the most recent ones."""
 
     def __init__(self, load: Callable[[int], FusionView], *, min_confidence: int, size: int) -> None:
@@ -95,16 +95,16 @@ class SightWindow:
         self._load = load
         self._min_confidence = min_confidence
         self._size = size
-        self._held: OrderedDict[int, Sight] = OrderedDict()
+        self._held: OrderedDict[int, ConfidentView] = OrderedDict()
 
-    def __getitem__(self, view_idx: int) -> Sight:
+    def __getitem__(self, view_idx: int) -> ConfidentView:
         """Return a view, loaded again if it was dropped."""
         if view_idx in self._held:
             self._held.move_to_end(view_idx)
         else:
             while len(self._held) >= self._size:
                 self._held.popitem(last=False)
-            self._held[view_idx] = sight_of(self._load(view_idx), min_confidence=self._min_confidence)
+            self._held[view_idx] = confident_view(self._load(view_idx), min_confidence=self._min_confidence)
         return self._held[view_idx]
 
 

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.matching.integer_descriptors import can_compare_as_integers, nearest_two_integers
 from pano_mvs.algorithms.matching.nearest_two import nearest_two
-from pano_mvs.algorithms.matching.whole_numbers import fits_whole_numbers, nearest_two_whole
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
 from pano_mvs.scene import Features
@@ -53,8 +53,8 @@ def match_features(
 def _match_l2(
     first: NDArray[np.generic], second: NDArray[np.generic], *, ratio: float, mutual: bool
 ) -> NDArray[np.int32]:
-    whole = fits_whole_numbers(first) and fits_whole_numbers(second)
-    found = nearest_two_whole(first, second) if whole else nearest_two(first, second)
+    whole = can_compare_as_integers(first) and can_compare_as_integers(second)
+    found = nearest_two_integers(first, second) if whole else nearest_two(first, second)
     kept = found.squared < np.float32(ratio**2) * found.next_squared if ratio < 1 else np.ones(len(first), np.bool_)
     if mutual:
         kept &= found.squared <= found.squared_back[found.nearest]

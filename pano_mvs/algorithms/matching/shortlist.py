@@ -7,8 +7,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.matching.integer_descriptors import (
+    PackedDescriptors,
+    can_compare_as_integers,
+    nearest_two_packed,
+)
 from pano_mvs.algorithms.matching.nearest_two import NearestTwo, nearest_two
-from pano_mvs.algorithms.matching.whole_numbers import PackedDescriptors, fits_whole_numbers, nearest_two_packed
 
 _MIN_SHORTLIST, _SHORTLIST_PER_NEIGHBOUR = 300, 10
 _RATIO = 0.8  # threshold of the ratio test of Lowe 2004, section 7.1
@@ -46,7 +50,7 @@ def sample_matches(
 
 def _comparison(samples: Sequence[NDArray[np.int16]]) -> Callable[[int, int], NearestTwo]:
     """Return a function that compares two samples given by their positions, compiled if the machine supports it."""
-    if all(map(fits_whole_numbers, samples)):
+    if all(map(can_compare_as_integers, samples)):
         packed = {idx: PackedDescriptors.of(sample) for idx, sample in enumerate(samples) if sample.size}
         return lambda first, second: nearest_two_packed(packed[first], packed[second])
     return lambda first, second: nearest_two(samples[first], samples[second])

@@ -24,7 +24,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.sweep.preparation import voting_pixels
+from pano_mvs.algorithms.sweep.preparation import pixels_with_valid_window
 from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
 from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import UsageError
@@ -179,7 +179,7 @@ def _source_arrays(
     valid = np.zeros(0, np.uint8)
     if masks is not None and not all(mask is None or mask.all() for mask in masks):
         given = [np.ones(s.shape[:2], np.bool_) if m is None else m for s, m in zip(sources, masks, strict=True)]
-        voting = [voting_pixels(mask, ceil(reach * mask.shape[0])) for mask in given]
+        voting = [pixels_with_valid_window(mask, ceil(reach * mask.shape[0])) for mask in given]
         patches = [_packed(mask.astype(np.uint64)).ravel() for mask in voting]
         valid = (np.concatenate(patches) == 0x0001000100010001).astype(np.uint8)
     matrices = np.stack([np.column_stack([pose.rotation, pose.translation]) for pose in poses])

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pano_mvs.algorithms.poses.placement.pair_evidence import Witnesses
+from pano_mvs.algorithms.poses.placement.pair_evidence import PairEvidence
 from pano_mvs.algorithms.poses.placement.placed_model import (
     MIN_POINTS,
     MIN_SHARE,
@@ -54,7 +54,7 @@ class GrownModel:
     arbitration: Arbitration | None
     aliased: bool = False
 
-    def satisfies(self) -> bool:
+    def is_satisfactory(self) -> bool:
         """Return whether no other model needs to be tried."""
         if self.refused or self.aliased:
             return False
@@ -95,7 +95,7 @@ def grown_models(
         tried |= {seeds[0], *models[-1].model.chosen.items()}
         # Do not try seeds that no image can be attached to.
         grown = sum(len(found.model.cameras) > 2 for found in models)
-        if models[-1].satisfies() or grown == _MAX_GROWN or len(models) == 2 * _MAX_GROWN:
+        if models[-1].is_satisfactory() or grown == _MAX_GROWN or len(models) == 2 * _MAX_GROWN:
             break
     models.sort(key=GrownModel.rank)
     if models and models[0].arbitration is not None and confirmation is not None:
@@ -152,9 +152,9 @@ def _support(pairs: Pairs, edge: Edge, rank: int) -> float:
     total = 0.25
     for image in thirds:
         _, found = model.place(image)
-        witnesses_of_both = [place for place in found if place.explained.sum() >= 2]
-        if witnesses_of_both:
-            total += witnesses_of_both[0].score
+        agreeing_with_both = [place for place in found if place.explained.sum() >= 2]
+        if agreeing_with_both:
+            total += agreeing_with_both[0].score
     return total
 
 
@@ -210,11 +210,11 @@ def _unsupported(model: PlacedModel, image: int) -> str:
     without = model.copy()
     without.remove(image)
     without.learn_ranges()
-    witnesses = without.witnesses(image)
+    evidence = without.evidence(image)
     pose = model.cameras[image]
-    agrees = agreement(witnesses, pose.rotation[None], pose.center[None])[0]
-    _, support, known = without.polished(image, witnesses, Placement(pose, agrees, 0.0))
-    agreeing = len(set(witnesses.partner[agrees].tolist()))
+    agrees = agreement(evidence, pose.rotation[None], pose.center[None])[0]
+    _, support, known = without.polished(image, evidence, Placement(pose, agrees, 0.0))
+    agreeing = len(set(evidence.partner[agrees].tolist()))
     if enough_points(support, known, agreeing=agreeing):
         return ""
     return _why_refused(model.pairs, image, support, known, agreeing=agreeing)
@@ -233,21 +233,21 @@ def _next(
     """
     order = sorted(weights, key=lambda idx: (-weights[idx], idx))
     for first in range(0, len(order), _LOOKED_AT):
-        doubtful: list[tuple[float, int, Witnesses, list[Placement]]] = []
+        doubtful: list[tuple[float, int, PairEvidence, list[Placement]]] = []
         for image in order[first : first + _LOOKED_AT]:
-            witnesses, found = model.place(image)
+            evidence, found = model.place(image)
             if not found:
                 reasons[image] = _why_nothing(model, image)
                 continue
             rival = found[1].score / found[0].score if len(found) > 1 else 0.0
-            share = found[0].score / witnesses.total
+            share = found[0].score / evidence.total
             clear = rival < (_CLEAR if confirmation is None else _CLEAR_WITH_IMAGES) and share > _MIN_SHARE
-            if clear and (pose := _accepted(model, image, witnesses, found[0], reasons)):
+            if clear and (pose := _accepted(model, image, evidence, found[0], reasons)):
                 return image, pose
-            doubtful.append((share * (1 - 0.5 * rival), image, witnesses, found))
-        for _, image, witnesses, found in sorted(doubtful, key=lambda item: (-item[0], item[1])):
+            doubtful.append((share * (1 - 0.5 * rival), image, evidence, found))
+        for _, image, evidence, found in sorted(doubtful, key=lambda item: (-item[0], item[1])):
             for placement in _by_images(model, image, found, confirmation):
-                if pose := _accepted(model, image, witnesses, placement, reasons):
+                if pose := _accepted(model, image, evidence, placement, reasons):
                     return image, pose
     return None
 
@@ -264,11 +264,11 @@ def _by_images(
 
 
 def _accepted(
-    model: PlacedModel, image: int, witnesses: Witnesses, placement: Placement, reasons: dict[int, str]
+    model: PlacedModel, image: int, evidence: PairEvidence, placement: Placement, reasons: dict[int, str]
 ) -> Rigid3 | None:
     """Return the refined pose of a placement; None, noting the reason, if too few known points support it."""
-    pose, support, known = model.polished(image, witnesses, placement)
-    agreeing = len(set(witnesses.partner[placement.explained].tolist()))
+    pose, support, known = model.polished(image, evidence, placement)
+    agreeing = len(set(evidence.partner[placement.explained].tolist()))
     if enough_points(support, known, agreeing=agreeing):
         return pose
     reasons[image] = _why_refused(model.pairs, image, support, known, agreeing=agreeing)
@@ -294,14 +294,14 @@ def _moved_cameras(model: PlacedModel, confirmation: Confirmation | None) -> boo
     if len(model.cameras) < 3:
         return False
     for image in sorted(model.cameras):
-        witnesses = model.witnesses(image)
+        evidence = model.evidence(image)
         mine = [rank for edge, rank in model.chosen.items() if image in edge]
         score = sum(model.pairs.geometries[edge][rank].weight for edge, rank in model.chosen.items() if image in edge)
-        if not mine or score > 0.8 * witnesses.total:
+        if not mine or score > 0.8 * evidence.total:
             continue
         _, found = model.place(image)
         if found and found[0].score > 1.2 * score:
-            pose, support, known = model.polished(image, witnesses, found[0])
+            pose, support, known = model.polished(image, evidence, found[0])
             if enough_points(support, known) and _better_by_images(model, image, pose, confirmation):
                 model.add(image, pose)
                 moved = True

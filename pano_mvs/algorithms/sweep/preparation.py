@@ -81,7 +81,7 @@ def derotated(
     return turned, straight, tuple(share > 1 - 1e-9 for share in shares)
 
 
-def voting_pixels(mask: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
+def pixels_with_valid_window(mask: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
     """Return the valid pixels of a source around which the whole window is valid too, (H, W).
 
     A window that looks beyond the mask would compare with the tripod. The window is widened in columns like those of

@@ -17,7 +17,13 @@ from pano_mvs.algorithms.sweep.backends.registry import backend_for, helper_back
 from pano_mvs.algorithms.sweep.exposure import match_all, shrink
 from pano_mvs.algorithms.sweep.hypotheses import virtual_ranges
 from pano_mvs.algorithms.sweep.no_match import has_match
-from pano_mvs.algorithms.sweep.preparation import SweepInput, derotated, prepare_picture, sees_winner, voting_pixels
+from pano_mvs.algorithms.sweep.preparation import (
+    SweepInput,
+    derotated,
+    pixels_with_valid_window,
+    prepare_picture,
+    sees_winner,
+)
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.winner import range_map_from_winners
 from pano_mvs.core.errors import UsageError
@@ -182,7 +188,7 @@ def _voting(masks: tuple[Mask, ...] | None, settings: SweepSettings, *, rows: in
     if masks is None:
         return None
     radius = settings.compare_radius + settings.box_radius
-    return tuple(voting_pixels(mask, ceil(radius * mask.shape[0] / rows)) for mask in masks)
+    return tuple(pixels_with_valid_window(mask, ceil(radius * mask.shape[0] / rows)) for mask in masks)
 
 
 def _checked_sources(

@@ -27,7 +27,7 @@ from pano_mvs.core.paths import children, exists, is_link, reason_of
 from pano_mvs.engine.cache.blobs import BlobRef, BlobStore, DamagedBlobError
 from pano_mvs.engine.cache.disk_guard import DiskGuard, is_full_disk
 from pano_mvs.engine.cache.latest_runs import RunHistory
-from pano_mvs.engine.cache.packed_parts import PackedParts
+from pano_mvs.engine.cache.packed_refs import PackedRefs
 from pano_mvs.engine.cache.stat_cache import StatCache
 from pano_mvs.scene import Record
 
@@ -56,7 +56,7 @@ class ItemRef:
     def from_json(value: Mapping[str, Any]) -> ItemRef:
         """Return the reference from the result of `to_json`."""
         parts = {str(name): BlobRef.from_json(part) for name, part in value["parts"].items()}
-        return ItemRef(intern(str(value["kind"])), str(value["digest"]), PackedParts(parts))
+        return ItemRef(intern(str(value["kind"])), str(value["digest"]), PackedRefs(parts))
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,7 +218,7 @@ class Store:
             raise ContractError(f"{value.kind_name()} holds something that cannot be stored: {error}") from error
         digests = {name: [ref.digest, ref.suffix] for name, ref in parts.items()}
         digest = digest_from_value([value.kind_name(), value.kind_version, digests])
-        return ItemRef(value.kind_name(), digest, PackedParts(parts))
+        return ItemRef(value.kind_name(), digest, PackedRefs(parts))
 
     def load(self, ref: ItemRef, kind: type[Record]) -> Record:
         """Return a stored value; its arrays are memory-mapped and read-only.

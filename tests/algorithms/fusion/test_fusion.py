@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from pano_mvs.algorithms.filters.sphere.steps import columns_per_step
 from pano_mvs.algorithms.fusion import voxels
+from pano_mvs.algorithms.fusion.fuse import fuse_reference, fuse_stream, fuse_views, join_clouds
 from pano_mvs.algorithms.fusion.normals import normals_from_range
 from pano_mvs.algorithms.fusion.settings import FusionSettings
 from pano_mvs.algorithms.fusion.view import FusionView, nearest_views
-from pano_mvs.algorithms.fusion.vote import fuse_reference, fuse_stream, fuse_views, join_clouds
 from pano_mvs.algorithms.fusion.voxels import thin_by_voxels
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, angle_between, ray_grid

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.sphere.steps import columns_per_step
+from pano_mvs.algorithms.fusion.kernels_fuse import add_source
 from pano_mvs.algorithms.fusion.kernels_support import find_supported
-from pano_mvs.algorithms.fusion.kernels_vote import vote
 from pano_mvs.geometry import Rigid3, ray_grid, rotation_from_rotvec
 from tests.oracles import fusion as oracle
 
@@ -28,8 +28,8 @@ def rough_sphere(rng: np.random.Generator, size_hw: tuple[int, int]) -> np.ndarr
     return ranges.astype(np.float32)
 
 
-@pytest.mark.kernel("fusion.kernels_vote")
-def test_votes_of_a_source_equal_the_plain_ones() -> None:
+@pytest.mark.kernel("fusion.kernels_fuse")
+def test_what_a_source_adds_equals_the_plain_sums() -> None:
     rng = np.random.default_rng(20)
     ranges, source_ranges = rough_sphere(rng, SIZE), rough_sphere(rng, SOURCE_SIZE)
     rays = ray_grid(SIZE)
@@ -49,8 +49,8 @@ def test_votes_of_a_source_equal_the_plain_ones() -> None:
     }
     source = (np.array(pose.rotation), np.array(pose.translation), source_ranges, confidence, image)
     for rows in ((0, 5), (5, 12)):
-        vote((ranges, rays, normals, written), source, LIMITS, rows, tuple(found[name] for name in FIELDS))
-    expected = oracle.vote((ranges, rays, normals, written), pose, (source_ranges, confidence, image), LIMITS)
+        add_source((ranges, rays, normals, written), source, LIMITS, rows, tuple(found[name] for name in FIELDS))
+    expected = oracle.add_source((ranges, rays, normals, written), pose, (source_ranges, confidence, image), LIMITS)
     for name in FIELDS:  # as plain Python, quotients of ranges are float32
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-3, atol=1e-5, err_msg=name)
     assert 0.2 < found["counts"].mean() < 0.8

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pano_mvs.algorithms.poses.placement.pair_evidence import (
-    Witnesses,
-    gather_witnesses,
+    PairEvidence,
+    gather_pair_evidence,
     geometries_of,
     oriented,
 )
@@ -31,10 +31,10 @@ NOTHING_KNOWN = [np.full(len(POINTS), np.nan)] * 2
 TRUE = view_of(SECOND @ FIRST.inverse(), same_matches(len(POINTS)))
 
 
-def gathered(view: TwoView = TRUE, *, image: int = 1, ranges: list[np.ndarray] = RANGES) -> Witnesses:
+def gathered(view: TwoView = TRUE, *, image: int = 1, ranges: list[np.ndarray] = RANGES) -> PairEvidence:
     """Return what the pair says about one of the two images, the other being registered where it truly stands."""
     partner = 1 - image
-    return gather_witnesses(
+    return gather_pair_evidence(
         image,
         [partner],
         geometries={(0, 1): geometries_of(view, *BEARINGS)},
@@ -77,7 +77,7 @@ def test_a_pair_that_is_stored_the_other_way_round_says_the_same() -> None:
 
 
 @pytest.mark.parametrize("image", [0, 1])
-def test_a_witness_has_pose_and_length_of_the_image(image: int) -> None:
+def test_pair_evidence_has_pose_and_length_of_the_image(image: int) -> None:
     pose = (FIRST, SECOND)[image]
     says = gathered(image=image)
     assert says.partner.tolist() == [1 - image]
@@ -109,7 +109,7 @@ def test_ranges_that_agree_on_nothing_give_no_length() -> None:
     assert np.isnan(gathered(ranges=scattered).lengths).all()
 
 
-def test_every_geometry_of_a_pair_is_a_witness_the_heaviest_first() -> None:
+def test_every_geometry_of_a_pair_is_evidence_the_heaviest_first() -> None:
     feigned = view_of(Rigid3(TRUE.rotation, np.array([1.0, 0.0, 0.0])), same_matches(30))
     says = gathered(TRUE.with_alternatives([feigned]))
     assert says.rank.tolist() == [0, 1]
@@ -135,8 +135,8 @@ def test_parallax_is_the_angle_between_rays_after_derotation() -> None:
     assert geometries_of(empty, *BEARINGS)[0].parallax_deg == 0
 
 
-def test_no_partner_is_no_witness() -> None:
-    says = gather_witnesses(
+def test_no_partner_is_no_evidence() -> None:
+    says = gather_pair_evidence(
         0, [], geometries={}, cameras={}, bearings=BEARINGS, ranges=RANGES, estimator="cauchy", kappa=0.01
     )
     assert len(says) == 0
@@ -149,5 +149,5 @@ def test_a_model_asks_only_registered_partners() -> None:
     model = PlacedModel(pairs_of(capture.features, capture.two_views))
     for image in (0, 2):
         model.cameras[image] = capture.poses[capture.names[image]]
-    assert set(model.witnesses(1).partner.tolist()) == {0, 2}
-    assert model.witnesses(1, [2]).partner.tolist() == [2]
+    assert set(model.evidence(1).partner.tolist()) == {0, 2}
+    assert model.evidence(1, [2]).partner.tolist() == [2]

@@ -73,7 +73,7 @@ def test_a_removed_image_leaves_nothing_behind(model: PlacedModel) -> None:
     model.remove(2)
     assert 2 not in model.cameras
     assert not any(2 in edge for edge in model.chosen)
-    assert 2 not in model.witnesses(0).partner
+    assert 2 not in model.evidence(0).partner
 
 
 def test_known_points_are_where_their_rays_point(model: PlacedModel, capture: AliasedCapture) -> None:
@@ -94,12 +94,12 @@ def test_points_of_a_false_geometry_are_elsewhere(model: PlacedModel, capture: A
 
 def test_an_image_is_placed_and_polished_where_it_stands(model: PlacedModel, capture: AliasedCapture) -> None:
     model.remove(3)
-    witnesses, found = model.place(3)
-    pose, support, known = model.polished(3, witnesses, found[0])
+    evidence, found = model.place(3)
+    pose, support, known = model.polished(3, evidence, found[0])
     assert enough_points(support, known)
     assert np.linalg.norm(pose.center - capture.poses["3.jpg"].center) < 0.01
-    assert explained_partners(witnesses, found[0].explained) == {0: 1, 1: 0, 2: 0, 4: 0, 5: 0}
-    feigned = next(place for place in found if place.explained[(witnesses.partner == 0) & (witnesses.rank == 0)])
+    assert explained_partners(evidence, found[0].explained) == {0: 1, 1: 0, 2: 0, 4: 0, 5: 0}
+    feigned = next(place for place in found if place.explained[(evidence.partner == 0) & (evidence.rank == 0)])
     assert np.linalg.norm(feigned.cam_from_world.center - capture.poses["3.jpg"].center) > 0.3
 
 
@@ -127,7 +127,7 @@ def test_a_seed_is_a_pair_one_unit_apart(pairs: Pairs) -> None:
     assert sorted(model.cameras) == [1, 4]
     np.testing.assert_array_equal(model.cameras[1].center, 0)
     assert np.linalg.norm(model.cameras[4].center) == pytest.approx(1.0)
-    assert np.isfinite(model.witnesses(0).lengths).any()
+    assert np.isfinite(model.evidence(0).lengths).any()
 
 
 def test_the_first_seed_is_true_although_a_false_one_has_more_matches(pairs: Pairs) -> None:
@@ -142,7 +142,7 @@ def test_the_first_seed_is_true_although_a_false_one_has_more_matches(pairs: Pai
 def test_a_grown_model_has_all_images_and_needs_no_rival(pairs: Pairs, capture: AliasedCapture) -> None:
     best = grown_models(pairs, range(6), adjust=True, confirmation=None)[0]
     assert best.refused == {}
-    assert best.satisfies()
+    assert best.is_satisfactory()
     assert _error_deg(best.model, capture) < 0.5
 
 
@@ -152,7 +152,7 @@ def test_pairs_know_the_partners_with_most_matches_first(pairs: Pairs) -> None:
     nothing = Pairs.without(["a", "b"])
     assert nothing.names == ("a", "b")
     assert nothing.partners == ((), ())
-    assert len(PlacedModel(nothing, {0: Rigid3.identity()}).witnesses(1)) == 0
+    assert len(PlacedModel(nothing, {0: Rigid3.identity()}).evidence(1)) == 0
 
 
 @pytest.mark.parametrize(("support", "known", "enough"), [(0, 0, False), (300, 300, True), (30, 300, False)])

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import pytest
 
-from pano_mvs.algorithms.poses.placement.pair_evidence import Witnesses
+from pano_mvs.algorithms.poses.placement.pair_evidence import PairEvidence
 from pano_mvs.algorithms.poses.placement.places import agreement, placements
 from pano_mvs.geometry import Rigid3, Similarity3, geodesic_angle, rotation_from_rotvec
 from tests.algorithms.poses.synthetic_capture import random_rotation
@@ -27,10 +27,10 @@ class Says:
     rank: int = 0
 
 
-def witnesses_of(said: list[Says]) -> Witnesses:
+def evidence_of(said: list[Says]) -> PairEvidence:
     offsets = np.array([says.pose.center - ORIGINS[says.partner] for says in said]).reshape(-1, 3)
     distances = np.linalg.norm(offsets, axis=1)
-    return Witnesses(
+    return PairEvidence(
         partner=np.array([says.partner for says in said], np.intp),
         rank=np.array([says.rank for says in said], np.intp),
         weight=np.array([says.weight for says in said]),
@@ -42,8 +42,8 @@ def witnesses_of(said: list[Says]) -> Witnesses:
     )
 
 
-def reordered(witnesses: Witnesses, order: np.ndarray) -> Witnesses:
-    return Witnesses(*(getattr(witnesses, field.name)[order] for field in fields(witnesses)))
+def reordered(evidence: PairEvidence, order: np.ndarray) -> PairEvidence:
+    return PairEvidence(*(getattr(evidence, field.name)[order] for field in fields(evidence)))
 
 
 def elsewhere(by: list[float], *, turn_deg: float = 0.0) -> Rigid3:
@@ -62,7 +62,7 @@ OUTVOTED = [Says(0), Says(1), Says(2), Says(3, FALSE, weight=2.5), Says(3, weigh
 
 
 def test_what_partners_agree_on_beats_what_one_says_louder() -> None:
-    found = placements(witnesses_of(OUTVOTED))
+    found = placements(evidence_of(OUTVOTED))
     assert_same_pose(found[0].cam_from_world, TRUTH)
     np.testing.assert_array_equal(found[0].explained, [True, True, True, False, True])
     assert found[0].score == pytest.approx(3.4)
@@ -74,17 +74,17 @@ def test_what_partners_agree_on_beats_what_one_says_louder() -> None:
 def test_each_partner_has_one_vote() -> None:
     """Of several geometries of one partner that agree only the heaviest counts."""
     repeated = [Says(0, FALSE, rank=rank) for rank in range(4)]
-    found = placements(witnesses_of([*repeated, Says(1), Says(2)]))
+    found = placements(evidence_of([*repeated, Says(1), Says(2)]))
     assert_same_pose(found[0].cam_from_world, TRUTH)
     assert [place.score for place in found] == pytest.approx([2.0, 1.0])
-    assert witnesses_of([*repeated, Says(1), Says(2, weight=0.3), Says(2, weight=0.7)]).total == pytest.approx(2.7)
+    assert evidence_of([*repeated, Says(1), Says(2, weight=0.3), Says(2, weight=0.7)]).total == pytest.approx(2.7)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_order_of_witnesses_does_not_matter(seed: int) -> None:
-    witnesses = witnesses_of([*OUTVOTED, Says(4, length_known=False)])
-    order = np.random.default_rng(seed).permutation(len(witnesses))
-    expected, found = placements(witnesses), placements(reordered(witnesses, order))
+def test_the_order_of_the_evidence_does_not_matter(seed: int) -> None:
+    evidence = evidence_of([*OUTVOTED, Says(4, length_known=False)])
+    order = np.random.default_rng(seed).permutation(len(evidence))
+    expected, found = placements(evidence), placements(reordered(evidence, order))
     assert len(found) == len(expected)
     for one, other in zip(expected, found, strict=True):
         assert one.score == pytest.approx(other.score)
@@ -96,15 +96,15 @@ def test_the_order_of_witnesses_does_not_matter(seed: int) -> None:
 def test_the_world_may_be_turned_moved_and_scaled(size: float) -> None:
     rng = np.random.default_rng(int(1000 * size))
     moved_from = Similarity3(size, random_rotation(rng), size * 5 * rng.normal(size=3))
-    witnesses = witnesses_of([*OUTVOTED, Says(4, FALSE, length_known=False)])
+    evidence = evidence_of([*OUTVOTED, Says(4, FALSE, length_known=False)])
     moved = replace(
-        witnesses,
-        rotations=witnesses.rotations @ moved_from.rotation.T,
-        origins=moved_from.apply(witnesses.origins),
-        directions=witnesses.directions @ moved_from.rotation.T,
-        lengths=moved_from.scale * witnesses.lengths,
+        evidence,
+        rotations=evidence.rotations @ moved_from.rotation.T,
+        origins=moved_from.apply(evidence.origins),
+        directions=evidence.directions @ moved_from.rotation.T,
+        lengths=moved_from.scale * evidence.lengths,
     )
-    expected, found = placements(witnesses), placements(moved)
+    expected, found = placements(evidence), placements(moved)
     assert len(found) == len(expected) >= 2
     for one, other in zip(expected, found, strict=True):
         assert_same_pose(other.cam_from_world, moved_from.move_camera(one.cam_from_world), size=moved_from.scale)
@@ -112,41 +112,41 @@ def test_the_world_may_be_turned_moved_and_scaled(size: float) -> None:
 
 
 def test_rays_cross_where_no_length_is_known() -> None:
-    found = placements(witnesses_of([Says(partner, length_known=False) for partner in range(3)]))
+    found = placements(evidence_of([Says(partner, length_known=False) for partner in range(3)]))
     assert_same_pose(found[0].cam_from_world, TRUTH)
     assert found[0].explained.all()
 
 
 def test_rays_do_not_cross_behind_a_partner() -> None:
     """Both point away from where their lines meet."""
-    witnesses = witnesses_of([Says(0, length_known=False), Says(1, length_known=False)])
-    assert placements(replace(witnesses, directions=-witnesses.directions)) == []
+    evidence = evidence_of([Says(0, length_known=False), Says(1, length_known=False)])
+    assert placements(replace(evidence, directions=-evidence.directions)) == []
 
 
 def test_a_known_length_places_an_image_alone() -> None:
-    (found,) = placements(witnesses_of([Says(0)]))
+    (found,) = placements(evidence_of([Says(0)]))
     assert_same_pose(found.cam_from_world, TRUTH)
 
 
 @pytest.mark.parametrize(
     "said",
     [
-        pytest.param([], id="no witness"),
+        pytest.param([], id="no evidence"),
         pytest.param([Says(0, length_known=False)], id="one ray"),
         pytest.param([Says(0, length_known=False), Says(0, FALSE, length_known=False)], id="two rays of one partner"),
     ],
 )
 def test_nothing_is_placed_by_less_than_a_length_or_two_rays(said: list[Says]) -> None:
-    assert placements(witnesses_of(said)) == []
+    assert placements(evidence_of(said)) == []
 
 
 def test_directions_that_are_a_little_off_are_averaged() -> None:
     rng = np.random.default_rng(7)
-    witnesses = witnesses_of([Says(partner) for partner in range(5)])
-    noisy = witnesses.directions + np.deg2rad(0.4) * rng.normal(size=(5, 3))
+    evidence = evidence_of([Says(partner) for partner in range(5)])
+    noisy = evidence.directions + np.deg2rad(0.4) * rng.normal(size=(5, 3))
     noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
-    (found,) = placements(replace(witnesses, directions=noisy, lengths=witnesses.lengths * rng.uniform(0.95, 1.05, 5)))
-    chains = witnesses.origins + witnesses.lengths[:, None] * noisy
+    (found,) = placements(replace(evidence, directions=noisy, lengths=evidence.lengths * rng.uniform(0.95, 1.05, 5)))
+    chains = evidence.origins + evidence.lengths[:, None] * noisy
     assert found.explained.all()
     error = np.linalg.norm(found.cam_from_world.center - TRUTH.center)
     assert error < np.linalg.norm(chains - TRUTH.center, axis=1).max()
@@ -165,11 +165,11 @@ def test_directions_that_are_a_little_off_are_averaged() -> None:
     ],
 )
 def test_a_geometry_agrees_in_rotation_direction_and_distance(pose: Rigid3, agrees: bool) -> None:
-    said = witnesses_of([Says(0)])
+    said = evidence_of([Says(0)])
     assert agreement(said, pose.rotation[None], pose.center[None]).tolist() == [[agrees]]
 
 
 def test_without_a_length_any_distance_along_the_ray_agrees() -> None:
-    said = witnesses_of([Says(0, length_known=False), Says(0)])
+    said = evidence_of([Says(0, length_known=False), Says(0)])
     far = Rigid3.from_center(TRUTH.rotation, 5 * TRUTH.center)
     assert agreement(said, far.rotation[None], far.center[None]).tolist() == [[True, False]]

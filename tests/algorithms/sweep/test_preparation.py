@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.exposure import match_exposure, shrink
-from pano_mvs.algorithms.sweep.preparation import prepare_picture, voting_pixels
+from pano_mvs.algorithms.sweep.preparation import pixels_with_valid_window, prepare_picture
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.windows import column_offsets, column_stretch
 from pano_mvs.geometry import Rigid3, pad_panorama
@@ -72,17 +72,17 @@ def test_shrinking_averages_whole_blocks() -> None:
 def test_a_pixel_votes_if_its_whole_window_is_valid_over_seam_and_pole() -> None:
     mask = np.ones((32, 64), np.bool_)
     mask[16, 0] = mask[0, 5] = False
-    votes = voting_pixels(mask, 2)
+    votes = pixels_with_valid_window(mask, 2)
     assert not votes[14:19, [62, 63, 0, 1, 2]].any()
     assert votes[16, [61, 3]].all()
     assert not votes[:2, 5 + 32].any()  # beyond the pole, half a turn further on
-    assert voting_pixels(~mask, 1).sum() == 0
+    assert pixels_with_valid_window(~mask, 1).sum() == 0
 
 
-def test_a_voting_pixels_window_holds_no_masked_pixel() -> None:
+def test_a_valid_window_holds_no_masked_pixel() -> None:
     rng = np.random.default_rng(3)
     mask = rng.random((32, 64)) > 0.01
-    votes = voting_pixels(mask, 2)
+    votes = pixels_with_valid_window(mask, 2)
     offsets = column_offsets((32, 64), 2, spherical=True)
     padded = pad_panorama(mask, 16)
     for row, column in np.argwhere(votes):

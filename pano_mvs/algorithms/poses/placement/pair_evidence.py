@@ -67,7 +67,7 @@ def geometries_of(view: TwoView, bearings_first: FloatArray, bearings_second: Fl
 
 
 @dataclass(frozen=True, eq=False)
-class Witnesses:
+class PairEvidence:
     """The W geometries that join an image to registered images.
 
     Attributes:
@@ -108,7 +108,7 @@ def best_by_partner(partner: NDArray[np.intp], weights: FloatArray) -> FloatArra
     return total
 
 
-def gather_witnesses(
+def gather_pair_evidence(
     image: int,
     partners: Sequence[int],
     *,
@@ -118,7 +118,7 @@ def gather_witnesses(
     ranges: Sequence[FloatArray],
     estimator: ScaleEstimator,
     kappa: float,
-) -> Witnesses:
+) -> PairEvidence:
     """Return the evidence of the pairs of an image with registered partners.
 
     Args:
@@ -157,7 +157,7 @@ def gather_witnesses(
                 )
             )
     columns = list(zip(*rows, strict=True)) if rows else [()] * 8
-    return Witnesses(
+    return PairEvidence(
         partner=np.array(columns[0], np.intp),
         rank=np.array(columns[1], np.intp),
         weight=np.array(columns[2], np.float64),

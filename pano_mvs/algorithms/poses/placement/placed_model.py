@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.poses.adjustment.tracks import Tracks, build_tracks
 from pano_mvs.algorithms.poses.placement.pair_evidence import (
     Geometry,
-    Witnesses,
-    gather_witnesses,
+    PairEvidence,
+    gather_pair_evidence,
     geometries_of,
     oriented,
 )
@@ -127,11 +127,11 @@ class PlacedModel:
         model._parallax = [parallax.copy() for parallax in self._parallax]
         return model
 
-    def witnesses(self, image: int, partners: Sequence[int] | None = None) -> Witnesses:
+    def evidence(self, image: int, partners: Sequence[int] | None = None) -> PairEvidence:
         """Return the evidence of the pairs of an image with all, or with the given, registered images for its pose."""
         if partners is None:
             partners = [idx for idx in self.pairs.partners[image] if idx in self.cameras][:_MAX_PARTNERS]
-        return gather_witnesses(
+        return gather_pair_evidence(
             image,
             partners,
             geometries=self.pairs.geometries,
@@ -142,25 +142,25 @@ class PlacedModel:
             kappa=self.pairs.kappa,
         )
 
-    def place(self, image: int) -> tuple[Witnesses, list[Placement]]:
+    def place(self, image: int) -> tuple[PairEvidence, list[Placement]]:
         """Return the evidence of the pairs of an image for its pose, and the poses on which they agree, best first."""
-        witnesses = self.witnesses(image)
-        return witnesses, placements(witnesses)
+        evidence = self.evidence(image)
+        return evidence, placements(evidence)
 
     def add(self, image: int, cam_from_world: Rigid3) -> None:
         """Register an image, choose the geometries of its pairs that agree, and update ranges from them."""
         self.cameras[image] = cam_from_world
-        witnesses = self.witnesses(image)
+        evidence = self.evidence(image)
         for edge in [edge for edge in self.chosen if image in edge]:
             del self.chosen[edge]
-        if not len(witnesses):
+        if not len(evidence):
             return
-        agrees = agreement(witnesses, cam_from_world.rotation[None], cam_from_world.center[None])[0]
+        agrees = agreement(evidence, cam_from_world.rotation[None], cam_from_world.center[None])[0]
         for idx in np.flatnonzero(agrees):
-            edge = _edge(image, int(witnesses.partner[idx]))
+            edge = _edge(image, int(evidence.partner[idx]))
             # Geometries are sorted by weight, so the first one that agrees is the heaviest.
             if edge not in self.chosen:
-                self.chosen[edge] = int(witnesses.rank[idx])
+                self.chosen[edge] = int(evidence.rank[idx])
                 self._learn_ranges(edge)
 
     def remove(self, image: int) -> None:
@@ -198,12 +198,12 @@ class PlacedModel:
             rays.append(self.pairs.bearings[image][mine])
         return np.concatenate(points), np.concatenate(rays)
 
-    def polished(self, image: int, witnesses: Witnesses, placement: Placement) -> tuple[Rigid3, int, int]:
+    def polished(self, image: int, evidence: PairEvidence, placement: Placement) -> tuple[Rigid3, int, int]:
         """Return the pose refined on known points, how many of them it sees where it should, and how many it matches.
 
         A placement that matches too few known points is returned as it is.
         """
-        points, rays = self.known_points(image, explained_partners(witnesses, placement.explained))
+        points, rays = self.known_points(image, explained_partners(evidence, placement.explained))
         pose = placement.cam_from_world
         if len(points) < MIN_POINTS:
             return pose, 0, len(points)
@@ -260,13 +260,13 @@ class PlacedModel:
         """Choose the geometry of every pair of registered images again, by the current cameras."""
         self.chosen = {}
         for image in sorted(self.cameras):
-            witnesses = self.witnesses(image)
-            if not len(witnesses):
+            evidence = self.evidence(image)
+            if not len(evidence):
                 continue
             pose = self.cameras[image]
-            agrees = agreement(witnesses, pose.rotation[None], pose.center[None])[0]
+            agrees = agreement(evidence, pose.rotation[None], pose.center[None])[0]
             for idx in np.flatnonzero(agrees):
-                self.chosen.setdefault(_edge(image, int(witnesses.partner[idx])), int(witnesses.rank[idx]))
+                self.chosen.setdefault(_edge(image, int(evidence.partner[idx])), int(evidence.rank[idx]))
 
     def learn_ranges(self) -> None:
         """Compute the ranges of all matches of the chosen geometries again."""
@@ -321,11 +321,11 @@ class PlacedModel:
             self._parallax[image][keypoints[better]] = parallax[better]
 
 
-def explained_partners(witnesses: Witnesses, explained: NDArray[np.bool_]) -> dict[int, int]:
+def explained_partners(evidence: PairEvidence, explained: NDArray[np.bool_]) -> dict[int, int]:
     """Return the partners with a geometry that agrees, each with the rank of its heaviest such geometry."""
     found: dict[int, int] = {}
     for idx in np.flatnonzero(explained):
-        found.setdefault(int(witnesses.partner[idx]), int(witnesses.rank[idx]))
+        found.setdefault(int(evidence.partner[idx]), int(evidence.rank[idx]))
     return found
 
 

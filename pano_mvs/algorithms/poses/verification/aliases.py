@@ -220,20 +220,22 @@ def _suggestions(model: PlacedModel) -> list[_Suggestion]:
         if i not in model.cameras or j not in model.cameras:
             continue
         for fixed, image, sign in ((i, j, 1.0), (j, i, -1.0)):
-            witnesses = model.witnesses(image, [fixed])
+            pair_evidence = model.evidence(image, [fixed])
             distance = float(np.linalg.norm(model.cameras[image].center - model.cameras[fixed].center))
-            for idx in np.flatnonzero(np.isfinite(witnesses.lengths)):
-                if model.chosen.get((i, j)) == witnesses.rank[idx]:
+            for idx in np.flatnonzero(np.isfinite(pair_evidence.lengths)):
+                if model.chosen.get((i, j)) == pair_evidence.rank[idx]:
                     continue
-                there = witnesses.origins[idx] + witnesses.lengths[idx] * witnesses.directions[idx]
+                there = pair_evidence.origins[idx] + pair_evidence.lengths[idx] * pair_evidence.directions[idx]
                 here = model.cameras[image]
-                turn = witnesses.rotations[idx].T @ here.rotation
+                turn = pair_evidence.rotations[idx].T @ here.rotation
                 motion = Rigid3(turn, there - turn @ here.center)
                 displacement = sign * (there - here.center)
                 if float(np.linalg.norm(displacement)) > _MIN_MOVE * distance or _angle(motion) > _MIN_TURN_RAD:
                     motion = motion if sign > 0 else motion.inverse()
                     center = model.cameras[j].center
-                    suggestions.append(_Suggestion((i, j), float(witnesses.weight[idx]), motion, center, displacement))
+                    suggestions.append(
+                        _Suggestion((i, j), float(pair_evidence.weight[idx]), motion, center, displacement)
+                    )
     heaviest = np.sort(np.argsort([-found.weight for found in suggestions], kind="stable")[:_MAX_MOVES])
     return [suggestions[idx] for idx in heaviest]
 

@@ -327,12 +327,12 @@ def _alternatives(model: PlacedModel, image: int, cameras: Mapping[int, Rigid3])
     """Return the poses that an image's pairs with some cameras suggest, refined on known points."""
     without = model.copy()
     without.cameras = dict(cameras)
-    witnesses, places = without.place(image)
+    pair_evidence, places = without.place(image)
     poses = []
     for place in places[:_ALTERNATIVES]:
         if place.score < _MIN_SCORE * places[0].score:
             continue
-        pose, support, known = without.polished(image, witnesses, place)
+        pose, support, known = without.polished(image, pair_evidence, place)
         if enough_points(support, known):
             poses.append(pose)
     return poses

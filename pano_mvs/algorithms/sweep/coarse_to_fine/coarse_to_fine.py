@@ -24,7 +24,7 @@ from pano_mvs.algorithms.sweep.coarse_to_fine.kernels_guides import split_layers
 from pano_mvs.algorithms.sweep.exposure import shrink
 from pano_mvs.algorithms.sweep.hypotheses import virtual_ranges
 from pano_mvs.algorithms.sweep.numba.threads import workers
-from pano_mvs.algorithms.sweep.preparation import SweepInput, voting_pixels
+from pano_mvs.algorithms.sweep.preparation import SweepInput, pixels_with_valid_window
 from pano_mvs.algorithms.sweep.winner import Winners, subplane_offset
 from pano_mvs.geometry import pad_panorama
 
@@ -82,7 +82,7 @@ def _halved_masks(work: SweepInput) -> tuple[NDArray[np.bool_], ...] | None:
         return None
     radius = work.settings.compare_radius + work.settings.box_radius
     halves = [_halved(255 * mask.astype(np.uint8)[..., None])[..., 0] == 255 for mask in work.source_valid]
-    return tuple(voting_pixels(half, -(-radius // 2)) for half in halves)
+    return tuple(pixels_with_valid_window(half, -(-radius // 2)) for half in halves)
 
 
 def _guides(found: Winners, coarse: SweepInput, work: SweepInput) -> NDArray[np.float32]:

@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 from pano_mvs.algorithms.filters.sphere.steps import columns_per_step
 from pano_mvs.algorithms.fusion.normals import normals_from_range
 from pano_mvs.algorithms.fusion.settings import FusionSettings
-from pano_mvs.algorithms.fusion.view import FusionView, Sight, SightWindow, held_rays, nearest_views, sight_of
+from pano_mvs.algorithms.fusion.view import (
+    ConfidentView,
+    FusionView,
+    ViewWindow,
+    confident_view,
+    held_rays,
+    nearest_views,
+)
 from pano_mvs.algorithms.fusion.voxels import VoxelGrid
 from pano_mvs.core.bands import for_bands
 from pano_mvs.geometry import Rigid3
@@ -64,7 +71,7 @@ def fuse_stream(
         UsageError: as `fuse_views`.
     """
     chosen = settings or FusionSettings()
-    window = SightWindow(load, min_confidence=chosen.min_confidence, size=chosen.neighbours + 1)
+    window = ViewWindow(load, min_confidence=chosen.min_confidence, size=chosen.neighbours + 1)
     grid = None if chosen.voxel_size is None else VoxelGrid(chosen.voxel_size)
     clouds: list[PointCloud] = []
     for idx, neighbours in enumerate(nearest_views(poses, chosen.neighbours)):
@@ -109,9 +116,9 @@ def fuse_reference(
     """
     chosen = settings or FusionSettings()
     views = [*earlier, *later]
-    window = SightWindow(views.__getitem__, min_confidence=chosen.min_confidence, size=1)
+    window = ViewWindow(views.__getitem__, min_confidence=chosen.min_confidence, size=1)
     sources = [(window, idx, _tie(is_earlier=idx < len(earlier))) for idx in range(len(views))]
-    return _points_of(sight_of(reference, min_confidence=chosen.min_confidence), sources, chosen, threads)
+    return _points_of(confident_view(reference, min_confidence=chosen.min_confidence), sources, chosen, threads)
 
 
 def join_clouds(clouds: Sequence[PointCloud]) -> PointCloud:
@@ -129,7 +136,7 @@ def join_clouds(clouds: Sequence[PointCloud]) -> PointCloud:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Tallies:
-    """Agreement of the sources with each pixel, as computed by `kernels_vote.vote`."""
+    """Agreement of the sources with each pixel, as computed by `kernels_fuse.add_source`."""
 
     yields: NDArray[np.bool_]
     counts: NDArray[np.uint8]
@@ -144,7 +151,7 @@ class _Tallies:
 
 
 def _points_of(
-    reference: Sight, sources: Sequence[tuple[SightWindow, int, float]], settings: FusionSettings, threads: int
+    reference: ConfidentView, sources: Sequence[tuple[ViewWindow, int, float]], settings: FusionSettings, threads: int
 ) -> PointCloud:
     """Return the points of one view; sources are (window of views, position in it, `_tie`)."""
     height, width = reference.ranges.shape
@@ -167,7 +174,7 @@ def _points_of(
     )
 
 
-def _own_tallies(reference: Sight, rays: NDArray[np.float64], normals: NDArray[np.float32]) -> _Tallies:
+def _own_tallies(reference: ConfidentView, rays: NDArray[np.float64], normals: NDArray[np.float32]) -> _Tallies:
     """Return tallies with only the reference's own pixels."""
     shape = reference.ranges.shape
     ranges = reference.ranges.astype(np.float64)
@@ -185,14 +192,14 @@ def _own_tallies(reference: Sight, rays: NDArray[np.float64], normals: NDArray[n
 
 
 def _compare_with(
-    source: Sight,
+    source: ConfidentView,
     tie: float,
-    pixels: tuple[Sight, NDArray[np.float64], NDArray[np.float32], NDArray[np.bool_]],
+    pixels: tuple[ConfidentView, NDArray[np.float64], NDArray[np.float32], NDArray[np.bool_]],
     settings: FusionSettings,
     tallies: _Tallies,
     threads: int,
 ) -> None:
-    from pano_mvs.algorithms.fusion.kernels_vote import vote  # compiles on import
+    from pano_mvs.algorithms.fusion.kernels_fuse import add_source  # compiles on import
 
     reference, *grids = pixels
     height, width = reference.ranges.shape
@@ -215,12 +222,12 @@ def _compare_with(
     arrays = (*relation, source.ranges, source.confidence, source.image)
 
     def of_rows(first: int, rows: int) -> None:
-        vote((reference.ranges, *grids), arrays, limits, (first, first + rows), tallies.arrays())
+        add_source((reference.ranges, *grids), arrays, limits, (first, first + rows), tallies.arrays())
 
     for_bands(of_rows, height, threads=threads)
 
 
-def _kept(reference: Sight, tallies: _Tallies, settings: FusionSettings) -> NDArray[np.bool_]:
+def _kept(reference: ConfidentView, tallies: _Tallies, settings: FusionSettings) -> NDArray[np.bool_]:
     """Return the pixels, (H, W), that become points."""
     from pano_mvs.algorithms.fusion.kernels_support import find_supported  # compiles on import
 
@@ -244,7 +251,7 @@ def _tie(*, is_earlier: bool) -> float:
 
 
 def _normals_or_views(
-    reference: Sight, rays: NDArray[np.float64], wanted: NDArray[np.bool_], threads: int
+    reference: ConfidentView, rays: NDArray[np.float64], wanted: NDArray[np.bool_], threads: int
 ) -> NDArray[np.float32]:
     """Return unit normals, (H, W, 3): given or, where wanted, fitted ones, else the direction to the camera."""
     normals = normals_from_range(reference.ranges, given=reference.normals, wanted=wanted, threads=threads)

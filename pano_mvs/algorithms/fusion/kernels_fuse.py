@@ -56,7 +56,9 @@ def confidence_at(confidence: NDArray[np.uint8], x: float, y: float) -> int:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def vote(reference: Reference, source: Source, limits: FloatArray, rows: tuple[int, int], tallies: Tallies) -> None:
+def add_source(
+    reference: Reference, source: Source, limits: FloatArray, rows: tuple[int, int], tallies: Tallies
+) -> None:
     """Add one source's support for the pixels of the rows [first, end) of a reference view.
 
     `reference` is (ranges, rays, normals, bool where a point may be written); `source` is (rotation, translation of

@@ -16,7 +16,7 @@ _FAR = 1 << 29
 _START = -(1 << 30)
 
 
-def fits_whole_numbers(descriptors: NDArray[np.generic]) -> bool:
+def can_compare_as_integers(descriptors: NDArray[np.generic]) -> bool:
     """Return whether descriptors (N, D) are integers small enough for an exact comparison on this machine."""
     from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR
 
@@ -27,11 +27,11 @@ def fits_whole_numbers(descriptors: NDArray[np.generic]) -> bool:
     return greatest**2 * descriptors.shape[1] <= _MAX_SQUARE and np.array_equal(descriptors, np.rint(descriptors))
 
 
-def nearest_two_whole(first: NDArray[np.generic], second: NDArray[np.generic]) -> NearestTwo:
+def nearest_two_integers(first: NDArray[np.generic], second: NDArray[np.generic]) -> NearestTwo:
     """Return the two nearest neighbours of each descriptor by Euclidean distance, like `nearest_two`, without rounding.
 
     Args:
-        first: (N, D) integers for which `fits_whole_numbers` is true.
+        first: (N, D) integers for which `can_compare_as_integers` is true.
         second: (M, D) likewise, M at least 2.
 
     Raises:
@@ -65,11 +65,11 @@ class PackedDescriptors:
         """Return descriptors (N, D) packed.
 
         Raises:
-            UsageError: if `fits_whole_numbers` is false for them.
+            UsageError: if `can_compare_as_integers` is false for them.
         """
         from pano_mvs.algorithms.matching import kernels_vector_match as kernels
 
-        if not fits_whole_numbers(descriptors):
+        if not can_compare_as_integers(descriptors):
             raise UsageError("descriptors must be small integers, on a machine with vector instructions")
         rows, columns = _filled_up(descriptors, kernels.ROWS), _filled_up(descriptors, kernels.COLUMNS)
         packed = columns.reshape(-1, kernels.COLUMNS, columns.shape[1] // 2, 2).transpose(0, 2, 1, 3)
@@ -78,7 +78,7 @@ class PackedDescriptors:
 
 
 def nearest_two_packed(first: PackedDescriptors, second: PackedDescriptors) -> NearestTwo:
-    """Return the result of `nearest_two_whole`; `second` holds two or more descriptors of the same length."""
+    """Return the result of `nearest_two_integers`; `second` holds two or more descriptors of the same length."""
     from pano_mvs.algorithms.matching import kernels_vector_match as kernels
 
     state = np.full((len(first.rows), 3, kernels.LANES), _START, np.int32)

@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.matching.brute_force import match_features
+from pano_mvs.algorithms.matching.integer_descriptors import can_compare_as_integers, nearest_two_integers
 from pano_mvs.algorithms.matching.nearest_two import NearestTwo, nearest_two
-from pano_mvs.algorithms.matching.whole_numbers import fits_whole_numbers, nearest_two_whole
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR
 from pano_mvs.core.errors import UsageError
 from tests.algorithms.features.test_matching import features
@@ -36,7 +36,7 @@ def test_kernel_equals_the_plain_products(counts: tuple[int, int], size: int) ->
     """Counts at and beside full blocks of rows and columns; an odd number of components."""
     rng = np.random.default_rng([*counts, size])
     first, second = (draw(rng, count, size) for count in counts)
-    assert_same(nearest_two_whole(first, second), nearest_two(first, second))
+    assert_same(nearest_two_integers(first, second), nearest_two(first, second))
 
 
 @pytest.mark.kernel("matching.kernels_vector_match")
@@ -47,7 +47,7 @@ def test_kernel_settles_ties_as_the_plain_products_do() -> None:
     first, second = draw(rng, 90, 4, high=3), draw(rng, 300, 4, high=3)
     expected = nearest_two(first, second)
     assert np.sum(expected.squared == expected.next_squared) > 60
-    assert_same(nearest_two_whole(first, second), expected)
+    assert_same(nearest_two_integers(first, second), expected)
 
 
 @pytest.mark.kernel("matching.kernels_vector_match")
@@ -56,8 +56,8 @@ def test_kernel_is_exact_up_to_the_greatest_numbers_that_fit() -> None:
     """Opposite signs make the products most negative; squared distances are beyond what float32 counts singly."""
     rng = np.random.default_rng(9)
     first, second = draw(rng, 40, 128, low=900, high=1025), draw(rng, 70, 128, low=-1024, high=-900)
-    assert fits_whole_numbers(first)
-    found = nearest_two_whole(first, second)
+    assert can_compare_as_integers(first)
+    found = nearest_two_integers(first, second)
     exact = ((first[:, None].astype(np.int64) - second.astype(np.int64)) ** 2).sum(axis=2)
     np.testing.assert_array_equal(found.nearest, exact.argmin(axis=1))
     np.testing.assert_array_equal(found.squared, exact.min(axis=1).astype(np.float32))
@@ -68,9 +68,9 @@ def test_kernel_is_exact_up_to_the_greatest_numbers_that_fit() -> None:
 @pytest.mark.parametrize("wrong", [0.5, np.nan, np.inf, 2000.0, 1e30])
 def test_other_numbers_are_left_to_the_plain_products(wrong: float) -> None:
     descriptors = np.full((3, 128), 7, np.float32)
-    assert fits_whole_numbers(descriptors) == HAS_VECTOR
+    assert can_compare_as_integers(descriptors) == HAS_VECTOR
     descriptors[1, 5] = wrong
-    assert not fits_whole_numbers(descriptors)
+    assert not can_compare_as_integers(descriptors)
 
 
 @pytest.mark.parametrize("mutual", [True, False])
@@ -91,8 +91,8 @@ def test_matches_equal_the_plain_search_with_and_without_whole_numbers(mutual: b
 def test_refuses_what_it_cannot_compare() -> None:
     whole = np.ones((4, 8), np.float32)
     with pytest.raises(UsageError, match="nearest two among"):
-        nearest_two_whole(whole, whole[:1])
+        nearest_two_integers(whole, whole[:1])
     with pytest.raises(UsageError, match="nearest two among"):
-        nearest_two_whole(whole, np.ones((4, 6), np.float32))
+        nearest_two_integers(whole, np.ones((4, 6), np.float32))
     with pytest.raises(UsageError, match="small integers"):
-        nearest_two_whole(whole, whole + np.float32(0.5))
+        nearest_two_integers(whole, whole + np.float32(0.5))

@@ -17,7 +17,7 @@ _Form: TypeAlias = "dict[str, tuple[int, str, bool]]"
 _forms: dict[tuple[tuple[str, str, bool], ...], _Form] = {}
 
 
-class PackedParts(Mapping[str, BlobRef]):
+class PackedRefs(Mapping[str, BlobRef]):
     """References to blobs by name; equal to a dict with the same entries."""
 
     __slots__ = ("_form", "_packed")

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from pano_mvs.engine.cache.blobs import BlobRef
-from pano_mvs.engine.cache.packed_parts import PackedParts
+from pano_mvs.engine.cache.packed_refs import PackedRefs
 
 PARTS = {
     "meta": BlobRef("0" * 32, 0, ".json"),
@@ -19,18 +19,18 @@ PARTS = {
 
 
 @pytest.mark.parametrize("names", [[], ["array"], list(PARTS), list(reversed(PARTS))])
-def test_packed_parts_equal_a_dict_of_the_same(names: list[str]) -> None:
+def test_packed_references_equal_a_dict_of_the_same(names: list[str]) -> None:
     parts = {name: PARTS[name] for name in names}
-    packed = PackedParts(parts)
+    packed = PackedRefs(parts)
     assert list(packed.items()) == list(parts.items())
     assert packed == parts
     assert parts == packed
-    assert packed == PackedParts(parts)
+    assert packed == PackedRefs(parts)
     assert repr(packed) == repr(parts)
 
 
-def test_packed_parts_differ_in_any_field() -> None:
-    packed = PackedParts(PARTS)
+def test_packed_references_differ_in_any_field() -> None:
+    packed = PackedRefs(PARTS)
     for name, ref in PARTS.items():
         others = [
             BlobRef("2" * 32, ref.size_bytes, ref.suffix, ref.external),
@@ -38,12 +38,12 @@ def test_packed_parts_differ_in_any_field() -> None:
             BlobRef(ref.digest, ref.size_bytes, ".other", ref.external),
             BlobRef(ref.digest, ref.size_bytes, ref.suffix, not ref.external),
         ]
-        assert all(packed != PackedParts(PARTS | {name: other}) for other in others)
+        assert all(packed != PackedRefs(PARTS | {name: other}) for other in others)
     with pytest.raises(KeyError, match="nothing"):
         packed["nothing"]
 
 
-def test_packed_parts_take_a_third_of_the_memory_of_a_dict() -> None:
+def test_packed_references_take_a_third_of_the_memory_of_a_dict() -> None:
     def bytes_of(make: Callable[[dict[str, BlobRef]], object]) -> int:
         tracemalloc.start()
         held = [make({name: BlobRef(f"{idx:032x}", 1000 + idx, ".npy") for name in PARTS}) for idx in range(100)]
@@ -52,4 +52,4 @@ def test_packed_parts_take_a_third_of_the_memory_of_a_dict() -> None:
         assert len(held) == 100
         return found
 
-    assert 3 * bytes_of(PackedParts) < bytes_of(dict)
+    assert 3 * bytes_of(PackedRefs) < bytes_of(dict)
