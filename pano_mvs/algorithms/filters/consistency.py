@@ -102,7 +102,8 @@ def checked_with_agreement(
         min_contradictions: number of sources that must contradict; at most the number of sources.
 
     Returns:
-        The checked range map with the uncertainty of its ranges (`confirmed_uncertainty`), and the agreement of the sources with the view as a whole.
+        The checked range map with the uncertainty of its ranges (`confirmed_uncertainty`), and the agreement of the
+        sources with the view as a whole.
 
     Raises:
         UsageError: if sources and poses differ in number, or a setting is out of bounds.

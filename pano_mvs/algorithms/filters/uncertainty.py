@@ -32,7 +32,13 @@ _LEAST, _MOST = 0.0005, 0.5
 
 
 def confirmed_uncertainty(
-    consistent: Mask, seen: Mask, *, support: FloatArray, squared_error: FloatArray, motion: FloatArray, step: FloatArray
+    consistent: Mask,
+    seen: Mask,
+    *,
+    support: FloatArray,
+    squared_error: FloatArray,
+    motion: FloatArray,
+    step: NDArray[np.float32],
 ) -> NDArray[np.float16]:
     """Return the relative standard deviation of ranges, (H, W); `UNCONFIRMED_UNCERTAINTY` where they are not confirmed.
 
@@ -48,17 +54,21 @@ def confirmed_uncertainty(
         motion: (H, W) M in pixels.
         step: (H, W) ln(largest / smallest range) around the pixel.
     """
-    height = consistent.shape[0]
-    near, wide = (max(1, min(radius, height // 2 - 1)) for radius in (_PRECISION_RADIUS, _SHARE_RADIUS))
-    confirmed = consistent.astype(np.float64)
-    squares, supports = np.moveaxis(box_sum(np.stack([squared_error, support], axis=-1) * confirmed[..., None], near), -1, 0)
-    layers = np.stack([confirmed, seen, step > _STEP, np.ones(seen.shape)], axis=-1)
-    agreed, observed, steps, pixels = np.moveaxis(box_sum(layers.astype(np.float64), wide), -1, 0)
-    error_px = np.sqrt(np.maximum(squares, 0) / np.maximum(supports, 1e-9))
-    share = np.maximum(agreed / np.maximum(observed, 1), _MIN_SHARE)
-    scale = _SCALE * (1 + _STEP_WEIGHT * steps / pixels) / share**2
-    sigma = scale * np.maximum(error_px, _MIN_ERROR_PX) / np.maximum(motion, 1e-9)
+    near, wide = (max(1, min(radius, len(seen) // 2 - 1)) for radius in (_PRECISION_RADIUS, _SHARE_RADIUS))
+    sigma = box_sum(np.where(consistent, squared_error, 0), near)
+    sigma /= np.maximum(box_sum(np.where(consistent, support, 0), near), 1e-9)
+    sigma = np.maximum(np.sqrt(np.maximum(sigma, 0)), _MIN_ERROR_PX)
+    sigma /= _share(consistent, seen, wide) ** 2
+    sigma *= 1 + _STEP_WEIGHT * _share(step > _STEP, np.ones_like(seen), wide, least=0)
+    sigma *= _SCALE / np.maximum(motion, 1e-9)
     return np.where(consistent, np.clip(sigma, _LEAST, _MOST), UNCONFIRMED_UNCERTAINTY).astype(np.float16)
+
+
+def _share(part: Mask, whole: Mask, radius: int, *, least: float = _MIN_SHARE) -> FloatArray:
+    """Return the share of the pixels of a set within a window that are in a part of it."""
+    share = box_sum(part.astype(np.float64), radius)
+    share /= np.maximum(box_sum(whole.astype(np.float64), radius), 1)
+    return np.asarray(np.maximum(share, least))
 
 
 def replaced_uncertainty(

@@ -43,6 +43,7 @@ class ConfidentView:
         confidence: (H, W) uint8.
         image: (H, W, 3) uint8.
         normals: (H, W, 3) float32 normals of the range map, or None.
+        uncertainty: (H, W) float32 relative standard deviation of the range, or None.
     """
 
     pose: Rigid3
@@ -50,6 +51,7 @@ class ConfidentView:
     confidence: NDArray[np.uint8]
     image: NDArray[np.uint8]
     normals: NDArray[np.float32] | None
+    uncertainty: NDArray[np.float32] | None = None
 
 
 @lru_cache(maxsize=1)
@@ -77,13 +79,14 @@ def confident_view(view: FusionView, *, min_confidence: int) -> ConfidentView:
         if view.mask.shape != ranges.shape:
             raise UsageError(f"a view's mask must have the size of its range map {ranges.shape}, got {view.mask.shape}")
         good &= view.mask
-    given = view.range_map.normals_in_cam
+    given, uncertainty = view.range_map.normals_in_cam, view.range_map.uncertainty
     return ConfidentView(
         view.pose,
         np.where(good, ranges, np.float32(np.nan)),
         np.ascontiguousarray(confidence),
         np.ascontiguousarray(view.image),
         None if given is None else np.where(good[..., None], given, np.float16(np.nan)).astype(np.float32),
+        None if uncertainty is None else uncertainty.astype(np.float32),
     )
 
 

@@ -1,0 +1,120 @@
+"""Compiled: the height of the surface of a point's neighbours above the point."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.fusion.kernels_normals import solve_symmetric
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Cloud = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
+Cells = tuple[IntArray, IntArray, IntArray]
+
+_MIN_COSINE = 0.8
+_MAX_DEVIATIONS = 2.0
+_MAX_OFF_CENTER = 0.3
+_MIN_NEIGHBOURS = 6
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def cell_range(keys: IntArray, key: int) -> tuple[int, int]:
+    """Return the first position of a key among sorted keys, and the first one behind it."""
+    begin = int(np.searchsorted(keys, key))
+    return begin, begin + int(np.searchsorted(keys[begin:], key, side="right"))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def tangents(normal: NDArray[np.float32]) -> tuple[float, float, float, float, float, float]:
+    """Return two unit vectors perpendicular to a normal and to each other."""
+    x, y, z = float(normal[0]), float(normal[1]), float(normal[2])
+    # Across the axis that is least aligned with the normal.
+    if abs(x) <= abs(y) and abs(x) <= abs(z):
+        a, b, c = 0.0, z, -y
+    elif abs(y) <= abs(z):
+        a, b, c = -z, 0.0, x
+    else:
+        a, b, c = y, -x, 0.0
+    length = math.sqrt(a * a + b * b + c * c)
+    a, b, c = a / length, b / length, c / length
+    return a, b, c, y * c - z * b, z * a - x * c, x * b - y * a
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def add_neighbour(cloud: Cloud, i: int, j: int, axes: FloatArray, radius: float, a: FloatArray, b: FloatArray) -> float:
+    """Add point j to the normal equations of the plane h + s u + t v around point i; return its weight, 0 if unused."""
+    points, normals, sigmas = cloud
+    cosine = 0.0
+    for axis in range(3):
+        cosine += normals[i, axis] * normals[j, axis]
+    if cosine < _MIN_COSINE:
+        return 0.0
+    height, u, v = 0.0, 0.0, 0.0
+    for axis in range(3):
+        offset = float(points[j, axis]) - float(points[i, axis])
+        height += offset * normals[i, axis]
+        u += offset * axes[axis]
+        v += offset * axes[3 + axis]
+    share = (u * u + v * v) / (radius * radius)
+    variance = sigmas[i] * sigmas[i] + sigmas[j] * sigmas[j]
+    deviation = height * height / (_MAX_DEVIATIONS * _MAX_DEVIATIONS * variance)
+    if share >= 1 or deviation >= 1:
+        return 0.0
+    weight: float = (1 - share) ** 2 * (1 - deviation) ** 2 / (sigmas[j] * sigmas[j])
+    u, v = u / radius, v / radius
+    a[0] += weight
+    a[1] += weight * u
+    a[2] += weight * v
+    a[3] += weight * u * u
+    a[4] += weight * u * v
+    a[5] += weight * v * v
+    b[0] += weight * height
+    b[1] += weight * height * u
+    b[2] += weight * height * v
+    return weight
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def find_heights(
+    cloud: Cloud,
+    radii: FloatArray,
+    chosen: IntArray,
+    cells: Cells,
+    most: int,
+    heights: FloatArray,
+    part: tuple[int, int],
+) -> None:
+    """Write the heights of the surface above the points chosen[first:end]; 0 where it is undefined.
+
+    Args:
+        cloud: (N, 3) points, (N, 3) normals and (N,) standard deviations.
+        radii: (N,) radius within which neighbours count.
+        chosen: indices of points, the radii of which are at most the edge of a cell.
+        cells: (N,) sorted keys of cells, (N,) the points in that order, and (27 + N,): the differences of keys to the
+            27 neighbouring cells, then the key of each point.
+        most: number of points of a cell that count, evenly among them.
+        heights: (N,) written, along the normal.
+        part: first and end.
+    """
+    keys, order, own = cells
+    a, b, axes = np.empty(6), np.empty(3), np.empty(6)
+    for number in range(part[0], part[1]):
+        i = chosen[number]
+        axes[0], axes[1], axes[2], axes[3], axes[4], axes[5] = tangents(cloud[1][i])
+        a[:] = 0.0
+        b[:] = 0.0
+        count = 0
+        for cell in range(27):
+            begin, end = cell_range(keys, own[27 + i] + own[cell])
+            inside = min(end - begin, most)
+            for k in range(inside):
+                j = order[begin + k * (end - begin) // inside]
+                if add_neighbour(cloud, i, j, axes, radii[i], a, b) > 0:
+                    count += 1
+        height, _, _, ok = solve_symmetric(a, b)
+        off_center = (a[1] * a[1] + a[2] * a[2]) / (_MAX_OFF_CENTER * _MAX_OFF_CENTER * a[0] * a[0])
+        heights[i] = height if ok and count >= _MIN_NEIGHBOURS and off_center < 1 else 0.0
