@@ -13,7 +13,7 @@ from pano_mvs.algorithms.fusion.kernels_normals import solve_symmetric
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Cloud = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
-Cells = tuple[IntArray, IntArray, IntArray]
+Cells = tuple[IntArray, IntArray, IntArray, IntArray, IntArray]
 
 _MIN_COSINE = 0.8
 _MAX_DEVIATIONS = 2.0
@@ -22,10 +22,13 @@ _MIN_NEIGHBOURS = 6
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def cell_range(keys: IntArray, key: int) -> tuple[int, int]:
-    """Return the first position of a key among sorted keys, and the first one behind it."""
-    begin = int(np.searchsorted(keys, key))
-    return begin, begin + int(np.searchsorted(keys[begin:], key, side="right"))
+def column_range(keys: IntArray, starts: IntArray, key: int) -> tuple[int, int]:
+    """Return where the points of a cell and of those before and behind it begin and end; their keys are successive."""
+    first = int(np.searchsorted(keys, key - 1))
+    end = first
+    while end < len(keys) and keys[end] <= key + 1:
+        end += 1
+    return starts[first], starts[end]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -94,13 +97,14 @@ def find_heights(
         cloud: (N, 3) points, (N, 3) normals and (N,) standard deviations.
         radii: (N,) radius within which neighbours count.
         chosen: indices of points, the radii of which are at most the edge of a cell.
-        cells: (N,) sorted keys of cells, (N,) the points in that order, and (27 + N,): the differences of keys to the
-            27 neighbouring cells, then the key of each point.
-        most: number of points of a cell that count, evenly among them.
+        cells: sorted keys of the occupied cells, where the points of each begin (and the last ends), the points in
+            that order, (N,) the key of the cell of each point, and the differences to the keys of the 9 columns of
+            three cells around a cell.
+        most: number of points of a column that count, evenly among them.
         heights: (N,) written, along the normal.
         part: first and end.
     """
-    keys, order, own = cells
+    keys, starts, order, own, steps = cells
     a, b, axes = np.empty(6), np.empty(3), np.empty(6)
     for number in range(part[0], part[1]):
         i = chosen[number]
@@ -108,8 +112,8 @@ def find_heights(
         a[:] = 0.0
         b[:] = 0.0
         count = 0
-        for cell in range(27):
-            begin, end = cell_range(keys, own[27 + i] + own[cell])
+        for step in steps:
+            begin, end = column_range(keys, starts, own[i] + step)
             inside = min(end - begin, most)
             for k in range(inside):
                 j = order[begin + k * (end - begin) // inside]

@@ -17,13 +17,14 @@ from pano_mvs.scene import PointCloud
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-# Neighbours count within this many standard deviations of the point's position, and no point moves by more than this
-# many in one pass.
-_REACH, _MAX_MOVE = 2.0, 0.5
+_PASSES = 2
+# Neighbours count within this many standard deviations of the point's position.
+_REACH = 2.0
 # Larger standard deviations, relative to the distance of the nearest camera, reach no farther.
 _MOST_UNCERTAIN = 0.03
-_PASSES = 2
-_POINTS_PER_CELL = 8
+_POINTS_PER_COLUMN = 15
+# Points with a smaller standard deviation, relative to the same distance, stay where they are.
+_LEAST_UNCERTAIN = 0.005
 _MAX_LEVELS, _MAX_CELLS_PER_AXIS = 16, 1 << 20
 
 
@@ -34,7 +35,7 @@ def smooth_surfaces(cloud: PointCloud, centers: FloatArray, *, threads: int = 1)
     plane at a point is fitted to the points within twice its standard deviation σ that have a similar normal and whose
     distance from it can be explained by both uncertainties, weighted by their precision. In each of two passes, the
     point moves by the height of the plane, at most by σ/2. σ is at most 3 % of the distance of the nearest camera.
-    Points whose neighbours are few or all on one side stay where they are.
+    Points with less than 0.5 %, and points whose neighbours are few or all on one side, stay where they are.
 
     Args:
         cloud: N points of one group; unchanged if it has no uncertainty.
@@ -46,11 +47,11 @@ def smooth_surfaces(cloud: PointCloud, centers: FloatArray, *, threads: int = 1)
     points, normals = np.ascontiguousarray(cloud.points_in_world), np.ascontiguousarray(cloud.normals_in_world)
     distances = np.asarray(cKDTree(centers).query(points)[0], np.float32)
     sigmas = np.maximum(np.minimum(cloud.uncertainty, _MOST_UNCERTAIN * distances), np.float32(1e-12))
+    chosen = np.flatnonzero(sigmas >= _LEAST_UNCERTAIN * distances)
+    most = sigmas / _PASSES
     for _ in range(_PASSES):
-        moves = np.clip(
-            surface_heights(points, normals, sigmas, threads=threads), -_MAX_MOVE * sigmas, _MAX_MOVE * sigmas
-        )
-        points = (points + moves[:, None] * normals).astype(np.float32)
+        heights = surface_heights(points, normals, sigmas, chosen=chosen, threads=threads)
+        points = (points + np.clip(heights, -most, most)[:, None] * normals).astype(np.float32)
     return replace(cloud, points_in_world=points)
 
 
@@ -59,7 +60,8 @@ def surface_heights(
     normals: NDArray[np.float32],
     sigmas: NDArray[np.float32],
     *,
-    per_cell: int = _POINTS_PER_CELL,
+    chosen: IntArray | None = None,
+    per_column: int = _POINTS_PER_COLUMN,
     threads: int = 1,
 ) -> FloatArray:
     """Return the heights (N,) along their normals of the planes of their neighbours above points; 0 if undefined.
@@ -68,16 +70,19 @@ def surface_heights(
         points: (N, 3), N ≥ 1.
         normals: (N, 3) unit vectors.
         sigmas: (N,) standard deviations, positive.
-        per_cell: of each of the 27 cells around a point, whose edge is at least its reach, this many points count.
+        chosen: indices of the points whose heights are wanted; those of others are 0. None: all.
+        per_column: of each of the 9 columns of three cells around a point, this many points count; the edge of a cell
+            is at least the reach of the point.
         threads: as in `smooth_surfaces`.
     """
     from pano_mvs.algorithms.fusion.kernels_smooth import find_heights  # compiles on import
 
     radii = _REACH * sigmas.astype(np.float64)
     heights = np.zeros(len(points))
-    for chosen, edge in _levels(points, radii):
-        arguments = (points, normals, sigmas), radii, chosen, _cells(points, edge), per_cell, heights
-        for_bands(partial(_find, find_heights, arguments), len(chosen), threads=threads)
+    wanted = np.arange(len(points)) if chosen is None else chosen
+    for some, edge in _levels(points, radii, wanted):
+        arguments = (points, normals, sigmas), radii, some, _cells(points, edge), per_column, heights
+        for_bands(partial(_find, find_heights, arguments), len(some), threads=threads)
     return heights
 
 
@@ -85,22 +90,24 @@ def _find(kernel: Callable[..., object], arguments: tuple[object, ...], first: i
     kernel(*arguments, (first, first + count))
 
 
-def _levels(points: NDArray[np.float32], radii: FloatArray) -> list[tuple[IntArray, float]]:
-    """Return the points of each level and the edge of its cells, which is not smaller than their radii."""
+def _levels(points: NDArray[np.float32], radii: FloatArray, wanted: IntArray) -> list[tuple[IntArray, float]]:
+    """Return the wanted points of each level, and the edge of its cells, which is not smaller than their radii."""
+    if not len(wanted):
+        return []
     extent = float((points.max(axis=0) - points.min(axis=0)).max())
-    least = max(
-        float(np.quantile(radii, 0.05)), float(radii.max()) / 2 ** (_MAX_LEVELS - 1), extent / _MAX_CELLS_PER_AXIS
-    )
-    level = np.ceil(np.log2(np.maximum(radii / least, 1))).astype(np.int64)
-    return [(np.flatnonzero(level == number), least * 2.0**number) for number in np.unique(level)]
+    most = float(radii[wanted].max()) / 2 ** (_MAX_LEVELS - 1)
+    least = max(float(np.quantile(radii[wanted], 0.3)), most, extent / _MAX_CELLS_PER_AXIS)
+    level = np.ceil(np.log2(np.maximum(radii[wanted] / least, 1))).astype(np.int64)
+    return [(wanted[level == number], least * 2.0**number) for number in np.unique(level)]
 
 
-def _cells(points: NDArray[np.float32], edge: float) -> tuple[IntArray, IntArray, IntArray]:
-    """Return the sorted keys of cells, the points in that order, and the steps to neighbours before the keys."""
+def _cells(points: NDArray[np.float32], edge: float) -> tuple[IntArray, ...]:
+    """Return the points sorted by cells of this edge, as `find_heights` needs them."""
     places = np.floor((points - points.min(axis=0)) / edge).astype(np.int64) + 1
     size = places.max(axis=0) + 2
     strides = np.array([size[1] * size[2], size[2], 1], np.int64)
     own = places @ strides
     order = np.argsort(own, kind="stable")
-    steps = np.array(list(product((-1, 0, 1), repeat=3)), np.int64) @ strides
-    return own[order], order, np.concatenate([steps, own])
+    keys, starts = np.unique(own[order], return_index=True)
+    steps = np.array(list(product((-1, 0, 1), repeat=2)), np.int64) @ strides[:2]
+    return keys, np.append(starts, len(own)), order, own, steps

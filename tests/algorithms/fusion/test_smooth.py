@@ -38,11 +38,11 @@ def wall(rng: np.random.Generator, *, noise: float, sigma: float, count: int = 4
 def test_heights_equal_the_plain_fit() -> None:
     rng = np.random.default_rng(3)
     points = rng.uniform(-1, 1, (150, 3)) * (1, 1, 0.1)
-    normals = rng.normal(0, 0.2, (150, 3)) + (0, 0, 1)
+    normals = rng.normal((0, 0, 1), 0.2, (150, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     sigmas = rng.uniform(0.1, 0.4, 150).astype(np.float32)
     arrays = points.astype(np.float32), normals.astype(np.float32), sigmas
-    found, expected = surface_heights(*arrays, per_cell=1000, threads=2), oracle.surface_heights(*arrays)
+    found, expected = surface_heights(*arrays, per_column=1000, threads=2), oracle.surface_heights(*arrays)
     np.testing.assert_allclose(found, expected, atol=1e-5)
     assert 0.1 < (expected != 0).mean() < 0.95
 
@@ -57,16 +57,16 @@ def test_a_noisy_wall_becomes_thin() -> None:
 
 
 def test_no_point_moves_by_more_than_its_uncertainty() -> None:
-    before = wall(np.random.default_rng(1), noise=0.03, sigma=0.01)
+    before = wall(np.random.default_rng(1), noise=0.03, sigma=0.02)
     moves = np.linalg.norm(smooth_surfaces(before, CENTERS).points_in_world - before.points_in_world, axis=1)
-    assert 0.003 < moves.max() < 0.0101
+    assert 0.01 < moves.max() < 0.0201
 
 
 def test_two_surfaces_farther_apart_than_their_uncertainty_stay_apart() -> None:
     rng = np.random.default_rng(2)
     first, second = (wall(rng, noise=0.003, sigma=0.01, count=3000) for _ in range(2))
-    points = np.concatenate([first.points_in_world, second.points_in_world + np.float32([0, 0, 0.1])])
-    both = cloud_of(points.astype(float), np.array([0.0, 0.0, -1.0]), 0.01)
+    points = np.concatenate([first.points_in_world, second.points_in_world + np.array([0, 0, 0.1])])
+    both = cloud_of(points, np.array([0.0, 0.0, -1.0]), 0.01)
     after = smooth_surfaces(both, CENTERS).points_in_world[:, 2]
     np.testing.assert_allclose([after[:3000].mean(), after[3000:].mean()], [3, 3.1], atol=0.001)
 
