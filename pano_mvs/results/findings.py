@@ -18,6 +18,8 @@ GOOD_RESIDUAL_PX, FAIR_RESIDUAL_PX = 1.0, 2.0
 GOOD_COMPLETE, FAIR_COMPLETE = 0.8, 0.35
 # Plain walls are confirmed by nobody: a third of a furnished room is as much as can be had.
 GOOD_CONSISTENT, FAIR_CONSISTENT = 0.3, 0.12
+# Of plain ceilings and floors hardly anything is confirmed, and their ranges may be anything.
+FAIR_CONFIRMED_SIDE = 0.15
 _FEW_LINKS = 2
 _SHOWN_GROUPS = 5
 _SHOWN_DOUBTS = 5
@@ -50,6 +52,7 @@ def findings(summary: RunSummary, *, residual_px: float | None = None) -> tuple[
         *_graph(summary),
         *_residual(residual_px),
         *_views(summary),
+        *_sides(summary),
         *_cloud(summary),
         *_baseline(summary),
     ]
@@ -245,6 +248,24 @@ def _views(summary: RunSummary) -> list[Finding]:
                 "far apart or the poses are wrong.",
             )
         )
+    return found
+
+
+def _sides(summary: RunSummary) -> list[Finding]:
+    """Return whether most ranges above or below the cameras are unconfirmed, in half of the views."""
+    found = []
+    for side, surface in (("above", "ceilings"), ("below", "floors")) if compares_views(summary) else ():
+        confirmed = median([view.metrics.get(f"confirmed_{side}") for view in summary.views])
+        if confirmed is not None and confirmed < FAIR_CONFIRMED_SIDE:
+            found.append(
+                Finding(
+                    "fair",
+                    f"Other views confirm only {share(confirmed)} of the ranges {side} the cameras in the median view; "
+                    "the others may be wrong.",
+                    f"Plain {surface} cannot be matched. Previews show their ranges pale; leave them out by confidence "
+                    "(128 and more is confirmed) or by uncertainty, or use the preset quality.",
+                )
+            )
     return found
 
 

@@ -17,7 +17,7 @@ def surface_heights(
         height = offsets @ normal
         place = offsets @ across.T / (2 * float(sigma))
         share = (place**2).sum(axis=1)
-        deviation = height**2 / (4 * (sigma**2 + sigmas.astype(float) ** 2))
+        deviation = height**2 / (6.25 * (sigma**2 + sigmas.astype(float) ** 2))
         near = (share < 1) & (deviation < 1) & (normals.astype(float) @ normal >= 0.8)
         weight = np.where(near, (1 - share) ** 2 * (1 - deviation) ** 2 / sigmas.astype(float) ** 2, 0.0)
         center = weight @ place / weight.sum()

@@ -13,10 +13,10 @@ from pano_mvs.algorithms.fusion.kernels_normals import solve_symmetric
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Cloud = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
-Cells = tuple[IntArray, IntArray, IntArray, IntArray, IntArray]
+Cells = tuple[IntArray, IntArray, IntArray, IntArray]
 
 _MIN_COSINE = 0.8
-_MAX_DEVIATIONS = 2.0
+_MAX_DEVIATIONS = 2.5
 _MAX_OFF_CENTER = 0.3
 _MIN_NEIGHBOURS = 6
 
@@ -51,22 +51,17 @@ def tangents(normal: NDArray[np.float32]) -> tuple[float, float, float, float, f
 def add_neighbour(cloud: Cloud, i: int, j: int, axes: FloatArray, radius: float, a: FloatArray, b: FloatArray) -> float:
     """Add point j to the normal equations of the plane h + s u + t v around point i; return its weight, 0 if unused."""
     points, normals, sigmas = cloud
-    cosine = 0.0
-    for axis in range(3):
-        cosine += normals[i, axis] * normals[j, axis]
-    if cosine < _MIN_COSINE:
-        return 0.0
-    height, u, v = 0.0, 0.0, 0.0
-    for axis in range(3):
-        offset = float(points[j, axis]) - float(points[i, axis])
-        height += offset * normals[i, axis]
-        u += offset * axes[axis]
-        v += offset * axes[3 + axis]
-    share = (u * u + v * v) / (radius * radius)
+    x, y, z = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2]
+    height = float(x * normals[i, 0] + y * normals[i, 1] + z * normals[i, 2])
+    share = (x * x + y * y + z * z - height * height) / (radius * radius)
     variance = sigmas[i] * sigmas[i] + sigmas[j] * sigmas[j]
     deviation = height * height / (_MAX_DEVIATIONS * _MAX_DEVIATIONS * variance)
     if share >= 1 or deviation >= 1:
         return 0.0
+    cosine = normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] + normals[i, 2] * normals[j, 2]
+    if cosine < _MIN_COSINE:
+        return 0.0
+    u, v = x * axes[0] + y * axes[1] + z * axes[2], x * axes[3] + y * axes[4] + z * axes[5]
     weight: float = (1 - share) ** 2 * (1 - deviation) ** 2 / (sigmas[j] * sigmas[j])
     u, v = u / radius, v / radius
     a[0] += weight
@@ -94,17 +89,16 @@ def find_heights(
     """Write the heights of the surface above the points chosen[first:end]; 0 where it is undefined.
 
     Args:
-        cloud: (N, 3) points, (N, 3) normals and (N,) standard deviations.
+        cloud: (N, 3) points, (N, 3) normals and (N,) standard deviations, sorted by cells.
         radii: (N,) radius within which neighbours count.
         chosen: indices of points, the radii of which are at most the edge of a cell.
-        cells: sorted keys of the occupied cells, where the points of each begin (and the last ends), the points in
-            that order, (N,) the key of the cell of each point, and the differences to the keys of the 9 columns of
-            three cells around a cell.
+        cells: keys of the occupied cells, where the points of each begin (and the last ends), (N,) the key of the cell
+            of each point, and the differences to the keys of the 9 columns of three cells around a cell.
         most: number of points of a column that count, evenly among them.
         heights: (N,) written, along the normal.
         part: first and end.
     """
-    keys, starts, order, own, steps = cells
+    keys, starts, own, steps = cells
     a, b, axes = np.empty(6), np.empty(3), np.empty(6)
     for number in range(part[0], part[1]):
         i = chosen[number]
@@ -116,7 +110,7 @@ def find_heights(
             begin, end = column_range(keys, starts, own[i] + step)
             inside = min(end - begin, most)
             for k in range(inside):
-                j = order[begin + k * (end - begin) // inside]
+                j = begin + k * (end - begin) // inside
                 if add_neighbour(cloud, i, j, axes, radii[i], a, b) > 0:
                     count += 1
         height, _, _, ok = solve_symmetric(a, b)

@@ -22,7 +22,7 @@ _PASSES = 2
 _REACH = 2.0
 # Larger standard deviations, relative to the distance of the nearest camera, reach no farther.
 _MOST_UNCERTAIN = 0.03
-_POINTS_PER_COLUMN = 15
+_POINTS_PER_COLUMN = 12
 # Points with a smaller standard deviation, relative to the same distance, stay where they are.
 _LEAST_UNCERTAIN = 0.005
 _MAX_LEVELS, _MAX_CELLS_PER_AXIS = 16, 1 << 20
@@ -81,8 +81,16 @@ def surface_heights(
     heights = np.zeros(len(points))
     wanted = np.arange(len(points)) if chosen is None else chosen
     for some, edge in _levels(points, radii, wanted):
-        arguments = (points, normals, sigmas), radii, some, _cells(points, edge), per_column, heights
-        for_bands(partial(_find, find_heights, arguments), len(some), threads=threads)
+        order, cells = _cells(points, edge)
+        marked = np.zeros(len(points), np.bool_)
+        marked[some] = True
+        found = np.zeros(len(points))
+        # Sorted by cells, so that neighbours are near each other in memory.
+        arrays = points[order], normals[order], sigmas[order]
+        targets = np.flatnonzero(marked[order])
+        arguments = arrays, radii[order], targets, cells, per_column, found
+        for_bands(partial(_find, find_heights, arguments), len(targets), threads=threads)
+        heights[order[targets]] = found[targets]
     return heights
 
 
@@ -101,13 +109,14 @@ def _levels(points: NDArray[np.float32], radii: FloatArray, wanted: IntArray) ->
     return [(wanted[level == number], least * 2.0**number) for number in np.unique(level)]
 
 
-def _cells(points: NDArray[np.float32], edge: float) -> tuple[IntArray, ...]:
-    """Return the points sorted by cells of this edge, as `find_heights` needs them."""
+def _cells(points: NDArray[np.float32], edge: float) -> tuple[IntArray, tuple[IntArray, ...]]:
+    """Return the order of points by cells of this edge, and the cells as `find_heights` needs them."""
     places = np.floor((points - points.min(axis=0)) / edge).astype(np.int64) + 1
     size = places.max(axis=0) + 2
     strides = np.array([size[1] * size[2], size[2], 1], np.int64)
     own = places @ strides
     order = np.argsort(own, kind="stable")
-    keys, starts = np.unique(own[order], return_index=True)
+    own = own[order]
+    starts = np.flatnonzero(np.diff(own, prepend=own[0] - 1))
     steps = np.array(list(product((-1, 0, 1), repeat=2)), np.int64) @ strides[:2]
-    return keys, np.append(starts, len(own)), order, own, steps
+    return order, (own[starts], np.append(starts, len(own)), own, steps)
