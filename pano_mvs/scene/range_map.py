@@ -25,8 +25,8 @@ class RangeMap(Record):
             consistent with other views.
         normals_in_cam: (H, W, 3) float16 unit normals of the surfaces in the camera frame, towards the camera; NaN
             where unknown. None if they were not computed.
-        uncertainty: (H, W) float16 standard deviation of the range relative to it; NaN where invalid. None if it is
-            not known.
+        uncertainty: (H, W) float16 standard deviation of the range relative to it; NaN where unknown, ignored where the
+            range is invalid. None if it was not computed.
     """
 
     axis: ClassVar[Axis | None] = Axis.VIEW
@@ -58,5 +58,6 @@ class RangeMap(Record):
             require(not np.any(np.abs(length - 1) > 0.01), self, "a normal is not of unit length; unknown is NaN")
         if self.uncertainty is not None:
             uncertainty = require_array(self, "uncertainty", dtype=np.float16, shape=array.shape, finite=False)
-            require(bool(np.all(uncertainty[valid] > 0)), self, "a valid range has no positive uncertainty")
-            require(bool(np.isnan(uncertainty[~valid]).all()), self, "an invalid range has an uncertainty")
+            known = uncertainty[~np.isnan(uncertainty)]
+            positive = bool(np.all((known > 0) & (known < np.inf)))
+            require(positive, self, "an uncertainty is not positive or infinite; unknown is NaN")

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap
@@ -43,7 +44,8 @@ class ConfidentView:
         confidence: (H, W) uint8.
         image: (H, W, 3) uint8.
         normals: (H, W, 3) float32 normals of the range map, or None.
-        uncertainty: (H, W) float32 relative standard deviation of the range, or None.
+        uncertainty: (H, W) float32 relative standard deviation of the range, that of unconfirmed ranges where it is
+            unknown; or None.
     """
 
     pose: Rigid3
@@ -86,7 +88,7 @@ def confident_view(view: FusionView, *, min_confidence: int) -> ConfidentView:
         np.ascontiguousarray(confidence),
         np.ascontiguousarray(view.image),
         None if given is None else np.where(good[..., None], given, np.float16(np.nan)).astype(np.float32),
-        None if uncertainty is None else uncertainty.astype(np.float32),
+        None if uncertainty is None else np.nan_to_num(uncertainty.astype(np.float32), nan=UNCONFIRMED_UNCERTAINTY),
     )
 
 
