@@ -89,7 +89,7 @@ class ConsistencyParams(Params):
     """Settings of filters.consistency."""
 
 
-@stage("filters.consistency", memory=bytes_per_pixel(112, each_source=8))
+@stage("filters.consistency", memory=bytes_per_pixel(160, each_source=8))
 def consistency(
     range_map: Each[RangeMap],
     pose: Each[Pose],
