@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.core.errors import InputError
-from pano_mvs.io.images.preview import color_mapped, range_limits, scale_ticks
+from pano_mvs.io.images.preview import color_mapped, mark_unconfirmed, range_limits, scale_ticks
 from pano_mvs.report.completeness import Shares, fact_of, shares_from_fact, shares_of
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.results.pictures import Picture, picture, preview_panels, resized
@@ -21,7 +21,7 @@ from pano_mvs.results.records import ViewSummary
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, WEAK_CONFIDENCE
 
-VERSION = 2
+VERSION = 3
 """Raise it when the pictures change: earlier pages' are then drawn again."""
 
 MAX_CARDS = 36
@@ -30,6 +30,8 @@ MAX_BYTES = 80_000
 _TICKS_APART = 0.09
 _DECODERS = 2  # a large panorama takes 100 MB while it is decoded
 _PARTS = ("panorama", "range", "confidence")
+# Relative standard deviations from this one (dark) to this one (bright), on a logarithmic scale.
+UNCERTAINTY_LIMITS = 0.001, 0.2
 # Colours of the low and high end of each class, distinguishable for colour-blind readers and in grey.
 _CLASSES = (
     (FILLED_CONFIDENCE, (150, 95, 160), (196, 140, 204)),
@@ -45,7 +47,7 @@ class ViewCard:
 
     Attributes:
         name: of the image.
-        pictures: the available images among `panorama`, `range` and `confidence`.
+        pictures: the available images among `panorama`, `range`, `confidence` and `uncertainty`.
         shares: of the sphere, or None.
         ticks: (position on the colour scale from 0 to 1, range).
     """
@@ -100,6 +102,17 @@ def confidence_colors(confidence: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return table[confidence]
 
 
+def uncertainty_colors(uncertainty: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Return relative standard deviations (H, W) in colours (H, W, 3) RGB, from dark to bright; invalid is grey."""
+    low, high = np.log(UNCERTAINTY_LIMITS)
+    known = np.isfinite(uncertainty)
+    share = (np.log(np.where(known, uncertainty, 1).astype(np.float32)) - low) / (high - low)
+    colors = cv2.applyColorMap(np.rint(255 * np.clip(share, 0, 1)).astype(np.uint8), cv2.COLORMAP_CIVIDIS)
+    rgb: NDArray[np.uint8] = cv2.cvtColor(colors, cv2.COLOR_BGR2RGB)
+    rgb[~known] = _INVALID
+    return rgb
+
+
 def key_of(results: StoredValues, name: str, what: str, version: int) -> str:
     """Return the key of an image derived from a view's panorama and range map; "" if it has no range map."""
     digest = results.digest("ranges", name)
@@ -113,8 +126,11 @@ def _quality(view: ViewSummary) -> float:
 def _kept_card(results: StoredValues, kept: EarlierPage, name: str) -> ViewCard | None:
     stem = key_of(results, name, "v", VERSION)
     fact = kept.fact(stem) if stem else None
-    found = {part: shown for part in _PARTS if (shown := kept.picture(f"{stem}.{part}")) is not None}
-    if not isinstance(fact, dict) or len(found) < len(_PARTS):
+    parts = fact.get("parts") if isinstance(fact, dict) else None
+    if not isinstance(fact, dict) or not isinstance(parts, list):
+        return None
+    found = {part: shown for part in parts if (shown := kept.picture(f"{stem}.{part}")) is not None}
+    if len(found) < len(parts):
         return None
     try:
         ticks = tuple((float(at), float(value)) for at, value in fact["ticks"])
@@ -138,17 +154,24 @@ def _new_card(results: StoredValues, kept: EarlierPage, name: str, out_dir: Path
     if range_map is not None:
         small = _shrunk(range_map.range)
         near, far = range_limits(small)
-        pictures["range"] = _part(color_mapped(small, near, far), stem, "range")
-        pictures["confidence"] = _part(confidence_colors(_shrunk(range_map.confidence)), stem, "confidence")
+        confidence = _shrunk(range_map.confidence)
+        pictures["range"] = _part(mark_unconfirmed(color_mapped(small, near, far), confidence), stem, "range")
+        pictures["confidence"] = _part(confidence_colors(confidence), stem, "confidence")
+        if range_map.uncertainty is not None:
+            colors = uncertainty_colors(_shrunk(range_map.uncertainty.astype(np.float32)))
+            pictures["uncertainty"] = _part(colors, stem, "uncertainty")
         fits = mask is not None and mask.shape == range_map.range.shape
         shares = shares_of(range_map.confidence, mask if fits else None)
         ticks = _ticks(near, far)
-    if stem and len(pictures) == len(_PARTS):  # a missing image may be available for the next page
-        kept.keep(stem, {"ticks": ticks, "shares": fact_of(shares) if shares else None})
-    panels = preview_panels(out_dir, preview) if len(pictures) < len(_PARTS) else ()
+    if stem and all(part in pictures for part in _PARTS):  # a missing image may be available for the next page
+        fact = {"ticks": ticks, "shares": fact_of(shares) if shares else None, "parts": list(pictures)}
+        kept.keep(stem, fact)
+    panels = () if all(part in pictures for part in _PARTS) else preview_panels(out_dir, preview)
     for part, panel in zip(_PARTS, panels, strict=False):
         pictures.setdefault(part, _part(panel, "", part))
-    return ViewCard(name, {part: pictures[part] for part in _PARTS if part in pictures}, shares, ticks)
+    return ViewCard(
+        name, {part: pictures[part] for part in (*_PARTS, "uncertainty") if part in pictures}, shares, ticks
+    )
 
 
 def _ticks(near: float, far: float) -> tuple[tuple[float, float], ...]:

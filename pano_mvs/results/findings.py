@@ -12,6 +12,7 @@ from pano_mvs.results.records import Finding, PoseGroup, PosesSummary
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.results.thresholds import (
     FAIR_COMPLETE,
+    FAIR_CONFIRMED_SIDE,
     FAIR_CONSISTENT,
     FAIR_REGISTERED,
     FAIR_RESIDUAL_PX,
@@ -46,6 +47,7 @@ def findings(summary: RunSummary, *, residual_px: float | None = None) -> tuple[
         *_graph(summary),
         *_residual(residual_px),
         *_views(summary),
+        *_sides(summary),
         *_cloud(summary),
         *_baseline(summary),
     ]
@@ -243,6 +245,24 @@ def _views(summary: RunSummary) -> list[Finding]:
                 "far apart or the poses are wrong.",
             )
         )
+    return found
+
+
+def _sides(summary: RunSummary) -> list[Finding]:
+    """Return whether most ranges above or below the cameras are unconfirmed, in half of the views."""
+    found = []
+    for side, surface in (("above", "ceilings"), ("below", "floors")) if compares_views(summary) else ():
+        confirmed = median([view.metrics.get(f"confirmed_{side}") for view in summary.views])
+        if confirmed is not None and confirmed < FAIR_CONFIRMED_SIDE:
+            found.append(
+                Finding(
+                    "fair",
+                    f"Other views confirm only {share(confirmed)} of the ranges {side} the cameras in the median view; "
+                    "the others may be wrong.",
+                    f"Plain {surface} cannot be matched. Previews show their ranges pale; leave them out by confidence "
+                    "(128 and more is confirmed) or by uncertainty, or use the preset quality.",
+                )
+            )
     return found
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from pano_mvs.io.images.preview import color_mapped, range_limits
+from pano_mvs.io.images.preview import color_mapped, mark_unconfirmed, range_limits
 from pano_mvs.results.figures import duration, figure
 from pano_mvs.results.pictures import Picture, picture
 from pano_mvs.results.run_output import RunOutput, RunView
@@ -64,6 +64,8 @@ def _pictures(view: RunView) -> Iterable[tuple[str, Picture]]:
         found.append(("panorama", picture(view.image, width=_WIDTH, most_bytes=_MAX_BYTES)))
     if view.range_map is not None:
         colors = color_mapped(view.range_map, *range_limits(view.range_map))
+        if view.confidence is not None:
+            colors = mark_unconfirmed(colors, view.confidence)
         found.append(("range map", picture(colors, width=_WIDTH, most_bytes=_MAX_BYTES)))
     return found
 

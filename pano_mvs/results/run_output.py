@@ -149,6 +149,18 @@ class RunView:
         return read_confidence_png(path) if path else None
 
     @cached_property
+    def uncertainty(self) -> NDArray[np.float32] | None:
+        """Standard deviations of the ranges divided by the ranges, (H, W) float32; NaN where there is no range.
+
+        None if no stage compared the views.
+        """
+        if self._record is not None:
+            known = self._record.uncertainty
+            return None if known is None else known.astype(np.float32)
+        path = self._exported("uncertainty", ".tiff")
+        return read_range_tiff(path) if path else None
+
+    @cached_property
     def image(self) -> NDArray[np.uint8] | None:
         """The panorama, (H, W, 3) uint8 RGB, at the size of its file."""
         panorama = self._run.values.panorama(self.name)

@@ -9,6 +9,8 @@ GOOD_RESIDUAL_PX, FAIR_RESIDUAL_PX = 1.0, 2.0
 GOOD_COMPLETE, FAIR_COMPLETE = 0.8, 0.35
 # No other view confirms walls without texture: a third of the pixels of a furnished room is a good share.
 GOOD_CONSISTENT, FAIR_CONSISTENT = 0.3, 0.12
+# A ceiling or floor of which other views confirm less than this is reported, because its ranges may be far off.
+FAIR_CONFIRMED_SIDE = 0.15
 # A model is bad if more than half of its cameras are doubtful.
 FAIR_UNDOUBTED = 0.5
 

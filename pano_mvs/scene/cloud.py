@@ -27,6 +27,7 @@ class PointCloud(Record):
         view_counts: (N,) uint8 number of views that agree on the point.
         confidence: (N,) uint8, the largest confidence in the range maps of the views that agree; None if unknown.
         group_sizes: number of points of each group, in the order of the points; empty with one group.
+        uncertainty: (N,) float32 standard deviation of the position in scene units; None if unknown.
     """
 
     axis: ClassVar[Axis | None] = Axis.ONE
@@ -38,6 +39,7 @@ class PointCloud(Record):
     view_counts: NDArray[np.uint8]
     confidence: NDArray[np.uint8] | None = None
     group_sizes: tuple[int, ...] = ()
+    uncertainty: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         """Return the number of points."""
@@ -52,6 +54,8 @@ class PointCloud(Record):
         require_array(self, "view_counts", dtype=np.uint8, shape=(count,))
         if self.confidence is not None:
             require_array(self, "confidence", dtype=np.uint8, shape=(count,))
+        if self.uncertainty is not None:
+            require_array(self, "uncertainty", dtype=np.float32, shape=(count,))
         if self.group_sizes:
             fits = min(self.group_sizes) >= 0 and sum(self.group_sizes) == count
             require(fits, self, f"groups of {self.group_sizes} points do not make up {count}")
@@ -67,6 +71,7 @@ class PointCloud(Record):
                 self.colors_rgb[end - size : end],
                 self.view_counts[end - size : end],
                 None if self.confidence is None else self.confidence[end - size : end],
+                uncertainty=None if self.uncertainty is None else self.uncertainty[end - size : end],
             )
             for size, end in zip(self.group_sizes, accumulate(self.group_sizes), strict=True)
         ]
@@ -84,4 +89,11 @@ class PointCloud(Record):
             np.concatenate([cloud.view_counts for cloud in clouds]),
             np.concatenate(confidences) if len(confidences) == len(clouds) else None,
             tuple(len(cloud) for cloud in clouds),
+            joined_uncertainty(clouds),
         )
+
+
+def joined_uncertainty(clouds: Sequence[PointCloud]) -> NDArray[np.float32] | None:
+    """Return the uncertainties of the points of several clouds, in order; None unless all clouds have them."""
+    known = [cloud.uncertainty for cloud in clouds if cloud.uncertainty is not None]
+    return np.concatenate([np.zeros(0, np.float32), *known]) if len(known) == len(clouds) else None

@@ -25,6 +25,8 @@ class RangeMap(Record):
             consistent with other views.
         normals_in_cam: (H, W, 3) float16 unit normals of the surfaces in the camera frame, towards the camera; NaN
             where unknown. None if they were not computed.
+        uncertainty: (H, W) float16 standard deviation of the range relative to it; NaN where unknown, ignored where the
+            range is invalid. None if it was not computed.
     """
 
     axis: ClassVar[Axis | None] = Axis.VIEW
@@ -33,6 +35,7 @@ class RangeMap(Record):
     range: NDArray[np.float32]
     confidence: NDArray[np.uint8]
     normals_in_cam: NDArray[np.float16] | None = None
+    uncertainty: NDArray[np.float16] | None = None
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -53,3 +56,8 @@ class RangeMap(Record):
             normals = require_array(self, "normals_in_cam", dtype=np.float16, shape=(*array.shape, 3), finite=False)
             length = np.linalg.norm(normals.astype(np.float32), axis=-1)
             require(not np.any(np.abs(length - 1) > 0.01), self, "a normal is not of unit length; unknown is NaN")
+        if self.uncertainty is not None:
+            uncertainty = require_array(self, "uncertainty", dtype=np.float16, shape=array.shape, finite=False)
+            known = uncertainty[~np.isnan(uncertainty)]
+            positive = bool(np.all((known > 0) & (known < np.inf)))
+            require(positive, self, "an uncertainty is not positive or infinite; unknown is NaN")

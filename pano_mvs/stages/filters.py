@@ -18,9 +18,13 @@ from pano_mvs.algorithms.filters.planes import lay_planes
 from pano_mvs.algorithms.filters.replacement import with_ranges
 from pano_mvs.algorithms.filters.speckle import remove_speckles
 from pano_mvs.api import Context, Each, Near, Panorama, Params, Pose, RangeMap, arguments_from, params_from, stage
+from pano_mvs.geometry import pixel_solid_angle
 from pano_mvs.scene.pose_groups import require_one_group
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 from pano_mvs.stages.memory import bytes_per_pixel
+
+# Of what is above or below a camera, at least this share must have a range, or it is a sky or masked.
+_MIN_VALID = 0.5
 
 
 @params_from(median_range)
@@ -85,7 +89,7 @@ class ConsistencyParams(Params):
     """Settings of filters.consistency."""
 
 
-@stage("filters.consistency", memory=bytes_per_pixel(112, each_source=8))
+@stage("filters.consistency", memory=bytes_per_pixel(160, each_source=8))
 def consistency(
     range_map: Each[RangeMap],
     pose: Each[Pose],
@@ -163,5 +167,12 @@ def _unmasked(range_map: RangeMap, image: Panorama) -> RangeMap:
 
 def _measured(range_map: RangeMap, ctx: Context) -> RangeMap:
     ctx.metric("completeness", float(range_map.valid.mean()))
-    ctx.metric("consistent", float((range_map.confidence >= CONSISTENT_CONFIDENCE[0]).mean()))
+    confirmed = range_map.confidence >= CONSISTENT_CONFIDENCE[0]
+    ctx.metric("consistent", float(confirmed.mean()))
+    quarter = max(1, len(confirmed) // 4)
+    for side, rows in (("above", slice(0, quarter)), ("below", slice(-quarter, None))):
+        weights = pixel_solid_angle(confirmed.shape)[rows, None]
+        valid = float((range_map.valid[rows] * weights).mean())
+        if valid >= _MIN_VALID * float(weights.mean()):
+            ctx.metric(f"confirmed_{side}", float((confirmed[rows] * weights).mean()) / valid)
     return range_map

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,14 @@ from numpy.typing import NDArray
 from pano_mvs.core.errors import InputError, UsageError
 from pano_mvs.geometry import Rigid3
 from pano_mvs.io.clouds.ply_writer import read_ply, write_ply
-from pano_mvs.io.images.preview import color_mapped, range_limits, scale_ticks, write_preview
+from pano_mvs.io.images.preview import (
+    color_mapped,
+    mark_unconfirmed,
+    range_limits,
+    scale_ticks,
+    unconfirmed_classes,
+    write_preview,
+)
 from pano_mvs.io.ranges.files import read_confidence_png, read_range_tiff, write_confidence_png, write_range_tiff
 from pano_mvs.scene import PointCloud
 from pano_mvs.testing.room import default_room, render
@@ -138,6 +146,45 @@ def test_a_preview_shows_the_panorama_above_its_range(tmp_path: Path) -> None:
     assert np.abs(small.astype(float) - image).mean() < 5
     hole = shown[644 + 210 : 644 + 290, 410:590].astype(float)
     assert np.abs(hole - 128).max() < 12
+
+
+def test_weak_ranges_are_pale_and_filled_ones_striped() -> None:
+    colors = np.full((20, 40, 3), (200, 40, 0), np.uint8)
+    confidence = np.full((20, 40), 200, np.uint8)
+    confidence[:, 10:20], confidence[:, 20:30], confidence[:, 30:] = 90, 30, 0
+    marked = mark_unconfirmed(colors, confidence)
+    np.testing.assert_array_equal(marked[:, :10], colors[:, :10])
+    np.testing.assert_array_equal(marked[:, 30:], colors[:, 30:])
+    assert len(np.unique(marked[:, 10:20].reshape(-1, 3), axis=0)) == 1
+    assert (marked[:, 10:20] > colors[:, 10:20]).all()
+    assert {tuple(color) for color in marked[:, 20:30].reshape(-1, 3)} == {tuple(marked[0, 10]), (255, 255, 255)}
+    assert unconfirmed_classes(confidence) == ["weak", "filled"]
+
+
+def test_where_views_were_not_compared_nothing_is_pale() -> None:
+    colors, confidence = np.zeros((2, 4, 3), np.uint8), np.full((2, 4), 90, np.uint8)
+    np.testing.assert_array_equal(mark_unconfirmed(colors, confidence), colors)
+    assert unconfirmed_classes(confidence) == []
+
+
+def test_a_preview_explains_its_marks(tmp_path: Path) -> None:
+    image, ranges = render(default_room(), Rigid3.identity(), (64, 128))
+    confidence = np.full(ranges.shape, 200, np.uint8)
+    write_preview(tmp_path / "sure.jpg", image, ranges, confidence=confidence)
+    confidence[:20], confidence[20:30] = 90, 30
+    write_preview(tmp_path / "weak.jpg", image, ranges, confidence=confidence)
+    sure, weak = read_picture(tmp_path / "sure.jpg"), read_picture(tmp_path / "weak.jpg")
+    assert weak.shape[0] > sure.shape[0]
+    assert weak[650:840].mean() > sure[650:840].mean() + 40
+
+
+@pytest.mark.parametrize(("quality", "uncertainty"), [(False, True), (True, True)])
+def test_the_uncertainty_of_points_survives(tmp_path: Path, quality: bool, uncertainty: bool) -> None:
+    known = replace(cloud(3), uncertainty=np.array([0.01, 0.02, 0.5], np.float32))
+    write_ply(tmp_path / "a.ply", known, quality=quality, uncertainty=uncertainty)
+    np.testing.assert_array_equal(read_ply(tmp_path / "a.ply").uncertainty, known.uncertainty)
+    write_ply(tmp_path / "b.ply", cloud(3), quality=quality, uncertainty=uncertainty)
+    assert read_ply(tmp_path / "b.ply").uncertainty is None
 
 
 def test_near_is_red_far_is_blue_and_nothing_is_grey() -> None:

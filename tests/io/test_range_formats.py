@@ -155,3 +155,15 @@ def test_normals_that_came_with_the_ranges_are_kept(tmp_path: Path) -> None:
     known = RangeMap(ranges_map, np.full(SIZE_HW, 200, np.uint8), given)
     files = ranges(known, None, RangesParams(normals=("npy",)), Context(np.random.default_rng(0), tmp_path)).files
     np.testing.assert_array_equal(np.load(files["normals/{item}.npy"]), given.astype(np.float32))
+
+
+def test_the_uncertainty_is_written_where_it_is_known(tmp_path: Path) -> None:
+    capture = tiny_capture(Variant(masked=True))
+    image, true_range = capture.images[capture.names[0]], capture.ranges[0]
+    sigma = np.full(true_range.shape, 0.02, np.float16)
+    known = RangeMap(true_range, np.full(true_range.shape, 200, np.uint8), uncertainty=sigma)
+    files = ranges(known, image, RangesParams(), Context(np.random.default_rng(0), tmp_path)).files
+    written = read_picture(files["uncertainty/{item}.tiff"], cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(written, np.where(image.load_mask(), np.float32(np.float16(0.02)), np.nan))
+    without = ranges(known, image, RangesParams(uncertainty=False), Context(np.random.default_rng(0), tmp_path)).files
+    assert set(without) == {"range/{item}.tiff", "confidence/{item}.png"}

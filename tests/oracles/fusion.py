@@ -20,17 +20,18 @@ def footprint(view: NDArray[np.float64], normal: NDArray[np.float32]) -> float:
 def add_source(
     reference: tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float32], NDArray[np.bool_]],
     source_from_reference: Rigid3,
-    source: tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]],
+    source: tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float32]],
     limits: NDArray[np.float64],
 ) -> dict[str, NDArray[Any]]:
     """Return what `kernels_fuse.add_source` adds to tallies of zeros."""
     ranges, rays, normals, written = reference
-    source_ranges, source_confidence, image = source
+    source_ranges, source_confidence, image, uncertainty = source
     max_error, max_angle, max_step, max_ratio, merge_within, least_confidence = limits
     center = source_from_reference.inverse().apply(np.zeros(3))
     shape = ranges.shape
     yields, counts, violations = np.zeros(shape, np.bool_), np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
     confidence, sums, colors = np.zeros(shape, np.uint8), np.zeros((*shape, 4)), np.zeros((*shape, 4))
+    precisions = np.zeros(shape)
     for row, column in np.argwhere(np.isfinite(ranges)):
         at = row, column
         point = float(ranges[at]) * rays[at]
@@ -54,7 +55,9 @@ def add_source(
         yields[at] = footprint(point, normals[at]) > max_ratio * area
         colors[at] = np.append(sample_panorama(image, pixel[None])[0], 1) / area
         if error < merge_within:
-            weight = (1 - (error / merge_within) ** 2) ** 2 / distance**2
+            sigma = uncertainty[int(pixel[1]), int(pixel[0]) % image.shape[1]] if uncertainty.size else 1.0
+            precisions[at] = 1 / (sigma * distance) ** 2
+            weight = (1 - (error / merge_within) ** 2) ** 2 * precisions[at]
             sums[at] = weight * np.append(put, 1)
     return {
         "yields": yields,
@@ -63,6 +66,7 @@ def add_source(
         "confidence": confidence,
         "sums": sums,
         "colors": colors,
+        "precisions": precisions if uncertainty.size else np.zeros((0, 0)),
     }
 
 

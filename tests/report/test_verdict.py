@@ -63,6 +63,11 @@ def doubting(count: int) -> dict[str, Any]:
         ({"views": [{"completeness": 0.6, "consistent": 0.5}]}, "fair", "less than 60 %"),
         ({"views": [{"completeness": 0.2, "consistent": 0.5}]}, "bad", "less than 20 %"),
         ({"views": [{"completeness": 1.0, "consistent": 0.05}]}, "bad", "confirm only 5"),
+        (
+            {"views": [{"completeness": 1.0, "consistent": 0.5, "confirmed_above": 0.1, "confirmed_below": 0.9}]},
+            "fair",
+            "confirm only 10 % of the ranges above the cameras",
+        ),
         ({"cloud": {"points": 0}}, "bad", "The cloud has no points"),
         ({"scores": {"views": {"1": {"psnr_db": 17.0, "constant_psnr_db": 18.0}}}}, "bad", "18.0 dB, against 17.0 dB"),
         (

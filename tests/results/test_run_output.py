@@ -72,17 +72,20 @@ def test_exported_files_stand_in_for_a_cache_that_is_gone(tmp_path: Path) -> Non
     out = write_output(tmp_path, {"a.png": Rigid3.identity(), "b.jpg.png": Rigid3.identity()}, points=200)
     views = [{"name": "a.png"}, {"name": "b.jpg.png"}]
     RunSummary.read(out).model_copy(update={"views": RunSummary.from_json({"views": views}).views}).write(out)
-    for folder in ("range", "confidence"):
+    for folder in ("range", "confidence", "uncertainty"):
         (out / folder).mkdir()
     ranges = np.arange(1, 9, dtype=np.float32).reshape(2, 4)
     write_range_tiff(out / "range" / "a.tiff", ranges)
     write_confidence_png(out / "confidence" / "a.png.png", np.full((2, 4), 200, np.uint8))
+    write_range_tiff(out / "uncertainty" / "a.tiff", ranges / 100)
     run = load(out)
     view = run.views["a.png"]
     assert view.range_map is not None
     assert np.array_equal(view.range_map, ranges)
     assert view.confidence is not None
     assert view.confidence.min() == 200
+    assert view.uncertainty is not None
+    assert np.array_equal(view.uncertainty, ranges / 100)
     assert run.views["b.jpg.png"].range_map is None
     assert view.image is not None
     assert view.image.shape[2] == 3
@@ -101,3 +104,4 @@ def test_what_a_run_does_not_have_is_none(tmp_path: Path) -> None:
     assert (run.poses, run.cloud) == (None, None)
     view = run.views["a.png"]
     assert (view.range_map, view.confidence, view.image, view.cam_from_world) == (None, None, None, None)
+    assert view.uncertainty is None

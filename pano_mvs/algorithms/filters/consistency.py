@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.filters.uncertainty import confirmed_uncertainty
 from pano_mvs.algorithms.filters.view_doubts import Agreement
 from pano_mvs.core.bands import for_bands
 from pano_mvs.core.errors import UsageError
@@ -101,7 +102,8 @@ def checked_with_agreement(
         min_contradictions: number of sources that must contradict; at most the number of sources.
 
     Returns:
-        The checked range map, and the agreement of the sources with the view as a whole.
+        The checked range map with the uncertainty of its ranges (`confirmed_uncertainty`), and the agreement of the
+        sources with the view as a whole.
 
     Raises:
         UsageError: if sources and poses differ in number, or a setting is out of bounds.
@@ -125,8 +127,17 @@ def checked_with_agreement(
     if remove_inconsistent and sources:
         removed = (comparison.agreeing == 0) & (comparison.contradicting >= min(min_contradictions, len(sources)))
         ranges = np.where(removed, np.float32(np.nan), ranges)
+    uncertainty = confirmed_uncertainty(
+        consistent & seen,
+        seen,
+        support=comparison.support,
+        squared_error=comparison.squared_error * px_per_rad**2,
+        motion=px_per_rad * np.sqrt(comparison.motion),
+        step=step,
+    )
     confidence[np.isnan(ranges)] = 0
-    return RangeMap(ranges, confidence, reference.normals_in_cam), _agreement(comparison, seen)
+    uncertainty[np.isnan(ranges)] = np.nan
+    return RangeMap(ranges, confidence, reference.normals_in_cam, uncertainty), _agreement(comparison, seen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,6 +150,7 @@ class _Comparison:
         hiding: number of sources that see something nearer.
         support: sum of the supports of the agreeing sources.
         motion: sum of their supports times their squared motions, in rad².
+        squared_error: sum of their supports times their squared reprojection errors, in rad².
     """
 
     agreeing: NDArray[np.int64]
@@ -146,6 +158,7 @@ class _Comparison:
     hiding: NDArray[np.uint16]
     support: NDArray[np.float64]
     motion: NDArray[np.float64]
+    squared_error: NDArray[np.float64]
 
 
 def _compare_with_sources(
@@ -164,8 +177,7 @@ def _compare_with_sources(
         np.zeros(shape, np.int64),
         np.zeros(shape, np.int64),
         np.zeros(shape, np.uint16),
-        np.zeros(shape),
-        np.zeros(shape),
+        *(np.zeros(shape) for _ in range(3)),
     )
     ranges, rays = np.ascontiguousarray(reference.range), ray_grid((shape[0], shape[1]))
     verdicts, supports, motions = np.empty(shape, np.uint8), np.empty(shape), np.empty(shape)
@@ -181,6 +193,9 @@ def _compare_with_sources(
         # Rounded, so that the sum of a few values does not depend on the order of the sources.
         comparison.support[...] += np.rint(supports * 2**40) / 2**40
         comparison.motion[...] += np.rint(supports * motions * 2**40) / 2**40
+        # A support is (1 − (error / limit)²)².
+        squared_error = supports * limits[1] ** 2 * (1 - np.sqrt(supports))
+        comparison.squared_error[...] += np.rint(squared_error * 2**60) / 2**60
     return comparison
 
 

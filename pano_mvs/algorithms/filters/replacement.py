@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.filters.uncertainty import replaced_uncertainty
 from pano_mvs.scene import RangeMap
 
 
@@ -13,9 +14,10 @@ def with_ranges(
 ) -> RangeMap:
     """Return a range map with other ranges (H, W), and other confidences if given.
 
-    Normals are kept where the range did not change.
+    Normals are kept where the range did not change; for the uncertainty see `replaced_uncertainty`.
     """
+    confidence = range_map.confidence if confidence is None else confidence
     normals = range_map.normals_in_cam
     if normals is not None:
         normals = np.where((ranges == range_map.range)[..., None], normals, np.float16(np.nan))
-    return RangeMap(ranges, range_map.confidence if confidence is None else confidence, normals)
+    return RangeMap(ranges, confidence, normals, replaced_uncertainty(range_map, ranges, confidence))

@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.filters.sphere.steps import columns_per_step
+from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY
 from pano_mvs.algorithms.fusion.normals import normals_from_range
 from pano_mvs.algorithms.fusion.settings import FusionSettings
+from pano_mvs.algorithms.fusion.smooth import smooth_surfaces
 from pano_mvs.algorithms.fusion.view import (
     ConfidentView,
     FusionView,
@@ -23,6 +25,7 @@ from pano_mvs.algorithms.fusion.voxels import VoxelGrid
 from pano_mvs.core.bands import for_bands
 from pano_mvs.geometry import Rigid3
 from pano_mvs.scene import PointCloud
+from pano_mvs.scene.cloud import joined_uncertainty
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 
 _MAX_SURFACE_STEP = 0.05
@@ -59,7 +62,8 @@ def fuse_stream(
     """Fuse views that are loaded one at a time; at most a view and its neighbours are in memory.
 
     Each view in turn is the reference of `fuse_reference`, with its neighbours as sources. The clouds are joined in the
-    order of the views, merged by voxels if `voxel_size` is set. The result does not depend on what is cached.
+    order of the views, merged by voxels if `voxel_size` is set, and smoothed (`smooth_surfaces`). The result does not
+    depend on what is cached.
 
     Args:
         poses: cam_from_world of all views.
@@ -81,7 +85,10 @@ def fuse_stream(
             clouds.append(cloud)
         else:
             grid.add(cloud)
-    return join_clouds(clouds) if grid is None else grid.cloud()
+    cloud = join_clouds(clouds) if grid is None else grid.cloud()
+    if not chosen.smooth:
+        return cloud
+    return smooth_surfaces(cloud, np.array([pose.center for pose in poses]), threads=threads)
 
 
 def fuse_reference(
@@ -98,8 +105,10 @@ def fuse_reference(
     whose own pixel is consistent see through it than agree, which means that it is in free space. A pixel that lacks a
     single view is accepted by the support of its surface (`min_support`), unless a consistent pixel contradicts it.
     Points that another agreeing view sees clearly better are left to that view. A point is the mean of the positions in
-    all agreeing views, weighted by 1 / r² (`merge_within`); its colour is their mean weighted by cos / r², the inverse
-    of the area that a pixel covers; its confidence is the largest of theirs.
+    all agreeing views, weighted by 1 / (σ r)² (`merge_within`), where σ is the relative uncertainty of the range, or 1;
+    its colour is their mean weighted by cos / r², the inverse of the area that a pixel covers; its confidence is the
+    largest of theirs, its uncertainty the smallest, because views that confirm each other share their errors. The
+    result is not smoothed.
 
     Args:
         reference: the view that contributes the points.
@@ -131,12 +140,17 @@ def join_clouds(clouds: Sequence[PointCloud]) -> PointCloud:
         np.concatenate([empty.astype(np.uint8), *(cloud.colors_rgb for cloud in clouds)]),
         np.concatenate([np.zeros(0, np.uint8), *(cloud.view_counts for cloud in clouds)]),
         np.concatenate([np.zeros(0, np.uint8), *confidences]) if len(confidences) == len(clouds) else None,
+        (),
+        joined_uncertainty(clouds),
     )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Tallies:
-    """Agreement of the sources with each pixel, as computed by `kernels_fuse.add_source`."""
+    """Agreement of the sources with each pixel, as computed by `kernels_fuse.add_source`.
+
+    The precisions, 1 / variance in scene units, have the size 0 if they are not known.
+    """
 
     yields: NDArray[np.bool_]
     counts: NDArray[np.uint8]
@@ -144,10 +158,15 @@ class _Tallies:
     confidence: NDArray[np.uint8]
     sums: NDArray[np.float64]
     colors: NDArray[np.float64]
+    precisions: NDArray[np.float64]
+
+    def deviations(self) -> NDArray[np.float32]:
+        """Return the standard deviation of each merged point in scene units, (H, W): that of its best view."""
+        return np.asarray(1 / np.sqrt(self.precisions), np.float32)
 
     def arrays(self) -> tuple[NDArray[np.generic], ...]:
         """Return all arrays in the kernel's order."""
-        return self.yields, self.counts, self.violations, self.confidence, self.sums, self.colors
+        return self.yields, self.counts, self.violations, self.confidence, self.sums, self.colors, self.precisions
 
 
 def _points_of(
@@ -171,6 +190,7 @@ def _points_of(
         colors_rgb=np.rint(color[:, :3] / color[:, 3:]).clip(0, 255).astype(np.uint8),
         view_counts=tallies.counts[kept],
         confidence=tallies.confidence[kept],
+        uncertainty=None if reference.uncertainty is None else tallies.deviations()[kept],
     )
 
 
@@ -178,16 +198,19 @@ def _own_tallies(reference: ConfidentView, rays: NDArray[np.float64], normals: N
     """Return tallies with only the reference's own pixels."""
     shape = reference.ranges.shape
     ranges = reference.ranges.astype(np.float64)
+    sigma = reference.uncertainty
     weight = 1 / ranges**2
     # As in the kernel: a pixel's footprint is r² / cosine.
     color_weight = weight * (-np.einsum("hwc,hwc->hw", rays, normals, dtype=np.float64)).clip(0.05)
+    precision = weight if sigma is None else weight / sigma.astype(np.float64) ** 2
     return _Tallies(
         yields=np.zeros(shape, np.bool_),
         counts=np.isfinite(ranges).astype(np.uint8),
         violations=np.zeros(shape, np.uint8),
         confidence=reference.confidence.copy(),
-        sums=np.concatenate([rays * (weight * ranges)[..., None], weight[..., None]], axis=-1),
+        sums=np.concatenate([rays * (precision * ranges)[..., None], precision[..., None]], axis=-1),
         colors=np.concatenate([reference.image * color_weight[..., None], color_weight[..., None]], axis=-1),
+        precisions=np.zeros((0, 0)) if sigma is None else precision.copy(),
     )
 
 
@@ -219,12 +242,21 @@ def _compare_with(
         np.ascontiguousarray(source_from_reference.rotation),
         np.ascontiguousarray(source_from_reference.translation),
     )
-    arrays = (*relation, source.ranges, source.confidence, source.image)
+    arrays = (*relation, source.ranges, source.confidence, source.image, _uncertainty_of(source, reference))
 
     def of_rows(first: int, rows: int) -> None:
         add_source((reference.ranges, *grids), arrays, limits, (first, first + rows), tallies.arrays())
 
     for_bands(of_rows, height, threads=threads)
+
+
+def _uncertainty_of(source: ConfidentView, reference: ConfidentView) -> NDArray[np.float32]:
+    """Return a source's relative uncertainty; of size 0 if the reference's is not known."""
+    if reference.uncertainty is None:
+        return np.zeros((0, 0), np.float32)
+    if source.uncertainty is None:
+        return np.full(source.ranges.shape, UNCONFIRMED_UNCERTAINTY, np.float32)
+    return source.uncertainty
 
 
 def _kept(reference: ConfidentView, tallies: _Tallies, settings: FusionSettings) -> NDArray[np.bool_]:
@@ -242,6 +274,8 @@ def _kept(reference: ConfidentView, tallies: _Tallies, settings: FusionSettings)
             reference.ranges, confirmed, stretches, _SUPPORT_RADIUS, _MAX_SUPPORT_STEP, settings.min_support
         )
         kept = confirmed | (supported & (agreeing == settings.min_views - 1) & (tallies.violations == 0))
+    if settings.max_uncertainty is not None and reference.uncertainty is not None:
+        kept = kept & (tallies.deviations() <= settings.max_uncertainty * reference.ranges)
     return kept & ~tallies.yields
 
 

@@ -18,8 +18,10 @@ from pano_mvs.geometry.kernels_sphere import bilinear, corners_at, pixel_at
 
 FloatArray = NDArray[np.float64]
 Reference = tuple[NDArray[np.float32], FloatArray, NDArray[np.float32], NDArray[np.bool_]]
-Source = tuple[FloatArray, FloatArray, NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]]
-Tallies = tuple[NDArray[np.bool_], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8], FloatArray, FloatArray]
+Source = tuple[FloatArray, FloatArray, NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float32]]
+Tallies = tuple[
+    NDArray[np.bool_], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8], FloatArray, FloatArray, FloatArray
+]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -56,23 +58,34 @@ def confidence_at(confidence: NDArray[np.uint8], x: float, y: float) -> int:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
+def uncertainty_at(uncertainty: NDArray[np.float32], x: float, y: float) -> float:
+    """Return the relative uncertainty of the pixel at a position."""
+    row, column = pixel_at(x, y, uncertainty.shape[0], uncertainty.shape[1])
+    return float(uncertainty[row, column])
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def add_source(
     reference: Reference, source: Source, limits: FloatArray, rows: tuple[int, int], tallies: Tallies
 ) -> None:
     """Add one source's support for the pixels of the rows [first, end) of a reference view.
 
     `reference` is (ranges, rays, normals, bool where a point may be written); `source` is (rotation, translation of
-    source_from_reference, ranges, confidence, image); `limits` holds the three of `judge_point`, the maximum ratio
-    of this view's footprint to the source's, the maximum relative difference of merged points, and the minimum
-    confidence of a contradiction. `tallies` changes in place: yields (H, W) bool is set where the
-    footprint is too large; counts, violations and confidence (H, W) uint8 of agreeing views, of contradicting ones, and
-    the largest confidence; sums (H, W, 4) of weighted points in the reference frame and their weights; colors (H, W, 4)
-    likewise. Where no point may be written, only counts and violations change.
+    source_from_reference, ranges, confidence, image, relative uncertainties); if the latter are not known, they are (0,
+    0), and all ranges are taken as equally uncertain relative to the range. `limits` holds the three of `judge_point`,
+    the maximum ratio of this view's footprint to the source's, the maximum relative difference of merged points, and
+    the minimum confidence of a contradiction. `tallies` changes in place: yields (H, W) bool is set where the footprint
+    is too large; counts, violations and confidence (H, W) uint8 of agreeing views, of contradicting ones, and the
+    largest confidence; sums (H, W, 4) of weighted points in the reference frame and their weights; colors (H, W, 4)
+    likewise; precisions (H, W), the largest 1 / variance of the merged points, (0, 0) if it is unknown. Where no point
+    may be written, only counts and violations change.
     """
     ranges, rays, normals, written = reference
-    rotation, translation, source_ranges, source_confidence, image = source
-    yields, counts, violations, confidence, sums, colors = tallies
+    rotation, translation, source_ranges, source_confidence, image, uncertainty = source
+    yields, counts, violations, confidence, sums, colors, precisions = tallies
     center = -(rotation.T @ translation)
+    weighted = uncertainty.size > 0
+    sigma = 1.0
     for row in range(rows[0], rows[1]):
         for column in range(ranges.shape[1]):
             r = ranges[row, column]
@@ -96,9 +109,14 @@ def add_source(
                 yields[row, column] = True
             add_color(image, x, y, 1 / footprint, colors[row, column])
             if error < limits[4]:
-                squared = view[0] * view[0] + view[1] * view[1] + view[2] * view[2]
                 share = error / limits[4]
-                weight, ratio = (1 - share * share) ** 2 / squared, seen / math.sqrt(squared)
+                squared = view[0] * view[0] + view[1] * view[1] + view[2] * view[2]
+                if weighted:
+                    sigma = uncertainty_at(uncertainty, x, y)
+                variance = squared * sigma * sigma
+                weight, ratio = (1 - share * share) ** 2 / variance, seen / math.sqrt(squared)
+                if weighted:
+                    precisions[row, column] = max(precisions[row, column], 1 / variance)
                 for axis in range(3):
                     sums[row, column, axis] += weight * (center[axis] + ratio * view[axis])
                 sums[row, column, 3] += weight

@@ -13,8 +13,9 @@ class FusionSettings:
 
     The view that contributes a point counts towards `min_views`. A pixel that lacks one view is accepted if at least
     `min_support` of the window around it is confirmed and on the same surface, and no view contradicts it. Points are
-    averaged with Tukey's biweight of their relative difference. Pixels below `min_confidence` contribute no points
-    either. With `max_footprint_ratio` 1, each part of the surface is contributed by one view only.
+    averaged with Tukey's biweight of their relative difference and, if the range maps have an uncertainty, by their
+    precision; `max_uncertainty` and `smooth` have no effect without one. Pixels below `min_confidence` contribute no
+    points either. With `max_footprint_ratio` 1, each part of the surface is contributed by one view only.
     """
 
     min_views: int = setting(2, ge=1, doc="minimum number of views that agree on a point")
@@ -26,6 +27,10 @@ class FusionSettings:
     max_footprint_ratio: float = setting(
         4.0, ge=1, doc="leave a point to another view that sees it this much better; 1: no duplicate points"
     )
+    max_uncertainty: float | None = setting(
+        0.16, gt=0, doc="maximum standard deviation of a point relative to its range, where it is known"
+    )
+    smooth: bool = setting(True, doc="move points to the planes of their neighbours, within their standard deviation")
     even_density: bool = setting(True, doc="thin rows away from the equator to even density per solid angle")
     stride: int = setting(1, ge=1, doc="use every stride-th pixel in both directions")
     min_confidence: int = setting(64, ge=1, le=255, doc="minimum confidence of pixels (64: seen, 128: consistent)")

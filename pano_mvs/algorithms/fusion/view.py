@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY
 from pano_mvs.core.errors import UsageError
 from pano_mvs.geometry import Rigid3, ray_grid
 from pano_mvs.scene import RangeMap
@@ -43,6 +44,8 @@ class ConfidentView:
         confidence: (H, W) uint8.
         image: (H, W, 3) uint8.
         normals: (H, W, 3) float32 normals of the range map, or None.
+        uncertainty: (H, W) float32 relative standard deviation of the range, that of unconfirmed ranges where it is
+            unknown; or None.
     """
 
     pose: Rigid3
@@ -50,6 +53,7 @@ class ConfidentView:
     confidence: NDArray[np.uint8]
     image: NDArray[np.uint8]
     normals: NDArray[np.float32] | None
+    uncertainty: NDArray[np.float32] | None = None
 
 
 @lru_cache(maxsize=1)
@@ -77,13 +81,14 @@ def confident_view(view: FusionView, *, min_confidence: int) -> ConfidentView:
         if view.mask.shape != ranges.shape:
             raise UsageError(f"a view's mask must have the size of its range map {ranges.shape}, got {view.mask.shape}")
         good &= view.mask
-    given = view.range_map.normals_in_cam
+    given, uncertainty = view.range_map.normals_in_cam, view.range_map.uncertainty
     return ConfidentView(
         view.pose,
         np.where(good, ranges, np.float32(np.nan)),
         np.ascontiguousarray(confidence),
         np.ascontiguousarray(view.image),
         None if given is None else np.where(good[..., None], given, np.float16(np.nan)).astype(np.float32),
+        None if uncertainty is None else np.nan_to_num(uncertainty.astype(np.float32), nan=UNCONFIRMED_UNCERTAINTY),
     )
 
 

@@ -25,11 +25,20 @@ _PLAIN = np.dtype(
         ("blue", "u1"),
     ]
 )
-_WITH_QUALITY = np.dtype([*_PLAIN.descr, ("views", "u1"), ("confidence", "u1")])
+_QUALITY = [("views", "u1"), ("confidence", "u1")]
+_UNCERTAINTY = [("uncertainty", "<f4")]
+_LAYOUTS = [np.dtype([*_PLAIN.descr, *more]) for more in ([], _QUALITY, _UNCERTAINTY, [*_QUALITY, *_UNCERTAINTY])]
 _PLY_TYPES = {"f": "float", "u": "uchar"}
 
 
-def write_ply(path: Path, cloud: PointCloud, *, quality: bool = False, kept: SelectedPoints | None = None) -> None:
+def write_ply(
+    path: Path,
+    cloud: PointCloud,
+    *,
+    quality: bool = False,
+    uncertainty: bool = False,
+    kept: SelectedPoints | None = None,
+) -> None:
     """Write a cloud as binary little-endian PLY: x y z nx ny nz (float), red green blue (uchar).
 
     The cloud is written in chunks, so that memory-mapped arrays need not fit in memory.
@@ -38,9 +47,11 @@ def write_ply(path: Path, cloud: PointCloud, *, quality: bool = False, kept: Sel
         path: the file to write.
         cloud: the points.
         quality: also write `views`, the number of views that agree on the point, and `confidence` (uchar).
+        uncertainty: also write `uncertainty`, the standard deviation of the position in scene units (float); NaN if
+            unknown.
         kept: the points to write; all by default.
     """
-    layout = _WITH_QUALITY if quality else _PLAIN
+    layout = _LAYOUTS[quality + 2 * uncertainty]
     with path.open("wb") as stream:
         stream.write(_header(len(cloud) if kept is None else kept.count, layout))
         for chunk in chunks(len(cloud)):
@@ -55,9 +66,12 @@ def _vertices(cloud: PointCloud, chunk: slice, layout: np.dtype[np.void]) -> NDA
         vertices[f"n{name}"] = cloud.normals_in_world[chunk, idx]
     for idx, name in enumerate(("red", "green", "blue")):
         vertices[name] = cloud.colors_rgb[chunk, idx]
-    if layout == _WITH_QUALITY:
+    names = layout.names or ()
+    if "views" in names:
         vertices["views"] = cloud.view_counts[chunk]
         vertices["confidence"] = 0 if cloud.confidence is None else cloud.confidence[chunk]
+    if "uncertainty" in names:
+        vertices["uncertainty"] = np.nan if cloud.uncertainty is None else cloud.uncertainty[chunk]
     return vertices
 
 
@@ -70,7 +84,7 @@ def read_ply(path: Path) -> PointCloud:
     head, mark, body = FilePart(path).read_bytes().partition(b"end_header\n")
     counted = re.search(rb"^element vertex ([0-9]{1,18})$", head, re.MULTILINE)
     count = int(counted[1]) if counted else 0
-    layout = next((known for known in (_PLAIN, _WITH_QUALITY) if head + mark == _header(count, known)), None)
+    layout = next((known for known in _LAYOUTS if head + mark == _header(count, known)), None)
     if layout is None:
         raise InputError(f"{path}: not a PLY file of pano-mvs (binary little endian, x y z nx ny nz red green blue)")
     if len(body) != count * layout.itemsize:
@@ -82,9 +96,13 @@ def read_ply(path: Path) -> PointCloud:
         np.stack([vertices[name] for name in names], axis=-1)
         for names in (("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue"))
     )
-    if layout == _PLAIN:
-        return PointCloud(points, normals, colors, np.zeros(count, np.uint8))
-    return PointCloud(points, normals, colors, vertices["views"].copy(), vertices["confidence"].copy())
+    names = layout.names or ()
+    known = {name: vertices[name].copy() for name in ("views", "confidence", "uncertainty") if name in names}
+    uncertainty = known.get("uncertainty")
+    if uncertainty is not None and not np.isfinite(uncertainty).all():
+        uncertainty = None
+    views = known.get("views", np.zeros(count, np.uint8))
+    return PointCloud(points, normals, colors, views, known.get("confidence"), uncertainty=uncertainty)
 
 
 def _header(count: int, layout: np.dtype[np.void]) -> bytes:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE
 
 _WIDTH = 1280
 _BAR_HEIGHT, _MARGIN = 24, 16
@@ -14,18 +18,29 @@ _INVALID_GREY = 128
 _QUALITY = 88
 _PAPER, _INK = (255, 255, 255), (60, 60, 60)
 _TEXT_SIZE, _TEXT_WEIGHT = 0.9, 2  # legible when the picture is shown at a third of its width
+# Colours of unconfirmed ranges are mixed with white to this share; filled ones have stripes of a period and a width.
+_DIMMED = 0.55
+_STRIPES_PX = 10, 4
 
 
 def write_preview(
-    path: Path, image: NDArray[np.uint8], range_map: NDArray[np.float32], *, mask: NDArray[np.bool_] | None = None
+    path: Path,
+    image: NDArray[np.uint8],
+    range_map: NDArray[np.float32],
+    *,
+    mask: NDArray[np.bool_] | None = None,
+    confidence: NDArray[np.uint8] | None = None,
 ) -> None:
     """Write a JPEG of a panorama above its range map, with a scale bar that carries numbers.
+
+    Weak ranges are pale and filled ones striped, with a legend; see `mark_unconfirmed`.
 
     Args:
         path: the file to write.
         image: (H, W, 3) uint8 RGB.
         range_map: (h, w) float32 range in scene units, NaN where invalid (shown grey).
         mask: (H, W), False where the picture is to be ignored (shown grey), or None.
+        confidence: (h, w) uint8 of the ranges, or None.
     """
     height = _WIDTH // 2
     if mask is not None:
@@ -33,7 +48,13 @@ def write_preview(
     shown = cv2.resize(image, (_WIDTH, height), interpolation=cv2.INTER_AREA)
     resized = cv2.resize(range_map, (_WIDTH, height), interpolation=cv2.INTER_NEAREST)
     near, far = range_limits(resized)
-    stack = [shown, np.full((4, _WIDTH, 3), 255, np.uint8), color_mapped(resized, near, far), _scale_bar(near, far)]
+    colors, legend = color_mapped(resized, near, far), []
+    if confidence is not None:
+        sure = cv2.resize(confidence, (_WIDTH, height), interpolation=cv2.INTER_NEAREST)
+        colors, legend = mark_unconfirmed(colors, sure), unconfirmed_classes(confidence)
+    stack = [shown, np.full((4, _WIDTH, 3), 255, np.uint8), colors, _scale_bar(near, far)]
+    if legend:
+        stack.append(_legend(legend))
     bgr = cv2.cvtColor(np.vstack(stack), cv2.COLOR_RGB2BGR)
     path.write_bytes(bytes(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]))
 
@@ -59,6 +80,53 @@ def color_mapped(range_map: NDArray[np.float32], near: float, far: float) -> NDA
     rgb: NDArray[np.uint8] = cv2.cvtColor(colors, cv2.COLOR_BGR2RGB)
     rgb[~valid] = _INVALID_GREY
     return rgb
+
+
+def unconfirmed_classes(confidence: NDArray[np.uint8]) -> list[Literal["weak", "filled"]]:
+    """Return which marks `mark_unconfirmed` makes; without confirmed ranges, views were not compared: none is weak."""
+    filled, weak = _unconfirmed(confidence)
+    found: list[Literal["weak", "filled"]] = ["weak"] if weak.any() else []
+    return [*found, "filled"] if filled.any() else found
+
+
+def mark_unconfirmed(colors: NDArray[np.uint8], confidence: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the colours of a range map with weak ranges pale and filled ones pale with stripes.
+
+    Args:
+        colors: (H, W, 3) RGB.
+        confidence: (H, W) uint8 as of range maps. If it confirms no range, weak ones keep their colours.
+    """
+    filled, weak = _unconfirmed(confidence)
+    height, width = confidence.shape
+    period, thickness = _STRIPES_PX
+    stripes = (np.arange(height)[:, None] + np.arange(width)) % period < thickness
+    paper = np.where(weak | filled, _DIMMED, 0.0)
+    paper[filled & stripes] = 1.0
+    mixed = (1 - paper[..., None]) * colors + 255 * paper[..., None]
+    return np.asarray(np.rint(mixed), np.uint8)
+
+
+def _unconfirmed(confidence: NDArray[np.uint8]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return the filled and the weak pixels, (H, W) each."""
+    low, high = FILLED_CONFIDENCE
+    filled = (confidence >= low) & (confidence <= high)
+    confirmed = confidence >= CONSISTENT_CONFIDENCE[0]
+    return filled, (confidence > high) & ~confirmed & confirmed.any()
+
+
+def _legend(classes: Sequence[Literal["weak", "filled"]]) -> NDArray[np.uint8]:
+    """Return a strip (h, W, 3) that explains the marks."""
+    strip = np.full((_BAR_HEIGHT + _MARGIN, _WIDTH, 3), _PAPER, np.uint8)
+    meanings = {"weak": "pale: not confirmed by other views", "filled": "striped: filled in, not seen"}
+    codes = {"weak": FILLED_CONFIDENCE[1] + 1, "filled": FILLED_CONFIDENCE[0]}
+    for idx, name in enumerate(classes):
+        left = 2 * _MARGIN + idx * _WIDTH // 2
+        colors = color_mapped(np.full((_BAR_HEIGHT, 3 * _BAR_HEIGHT + 1), 2, np.float32), 1.0, 8.0)
+        confidence = np.full(colors.shape[:2], codes[name], np.uint8)
+        confidence[:, -1] = CONSISTENT_CONFIDENCE[1]  # so that weak ones are pale
+        strip[:_BAR_HEIGHT, left : left + 3 * _BAR_HEIGHT] = mark_unconfirmed(colors, confidence)[:, :-1]
+        _write(strip, meanings[name], (left + 3 * _BAR_HEIGHT + _MARGIN, _BAR_HEIGHT - 3), centered=False)
+    return strip
 
 
 def _scale_bar(near: float, far: float) -> NDArray[np.uint8]:

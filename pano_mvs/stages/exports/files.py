@@ -45,6 +45,9 @@ class PlyParams(Params):
     quality: bool = Field(
         default=False, description="add the number of agreeing views and the confidence to each point"
     )
+    uncertainty: bool = Field(
+        default=False, description="add the standard deviation of each point, in scene units; NaN if unknown"
+    )
 
 
 @stage("export.ply")
@@ -60,7 +63,7 @@ def ply(cloud: One[PointCloud], params: PlyParams, ctx: Context) -> Files:
         name = group_file("cloud.ply", number)
         kept = select_points(group, selection, ctx.scratch)
         files[name] = ctx.scratch / name
-        write_ply(files[name], group, quality=params.quality, kept=kept)
+        write_ply(files[name], group, quality=params.quality, uncertainty=params.uncertainty, kept=kept)
         points += len(group) if kept is None else kept.count
         if kept is not None and kept.voxel and not number:
             ctx.metric("voxel", kept.voxel)
@@ -76,6 +79,9 @@ class RangesParams(Params):
     )
     png_unit: float = Field(default=0.001, gt=0, description="scene units per step of a 16-bit PNG; 0 is invalid")
     confidence: bool = Field(default=True, description="also write confidence/<image>.png")
+    uncertainty: bool = Field(
+        default=True, description="also write uncertainty/<image>.tiff: relative standard deviations, where known"
+    )
     normals: tuple[Literal["tiff", "png", "exr", "npy"], ...] = Field(
         default=(), description="file formats of surface normals in the camera frame (x right, y down, z forward)"
     )
@@ -92,6 +98,7 @@ class RangesParams(Params):
 def ranges(range_map: Each[RangeMap], image: Each[Panorama] | None, params: RangesParams, ctx: Context) -> Files:
     """Write each range map as range/<image>.tiff (float32, NaN invalid) and confidence/<image>.png (8 bit, 0 invalid).
 
+    If the uncertainty is known, uncertainty/<image>.tiff has the standard deviation divided by the range (float32).
     Other formats, and normals/<image>, are optional. The unit of a 16-bit PNG is in range/<image>.json.
     """
     valid = range_map.valid if image is None else range_map.valid & image.load_mask()
@@ -102,6 +109,10 @@ def ranges(range_map: Each[RangeMap], image: Each[Panorama] | None, params: Rang
     if params.confidence:
         files["confidence/{item}.png"] = ctx.scratch / "confidence.png"
         write_confidence_png(files["confidence/{item}.png"], np.where(valid, range_map.confidence, np.uint8(0)))
+    if params.uncertainty and range_map.uncertainty is not None:
+        files["uncertainty/{item}.tiff"] = ctx.scratch / "uncertainty.tiff"
+        relative = np.where(valid, range_map.uncertainty, np.float16(np.nan)).astype(np.float32)
+        write_range_tiff(files["uncertainty/{item}.tiff"], relative)
     if params.normals:
         known = _normals(range_map, valid, threads=ctx.threads)
         files |= {f"normals/{{item}}.{name}": _write_normals(known, name, ctx.scratch) for name in params.normals}
@@ -112,10 +123,10 @@ def ranges(range_map: Each[RangeMap], image: Each[Panorama] | None, params: Rang
 def previews(range_map: Each[RangeMap], image: Each[Panorama], ctx: Context) -> Files:
     """Write a preview of each view, preview/<image>.jpg: the panorama beside its colour-mapped range with a scale bar.
 
-    Masked pixels and pixels without a range are grey.
+    Masked pixels and pixels without a range are grey. Ranges that no other view confirms are pale, filled ones striped.
     """
     path = ctx.scratch / "preview.jpg"
-    write_preview(path, image.load(), range_map.range, mask=image.load_mask())
+    write_preview(path, image.load(), range_map.range, mask=image.load_mask(), confidence=range_map.confidence)
     return Files({"preview/{item}.jpg": path})
 
 

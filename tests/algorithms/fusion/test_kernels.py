@@ -16,7 +16,7 @@ from tests.oracles import fusion as oracle
 
 SIZE, SOURCE_SIZE = (12, 24), (10, 20)
 LIMITS = np.array([0.05, 0.2, 0.05, 1.05, 0.03, 100.0])
-FIELDS = ("yields", "counts", "violations", "confidence", "sums", "colors")
+FIELDS = ("yields", "counts", "violations", "confidence", "sums", "colors", "precisions")
 
 
 def rough_sphere(rng: np.random.Generator, size_hw: tuple[int, int]) -> np.ndarray:
@@ -29,7 +29,8 @@ def rough_sphere(rng: np.random.Generator, size_hw: tuple[int, int]) -> np.ndarr
 
 
 @pytest.mark.kernel("fusion.kernels_fuse")
-def test_what_a_source_adds_equals_the_plain_sums() -> None:
+@pytest.mark.parametrize("with_uncertainty", [False, True])
+def test_what_a_source_adds_equals_the_plain_sums(with_uncertainty: bool) -> None:
     rng = np.random.default_rng(20)
     ranges, source_ranges = rough_sphere(rng, SIZE), rough_sphere(rng, SOURCE_SIZE)
     rays = ray_grid(SIZE)
@@ -39,6 +40,7 @@ def test_what_a_source_adds_equals_the_plain_sums() -> None:
     confidence = rng.integers(30, 200, SOURCE_SIZE).astype(np.uint8)
     image = rng.integers(0, 256, (*SOURCE_SIZE, 3)).astype(np.uint8)
     pose = Rigid3(rotation_from_rotvec((0.4, -1.9, 0.7)), np.array([0.05, -0.03, 0.06]))
+    uncertainty = rng.uniform(0.01, 0.2, SOURCE_SIZE if with_uncertainty else (0, 0)).astype(np.float32)
     found: dict[str, NDArray[Any]] = {
         "yields": np.zeros(SIZE, np.bool_),
         "counts": np.zeros(SIZE, np.uint8),
@@ -46,11 +48,14 @@ def test_what_a_source_adds_equals_the_plain_sums() -> None:
         "confidence": np.zeros(SIZE, np.uint8),
         "sums": np.zeros((*SIZE, 4)),
         "colors": np.zeros((*SIZE, 4)),
+        "precisions": np.zeros(SIZE if with_uncertainty else (0, 0)),
     }
-    source = (np.array(pose.rotation), np.array(pose.translation), source_ranges, confidence, image)
+    source = (np.array(pose.rotation), np.array(pose.translation), source_ranges, confidence, image, uncertainty)
     for rows in ((0, 5), (5, 12)):
         add_source((ranges, rays, normals, written), source, LIMITS, rows, tuple(found[name] for name in FIELDS))
-    expected = oracle.add_source((ranges, rays, normals, written), pose, (source_ranges, confidence, image), LIMITS)
+    expected = oracle.add_source(
+        (ranges, rays, normals, written), pose, (source_ranges, confidence, image, uncertainty), LIMITS
+    )
     for name in FIELDS:  # as plain Python, quotients of ranges are float32
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-3, atol=1e-5, err_msg=name)
     assert 0.2 < found["counts"].mean() < 0.8

@@ -1,0 +1,105 @@
+"""Uncertainty of ranges: larger where parallax is small or views disagree, and never smaller after a change."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pano_mvs.algorithms.filters.consistency import check_consistency
+from pano_mvs.algorithms.filters.replacement import with_ranges
+from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY
+from pano_mvs.core.errors import ContractError
+from pano_mvs.geometry import ray_grid
+from pano_mvs.scene import RangeMap
+from pano_mvs.testing.room import capture_poses, default_room
+from tests.algorithms.range_scenes import as_map, room_range
+
+SIZE = (128, 256)
+POSES = capture_poses(4, seed=1, spread=0.4)
+
+
+def noisy_maps(noise: float) -> list[RangeMap]:
+    rng = np.random.default_rng(0)
+    room = default_room()
+    return [as_map(room_range(room, pose, SIZE) * np.exp(rng.normal(0, noise, SIZE))) for pose in POSES]
+
+
+@pytest.fixture(scope="module")
+def checked() -> RangeMap:
+    return checked_of(noisy_maps(0.002))
+
+
+def checked_of(maps: list[RangeMap]) -> RangeMap:
+    result = check_consistency(maps[0], POSES[0], maps[1:], POSES[1:], min_motion_px=0.01)
+    result.check()
+    return result
+
+
+def uncertainty_of(range_map: RangeMap) -> np.ndarray:
+    assert range_map.uncertainty is not None
+    return range_map.uncertainty.astype(np.float64)
+
+
+def test_every_range_has_one_and_unconfirmed_ones_have_the_same(checked: RangeMap) -> None:
+    sigma = uncertainty_of(checked)
+    confirmed = checked.confidence >= 128
+    np.testing.assert_array_equal(np.isfinite(sigma), checked.valid)
+    np.testing.assert_allclose(sigma[checked.valid & ~confirmed], UNCONFIRMED_UNCERTAINTY, rtol=1e-3)
+    assert np.median(sigma[confirmed]) < 0.03
+
+
+def test_it_grows_with_the_scatter_of_the_views(checked: RangeMap) -> None:
+    rough = checked_of(noisy_maps(0.006))
+    both = (checked.confidence >= 128) & (rough.confidence >= 128)
+    assert np.median(uncertainty_of(rough)[both]) > 1.5 * np.median(uncertainty_of(checked)[both])
+
+
+def test_it_grows_towards_the_epipoles_and_with_fewer_confirmed_neighbours(checked: RangeMap) -> None:
+    maps = noisy_maps(0.002)
+    single = check_consistency(maps[0], POSES[0], maps[1:2], POSES[1:2], min_motion_px=0.01)
+    baseline = (POSES[1] @ POSES[0].inverse()).center
+    sine = np.linalg.norm(np.cross(ray_grid(SIZE), baseline / np.linalg.norm(baseline)), axis=-1)
+    sigma, confirmed = uncertainty_of(single), single.confidence >= 128
+    assert np.median(sigma[confirmed & (sine < 0.35)]) > 1.5 * np.median(sigma[confirmed & (sine > 0.9)])
+    rng = np.random.default_rng(1)
+    wrong = [as_map(np.where(rng.random(SIZE) < 0.3, 1.4, 1) * maps[0].range), *maps[1:]]
+    both = (checked.confidence >= 128) & ((sparse := checked_of(wrong)).confidence >= 128)
+    assert np.median(uncertainty_of(sparse)[both]) > 1.3 * np.median(uncertainty_of(checked)[both])
+
+
+def test_changes_add_to_it(checked: RangeMap) -> None:
+    before, valid = uncertainty_of(checked), checked.valid
+    moved = np.where(np.arange(SIZE[1]) < 100, checked.range * np.float32(1.05), checked.range)
+    after = with_ranges(checked, moved)
+    after.check()
+    sigma, confirmed = uncertainty_of(after), checked.confidence >= 128
+    left = np.broadcast_to(np.arange(SIZE[1]) < 100, SIZE)
+    np.testing.assert_array_equal(sigma[~left & valid], before[~left & valid])
+    np.testing.assert_allclose(sigma[left & confirmed], np.hypot(before, 0.05)[left & confirmed], rtol=2e-3)
+    assert (sigma[left & valid & ~confirmed] >= 0.149).all()
+
+
+def test_filled_pixels_get_a_large_one_and_removed_ones_none(checked: RangeMap) -> None:
+    hole = np.zeros(SIZE, np.bool_)
+    hole[40:60, 100:120] = True
+    open_map = with_ranges(
+        checked, np.where(hole, np.float32(np.nan), checked.range), np.where(hole, 0, checked.confidence)
+    )
+    open_map.check()
+    filled = with_ranges(
+        open_map, np.where(hole, np.float32(2), open_map.range), np.where(hole, 30, open_map.confidence)
+    )
+    filled.check()
+    np.testing.assert_allclose(uncertainty_of(filled)[hole], UNCONFIRMED_UNCERTAINTY, rtol=1e-3)
+    assert with_ranges(replace(checked, uncertainty=None), checked.range).uncertainty is None
+
+
+def test_wrong_uncertainties_are_refused(checked: RangeMap) -> None:
+    zero = np.zeros(SIZE, np.float16)
+    with pytest.raises(ContractError, match="an uncertainty is not positive or infinite"):
+        replace(checked, uncertainty=zero).check()
+    with pytest.raises(ContractError, match="uncertainty must be float16"):
+        replace(checked, uncertainty=zero.astype(np.float32)).check()
+    replace(checked, uncertainty=np.full(SIZE, np.nan, np.float16)).check()
