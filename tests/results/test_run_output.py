@@ -77,7 +77,7 @@ def test_exported_files_stand_in_for_a_cache_that_is_gone(tmp_path: Path) -> Non
     ranges = np.arange(1, 9, dtype=np.float32).reshape(2, 4)
     write_range_tiff(out / "range" / "a.tiff", ranges)
     write_confidence_png(out / "confidence" / "a.png.png", np.full((2, 4), 200, np.uint8))
-    write_range_tiff(out / "uncertainty" / "a.tiff", ranges / 100)
+    write_range_tiff(out / "uncertainty" / "a.tiff", ranges / np.float32(100))
     run = load(out)
     view = run.views["a.png"]
     assert view.range_map is not None
@@ -85,7 +85,7 @@ def test_exported_files_stand_in_for_a_cache_that_is_gone(tmp_path: Path) -> Non
     assert view.confidence is not None
     assert view.confidence.min() == 200
     assert view.uncertainty is not None
-    assert np.array_equal(view.uncertainty, ranges / 100)
+    assert np.array_equal(view.uncertainty, ranges / np.float32(100))
     assert run.views["b.jpg.png"].range_map is None
     assert view.image is not None
     assert view.image.shape[2] == 3
