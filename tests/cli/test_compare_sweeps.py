@@ -79,4 +79,4 @@ def test_without_in_a_second_branch_is_ambiguous_and_the_message_says_what_to_wr
     result = pano_mvs("check", "two.yaml")
     assert result.code == 2
     assert "two.yaml:5:17: stage 'median': port range_map: Each[RangeMap] could be fed by" in result.flat
-    assert "smooth, other; choose with `in: {range_map: …}`" in result.flat
+    assert "smooth, planes, other; choose with `in: {range_map: …}`" in result.flat

@@ -85,7 +85,7 @@ def test_exported_files_stand_in_for_a_cache_that_is_gone(tmp_path: Path) -> Non
     assert view.confidence is not None
     assert view.confidence.min() == 200
     assert view.uncertainty is not None
-    assert np.array_equal(view.uncertainty, ranges / 100)
+    assert np.array_equal(view.uncertainty, ranges / np.float32(100))
     assert run.views["b.jpg.png"].range_map is None
     assert view.image is not None
     assert view.image.shape[2] == 3

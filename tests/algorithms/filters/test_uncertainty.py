@@ -9,7 +9,7 @@ import pytest
 
 from pano_mvs.algorithms.filters.consistency import check_consistency
 from pano_mvs.algorithms.filters.replacement import with_ranges
-from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY
+from pano_mvs.algorithms.filters.uncertainty import UNCONFIRMED_UNCERTAINTY, confirmed_uncertainty
 from pano_mvs.core.errors import ContractError
 from pano_mvs.geometry import ray_grid
 from pano_mvs.scene import RangeMap
@@ -67,6 +67,33 @@ def test_it_grows_towards_the_epipoles_and_with_fewer_confirmed_neighbours(check
     wrong = [as_map(np.where(rng.random(SIZE) < 0.3, 1.4, 1) * maps[0].range), *maps[1:]]
     both = (checked.confidence >= 128) & ((sparse := checked_of(wrong)).confidence >= 128)
     assert np.median(uncertainty_of(sparse)[both]) > 1.3 * np.median(uncertainty_of(checked)[both])
+
+
+def test_it_is_the_formula() -> None:
+    """σ = 2.2 e (1 + 5 d) / (p² M), each factor on its own."""
+    whole = np.ones((64, 128), np.bool_)
+    half = (np.add.outer(np.arange(64), np.arange(128)) % 2 == 0).astype(np.bool_)
+    flat, steep = np.zeros((64, 128), np.float32), np.full((64, 128), 0.2, np.float32)
+
+    def middle(
+        consistent: np.ndarray = whole, step: np.ndarray = flat, error_px: float = 0.1, motion: float = 20
+    ) -> float:
+        support = np.full((64, 128), 2.0)
+        found = confirmed_uncertainty(
+            consistent,
+            whole,
+            support=support,
+            squared_error=support * error_px**2,
+            motion=support * motion / 2,
+            step=step,
+        )
+        return float(found[32, 64])
+
+    assert middle() == pytest.approx(2.2 * 0.1 / 20, rel=2e-3)
+    assert middle(motion=40) == pytest.approx(middle() / 2, rel=2e-3)
+    assert middle(error_px=0.2) == pytest.approx(2 * middle(), rel=2e-3)
+    assert middle(step=steep) == pytest.approx(6 * middle(), rel=2e-3)
+    assert middle(consistent=half) == pytest.approx(4 * middle(), rel=0.03)
 
 
 def test_changes_add_to_it(checked: RangeMap) -> None:

@@ -61,7 +61,7 @@ def test_quickstart_writes_what_the_contract_promises(quickstart: tuple[Path, st
     views = {
         f"{folder}/{name}.{suffix}"
         for name in NAMES
-        for folder, suffix in (("range", "tiff"), ("confidence", "png"), ("preview", "jpg"))
+        for folder, suffix in (("range", "tiff"), ("confidence", "png"), ("uncertainty", "tiff"), ("preview", "jpg"))
     }
     files = {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}
     assert files == model | views | {"cloud.ply", "report.html", "run.json", ".pano-mvs-output"}
