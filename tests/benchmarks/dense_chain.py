@@ -72,26 +72,22 @@ class DenseChain:
             poses: other poses than the true ones, of all pictures.
             references: the images to make range maps of; all if not given (consistency needs all).
         """
-        solved = poses or Poses.without_points(capture.poses, frame="the truth's", scale="the truth's", metric=True)
-        by_name = {name: Pose(solved.cam_from_world(idx)) for idx, name in enumerate(solved.names)}
-        given: dict[type[Record], dict[str, Any]] = {
-            Panorama: dict(capture.panoramas),
-            Pose: dict(by_name),
-            Poses: {"": solved},
-        }
+        solved = poses or true_poses(capture)
+        given = given_records(capture, solved)
         done = DenseRun()
         for name in self.dense:
-            index = self._index(name, solved)
+            index = self.index(name, solved)
             started = time.process_time()
             done.results[name] = {
-                image: self._run_one(name, image, index, given, done)
+                image: self.run_one(name, image, index, given, done)
                 for image in (references or capture.panoramas)
                 if image in index.neighbours
             }
             done.cpu_s[name] = time.process_time() - started
         return done
 
-    def _index(self, name: str, poses: Poses) -> Views:
+    def index(self, name: str, poses: Poses) -> Views:
+        """Return the sources of each image for a stage."""
         edge = self.graph.edges[name].get(INDEX_PORT)
         selectors = [key for key, entry in self.stages.items() if entry.spec.output is Views]
         entry = self.stages[edge.producer if edge else selectors[0]]
@@ -99,9 +95,18 @@ class DenseChain:
         assert isinstance(views, Views)
         return views
 
-    def _run_one(
+    def run_one(
         self, name: str, image: str, index: Views, given: Mapping[type[Record], dict[str, Any]], done: DenseRun
     ) -> Record:
+        """Return what a stage makes of one image.
+
+        Args:
+            name: of the stage.
+            image: name of the image.
+            index: the sources of each image.
+            given: what is given, by type and image.
+            done: results of the stages before.
+        """
         entry = self.stages[name]
         arguments: dict[str, Any] = {}
         for port in entry.spec.ports:
@@ -124,6 +129,20 @@ class DenseChain:
             if issubclass(kind, port.kind):
                 return items
         raise LookupError(f"nothing gives {port}")
+
+
+def true_poses(capture: Capture) -> Poses:
+    """Return the true poses of a capture, without points."""
+    return Poses.without_points(capture.poses, frame="the truth's", scale="the truth's", metric=True)
+
+
+def given_records(capture: Capture, poses: Poses) -> dict[type[Record], dict[str, Any]]:
+    """Return what the dense stages are given of a capture, by type and image."""
+    return {
+        Panorama: dict(capture.panoramas),
+        Pose: {name: Pose(poses.cam_from_world(idx)) for idx, name in enumerate(poses.names)},
+        Poses: {"": poses},
+    }
 
 
 def _delivered(port: Port, items: Mapping[str, Any], image: str, index: Views) -> Any:

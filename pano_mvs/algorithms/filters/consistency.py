@@ -54,8 +54,11 @@ def checked_with_agreement(
     *,
     max_relative_error: Annotated[float, Setting("maximum relative difference of ranges that agree", gt=0)] = 0.02,
     max_reprojection_px: Annotated[float, Setting("maximum forward-backward reprojection error", gt=0)] = 1.0,
+    max_reprojection_deg: Annotated[
+        float, Setting("the same as an angle, which replaces a smaller max_reprojection_px", ge=0)
+    ] = 0.35,
     min_support: Annotated[
-        float, Setting("minimum sum over sources of (1 - (error / max_reprojection_px)²)² for a pixel", ge=0)
+        float, Setting("minimum sum over sources of (1 - (error / maximum)²)² for a pixel", ge=0)
     ] = 0.85,
     min_motion_px: Annotated[
         float, Setting("minimum motion of a pixel in the sources if its range changes by max_relative_error", ge=0)
@@ -70,11 +73,11 @@ def checked_with_agreement(
 
     Forward and backward: the point at range r along a pixel's ray is projected into a source, X' = R r F(u) + t. The
     source's own range s there must equal |X'| within `max_relative_error`, and the source's point at s, seen from the
-    reference, must lie within `max_reprojection_px` of the pixel (Schönberger et al., "Pixelwise view selection for
-    unstructured multi-view stereo", 2016, section 4.3, on the sphere). The source then agrees, and supports the pixel
-    with (1 − (e / max_reprojection_px)²)², where e is its reprojection error. If s is smaller, the point is occluded
-    and the source is ignored. If s is larger by more than twice the limit, the source sees through the point and
-    contradicts it. Filled ranges of sources are ignored, too.
+    reference, must lie within the maximum reprojection error of the pixel (Schönberger et al., "Pixelwise view
+    selection for unstructured multi-view stereo", 2016, section 4.3, on the sphere). The source then agrees, and
+    supports the pixel with (1 − (e / maximum)²)², where e is its reprojection error. If s is smaller, the point is
+    occluded and the source is ignored. If s is larger by more than twice the limit, the source sees through the point
+    and contradicts it. Filled ranges of sources are ignored, too.
 
     Close to the epipoles, sources agree on any range. So each source also measures how far a relative change of the
     range would move the point, m = sin γ r / |X'| radians, where γ is the angle between the two rays at the point. With
@@ -93,8 +96,11 @@ def checked_with_agreement(
         source_poses: cam_from_world of each.
         max_relative_error: largest |s − |X'|| / |X'|.
         max_reprojection_px: largest angle between pixel and reprojection, in pixels of the reference at the equator.
-        min_support: smallest S; one source supports a pixel with at most 1, and with 0.85 at an error of 0.28
-            max_reprojection_px.
+        max_reprojection_deg: the same in degrees; the larger of the two counts. Poses, stitching and soft panoramas
+            limit the accuracy of matches to an angle, so that a limit in pixels alone confirms less the more pixels
+            there are. 0.35° is a pixel at 1024 columns.
+        min_support: smallest S; one source supports a pixel with at most 1, and with 0.85 at 0.28 times the maximum
+            reprojection error.
         min_motion_px: smallest μ, in pixels of the reference at the equator.
         min_views: number of sources that must agree.
         remove_inconsistent: whether to invalidate pixels that no source confirms and `min_contradictions` sources
@@ -111,7 +117,8 @@ def checked_with_agreement(
     if len(sources) != len(source_poses):
         raise UsageError(f"{len(sources)} source range maps but {len(source_poses)} poses: give one pose per source")
     px_per_rad = reference.range.shape[1] / (2 * np.pi)
-    limits = np.array([max_relative_error, max_reprojection_px / px_per_rad, _MAX_SURFACE_STEP])
+    max_angle = max(max_reprojection_px / px_per_rad, np.radians(max_reprojection_deg))
+    limits = np.array([max_relative_error, max_angle, _MAX_SURFACE_STEP])
     comparison = _compare_with_sources(reference, reference_pose, sources, source_poses, limits)
     motion = max_relative_error * px_per_rad * np.sqrt(comparison.motion)
     consistent = (comparison.agreeing >= min_views) & (comparison.support >= min_support) & (motion >= min_motion_px)

@@ -24,6 +24,8 @@ from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE
 _STEPS_PER_OCTAVE = 4
 _WIDTH = 256
 _PLANES = 96
+# Heavier penalties than those of a sweep for its own sake: surfaces must agree, not details.
+_P1, _P2 = 80, 1600
 _MAX_PICTURES = 5
 _NEAREST_BASELINES = 0.15
 _NEAR_QUANTILE, _FAR_QUANTILE = 0.005, 0.995
@@ -118,7 +120,7 @@ def _coarse(
         [poses[other] @ poses[idx].inverse() for other in others],
         near=near,
         far=far,
-        settings=SweepSettings(planes=_PLANES, cost="census", no_match="keep"),
+        settings=SweepSettings(planes=_PLANES, cost="census", p1=_P1, p2=_P2, no_match="keep"),
         backend=backend,
         device=device,
         reference_mask=masks[idx],

@@ -106,10 +106,24 @@ def test_agreement_by_a_hair_is_not_enough(true_maps: list[RangeMap]) -> None:
     for factor in (1.0, 1.012):
         for support in (0.0, 0.9):
             maps = [as_map(true_maps[0].range * factor), *true_maps[1:]]
-            result = checked(maps, max_reprojection_px=0.15, min_support=support)
+            result = checked(maps, max_reprojection_px=0.15, max_reprojection_deg=0, min_support=support)
             shares[factor, support] = (result.confidence >= 128).mean()
     assert min(shares[1.0, 0.0], shares[1.0, 0.9], shares[1.012, 0.0]) > 0.98
     assert shares[1.012, 0.9] < 0.8
+
+
+@pytest.mark.parametrize(("angle_deg", "is_kept"), [(0.0, False), (0.28125, True)])
+def test_more_pixels_confirm_no_less_if_the_limit_is_an_angle(angle_deg: float, is_kept: bool) -> None:
+    """Ranges that were off by the same at any resolution were confirmed less the more pixels there were."""
+    shares = []
+    for size in [(64, 128), (128, 256)]:
+        rng, rays = np.random.default_rng(5), ray_grid(size)
+        waves = [np.sin(rays @ rng.normal(0, 4, 3)) for _ in POSES]
+        ranges = [room_range(default_room(), pose, size) for pose in POSES]
+        maps = [as_map(one * (1 + 0.01 * wave)) for one, wave in zip(ranges, waves, strict=True)]
+        limits = {"max_relative_error": 0.05, "max_reprojection_px": 0.1, "max_reprojection_deg": angle_deg}
+        shares.append((checked(maps, **limits).confidence >= 128).mean())
+    assert (shares[1] > shares[0] - 0.02) == is_kept
 
 
 def test_beside_a_step_sides_are_doubtful_and_normals_are_kept(true_maps: list[RangeMap]) -> None:

@@ -1,0 +1,1 @@
+"""Benchmarks of the dense stages over many places at once."""
