@@ -280,20 +280,20 @@ def sum_windows(
     weights, centred, means = window
     packed, starts, shapes, poses, valid, valid_starts = sources
     n, side = planes.shape[1], len(rows)
-    inverse, values, gradients = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
+    inverse = np.empty((side * side, n), np.float32)
+    values, gradients, products = np.empty(n, np.float32), np.empty(n, np.float32), np.empty((4, n), np.float32)
     index, patches = np.empty(n, np.int32), np.empty(n, np.uint64)
     blend, slopes = np.empty((2, n), np.float32), np.empty((2, n), np.float32)
-    products = np.empty((4, n), np.float32)
     matrix = np.empty((3, 4), np.float32)
     sums[:] = _F(0)
     for k in range(side * side):
-        v, column = rows[k // side], columns[k % side]
-        elevation = elevation_from_y(row + v + 0.5, height)
-        start = pad + first + column
-        inverse_ranges(planes, azimuth, start, _F(np.cos(elevation)), _F(-np.sin(elevation)), inverse)
-        for s in range(len(starts)):
-            row_matrix(poses[s], elevation, matrix)
-            project_samples(azimuth, start, inverse, matrix, shapes[s], index, blend, slopes)
+        elevation, start = elevation_from_y(row + rows[k // side] + 0.5, height), pad + first + columns[k % side]
+        inverse_ranges(planes, azimuth, start, _F(np.cos(elevation)), _F(-np.sin(elevation)), inverse[k])
+    for s in range(len(starts)):  # one after the other: its sums stay in the nearest cache
+        for k in range(side * side):
+            v, column = rows[k // side], columns[k % side]
+            row_matrix(poses[s], elevation_from_y(row + v + 0.5, height), matrix)
+            project_samples(azimuth, pad + first + column, inverse[k], matrix, shapes[s], index, blend, slopes)
             gather_samples(packed, starts[s], index, patches)
             blend_samples(patches, blend, slopes, means, values, gradients)
             add_samples(values, weights[k], centred[k], sums[s])

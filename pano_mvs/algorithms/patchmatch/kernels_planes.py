@@ -23,14 +23,13 @@ _MIN_WEIGHT, _MIN_SPREAD = 5.0, 0.25
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def tangent_basis(row: int, column: int, height: int, width: int, stretch: float, basis: FloatArray) -> None:
-    """Write the ray of a pixel and its derivatives by u and v, (3, 3); the rows are orthogonal."""
-    elevation, azimuth = elevation_from_y(row + 0.5, height), azimuth_from_x(column + 0.5, width)
-    level, dip, s, c = np.cos(elevation), np.sin(elevation), np.sin(azimuth), np.cos(azimuth)
-    across, down = 2 * np.pi / width * level * stretch, np.pi / height
-    basis[0, 0], basis[0, 1], basis[0, 2] = level * s, -dip, level * c
-    basis[1, 0], basis[1, 1], basis[1, 2] = across * c, 0.0, -across * s
-    basis[2, 0], basis[2, 1], basis[2, 2] = down * dip * s, down * level, down * dip * c
+def sines_of_columns(width: int) -> FloatArray:
+    """Return the sine and the cosine of the azimuth of each column, (2, W)."""
+    turned = np.empty((2, width))
+    for x in range(width):
+        azimuth = azimuth_from_x(x + 0.5, width)
+        turned[0, x], turned[1, x] = np.sin(azimuth), np.cos(azimuth)
+    return turned
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -195,14 +194,11 @@ def fit_planes(
     height, width = inverse.shape
     radius, pad = offsets.shape[1] // 2, offsets[first : first + rows].max()
     padded = _padded_rows(inverse, first - radius, rows + 2 * radius, pad)
-    azimuth = np.empty((2, width))
-    for x in range(width):
-        azimuth[0, x] = np.sin(azimuth_from_x(x + 0.5, width))
-        azimuth[1, x] = np.cos(azimuth_from_x(x + 0.5, width))
+    turned = sines_of_columns(width)
     for row in range(first, first + rows):
         elevation = elevation_from_y(row + 0.5, height)
         level, dip, stretch = np.cos(elevation), np.sin(elevation), stretches[row]
-        # The length of the ray's derivatives by u and v, see `tangent_basis`.
+        # The lengths of the ray's derivatives by u and v: (cos θ, 0, −sin θ) and (sin φ sin θ, cos φ, sin φ cos θ).
         across, down = 2 * np.pi / width * level * stretch, np.pi / height
         for start in range(0, width, _STRETCH):
             slopes = np.empty((3, min(_STRETCH, width - start)))
@@ -210,7 +206,7 @@ def fit_planes(
             for i in range(_U(slopes.shape[1])):
                 x = _U(start) + i
                 q = np.float64(inverse[row, x])
-                s, c = azimuth[0, x], azimuth[1, x]
+                s, c = turned[0, x], turned[1, x]
                 alpha, beta, gamma = q * slopes[0, i], q * slopes[1, i] / across, q * slopes[2, i] / down
                 ahead = alpha * level + gamma * dip
                 known = np.isfinite(q)
