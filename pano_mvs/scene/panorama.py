@@ -10,12 +10,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.core.digest import digest_from_bytes
 from pano_mvs.core.errors import InputError
 from pano_mvs.scene.cropping import inside_crop, placed_picture, same_shape
 from pano_mvs.scene.image_files.decoding import MASK_BYTES_PER_PIXEL, MAX_PIXELS, decoding_bytes_per_pixel
 from pano_mvs.scene.image_files.image_file import decode_image, write_png
+from pano_mvs.scene.image_files.recent_pictures import RecentPictures
 from pano_mvs.scene.masking import decode_mask, painted_over, placed_mask
 from pano_mvs.scene.record import Axis, FilePart, Record, require
+
+_RECENT = RecentPictures(limit_bytes=48 << 20)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +88,17 @@ class Panorama(Record):
         Raises:
             InputError: see `load`.
         """
+        data = self.image.read_bytes()
+        key = digest_from_bytes(data), self.size_hw, self.source_size_hw, self.crop_ltwh
+        picture = _RECENT.get(key)
+        if picture is None:
+            picture = self._decoded(data)
+            _RECENT.put(key, picture)
+        return picture
+
+    def _decoded(self, data: bytes) -> NDArray[np.uint8]:
         height, width = self.source_size_hw  # which the source accepted, possibly above the usual limit
-        image = decode_image(self.image.path, self.image.read_bytes(), max_pixels=max(MAX_PIXELS, height * width))
+        image = decode_image(self.image.path, data, max_pixels=max(MAX_PIXELS, height * width))
         _, _, width, height = self.covers_ltwh
         if (not same_shape(image.shape[:2], (height, width))) or (
             self.crop_ltwh is None and image.shape[:2] != self.source_size_hw

@@ -194,35 +194,53 @@ def add_samples(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def add_gradients(
+def weigh_gradients(
     samples: NDArray[np.float32],
     gradients: NDArray[np.float32],
     window_weights: NDArray[np.float32],
     reference: NDArray[np.float32],
-    u: np.float32,
-    v: np.float32,
-    sums: NDArray[np.float32],
+    products: NDArray[np.float32],
 ) -> None:
-    """Add the slopes of one window sample, at columns u and rows v from the centre, to the sums of one source."""
+    """Write w g, w g g, w g b and w g a, (4, n), of the slopes g of one window sample of each pixel, all (n,)."""
     for i in range(_U(samples.shape[0])):
         g = gradients[i]
         wg = window_weights[i] * g
-        wgg, wgb, wga = wg * g, wg * samples[i], wg * reference[i]
-        sums[SUM_G, i] += wg
-        sums[SUM_G + 1, i] += u * wg
-        sums[SUM_G + 2, i] += v * wg
-        sums[SUM_GG, i] += wgg
-        sums[SUM_GG + 1, i] += u * wgg
-        sums[SUM_GG + 2, i] += v * wgg
-        sums[SUM_GG + 3, i] += u * u * wgg
-        sums[SUM_GG + 4, i] += u * v * wgg
-        sums[SUM_GG + 5, i] += v * v * wgg
-        sums[SUM_GB, i] += wgb
-        sums[SUM_GB + 1, i] += u * wgb
-        sums[SUM_GB + 2, i] += v * wgb
-        sums[SUM_GA, i] += wga
-        sums[SUM_GA + 1, i] += u * wga
-        sums[SUM_GA + 2, i] += v * wga
+        products[0, i] = wg
+        products[1, i] = wg * g
+        products[2, i] = wg * samples[i]
+        products[3, i] = wg * reference[i]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def add_moments(
+    products: NDArray[np.float32],
+    row: int,
+    factors: tuple[np.float32, np.float32, np.float32],
+    sums: NDArray[np.float32],
+    first: int,
+) -> None:
+    """Add a row of `products`, times each of three factors, to three rows of `sums` from `first` on."""
+    p, s = _U(row), _U(first)
+    f0, f1, f2 = factors
+    for i in range(_U(products.shape[1])):
+        value = products[p, i]
+        sums[s, i] += f0 * value
+        sums[s + _U(1), i] += f1 * value
+        sums[s + _U(2), i] += f2 * value
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def add_gradients(products: NDArray[np.float32], u: np.float32, v: np.float32, sums: NDArray[np.float32]) -> None:
+    """Add what `weigh_gradients` wrote of one window sample, at columns u and rows v from the centre, to the sums.
+
+    One loop over all of it would not be vectorised: too many rows would have to be proved not to overlap.
+    """
+    basis = _ONE, u, v
+    add_moments(products, 0, basis, sums, SUM_G)
+    add_moments(products, 1, basis, sums, SUM_GG)
+    add_moments(products, 1, (u * u, u * v, v * v), sums, SUM_GG + 3)
+    add_moments(products, 2, basis, sums, SUM_GB)
+    add_moments(products, 3, basis, sums, SUM_GA)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -262,23 +280,25 @@ def sum_windows(
     weights, centred, means = window
     packed, starts, shapes, poses, valid, valid_starts = sources
     n, side = planes.shape[1], len(rows)
-    inverse, values, gradients = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
+    inverse = np.empty((side * side, n), np.float32)
+    values, gradients, products = np.empty(n, np.float32), np.empty(n, np.float32), np.empty((4, n), np.float32)
     index, patches = np.empty(n, np.int32), np.empty(n, np.uint64)
     blend, slopes = np.empty((2, n), np.float32), np.empty((2, n), np.float32)
     matrix = np.empty((3, 4), np.float32)
     sums[:] = _F(0)
     for k in range(side * side):
-        v, column = rows[k // side], columns[k % side]
-        elevation = elevation_from_y(row + v + 0.5, height)
-        start = pad + first + column
-        inverse_ranges(planes, azimuth, start, _F(np.cos(elevation)), _F(-np.sin(elevation)), inverse)
-        for s in range(len(starts)):
-            row_matrix(poses[s], elevation, matrix)
-            project_samples(azimuth, start, inverse, matrix, shapes[s], index, blend, slopes)
+        elevation, start = elevation_from_y(row + rows[k // side] + 0.5, height), pad + first + columns[k % side]
+        inverse_ranges(planes, azimuth, start, _F(np.cos(elevation)), _F(-np.sin(elevation)), inverse[k])
+    for s in range(len(starts)):  # one after the other: its sums stay in the nearest cache
+        for k in range(side * side):
+            v, column = rows[k // side], columns[k % side]
+            row_matrix(poses[s], elevation_from_y(row + v + 0.5, height), matrix)
+            project_samples(azimuth, pad + first + column, inverse[k], matrix, shapes[s], index, blend, slopes)
             gather_samples(packed, starts[s], index, patches)
             blend_samples(patches, blend, slopes, means, values, gradients)
             add_samples(values, weights[k], centred[k], sums[s])
-            add_gradients(values, gradients, weights[k], centred[k], _F(column / stretch), _F(v), sums[s])
+            weigh_gradients(values, gradients, weights[k], centred[k], products)
+            add_gradients(products, _F(column / stretch), _F(v), sums[s])
             if v == 0 and column == 0:
                 for i in range(n):
                     votes[s, i] = len(valid) == 0 or valid[_U(valid_starts[s]) + _U(index[i])] != 0

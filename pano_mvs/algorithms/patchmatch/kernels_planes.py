@@ -15,28 +15,85 @@ from pano_mvs.geometry.kernels_sphere import azimuth_from_x, elevation_from_y, w
 FloatArray = NDArray[np.float64]
 
 _F = np.float32
+_U = np.uint64
+# Number of pixels of a row whose planes are fitted together, so that their windows fit the cache.
+_STRETCH = 128
 # Minimum weight of the pixels of a plane, and minimum determinant of their covariance in u and v.
 _MIN_WEIGHT, _MIN_SPREAD = 5.0, 0.25
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def tangent_basis(row: int, column: int, height: int, width: int, stretch: float, basis: FloatArray) -> None:
-    """Write the ray of a pixel and its derivatives by u and v, (3, 3); the rows are orthogonal."""
-    elevation, azimuth = elevation_from_y(row + 0.5, height), azimuth_from_x(column + 0.5, width)
-    level, dip, s, c = np.cos(elevation), np.sin(elevation), np.sin(azimuth), np.cos(azimuth)
-    across, down = 2 * np.pi / width * level * stretch, np.pi / height
-    basis[0, 0], basis[0, 1], basis[0, 2] = level * s, -dip, level * c
-    basis[1, 0], basis[1, 1], basis[1, 2] = across * c, 0.0, -across * s
-    basis[2, 0], basis[2, 1], basis[2, 2] = down * dip * s, down * level, down * dip * c
+def sines_of_columns(width: int) -> FloatArray:
+    """Return the sine and the cosine of the azimuth of each column, (2, W)."""
+    turned = np.empty((2, width))
+    for x in range(width):
+        azimuth = azimuth_from_x(x + 0.5, width)
+        turned[0, x], turned[1, x] = np.sin(azimuth), np.cos(azimuth)
+    return turned
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def plane_from_slopes(alpha: float, beta: float, gamma: float, basis: FloatArray, plane: FloatArray) -> None:
-    """Write the plane p, (3,), on which q = α + β u + γ v to first order."""
-    across = basis[1, 0] ** 2 + basis[1, 2] ** 2
-    down = basis[2, 0] ** 2 + basis[2, 1] ** 2 + basis[2, 2] ** 2
-    for a in range(3):
-        plane[a] = alpha * basis[0, a] + beta / across * basis[1, a] + gamma / down * basis[2, a]
+def _padded_rows(inverse: NDArray[np.float32], first: int, rows: int, pad: int) -> NDArray[np.float32]:
+    """Return some rows of an image with `pad` columns more on either side, beyond the poles and the seam too."""
+    height, width = inverse.shape
+    padded = np.empty((rows, width + 2 * pad), np.float32)
+    for y in range(rows):
+        row = wrapped_row(first + y, height)
+        for x in range(width + 2 * pad):
+            padded[y, x] = inverse[row, wrapped_column(first + y, x - pad, height, width)]
+    return padded
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _weigh(
+    values: FloatArray, k: int, u: float, v: float, reach: float, slopes: FloatArray, products: FloatArray
+) -> None:
+    """Write Tukey's weights of one neighbour of each pixel, and those times its value, (2, n)."""
+    neighbour = _U(k)
+    for i in range(_U(values.shape[1])):
+        value = values[neighbour, i]
+        deviation = (value - slopes[0, i] - slopes[1, i] * u - slopes[2, i] * v) / reach
+        rest = 1 - deviation * deviation
+        inside = rest > 0  # NaN is not
+        products[0, i] = rest * rest if inside else 0.0
+        products[1, i] = rest * rest * value if inside else 0.0
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _add_first(products: FloatArray, row: int, u: float, v: float, sums: FloatArray, first: int) -> None:
+    """Add a row of `products`, alone and times u and v, to three rows of `sums` from `first` on."""
+    p, s = _U(row), _U(first)
+    for i in range(_U(products.shape[1])):
+        value = products[p, i]
+        sums[s, i] += value
+        sums[s + _U(1), i] += value * u
+        sums[s + _U(2), i] += value * v
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _add_second(products: FloatArray, u: float, v: float, sums: FloatArray) -> None:
+    """Add the weights times u², u v and v² to three rows of `sums`."""
+    for i in range(_U(products.shape[1])):
+        across = products[0, i] * u
+        sums[3, i] += across * u
+        sums[4, i] += across * v
+        sums[5, i] += products[0, i] * v * v
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _solve_slopes(sums: FloatArray, slopes: FloatArray) -> None:
+    """Write the weighted means' planes (α, β, γ), (3, n), from the nine sums; ill posed ones stay as they are."""
+    for i in range(_U(sums.shape[1])):
+        n = max(sums[0, i], 1e-30)
+        mu, mv, mq = sums[1, i] / n, sums[2, i] / n, sums[6, i] / n
+        suu, suv, svv = sums[3, i] / n - mu * mu, sums[4, i] / n - mu * mv, sums[5, i] / n - mv * mv
+        squ, sqv = sums[7, i] / n - mq * mu, sums[8, i] / n - mq * mv
+        determinant = suu * svv - suv * suv
+        if n >= _MIN_WEIGHT and determinant >= _MIN_SPREAD:
+            beta, gamma = (svv * squ - suv * sqv) / determinant, (suu * sqv - suv * squ) / determinant
+            slopes[0, i] = mq - beta * mu - gamma * mv
+            slopes[1, i] = beta
+            slopes[2, i] = gamma
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -44,74 +101,73 @@ def weighted_slopes(
     values: FloatArray,
     offsets: NDArray[np.int64],
     stretch: float,
-    guess: tuple[float, float, float],
     tolerance: float,
     growth: float,
-) -> tuple[float, float, float, bool]:
-    """Return (α, β, γ, well posed) of the plane through the values (side, side) of a window.
+    slopes: FloatArray,
+    scratch: tuple[FloatArray, FloatArray],
+) -> None:
+    """Improve the planes (α, β, γ) through the windows of a stretch of pixels.
 
-    Weights are Tukey's biweight of the distance from the plane `guess` (α, β, γ), which is 0 from `tolerance` plus
-    `growth` per step from the centre.
+    Weights are Tukey's biweight of the distance from the present planes, which is 0 from `tolerance` plus `growth` per
+    step from the centre. The loops over the pixels are short and many, so that all of them are vectorised.
+
+    Args:
+        values: (side², n) float64 of the windows.
+        offsets: (side,) columns of the window.
+        stretch: columns per step in u.
+        tolerance: see above.
+        growth: see above.
+        slopes: (3, n) float64 α, β and γ, updated; those that are ill posed stay as they are.
+        scratch: (2, n) and (9, n) float64.
     """
+    products, sums = scratch
     side = len(offsets)
     radius = side // 2
-    n, su, sv, suu, suv, svv, sq, squ, sqv = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for row in range(side):
-        v = row - radius
-        for step in range(side):
-            u, value = offsets[step] / stretch, values[row, step]
-            reach = tolerance + growth * max(abs(step - radius), abs(v))
-            deviation = (value - guess[0] - guess[1] * u - guess[2] * v) / reach
-            if not deviation * deviation < 1:  # NaN included
-                continue
-            w = (1 - deviation * deviation) ** 2
-            n += w
-            su += w * u
-            sv += w * v
-            suu += w * u * u
-            suv += w * u * v
-            svv += w * v * v
-            sq += w * value
-            squ += w * value * u
-            sqv += w * value * v
-    n = max(n, 1e-30)
-    mu, mv, mq = su / n, sv / n, sq / n
-    suu, suv, svv = suu / n - mu * mu, suv / n - mu * mv, svv / n - mv * mv
-    squ, sqv = squ / n - mq * mu, sqv / n - mq * mv
-    determinant = suu * svv - suv * suv
-    if n < _MIN_WEIGHT or determinant < _MIN_SPREAD:
-        return guess[0], guess[1], guess[2], False
-    beta, gamma = (svv * squ - suv * sqv) / determinant, (suu * sqv - suv * squ) / determinant
-    return mq - beta * mu - gamma * mv, beta, gamma, True
+    sums[:] = 0.0
+    for k in range(side * side):
+        step, v = k % side, k // side - radius
+        u, reach = offsets[step] / stretch, tolerance + growth * max(abs(step - radius), abs(v))
+        _weigh(values, k, u, float(v), reach, slopes, products)
+        _add_first(products, 0, u, float(v), sums, 0)
+        _add_second(products, u, float(v), sums)
+        _add_first(products, 1, u, float(v), sums, 6)
+    _solve_slopes(sums, slopes)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def fit_slopes(
-    inverse: NDArray[np.float32],
-    row: int,
-    column: int,
+    padded: NDArray[np.float32],
+    place: tuple[int, int, int],
     offsets: NDArray[np.int64],
     stretch: float,
     max_step: float,
-    values: FloatArray,
-) -> tuple[float, float, float]:
-    """Return (α, β, γ) of the plane through the inverse ranges around a pixel, robustly, in units of its own q.
+    slopes: FloatArray,
+) -> None:
+    """Write (α, β, γ), (3, n), of the planes through the inverse ranges around pixels, robustly, in units of their own.
 
     First fit the neighbours that differ from the pixel by less than `max_step` per step plus one, then those within
     `max_step` of that plane. With too few neighbours q stays as it is, and the surface faces the camera.
-    `values`, (side, side) float64, is scratch space.
+
+    Args:
+        padded: rows of inverse ranges, see `_padded_rows`.
+        place: the row, the first pixel and the number of columns beyond the seam, in `padded`.
+        offsets: (side,) columns of the window.
+        stretch: columns per step in u.
+        max_step: see above.
+        slopes: (3, n) float64, written.
     """
-    height, width = inverse.shape
-    side = len(offsets)
-    center = np.float64(inverse[row, column])
-    for j in range(side):
-        y = row + j - side // 2
-        in_row = wrapped_row(y, height)
-        for step in range(side):
-            values[j, step] = inverse[in_row, wrapped_column(y, column + offsets[step], height, width)] / center
-    alpha, beta, gamma, _ = weighted_slopes(values, offsets, stretch, (1.0, 0.0, 0.0), max_step, max_step)
-    alpha, beta, gamma, _ = weighted_slopes(values, offsets, stretch, (alpha, beta, gamma), max_step, 0.0)
-    return alpha, beta, gamma
+    row, first, pad = place
+    side, n = len(offsets), slopes.shape[1]
+    values, scratch = np.empty((side * side, n)), (np.empty((2, n)), np.empty((9, n)))
+    center = _U(first + pad)
+    for k in range(side * side):
+        y, start = _U(row + k // side - side // 2), _U(first + pad + offsets[k % side])
+        for i in range(_U(n)):
+            values[_U(k), i] = np.float64(padded[y, start + i]) / np.float64(padded[_U(row), center + i])
+    slopes[0] = 1.0
+    slopes[1:] = 0.0
+    weighted_slopes(values, offsets, stretch, max_step, max_step, slopes, scratch)
+    weighted_slopes(values, offsets, stretch, max_step, 0.0, slopes, scratch)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -136,15 +192,24 @@ def fit_planes(
         planes: (3, H, W) float32, written.
     """
     height, width = inverse.shape
-    basis, plane = np.empty((3, 3)), np.empty(3)
-    values = np.empty((offsets.shape[1], offsets.shape[1]))
+    radius, pad = offsets.shape[1] // 2, offsets[first : first + rows].max()
+    padded = _padded_rows(inverse, first - radius, rows + 2 * radius, pad)
+    turned = sines_of_columns(width)
     for row in range(first, first + rows):
-        for column in range(width):
-            q = np.float64(inverse[row, column])
-            plane[:] = 0.0
-            if np.isfinite(q):
-                alpha, beta, gamma = fit_slopes(inverse, row, column, offsets[row], stretches[row], max_step, values)
-                tangent_basis(row, column, height, width, stretches[row], basis)
-                plane_from_slopes(q * alpha, q * beta, q * gamma, basis, plane)
-            for a in range(3):
-                planes[a, row, column] = _F(plane[a])
+        elevation = elevation_from_y(row + 0.5, height)
+        level, dip, stretch = np.cos(elevation), np.sin(elevation), stretches[row]
+        # The lengths of the ray's derivatives by u and v: (cos θ, 0, −sin θ) and (sin φ sin θ, cos φ, sin φ cos θ).
+        across, down = 2 * np.pi / width * level * stretch, np.pi / height
+        for start in range(0, width, _STRETCH):
+            slopes = np.empty((3, min(_STRETCH, width - start)))
+            fit_slopes(padded, (row - first + radius, start, pad), offsets[row], stretch, max_step, slopes)
+            for i in range(_U(slopes.shape[1])):
+                x = _U(start) + i
+                q = np.float64(inverse[row, x])
+                s, c = turned[0, x], turned[1, x]
+                alpha, beta, gamma = q * slopes[0, i], q * slopes[1, i] / across, q * slopes[2, i] / down
+                ahead = alpha * level + gamma * dip
+                known = np.isfinite(q)
+                planes[0, row, x] = _F(ahead * s + beta * c) if known else _F(0)
+                planes[1, row, x] = _F(gamma * level - alpha * dip) if known else _F(0)
+                planes[2, row, x] = _F(ahead * c - beta * s) if known else _F(0)

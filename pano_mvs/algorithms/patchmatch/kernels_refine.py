@@ -19,7 +19,8 @@ from pano_mvs.algorithms.patchmatch.kernels_match import (
     sum_windows,
     weigh_window,
 )
-from pano_mvs.algorithms.patchmatch.kernels_planes import tangent_basis
+from pano_mvs.algorithms.patchmatch.kernels_planes import sines_of_columns
+from pano_mvs.geometry.kernels_sphere import elevation_from_y
 
 FloatArray = NDArray[np.float64]
 Reference = tuple[NDArray[np.float32], NDArray[np.float32], int, FloatArray, NDArray[np.int64], NDArray[np.int64]]
@@ -172,8 +173,10 @@ def refine_rows(
     color_scale, noise, prior_q, prior_slope, samples, largest = numbers
     _, height, width = planes.shape
     count, side = len(sources[1]), len(window_rows)
-    prior, basis = (prior_q, prior_slope), np.empty((3, 3))
+    prior, turned = (prior_q, prior_slope), sines_of_columns(width)
     for row in range(first_row, first_row + rows):
+        elevation = elevation_from_y(row + 0.5, height)
+        level, dip = np.cos(elevation), np.sin(elevation)
         for first in range(0, width, STRETCH):
             n = min(STRETCH, width - first)
             weights, centred = np.empty((side * side, n), np.float32), np.empty((side * side, n), np.float32)
@@ -185,7 +188,7 @@ def refine_rows(
             sum_windows(part, place, azimuth, (weights, centred, moments[0]), sources, sums, votes)
             correlate_sources(sums, votes, moments[1], noise, correlations)
             most_likely_steps(sums, correlations, moments[1], noise, prior, samples, steps)
-            for i in range(n):
-                tangent_basis(row, first + i, height, width, 1.0, basis)
-                q = part[0, i] * basis[0, 0] + part[1, i] * basis[0, 1] + part[2, i] * basis[0, 2]
-                inverse[row, first + i] = max(q + min(max(steps[i], -largest), largest), q / 2)
+            for i in range(_U(n)):
+                x = _U(first) + i
+                q = part[0, i] * (level * turned[0, x]) + part[1, i] * -dip + part[2, i] * (level * turned[1, x])
+                inverse[row, x] = max(q + min(max(steps[i], -largest), largest), q / 2)

@@ -38,7 +38,9 @@ class Exposure:
 
     def apply(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the picture as the reference's exposure would have shown it, (H, W, C)."""
-        return np.asarray(np.clip(np.rint(picture * self.gain + self.offset), 0, 255), dtype=np.uint8)
+        levels = np.arange(256)[:, None] * self.gain + self.offset
+        table = np.asarray(np.clip(np.rint(levels), 0, 255), dtype=np.uint8)
+        return np.stack([table[picture[..., c], c] for c in range(picture.shape[-1])], axis=-1)
 
 
 def match_exposure(
@@ -61,20 +63,44 @@ def match_exposure(
         ranges: (h, w) rough ranges of the reference, at any resolution; NaN is left out.
         source_mask: (Hs, Ws) False is left out.
     """
-    known = np.isfinite(ranges)
-    size_hw = reference.shape[0], reference.shape[1]
-    ours = pixel_from_ray(ray_grid((ranges.shape[0], ranges.shape[1]))[known], size_hw)
-    ours = np.floor(ours) + 0.5 + _BETWEEN_PIXELS
-    points = ray_from_pixel(ours, size_hw) * ranges[known].astype(np.float64)[:, None]
-    pixels = pixel_from_ray(source_from_reference.apply(points), source.shape[:2])
-    seen, wanted = sample_panorama(_smooth(source), pixels), sample_panorama(_smooth(reference), ours)
-    cut_off = sample_panorama(_smooth(_at_an_end(source)), pixels) + sample_panorama(
-        _smooth(_at_an_end(reference)), ours
-    )
+    return _exposure_of(source, source_from_reference, _Known.of(reference, ranges), source_mask)
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """What every source is compared with: pixels of the reference whose range is known roughly.
+
+    Attributes:
+        points: (N, 3) in the reference's frame.
+        colors: (N, C) of the reference, smoothed.
+        cut_off: (N, 1) how much of the colours may have been cut off, 255 is all.
+    """
+
+    points: NDArray[np.float64]
+    colors: NDArray[np.float64]
+    cut_off: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, reference: NDArray[np.uint8], ranges: NDArray[np.float32]) -> _Known:
+        known = np.isfinite(ranges)
+        size_hw = reference.shape[0], reference.shape[1]
+        pixels = pixel_from_ray(ray_grid((ranges.shape[0], ranges.shape[1]))[known], size_hw)
+        pixels = np.floor(pixels) + 0.5 + _BETWEEN_PIXELS
+        points = ray_from_pixel(pixels, size_hw) * ranges[known].astype(np.float64)[:, None]
+        cut_off = sample_panorama(_smooth(_at_an_end(reference)), pixels)
+        return cls(points, sample_panorama(_smooth(reference), pixels), cut_off)
+
+
+def _exposure_of(
+    source: NDArray[np.uint8], source_from_reference: Rigid3, known: _Known, source_mask: NDArray[np.bool_] | None
+) -> Exposure:
+    pixels = pixel_from_ray(source_from_reference.apply(known.points), source.shape[:2])
+    seen = sample_panorama(_smooth(source), pixels)
+    cut_off = sample_panorama(_smooth(_at_an_end(source)), pixels) + known.cut_off
     usable = cut_off[..., 0] < _MAX_CUT_OFF
     if source_mask is not None:
         usable &= sample_panorama(source_mask, pixels) > 0.999
-    lines = [_robust_line(seen[usable, c], wanted[usable, c]) for c in range(seen.shape[-1])]
+    lines = [_robust_line(seen[usable, c], known.colors[usable, c]) for c in range(seen.shape[-1])]
     return Exposure(np.array([gain for gain, _ in lines]), np.array([offset for _, offset in lines]))
 
 
@@ -103,8 +129,10 @@ def _robust_line(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float,
 
 def _at_an_end(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return 255 where a colour is so dark or so bright that it may have been cut off, (H, W, 1)."""
-    at_an_end = ((picture <= _ENDS[0]) | (picture >= _ENDS[1])).any(axis=-1, keepdims=True)
-    return np.where(at_an_end, np.uint8(255), np.uint8(0))
+    at_an_end = np.zeros(picture.shape[:2], np.bool_)
+    for c in range(picture.shape[-1]):  # many times as fast as `any` over a short last axis
+        at_an_end |= (picture[..., c] <= _ENDS[0]) | (picture[..., c] >= _ENDS[1])
+    return np.where(at_an_end[..., None], np.uint8(255), np.uint8(0))
 
 
 def _smooth(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -134,8 +162,9 @@ def match_all(
     masks: Sequence[NDArray[np.bool_]] | None,
 ) -> list[NDArray[np.uint8]]:
     """Return all sources in the reference's exposure."""
+    known = _Known.of(reference, ranges)
     matched = []
     for idx, (source, pose) in enumerate(zip(sources, source_from_reference, strict=True)):
         mask = None if masks is None else masks[idx]
-        matched.append(match_exposure(reference, source, pose, ranges=ranges, source_mask=mask).apply(source))
+        matched.append(_exposure_of(source, pose, known, mask).apply(source))
     return matched

@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numba import njit
 
-from pano_mvs.algorithms.sweep.backends.numpy_backend import path_step, winners_of
-from pano_mvs.algorithms.sweep.numba import kernels_sgm
+from pano_mvs.algorithms.sweep.backends import compiled_aggregation
+from pano_mvs.algorithms.sweep.backends.compiled_aggregation import winners_by_paths
+from pano_mvs.algorithms.sweep.backends.numpy_backend import _aggregate, path_step, winners_of
+from pano_mvs.algorithms.sweep.numba import kernels_sgm, kernels_sgm_rows
 from pano_mvs.algorithms.sweep.numba.kernels_combine import combine_row
 from pano_mvs.algorithms.sweep.numba.kernels_cost import box_rows, census_row, difference_row
 from pano_mvs.algorithms.sweep.numba.kernels_records import Combination
 from pano_mvs.algorithms.sweep.numba.kernels_sad import average_differences, one_box_serves
-from pano_mvs.algorithms.sweep.numba.kernels_sgm import sweep_row, sweep_strip
+from pano_mvs.algorithms.sweep.numba.kernels_sgm import (
+    DRIFTS,
+    Front,
+    PathCosts,
+    Sums,
+    follow_block,
+    look_up_penalties,
+    state_columns,
+)
+from pano_mvs.algorithms.sweep.numba.kernels_sgm_rows import follow_rows
 from pano_mvs.algorithms.sweep.numba.kernels_source_cost import store_row
 from pano_mvs.algorithms.sweep.numba.kernels_winner import (
     AFTER,
@@ -25,7 +38,9 @@ from pano_mvs.algorithms.sweep.numba.kernels_winner import (
     winners_of_rows,
 )
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR
-from pano_mvs.algorithms.sweep.penalties import DIRECTIONS
+from pano_mvs.algorithms.sweep.penalties import DIRECTIONS, padded_brightness, penalty_table, step_penalties
+from pano_mvs.algorithms.sweep.preparation import SweepInput
+from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.windows import column_offsets
 from pano_mvs.geometry import pad_panorama
 from tests.oracles import sweep as oracle
@@ -180,38 +195,80 @@ def test_costs_are_stored_rounded_and_saturated() -> None:
     assert voxels.tolist() == [0, 2, 3, 200, 255]
 
 
+def _follow(
+    costs: kernels_sgm.PathCosts, strips: list[int], blocks: list[int], warm: int, follow: Any = follow_block
+) -> np.ndarray:
+    """Return the sum of the three paths to each pixel, and 3, strip by strip and block by block."""
+    height, depth, width = costs.volume.shape
+    fronts = [Front(np.zeros((3, depth, width), np.uint16), np.zeros((3, width), np.uint16)) for _ in range(2)]
+    before, after = np.full((2, height, depth, width + 2), 3, np.uint16)
+    state = np.full((3, depth + 1, state_columns(max(strips), max(blocks))), 77, np.uint16)
+    step = -warm
+    for count in blocks:
+        first = 0
+        for lines in strips:
+            follow(costs, fronts[0], fronts[1], (step, count), (first, lines), Sums(before, 0, after, 0), state)
+            first += lines
+        fronts.reverse()
+        step += count
+    assert (first, step) == (width, height)
+    assert (after[:, :, width:] == 3).all()
+    total: np.ndarray = after[:, :, :width]
+    return total
+
+
 @pytest.mark.kernel("sweep.numba.kernels_sgm")
-@pytest.mark.parametrize("direction", DIRECTIONS)
-def test_paths_over_the_poles_equal_a_walk_pixel_by_pixel(direction: tuple[int, int]) -> None:
+@pytest.mark.parametrize("upward", [False, True])
+@pytest.mark.parametrize(("strips", "blocks"), [([20], [3, 8]), ([7, 13], [2, 1, 5, 3]), ([1, 18, 1], [3, 6, 2])])
+def test_paths_over_the_poles_equal_a_walk_pixel_by_pixel(upward: bool, strips: list[int], blocks: list[int]) -> None:
     rng = np.random.default_rng(9)
     (height, width), depth, p1, warm = (8, 20), 5, 9, 3
     volume = rng.integers(0, 200, (height, depth, width)).astype(np.uint8)
-    penalties = rng.integers(20, 90, (height, width)).astype(np.uint16)
-    total = np.zeros(volume.shape, np.uint16)
-    for first, lines in ((0, 7), (7, 13)):
-        sweep_strip(volume, total, penalties, np.uint16(p1), first, lines, direction[1], direction[0] < 0, warm)
-    for line in range(width):
-        path = oracle.path_pixels((height, width), direction, line, warm=(warm, 0))
-        costs = oracle.path_costs(volume, penalties, path, p1)
-        for (row, column), cost in list(zip(path, costs, strict=True))[warm:]:
-            assert total[row, :, column].tolist() == cost.tolist()
+    penalties = rng.integers(20, 90, (3, height, width)).astype(np.uint16)
+    total = _follow(PathCosts(volume, penalties, np.uint16(p1), upward), strips, blocks, warm)
+    expected = np.full(volume.shape, 3, np.int64)
+    for way, drift in enumerate(DRIFTS):
+        for line in range(width):
+            path = oracle.path_pixels((height, width), (-1 if upward else 1, drift), line, warm=(warm, 0))
+            costs = oracle.path_costs(volume, penalties[way], path, p1)
+            for (row, column), cost in list(zip(path, costs, strict=True))[warm:]:
+                expected[row, :, column] += cost
+    np.testing.assert_array_equal(total, expected)
+
+
+@pytest.mark.kernel("sweep.numba.kernels_sgm_rows")
+@pytest.mark.parametrize("largest", [90, 4000])  # with dear steps, a path remembers for more than once around
+def test_paths_along_a_row_equal_a_walk_pixel_by_pixel(largest: int) -> None:
+    rng = np.random.default_rng(10)
+    (height, width), depth, p1 = (3, 20), 5, 9
+    volume = rng.integers(0, 200, (height, depth, width)).astype(np.uint8)
+    penalties = rng.integers(20, largest, (2, height, width)).astype(np.uint16)
+    sums, expected = np.full((2, depth, width + 3), 7, np.uint16), np.zeros((2, depth, width), np.int64)
+    follow_rows(volume, penalties, np.uint16(p1), (1, 2), sums, 1)
+    for row in (1, 2):
+        for idx, step in enumerate((1, -1)):
+            path = oracle.path_pixels((height, width), (0, step), row, warm=(0, width))
+            costs = oracle.path_costs(volume, penalties[idx], path, p1)
+            for (_, column), cost in list(zip(path, costs, strict=True))[width:]:
+                expected[row - 1, :, column] += cost
+    np.testing.assert_array_equal(sums[:, :, :width], expected)
+    assert (sums[:, :, width:] == 7).all()
 
 
 @pytest.mark.kernel("sweep.numba.kernels_sgm")
-def test_paths_along_a_row_equal_a_walk_pixel_by_pixel() -> None:
-    rng = np.random.default_rng(10)
-    (height, width), depth, p1, warm = (3, 20), 5, 9, 10
-    volume = rng.integers(0, 200, (height, depth, width)).astype(np.uint8)
-    penalties = rng.integers(20, 90, (2, height, width)).astype(np.uint16)
-    total, expected = np.zeros(volume.shape, np.uint16), np.zeros(volume.shape, np.int64)
-    for row in range(height):
-        sweep_row(volume, total, penalties, np.uint16(p1), row, warm)
-        for idx, step in enumerate((1, -1)):
-            path = oracle.path_pixels((height, width), (0, step), row, warm=(0, warm))
-            costs = oracle.path_costs(volume, penalties[idx], path, p1)
-            for (_, column), cost in list(zip(path, costs, strict=True))[warm:]:
-                expected[row, :, column] += cost
-    np.testing.assert_array_equal(total, expected)
+@pytest.mark.parametrize("contrast", [15.0, 0.0])
+def test_penalties_are_looked_up_as_they_are_defined(contrast: float) -> None:
+    picture = np.random.default_rng(12).integers(0, 256, (*SIZE, 3), dtype=np.uint8)
+    settings = SweepSettings(p1=300, p2=3000, p2_contrast=contrast)
+    found = np.empty((len(DIRECTIONS), 9, SIZE[1]), np.uint16)
+    table = penalty_table(settings, SIZE[0], 3)
+    look_up_penalties(padded_brightness(picture), table, np.array(DIRECTIONS), 4, found)
+    for direction, penalties in zip(DIRECTIONS, found, strict=True):
+        np.testing.assert_array_equal(penalties, step_penalties(picture, direction, settings, rows=slice(4, 13)))
+    grey = pad_panorama(picture.astype(np.float64).mean(axis=-1), 1)
+    expected = np.maximum(9, 94 / (1 + np.abs(grey[1:-1, 1:-1] - grey[:-2, 2:]) / contrast)) if contrast else 94.0
+    found = step_penalties(picture, (1, -1), settings)
+    np.testing.assert_allclose(found, np.broadcast_to(expected, SIZE), atol=0.5 + 1e-9)
 
 
 def test_one_step_of_many_paths_equals_each_alone() -> None:
@@ -226,22 +283,63 @@ def test_one_step_of_many_paths_equals_each_alone() -> None:
             assert together[d, k] == costs[d, k] + min([before[d, k], floor + p2, *around]) - floor
 
 
+def _by_loops(monkeypatch: pytest.MonkeyPatch, module: Any, *names: str) -> Any:
+    """Return the last of some kernels, compiled again without vector instructions; each calls those before it."""
+    monkeypatch.setattr(module, "HAS_VECTOR", False)
+    for name in names:
+        monkeypatch.setattr(module, name, njit(getattr(module, name).py_func, error_model="numpy"))
+    return getattr(module, names[-1])
+
+
 @pytest.mark.kernel("sweep.numba.kernels_sgm", "sweep.numba.x86.kernels_vector_path")
+@pytest.mark.slow
 @pytest.mark.skipif(not HAS_VECTOR, reason="there is nothing but loops")
-@pytest.mark.parametrize(("drift", "upward"), [(0, False), (1, False), (-1, True)])
-@pytest.mark.parametrize(("lines", "first"), [(100, 0), (40, 70), (5, 99), (33, 1)])
-def test_paths_by_vector_instructions_equal_those_by_loops(
-    drift: int, upward: bool, lines: int, first: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rng = np.random.default_rng(lines)
+def test_paths_by_vector_instructions_equal_those_by_loops(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(13)
     (height, width), depth = (9, 100), 7
     volume = rng.integers(1, 256, (height, depth, width), dtype=np.uint8)
-    penalties = rng.integers(20, 90, (height, width)).astype(np.uint16)
-    totals = []
-    for vector in (True, False):
-        monkeypatch.setattr(kernels_sgm, "HAS_VECTOR", vector)
-        strip = kernels_sgm.sweep_strip if vector else njit(sweep_strip.py_func, error_model="numpy")
-        totals.append(np.full(volume.shape, 3, np.uint16))
-        strip(volume, totals[-1], penalties, np.uint16(11), first, lines, drift, upward, 3)
-    assert totals[0].tobytes() == totals[1].tobytes()
-    assert (totals[0] == 3).sum() == (width - lines) * depth * height
+    penalties = rng.integers(20, 90, (3, height, width)).astype(np.uint16)
+    loops = _by_loops(monkeypatch, kernels_sgm, "_step_row", "follow_block")
+    for upward in (False, True):
+        costs = PathCosts(volume, penalties, np.uint16(11), upward)
+        expected = _follow(costs, [100], [3, 9], 3, loops)
+        for strips, blocks in (([100], [3, 9]), ([64, 36], [1, 2, 5, 4]), ([5, 33, 1, 61], [3, 2, 7])):
+            assert _follow(costs, strips, blocks, 3).tobytes() == expected.tobytes()
+
+
+@pytest.mark.kernel("sweep.numba.kernels_sgm_rows", "sweep.numba.x86.kernels_vector_planes")
+@pytest.mark.slow
+@pytest.mark.skipif(not HAS_VECTOR, reason="there is nothing but loops")
+def test_paths_along_rows_by_vector_instructions_equal_those_by_loops(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(15)
+    names = ("_turn_row", "_turn_sums", "step_pixel", "_close_circle", "follow_rows")
+    loops = _by_loops(monkeypatch, kernels_sgm_rows, *names)
+    for depth, width in ((64, 96), (37, 50), (7, 90), (40, 9)):
+        volume = rng.integers(0, 256, (4, depth, width), dtype=np.uint8)
+        penalties = rng.integers(100, 3000, (2, 4, width)).astype(np.uint16)
+        results = np.zeros((2, 3, depth, width + 32), np.uint16)
+        for follow, sums in zip((follow_rows, loops), results, strict=True):
+            follow(volume, penalties, np.uint16(90), (1, 3), sums, 1)
+        assert results[0].tobytes() == results[1].tobytes()
+
+
+@pytest.mark.parametrize(("size", "top", "count"), [((24, 48), 0, 24), ((40, 100), 0, 40), ((64, 128), 20, 30)])
+def test_all_paths_equal_the_readable_ones(
+    size: tuple[int, int], top: int, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(14)
+    settings = SweepSettings(planes=33, p1=200, p2=4000)
+    picture = rng.integers(0, 256, (*size, 3), dtype=np.uint8)
+    work = SweepInput(picture, (), (), None, np.linspace(1, 2, 33), settings)
+    volume = rng.integers(0, 256, (count, 33, size[1]), dtype=np.uint8)
+    found = winners_by_paths(work, volume, top=top)
+    monkeypatch.setattr(compiled_aggregation, "_BLOCK_ROWS", 5)
+    monkeypatch.setattr(compiled_aggregation, "_STRIP_COLUMNS", 31)
+    again = winners_by_paths(work, volume, top=top)
+    for name in ("plane", "cost", "before", "after", "rival"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(again, name))
+    if count == size[0]:
+        expected = winners_of(_aggregate(volume.astype(np.int64), work).astype(np.float64))
+        np.testing.assert_array_equal(found.plane, expected.plane)
+        np.testing.assert_array_equal(found.cost, expected.cost)
+        np.testing.assert_array_equal(found.rival, expected.rival)

@@ -77,7 +77,7 @@ def changed_by(module: str, old: str, new: str) -> set[str]:
             "2 * math.pi * (x / width - 1.5)",
             {"depth.patchmatch"},
         ),
-        ("algorithms.sweep.numba.kernels_sgm", "_BLOCK = ", "_BLOCK = 1 * ", SWEEPS),
+        ("algorithms.sweep.numba.kernels_sgm_rows", "_BLOCK = ", "_BLOCK = 1 * ", SWEEPS),
         ("algorithms.filters.kernels_fill", "_DIRECTIONS = ", "_DIRECTIONS = 1 * ", {"filters.fill"}),
         (
             "algorithms.two_view.kernels_five_point",
@@ -105,7 +105,7 @@ def test_every_kernel_that_a_stage_can_run_is_in_its_key(name: str) -> None:
     ("module", "old", "new"),
     [
         ("algorithms.sweep.sweep", '"""', '"""Anew. '),
-        ("algorithms.sweep.numba.kernels_sgm", "_BLOCK = ", "# how many\n_BLOCK = "),
+        ("algorithms.sweep.numba.kernels_sgm_rows", "_BLOCK = ", "# how many\n_BLOCK = "),
         ("algorithms.sweep.settings", 'doc="number of depth hypotheses"', 'doc="how many hypotheses"'),
         ("stages.depth", "_PICTURE_BYTES, _RESULT_BYTES = 16", "_PICTURE_BYTES, _RESULT_BYTES = 17"),
     ],

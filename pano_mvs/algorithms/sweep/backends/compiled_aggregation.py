@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from math import ceil
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from pano_mvs.algorithms.sweep.numba.arguments import BAND_ROWS
-from pano_mvs.algorithms.sweep.numba.kernels_sgm import sweep_row, sweep_strip
+from pano_mvs.algorithms.sweep.numba.kernels_sgm import (
+    DRIFTS,
+    Front,
+    PathCosts,
+    Sums,
+    follow_block,
+    look_up_penalties,
+    state_columns,
+)
+from pano_mvs.algorithms.sweep.numba.kernels_sgm_rows import follow_rows
 from pano_mvs.algorithms.sweep.numba.kernels_winner import AFTER, BEFORE, BEST, RIVAL, STATES, winners_of_rows
 from pano_mvs.algorithms.sweep.numba.threads import Pool, run_jobs, workers
-from pano_mvs.algorithms.sweep.penalties import step_penalties, warm_up
+from pano_mvs.algorithms.sweep.penalties import padded_brightness, penalty_table, warm_up
 from pano_mvs.algorithms.sweep.preparation import SweepInput
 from pano_mvs.algorithms.sweep.settings import SweepSettings
 from pano_mvs.algorithms.sweep.winner import Winners
@@ -22,7 +33,10 @@ VOLUME_BYTES = 3
 """Bytes for each pixel and plane: a uint8 cost and a uint16 sum of paths."""
 
 _OVERLAP = 1 / 20
-_STRIP_LINES = 128
+_BLOCK_ROWS = 32
+_JOB_ROWS = 4
+_STRIP_COLUMNS = 512
+_LINE_WORDS = 32  # uint16 in a line of the cache
 # More than the eight paths of a plane can cost, see `SweepSettings.penalties`.
 _NO_SUM = 65535
 
@@ -84,17 +98,18 @@ def winners_by_paths(work: SweepInput, volume: NDArray[np.uint8], *, top: int = 
     height, _, width = volume.shape
     found = Winners.unset((height, width))
 
-    def decide(first: int) -> None:
-        rows = min(BAND_ROWS, height - first)
-        state, planes = np.full((STATES, rows, width), _NO_SUM, np.uint16), np.zeros((rows, width), np.uint16)
-        winners_of_rows(total, first, state, planes)
-        keep_band(found, state, planes, first=first)
-        rival = found.rival[first : first + rows]
+    def decide(first: int, *, rows: slice, sums: NDArray[np.uint16]) -> None:
+        count = min(_JOB_ROWS, rows.stop - first)
+        columns = sums.shape[2]
+        state, planes = np.full((STATES, count, columns), _NO_SUM, np.uint16), np.zeros((count, columns), np.uint16)
+        winners_of_rows(sums, first - rows.start, state, planes)
+        keep_band(found, state[:, :, :width], planes[:, :width], first=first)
+        rival = found.rival[first : first + count]
         rival[rival == _NO_SUM] = np.inf
 
     with workers() as pool:
-        total = _sum_paths(pool, work, volume, top=top)
-        run_jobs(pool, decide, range(0, height, BAND_ROWS))
+        for rows, sums in _summed_paths(pool, work, volume, top=top):
+            run_jobs(pool, partial(decide, rows=rows, sums=sums), range(rows.start, rows.stop, _JOB_ROWS))
     return found
 
 
@@ -110,40 +125,100 @@ def keep_band(
     found.rival[rows] = state[RIVAL]
 
 
-def _sum_paths(pool: Pool, work: SweepInput, volume: NDArray[np.uint8], *, top: int) -> NDArray[np.uint16]:
-    """Return the sum of the eight paths' costs, (rows, D, W) uint16."""
-    height, width = work.reference.shape[:2]
-    settings, rows = work.settings, slice(top, top + len(volume))
-    total = np.zeros(volume.shape, np.uint16)
-    p1 = np.uint16(settings.penalties(height)[0])
-    beyond_pole, before_seam = warm_up((height, width))
+def _summed_paths(
+    pool: Pool, work: SweepInput, volume: NDArray[np.uint8], *, top: int
+) -> Iterator[tuple[slice, NDArray[np.uint16]]]:
+    """Yield blocks of rows, the last ones first, with the sums of the eight paths' costs, (rows, D, W) uint16.
+
+    The paths along the rows and downwards come first, and their sums are kept; those upwards complete a block's sums,
+    which are valid until the next block.
+    """
+    size_hw, settings = (work.reference.shape[0], work.reference.shape[1]), work.settings
+    height, end = len(volume), top + len(volume)
+    p1 = np.uint16(settings.penalties(size_hw[0])[0])
+    beyond_pole, _ = warm_up(size_hw)
+
+    brightness = padded_brightness(work.reference)
+    table = penalty_table(settings, size_hw[0], work.reference.shape[2])
+
+    def penalties(*directions: tuple[int, int]) -> NDArray[np.uint16]:
+        found = np.empty((len(directions), height, size_hw[1]), np.uint16)
+        look_up_penalties(brightness, table, np.array(directions), top, found)
+        return found
+
+    total, block = (np.empty((count, *_sum_shape(volume)), np.uint16) for count in (height, min(_BLOCK_ROWS, height)))
+    sideways = penalties((0, 1), (0, -1))
+    paths = _PolePaths(PathCosts(volume, penalties(*((1, drift) for drift in DRIFTS)), p1, False))
     # Where rows end that are not at a pole, nothing lies beyond.
-    warm = (beyond_pole if rows.start == 0 else 0, beyond_pole if rows.stop == height else 0)
-    for drift in (-1, 0, 1):
-        penalties = (
-            step_penalties(work.reference, (1, drift), settings, rows=rows),
-            step_penalties(work.reference, (-1, -drift), settings, rows=rows),
-        )
-        follow = partial(_follow_lines, volume, total, penalties=penalties, p1=p1, drift=drift, warm=warm)
-        run_jobs(pool, follow, range(0, width, _STRIP_LINES))
-    sideways = np.stack([step_penalties(work.reference, (0, step), settings, rows=rows) for step in (1, -1)])
-    run_jobs(pool, lambda y: sweep_row(volume, total, sideways, p1, y, before_seam), range(len(volume)))
-    return total
+    paths.prepare(pool, beyond_pole if top == 0 else 0)
+    for first in range(0, height, _BLOCK_ROWS):
+        count = min(_BLOCK_ROWS, height - first)
+        along = partial(_follow_some_rows, volume, sideways, p1, block, range(first, first + count))
+        run_jobs(pool, along, range(first, first + count, _JOB_ROWS))
+        paths.follow(pool, first, count, Sums(block, first, total, 0))
+    paths = _PolePaths(PathCosts(volume, penalties(*((-1, drift) for drift in DRIFTS)), p1, True))
+    paths.prepare(pool, beyond_pole if end == size_hw[0] else 0)
+    for step in range(0, height, _BLOCK_ROWS):
+        count = min(_BLOCK_ROWS, height - step)
+        first = height - step - count
+        paths.follow(pool, step, count, Sums(total, 0, block, first))
+        yield slice(first, first + count), block
 
 
-def _follow_lines(
+def _follow_some_rows(
     volume: NDArray[np.uint8],
-    total: NDArray[np.uint16],
-    first: int,
-    *,
-    penalties: tuple[NDArray[np.uint16], NDArray[np.uint16]],
+    penalties: NDArray[np.uint16],
     p1: np.uint16,
-    drift: int,
-    warm: tuple[int, int],
+    block: NDArray[np.uint16],
+    rows: range,
+    first: int,
 ) -> None:
-    """Follow a strip of lines down and then, while caches still hold it, up again."""
-    height, _, width = volume.shape
-    lines = min(_STRIP_LINES, width - first)
-    sweep_strip(volume, total, penalties[0], p1, first, lines, drift, False, warm[0])
-    last = (first + drift * (height - 1)) % width
-    sweep_strip(volume, total, penalties[1], p1, last, lines, -drift, True, warm[1])
+    follow_rows(volume, penalties, p1, (first, min(_JOB_ROWS, rows.stop - first)), block, rows.start)
+
+
+class _PolePaths:
+    """All paths from one pole to the other, followed block by block."""
+
+    def __init__(self, costs: PathCosts) -> None:
+        _, depth, width = costs.volume.shape
+        self._costs = costs
+        self._fronts = [
+            Front(np.zeros((len(DRIFTS), depth, width), np.uint16), np.zeros((len(DRIFTS), width), np.uint16))
+            for _ in range(2)
+        ]
+        self._strip = _strip_columns(width)
+        columns = state_columns(self._strip, _BLOCK_ROWS)
+        self._states = np.empty((-(-width // self._strip), len(DRIFTS), depth + 1, columns), np.uint16)
+
+    def prepare(self, pool: Pool, steps: int) -> None:
+        """Follow the paths beyond the pole from which they come."""
+        nowhere = np.empty((0, *_sum_shape(self._costs.volume)), np.uint16)
+        for first in range(-steps, 0, _BLOCK_ROWS):
+            self.follow(pool, first, min(_BLOCK_ROWS, -first), Sums(nowhere, 0, nowhere, 0))
+
+    def follow(self, pool: Pool, step: int, count: int, sums: Sums) -> None:
+        """Follow the paths by some steps, the same for any strips, and add their costs to the sums."""
+        width, strip = self._costs.volume.shape[2], self._strip
+
+        def follow_strip(first: int) -> None:
+            columns = first, min(strip, width - first)
+            state = self._states[first // strip]
+            follow_block(self._costs, self._fronts[0], self._fronts[1], (step, count), columns, sums, state)
+
+        run_jobs(pool, follow_strip, range(0, width, strip))
+        self._fronts.reverse()
+
+
+def _sum_shape(volume: NDArray[np.uint8]) -> tuple[int, int]:
+    """Return (D, columns) of the sums of paths for a row.
+
+    Planes must not lie a power of two apart, or all of a pixel's sums fall on a few places of the cache.
+    """
+    _, depth, width = volume.shape
+    return depth, (-(-width // _LINE_WORDS) | 1) * _LINE_WORDS
+
+
+def _strip_columns(width: int) -> int:
+    """Return how many columns a strip has: few enough that its paths fit the caches, one strip for each thread."""
+    threads: int = numba.get_num_threads()
+    return min(_STRIP_COLUMNS, ceil(width / threads))

@@ -1,223 +1,306 @@
-"""Compiled: semi-global matching on the sphere, one path direction and one strip or row at a time.
+"""Compiled: semi-global matching on the sphere, three path directions from pole to pole at a time, block by block.
 
 H. Hirschmüller, "Stereo processing by semiglobal matching and mutual information", TPAMI 2008, equation 13:
 L(p, d) = C(p, d) + min(L(q, d), L(q, d ± 1) + P1, min L(q) + P2) − min L(q), q the pixel before p on the path.
+
+The straight and the two diagonal paths that come to a pixel from one pole advance together, so that costs and sums are
+read once. Where a strip of columns begins and ends, diagonal paths come from beyond it: for a block of rows, a strip
+starts with as many more columns on either side and loses one with each row.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
-from pano_mvs.algorithms.sweep.numba.kernels_records import U8, U16
+from pano_mvs.algorithms.sweep.numba.kernels_records import I16, I64, U8, U16
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import HAS_VECTOR
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector_path import LINES, step_lines
 
 _U = np.uint64
 _H = np.uint16
 _OUTSIDE = np.uint16(60000)  # the cost of the planes before the first and after the last; P1 on top must not overflow
-_BLOCK = 32  # columns of which all planes fit the nearest cache
+_ALL = -1
+
+DRIFTS = (0, 1, -1)
+"""Columns by which the paths of each direction move in a step."""
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def look_up_penalties(brightness: I16, table: U16, steps: I64, first: int, penalties: U16) -> None:
+    """Do what `penalties.step_penalties` does for several directions.
+
+    Args:
+        brightness: (H + 2, W + 2) int16, see `padded_brightness`.
+        table: see `penalty_table`.
+        steps: (K, 2) int64 rows and columns of each direction.
+        first: the first row.
+        penalties: (K, rows, W) uint16, written.
+    """
+    for k in range(_U(penalties.shape[0])):
+        for y in range(_U(penalties.shape[1])):
+            here = _U(first + 1) + y
+            before = _U(first + 1 - steps[k, 0]) + y
+            shift = _U(1 - steps[k, 1])
+            for x in range(_U(penalties.shape[2])):
+                contrast = np.int16(brightness[here, x + _U(1)] - brightness[before, x + shift])
+                penalties[k, y, x] = table[_U(abs(contrast))]
+
+
+class PathCosts(NamedTuple):
+    """What paths from one pole to the other read.
+
+    Attributes:
+        volume: (H, D, W) uint8.
+        penalties: (3, H, W) uint16 P2 of the step into each pixel, for each of `DRIFTS`.
+        p1: uint16.
+        upward: whether the paths run from the last row to the first.
+    """
+
+    volume: U8
+    penalties: U16
+    p1: np.uint16
+    upward: bool
+
+
+class Front(NamedTuple):
+    """Where paths have come to.
+
+    Attributes:
+        paths: (3, D, W) uint16 costs of the paths in the last pixels that they came to, by the columns of these.
+        least: (3, W) uint16 the least of each.
+    """
+
+    paths: U16
+    least: U16
+
+
+class Sums(NamedTuple):
+    """Where sums of path costs are read and written.
+
+    Attributes:
+        before: (·, D, ·) uint16 sums of other paths; rows may be longer than the volume's.
+        first_before: the row of the picture with which `before` begins.
+        after: (·, D, ·) uint16, written: with those of these paths; the same length of rows.
+        first_after: the row with which `after` begins.
+    """
+
+    before: U16
+    first_before: int
+    after: U16
+    first_after: int
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def step_plain(
-    volume: U8,
-    total: U16,
+    costs: PathCosts,
     place: tuple[int, int],
-    segment: tuple[int, int],
-    penalties: U16,
-    p1: np.uint16,
-    before: U16,
-    least_before: U16,
-    after: U16,
+    lines: int,
+    direction: int,
+    line: int,
+    state: U16,
     least: U16,
+    scratch: U16,
+    sums: Sums,
+    others: bool,
     keep: bool,
 ) -> None:
-    """Advance the lines of one segment by one row: `place` (row, column), `segment` (first line, lines)."""
-    row, column = _U(place[0]), _U(place[1])
-    first, lines = _U(segment[0]), _U(segment[1])
+    """Advance neighbouring lines of one direction by one row.
+
+    Args:
+        costs: what paths read.
+        place: row and column of the first line's pixel; the others follow in the row.
+        lines: number of lines.
+        direction: among `DRIFTS`.
+        line: the first line's place in the state.
+        state: (3, D + 1, ·) uint16 costs of the paths, updated.
+        least: (3, ·) uint16 the least of each, updated.
+        scratch: (2, ·) uint16.
+        sums: where to write sums.
+        others: whether these lines are added to `sums.before`, or to those that were added to them already.
+        keep: whether to write sums.
+    """
+    volume, p1 = costs.volume, costs.p1
+    row, column, first, way = _U(place[0]), _U(place[1]), _U(line), _U(direction)
+    row_before, row_after = _U(place[0] - sums.first_before), _U(place[0] - sums.first_after)
+    for k in range(_U(lines)):
+        scratch[0, k], scratch[1, k] = _OUTSIDE, _OUTSIDE
     for d in range(_U(volume.shape[1])):
-        for k in range(lines):
-            line = first + k
-            floor = least_before[line]
-            stay = before[d + _U(1), line]
-            down, up = _H(before[d, line] + p1), _H(before[d + _U(2), line] + p1)
+        for k in range(_U(lines)):
+            floor = least[way, first + k]
+            stay = state[way, d, first + k]
+            down, up = _H(scratch[0, k] + p1), _H(state[way, d + _U(1), first + k] + p1)
             near = down if down < up else up
-            jump = _H(floor + penalties[row, column + k])
+            jump = _H(floor + costs.penalties[way, row, column + k])
             near = near if near < jump else jump
             near = stay if stay < near else near
             value = _H(_H(near - floor) + _H(volume[row, d, column + k]))
-            after[d + _U(1), line] = value
-            least[line] = value if value < least[line] else least[line]
-        if keep:
-            for k in range(lines):
-                total[row, d, column + k] = _H(total[row, d, column + k] + after[d + _U(1), first + k])
+            scratch[0, k] = stay
+            scratch[1, k] = value if value < scratch[1, k] else scratch[1, k]
+            state[way, d, first + k] = value
+        if keep and others:
+            for k in range(_U(lines)):
+                sums.after[row_after, d, column + k] = _H(
+                    sums.before[row_before, d, column + k] + state[way, d, first + k]
+                )
+        elif keep:
+            for k in range(_U(lines)):
+                sums.after[row_after, d, column + k] = _H(
+                    sums.after[row_after, d, column + k] + state[way, d, first + k]
+                )
+    for k in range(_U(lines)):
+        least[way, first + k] = scratch[1, k]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def step_segment(
-    volume: U8,
-    total: U16,
+def _step_vector(
+    costs: PathCosts,
     place: tuple[int, int],
-    segment: tuple[int, int],
-    penalties: U16,
-    p1: np.uint16,
+    lines: int,
+    direction: int,
+    line: tuple[int, int, int],
     state: U16,
     least: U16,
+    sums: Sums,
     keep: bool,
 ) -> None:
-    """Do what `step_plain` does by vector instructions, in place; volume and total must be contiguous.
+    """Advance neighbouring lines of all directions, or of one, by one row.
 
     Lines have a margin of `LINES` on either side: where the row ends before a register does, it starts earlier, with
     lines of no meaning that are left as they are.
     """
-    _, depth, width = volume.shape
-    first, lines = segment
+    volume, p1, penalties = costs.volume, costs.p1, costs.penalties
+    height, depth, width = volume.shape
+    planes, stride = state.shape[1:]
+    sum_step = sums.after.shape[2]
+    row = place[0]
+    row_before, row_after = row - sums.first_before if keep else 0, row - sums.first_after if keep else 0
     for done in range(0, lines, LINES):
         back = max(0, place[1] + done + LINES - width)
-        column = place[1] + done - back
-        counted = _U(back), _U(back + min(LINES, lines - done))
-        step_lines(
-            volume,
-            total,
-            (_U(place[0] * depth * width + column), _U(width), _U(depth)),
-            p1,
-            penalties,
-            _U(place[0] * width + column),
-            state,
-            least,
-            (_U(LINES + first + done - back), _U(state.shape[1]), counted[0], counted[1]),
-            _U(keep),
+        column, first = place[1] + done - back, done - back
+        places = row * depth * width, row_before * depth * sum_step, row_after * depth * sum_step
+        voxels = (
+            *(_U(places[0] + column), _U(places[1] + column), _U(places[2] + column)),
+            *(_U(width), _U(sum_step), _U(depth)),
         )
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def sweep_strip(
-    volume: U8, total: U16, penalties: U16, p1: np.uint16, first: int, lines: int, drift: int, upward: bool, warm: int
-) -> None:
-    """Follow one strip of parallel paths from pole to pole and add their costs to the total.
-
-    Line k is at column first + k + drift·i in step i. Steps i < 0 lie beyond the pole from which the paths come:
-    in row −1 − i, half a turn further on; their costs only prepare the state.
-
-    Args:
-        volume: (H, D, W) uint8.
-        total: (H, D, W) uint16, added to; strips of one direction touch disjoint entries.
-        penalties: (H, W) uint16 P2 of the step into each pixel.
-        p1: uint16.
-        first: column of the first line in row 0 (row H − 1 for upward paths).
-        lines: number of lines.
-        drift: columns by which a path moves in each step: −1, 0 or 1.
-        upward: whether the paths run from the last row to the first.
-        warm: steps before the pole.
-    """
-    height, depth, width = volume.shape
-    vector = HAS_VECTOR and width >= LINES
-    margin = LINES if vector else 0
-    buffers = np.zeros((1 if vector else 2, depth + 2, lines + 2 * margin), np.uint16)
-    buffers[:, 0, :] = _OUTSIDE
-    buffers[:, depth + 1, :] = _OUTSIDE
-    least = np.zeros((2, lines + 2 * margin), np.uint16)
-    for i in range(-warm, height):
-        now = (i + warm) % 2
-        row = i if i >= 0 else -1 - i
-        row = height - 1 - row if upward else row
-        column = first + drift * i + (0 if i >= 0 else width // 2)
-        column = (column % width + width) % width
-        direct = min(lines, width - column)
-        if HAS_VECTOR:  # a constant: without it step_segment is not compiled, which is impossible on other processors
-            if vector:
-                step_segment(volume, total, (row, column), (0, direct), penalties, p1, buffers[0, 1:], least[0], i >= 0)
-                step_segment(
-                    volume, total, (row, 0), (direct, lines - direct), penalties, p1, buffers[0, 1:], least[0], i >= 0
-                )
-                continue
-        least[now, :] = _OUTSIDE
-        for place, segment in (((row, column), (0, direct)), ((row, 0), (direct, lines - direct))):
-            step_plain(
-                volume,
-                total,
-                place,
-                segment,
-                penalties,
-                p1,
-                buffers[1 - now],
-                least[1 - now],
-                buffers[now],
-                least[now],
-                i >= 0,
+        counted = _U(stride), _U(back), _U(back + min(LINES, lines - done)), _U(keep)
+        if direction == _ALL:
+            pixel, lower = row * width + column, planes * stride
+            pixels = _U(pixel), _U(pixel + height * width), _U(pixel + 2 * height * width)
+            at = (
+                *(_U(line[0] + first), _U(line[0] + first)),
+                *(_U(lower + line[1] + first), _U(stride + line[1] + first)),
+                *(_U(2 * lower + line[2] + first), _U(2 * stride + line[2] + first)),
             )
+            step_lines(volume, voxels, p1, penalties, pixels, state, least, at, counted, sums.before, sums.after)
+        else:
+            start = line[direction] + first
+            one_pixel = (_U((direction * height + row) * width + column),)
+            one_at = _U(direction * planes * stride + start), _U(direction * stride + start)
+            step_lines(volume, voxels, p1, penalties, one_pixel, state, least, one_at, counted, sums.before, sums.after)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _turn_row(volume: U8, y: int, costs: U8) -> None:
-    """Write row y of a volume, (H, D, W), pixel by pixel, into (W, D)."""
-    row, width = _U(y), volume.shape[2]
-    for start in range(0, width, _BLOCK):
-        stop = min(start + _BLOCK, width)
-        for d in range(_U(volume.shape[1])):
-            for x in range(_U(start), _U(stop)):
-                costs[x, d] = volume[row, d, x]
+def _step_row(
+    costs: PathCosts,
+    row: int,
+    columns: tuple[int, int],
+    direction: int,
+    line: tuple[int, int, int],
+    state: U16,
+    least: U16,
+    scratch: U16,
+    sums: Sums,
+    keep: bool,
+) -> None:
+    """Advance the lines that come to some columns, (first, how many), which may pass the seam, by one row."""
+    width = costs.volume.shape[2]
+    done = 0
+    while done < columns[1]:
+        column = (columns[0] + done) % width
+        lines = min(columns[1] - done, width - column)
+        place, start = (row, column), (line[0] + done, line[1] + done, line[2] + done)
+        vector = False
+        if HAS_VECTOR:  # a constant: without it `step_lines` is not compiled, which is impossible on other processors
+            vector = width >= LINES
+            if vector:
+                _step_vector(costs, place, lines, direction, start, state, least, sums, keep)
+        if not vector:
+            for way in range(3):
+                if direction in (_ALL, way):
+                    step_plain(costs, place, lines, way, start[way], state, least, scratch, sums, way == 0, keep)
+        done += lines
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _add_turned_row(sums: U16, y: int, total: U16) -> None:
-    """Add (W, D) to row y of (H, D, W)."""
-    row, width = _U(y), total.shape[2]
-    for start in range(0, width, _BLOCK):
-        stop = min(start + _BLOCK, width)
-        for d in range(_U(total.shape[1])):
-            for x in range(_U(start), _U(stop)):
-                total[row, d, x] = _H(total[row, d, x] + sums[x, d])
+def _take_front(front: Front, column: int, lines: int, state: U16, least: U16) -> None:
+    """Copy where the paths have come to in some columns, which may go around the seam several times."""
+    depth, width = front.paths.shape[1:]
+    for way in range(3):
+        done = 0
+        while done < lines:
+            start = (column + done) % width
+            count = min(lines - done, width - start)
+            to = LINES + done
+            least[way, to : to + count] = front.least[way, start : start + count]
+            for d in range(depth):
+                state[way, d, to : to + count] = front.paths[way, d, start : start + count]
+            done += count
+
+
+def state_columns(strip: int, steps: int) -> int:
+    """Return how many columns of scratch space `follow_block` needs for a strip of columns and some steps."""
+    return strip + 2 * steps + 2 * LINES
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _circle(costs: U8, penalties: U16, p1: np.uint16, direction: int, warm: int, sums: U16) -> None:
-    """Follow one horizontal path and add its costs to `sums`, (W, D) uint16; `penalties` is (W,).
+def follow_block(
+    costs: PathCosts,
+    front: Front,
+    new_front: Front,
+    steps: tuple[int, int],
+    strip: tuple[int, int],
+    sums: Sums,
+    state: U16,
+) -> None:
+    """Follow the paths that come to a strip of columns through a block of rows and add their costs to the sums.
 
-    The loops are in this function, and not in one for each pixel: views of arrays take longer than a pixel's planes.
-    """
-    width, depth = costs.shape
-    before, after = np.full(depth + 2, _OUTSIDE, np.uint16), np.full(depth + 2, _OUTSIDE, np.uint16)
-    before[1 : depth + 1] = 0
-    floor = _H(0)
-    for i in range(-warm, width):
-        x = (i + warm * width) % width
-        pixel = _U(width - 1 - x if direction == 1 else x)
-        jump = _H(floor + penalties[pixel])
-        for d in range(_U(depth)):
-            stay = before[d + _U(1)]
-            down, up = _H(before[d] + p1), _H(before[d + _U(2)] + p1)
-            near = down if down < up else up
-            near = near if near < jump else jump
-            near = stay if stay < near else near
-            after[d + _U(1)] = _H(_H(near - floor) + _H(costs[pixel, d]))
-        floor = _OUTSIDE
-        for d in range(_U(depth)):
-            value = after[d + _U(1)]
-            floor = value if value < floor else floor
-            before[d + _U(1)] = value
-        if i >= 0:
-            for d in range(_U(depth)):
-                sums[pixel, d] = _H(sums[pixel, d] + before[d + _U(1)])
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def sweep_row(volume: U8, total: U16, penalties: U16, p1: np.uint16, y: int, warm: int) -> None:
-    """Follow both horizontal paths of one row around the sphere and add their costs to the total.
+    Step i comes to the row i, counted from where the paths begin. Steps i < 0 lie beyond the pole: in row −1 − i, half
+    a turn further on; their costs only prepare the paths, and a block has none or only such steps.
 
     Args:
-        volume: (H, D, W) uint8.
-        total: (H, D, W) uint16, added to.
-        penalties: (2, H, W) uint16 P2 of the step into each pixel from its left and from its right.
-        p1: uint16.
-        y: the row.
-        warm: steps before the seam, which only prepare the state.
+        costs: what paths read.
+        front: where all paths have come to before the block.
+        new_front: written in the columns of the strip: where its paths have come to.
+        steps: the first step, and how many.
+        strip: the first column, and how many.
+        sums: what is added to; strips of one block write disjoint entries.
+        state: (3, D + 1, ·) uint16, scratch space of `state_columns` columns.
     """
-    depth, width = volume.shape[1:]
-    costs = np.empty((width, depth), np.uint8)
-    sums = np.zeros((width, depth), np.uint16)
-    _turn_row(volume, y, costs)
-    for direction in range(2):
-        _circle(costs, penalties[direction, y], p1, direction, warm, sums)
-    _add_turned_row(sums, y, total)
+    height, depth, width = costs.volume.shape
+    (first_step, count), (first, lines) = steps, strip
+    beyond = first_step < 0
+    least = np.empty((3, state.shape[2]), np.uint16)
+    state[:, depth] = _OUTSIDE
+    scratch = np.empty((2, lines + 2 * count), np.uint16)
+    _take_front(front, first - count, lines + 2 * count, state, least)
+    turn = width // 2 if beyond else 0
+    for k in range(count):
+        row = -1 - first_step - k if beyond else first_step + k
+        row = height - 1 - row if costs.upward else row
+        halo = count - 1 - k
+        # Where the lines that come to the strip's first column are in the state.
+        line = LINES + count, LINES + count - (k + 1), LINES + count + (k + 1)
+        before = line[0] - halo, line[1] - halo, line[2] - halo
+        after = line[0] + lines, line[1] + lines, line[2] + lines
+        columns = first + turn
+        _step_row(costs, row, (columns - halo, halo), 1, before, state, least, scratch, sums, False)
+        _step_row(costs, row, (columns, lines), _ALL, line, state, least, scratch, sums, not beyond)
+        _step_row(costs, row, (columns + lines, halo), 2, after, state, least, scratch, sums, False)
+    for way in range(3):
+        start = LINES + count - (0, count, -count)[way]
+        new_front.least[way, first : first + lines] = least[way, start : start + lines]
+        for d in range(depth):
+            new_front.paths[way, d, first : first + lines] = state[way, d, start : start + lines]

@@ -1,11 +1,13 @@
 """Compiled to vector instructions: one step of several neighbouring paths of semi-global matching, all planes.
 
 The costs of the planes before and after stay in registers; a loop cannot be proved free of aliasing without more checks
-than a strip has work.
+than a strip has work. Paths of several directions that come to the same pixels are advanced together, so that costs and
+sums are read once.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Final
 
 from llvmlite import ir
@@ -16,39 +18,75 @@ from numba.extending import intrinsic
 from pano_mvs.algorithms.sweep.numba.x86.kernels_vector import REGISTER_BYTES, element_pointer, load_unaligned
 
 LINES: Final = REGISTER_BYTES // 2
-"""How many paths one call advances."""
+"""How many paths of each direction one call advances."""
 
 _I16, _I32, _I64 = (ir.IntType(bits) for bits in (16, 32, 64))
 _WORDS = ir.VectorType(_I16, LINES)
 _BYTES = ir.VectorType(ir.IntType(8), LINES)
+_OUTSIDE = ir.Constant(_WORDS, [60000] * LINES)
 
 
-def _everywhere(builder: Any, value: Any) -> Any:
+def everywhere(builder: Any, value: Any) -> Any:
+    """Return a register filled with one value."""
     first = builder.insert_element(ir.Constant(_WORDS, ir.Undefined), value, ir.Constant(_I32, 0))
     return builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(_I32, LINES), [0] * LINES))
 
 
-def _least(builder: Any, first: Any, second: Any) -> Any:
+def least_of(builder: Any, first: Any, second: Any) -> Any:
+    """Return the lesser of each pair of numbers."""
     return builder.select(builder.icmp_unsigned("<", first, second), first, second)
 
 
 def _inside(builder: Any, first: Any, last: Any) -> Any:
     """Return which of the lines are from `first` to before `last`."""
     lines = ir.Constant(_WORDS, list(range(LINES)))
-    bounds = [_everywhere(builder, builder.trunc(bound, _I16)) for bound in (first, last)]
+    bounds = [everywhere(builder, builder.trunc(bound, _I16)) for bound in (first, last)]
     return builder.and_(builder.icmp_unsigned(">=", lines, bounds[0]), builder.icmp_unsigned("<", lines, bounds[1]))
 
 
-def _add(builder: Any, pointer: Any, value: Any, inside: Any, whole: Any) -> None:
-    """Add to what a pointer points to, and write nothing outside: another thread may be at work there."""
-    added = builder.add(load_unaligned(builder, pointer), value)
-    with builder.if_else(whole) as (all_lines, some):
-        with all_lines:
-            builder.store(added, pointer, align=1)
-        with some:
-            kind = ir.FunctionType(ir.VoidType(), [_WORDS, pointer.type, _I32, inside.type])
-            store = cgutils.get_or_insert_function(builder.module, kind, f"llvm.masked.store.v{LINES}i16.p0")
-            builder.call(store, [added, pointer, ir.Constant(_I32, 1), inside])
+class _Paths:
+    """The paths of one direction: what they carry from plane to plane, in registers."""
+
+    def __init__(self, builder: Any, penalties: Any, least: Any, paths_in: Callable[[Any], Any], p1: Any) -> None:
+        """Load what does not change; `paths_in` returns where the paths' costs in a plane are."""
+        self.builder, self.p1, self.least, self.paths_in = builder, p1, least, paths_in
+        self.floor = load_unaligned(builder, least)
+        self.jump = builder.add(self.floor, load_unaligned(builder, penalties))
+        self.before, self.here, self.lowest = (cgutils.alloca_once(builder, _WORDS) for _ in range(3))
+
+    def begin(self) -> None:
+        """Start with the first plane."""
+        self.builder.store(_OUTSIDE, self.before)
+        self.builder.store(_OUTSIDE, self.lowest)
+        self.builder.store(load_unaligned(self.builder, self.paths_in(ir.Constant(_I64, 0))), self.here)
+
+    def step(self, plane: Any, cost: Any, inside: Any) -> Any:
+        """Write and return the costs of a plane; where not `inside`, if that is given, nothing is written."""
+        builder = self.builder
+        stay = builder.load(self.here)
+        after = load_unaligned(builder, self.paths_in(builder.add(plane, ir.Constant(_I64, 1))))
+        near = builder.add(least_of(builder, builder.load(self.before), after), self.p1)
+        near = least_of(builder, stay, least_of(builder, near, self.jump))
+        value = builder.add(builder.sub(near, self.floor), cost)
+        builder.store(least_of(builder, value, builder.load(self.lowest)), self.lowest)
+        builder.store(stay, self.before)
+        builder.store(after, self.here)
+        kept = value if inside is None else builder.select(inside, value, stay)
+        builder.store(kept, self.paths_in(plane), align=1)
+        return value
+
+    def finish(self, inside: Any) -> None:
+        """Write the least costs."""
+        lowest = self.builder.load(self.lowest)
+        kept = lowest if inside is None else self.builder.select(inside, lowest, self.floor)
+        self.builder.store(kept, self.least, align=1)
+
+
+def _store_some(builder: Any, value: Any, pointer: Any, inside: Any) -> None:
+    """Write nothing outside: another thread may be at work there."""
+    kind = ir.FunctionType(ir.VoidType(), [_WORDS, pointer.type, _I32, inside.type])
+    store = cgutils.get_or_insert_function(builder.module, kind, f"llvm.masked.store.v{LINES}i16.p0")
+    builder.call(store, [value, pointer, ir.Constant(_I32, 1), inside])
 
 
 def _emit_step_lines(context: Any, builder: Any, sig: Any, args: Any) -> None:
@@ -57,79 +95,88 @@ def _emit_step_lines(context: Any, builder: Any, sig: Any, args: Any) -> None:
     def at(k: int, position: Any, kind: Any = _WORDS) -> Any:
         return element_pointer(context, builder, sig.args[k], args[k], position, kind)
 
-    voxel_at, voxel_step, depth = cgutils.unpack_tuple(builder, args[2], 3)
-    line, stride, first, last = cgutils.unpack_tuple(builder, args[8], 4)
+    def unpack(k: int) -> list[Any]:
+        return list(cgutils.unpack_tuple(builder, args[k], sig.args[k].count))
+
+    voxel_at, before_at, after_at, voxel_step, sum_step, depth = unpack(1)
+    stride, first, last, keep = unpack(8)
+
+    def paths_in(line: Any) -> Callable[[Any], Any]:
+        return lambda plane: at(5, builder.add(line, builder.mul(plane, stride)))
+
+    p1 = everywhere(builder, args[2])
+    directions = [
+        _Paths(builder, at(3, penalty), at(6, least), paths_in(line), p1)
+        for penalty, line, least in zip(unpack(4), unpack(7)[::2], unpack(7)[1::2], strict=True)
+    ]
     inside = _inside(builder, first, last)
+    keeps = builder.icmp_unsigned("!=", keep, ir.Constant(_I64, 0))
+
+    def all_planes(within: Any) -> None:
+        for direction in directions:
+            direction.begin()
+        with cgutils.for_range(builder, depth) as loop:
+            moved = builder.mul(loop.index, voxel_step)
+            cost = builder.zext(load_unaligned(builder, at(0, builder.add(voxel_at, moved), _BYTES)), _WORDS)
+            values = [direction.step(loop.index, cost, within) for direction in directions]
+            with builder.if_then(keeps):
+                moved = builder.mul(loop.index, sum_step)
+                added = load_unaligned(builder, at(9, builder.add(before_at, moved)))
+                for value in values:
+                    added = builder.add(added, value)
+                pointer = at(10, builder.add(after_at, moved))
+                if within is None:
+                    builder.store(added, pointer, align=1)
+                else:
+                    _store_some(builder, added, pointer, within)
+        for direction in directions:
+            direction.finish(within)
+
     whole = builder.icmp_unsigned("==", builder.sub(last, first), ir.Constant(_I64, LINES))
-    keep = builder.icmp_unsigned("!=", args[9], ir.Constant(_I64, 0))
-    least_at = at(7, line)
-    floor = load_unaligned(builder, least_at)
-    jump = builder.add(floor, load_unaligned(builder, at(4, args[5])))
-    p1 = _everywhere(builder, args[3])
-    outside = ir.Constant(_WORDS, [60000] * LINES)
-    before = cgutils.alloca_once_value(builder, outside)
-    here = cgutils.alloca_once_value(builder, load_unaligned(builder, at(6, line)))
-    lowest = cgutils.alloca_once_value(builder, outside)
-    with cgutils.for_range(builder, depth) as loop:
-        position = builder.add(line, builder.mul(loop.index, stride))
-        voxel = builder.add(voxel_at, builder.mul(loop.index, voxel_step))
-        stay, after = builder.load(here), load_unaligned(builder, at(6, builder.add(position, stride)))
-        near = builder.add(_least(builder, builder.load(before), after), p1)
-        near = _least(builder, stay, _least(builder, near, jump))
-        cost = builder.zext(load_unaligned(builder, at(0, voxel, _BYTES)), _WORDS)
-        value = builder.add(builder.sub(near, floor), cost)
-        builder.store(_least(builder, value, builder.load(lowest)), lowest)
-        builder.store(stay, before)
-        builder.store(after, here)
-        builder.store(builder.select(inside, value, stay), at(6, position), align=1)
-        with builder.if_then(keep):
-            _add(builder, at(1, voxel), value, inside, whole)
-    builder.store(builder.select(inside, builder.load(lowest), floor), least_at, align=1)
+    with builder.if_else(whole) as (all_lines, some):
+        with all_lines:
+            all_planes(None)
+        with some:
+            all_planes(inside)
 
 
 @intrinsic
 def step_lines(
     typingctx: Any,
     volume: Any,
-    total: Any,
     voxels: Any,
     p1: Any,
     penalties: Any,
-    penalty_at: Any,
+    penalties_at: Any,
     state: Any,
     least: Any,
     lines: Any,
-    keep: Any,
+    counted: Any,
+    before: Any,
+    after: Any,
 ) -> Any:
-    """Do what `kernels_sgm.step_plain` does, for some of the lines that a register holds.
+    """Do what `kernels_sgm.step_plain` does, for some of the lines that a register holds, of one or more directions.
+
+    Positions are uint64 and count elements of arrays of any rank; arrays must be contiguous.
 
     Args:
         typingctx: numba's.
-        volume: uint8, of any rank; positions are counted in elements.
-        total: uint16, of the volume's shape.
-        voxels: three uint64: where in both the register's first line is in the first plane, from a plane to the next,
-            the number of planes.
+        volume: uint8.
+        voxels: where the register's first line is in the first plane of the volume, of `before` and of `after`; from a
+            plane to the next in the volume, and in both sums; the number of planes.
         p1: uint16.
         penalties: uint16.
-        penalty_at: where the first line's is.
-        state: (depth + 1, stride) uint16.
-        least: (stride,) uint16.
-        lines: four uint64: where the first line is in those, the stride of the state, the first of the lines that
-            count and one past the last.
-        keep: 1 to add to the total, 0 not to.
+        penalties_at: for each direction, where the first line's is.
+        state: uint16, the costs of the paths, plane after plane, with one beyond the last.
+        least: uint16.
+        lines: for each direction, where the first line is in the first plane of `state` and where in `least`.
+        counted: from a plane to the next in `state`; the first of the lines that count and one past the last; 1 to
+            write the sums, 0 not to.
+        before: uint16, the sums of other paths.
+        after: uint16, written: those with the paths of these directions.
     """
-    place = types.uint64
     signature = types.void(
-        volume,
-        total,
-        types.UniTuple(place, 3),
-        types.uint16,
-        penalties,
-        place,
-        state,
-        least,
-        types.UniTuple(place, 4),
-        place,
+        volume, voxels, types.uint16, penalties, penalties_at, state, least, lines, counted, before, after
     )
 
     return signature, _emit_step_lines
