@@ -16,8 +16,9 @@ from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.running.run import Run
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene import Panorama, PointCloud, Poses, RangeMap, Record
+from pano_mvs.scene.static_masks import StaticMasks
 
-ROLES = ("images", "pairs", "poses", "ranges", "cloud")
+ROLES = ("images", "pairs", "poses", "ranges", "cloud", "static")
 """The final values of a run by role; run.json says which stage made each."""
 
 _Kind = TypeVar("_Kind", bound=Record)
@@ -81,6 +82,11 @@ class StoredValues:
     def cloud(self) -> PointCloud | None:
         """The fused cloud."""
         return self._load("cloud", "", PointCloud)
+
+    @property
+    def static_masks(self) -> StaticMasks | None:
+        """What moves with the cameras."""
+        return self._load("static", "", StaticMasks)
 
     def panorama(self, name: str) -> Panorama | None:
         """Return a panorama, whose picture is decoded on demand."""
@@ -153,7 +159,7 @@ class _Recorded(Mapping[str, ItemRef]):
 
 def _find_images(store: Store, summary: RunSummary, refs: Mapping[str, ItemRef]) -> None:
     """Register the user's images with the store, which knows only their digests."""
-    source = next((stage for stage in summary.stages if stage.name == summary.results.get("images")), None)
+    source = next((stage for stage in summary.stages if stage.use.startswith("source.")), None)
     folder = source.params.get("path") if source else None
     for name, ref in refs.items() if folder else ():
         path = Path(str(folder)) / name

@@ -23,7 +23,7 @@ from pano_mvs.stages.filters import (
 )
 from pano_mvs.stages.frame import level, scale, unit_translations
 from pano_mvs.stages.fusion import vote
-from pano_mvs.stages.masks import color
+from pano_mvs.stages.masks import apply, color, static
 from pano_mvs.stages.matches import brute_force
 from pano_mvs.stages.pairs import exhaustive, position, retrieval, sequential, vlad
 from pano_mvs.stages.patchmatch import patchmatch
@@ -35,6 +35,7 @@ from pano_mvs.stages.source_video import video
 from pano_mvs.stages.views import nearest
 
 __all__ = [
+    "apply",
     "bilateral_solver",
     "brute_force",
     "colmap",
@@ -75,6 +76,7 @@ __all__ = [
     "sift_tangent",
     "speckle",
     "sphorb",
+    "static",
     "surface",
     "sweep",
     "tracked",
