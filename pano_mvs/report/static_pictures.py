@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pano_mvs.algorithms.masks.areas import share_of_sphere
 from pano_mvs.core.errors import InputError
-from pano_mvs.geometry import pixel_solid_angle
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.results.pictures import Picture, picture
 from pano_mvs.results.stored_values import StoredValues
@@ -43,7 +43,7 @@ def static_pictures(results: StoredValues, kept: EarlierPage) -> tuple[tuple[str
         except InputError as error:
             results.notes.append(str(error))
             continue
-        shown.append((name, _share(pixels), drawn))
+        shown.append((name, share_of_sphere(pixels), drawn))
     return tuple(shown)
 
 
@@ -59,8 +59,3 @@ def _picture(panorama: Panorama, pixels: NDArray[np.bool_], key: str) -> Picture
     image = panorama.load_unmasked().astype(np.float32)
     image[pixels] = 0.5 * image[pixels] + 0.5 * _TINT
     return picture(image.astype(np.uint8), width=_WIDTH, most_bytes=_MAX_BYTES, key=key)
-
-
-def _share(pixels: NDArray[np.bool_]) -> float:
-    per_row = pixel_solid_angle((pixels.shape[0], pixels.shape[1]))
-    return float((pixels.mean(axis=1) * per_row).sum() / per_row.sum())

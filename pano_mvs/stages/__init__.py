@@ -30,6 +30,7 @@ from pano_mvs.stages.patchmatch import patchmatch
 from pano_mvs.stages.points import surface, tracked
 from pano_mvs.stages.poses import from_model, refine, scaled_translation, triangulate, verify
 from pano_mvs.stages.poses_colmap import colmap_poses, colmap_sift_poses, extend
+from pano_mvs.stages.sky import sky
 from pano_mvs.stages.source import folder
 from pano_mvs.stages.source_video import video
 from pano_mvs.stages.views import nearest
@@ -74,6 +75,7 @@ __all__ = [
     "scaled_translation",
     "sequential",
     "sift_tangent",
+    "sky",
     "speckle",
     "sphorb",
     "static",

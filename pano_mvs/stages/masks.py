@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from pano_mvs.algorithms.masks.areas import share_of_sphere
 from pano_mvs.algorithms.masks.one_color import areas_of_color
 from pano_mvs.algorithms.masks.static import MAX_VIEWS, WIDTH, StaticContent, reduced_to_width, static_content
 from pano_mvs.api import All, Context, Each, One, Panorama, Params, arguments_from, params_from, stage
-from pano_mvs.geometry import pixel_solid_angle
 from pano_mvs.scene.static_masks import Camera, StaticMasks, camera_of
 
 
@@ -58,7 +58,7 @@ def static(images: All[Panorama], params: StaticParams, ctx: Context) -> StaticM
             ctx.note(f"{which}nothing that moves with the camera was looked for: {content.reason}")
         elif content.pixels.any():
             found[camera] = content.pixels
-            ctx.note(f"{which}{_share(content):.1%} of the sphere moves with the camera and is masked")
+            ctx.note(f"{which}{share_of_sphere(content.pixels):.1%} of the sphere moves with the camera and is masked")
     ctx.metric("masked", sum(len(cameras[camera]) for camera in found) / max(1, sum(map(len, cameras.values()))))
     masks = [_at_width(pixels) for pixels in found.values()]
     return StaticMasks(np.array(masks, np.uint8).reshape(-1, WIDTH // 2, WIDTH), tuple(found))
@@ -84,11 +84,6 @@ def _static_content(panoramas: list[Panorama], params: StaticParams) -> StaticCo
 def _spread(names: list[str]) -> list[str]:
     """Return at most `MAX_VIEWS` names, evenly spread."""
     return [names[idx] for idx in np.unique(np.rint(np.linspace(0, len(names) - 1, MAX_VIEWS)).astype(int))]
-
-
-def _share(content: StaticContent) -> float:
-    size_hw = (content.pixels.shape[0], content.pixels.shape[1])
-    return float((content.pixels.mean(axis=1) * pixel_solid_angle(size_hw)).sum() / pixel_solid_angle(size_hw).sum())
 
 
 def _at_width(pixels: NDArray[np.bool_]) -> NDArray[np.bool_]:

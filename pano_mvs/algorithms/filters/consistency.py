@@ -126,7 +126,7 @@ def checked_with_agreement(
         removed = (comparison.agreeing == 0) & (comparison.contradicting >= min(min_contradictions, len(sources)))
         ranges = np.where(removed, np.float32(np.nan), ranges)
     confidence[np.isnan(ranges)] = 0
-    return RangeMap(ranges, confidence, reference.normals_in_cam), _agreement(comparison, seen)
+    return RangeMap(ranges, confidence, reference.normals_in_cam, reference.sky), _agreement(comparison, seen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,9 +13,14 @@ def with_ranges(
 ) -> RangeMap:
     """Return a range map with other ranges (H, W), and other confidences if given.
 
-    Normals are kept where the range did not change.
+    Normals are kept where the range did not change. The sky gets no range.
     """
+    if confidence is None:
+        confidence = range_map.confidence
+    if range_map.sky is not None:
+        ranges = np.where(range_map.sky, np.float32(np.nan), ranges)
+        confidence = np.where(range_map.sky, np.uint8(0), confidence)
     normals = range_map.normals_in_cam
     if normals is not None:
         normals = np.where((ranges == range_map.range)[..., None], normals, np.float16(np.nan))
-    return RangeMap(ranges, range_map.confidence if confidence is None else confidence, normals)
+    return RangeMap(ranges, confidence, normals, range_map.sky)

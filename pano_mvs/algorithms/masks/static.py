@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.algorithms.filters.sphere.box import box_sum
+from pano_mvs.algorithms.masks.areas import area_labels, dilated, pixel_weights, share_of_sphere
 from pano_mvs.algorithms.masks.frame_agreement import FrameAgreement, color_difference, frame_agreement
 from pano_mvs.core.errors import UsageError
 from pano_mvs.core.settings import Setting, checks_settings
-from pano_mvs.geometry import pad_panorama, pixel_solid_angle
+from pano_mvs.geometry import pad_panorama
 from pano_mvs.scene.masking import placed_mask
 
 Mask = NDArray[np.bool_]
@@ -101,14 +101,14 @@ def static_content(
     usable = _usable(valid, size_hw)
     structure = (agreement.contrast >= _MIN_CONTRAST) & usable
     moved = structure & (agreement.still < _MOVED)
-    if _share(moved) < _MIN_MOVED_SHARE:
+    if share_of_sphere(moved) < _MIN_MOVED_SHARE:
         return StaticContent(nothing, "the panoramas do not differ enough: are they all of one place?")
     core = _grown(agreement, structure, moved)
     if not core.any():
         return StaticContent(nothing)
     found = _large(_with_enclosed_parts(core, pictures, plain=usable & ~structure), min_area_deg2)
     margin = round(margin_deg * size_hw[0] / 180)
-    return StaticContent(_dilated(found, margin) if margin and found.any() else found)
+    return StaticContent(dilated(found, margin) if margin and found.any() else found)
 
 
 def reduced_to_width(picture: Picture, valid: Mask) -> tuple[Picture, Mask]:
@@ -125,20 +125,20 @@ def _usable(valid: Sequence[Mask] | None, size_hw: tuple[int, int]) -> Mask:
     """Return the pixels, (H, W), whose windows are not masked in any panorama."""
     if valid is None or all(mask.all() for mask in valid):
         return np.ones(size_hw, np.bool_)
-    return ~_dilated(~np.logical_and.reduce(list(valid)), 4)
+    return ~dilated(~np.logical_and.reduce(list(valid)), 4)
 
 
 def _grown(agreement: FrameAgreement, structure: Mask, moved: Mask) -> Mask:
     """Return connected areas of agreeing structure that contain seeds and lie in surroundings that move."""
     agrees = structure & (agreement.agreement >= _GROWN_AGREEMENT) & (agreement.sharpness >= _GROWN_SHARPNESS)
     seeds = structure & (agreement.agreement >= _SEED_AGREEMENT) & (agreement.sharpness >= _SEED_SHARPNESS)
-    labels = _labels(agrees | seeds)
-    weights = _weights(seeds.shape)
+    labels = area_labels(agrees | seeds)
+    weights = pixel_weights(seeds.shape)
     enough = np.bincount(labels[seeds], weights[seeds], labels.size) >= _MIN_SEED_PX
     found = np.zeros_like(seeds)
     for label in np.flatnonzero(enough):
         area = labels == label
-        ring = _dilated(area, _RING_PX) & ~_dilated(area, 1)
+        ring = dilated(area, _RING_PX) & ~dilated(area, 1)
         structured = float(weights[ring & structure].sum())
         if (
             structured >= _MIN_RING_STRUCTURE * weights[ring].sum()
@@ -156,24 +156,24 @@ def _with_enclosed_parts(core: Mask, pictures: Sequence[Picture], *, plain: Mask
     """
     brightness = np.median([picture.max(axis=-1) for picture in pictures], axis=0)
     alike = color_difference(pictures, _gains(pictures, core)) <= _MAX_DIFFERENCE + _MAX_CHANGE * brightness
-    closed = ~_dilated(~_dilated(core, _CLOSING_PX), _CLOSING_PX) | core
+    closed = ~dilated(~dilated(core, _CLOSING_PX), _CLOSING_PX) | core
     outline = closed | _lasting_edges(pictures)
     parts = _opened((alike | plain) & ~closed)
-    labels, weights = _labels(parts), _weights(core.shape)
+    labels, weights = area_labels(parts), pixel_weights(core.shape)
     result = closed.copy()
-    for label in np.unique(labels[parts & _dilated(closed, 1)]):
+    for label in np.unique(labels[parts & dilated(closed, 1)]):
         area = labels == label
-        border = _dilated(area, 1) & ~area
+        border = dilated(area, 1) & ~area
         if weights[border & outline].sum() >= _MIN_ENCLOSED * weights[border].sum():
             result |= area
     result = _without_pinholes(result)
     # Windows that agree reach over the outline by most of their radius.
-    return np.asarray((result & alike) | ~_dilated(~result, _OVERHANG_PX))
+    return np.asarray((result & alike) | ~dilated(~result, _OVERHANG_PX))
 
 
 def _gains(pictures: Sequence[Picture], pixels: Mask) -> NDArray[np.float64]:
     """Return factors (V, 3) that give most of some pixels the same colour in all views."""
-    inner = pixels & ~_dilated(~pixels, _CLOSING_PX)
+    inner = pixels & ~dilated(~pixels, _CLOSING_PX)
     levels = np.array([picture[inner if inner.any() else pixels] for picture in pictures]) + _DARK_LEVEL
     return np.asarray(np.median(np.median(levels, axis=0) / levels, axis=1))
 
@@ -191,13 +191,13 @@ def _lasting_edges(pictures: Sequence[Picture]) -> Mask:
 
 def _opened(pixels: Mask) -> Mask:
     """Return areas without bridges and specks one or two pixels wide."""
-    return np.asarray(_dilated(~_dilated(~pixels, 1), 1) & pixels)
+    return np.asarray(dilated(~dilated(~pixels, 1), 1) & pixels)
 
 
 def _without_pinholes(found: Mask) -> Mask:
     """Return areas with the small holes filled that no smaller area surrounds."""
-    labels = _labels(~found)
-    weights = _weights(found.shape)
+    labels = area_labels(~found)
+    weights = pixel_weights(found.shape)
     sizes = np.bincount(labels[~found], weights[~found], labels.size)
     filled = found.copy()
     filled[~found] = sizes[labels[~found]] < 0.05 * weights.sum() * (sizes.max() > 0.5 * sizes.sum())
@@ -205,33 +205,9 @@ def _without_pinholes(found: Mask) -> Mask:
 
 
 def _large(found: Mask, min_area_deg2: float) -> Mask:
-    labels = _labels(found)
-    area_deg2 = _weights(found.shape) * (_SQUARE_DEG_OF_SPHERE / _weights(found.shape).sum())
+    labels = area_labels(found)
+    area_deg2 = pixel_weights(found.shape) * (_SQUARE_DEG_OF_SPHERE / pixel_weights(found.shape).sum())
     sizes = np.bincount(labels[found], area_deg2[found], labels.size)
     large = np.zeros_like(found)
     large[found] = sizes[labels[found]] >= min_area_deg2
     return large
-
-
-def _labels(pixels: Mask) -> NDArray[np.int64]:
-    """Return the component of each pixel, across the seam and the poles, (H, W); −1 elsewhere."""
-    from pano_mvs.algorithms.filters.kernels_components import label_surfaces  # compiles on import
-
-    labels = label_surfaces(np.where(pixels, np.float32(1), np.float32(np.nan)), 1.0)
-    return np.asarray(labels).reshape(pixels.shape)
-
-
-def _dilated(pixels: Mask, radius_px: int) -> Mask:
-    """Return pixels and what is within a radius, in pixels at the equator, with the same extent everywhere."""
-    return np.asarray(box_sum(pixels.astype(np.float64), radius_px) > 0.5)
-
-
-def _weights(shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return the solid angle of each pixel, (H, W), in pixels at the equator."""
-    per_row = pixel_solid_angle((shape[0], shape[1]))
-    return np.broadcast_to((per_row / per_row.max())[:, None], (shape[0], shape[1]))
-
-
-def _share(pixels: Mask) -> float:
-    weights = _weights(pixels.shape)
-    return float(weights[pixels].sum() / weights.sum())
