@@ -21,7 +21,7 @@ from pano_mvs.results.records import ViewSummary
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, FILLED_CONFIDENCE, WEAK_CONFIDENCE
 
-VERSION = 2
+VERSION = 3
 """Raise it when the pictures change: earlier pages' are then drawn again."""
 
 MAX_CARDS = 36
@@ -141,7 +141,10 @@ def _new_card(results: StoredValues, kept: EarlierPage, name: str, out_dir: Path
         pictures["range"] = _part(color_mapped(small, near, far), stem, "range")
         pictures["confidence"] = _part(confidence_colors(_shrunk(range_map.confidence)), stem, "confidence")
         fits = mask is not None and mask.shape == range_map.range.shape
-        shares = shares_of(range_map.confidence, mask if fits else None)
+        kept_pixels = mask if fits else None
+        if range_map.sky is not None:
+            kept_pixels = ~range_map.sky if kept_pixels is None else kept_pixels & ~range_map.sky
+        shares = shares_of(range_map.confidence, kept_pixels)
         ticks = _ticks(near, far)
     if stem and len(pictures) == len(_PARTS):  # what is missing may be back for the next page
         kept.keep(stem, {"ticks": ticks, "shares": fact_of(shares) if shares else None})

@@ -101,6 +101,11 @@ class StoredValues:
         part = self._part("ranges", name, "confidence")
         return part if isinstance(part, np.ndarray) else None
 
+    def sky(self, name: str) -> NDArray[np.bool_] | None:
+        """Return the sky (H, W) of the final range map of a view; None if none was looked for."""
+        part = self._part("ranges", name, "sky")
+        return part if isinstance(part, np.ndarray) else None
+
     def pair_reason(self, name: str) -> str:
         """Return why a pair has no general geometry, "" if that is not known."""
         meta = self._part("pairs", name, "meta")

@@ -6,12 +6,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.report.page import write_report
 from pano_mvs.report.static_pictures import static_pictures
+from pano_mvs.report.thumbnails import measured_shares
+from pano_mvs.results.records import ViewSummary
 from pano_mvs.results.stored_values import StoredValues
 from pano_mvs.results.summary import RunSummary
+from pano_mvs.scene import RangeMap
 from pano_mvs.scene.static_masks import StaticMasks
 from pano_mvs.testing.tiny_capture import TinyCapture
 
@@ -39,3 +43,21 @@ def test_nothing_is_shown_without_masks(results: StoredValues) -> None:
     assert static_pictures(results, EarlierPage()) == ()
     nothing = StaticMasks(np.zeros((0, 8, 16), np.uint8))
     assert static_pictures(with_masks(results, nothing), EarlierPage()) == ()
+
+
+def test_the_sky_does_not_count_as_missing(results: StoredValues, tiny: TinyCapture) -> None:
+    """A correct run outdoors had too few pixels with a range."""
+    assert results.store is not None
+    known = tiny.each(RangeMap)[tiny.names[0]]
+    sky = ~known.valid
+    with_sky = {"v": results.store.put_value(replace(known, sky=sky))}
+    without = {"v": results.store.put_value(known)}
+    views = [ViewSummary(name="v")]
+    shown = {
+        name: measured_shares(views, replace(results, refs={**results.refs, "ranges": refs}), EarlierPage())["v"]
+        for name, refs in (("with", with_sky), ("without", without))
+    }
+    assert sky.any()
+    assert shown["without"].complete < 1
+    assert shown["with"].complete == pytest.approx(1)
+    assert shown["with"].masked > 0
