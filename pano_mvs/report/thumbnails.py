@@ -34,7 +34,7 @@ def thumbnails(
 
 
 def measured_shares(views: Sequence[ViewSummary], results: StoredValues, kept: EarlierPage) -> dict[str, Shares]:
-    """Return image name to its shares of the sphere, of at most 1,000 views, evenly apart; masks do not count, the sky does."""
+    """Return image name to its shares of the sphere, of at most 1,000 views, evenly apart; without the sky."""
     found: dict[str, Shares] = {}
     for idx in _evenly(len(views), MAX_MEASURED):
         name = views[idx].name

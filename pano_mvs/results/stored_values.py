@@ -164,8 +164,9 @@ class _Recorded(Mapping[str, ItemRef]):
 
 def _find_images(store: Store, summary: RunSummary, refs: Mapping[str, ItemRef]) -> None:
     """Register the user's images with the store, which knows only their digests."""
-    source = next((stage for stage in summary.stages if stage.use.startswith("source.")), None)
-    folder = source.params.get("path") if source else None
+    last = summary.results.get("images")  # the source, or a stage that masks its images
+    sources = [stage for stage in summary.stages if stage.name == last or stage.use.startswith("source.")]
+    folder = next((stage.params["path"] for stage in sources if stage.params.get("path")), None)
     for name, ref in refs.items() if folder else ():
         path = Path(str(folder)) / name
         if any(part.external for part in ref.parts.values()) and is_file(path):
