@@ -49,6 +49,8 @@ _MAX_PART_SHARE = 0.005
 # Larger ones count as small if they differ by at most this number of grey levels on average.
 _MAX_EXACT_SHARE, _EXACT_LEVELS = 0.03, 5.0
 _MIN_AGREEING = 0.3
+# Farther from known sky, the colours of the sky are not known.
+_REACH_PX = 40
 _CLOUD_RADIUS_PX, _CLOUD_SHARE, _ROUGH_ERRORS = 3, 0.7, 3
 _ROUNDS = 3
 # If less than this share of an area lies away from its border, all of it is compared.
@@ -229,7 +231,8 @@ def _grown(view: _View, seeds: Mask, rng: np.random.Generator) -> tuple[Mask, Sk
     sky, most = seeds, _MAX_PART_SHARE * pixel_weights(seeds.shape).sum()
     for _ in range(_ROUNDS):
         colors = sky_colors(view.picture, sky)
-        alike = view.valid & colors.match(view.picture) & (~solid | dilated(sky, 1))
+        reached = view.valid & dilated(sky, min(_REACH_PX, len(sky) // 2 - 1))
+        alike = reached & colors.match(view.picture) & (~solid | dilated(sky, 1))
         labels = area_labels(alike & ~sky)
         inside, weights = labels >= 0, pixel_weights(sky.shape)
         sizes = np.bincount(labels[inside], weights[inside], labels.size)
