@@ -38,7 +38,6 @@ class FrameAgreement:
     Attributes:
         contrast: median standard deviation of the windows, in grey levels.
         agreement: ZNCC of windows at the same pixel, exceeded by four fifths of the pairs.
-        usual: the same, exceeded by half of the pairs.
         sharpness: by how much that ZNCC exceeds the best one a pixel away, exceeded by four fifths of the pairs.
             Positive only where structure in all directions agrees to a fraction of a pixel: edges alone agree along
             themselves, and distant content is displaced a little.
@@ -48,7 +47,6 @@ class FrameAgreement:
 
     contrast: Plane
     agreement: Plane
-    usual: Plane
     sharpness: Plane
     still: Plane
 
@@ -103,7 +101,6 @@ def _chart_agreement(pictures: Sequence[Picture]) -> FrameAgreement:
     return FrameAgreement(
         contrast=np.sqrt(np.maximum(variance, 0)).astype(np.float32)[inner],
         agreement=np.quantile(same, _DISAGREEING, axis=0).astype(np.float32)[inner],
-        usual=np.median(same, axis=0).astype(np.float32)[inner],
         sharpness=np.quantile(sharper, _DISAGREEING, axis=0).astype(np.float32)[inner],
         still=np.quantile(still, 0.75, axis=0).astype(np.float32)[inner],
     )
