@@ -22,6 +22,7 @@ from pano_mvs.engine.workflows.schema import workflow_schema
 KINDS = {
     "source": "list the images of a capture and read them",
     "mask": "mask areas of an image",
+    "masks": "find what moves with the camera, from all images, and mask it",
     "features": "compute key points of a panorama, as bearings on the sphere",
     "global": "describe an image by one vector",
     "pairs": "select the pairs of images to match",

@@ -22,7 +22,7 @@ class Shares:
         weak: seen, but not confirmed (64–127).
         filled: interpolated, not seen (1–63).
         invalid: no range.
-        masked: excluded by a mask.
+        masked: excluded by a mask, or sky.
     """
 
     consistent: float
@@ -47,7 +47,7 @@ def shares_of(confidence: NDArray[np.uint8], mask: NDArray[np.bool_] | None = No
 
     Args:
         confidence: (H, W) uint8 as of range maps.
-        mask: (H, W) bool, False is masked; None if unknown.
+        mask: (H, W) bool, False is masked or sky; None if neither is known.
     """
     step = max(1, confidence.shape[0] // _ROWS)
     sampled = np.asarray(confidence[step // 2 :: step, step // 2 :: step])

@@ -12,9 +12,11 @@ from pano_mvs.report.cloud_pictures import CloudPictures, cloud_pictures
 from pano_mvs.report.completeness import Shares
 from pano_mvs.report.earlier_page import EarlierPage
 from pano_mvs.report.panorama_table import Row, panorama_rows
+from pano_mvs.report.static_pictures import static_pictures
 from pano_mvs.report.thumbnails import measured_shares, thumbnails
 from pano_mvs.report.view_cards import ViewCard, chosen_views, view_cards
 from pano_mvs.results.figures import score_tables, side_by_side
+from pano_mvs.results.pictures import Picture
 from pano_mvs.results.records import PairLink, PosesSummary, Verdict, ViewSummary
 from pano_mvs.results.residuals import Histogram, Residuals, histogram, reprojection_residuals
 from pano_mvs.results.stored_values import StoredValues
@@ -39,6 +41,7 @@ class Content:
         cloud: pictures of the cloud.
         cards: views shown in full.
         total_views: number of views.
+        static: (image, share, picture) of what moves with each camera.
         rows: one for each panorama.
         total_rows: number of panoramas.
         mean_shares: of the sphere, over all measured views.
@@ -59,6 +62,7 @@ class Content:
     cloud: CloudPictures
     cards: tuple[ViewCard, ...]
     total_views: int
+    static: tuple[tuple[str, float, Picture], ...]
     rows: tuple[Row, ...]
     total_rows: int
     mean_shares: Shares | None
@@ -102,6 +106,7 @@ def gather(out_dir: Path, summary: RunSummary, values: StoredValues, *, earlier:
         cloud=cloud_pictures(values, earlier, up=up_of(poses)),
         cards=cards,
         total_views=len(views),
+        static=static_pictures(values, earlier),
         rows=rows,
         total_rows=len({*poses.registered, *(view.name for view in views), *poses.rejected, *summary.rejected}),
         mean_shares=_mean(list(shares.values())),

@@ -20,7 +20,7 @@ MAX_MEASURED = 1000
 MAX_BYTES = 9_000
 _WIDTH = 160
 _THREADS = 2
-_VERSION = 1
+_VERSION = 2
 
 
 def thumbnails(
@@ -34,7 +34,7 @@ def thumbnails(
 
 
 def measured_shares(views: Sequence[ViewSummary], results: StoredValues, kept: EarlierPage) -> dict[str, Shares]:
-    """Return the shares of the sphere of at most 1,000 evenly spaced views, by name, without considering masks."""
+    """Return the shares of the sphere of at most 1,000 evenly spaced views, by name; the sky does not count."""
     found: dict[str, Shares] = {}
     for idx in _evenly(len(views), MAX_MEASURED):
         name = views[idx].name
@@ -42,7 +42,8 @@ def measured_shares(views: Sequence[ViewSummary], results: StoredValues, kept: E
         shares = shares_from_fact(kept.fact(key)) if key else None
         if shares is None and key:
             confidence = results.confidence(name)
-            shares = shares_of(confidence) if confidence is not None else None
+            sky = results.sky(name)
+            shares = shares_of(confidence, None if sky is None else ~sky) if confidence is not None else None
             if shares is not None:
                 kept.keep(key, fact_of(shares))
         if shares is not None:

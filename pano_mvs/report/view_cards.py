@@ -161,7 +161,10 @@ def _new_card(results: StoredValues, kept: EarlierPage, name: str, out_dir: Path
             colors = uncertainty_colors(_shrunk(range_map.uncertainty.astype(np.float32)))
             pictures["uncertainty"] = _part(colors, stem, "uncertainty")
         fits = mask is not None and mask.shape == range_map.range.shape
-        shares = shares_of(range_map.confidence, mask if fits else None)
+        kept_pixels = mask if fits else None
+        if range_map.sky is not None:
+            kept_pixels = ~range_map.sky if kept_pixels is None else kept_pixels & ~range_map.sky
+        shares = shares_of(range_map.confidence, kept_pixels)
         ticks = _ticks(near, far)
     if stem and all(part in pictures for part in _PARTS):  # a missing image may be available for the next page
         fact = {"ticks": ticks, "shares": fact_of(shares) if shares else None, "parts": list(pictures)}

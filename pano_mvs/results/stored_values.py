@@ -16,8 +16,9 @@ from pano_mvs.engine.cache.store import ItemRef, Store
 from pano_mvs.engine.running.run import Run
 from pano_mvs.results.summary import RunSummary
 from pano_mvs.scene import Panorama, PointCloud, Poses, RangeMap, Record
+from pano_mvs.scene.static_masks import StaticMasks
 
-ROLES = ("images", "pairs", "poses", "ranges", "cloud")
+ROLES = ("images", "pairs", "poses", "ranges", "cloud", "static")
 """The final values of a run by role; run.json says which stage made each."""
 
 _Kind = TypeVar("_Kind", bound=Record)
@@ -82,6 +83,11 @@ class StoredValues:
         """The fused cloud."""
         return self._load("cloud", "", PointCloud)
 
+    @property
+    def static_masks(self) -> StaticMasks | None:
+        """What moves with the cameras."""
+        return self._load("static", "", StaticMasks)
+
     def panorama(self, name: str) -> Panorama | None:
         """Return a panorama, whose pixels are decoded on access."""
         return self._load("images", name, Panorama)
@@ -93,6 +99,11 @@ class StoredValues:
     def confidence(self, name: str) -> NDArray[np.uint8] | None:
         """Return the confidence (H, W) of the final range map of a view, without reading the rest of it."""
         part = self._part("ranges", name, "confidence")
+        return part if isinstance(part, np.ndarray) else None
+
+    def sky(self, name: str) -> NDArray[np.bool_] | None:
+        """Return the sky (H, W) of the final range map of a view; None if none was looked for."""
+        part = self._part("ranges", name, "sky")
         return part if isinstance(part, np.ndarray) else None
 
     def pair_reason(self, name: str) -> str:
@@ -153,8 +164,9 @@ class _Recorded(Mapping[str, ItemRef]):
 
 def _find_images(store: Store, summary: RunSummary, refs: Mapping[str, ItemRef]) -> None:
     """Register the user's images with the store, which knows only their digests."""
-    source = next((stage for stage in summary.stages if stage.name == summary.results.get("images")), None)
-    folder = source.params.get("path") if source else None
+    last = summary.results.get("images")  # the source, or a stage that masks its images
+    sources = [stage for stage in summary.stages if stage.name == last or stage.use.startswith("source.")]
+    folder = next((stage.params["path"] for stage in sources if stage.params.get("path")), None)
     for name, ref in refs.items() if folder else ():
         path = Path(str(folder)) / name
         if any(part.external for part in ref.parts.values()) and is_file(path):

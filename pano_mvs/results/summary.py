@@ -62,7 +62,7 @@ class RunSummary(Entry):
         doubts: image that a stage finds doubtful to the reason.
         warnings: such as damaged files in the cache that were computed again.
         notes: of the stages.
-        results: role (`images`, `pairs`, `poses`, `ranges`, `cloud`) to the stage that made the final values.
+        results: role (`images`, `pairs`, `poses`, `ranges`, `cloud`, `static`) to the stage that made the final values.
         poses: the cameras.
         scores: of the first stage that compares with the ground truth.
         all_scores: scores by stage, if several branches were compared.

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pano_mvs.scene.record import Axis, Record, require, require_array
+from pano_mvs.scene.record import Axis, Parts, Record, require, require_array
 
 FILLED_CONFIDENCE = 1, 63
 WEAK_CONFIDENCE = 64, 127
@@ -27,6 +27,8 @@ class RangeMap(Record):
             where unknown. None if they were not computed.
         uncertainty: (H, W) float16 standard deviation of the range relative to it; NaN where unknown, ignored where the
             range is invalid. None if it was not computed.
+        sky: (H, W) bool, where the view shows the sky, which has no range. Later stages give it none. None if it was
+            not looked for.
     """
 
     axis: ClassVar[Axis | None] = Axis.VIEW
@@ -36,11 +38,20 @@ class RangeMap(Record):
     confidence: NDArray[np.uint8]
     normals_in_cam: NDArray[np.float16] | None = None
     uncertainty: NDArray[np.float16] | None = None
+    sky: NDArray[np.bool_] | None = None
 
     @property
     def valid(self) -> NDArray[np.bool_]:
         """The pixels that have a range, (H, W)."""
         return np.isfinite(self.range)
+
+    def to_parts(self) -> Parts:
+        """Return the record as named arrays; without a sky as before there was one."""
+        parts = dict(super().to_parts())
+        meta = parts["meta"]
+        assert isinstance(meta, dict)
+        parts["meta"] = {name: value for name, value in meta.items() if name != "sky"}
+        return parts
 
     def check(self) -> None:
         """Raise ContractError unless ranges are positive or NaN, and confidence is 0 exactly where they are NaN."""
@@ -61,3 +72,6 @@ class RangeMap(Record):
             known = uncertainty[~np.isnan(uncertainty)]
             positive = bool(np.all((known > 0) & (known < np.inf)))
             require(positive, self, "an uncertainty is not positive or infinite; unknown is NaN")
+        if self.sky is not None:
+            sky = require_array(self, "sky", dtype=np.bool_, shape=array.shape)
+            require(not bool((sky & valid).any()), self, "a pixel of the sky has a range")

@@ -23,18 +23,20 @@ from pano_mvs.stages.filters import (
 )
 from pano_mvs.stages.frame import level, scale, unit_translations
 from pano_mvs.stages.fusion import vote
-from pano_mvs.stages.masks import color
+from pano_mvs.stages.masks import apply, color, static
 from pano_mvs.stages.matches import brute_force
 from pano_mvs.stages.pairs import exhaustive, position, retrieval, sequential, vlad
 from pano_mvs.stages.patchmatch import patchmatch
 from pano_mvs.stages.points import surface, tracked
 from pano_mvs.stages.poses import from_model, refine, scaled_translation, triangulate, verify
 from pano_mvs.stages.poses_colmap import colmap_poses, colmap_sift_poses, extend
+from pano_mvs.stages.sky import sky
 from pano_mvs.stages.source import folder
 from pano_mvs.stages.source_video import video
 from pano_mvs.stages.views import nearest
 
 __all__ = [
+    "apply",
     "bilateral_solver",
     "brute_force",
     "colmap",
@@ -73,8 +75,10 @@ __all__ = [
     "scaled_translation",
     "sequential",
     "sift_tangent",
+    "sky",
     "speckle",
     "sphorb",
+    "static",
     "surface",
     "sweep",
     "tracked",

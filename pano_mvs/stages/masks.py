@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
+from pano_mvs.algorithms.masks.areas import share_of_sphere
 from pano_mvs.algorithms.masks.one_color import areas_of_color
-from pano_mvs.api import Context, Each, Panorama, Params, arguments_from, params_from, stage
+from pano_mvs.algorithms.masks.static import MAX_VIEWS, WIDTH, StaticContent, reduced_to_width, static_content
+from pano_mvs.api import All, Context, Each, One, Panorama, Params, arguments_from, params_from, stage
+from pano_mvs.scene.static_masks import Camera, StaticMasks, camera_of
 
 
 @params_from(areas_of_color)
@@ -26,3 +31,64 @@ def color(image: Each[Panorama], params: ColorParams, ctx: Context) -> Panorama:
     )
     ctx.metric("masked", float(found.mean()))
     return image.with_mask(~found, ctx.scratch)
+
+
+@params_from(static_content, own_last=True)
+class StaticParams(Params):
+    """Settings of masks.static."""
+
+    enabled: bool = Field(default=True, description="false masks nothing")
+
+
+@stage("masks.static", memory="160MB")
+def static(images: All[Panorama], params: StaticParams, ctx: Context) -> StaticMasks:
+    """Find what moves with the camera: the tripod, a rig, a selfie stick, the hand that holds it.
+
+    It is what stays in place in the images while the world moves, so at least three images of a camera are needed, from
+    different places. Images of the same size count as one camera. `masks.apply` masks it.
+    """
+    cameras: dict[Camera, list[str]] = {}
+    for name in images if params.enabled else ():
+        cameras.setdefault(camera_of(images[name]), []).append(name)
+    found = {}
+    for camera, names in cameras.items():
+        content = _static_content([images[name] for name in _spread(names)], params)
+        which = f"{len(names)} images of {camera[1]}×{camera[0]} px: " if len(cameras) > 1 else ""
+        if content.reason:
+            ctx.note(f"{which}nothing that moves with the camera was looked for: {content.reason}")
+        elif content.pixels.any():
+            found[camera] = content.pixels
+            ctx.note(f"{which}{share_of_sphere(content.pixels):.1%} of the sphere moves with the camera and is masked")
+    ctx.metric("masked", sum(len(cameras[camera]) for camera in found) / max(1, sum(map(len, cameras.values()))))
+    masks = [_at_width(pixels) for pixels in found.values()]
+    return StaticMasks(np.array(masks, np.uint8).reshape(-1, WIDTH // 2, WIDTH), tuple(found))
+
+
+@stage("masks.apply")
+def apply(image: Each[Panorama], static_masks: One[StaticMasks] | None, ctx: Context) -> Panorama:
+    """Mask what `masks.static` has found; all later stages then ignore it."""
+    pixels = None if static_masks is None else static_masks.of(image)
+    ctx.metric("masked", 0.0 if pixels is None else float(pixels.mean()))
+    return image if pixels is None or not pixels.any() else image.with_mask(~pixels, ctx.scratch)
+
+
+def _static_content(panoramas: list[Panorama], params: StaticParams) -> StaticContent:
+    reduced = [reduced_to_width(panorama.load(), panorama.load_mask()) for panorama in panoramas]
+    return static_content(
+        [picture for picture, _ in reduced],
+        [valid for _, valid in reduced],
+        **arguments_from(static_content, params),
+    )
+
+
+def _spread(names: list[str]) -> list[str]:
+    """Return at most `MAX_VIEWS` names, evenly spread."""
+    return [names[idx] for idx in np.unique(np.rint(np.linspace(0, len(names) - 1, MAX_VIEWS)).astype(int))]
+
+
+def _at_width(pixels: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return a mask at `WIDTH` columns."""
+    rows, columns = (
+        np.arange(size) * side // size for size, side in zip((WIDTH // 2, WIDTH), pixels.shape, strict=True)
+    )
+    return np.asarray(pixels[rows[:, None], columns])

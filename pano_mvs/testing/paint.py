@@ -83,11 +83,13 @@ def _octaves(
     return total
 
 
-def sky_color(rays_in_world: FloatArray, sky: tuple[Vector, Vector], *, seed: int) -> FloatArray:
-    """Return the colours (N, 3) of the sky along unit rays (N, 3); clouds are infinitely far away."""
+def sky_color(rays_in_world: FloatArray, sky: tuple[Vector, Vector], *, seed: int, clouds: float = 0.35) -> FloatArray:
+    """Return the colours (N, 3) of the sky along unit rays (N, 3); clouds are infinitely far away, and 1 is thick."""
     zenith, horizon = np.array(sky)
     height = np.clip(-rays_in_world[:, 1], 0, 1)[:, None] ** 0.5
-    clear = height * zenith + (1 - height) * horizon
+    clear: FloatArray = height * zenith + (1 - height) * horizon
+    if not clouds:
+        return clear
     cloud = 0.5 + 0.5 * np.tanh(noise(rays_in_world, cells=_CLOUDS, seed=seed + 0x5C))[:, None]
-    mixed: FloatArray = clear + 0.35 * cloud * (1 - clear)
+    mixed: FloatArray = clear + clouds * cloud * (1 - clear)
     return mixed

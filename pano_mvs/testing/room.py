@@ -32,6 +32,7 @@ class Room:
         textures: texture of each surface, if they differ; empty: all have `texture`.
         sky: colours at the zenith and at the horizon where a ray meets no surface, with clouds that are infinitely far
             away; None: black.
+        clouds: strength of the clouds; 0 is a clear sky.
     """
 
     surfaces: tuple[Surface, ...]
@@ -40,6 +41,7 @@ class Room:
     lamp: Vector = (0.4, -1.2, 0.3)
     textures: tuple[Texture | Pattern, ...] = ()
     sky: tuple[Vector, Vector] | None = None
+    clouds: float = 0.35
 
 
 def default_room(seed: int = 0, texture: Texture = "strong") -> Room:
@@ -204,7 +206,7 @@ def _shaded(
         colors[on] = albedo * (0.55 + 0.45 * facing[:, None])
     if room.sky is not None:
         nothing = surface_idx < 0
-        colors[nothing] = sky_color(rays[nothing], room.sky, seed=room.seed)
+        colors[nothing] = sky_color(rays[nothing], room.sky, seed=room.seed, clouds=room.clouds)
     return np.clip(colors, 0, 1)
 
 

@@ -21,12 +21,30 @@ from pano_mvs.testing.courtyard import courtyard_surfaces
 from pano_mvs.testing.paint import BLUE, BRICK, LEAVES, OAK, RED, STEEL, STONE, WHITE, Texture
 from pano_mvs.testing.room import Room, default_room, render, write_views
 from pano_mvs.testing.surfaces import Ball, Cuboid, Quad, Rod, Surface, Vector
+from pano_mvs.testing.yard import yard_surfaces
 
-__all__ = ["SCENES", "Scene", "corridor", "courtyard", "large_plain_room", "poles", "white_room", "write_scene"]
+__all__ = [
+    "SCENES",
+    "SKIES",
+    "Scene",
+    "corridor",
+    "courtyard",
+    "large_plain_room",
+    "poles",
+    "white_room",
+    "write_scene",
+    "yard",
+]
 
 Painted = tuple[Surface, Texture]
 
-_SKY = ((0.36, 0.55, 0.86), (0.80, 0.86, 0.92))
+# Colours at the zenith and at the horizon, and the strength of the clouds. The overcast sky is overexposed.
+SKIES: dict[str, tuple[Vector, Vector, float]] = {
+    "cloudy": ((0.36, 0.55, 0.86), (0.80, 0.86, 0.92), 0.35),
+    "blue": ((0.22, 0.42, 0.80), (0.66, 0.78, 0.92), 0.0),
+    "overcast": ((1.0, 1.0, 1.0), (0.97, 0.97, 0.98), 0.0),
+    "clouds": ((0.30, 0.50, 0.85), (0.72, 0.80, 0.90), 0.8),
+}
 
 
 @dataclass(frozen=True)
@@ -61,7 +79,9 @@ class Scene:
         return np.clip(np.rint(levels), 0, 255).astype(np.uint8), ranges
 
 
-def courtyard(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: float = 0.0) -> Scene:
+def courtyard(
+    *, seed: int = 0, views: int = 4, turned: bool = True, exposure: float = 0.0, sky: str = "cloudy"
+) -> Scene:
     """Return a paved court of 24 × 78 under an open sky: facades, columns, trees, a van; ranges from 1.4 to 60.
 
     Args:
@@ -70,12 +90,30 @@ def courtyard(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: f
         turned: whether every camera is rotated arbitrarily.
         exposure: standard deviation of the logarithm of the gain of each view and colour; 0.15 is large. Offsets have a
             standard deviation of 40 grey levels times this value.
+        sky: one of `SKIES`.
     """
     surfaces: list[Painted] = [(surface, "outdoor") for surface in courtyard_surfaces()]
-    room = _painted("outdoor", surfaces, seed=seed, lamp=(30.0, -80.0, 25.0), sky=_SKY)
+    room = _painted("outdoor", surfaces, seed=seed, lamp=(30.0, -80.0, 25.0), sky=sky)
     return _scene(
         "courtyard", room, views=views, turned=turned, spread=(1.2, 0.25, 1.2), exposure=exposure, outdoor=True
     )
+
+
+def yard(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: float = 0.0, sky: str = "blue") -> Scene:
+    """Return a yard of 60 × 60 under an open sky that is seen behind branches, through windows and between slats.
+
+    It is not one of `SCENES`, since the branches take long to render.
+
+    Args:
+        seed: seed of trees, textures, cameras and exposures.
+        views: number of cameras, about 0.8 apart.
+        turned: whether every camera is rotated arbitrarily.
+        exposure: as in `courtyard`.
+        sky: one of `SKIES`.
+    """
+    surfaces: list[Painted] = [(surface, "outdoor") for surface in yard_surfaces(seed)]
+    room = _painted("yard", surfaces, seed=seed, lamp=(-20.0, -60.0, -30.0), sky=sky)
+    return _scene("yard", room, views=views, turned=turned, spread=(0.8, 0.2, 0.8), exposure=exposure, outdoor=True)
 
 
 def white_room(*, seed: int = 0, views: int = 4, turned: bool = True, exposure: float = 0.0) -> Scene:
@@ -217,17 +255,17 @@ def write_scene(folder: Path, scene: Scene, size_hw: tuple[int, int]) -> None:
     write_views(folder, (scene.view(idx, size_hw) for idx in range(len(scene.poses))), scene.poses)
 
 
-def _painted(
-    name: str, surfaces: list[Painted], *, seed: int, lamp: Vector, sky: tuple[Vector, Vector] | None = None
-) -> Room:
-    """Return a room of surfaces with a texture each; the textures depend on the name of the room."""
+def _painted(name: str, surfaces: list[Painted], *, seed: int, lamp: Vector, sky: str | None = None) -> Room:
+    """Return a room of surfaces with a texture each, which depend on the name of the room; `sky` is one of `SKIES`."""
+    zenith, horizon, clouds = SKIES[sky] if sky else ((0.0,) * 3, (0.0,) * 3, 0.0)
     own = seed + sum(map(ord, name))
     return Room(
         tuple(surface for surface, _ in surfaces),
         seed=own,
         lamp=lamp,
         textures=tuple(texture for _, texture in surfaces),
-        sky=sky,
+        sky=(zenith, horizon) if sky else None,
+        clouds=clouds,
     )
 
 

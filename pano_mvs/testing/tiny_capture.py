@@ -32,6 +32,7 @@ from pano_mvs.scene import (
 )
 from pano_mvs.scene.face_files import FaceFiles
 from pano_mvs.scene.image_files.image_file import write_png
+from pano_mvs.scene.static_masks import StaticMasks, camera_of
 from pano_mvs.scene.surface_samples import SurfaceSamples
 from pano_mvs.scene.tracked_points import TrackedPoints
 from pano_mvs.testing.room import capture_poses, default_room, range_along, render
@@ -119,6 +120,7 @@ class TinyCapture:
             Poses: self._poses_with_points(),
             PointCloud: self._cloud(),
             TrackedPoints: self._tracked_points(),
+            StaticMasks: self._static_masks(),
             Scores: Scores({"registered": 1.0}, {}),
         }
 
@@ -260,6 +262,14 @@ class TinyCapture:
                 track_bearings=poses.track_bearings,
             )
         )
+
+    def _static_masks(self) -> StaticMasks:
+        """Return a mask of two areas, which turn with the images."""
+        pixels = np.zeros((8, 16), np.uint8)
+        pixels[5:, 2:6] = pixels[7:] = 1
+        pixels = np.roll(pixels, 16 * self.variant.rolled // self.variant.size_hw[1], axis=1)
+        camera = camera_of(self.images[self.names[0]])
+        return frozen(StaticMasks(pixels[None], (camera,)))
 
     def _cloud(self) -> PointCloud:
         points = self.points_in_world[: 0 if self.variant.blank else None]

@@ -105,10 +105,11 @@ def test_what_is_damaged_or_gone_is_left_out_and_told(
     assert "Not shown:" in page.words
 
 
+@pytest.mark.parametrize("source", ["images", "photos"])
 def test_a_folder_and_its_cache_give_the_page_of_the_run(
-    out_dir: Path, results: StoredValues, tiny: TinyCapture
+    out_dir: Path, results: StoredValues, tiny: TinyCapture, source: str
 ) -> None:
-    """`StoredValues.of_folder` finds by the book of runs what the run had in its hands."""
+    """`StoredValues.of_folder` finds the values of a run, also if a stage after the source made the panoramas."""
     store = results.store
     assert store is not None
     keys: dict[str, dict[str, str]] = {}
@@ -119,7 +120,8 @@ def test_a_folder_and_its_cache_give_the_page_of_the_run(
             store.put(UnitRecord(key, {"stage": role}, results.refs[role][item]))
     store.runs.remember("f" * 64, keys, workflow="tiny", out=out_dir)
     summary = summary_of(tiny) | {"results": {role: role for role in keys}}
-    summary["stages"] = [{"name": "images", "params": {"path": str(tiny.folder / "images")}}]
+    read = {"name": source, "use": "source.folder", "params": {"path": str(tiny.folder / "images")}}
+    summary["stages"] = [read, {"name": "images", "use": "masks.apply"}][: 1 + (source != "images")]
     again = StoredValues.of_folder(out_dir, RunSummary.from_json(summary), Store(store.root))
     assert {role: dict(refs) for role, refs in again.refs.items()} == results.refs
     panorama = again.panorama(tiny.names[0])

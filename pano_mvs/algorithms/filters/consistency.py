@@ -144,7 +144,9 @@ def checked_with_agreement(
     )
     confidence[np.isnan(ranges)] = 0
     uncertainty[np.isnan(ranges)] = np.nan
-    return RangeMap(ranges, confidence, reference.normals_in_cam, uncertainty), _agreement(comparison, seen)
+    return RangeMap(ranges, confidence, reference.normals_in_cam, uncertainty, reference.sky), _agreement(
+        comparison, seen
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,10 +14,15 @@ def with_ranges(
 ) -> RangeMap:
     """Return a range map with other ranges (H, W), and other confidences if given.
 
-    Normals are kept where the range did not change; for the uncertainty see `replaced_uncertainty`.
+    Normals are kept where the range did not change; for the uncertainty see `replaced_uncertainty`. The sky gets no
+    range.
     """
     confidence = range_map.confidence if confidence is None else confidence
+    if range_map.sky is not None:
+        ranges = np.where(range_map.sky, np.float32(np.nan), ranges)
+        confidence = np.where(range_map.sky, np.uint8(0), confidence)
     normals = range_map.normals_in_cam
     if normals is not None:
         normals = np.where((ranges == range_map.range)[..., None], normals, np.float16(np.nan))
-    return RangeMap(ranges, confidence, normals, replaced_uncertainty(range_map, ranges, confidence))
+    uncertainty = replaced_uncertainty(range_map, ranges, confidence)
+    return RangeMap(ranges, confidence, normals, uncertainty, range_map.sky)

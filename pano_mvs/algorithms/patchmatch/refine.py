@@ -155,7 +155,7 @@ def _range_map_from_planes(planes: FloatImage, before: RangeMap, seen: Mask) -> 
     normals = np.full((height, width, 3), np.nan, np.float16)
     # p · ray > 0 at the surface, so −p points back to the camera.
     normals[met] = -(planes[:, met] / length[met]).T
-    return RangeMap(ranges.astype(np.float32), before.confidence, normals)
+    return RangeMap(ranges.astype(np.float32), before.confidence, normals, sky=before.sky)
 
 
 def _reference_arrays(

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pano_mvs.testing.repeating.places import REPEATS
 from pano_mvs.testing.scenes import SCENES, large_plain_room
 from tests.benchmarks.captures import Capture, read_capture, scene_capture
+from tests.repeating.places import REPEATS
 
 SCENE_MAKERS = {**SCENES, **REPEATS, "large_plain_room": large_plain_room}
 

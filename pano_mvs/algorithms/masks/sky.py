@@ -1,0 +1,265 @@
+"""Find the sky in a panorama: what is smooth, and looks the same in all views if it is infinitely far away."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.filters.sphere.box import box_sum
+from pano_mvs.algorithms.masks.areas import area_labels, border_shares, dilated, pixel_weights, share_of_sphere
+from pano_mvs.algorithms.masks.sky_colors import SkyColors, sharpened_sky, sky_colors
+from pano_mvs.algorithms.masks.sky_comparison import Comparison, compare_with_source, errors_of_area, pixel_errors
+from pano_mvs.algorithms.sweep.no_match import is_bare
+from pano_mvs.core.errors import UsageError
+from pano_mvs.core.settings import Setting, checks_settings
+from pano_mvs.geometry import Rigid3, pad_panorama, ray_grid
+from pano_mvs.scene.masking import placed_mask
+from pano_mvs.scene.range_map import CONSISTENT_CONFIDENCE, RangeMap
+
+Mask = NDArray[np.bool_]
+Picture = NDArray[np.uint8]
+
+WIDTH = 512
+"""Columns at which views are compared."""
+
+MAX_SOURCES = 4
+"""More sources than this add little."""
+
+_MIN_WIDTH = 64
+# Grey levels between the darkest and the brightest pixel of a 3×3 window of a smooth area.
+_SMOOTH = 10
+# Errors in grey levels: of the sky at infinity, and by how much those at finite range may be less.
+_MAX_ERROR, _FLAT_RATIO, _FLAT_MARGIN = 4.0, 1.15, 0.5
+_PREFERS_RATIO, _PREFERS_MARGIN = 1.3, 0.1
+# Where there is no range: errors at infinity as a share of the standard deviation of the colours.
+_CONTENT_RATIO = 0.12
+# Without a preference for infinity: the most that may lie on one plane, and that other views may confirm.
+_MAX_PLANE_SHARE, _MAX_CONSISTENT = 0.7, 0.18
+# The smallest such area by which a sky is recognised; smaller ones are blinds and lamps.
+_MIN_FLAT_SHARE = 0.05
+_PLANE_TRIALS, _PLANE_TOLERANCE, _MIN_BORDER_POINTS = 200, 0.06, 30
+_SOLID_MARGIN = 3.0
+# Larger parts of the colours of the sky must agree at infinity too.
+_MAX_PART_SHARE = 0.005
+# Larger ones count as small if they differ by at most this number of grey levels on average.
+_MAX_EXACT_SHARE, _EXACT_LEVELS = 0.03, 5.0
+_MIN_AGREEING = 0.3
+# Farther from known sky, the colours of the sky are not known.
+_REACH_PX = 40
+_CLOUD_RADIUS_PX, _CLOUD_SHARE, _ROUGH_ERRORS = 3, 0.7, 3
+_ROUNDS = 3
+# If less than this share of an area lies away from its border, all of it is compared.
+_MIN_INNER = 0.3
+_CREEP_PX, _CREEP_LEVELS = 4, 16
+_ENCLOSED = 0.7
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """What is known of the reference at the comparison's resolution; arrays (H, W) or (H, W, 3)."""
+
+    picture: Picture
+    valid: Mask
+    ranges: NDArray[np.float32]
+    consistent: Mask
+    comparisons: tuple[Comparison, ...]
+
+
+@checks_settings
+def sky_pixels(
+    range_map: RangeMap,
+    picture: Picture,
+    sources: Sequence[Picture],
+    *,
+    source_from_reference: Sequence[Rigid3],
+    valid: Mask,
+    source_valid: Sequence[Mask],
+    rng: np.random.Generator,
+    min_share: Annotated[
+        float, Setting("smallest share of the sphere of an area by which a sky is recognised", gt=0, le=1)
+    ] = 0.01,
+) -> Mask:
+    """Return the pixels, (H, W), that show the sky.
+
+    Seeds are large smooth areas whose colours agree with the sources if the area is infinitely far away, up to a factor
+    per channel. Walls and ceilings do not: their shading and their extent move. If the colours agree as well at the
+    measured ranges (an overcast sky, an overexposed room), the sky is what other views hardly confirm, and whose border
+    does not lie on one plane. The colours of the seeds, as a function of direction, then find the sky in smaller areas:
+    behind branches, in windows. Edges follow the picture.
+
+    Args:
+        range_map: of the reference, after the check by other views.
+        picture: the reference, (H, W, 3) uint8.
+        sources: of which the first `MAX_SOURCES` are used.
+        source_from_reference: pose of each.
+        valid: (H, W), False is ignored.
+        source_valid: of each source.
+        rng: draws border points for planes.
+        min_share: of the sphere that one area must cover before anything is taken for sky.
+
+    Raises:
+        UsageError: if the sizes do not fit together, or there is no source.
+    """
+    if picture.shape[:2] != range_map.range.shape or valid.shape != range_map.range.shape:
+        raise UsageError(f"the picture is {picture.shape[:2]}, its ranges are {range_map.range.shape}")
+    if not sources or not len(sources) == len(source_from_reference) == len(source_valid):
+        raise UsageError("the sky needs one or more sources, each with its pose and mask")
+    if picture.shape[1] < _MIN_WIDTH:
+        return np.zeros_like(valid)
+    used = list(zip(sources, source_valid, source_from_reference, strict=True))[:MAX_SOURCES]
+    view = _view(range_map, picture, valid, used)
+    seeds = _seeds(view, min_share=min_share, rng=rng)
+    if not seeds.any():
+        return np.zeros_like(valid)
+    sky, colors = _grown(view, seeds, rng)
+    return sharpened_sky(sky, colors, picture) & valid
+
+
+def _view(range_map: RangeMap, picture: Picture, valid: Mask, sources: list[tuple[Picture, Mask, Rigid3]]) -> _View:
+    """Return the reference and its comparisons with the sources, at `WIDTH` columns or fewer."""
+    small, small_valid = _reduced(picture, valid)
+    rows, columns = (np.arange(new) * old // new for new, old in zip(small_valid.shape, valid.shape, strict=True))
+    ranges = range_map.range[rows[:, None], columns]
+    consistent = range_map.confidence[rows[:, None], columns] >= CONSISTENT_CONFIDENCE[0]
+    comparisons = tuple(
+        compare_with_source(small, ranges, *_reduced(source, mask), source_from_reference=pose)
+        for source, mask, pose in sources
+    )
+    return _View(small, small_valid, ranges, consistent, comparisons)
+
+
+def _reduced(picture: Picture, valid: Mask) -> tuple[Picture, Mask]:
+    height, width = valid.shape
+    if width <= WIDTH:
+        return picture, valid
+    size_hw = (WIDTH // 2, WIDTH)
+    small = cv2.resize(picture, size_hw[::-1], interpolation=cv2.INTER_AREA)
+    return np.asarray(small), placed_mask(valid, size_hw, of=(0, 0, width, height), whole_hw=(height, width))
+
+
+def _contrast(picture: Picture) -> NDArray[np.int16]:
+    """Return the largest difference of a channel within 3×3 pixels, (H, W), in grey levels."""
+    window = np.ones((3, 3), np.uint8)
+    padded = np.ascontiguousarray(pad_panorama(picture, 1))
+    contrast = cv2.dilate(padded, window).astype(np.int16) - cv2.erode(padded, window)
+    return np.asarray(contrast[1:-1, 1:-1].max(axis=-1), np.int16)
+
+
+def _seeds(view: _View, *, min_share: float, rng: np.random.Generator) -> Mask:
+    """Return the large areas that are sky: smooth ones, and clouds."""
+    possible = view.valid & ((_contrast(view.picture) < _SMOOTH) | _clouds(view))
+    labels, weights = area_labels(possible), pixel_weights(possible.shape)
+    sizes = np.bincount(labels[possible], weights[possible], labels.size)
+    found = np.zeros_like(possible)
+    for label in np.flatnonzero(sizes >= min_share * weights.sum()):
+        if _is_sky(view, area := labels == label, rng, min_flat_share=_MIN_FLAT_SHARE):
+            found |= area
+    return found
+
+
+def _clouds(view: _View) -> Mask:
+    """Return where most pixels agree at infinity, and not at their range."""
+    at_infinity, at_range = pixel_errors(view.picture, view.consistent, view.comparisons, area_at_infinity=False)
+    far = (at_infinity <= _ROUGH_ERRORS * _MAX_ERROR) & (at_range > at_infinity + _SOLID_MARGIN)
+    if far.any():  # these pixels know the exposure of the sky better than the ground does
+        at_infinity, at_range = pixel_errors(view.picture, far, view.comparisons, area_at_infinity=True)
+        far = (at_infinity <= _MAX_ERROR) & (at_range > at_infinity + _SOLID_MARGIN)
+    share = box_sum(far.astype(np.float64), _CLOUD_RADIUS_PX) / box_sum(np.ones(far.shape), _CLOUD_RADIUS_PX)
+    return np.asarray(share >= _CLOUD_SHARE)
+
+
+def _is_sky(view: _View, area: Mask, rng: np.random.Generator, *, min_flat_share: float = 0.0) -> bool:
+    """Return whether the colours of an area agree at infinity, and nothing speaks for a finite range."""
+    inner = area & ~dilated(~area, 2)
+    if inner.sum() < _MIN_INNER * area.sum():
+        inner = area
+    at_infinity, at_range = errors_of_area(view.picture, inner, view.comparisons)
+    if not at_infinity <= min(_MAX_ERROR, _FLAT_RATIO * at_range + _FLAT_MARGIN):
+        return False
+    if np.isfinite(at_range):
+        if at_range >= _PREFERS_RATIO * at_infinity + _PREFERS_MARGIN:
+            return True
+    elif at_infinity <= _CONTENT_RATIO * view.picture[inner].std(axis=0).max():
+        return True
+    border = dilated(area, 3) & ~area & view.consistent & ~is_bare(view.picture)
+    return bool(
+        share_of_sphere(area) >= min_flat_share
+        and view.consistent[inner].mean() <= _MAX_CONSISTENT
+        and _plane_share(view.ranges, border, inner, rng) <= _MAX_PLANE_SHARE
+    )
+
+
+def _plane_share(ranges: NDArray[np.float32], border: Mask, area: Mask, rng: np.random.Generator) -> float:
+    """Return the largest share of the border points that lie on one plane which all rays of the area meet.
+
+    It is 1 if there are too few points to say.
+    """
+    rays = ray_grid((ranges.shape[0], ranges.shape[1]))
+    bearings, weights, inside = rays[border], pixel_weights(border.shape)[border], rays[area]
+    if len(bearings) < _MIN_BORDER_POINTS:
+        return 1.0
+    distances = ranges[border].astype(np.float64)
+    points = bearings * distances[:, None]
+    inside = inside[:: max(1, len(inside) // 500)]
+    best = 0.0
+    for _ in range(_PLANE_TRIALS):
+        chosen = points[rng.choice(len(points), 3, replace=False, p=weights / weights.sum())]
+        normal = np.cross(chosen[1] - chosen[0], chosen[2] - chosen[0])
+        offset = float(normal @ chosen[0])
+        if abs(offset) < 1e-9 or ((inside @ normal) * offset > 0).mean() < 0.95:
+            continue
+        with np.errstate(divide="ignore"):
+            near = np.abs(offset / (bearings @ normal) / distances - 1) < _PLANE_TOLERANCE
+        best = max(best, float(weights[near].sum() / weights.sum()))
+    return best
+
+
+def _grown(view: _View, seeds: Mask, rng: np.random.Generator) -> tuple[Mask, SkyColors]:
+    """Return the sky with the smaller areas of its colours, and its colours.
+
+    A part of the colours of the sky needs no further evidence if it is small: in a window or between branches, the
+    sources see the window's frame or the branches at infinity, and at their range the part moves with them.
+    """
+    at_infinity, at_range = pixel_errors(view.picture, seeds, view.comparisons, area_at_infinity=True)
+    solid = view.consistent & ~is_bare(view.picture) & (at_range + _SOLID_MARGIN < at_infinity)
+    agrees = (at_infinity <= _MAX_ERROR) & ~solid & view.valid
+    sky, most = seeds, _MAX_PART_SHARE * pixel_weights(seeds.shape).sum()
+    for _ in range(_ROUNDS):
+        colors = sky_colors(view.picture, sky)
+        reached = view.valid & dilated(sky, min(_REACH_PX, len(sky) // 2 - 1))
+        alike = reached & colors.match(view.picture) & (~solid | dilated(sky, 1))
+        labels = area_labels(alike & ~sky)
+        inside, weights = labels >= 0, pixel_weights(sky.shape)
+        sizes = np.bincount(labels[inside], weights[inside], labels.size)
+        agreeing = np.bincount(labels[inside & agrees], weights[inside & agrees], labels.size)
+        away = np.abs(view.picture - colors.mean).max(axis=-1)
+        exact = np.bincount(labels[inside], (weights * away)[inside], labels.size) <= _EXACT_LEVELS * sizes
+        taken = (sizes <= most) | (exact & (sizes <= _MAX_EXACT_SHARE / _MAX_PART_SHARE * most))
+        for label in np.flatnonzero(~taken & (agreeing >= _MIN_AGREEING * sizes)):
+            taken[label] = _is_sky(view, labels == label, rng)
+        sky = sky | (inside & taken[labels])
+        sky = _with_enclosed_parts(_crept(sky, view.picture, agrees), agrees | alike)
+    return sky, sky_colors(view.picture, sky)
+
+
+def _crept(sky: Mask, picture: Picture, agrees: Mask) -> Mask:
+    """Return the sky with neighbouring pixels that agree at infinity and whose colours continue it, as at a horizon."""
+    for _ in range(_CREEP_PX):
+        count = box_sum(sky.astype(np.float64), 2)
+        local = box_sum(picture.astype(np.float64) * sky[..., None], 2) / np.maximum(count, 1)[..., None]
+        further = agrees & ~sky & (count > 0) & (np.abs(picture - local).max(axis=-1) <= _CREEP_LEVELS)
+        if not further.any():
+            break
+        sky = sky | further
+    return sky
+
+
+def _with_enclosed_parts(sky: Mask, possible: Mask) -> Mask:
+    """Return the sky with the parts, such as the edges of clouds, whose border is mostly sky."""
+    labels = area_labels(possible & ~sky)
+    return sky | ((labels >= 0) & (border_shares(labels, sky) >= _ENCLOSED)[labels])

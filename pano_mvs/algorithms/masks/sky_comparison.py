@@ -1,0 +1,132 @@
+"""Compare the colours of a panorama with those of its sources, at infinity and at its ranges."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pano_mvs.geometry import Rigid3, pad_panorama, pixel_from_ray, ray_grid, sample_panorama
+
+Colors = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+# Below this parallax, infinity and the range look the same.
+_MIN_PARALLAX_PX = 1.0
+_MIN_PIXELS = 20
+_DARK_LEVEL = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A source as seen from the reference.
+
+    Attributes:
+        at_infinity: (H, W, 3) colours of the source where each pixel would be if it were infinitely far away; NaN where
+            the source is masked.
+        at_range: the same at the pixel's range; NaN where it has none.
+        parallax_px: (H, W) pixels of the reference between the two; 0 without a range.
+    """
+
+    at_infinity: Colors
+    at_range: Colors
+    parallax_px: NDArray[np.float32]
+
+
+def compare_with_source(
+    reference: NDArray[np.uint8],
+    ranges: NDArray[np.float32],
+    source: NDArray[np.uint8],
+    source_valid: Mask,
+    *,
+    source_from_reference: Rigid3,
+) -> Comparison:
+    """Look a source up from a reference.
+
+    Args:
+        reference: (H, W, 3) uint8.
+        ranges: (H, W) of the reference, NaN without.
+        source: (Hs, Ws, 3) uint8.
+        source_valid: (Hs, Ws), False is ignored.
+        source_from_reference: the pose of the source.
+    """
+    size_hw = (reference.shape[0], reference.shape[1])
+    colors = smoothed(source)
+    colors[~source_valid] = np.nan
+    far = ray_grid(size_hw) @ source_from_reference.rotation.T
+    known = np.isfinite(ranges)
+    points = far * np.where(known, ranges, 1.0)[..., None] + source_from_reference.translation
+    near = points / np.maximum(np.linalg.norm(points, axis=-1, keepdims=True), 1e-12)
+    angle = np.arccos(np.clip((far * near).sum(axis=-1), -1, 1))
+    source_hw = (source.shape[0], source.shape[1])
+    at_range = sample_panorama(colors, pixel_from_ray(near, source_hw))
+    at_range[~known] = np.nan
+    return Comparison(
+        sample_panorama(colors, pixel_from_ray(far, source_hw)).astype(np.float32),
+        at_range.astype(np.float32),
+        np.where(known, angle * size_hw[1] / (2 * np.pi), 0).astype(np.float32),
+    )
+
+
+def smoothed(picture: NDArray[np.uint8]) -> Colors:
+    """Return the mean colour of 3×3 pixels, (H, W, 3) float32, to suppress noise."""
+    return np.ascontiguousarray(cv2.blur(pad_panorama(picture, 1).astype(np.float32), (3, 3))[1:-1, 1:-1])
+
+
+def errors_of_area(picture: NDArray[np.uint8], area: Mask, comparisons: Sequence[Comparison]) -> tuple[float, float]:
+    """Return the median colour differences, in grey levels, of an area at infinity and at its ranges.
+
+    Each is the mean over the better half of the sources, after a factor per channel. Both come from pixels whose
+    ranges have parallax, if there are some; otherwise the second one is infinite. Both are infinite if no source sees
+    the area.
+    """
+    own = smoothed(picture)
+    found: tuple[list[float], list[float]] = ([], [])
+    for source in comparisons:
+        seen = area & np.isfinite(source.at_infinity[..., 0])
+        ranged = seen & (source.parallax_px > _MIN_PARALLAX_PX) & np.isfinite(source.at_range[..., 0])
+        if ranged.sum() >= _MIN_PIXELS:
+            found[0].append(_median_error(own[ranged], source.at_infinity[ranged]))
+            found[1].append(_median_error(own[ranged], source.at_range[ranged]))
+        elif seen.sum() >= _MIN_PIXELS:
+            found[0].append(_median_error(own[seen], source.at_infinity[seen]))
+    return _better_half(found[0]), _better_half(found[1])
+
+
+def pixel_errors(
+    picture: NDArray[np.uint8], area: Mask, comparisons: Sequence[Comparison], *, area_at_infinity: bool
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the colour differences, (H, W) in grey levels, at infinity and at the ranges.
+
+    Each is the least of all sources, since others may be occluded. Infinite without a source, or without a range.
+
+    Args:
+        picture: (H, W, 3) uint8, the reference.
+        area: (H, W), the pixels that give the factor of each channel.
+        comparisons: with the sources.
+        area_at_infinity: whether these pixels are infinitely far away, or at their ranges.
+    """
+    own = smoothed(picture)
+    errors = []
+    for source in comparisons:
+        known = source.at_infinity if area_at_infinity else source.at_range
+        seen = area & np.isfinite(known[..., 0])
+        gain = _gain(own[seen], known[seen]) if seen.any() else np.ones(3, np.float32)
+        errors.append([np.abs(other / gain - own).max(axis=-1) for other in (source.at_infinity, source.at_range)])
+    least = np.nan_to_num(np.array(errors, np.float32), nan=np.inf).min(axis=0)
+    return least[0], least[1]
+
+
+def _median_error(own: Colors, other: Colors) -> float:
+    return float(np.median(np.abs(other / _gain(own, other) - own).max(axis=-1)))
+
+
+def _gain(own: Colors, other: Colors) -> NDArray[np.float32]:
+    return np.asarray(np.median((other + _DARK_LEVEL) / (own + _DARK_LEVEL), axis=0), np.float32)
+
+
+def _better_half(errors: list[float]) -> float:
+    return float(np.mean(sorted(errors)[: (len(errors) + 1) // 2])) if errors else float("inf")

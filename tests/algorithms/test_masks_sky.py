@@ -1,0 +1,226 @@
+"""The sky is found in a small place under several skies, and never indoors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.masks.areas import area_labels, border_shares, share_of_sphere
+from pano_mvs.algorithms.masks.sky import sky_pixels
+from pano_mvs.algorithms.masks.sky_colors import sharpened_sky, sky_colors
+from pano_mvs.algorithms.masks.sky_comparison import compare_with_source, errors_of_area
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import Rigid3, pixel_solid_angle, ray_grid, roll_panorama, rotation_from_rotvec
+from pano_mvs.scene import RangeMap
+from pano_mvs.testing.paint import BRICK, LEAVES, OAK, STONE
+from pano_mvs.testing.room import Room, default_room, render
+from pano_mvs.testing.scenes import SKIES
+from pano_mvs.testing.surfaces import Ball, Cuboid, Quad, Rod
+
+SIZE_HW = (128, 256)
+CENTERS = [(0.0, 0.0, 0.0), (0.7, 0.1, 0.3), (-0.5, -0.1, 0.6), (0.2, 0.0, -0.7)]
+AREA = np.broadcast_to(pixel_solid_angle(SIZE_HW)[:, None], SIZE_HW)
+
+# Houses, a tree with branches, and a wall with a window, all of different ranges.
+_SURFACES = (
+    Quad((-20, 1.6, -20), (40, 0, 0), (0, 0, 40), LEAVES),
+    Cuboid((5, -3, -4), (9, 1.6, 9), BRICK),
+    Cuboid((-14, -5, 4), (-8, 1.6, 16), STONE),
+    Cuboid((-3, -1.5, 3), (-1.0, 1.6, 3.3), BRICK),
+    Cuboid((0.5, -1.5, 3), (2.4, 1.6, 3.3), BRICK),
+    Cuboid((-1.0, 0.2, 3), (0.5, 1.6, 3.3), BRICK),
+    Cuboid((-1.0, -1.5, 3), (0.5, -0.9, 3.3), BRICK),
+    Rod((-3, 1.6, -3), (-3, -1.2, -3), 0.1, OAK),
+    Rod((-3, -0.6, -3), (-1.6, -1.9, -2.6), 0.06, OAK),
+    Rod((-3, -0.9, -3), (-4.2, -2.2, -3.3), 0.06, OAK),
+    Ball((3, 0.6, -4), 1.2, LEAVES),
+)
+
+Views = tuple[list[NDArray[np.uint8]], list[NDArray[np.float32]], list[Rigid3]]
+
+
+def views_of(room: Room, *, gain: float = 1.0, turned: bool = True) -> Views:
+    """Return noisy pictures, true ranges and poses of four views, with gains of their own."""
+    rng = np.random.default_rng(4)
+    pictures, ranges, poses = [], [], []
+    for center in CENTERS:
+        turn = rotation_from_rotvec(rng.normal(size=3)) if turned else np.eye(3)
+        pose = Rigid3.from_center(turn, np.array(center))
+        picture, true_range = render(room, pose, SIZE_HW, supersample=2)
+        levels = picture * rng.uniform(0.95, 1.05, 3) * gain + rng.normal(0, 1, picture.shape)
+        pictures.append(np.clip(np.rint(levels), 0, 255).astype(np.uint8))
+        ranges.append(true_range)
+        poses.append(pose)
+    return pictures, ranges, poses
+
+
+def measured(true_range: NDArray[np.float32], *, confirmed: float = 0.9) -> RangeMap:
+    """Return ranges as a sweep gives them: the sky has some as well, which other views hardly confirm."""
+    rng = np.random.default_rng(5)
+    smooth = 4 + np.sin(np.arange(true_range.shape[1]) / 9).astype(np.float32)
+    sky = np.isnan(true_range)
+    share = np.where(sky, 0.08, confirmed)
+    confidence = np.where(rng.random(true_range.shape) < share, 200, 90).astype(np.uint8)
+    return RangeMap(np.where(sky, smooth, true_range).astype(np.float32), confidence)
+
+
+def found_in(
+    views: Views, *, range_map: RangeMap | None = None, valid: NDArray[np.bool_] | None = None
+) -> NDArray[np.bool_]:
+    pictures, ranges, poses = views
+    everything = np.ones(SIZE_HW, np.bool_)
+    return sky_pixels(
+        measured(ranges[0]) if range_map is None else range_map,
+        pictures[0],
+        pictures[1:],
+        source_from_reference=[pose @ poses[0].inverse() for pose in poses[1:]],
+        valid=everything if valid is None else valid,
+        source_valid=[everything] * 3,
+        rng=np.random.default_rng(0),
+    )
+
+
+def outdoors(sky: str, *, turned: bool = True) -> Views:
+    zenith, horizon, clouds = SKIES[sky]
+    return views_of(
+        Room(_SURFACES, "outdoor", 3, lamp=(9.0, -40.0, -20.0), sky=(zenith, horizon), clouds=clouds), turned=turned
+    )
+
+
+@pytest.fixture(scope="module")
+def blue() -> Views:
+    return outdoors("blue")
+
+
+@pytest.mark.parametrize("sky", SKIES)
+@pytest.mark.parametrize("turned", [True, False])
+def test_skies_are_found(sky: str, turned: bool) -> None:
+    views = outdoors(sky, turned=turned)
+    truth = np.isnan(views[1][0])
+    found = found_in(views)
+    assert AREA[found & truth].sum() > 0.96 * AREA[truth].sum()  # edges weigh more at this size
+    assert AREA[found & ~truth].sum() < 0.005 * AREA[~truth].sum()
+
+
+def test_a_sky_without_ranges_is_found(blue: Views) -> None:
+    truth = np.isnan(blue[1][0])
+    known = measured(blue[1][0])
+    bare = RangeMap(np.where(truth, np.nan, known.range).astype(np.float32), np.where(truth, 0, known.confidence))
+    assert AREA[found_in(blue, range_map=bare) & truth].sum() > 0.97 * AREA[truth].sum()
+
+
+@pytest.mark.parametrize("gain", [1.0, 1.6])
+def test_rooms_have_no_sky(gain: float) -> None:
+    """Not even plain rooms, nor overexposed ones, of whose walls other views confirm a third."""
+    room = replace(default_room(), texture="none")
+    views = views_of(room, gain=gain)
+    assert not found_in(views, range_map=measured(views[1][0], confirmed=0.33)).any()
+
+
+def test_masked_pixels_are_not_sky(blue: Views) -> None:
+    valid = np.ones(SIZE_HW, np.bool_)
+    valid[:, 60:90] = False
+    found = found_in(blue, valid=valid)
+    assert found.any()
+    assert not found[~valid].any()
+
+
+def test_the_sky_rolls_with_the_picture(blue: Views) -> None:
+    pictures, ranges, poses = blue
+    picture, turn = roll_panorama(pictures[0], 37)
+    rolled = (
+        [picture, *pictures[1:]],
+        ranges,
+        [Rigid3(turn, np.zeros(3)) @ poses[0], *poses[1:]],
+    )
+    known = measured(ranges[0])
+    moved = RangeMap(np.roll(known.range, 37, axis=1), np.roll(known.confidence, 37, axis=1))
+    straight, back = found_in(blue), np.roll(found_in(rolled, range_map=moved), -37, axis=1)
+    assert (straight != back).mean() < 0.01
+
+
+def test_the_same_input_gives_the_same_sky(blue: Views) -> None:
+    assert np.array_equal(found_in(blue), found_in(blue))
+
+
+def test_sizes_must_agree(blue: Views) -> None:
+    pictures, ranges, poses = blue
+    valid, rng = np.ones(SIZE_HW, np.bool_), np.random.default_rng(0)
+    for range_map, source, what in (
+        (measured(ranges[0][:64]), pictures[1:2], "its ranges are"),
+        (measured(ranges[0]), [], "one or more sources"),
+    ):
+        with pytest.raises(UsageError, match=what):
+            sky_pixels(
+                range_map,
+                pictures[0],
+                source,
+                source_from_reference=poses[1:2],
+                valid=valid,
+                source_valid=[valid],
+                rng=rng,
+            )
+
+
+def test_walls_disagree_at_infinity_and_agree_at_their_range() -> None:
+    pictures, ranges, poses = views_of(default_room(0, "weak"))
+    comparison = compare_with_source(
+        pictures[0],
+        ranges[0],
+        pictures[1],
+        np.ones(SIZE_HW, np.bool_),
+        source_from_reference=poses[1] @ poses[0].inverse(),
+    )
+    at_infinity, at_range = errors_of_area(pictures[0], np.ones(SIZE_HW, np.bool_), [comparison])
+    assert at_range < 2
+    assert at_infinity > 3 * at_range
+
+
+def test_masked_sources_say_nothing(blue: Views) -> None:
+    pictures, ranges, poses = blue
+    comparison = compare_with_source(
+        pictures[0],
+        ranges[0],
+        pictures[1],
+        np.zeros(SIZE_HW, np.bool_),
+        source_from_reference=poses[1] @ poses[0].inverse(),
+    )
+    assert errors_of_area(pictures[0], np.ones(SIZE_HW, np.bool_), [comparison]) == (float("inf"), float("inf"))
+
+
+def test_colors_of_the_sky_are_known_beyond_the_seeds() -> None:
+    up = -ray_grid(SIZE_HW)[..., 1]
+    picture = np.rint(np.stack([60 + 50 * up, 100 + 40 * up, 170 + 30 * up], axis=-1)).astype(np.uint8)
+    seeds = up > 0.4
+    colors = sky_colors(picture, seeds)
+    near = up > 0.3
+    assert colors.match(picture)[near].all()
+    assert not colors.match(np.full_like(picture, 90))[near].any()
+
+
+def test_edges_follow_a_larger_picture() -> None:
+    """The sky of a coarse mask ends at an edge of the picture that lies between its pixels."""
+    picture = np.full((64, 128, 3), (90, 140, 220), np.uint8)
+    picture[27:] = (80, 70, 40)
+    picture[:27, 40] = (80, 70, 40)
+    coarse = np.zeros((32, 64), np.bool_)
+    coarse[:14] = True
+    small = picture[::2, ::2]
+    found = sharpened_sky(coarse, sky_colors(small, coarse & (small[..., 2] == 220)), picture)
+    assert found[:27, :38].all()
+    assert not found[27:].any()
+
+
+def test_border_shares_count_the_border_by_its_length() -> None:
+    pixels = np.zeros((16, 32), np.bool_)
+    pixels[7:9, 30:] = pixels[7:9, :2] = True
+    labels = area_labels(pixels)
+    (label,) = np.unique(labels[labels >= 0])
+    above = np.zeros_like(pixels)
+    above[:7] = True
+    assert border_shares(labels, above)[label] == pytest.approx(1 / 3)
+    assert border_shares(labels, ~pixels)[label] == pytest.approx(1)
+    assert share_of_sphere(np.ones((16, 32), np.bool_)) == pytest.approx(1)

@@ -1,0 +1,129 @@
+"""What moves with the camera is found among panoramas, and nothing else is taken for it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pano_mvs.algorithms.masks.frame_agreement import color_difference, evenly_spread_pairs, frame_agreement
+from pano_mvs.algorithms.masks.static import MIN_VIEWS, reduced_to_width, static_content
+from pano_mvs.core.errors import UsageError
+from pano_mvs.geometry import Rigid3, pixel_solid_angle
+from pano_mvs.testing.rig import RIGS, with_rig
+from pano_mvs.testing.room import default_room, render
+
+SIZE_HW = (256, 512)
+CENTERS = [(0.0, 0.0, 0.0), (0.5, 0.1, 0.2), (-0.3, 0.0, 0.6), (0.2, -0.2, -0.5)]
+AREA = np.broadcast_to(pixel_solid_angle(SIZE_HW)[:, None], SIZE_HW)
+
+
+@pytest.fixture(scope="module")
+def views() -> list[NDArray[np.uint8]]:
+    """Panoramas by cameras that do not turn, so that everything distant stays in place."""
+    room = default_room()
+    return [render(room, Rigid3.from_center(np.eye(3), np.array(c)), SIZE_HW, supersample=1)[0] for c in CENTERS]
+
+
+def with_rigs(views: list[NDArray[np.uint8]], name: str) -> tuple[list[NDArray[np.uint8]], NDArray[np.bool_]]:
+    drawn = RIGS[name](SIZE_HW)
+    rng = np.random.default_rng(3)
+    gains = rng.uniform(0.9, 1.1, len(views))
+    return [with_rig(view, drawn, gain=g, rng=rng) for view, g in zip(views, gains, strict=True)], drawn[1]
+
+
+def share(pixels: NDArray[np.bool_], of: NDArray[np.bool_]) -> float:
+    return float(AREA[pixels & of].sum() / AREA[of].sum())
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_rigs_are_found(views: list[NDArray[np.uint8]], name: str) -> None:
+    pictures, truth = with_rigs(views, name)
+    found = static_content(pictures)
+    assert not found.reason
+    assert share(found.pixels, truth) > 0.85
+    assert share(found.pixels, ~truth) < 0.005
+
+
+@pytest.mark.parametrize("count", [MIN_VIEWS, len(CENTERS)])
+def test_nothing_is_found_without_a_rig(views: list[NDArray[np.uint8]], count: int) -> None:
+    found = static_content(views[:count])
+    assert not found.reason
+    assert not found.pixels.any()
+
+
+def test_a_distant_background_is_not_taken_for_a_rig(views: list[NDArray[np.uint8]]) -> None:
+    """Half of the sphere shows the same in all views, as mountains do, behind a foreground that hides parts of it."""
+    far = views[0].copy()
+    pictures = []
+    for number, view in enumerate(views):
+        picture = view.copy()
+        skyline = 96 + np.rint(14 * np.sin(np.arange(SIZE_HW[1]) / 15 + 2 * number)).astype(int)
+        above = np.arange(SIZE_HW[0])[:, None] < skyline
+        picture[above] = far[above]
+        pictures.append(picture)
+    assert not static_content(pictures).pixels.any()
+
+
+def test_views_of_one_place_are_refused(views: list[NDArray[np.uint8]]) -> None:
+    found = static_content([views[0]] * 4)
+    assert "of one place" in found.reason
+    assert not found.pixels.any()
+
+
+def test_two_views_are_too_few(views: list[NDArray[np.uint8]]) -> None:
+    assert "3 panoramas" in static_content(views[:2]).reason
+
+
+def test_tiny_panoramas_are_refused() -> None:
+    assert "128 columns" in static_content([np.zeros((32, 64, 3), np.uint8)] * 3).reason
+
+
+def test_sizes_must_agree() -> None:
+    with pytest.raises(UsageError, match="one size"):
+        static_content([np.zeros((64, 128, 3), np.uint8), np.zeros((32, 64, 3), np.uint8)])
+
+
+def test_masked_areas_are_no_evidence(views: list[NDArray[np.uint8]]) -> None:
+    pictures, truth = with_rigs(views, "helmet")
+    below = np.zeros(SIZE_HW, np.bool_)
+    below[170:] = True
+    assert truth[~below].sum() == 0
+    assert not static_content(pictures, [~below] + [np.ones(SIZE_HW, np.bool_)] * 3).pixels.any()
+
+
+def test_margin_and_area(views: list[NDArray[np.uint8]]) -> None:
+    pictures, _ = with_rigs(views, "helmet")
+    narrow, wide = (static_content(pictures, margin_deg=margin).pixels for margin in (0.0, 3.0))
+    assert (wide | ~narrow).all()
+    assert AREA[wide].sum() > 1.1 * AREA[narrow].sum()
+    assert not static_content(pictures, min_area_deg2=20_000).pixels.any()
+
+
+def test_sharpness_is_positive_only_where_structure_agrees_exactly(views: list[NDArray[np.uint8]]) -> None:
+    shifted = [np.roll(views[0], columns, axis=1) for columns in (0, 1, 2)]
+    middle = slice(64, 192)
+    textured = frame_agreement([views[0]] * 3).contrast[middle] > 8
+    assert (frame_agreement([views[0]] * 3).sharpness[middle][textured] > 0).mean() > 0.9
+    assert (frame_agreement(shifted).sharpness[middle][textured] > 0).mean() < 0.05
+
+
+def test_pairs_are_spread_over_all_views() -> None:
+    assert evenly_spread_pairs(3) == [(0, 1), (0, 2), (1, 2)]
+    pairs = evenly_spread_pairs(12)
+    assert len(set(pairs)) == 24
+    assert {view for pair in pairs for view in pair} == set(range(12))
+
+
+def test_color_difference_is_after_the_gains() -> None:
+    pictures = [np.full((8, 16, 3), level, np.uint8) for level in (50, 100, 100)]
+    assert color_difference(pictures, np.ones((3, 3))).max() == pytest.approx(50)
+    assert color_difference(pictures, np.array([[2.0] * 3, [1.0] * 3, [1.0] * 3])).max() == pytest.approx(0, abs=1e-4)
+
+
+def test_reduced_panoramas_keep_thin_masks() -> None:
+    valid = np.ones((512, 1024), np.bool_)
+    valid[100, 200] = False
+    picture, small = reduced_to_width(np.zeros((512, 1024, 3), np.uint8), valid)
+    assert picture.shape == (256, 512, 3)
+    assert np.argwhere(~small).tolist() == [[50, 100]]
